@@ -1,0 +1,65 @@
+"""Forces on a ball in flight: gravity, buoyancy, quadratic drag, Magnus lift, spin decay, wind.
+
+acceleration = g (1 - buoyancy) - K_d |u| u + K_m (omega x u),   u = v - wind
+K_d = C_d rho A / (2 m)                 (Abeyruwan et al. 2022, appendix "Details on Modeling Human Ball Distributions")
+K_m = k rho A r / (2 m)                 from C_L = k S with the spin ratio S = r |omega| / |u|
+d omega / dt = -spin_decay omega
+
+The defaults are the paper's drag-only ball. The literature's k runs from 0.3 to 1.5, so it is a parameter to be
+identified, not a constant. MJX cannot do this: it has only the inertia-box fluid model and drops lift silently.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+
+from ballmodel import constants as c
+from ballmodel.vec import cross, norm
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class FlightParams:
+    """Parameters of free flight; every field is a scalar or has the batch shape of the balls."""
+
+    drag_coefficient: jax.Array | float = c.DRAG_COEFFICIENT  # C_d
+    magnus_coefficient: jax.Array | float = 0.0  # k in C_L = k r |omega| / |u|
+    spin_decay: jax.Array | float = 0.0  # [1/s]
+    air_density: jax.Array | float = c.AIR_DENSITY  # [kg/m^3]
+    mass: jax.Array | float = c.BALL_MASS  # [kg]
+    radius: jax.Array | float = c.BALL_RADIUS  # [m]
+    area: jax.Array | float = c.BALL_AREA  # [m^2] cross-section
+    buoyancy: jax.Array | float = 0.0  # fraction of gravity taken away; 0.0149 for a ball in air at 20 degC
+    gravity_x: jax.Array | float = 0.0  # [m/s^2]
+    gravity_y: jax.Array | float = 0.0  # [m/s^2]
+    gravity_z: jax.Array | float = -c.GRAVITY  # [m/s^2]
+    wind_x: jax.Array | float = 0.0  # [m/s]
+    wind_y: jax.Array | float = 0.0  # [m/s]
+    wind_z: jax.Array | float = 0.0  # [m/s]
+    integrator: str = field(default="paper", metadata={"static": True})  # one of INTEGRATORS
+
+
+INTEGRATORS = ("paper", "midpoint")  # acceleration of a step taken at its start (the paper's), or at its middle
+
+
+def drag_factor(params: FlightParams):
+    """K_d [1/m]."""
+    return params.drag_coefficient * params.air_density * params.area / (2.0 * params.mass)
+
+
+def magnus_factor(params: FlightParams):
+    """K_m [dimensionless]: acceleration is K_m (omega x u)."""
+    return params.magnus_coefficient * params.air_density * params.area * params.radius / (2.0 * params.mass)
+
+
+def acceleration(params: FlightParams, velocity, spin):
+    """Acceleration [m/s^2], shape (3, ...), of a ball with velocity [m/s] and spin [rad/s], each (3, ...)."""
+    air = (params.wind_x, params.wind_y, params.wind_z)
+    u = jnp.stack([velocity[i] - air[i] for i in range(3)])
+    drag = -drag_factor(params) * norm(u)
+    lift = magnus_factor(params) * cross(spin, u)
+    weight = (params.gravity_x, params.gravity_y, params.gravity_z)
+    return jnp.stack([weight[i] * (1.0 - params.buoyancy) + drag * u[i] + lift[i] for i in range(3)])

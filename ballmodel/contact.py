@@ -1,0 +1,125 @@
+"""Impacts of a ball: where it meets a box (table, net) or the paddle, and what that does to velocity and spin.
+
+Tangential part, with the slip velocity v_s of the contact point and a thin shell, I = 2/3 m r^2:
+    dv_t = -alpha v_s,   d omega = -3 / (2 r) n x dv_t
+so the slip after the impact is (1 - 5/2 alpha) v_s.
+    table and net: alpha = min(mu (1 + e) |v_n| / |v_s|, 2/5): sliding by Coulomb friction or sticking (Nakashima et al.)
+    rubber:        alpha = k_v, tangential impulse proportional to slip; k_v > 2/5 reverses the slip, which Coulomb
+                   friction cannot (numbers: github.com/gossardt/tt_rackets)
+Normal part: v_n' = -e v_n, e = restitution - slope |v_n| kept within [0, 1].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from ballmodel import constants as c
+from ballmodel.vec import TINY, cross, dot, norm
+
+STICKING = 2.0 / 5.0  # alpha that brings the contact point of a thin shell to rest
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SurfaceParams:
+    """Impact on table or net; scalars or of the balls' batch shape."""
+
+    restitution: jax.Array | float  # e at zero speed
+    restitution_slope: jax.Array | float  # [s/m], loss of e per normal speed
+    friction: jax.Array | float  # mu
+    height: jax.Array | float  # [m], shift of the surface along z from its nominal place
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PaddleParams:
+    """Impact on the paddle's rubber and the blade's size; scalars or of the balls' batch shape."""
+
+    restitution: jax.Array | float = c.RUBBER_RESTITUTION  # a in e = a - b |v_n|
+    restitution_slope: jax.Array | float = c.RUBBER_RESTITUTION_SLOPE  # b [s/m]
+    tangential_gain: jax.Array | float = c.RUBBER_TANGENTIAL_GAIN  # k_v
+    radius: jax.Array | float = c.PADDLE_RADIUS  # [m]
+    thickness: jax.Array | float = c.PADDLE_THICKNESS  # [m]
+
+
+def table_params() -> SurfaceParams:
+    """The nominal table."""
+    return SurfaceParams(c.TABLE_RESTITUTION, 0.0, c.TABLE_FRICTION, 0.0)
+
+
+def net_params() -> SurfaceParams:
+    """The nominal net: it takes nearly all of the ball's normal speed (estimate, no published measurement)."""
+    return SurfaceParams(0.1, 0.0, 0.3, 0.0)
+
+
+def restitution_at(params, normal_speed):
+    """Coefficient of restitution at a normal speed [m/s], (...)."""
+    return jnp.clip(params.restitution - params.restitution_slope * jnp.abs(normal_speed), 0.0, 1.0)
+
+
+def _apply(velocity, spin, normal, surface_velocity, radius, restitution, alpha_of):
+    relative = velocity - surface_velocity
+    normal_speed = dot(relative, normal)
+    contact_arm = -radius * normal
+    slip = relative - normal_speed * normal + cross(spin, contact_arm)
+    slip = slip - dot(slip, normal) * normal
+    e = restitution(normal_speed)
+    alpha = alpha_of(e, normal_speed, norm(slip))
+    tangential = -alpha * slip
+    new_velocity = velocity - (1.0 + e) * normal_speed * normal + tangential
+    new_spin = spin - (1.0 / (c.SHELL_INERTIA_FACTOR * radius)) * cross(normal, tangential)
+    return new_velocity, new_spin
+
+
+def surface_impact(params: SurfaceParams, velocity, spin, normal, radius):
+    """Velocity and spin after an impact on a resting surface.
+
+    velocity [m/s], spin [rad/s] and the unit normal pointing to the ball are (3, ...); radius [m].
+    """
+
+    def alpha_of(e, normal_speed, slip_speed):
+        return jnp.minimum(params.friction * (1.0 + e) * jnp.abs(normal_speed) / (slip_speed + TINY), STICKING)
+
+    return _apply(velocity, spin, normal, jnp.zeros_like(velocity), radius, lambda s: restitution_at(params, s), alpha_of)
+
+
+def paddle_impact(params: PaddleParams, velocity, spin, normal, paddle_velocity, radius):
+    """Velocity and spin after an impact on the moving paddle.
+
+    velocity, paddle_velocity (of the contact point) [m/s], spin [rad/s] and the unit normal pointing to the ball: (3, ...).
+    The arm is so much heavier than the ball (60 kg to 2.7 g) that the paddle keeps its speed.
+    """
+    return _apply(
+        velocity, spin, normal, paddle_velocity, radius, lambda s: restitution_at(params, s),
+        lambda e, normal_speed, slip_speed: params.tangential_gain,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box, centre and half sizes [m]."""
+
+    centre: tuple[float, float, float]
+    half: tuple[float, float, float]
+
+
+TABLE = Box((0.0, 0.0, -c.TABLE_THICKNESS / 2), (c.TABLE_WIDTH / 2, c.TABLE_LENGTH / 2, c.TABLE_THICKNESS / 2))
+NET = Box(
+    (0.0, 0.0, c.NET_HEIGHT / 2), (c.TABLE_WIDTH / 2 + c.NET_OVERHANG, c.NET_THICKNESS / 2, c.NET_HEIGHT / 2)
+)
+
+
+def box_gap(box: Box, height, position):
+    """Vector from the nearest point of the box to ``position`` and its length [m]: (3, ...), (...).
+
+    ``height`` shifts the box along z. The vector is zero for a point inside the box.
+    """
+    shift = (0.0, 0.0, height)
+    gap = jnp.stack([
+        position[i] - jnp.clip(position[i], box.centre[i] - box.half[i] + shift[i], box.centre[i] + box.half[i] + shift[i])
+        for i in range(3)
+    ])  # fmt: skip
+    return gap, norm(gap)

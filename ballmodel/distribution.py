@@ -1,0 +1,157 @@
+"""The human ball distribution: 16 numbers that bound where balls start, how fast, and where they land.
+
+Abeyruwan et al. 2022, "Modeling Human Ball Distributions": the minima and maxima of initial position (6), initial velocity
+(6) and landing x and y on the robot's side (4), after DBSCAN took the outliers away. Velocities are signed and in the
+table frame, so a ball towards the robot has vy < 0.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from ballmodel.files import replacing
+from ballmodel.state import BallState
+
+AXES = {"position": ("x", "y", "z"), "velocity": ("x", "y", "z"), "landing": ("x", "y")}
+NOTES = ("name", "source", "paper")
+
+
+@dataclass(frozen=True)
+class BallDistribution:
+    """Box of start states and landing points; ``name`` and ``source`` say where it comes from.
+
+    Raises ValueError for a number that is not finite or a minimum above its maximum.
+    """
+
+    position_min: tuple[float, float, float]  # [m]
+    position_max: tuple[float, float, float]  # [m]
+    velocity_min: tuple[float, float, float]  # [m/s]
+    velocity_max: tuple[float, float, float]  # [m/s]
+    landing_min: tuple[float, float]  # [m] x, y of the ball's first bounce
+    landing_max: tuple[float, float]  # [m]
+    name: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for part, axes in AXES.items():
+            low, high = (tuple(float(v) for v in getattr(self, f"{part}_{end}")) for end in ("min", "max"))
+            if not len(low) == len(high) == len(axes):
+                raise ValueError(f"{self.name}: {part} needs {len(axes)} numbers at each end, got {low} and {high}")
+            for axis, a, b in zip(axes, low, high):
+                if not (np.isfinite(a) and np.isfinite(b) and a <= b):
+                    raise ValueError(f"{self.name}: {part}.{axis} is [{a}, {b}]; finite numbers with min <= max are allowed")
+            object.__setattr__(self, f"{part}_min", low)
+            object.__setattr__(self, f"{part}_max", high)
+
+    def to_dict(self) -> dict:
+        """The YAML form: position, velocity and landing as {axis: [min, max]}."""
+        intervals = {
+            part: {
+                axis: [low, high]
+                for axis, low, high in zip(axes, getattr(self, f"{part}_min"), getattr(self, f"{part}_max"))
+            }
+            for part, axes in AXES.items()
+        }
+        return {"name": self.name, "source": self.source, **intervals}
+
+
+def check_keys(data, allowed, where: str) -> None:
+    """Raises ValueError where ``data`` is no mapping of exactly the keys ``allowed``; notes such as ``name`` may be absent."""
+    if not isinstance(data, dict):
+        raise ValueError(f"{where}: a mapping with the keys {', '.join(allowed)} is wanted, got {data!r}")
+    for key in data:
+        if key not in allowed:
+            near = difflib.get_close_matches(str(key), allowed, n=1, cutoff=0.0)
+            raise ValueError(f"{where}: unknown key {key!r}; did you mean {near[0]!r}? Allowed: {', '.join(allowed)}")
+    missing = [key for key in allowed if key not in data and key not in NOTES]
+    if missing:
+        raise ValueError(f"{where}: missing key {', '.join(missing)}; wanted: {', '.join(allowed)}")
+
+
+def parse_distribution(data, where: str, name: str = "", source: str = "") -> BallDistribution:
+    """Builds a distribution from its YAML form; ``where`` (file and key) opens every error message. Raises ValueError."""
+    check_keys(data, (*NOTES, *AXES), where)
+    ends = {}
+    for part, axes in AXES.items():
+        check_keys(data[part], axes, f"{where}: {part}")
+        for axis in axes:
+            interval = data[part][axis]
+            numbers = isinstance(interval, list) and all(type(v) in (int, float) for v in interval)
+            if not numbers or len(interval) != 2:
+                raise ValueError(f"{where}: {part}.{axis} is {interval!r}; two numbers [min, max] are allowed")
+        ends[f"{part}_min"] = tuple(data[part][axis][0] for axis in axes)
+        ends[f"{part}_max"] = tuple(data[part][axis][1] for axis in axes)
+    try:
+        return BallDistribution(**ends, name=str(data.get("name", name)), source=str(data.get("source", source)))
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def read_yaml(path: str | os.PathLike):
+    """The content of a YAML file. Raises ValueError naming the file when it is no valid YAML."""
+    try:
+        return yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not a readable YAML file: {error}") from None
+
+
+def load_distribution(path: str | os.PathLike) -> BallDistribution:
+    """Reads one distribution from YAML. Raises ValueError naming file, key, what was given and what is allowed."""
+    return parse_distribution(read_yaml(path), str(path), name=Path(path).stem)
+
+
+def save_distribution(path: str | os.PathLike, distribution: BallDistribution) -> None:
+    """Writes the distribution as YAML; an existing file is replaced only by a complete one."""
+    with replacing(path) as temporary:
+        temporary.write_text(yaml.safe_dump(distribution.to_dict(), sort_keys=False), encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class DistributionReport:
+    """What ``fit_distribution`` did with its balls."""
+
+    n: int  # balls given
+    outlier: np.ndarray  # (n,) bool, taken away by DBSCAN
+    eps: float  # DBSCAN radius in robust standard deviations
+    min_samples: int
+
+
+def fit_distribution(
+    states: BallState,
+    landing,
+    eps: float = 2.0,
+    min_samples: int = 5,
+    name: str = "",
+    source: str = "",
+) -> tuple[BallDistribution, DistributionReport]:
+    """Minima and maxima of balls without their outliers.
+
+    states: position [m] and velocity [m/s] of the balls' starts, (3, n); landing: (2, n) [m].
+    A ball is an outlier when DBSCAN puts it into no cluster. Its eight coordinates are first centred on the median and
+    divided by a robust standard deviation (interquartile range / 1.349), so that outliers do not set their own scale.
+    The paper gives neither eps nor min_samples. In eight dimensions two neighbours drawn from a unit Gaussian lie 4
+    standard deviations apart on average, so eps = 2 keeps a ball that has ``min_samples`` clearly closer relatives.
+    Raises ValueError for non-finite input, unequal lengths, or when every ball is an outlier.
+    """
+    from sklearn.cluster import DBSCAN  # takes about a second to import; only this function needs it
+
+    position, velocity, landing = (np.asarray(a, float) for a in (states.position, states.velocity, landing))
+    points = np.concatenate([position, velocity, landing])
+    if points.shape[0] != 8 or not np.all(np.isfinite(points)):
+        raise ValueError(f"finite position (3, n), velocity (3, n) and landing (2, n) are wanted, got a stack of {points.shape}")
+    low, middle, high = np.percentile(points, [25, 50, 75], axis=1, keepdims=True)
+    scale = (high - low) / 1.349
+    standard = (points - middle) / np.where(scale > 0, scale, 1.0)
+    outlier = DBSCAN(eps=eps, min_samples=min_samples).fit_predict(standard.T) == -1
+    if np.all(outlier):
+        raise ValueError(f"DBSCAN with eps={eps}, min_samples={min_samples} calls all {outlier.size} balls outliers; raise eps")
+    inside = points[:, ~outlier]
+    low, high = inside.min(axis=1), inside.max(axis=1)
+    distribution = BallDistribution(low[:3], high[:3], low[3:6], high[3:6], low[6:], high[6:], name, source)
+    return distribution, DistributionReport(outlier.size, outlier, eps, min_samples)

@@ -1,0 +1,72 @@
+"""The step: from a gradient estimate to a change of theta, as optax transformations.
+
+Every function here is cached: the same arguments return the same object, so two equal configurations hash alike and
+share one compilation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import optax
+
+Schedule = Callable[[int], float]
+
+KINDS = ("sgd", "adam")
+PAPER_LEARNING_RATE = 0.00375  # Abeyruwan et al. 2022, appendix, table of BGS hyper-parameters: step size alpha
+
+
+@lru_cache(maxsize=None)
+def make(
+    kind: str = "sgd", learning_rate: float | Schedule = PAPER_LEARNING_RATE, b1: float = 0.9, b2: float = 0.999
+) -> optax.GradientTransformation:
+    """The transformation of kind "sgd" (plain step, the paper's) or "adam" (decay rates b1 and b2; unused by "sgd").
+
+    ``learning_rate`` is a positive number or a schedule: ``cosine``, ``piecewise`` or any optax schedule over updates.
+    Raises ValueError naming the argument, what was given and what is allowed.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"step.make: kind = {kind!r}, allowed are {KINDS}")
+    if not callable(learning_rate):
+        _positive("make", "learning_rate", learning_rate)
+    for name, value in (("b1", b1), ("b2", b2)):
+        if not 0 <= value < 1:
+            raise ValueError(f"step.make: {name} = {value}, allowed is [0, 1)")
+    return optax.sgd(learning_rate) if kind == "sgd" else optax.adam(learning_rate, b1=b1, b2=b2)
+
+
+@lru_cache(maxsize=None)
+def cosine(value: float, final: float, updates: int, hold: float = 0.5) -> Schedule:
+    """Stays at ``value`` for the first ``hold`` fraction of ``updates``, then falls to ``final`` along half a cosine.
+
+    Raises ValueError for a rate that is not positive, hold outside [0, 1) or fewer than 1 update.
+    """
+    _positive("cosine", "value", value)
+    _positive("cosine", "final", final)
+    if updates < 1:
+        raise ValueError(f"step.cosine: updates = {updates}, at least 1 is needed")
+    if not 0 <= hold < 1:
+        raise ValueError(f"step.cosine: hold = {hold}, allowed is [0, 1)")
+    held = int(hold * updates)
+    fall = optax.cosine_decay_schedule(value, decay_steps=updates - held, alpha=final / value)
+    return optax.join_schedules([optax.constant_schedule(value), fall], [held])
+
+
+@lru_cache(maxsize=None)
+def piecewise(value: float, changes: tuple[tuple[int, float], ...]) -> Schedule:
+    """``value`` until the first change; each change (update, new value) holds from that update on.
+
+    Raises ValueError for a rate that is not positive or for updates that do not increase from at least 1.
+    """
+    starts, values = [0, *(start for start, _ in changes)], [value, *(new for _, new in changes)]
+    if any(later <= earlier for earlier, later in zip(starts, starts[1:])):
+        raise ValueError(f"step.piecewise: changes at updates {starts[1:]}, allowed are increasing ones from 1 on")
+    for given in values:
+        _positive("piecewise", "value", given)
+    return optax.join_schedules([optax.constant_schedule(v) for v in values], starts[1:])
+
+
+def _positive(function: str, name: str, value: float) -> None:
+    if not 0 < value < float("inf"):
+        raise ValueError(f"step.{function}: {name} = {value}, allowed are positive finite numbers")

@@ -1,0 +1,170 @@
+"""Blackbox Gradient Sensing as init / ask / tell (Abeyruwan et al. 2022, appendix "Details on the BGS Algorithm").
+
+One update, maximising the mean return F:
+
+    directions = ask(key, state, config)                            # delta_i, the columns of (d, N)
+    members = population(state.theta, directions, config.sigma)     # theta +/- sigma delta_i, the columns of (d, 2N)
+    ... evaluate every member m times with frozen observation statistics, average ...
+    state, info = tell(state, directions, plus, minus, config)      # theta += alpha / (k s) sum_elites D_i delta_i
+
+Where the paper is silent or its Eq. 3 cannot be meant literally, the defaults follow the authors' library Iris. The
+observation statistics (``bgs.normalizer``) are not part of the state: the function being maximised may have no
+observations, and whoever evaluates the members both reads and extends them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from bgs import directions as direction_sampling
+from bgs import shaping
+from bgs import step as steps
+
+
+@dataclass(frozen=True)
+class BGSConfig:
+    """Settings of the optimiser; the defaults are the paper's simulation settings (appendix, BGS hyper-parameters).
+
+    pairs       N, antithetic pairs per update
+    sigma       perturbation scale: members are theta +/- sigma delta
+    keep        fraction of the pairs that become elites, in (0, 1]
+    rank        how elites are chosen: "abs", "signed" or "max" (``shaping.shape``)
+    weighting   "returns" or "centered_rank" (``shaping.shape``)
+    normalise   "std" or "none": division by the elites' standard deviation (``shaping.shape``)
+    orthogonal  orthogonal or independent Gaussian directions (``directions.sample``)
+    scale       "sqrt_d" or "chi": norms of orthogonal directions (``directions.sample``)
+    step        optax transformation, from ``bgs.step.make`` or optax itself
+    average     decay per update of the moving average of theta, in [0, 1); 0 makes the average theta itself
+
+    Raises ValueError naming the key, what was given and what is allowed.
+    """
+
+    pairs: int = 200
+    sigma: float = 0.025
+    keep: float = 0.3
+    rank: str = "abs"
+    weighting: str = "returns"
+    normalise: str = "std"
+    orthogonal: bool = True
+    scale: str = "sqrt_d"
+    step: optax.GradientTransformation = field(default_factory=steps.make)
+    average: float = 0.0
+
+    def __post_init__(self) -> None:
+        choices = {
+            "rank": shaping.RANKS,
+            "weighting": shaping.WEIGHTINGS,
+            "normalise": shaping.NORMALISATIONS,
+            "scale": direction_sampling.SCALES,
+        }
+        for key, allowed in choices.items():
+            self._require(key, getattr(self, key) in allowed, f"one of {allowed}")
+        self._require("pairs", isinstance(self.pairs, int) and self.pairs >= 1, "a whole number of at least 1")
+        self._require("sigma", 0 < self.sigma < float("inf"), "a positive finite number")
+        self._require("keep", 0 < self.keep <= 1, "a number in (0, 1]")
+        self._require("average", 0 <= self.average < 1, "a number in [0, 1)")
+        self._require("step", isinstance(self.step, optax.GradientTransformation), "an optax.GradientTransformation")
+
+    def _require(self, key: str, allowed: bool, wanted: str) -> None:
+        if not allowed:
+            raise ValueError(f"BGSConfig.{key} = {getattr(self, key)!r}, allowed is {wanted}")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class BGSState:
+    """State between updates.
+
+    theta      (d,) the parameters
+    average    (d,) moving average of theta after each update
+    opt_state  state of the optax step
+    updates    () int32, number of ``tell`` calls
+    """
+
+    theta: jax.Array
+    average: jax.Array
+    opt_state: optax.OptState
+    updates: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class BGSInfo:
+    """Measures of one update, each a scalar.
+
+    gradient_norm  norm of sum_elites D_i delta_i / (k s)
+    update_norm    norm of the change of theta
+    failed_pairs   int32, pairs dropped for a non-finite return
+    elites         int32, k
+    elite_std      standard deviation s of the 2 k elite returns, before "about 0 becomes 1"
+    mean_return    mean return of the members of all finite pairs; NaN when there are none
+    """
+
+    gradient_norm: jax.Array
+    update_norm: jax.Array
+    failed_pairs: jax.Array
+    elites: jax.Array
+    elite_std: jax.Array
+    mean_return: jax.Array
+
+
+def init(theta: jax.Array, config: BGSConfig) -> BGSState:
+    """State before the first update from the initial parameters theta (d,), float32 or float64."""
+    theta = jnp.asarray(theta)
+    if theta.ndim != 1 or not jnp.issubdtype(theta.dtype, jnp.floating):
+        raise ValueError(f"init: theta must be a vector of floats, got shape {theta.shape} of {theta.dtype}")
+    return BGSState(theta, theta, config.step.init(theta), jnp.zeros((), jnp.int32))
+
+
+@partial(jax.jit, static_argnames="config")
+def ask(key: jax.Array, state: BGSState, config: BGSConfig) -> jax.Array:
+    """Directions (d, N) of the next update, in theta's precision."""
+    return direction_sampling.sample(
+        key, state.theta.shape[0], config.pairs, config.orthogonal, config.scale, state.theta.dtype
+    )
+
+
+def population(theta: jax.Array, directions: jax.Array, sigma: float) -> jax.Array:
+    """Members (d, 2N) to evaluate: columns 0..N-1 are theta + sigma delta_i, columns N..2N-1 theta - sigma delta_i."""
+    offsets = sigma * directions
+    return jnp.concatenate([theta[:, None] + offsets, theta[:, None] - offsets], axis=1)
+
+
+@partial(jax.jit, static_argnames="config")
+def tell(
+    state: BGSState, directions: jax.Array, plus: jax.Array, minus: jax.Array, config: BGSConfig
+) -> tuple[BGSState, BGSInfo]:
+    """One ascent step from the members' returns (N,), each averaged over its repeats.
+
+    A non-finite return marks a failed evaluation and drops its pair. When every pair failed, theta, the average and the
+    optax state stay as they were (a step such as Adam's would otherwise move on momentum alone) and only ``updates``
+    advances. Raises ValueError when directions and returns do not fit together.
+    """
+    expected = (state.theta.shape[0], plus.shape[0])
+    if directions.shape != expected:
+        raise ValueError(f"tell: directions {directions.shape}, but theta and the returns call for {expected}")
+    shaped = shaping.shape(plus, minus, config.keep, config.rank, config.weighting, config.normalise)
+    # Accelerators would otherwise multiply float32 in a shorter format.
+    gradient = jnp.matmul(directions, shaped.weights, precision=jax.lax.Precision.HIGHEST)
+    # optax descends, returns are to rise.
+    change, opt_state = config.step.update(-gradient, state.opt_state, state.theta)
+    theta = optax.apply_updates(state.theta, change)
+    average = config.average * state.average + (1 - config.average) * theta
+
+    after = (theta, average, opt_state)
+    before = (state.theta, state.average, state.opt_state)
+    theta, average, opt_state = jax.tree.map(lambda new, old: jnp.where(shaped.n_elites > 0, new, old), after, before)
+    info = BGSInfo(
+        gradient_norm=jnp.linalg.norm(gradient),
+        update_norm=jnp.linalg.norm(theta - state.theta),
+        failed_pairs=shaped.failed_pairs,
+        elites=shaped.n_elites,
+        elite_std=shaped.elite_std,
+        mean_return=shaped.mean_return,
+    )
+    return BGSState(theta, average, opt_state, state.updates + 1), info

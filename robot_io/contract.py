@@ -1,0 +1,145 @@
+"""The one definition of what a policy sees and does, shared by the simulator and the robot.
+
+The simulator builds its observation from this module and so does the bridge at the robot; an exported policy
+carries it in its manifest and is refused where it differs. NumPy only: this module is imported on the robot.
+
+Observation at one control tick, in this order (11 numbers, SI units):
+    0..2   ball position x, y, z [m] in the table frame (origin on the table's top surface at its centre,
+           x across, y along the table towards the human, z up)
+    3..10  joint positions in ``JOINT_NAMES`` order: two gantry axes [m], six arm joints [rad]
+The policy input is the last ``HISTORY`` observations, oldest first: shape (8, 11). At the start of an episode the first
+observation fills the whole history.
+
+Action: eight numbers in [-1, 1], in ``JOINT_NAMES`` order; times ``LIMITS.policy_velocity`` they are the requested joint
+velocities [m/s], [rad/s]. The request passes ``robot_io.limits`` before anything moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+CONTRACT_VERSION = 1
+
+CONTROL_RATE = 75.0  # [Hz], Abeyruwan et al. 2022, section 4
+HISTORY = 8  # observations in the policy input, the paper's "past seven" and the current one
+
+JOINT_NAMES = ("gantry_x", "gantry_y", "joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6")
+JOINT_UNITS = ("m", "m", "rad", "rad", "rad", "rad", "rad", "rad")
+FESTO_JOINTS = (0, 1)  # indices into JOINT_NAMES moved by the two linear axes
+ABB_JOINTS = (2, 3, 4, 5, 6, 7)  # indices moved by the arm's controller
+
+OBSERVATION_NAMES = ("ball_x", "ball_y", "ball_z", *JOINT_NAMES)
+OBSERVATION_UNITS = ("m", "m", "m", *JOINT_UNITS)
+N_JOINTS = len(JOINT_NAMES)
+N_OBSERVATION = len(OBSERVATION_NAMES)
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """Kinematic limits of the eight joints, each a tuple in ``JOINT_NAMES`` order; SI units.
+
+    lower, upper      position range [m] / [rad]
+    velocity          highest joint speed [m/s] / [rad/s]: what the hardware does (ABB 120T manual; Festo: estimate)
+    acceleration      highest commanded acceleration [m/s^2] / [rad/s^2]
+    margin            distance kept from lower and upper by the braking envelope [m] / [rad]
+    policy_velocity   joint velocity that an action of 1 asks for; at most ``velocity``
+    """
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    velocity: tuple[float, ...]
+    acceleration: tuple[float, ...]
+    margin: tuple[float, ...]
+    policy_velocity: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for name, values in asdict(self).items():
+            if len(values) != N_JOINTS:
+                raise ValueError(f"JointLimits.{name} needs {N_JOINTS} numbers in the order {JOINT_NAMES}, got {len(values)}")
+            if not np.all(np.isfinite(values)):
+                raise ValueError(f"JointLimits.{name} has a non-finite number: {values}")
+        for i, joint in enumerate(JOINT_NAMES):
+            if not self.upper[i] - self.lower[i] > 2 * self.margin[i] >= 0:
+                raise ValueError(f"{joint}: range [{self.lower[i]}, {self.upper[i]}] leaves no room inside a margin of {self.margin[i]}")
+            if not 0 < self.policy_velocity[i] <= self.velocity[i]:
+                raise ValueError(f"{joint}: policy_velocity {self.policy_velocity[i]} must be in (0, {self.velocity[i]}]")
+            if not self.acceleration[i] > 0:
+                raise ValueError(f"{joint}: acceleration {self.acceleration[i]} must be positive")
+
+
+def _rad(*degrees: float) -> tuple[float, ...]:
+    return tuple(float(np.deg2rad(d)) for d in degrees)
+
+
+# Arm: ABB manual 3HAC035728 (ranges, 120T speeds). Accelerations: the base moments allow about 70 rad/s^2 on a stretched
+# joint 1; wrist joints are lighter. Gantry: estimates (2 m and 1 m stroke, 2 m/s, 15 m/s^2), centred on the stroke.
+LIMITS = JointLimits(
+    lower=(-1.0, -0.5, *_rad(-165.0, -110.0, -110.0, -160.0, -120.0, -400.0)),
+    upper=(1.0, 0.5, *_rad(165.0, 110.0, 70.0, 160.0, 120.0, 400.0)),
+    velocity=(2.0, 2.0, *_rad(250.0, 250.0, 250.0, 420.0, 590.0, 600.0)),
+    acceleration=(15.0, 15.0, 60.0, 60.0, 60.0, 100.0, 100.0, 120.0),
+    margin=(0.01, 0.01, *_rad(1.0, 1.0, 1.0, 1.0, 1.0, 1.0)),
+    policy_velocity=(2.0, 2.0, *_rad(250.0, 250.0, 250.0, 420.0, 590.0, 600.0)),
+)
+
+# The 976-parameter policy: three valid 1-D convolutions of kernel 2 over the history; layers 1 and 2 are gated
+# (tanh * sigmoid, so the convolution has twice the filters), layer 3 ends in tanh. reference: paper, appendix E.
+KERNEL = 2
+FILTERS = (8, 12, 8)
+DILATIONS = (1, 2, 4)
+GATED = (True, True, False)
+
+
+def parameter_shapes() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the policy's parameters in the order of the flat vector theta (976,).
+
+    ``conv<i>/kernel`` is (KERNEL, inputs, outputs) with kernel tap 0 the OLDER observation; the outputs of a gated layer
+    are the tanh half first, then the sigmoid half. ``conv<i>/bias`` is (outputs,). Arrays are flattened in C order.
+    """
+    shapes: dict[str, tuple[int, ...]] = {}
+    inputs = N_OBSERVATION
+    for i, (filters, gated) in enumerate(zip(FILTERS, GATED), start=1):
+        outputs = filters * (2 if gated else 1)
+        shapes[f"conv{i}/kernel"] = (KERNEL, inputs, outputs)
+        shapes[f"conv{i}/bias"] = (outputs,)
+        inputs = filters
+    return shapes
+
+
+def n_parameters() -> int:
+    """Number of policy parameters: 976."""
+    return sum(int(np.prod(shape)) for shape in parameter_shapes().values())
+
+
+def unflatten(theta):
+    """Splits theta (976, ...batch) into a dict of arrays shaped as ``parameter_shapes`` with batch axes last.
+
+    Works on NumPy and JAX arrays. Raises ValueError when the first axis is not 976 long.
+    """
+    if theta.shape[0] != n_parameters():
+        raise ValueError(f"theta has {theta.shape[0]} parameters, the policy has {n_parameters()}")
+    parts, start = {}, 0
+    for name, shape in parameter_shapes().items():
+        size = int(np.prod(shape))
+        parts[name] = theta[start : start + size].reshape(shape + theta.shape[1:])
+        start += size
+    return parts
+
+
+def describe() -> dict:
+    """The contract as plain data for manifests and error messages."""
+    return {
+        "version": CONTRACT_VERSION,
+        "control_rate_hz": CONTROL_RATE,
+        "history": HISTORY,
+        "observation": [{"name": n, "unit": u} for n, u in zip(OBSERVATION_NAMES, OBSERVATION_UNITS)],
+        "action": [
+            {"name": n, "unit": f"{u}/s", "scale": v}
+            for n, u, v in zip(JOINT_NAMES, JOINT_UNITS, LIMITS.policy_velocity)
+        ],
+        "limits": {name: list(values) for name, values in asdict(LIMITS).items()},
+        "parameters": {name: list(shape) for name, shape in parameter_shapes().items()},
+        "frame": "origin at the table's centre on its top surface; x across, y along the table (human y > 0), z up; SI units",
+    }
