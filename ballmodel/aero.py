@@ -14,10 +14,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import jax
-import jax.numpy as jnp
 
 from ballmodel import constants as c
-from ballmodel.vec import cross, norm
+from ballmodel.vec import Vec, cross, norm
 
 
 @jax.tree_util.register_dataclass
@@ -55,11 +54,11 @@ def magnus_factor(params: FlightParams):
     return params.magnus_coefficient * params.air_density * params.area * params.radius / (2.0 * params.mass)
 
 
-def acceleration(params: FlightParams, velocity, spin):
-    """Acceleration [m/s^2], shape (3, ...), of a ball with velocity [m/s] and spin [rad/s], each (3, ...)."""
+def acceleration(params: FlightParams, velocity, spin) -> Vec:
+    """Acceleration [m/s^2] of a ball with velocity [m/s] and spin [rad/s], each a Vec or a (3, ...) array."""
     air = (params.wind_x, params.wind_y, params.wind_z)
-    u = jnp.stack([velocity[i] - air[i] for i in range(3)])
+    u = Vec(*(velocity[i] - air[i] for i in range(3)))
     drag = -drag_factor(params) * norm(u)
-    lift = magnus_factor(params) * cross(spin, u)
+    lift = cross(spin, u) * magnus_factor(params)
     weight = (params.gravity_x, params.gravity_y, params.gravity_z)
-    return jnp.stack([weight[i] * (1.0 - params.buoyancy) + drag * u[i] + lift[i] for i in range(3)])
+    return Vec(*(weight[i] * (1.0 - params.buoyancy) + drag * u[i] + lift[i] for i in range(3)))

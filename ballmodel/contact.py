@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from ballmodel import constants as c
-from ballmodel.vec import TINY, cross, dot, norm
+from ballmodel.vec import TINY, Vec, components, cross, dot, norm
 
 STICKING = 2.0 / 5.0  # alpha that brings the contact point of a thin shell to rest
 
@@ -60,36 +60,37 @@ def restitution_at(params, normal_speed):
     return jnp.clip(params.restitution - params.restitution_slope * jnp.abs(normal_speed), 0.0, 1.0)
 
 
-def _apply(velocity, spin, normal, surface_velocity, radius, restitution, alpha_of):
+def _apply(velocity, spin, normal, surface_velocity, radius, restitution, alpha_of) -> tuple[Vec, Vec]:
+    velocity, spin, normal = components((velocity, spin, normal))
     relative = velocity - surface_velocity
     normal_speed = dot(relative, normal)
-    contact_arm = -radius * normal
-    slip = relative - normal_speed * normal + cross(spin, contact_arm)
-    slip = slip - dot(slip, normal) * normal
+    contact_arm = normal * -radius
+    slip = relative - normal * normal_speed + cross(spin, contact_arm)
+    slip = slip - normal * dot(slip, normal)
     e = restitution(normal_speed)
-    alpha = alpha_of(e, normal_speed, norm(slip))
-    tangential = -alpha * slip
-    new_velocity = velocity - (1.0 + e) * normal_speed * normal + tangential
-    new_spin = spin - (1.0 / (c.SHELL_INERTIA_FACTOR * radius)) * cross(normal, tangential)
+    tangential = slip * -alpha_of(e, normal_speed, norm(slip))
+    new_velocity = velocity - normal * ((1.0 + e) * normal_speed) + tangential
+    new_spin = spin - cross(normal, tangential) / (c.SHELL_INERTIA_FACTOR * radius)
     return new_velocity, new_spin
 
 
-def surface_impact(params: SurfaceParams, velocity, spin, normal, radius):
+def surface_impact(params: SurfaceParams, velocity, spin, normal, radius) -> tuple[Vec, Vec]:
     """Velocity and spin after an impact on a resting surface.
 
-    velocity [m/s], spin [rad/s] and the unit normal pointing to the ball are (3, ...); radius [m].
+    velocity [m/s], spin [rad/s] and the unit normal pointing to the ball are Vecs or (3, ...) arrays; radius [m].
     """
 
     def alpha_of(e, normal_speed, slip_speed):
         return jnp.minimum(params.friction * (1.0 + e) * jnp.abs(normal_speed) / (slip_speed + TINY), STICKING)
 
-    return _apply(velocity, spin, normal, jnp.zeros_like(velocity), radius, lambda s: restitution_at(params, s), alpha_of)
+    return _apply(velocity, spin, normal, (0.0, 0.0, 0.0), radius, lambda s: restitution_at(params, s), alpha_of)
 
 
-def paddle_impact(params: PaddleParams, velocity, spin, normal, paddle_velocity, radius):
+def paddle_impact(params: PaddleParams, velocity, spin, normal, paddle_velocity, radius) -> tuple[Vec, Vec]:
     """Velocity and spin after an impact on the moving paddle.
 
-    velocity, paddle_velocity (of the contact point) [m/s], spin [rad/s] and the unit normal pointing to the ball: (3, ...).
+    velocity, paddle_velocity (of the contact point) [m/s], spin [rad/s] and the unit normal pointing to the ball are Vecs
+    or (3, ...) arrays; radius [m].
     The arm is so much heavier than the ball (60 kg to 2.7 g) that the paddle keeps its speed.
     """
     return _apply(
@@ -112,14 +113,13 @@ NET = Box(
 )
 
 
-def box_gap(box: Box, height, position):
-    """Vector from the nearest point of the box to ``position`` and its length [m]: (3, ...), (...).
+def box_gap(box: Box, height, position) -> tuple[Vec, jax.Array]:
+    """Vector from the nearest point of the box to ``position`` (a Vec or a (3, ...) array) and its length [m], (...).
 
     ``height`` shifts the box along z. The vector is zero for a point inside the box.
     """
-    shift = (0.0, 0.0, height)
-    gap = jnp.stack([
-        position[i] - jnp.clip(position[i], box.centre[i] - box.half[i] + shift[i], box.centre[i] + box.half[i] + shift[i])
-        for i in range(3)
-    ])  # fmt: skip
+    centre = (box.centre[0], box.centre[1], box.centre[2] + height)
+    gap = Vec(
+        *(position[i] - jnp.clip(position[i], centre[i] - box.half[i], centre[i] + box.half[i]) for i in range(3))
+    )
     return gap, norm(gap)

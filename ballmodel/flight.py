@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from ballmodel import contact
 from ballmodel.aero import INTEGRATORS, FlightParams, acceleration
 from ballmodel.contact import NET, TABLE, Box, PaddleParams, SurfaceParams, box_gap
-from ballmodel.state import BallState, where
-from ballmodel.vec import TINY, cross, dot
+from ballmodel.state import BallState
+from ballmodel.vec import TINY, components, cross, dot, select, stack
 
 
 @jax.tree_util.register_dataclass
@@ -61,22 +61,34 @@ class Events:
 
 def free_step(params: FlightParams, state: BallState, dt) -> BallState:
     """One step of free flight over ``dt`` [s], a scalar or of the batch shape."""
+    return _stacked(_free_step(params, components(state), dt))
+
+
+def _stacked(state: BallState) -> BallState:
+    return BallState(stack(state.position), stack(state.velocity), stack(state.spin))
+
+
+def _free_step(params, state, dt):
     return _move(state, _step_acceleration(params, state, dt), params, dt)
 
 
 def _step_acceleration(params, state, dt):
     a = acceleration(params, state.velocity, state.spin)
     if params.integrator == "midpoint":
-        a = acceleration(params, state.velocity + 0.5 * dt * a, state.spin)
+        a = acceleration(params, state.velocity + a * (0.5 * dt), state.spin)
     elif params.integrator != "paper":
         raise ValueError(f"integrator {params.integrator!r} is not one of {INTEGRATORS}")
     return a
 
 
+def _position_at(state, a, t):
+    return state.position + (state.velocity + a * (0.5 * t)) * t
+
+
 def _move(state, a, params, dt):
     return BallState(
-        position=state.position + dt * (state.velocity + 0.5 * dt * a),
-        velocity=state.velocity + dt * a,
+        position=_position_at(state, a, dt),
+        velocity=state.velocity + a * dt,
         spin=state.spin * jnp.exp(-params.spin_decay * dt),
     )
 
@@ -90,7 +102,7 @@ def _box_time(box: Box, surface: SurfaceParams, state, a, end_position, radius, 
     middle = box.centre[thin] + (surface.height if thin == 2 else 0.0) - state.position[thin]
     travel = end_position[thin] - state.position[thin]
     t_middle = dt * jnp.where(middle * travel > 0.0, jnp.minimum(jnp.abs(middle) / (jnp.abs(travel) + TINY), 1.0), 1.0)
-    _, distance_middle = box_gap(box, surface.height, state.position + t_middle * (state.velocity + 0.5 * t_middle * a))
+    _, distance_middle = box_gap(box, surface.height, _position_at(state, a, t_middle))
     passes = distance_middle <= radius
     t1, distance1 = jnp.where(passes, t_middle, dt), jnp.where(passes, distance_middle, distance1)
     approaching = dot(state.velocity, gap0) < 0.0
@@ -104,11 +116,15 @@ def _box_time(box: Box, surface: SurfaceParams, state, a, end_position, radius, 
     # Elsewhere (edges, sides, cord) the distance is smooth within a step: a secant, refined once.
     rate = t1 / jnp.maximum(distance0 - distance1, 1e-9)
     t_chord = rate * (distance0 - radius)
-    _, chord = box_gap(box, surface.height, state.position + t_chord * (state.velocity + 0.5 * t_chord * a))
+    _, chord = box_gap(box, surface.height, _position_at(state, a, t_chord))
     t_edge = jnp.clip(t_chord + (chord - radius) * rate, 0.0, t1)
     over_top = (gap0[0] == 0.0) & (gap0[1] == 0.0) & (h > 0.0)
     t = jnp.where(over_top, jnp.clip(t_face, 0.0, dt), t_edge)
     return jnp.where(touches, t, jnp.where(overlapping, 0.0, dt + 1.0))
+
+
+def _mix(start, end, w):
+    return start * (1.0 - w) + end * w
 
 
 def _paddle_time(params: PaddleParams, radius, state, end_position, start: PaddlePose, end: PaddlePose, dt):
@@ -120,8 +136,8 @@ def _paddle_time(params: PaddleParams, radius, state, end_position, start: Paddl
     gap0, gap1 = side * s0 - reach, side * s1 - reach
     t = dt * jnp.clip(gap0 / jnp.where(gap0 > gap1, gap0 - gap1, 1.0), 0.0, 1.0)
     w = t / dt
-    offset = (state.position - start.position) * (1.0 - w) + (end_position - end.position) * w
-    along = dot(start.normal * (1.0 - w) + end.normal * w, offset)
+    offset = _mix(state.position - start.position, end_position - end.position, w)
+    along = dot(_mix(start.normal, end.normal, w), offset)
     radial2 = dot(offset, offset) - along * along
     touches = (gap1 < 0.0) & (gap1 < gap0) & (radial2 <= params.radius * params.radius)
     return jnp.where(touches, t, dt + 1.0), side
@@ -133,6 +149,7 @@ def step(params: BallParams, state: BallState, dt: float, paddle=None) -> tuple[
     ``paddle`` is None or a pair (pose at the step's start, pose at its end). Batch axes last throughout.
     """
     flight, radius = params.flight, params.flight.radius
+    state, paddle = components((state, paddle))
     a = _step_acceleration(flight, state, dt)
     free = _move(state, a, flight, dt)
     t_table = _box_time(TABLE, params.table, state, a, free.position, radius, dt)
@@ -153,21 +170,23 @@ def step(params: BallParams, state: BallState, dt: float, paddle=None) -> tuple[
     # One evaluation of the Coulomb impact serves table and net: only the surface and the normal differ.
     gap_table, distance_table = box_gap(TABLE, params.table.height, at.position)
     gap_net, distance_net = box_gap(NET, params.net.height, at.position)
-    normal = jnp.where(hit_table, gap_table / distance_table, gap_net / distance_net)
+    normal = select(hit_table, gap_table / distance_table, gap_net / distance_net)
     surface = jax.tree.map(lambda x, y: jnp.where(hit_table, x, y), params.table, params.net)
     velocity, spin = contact.surface_impact(surface, at.velocity, at.spin, normal, radius)
     if paddle is not None:
         w = t / dt
-        blade_normal = start.normal * (1.0 - w) + end.normal * w
-        blade_normal = side * blade_normal / jnp.sqrt(dot(blade_normal, blade_normal))
-        arm = at.position - (start.position * (1.0 - w) + end.position * w)
-        omega = start.angular_velocity * (1.0 - w) + end.angular_velocity * w
-        blade_velocity = start.velocity * (1.0 - w) + end.velocity * w + cross(omega, arm - radius * blade_normal)
+        blade_normal = _mix(start.normal, end.normal, w) * side
+        blade_normal = blade_normal / jnp.sqrt(dot(blade_normal, blade_normal))
+        arm = at.position - _mix(start.position, end.position, w) - blade_normal * radius
+        blade_velocity = _mix(start.velocity, end.velocity, w) + cross(
+            _mix(start.angular_velocity, end.angular_velocity, w), arm
+        )
         v_paddle, w_paddle = contact.paddle_impact(
             params.paddle, at.velocity, at.spin, blade_normal, blade_velocity, radius
         )
-        velocity = jnp.where(hit_paddle, v_paddle, velocity)
-        spin = jnp.where(hit_paddle, w_paddle, spin)
-    after = free_step(flight, BallState(at.position, velocity, spin), dt - t)
-    events = Events(hit_table, hit_net, hit_paddle, t, at.position)
-    return where(hit_any, after, free), events
+        velocity = select(hit_paddle, v_paddle, velocity)
+        spin = select(hit_paddle, w_paddle, spin)
+    after = _free_step(flight, BallState(at.position, velocity, spin), dt - t)
+    events = Events(hit_table, hit_net, hit_paddle, t, stack(at.position))
+    new = jax.tree.map(lambda x, y: jnp.where(hit_any, x, y), after, free)
+    return _stacked(new), events

@@ -23,12 +23,12 @@ from ballmodel import constants as c
 from ballmodel.contact import NET, TABLE, box_gap
 from ballmodel.distribution import BallDistribution
 from ballmodel.flight import BallParams, free_step, step
-from ballmodel.state import BallState, ball_state, where
+from ballmodel.state import BallState, ball_state
 
 DT = 1.0 / 300.0  # [s] simulation step
 MAX_FLIGHT = 4.0  # [s] after which a ball counts as lost
 PROPOSALS = 32768  # per call of the coarse flight
-CHUNK = 4096  # balls per call of the full simulation
+CHUNK = 2048  # balls per call of the full simulation
 COARSE_STEPS = 32
 NET_MARGIN = 0.03  # [m] error allowed to the coarse flight at the net
 LANDING_MARGIN = 0.05  # [m] and at the landing point
@@ -83,39 +83,37 @@ def throw(params: BallParams, state: BallState, landing_min, landing_max, dt: fl
 
     landing_min, landing_max: (2,) [m] corners of the landing box; dt [s]. Not jitted.
     """
-    landing_min, landing_max = jnp.asarray(landing_min), jnp.asarray(landing_max)
+    end, floor = -c.TABLE_LENGTH / 2, params.flight.radius - c.TABLE_HEIGHT
 
     def flying(carry):
         time, _, outcome, *_ = carry
         return jnp.any(outcome == UNDECIDED) & (time < MAX_FLIGHT)
 
+    # Reads the carried state and only events of the new one: what reads the new state computes all of the step again.
     def advance(carry):
-        time, state, outcome, bounced, landing, arrival = carry
+        time, state, outcome, bounced, x, y, arrival, y_before = carry
+        y_now = state.position[1]
+        gone = (outcome == UNDECIDED) & ((y_now <= end) | (state.position[2] <= floor))
+        outcome = jnp.where(gone, jnp.where(bounced, KEPT, MISSES), outcome)
+        over = jnp.clip((end - y_now) / jnp.where(y_before > y_now, y_before - y_now, 1.0), 0.0, 1.0)
+        arrival = jnp.where(gone & bounced, time - over * dt, arrival)
+
         new, events = step(params, state, dt)
         active = outcome == UNDECIDED
         first = active & events.table & ~bounced
-        xy = events.position[:2]
-        in_box = jnp.all((xy >= landing_min[:, None]) & (xy <= landing_max[:, None]), axis=0)
-        landing = jnp.where(first, xy, landing)
-        verdict = jnp.where(active & events.net, HITS_NET, outcome)
-        verdict = jnp.where(active & events.table & bounced, SECOND_BOUNCE, verdict)
-        verdict = jnp.where(first & ~in_box, OUTSIDE_BOX, verdict)
-        verdict = jnp.where(first & (xy[1] >= 0.0), OWN_SIDE, verdict)
-        bounced = bounced | first
-        end, floor = -c.TABLE_LENGTH / 2, params.flight.radius - c.TABLE_HEIGHT
-        gone = (verdict == UNDECIDED) & ((new.position[1] <= end) | (new.position[2] <= floor))
-        verdict = jnp.where(gone, jnp.where(bounced, KEPT, MISSES), verdict)
-        step_y = state.position[1] - new.position[1]
-        part = jnp.clip((state.position[1] - end) / jnp.where(step_y > 0.0, step_y, 1.0), 0.0, 1.0)
-        arrival = jnp.where(gone & bounced, time + part * dt, arrival)
-        return time + dt, where(active, new, state), verdict, bounced, landing, arrival
+        x, y = (jnp.where(first, now, before) for now, before in zip(events.position, (x, y)))
+        in_box = (x >= landing_min[0]) & (x <= landing_max[0]) & (y >= landing_min[1]) & (y <= landing_max[1])
+        outcome = jnp.where(active & events.net, HITS_NET, outcome)
+        outcome = jnp.where(active & events.table & bounced, SECOND_BOUNCE, outcome)
+        outcome = jnp.where(first & ~in_box, jnp.where(y < 0.0, OUTSIDE_BOX, OWN_SIDE), outcome)
+        return time + dt, new, outcome, bounced | first, x, y, arrival, y_now
 
     zero = jnp.zeros_like(state.position[0])
     outcome = jnp.where(_bad_start(state.position, params), BAD_START, UNDECIDED)
-    carry = (jnp.zeros((), zero.dtype), state, outcome, zero > 1.0, jnp.stack([zero, zero]), zero)
-    _, _, outcome, bounced, landing, arrival = jax.lax.while_loop(flying, advance, carry)
+    carry = (jnp.zeros((), zero.dtype), state, outcome, zero > 1.0, zero, zero, zero, state.position[1])
+    _, _, outcome, bounced, x, y, arrival, _ = jax.lax.while_loop(flying, advance, carry)
     outcome = jnp.where(outcome == UNDECIDED, jnp.where(bounced, SECOND_BOUNCE, MISSES), outcome)
-    return Throw(outcome, landing, arrival)
+    return Throw(outcome, jnp.stack([x, y]), arrival)
 
 
 _throw = jax.jit(throw)

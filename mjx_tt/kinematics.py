@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -34,6 +35,7 @@ def joint_transform(link: Link, q):
     return f.matmul(link.rot, rotation), link.pos
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class LinkMotion:
     """World pose and velocity of one link's frame, folded scalars."""
@@ -52,7 +54,7 @@ def forward(chain: Chain, q, qd=None) -> list[LinkMotion]:
     motions: list[LinkMotion] = []
     rot, pos, v, w = f.EYE3, f.ZERO3, f.ZERO3, f.ZERO3
     for i, link in enumerate(chain.links):
-        r, p = joint_transform(link, q[i])
+        r, p = f.materialise(joint_transform(link, q[i]))
         offset = f.matvec(rot, p)
         if qd is not None:
             v = f.vadd(v, f.cross(w, offset))
@@ -64,6 +66,7 @@ def forward(chain: Chain, q, qd=None) -> list[LinkMotion]:
                 v = f.vadd(v, f.vscale(axis, qd[i]))
             else:
                 w = f.vadd(w, f.vscale(axis, qd[i]))
+        rot, pos, v, w = f.materialise((rot, pos, v, w))
         motions.append(LinkMotion(rot, pos, v if qd is not None else None, w if qd is not None else None))
     return motions
 

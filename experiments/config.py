@@ -1,0 +1,355 @@
+"""The typed experiment YAML: what may stand in it, what is left out means, and errors that say what to change.
+
+Needs neither JAX nor NumPy, so that a mistake in a file is reported at once. Names and files that a configuration refers
+to are looked up by ``experiments.build``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import re
+import types
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+Decay = Annotated[float, Field(ge=0, lt=1)]
+
+
+class ConfigError(ValueError):
+    """A configuration cannot be used: the message names file, dotted path, what was given and what is allowed."""
+
+
+class Section(BaseModel):
+    """A mapping of the YAML: unknown keys are errors, nothing is converted silently."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True)
+
+
+class Rewards(Section):
+    """Weights of the eleven reward terms; a term that is left out keeps the weight of ``base``."""
+
+    base: Literal["sim", "real"] = "sim"
+    """The paper's weights for simulation or for the real robot."""
+    state_transition: Finite | None = None
+    net_clearance: Finite | None = None
+    hit_and_land: Finite | None = None
+    fault: Finite | None = None
+    jerk: Finite | None = None
+    acceleration: Finite | None = None
+    velocity: Finite | None = None
+    joint_angle: Finite | None = None
+    collision: Finite | None = None
+    paddle_height: Finite | None = None
+    style: Finite | None = None
+
+
+class Task(Section):
+    """The episode."""
+
+    engine: Literal["fused", "mjx"] = "fused"
+    """Robot dynamics: fused is fast, mjx is the reference."""
+    control_rate: Positive = 75.0
+    """[Hz] of the policy."""
+    sim_rate: Positive = 300.0
+    """[Hz] of the physics, a whole multiple of control_rate."""
+    max_steps: Count = 200
+    """Control steps after which an episode ends."""
+    rewards: Literal["sim", "real"] | Rewards = "sim"
+    """The paper's weights by name, or a mapping that changes single ones."""
+
+
+class Constant(Section):
+    """The learning rate never changes."""
+
+    kind: Literal["constant"]
+
+
+class Cosine(Section):
+    """The learning rate holds, then falls along half a cosine until the last update."""
+
+    kind: Literal["cosine"]
+    final: Positive = 0.001
+    """Learning rate after the last update."""
+    hold: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    """Share of the updates before the fall."""
+
+
+class Change(Section):
+    """A new learning rate from an update on."""
+
+    update: Count
+    learning_rate: Positive
+
+
+class Piecewise(Section):
+    """The learning rate changes at given updates."""
+
+    kind: Literal["piecewise"]
+    changes: Annotated[list[Change], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _increasing(self) -> Piecewise:
+        starts = [change.update for change in self.changes]
+        if any(later <= earlier for earlier, later in zip(starts, starts[1:])):
+            raise ValueError(f"the updates must increase, got {starts}")
+        return self
+
+
+class Step(Section):
+    """From a gradient estimate to a change of the parameters."""
+
+    kind: Literal["adam", "sgd"] = "adam"
+    learning_rate: Positive = 0.01
+    b1: Decay = 0.9
+    """Adam's decay of the first moment; sgd does not use it."""
+    b2: Decay = 0.99
+    """Adam's decay of the second moment; sgd does not use it."""
+    schedule: Annotated[Constant | Cosine | Piecewise, Field(discriminator="kind")] = Cosine(kind="cosine")
+
+
+class Optimiser(Section):
+    """Blackbox Gradient Sensing. The defaults are the recipe that trains best here; paper.yaml has the paper's."""
+
+    pairs: Count = 100
+    """Antithetic pairs of perturbations per update."""
+    repeats: Count = 10
+    """Episodes per perturbation."""
+    sigma: Positive = 0.025
+    """Scale of the perturbations."""
+    keep: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of the pairs that become elites."""
+    rank: Literal["abs", "signed", "max"] = "abs"
+    weighting: Literal["returns", "centered_rank"] = "returns"
+    normalise: Literal["std", "none"] = "std"
+    orthogonal: bool = True
+    scale: Literal["sqrt_d", "chi"] = "sqrt_d"
+    step: Step = Step()
+    average: Decay = 0.98
+    """Decay per update of the moving average of the parameters, which is what is evaluated and exported; 0: none."""
+    common_random_numbers: bool = True
+    """Both members of a pair meet the same balls, latencies and noise."""
+    initial_scale: Positive = 0.1
+    """Standard deviation of the random first parameters."""
+
+
+class Training(Section):
+    """How long to train and what to keep of it."""
+
+    updates: Count = 2000
+    max_minutes: Positive | None = None
+    """Stop after this much training time, all sessions of the run together; a larger value continues the run."""
+    stop_at_return_rate: Annotated[float, Field(gt=0, le=1)] | None = None
+    """Stop when an evaluation during training reaches this return rate."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    pool: Count = 65536
+    """Balls drawn from the distribution before training; episodes choose among them."""
+    checkpoint_seconds: Positive = 30.0
+    evaluate_every: Count | None = 200
+    """Updates between evaluations on fresh balls; null: none."""
+    evaluate_episodes: Count = 1024
+    devices: Count | Literal["auto"] = "auto"
+    """Devices that share the perturbations; auto: as many as divide them evenly."""
+
+
+class Evaluation(Section):
+    """The evaluation after training."""
+
+    episodes: Count = 2000
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 1000
+    sim_rate: Positive | None = None
+    """[Hz] of the physics; null: that of the task."""
+
+
+class Config(Section):
+    """One experiment."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    """Folder of the run."""
+    balls: str | dict[str, Any]
+    """A distribution's name such as player3/M1 or narrow, the path of a YAML, or the YAML's content."""
+    model: str | dict[str, Any] = {}
+    """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise."""
+    task: Task = Task()
+    optimiser: Optimiser = Optimiser()
+    training: Training = Training()
+    evaluation: Evaluation = Evaluation()
+    initial_policy: str | None = None
+    """A run folder or an exported artefact whose policy training starts from."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that ``parse`` reads back, with every default written out."""
+        return self.model_dump(mode="json")
+
+
+def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
+    """Reads one experiment; ``overrides`` are "dotted.path=value" with the value in YAML.
+
+    Relative paths in the file are relative to its folder. Raises ConfigError.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}{_shipped_hint(path)}") from None
+    data = read_yaml(text, str(path))
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: an experiment is a mapping with the keys {', '.join(Config.model_fields)}")
+    for override in overrides:
+        _override(data, override)
+    for key in ("balls", "model", "initial_policy"):
+        value = data.get(key)
+        if isinstance(value, str) and (key != "balls" or Path(value).suffix in (".yaml", ".yml")):
+            data[key] = str((path.parent / value).resolve())
+    return parse(data, str(path))
+
+
+def parse(data: dict[str, Any], where: str) -> Config:
+    """A Config from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError("\n".join(_line(where, mistake) for mistake in error.errors())) from None
+
+
+def shipped() -> dict[str, Path]:
+    """The experiments that come with the program, by name."""
+    return {path.stem: path for path in sorted(Path(__file__).parent.glob("*.yaml"))}
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of an experiment YAML, for editors that complete and check while one types."""
+    return Config.model_json_schema() | {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader that reads 1e-3 as a number, as YAML 1.2 does, and refuses a key given twice."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict:
+    keys = [loader.construct_object(key, deep=True) for key, _ in node.value]
+    for i, key in enumerate(keys):
+        if key in keys[:i]:
+            mark = node.value[i][0].start_mark
+            raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", mark)
+    return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
+
+
+def read_yaml(text: str, where: str) -> Any:
+    """Parsed YAML. Raises ConfigError naming ``where`` and the line."""
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from None
+
+
+def _override(data: dict[str, Any], override: str) -> None:
+    path, sign, value = override.partition("=")
+    if not sign or not path:
+        raise ConfigError(f"--set {override}: needs the form dotted.path=value, such as training.updates=500")
+    *parents, leaf = path.split(".")
+    for parent in parents:
+        data = data.setdefault(parent, {})
+        if not isinstance(data, dict):
+            raise ConfigError(f"--set {override}: {parent} is {data!r}, not a mapping")
+    data[leaf] = read_yaml(value, f"--set {override}")
+
+
+def _shipped_hint(path: Path) -> str:
+    names = shipped()
+    near = difflib.get_close_matches(path.stem, names, 1)
+    return f"; did you mean {names[near[0]]}?" if near else ""
+
+
+def _line(where: str, mistake: dict[str, Any]) -> str:
+    """One mistake as "file: dotted.path: what was given, what is allowed"."""
+    path, section = _walk(mistake["loc"])
+    kind, given = mistake["type"], mistake["input"]
+    if kind == "extra_forbidden":
+        parent, _, name = path.rpartition(".")
+        allowed = list(section.model_fields) if section else []
+        near = difflib.get_close_matches(name, allowed, 1)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        owner = f" in {parent}" if parent else ""
+        return f"{where}: {path}: unknown key; {hint}Allowed{owner}: {', '.join(allowed)}"
+    if kind == "missing":
+        return f"{where}: {path}: missing, it has no default"
+    if kind == "union_tag_invalid" or kind == "union_tag_not_found":
+        return f"{where}: {path}.kind: {_tag(given)}, allowed: {mistake.get('ctx', {}).get('expected_tags', 'a kind')}"
+    message = mistake["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    if kind == "literal_error":
+        options = re.findall(r"'([^']*)'", mistake["ctx"]["expected"])
+        near = difflib.get_close_matches(str(given), options, 1)
+        message += f"; did you mean {near[0]!r}?" if near else ""
+    return f"{where}: {path}: got {given!r}, allowed: {message}"
+
+
+def _tag(given: Any) -> str:
+    return f"got {given['kind']!r}" if isinstance(given, dict) and "kind" in given else "missing"
+
+
+def _walk(location: tuple[str | int, ...]) -> tuple[str, type[Section] | None]:
+    """The dotted path that a reader of the YAML sees, without pydantic's names of union members, and its section.
+
+    The section is the innermost one that encloses the last key.
+    """
+    path, section, choices = "", Config, [Config]
+    for part in location:
+        if isinstance(part, int):
+            path += f"[{part}]"
+            continue
+        member = next((c for c in choices if part in _names(c)), None)
+        if len(choices) > 1 or not any(_is_section(c) for c in choices):
+            if member is not None or part not in getattr(section, "model_fields", {}):
+                choices = [member] if member is not None else choices
+                section = member if _is_section(member) else section
+                continue
+        section = next((c for c in choices if _is_section(c)), section)
+        path += f".{part}" if path else str(part)
+        field = section.model_fields.get(part)
+        choices = _members(field.annotation) if field else []
+    return path, section
+
+
+def _members(annotation: Any) -> list[Any]:
+    """Types that a field's value may have; a list counts as its items."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        return _members(get_args(annotation)[0])
+    if origin in (Union, types.UnionType):
+        return [m for argument in get_args(annotation) for m in _members(argument)]
+    if origin is list:
+        return _members(get_args(annotation)[0])
+    return [annotation]
+
+
+def _is_section(candidate: Any) -> bool:
+    return isinstance(candidate, type) and issubclass(candidate, Section)
+
+
+def _names(candidate: Any) -> set[str]:
+    """How pydantic names a member of a union in an error's location."""
+    if not _is_section(candidate):
+        return set()
+    kind = candidate.model_fields.get("kind")
+    return {candidate.__name__, *(get_args(kind.annotation) if kind else ())}
+
+
+def write_schema(path: str | os.PathLike | None = None) -> str:
+    """The schema as indented JSON text."""
+    return json.dumps(json_schema(), indent=2)

@@ -1,0 +1,222 @@
+"""Every physical, sensing and actuation parameter of the simulation in one pytree.
+
+A diagnosis extends it, training consumes it. Fields are scalars, or arrays of the episodes' batch shape when
+``randomise`` has drawn them per episode. The robot's rigid-body constants are the MJCF's and live in ``chain.Chain``.
+
+YAML: the tree of field names, all of them optional, plus
+    randomise: {"ball.table.restitution": [0.85, 0.95], ...}   uniform ranges, drawn anew for every episode
+    provenance: {...}                                          free text, kept as it is
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import yaml
+
+from ballmodel import constants as c
+from ballmodel.aero import INTEGRATORS
+from ballmodel.flight import BallParams, ball_params
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LatencyParams:
+    """Gaussian delays, drawn per episode [s]. Means and deviations: the paper's table of sensor latencies.
+
+    The table heads its second column sigma^2 with unit ms; 8.2 ms is a plausible deviation and 2.9 ms (its root) is not
+    meant: a variance would have unit ms^2.
+    """
+
+    ball_observation: jax.Array | float = 0.040
+    ball_observation_std: jax.Array | float = 0.0082
+    abb_observation: jax.Array | float = 0.029
+    abb_observation_std: jax.Array | float = 0.0082
+    festo_observation: jax.Array | float = 0.033
+    festo_observation_std: jax.Array | float = 0.009
+    abb_action: jax.Array | float = 0.071
+    abb_action_std: jax.Array | float = 0.0057
+    festo_action: jax.Array | float = 0.0645
+    festo_action_std: jax.Array | float = 0.0115
+
+
+LATENCIES = ("ball_observation", "abb_observation", "festo_observation", "abb_action", "festo_action")
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SensingParams:
+    """What the ball tracker adds to the truth."""
+
+    # Half width of the uniform noise on each coordinate, per control step [m]: "2 x the diameter" is its whole width.
+    ball_noise: jax.Array | float = c.BALL_DIAMETER
+    ball_offset_x: jax.Array | float = 0.0  # [m], calibration bias
+    ball_offset_y: jax.Array | float = 0.0
+    ball_offset_z: jax.Array | float = 0.0
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ActuationParams:
+    """What the drives make of a velocity command before the servo of the MJCF follows it."""
+
+    velocity_gain: jax.Array | float = 1.0  # reached over commanded velocity
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class SimModel:
+    """The simulation's parameters."""
+
+    ball: BallParams = field(default_factory=ball_params)
+    latency: LatencyParams = field(default_factory=LatencyParams)
+    sensing: SensingParams = field(default_factory=SensingParams)
+    actuation: ActuationParams = field(default_factory=ActuationParams)
+
+
+@dataclass(frozen=True)
+class Range:
+    """A parameter that is drawn uniformly per episode, by its dotted path in SimModel."""
+
+    path: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """What a model YAML holds."""
+
+    model: SimModel
+    randomise: tuple[Range, ...] = ()
+    provenance: dict = field(default_factory=dict)
+
+
+def paths(node=None, prefix: str = "") -> dict[str, float | str]:
+    """Every leaf of a SimModel by its dotted path; of the nominal model by default."""
+    node = SimModel() if node is None else node
+    leaves: dict[str, float | str] = {}
+    for f in dataclasses.fields(node):
+        value = getattr(node, f.name)
+        if dataclasses.is_dataclass(value):
+            leaves |= paths(value, f"{prefix}{f.name}.")
+        else:
+            leaves[prefix + f.name] = value
+    return leaves
+
+
+def with_values(model: SimModel, values: dict) -> SimModel:
+    """The model with the leaves at the given dotted paths replaced. Raises ValueError for a path that does not exist."""
+    known = paths()
+    for path in values:
+        if path not in known:
+            raise ValueError(f"unknown parameter {path!r}{nearest(path, known)}")
+    return _with_values(model, values)
+
+
+def _with_values(node, values: dict):
+    changed = {}
+    for f in dataclasses.fields(node):
+        inner = {k.removeprefix(f.name + "."): v for k, v in values.items() if k.startswith(f.name + ".")}
+        if inner:
+            changed[f.name] = _with_values(getattr(node, f.name), inner)
+        elif f.name in values:
+            changed[f.name] = values[f.name]
+    return dataclasses.replace(node, **changed)
+
+
+def draw(key, model: SimModel, randomise: tuple[Range, ...], shape: tuple[int, ...]) -> SimModel:
+    """The model with every range drawn uniformly for a batch of ``shape`` episodes."""
+    keys = jax.random.split(key, max(len(randomise), 1))
+    drawn = {r.path: jax.random.uniform(k, shape, minval=r.low, maxval=r.high) for r, k in zip(randomise, keys)}
+    return with_values(model, drawn)
+
+
+def draw_latencies(key, latency: LatencyParams, shape: tuple[int, ...], longest: float):
+    """Delays (5, *shape) [s] in the order of ``LATENCIES``, kept within [0, longest]."""
+    mean = jnp.stack([jnp.broadcast_to(getattr(latency, n), shape) for n in LATENCIES])
+    std = jnp.stack([jnp.broadcast_to(getattr(latency, f"{n}_std"), shape) for n in LATENCIES])
+    return jnp.clip(mean + std * jax.random.normal(key, mean.shape), 0.0, longest)
+
+
+def nearest(name: str, known) -> str:
+    """', did you mean ...?' or the list of valid names."""
+    close = difflib.get_close_matches(name, list(known), 1)
+    return f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}"
+
+
+def load(path: str | os.PathLike) -> ModelFile:
+    """Reads a model YAML. Raises ValueError naming file, key, what was given and what is allowed."""
+    try:
+        data = yaml.safe_load(Path(path).read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: not valid YAML: {error}") from None
+    return from_dict(data or {}, str(path))
+
+
+def from_dict(data, where: str) -> ModelFile:
+    """A ModelFile from parsed YAML; ``where`` names its origin in errors."""
+    if not isinstance(data, dict):
+        raise ValueError(f"{where}: a model is a mapping of parameter groups, got {type(data).__name__}")
+    data = dict(data)
+    ranges, provenance = data.pop("randomise", None) or {}, data.pop("provenance", None) or {}
+    known = paths()
+    values = {}
+    for path, value in _flatten(data, where, known):
+        if isinstance(known[path], str):
+            if value not in INTEGRATORS:
+                raise ValueError(f"{where}: {path} = {value!r}, allowed are {INTEGRATORS}")
+        else:
+            value = _number(value, f"{where}: {path}")
+        values[path] = value
+    parsed = []
+    for path, bounds in ranges.items():
+        if path not in known or isinstance(known[path], str):
+            raise ValueError(f"{where}: randomise.{path}: unknown parameter{nearest(path, known)}")
+        if not isinstance(bounds, list | tuple) or len(bounds) != 2:
+            raise ValueError(f"{where}: randomise.{path} = {bounds!r}, a range is [low, high]")
+        low, high = (_number(b, f"{where}: randomise.{path}") for b in bounds)
+        if low > high:
+            raise ValueError(f"{where}: randomise.{path} = {bounds!r}, low must not exceed high")
+        parsed.append(Range(path, low, high))
+    return ModelFile(with_values(SimModel(), values), tuple(parsed), provenance)
+
+
+def save(path: str | os.PathLike, file: ModelFile) -> None:
+    """Writes every parameter, the ranges and the provenance; to a temporary file first, so nothing is half-written."""
+    tree: dict = {}
+    for name, value in paths(file.model).items():
+        *groups, leaf = name.split(".")
+        node = tree
+        for group in groups:
+            node = node.setdefault(group, {})
+        node[leaf] = value if isinstance(value, str) else float(value)
+    tree["randomise"] = {r.path: [r.low, r.high] for r in file.randomise}
+    tree["provenance"] = file.provenance
+    temporary = Path(f"{path}.tmp")
+    temporary.write_text(yaml.safe_dump(tree, sort_keys=False))
+    os.replace(temporary, path)
+
+
+def _flatten(data: dict, where: str, known, prefix: str = ""):
+    for key, value in data.items():
+        path = f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from _flatten(value, where, known, f"{path}.")
+        elif path in known:
+            yield path, value
+        else:
+            raise ValueError(f"{where}: unknown parameter {path!r}{nearest(path, known)}")
+
+
+def _number(value, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{where} = {value!r}, a finite number is needed")
+    return float(value)
