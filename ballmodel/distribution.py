@@ -20,6 +20,7 @@ from ballmodel.state import BallState
 
 AXES = {"position": ("x", "y", "z"), "velocity": ("x", "y", "z"), "landing": ("x", "y")}
 NOTES = ("name", "source", "paper")
+EPS_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class DistributionReport:
 def fit_distribution(
     states: BallState,
     landing,
-    eps: float = 2.0,
+    eps: float | None = None,
     min_samples: int = 5,
     name: str = "",
     source: str = "",
@@ -135,19 +136,26 @@ def fit_distribution(
     states: position [m] and velocity [m/s] of the balls' starts, (3, n); landing: (2, n) [m].
     A ball is an outlier when DBSCAN puts it into no cluster. Its eight coordinates are first centred on the median and
     divided by a robust standard deviation (interquartile range / 1.349), so that outliers do not set their own scale.
-    The paper gives neither eps nor min_samples. In eight dimensions two neighbours drawn from a unit Gaussian lie 4
-    standard deviations apart on average, so eps = 2 keeps a ball that has ``min_samples`` clearly closer relatives.
-    Raises ValueError for non-finite input, unequal lengths, or when every ball is an outlier.
+    The paper gives neither eps nor min_samples. Without ``eps`` it is EPS_FACTOR times the median distance of a ball to its
+    (min_samples - 1)-th neighbour, after Ester et al. 1996's k-distance, so that it follows the number of balls.
+    Raises ValueError for non-finite input, unequal lengths, fewer than min_samples balls, or when all are outliers.
     """
-    from sklearn.cluster import DBSCAN  # takes about a second to import; only this function needs it
+    from sklearn.cluster import DBSCAN  # sklearn takes about a second to import; only this function needs it
+    from sklearn.neighbors import NearestNeighbors
 
     position, velocity, landing = (np.asarray(a, float) for a in (states.position, states.velocity, landing))
     points = np.concatenate([position, velocity, landing])
     if points.shape[0] != 8 or not np.all(np.isfinite(points)):
         raise ValueError(f"finite position (3, n), velocity (3, n) and landing (2, n) are wanted, got a stack of {points.shape}")
+    if points.shape[1] < max(min_samples, 2):
+        raise ValueError(f"{points.shape[1]} balls are too few for clusters of min_samples={min_samples}")
     low, middle, high = np.percentile(points, [25, 50, 75], axis=1, keepdims=True)
     scale = (high - low) / 1.349
     standard = (points - middle) / np.where(scale > 0, scale, 1.0)
+    if eps is None:
+        neighbours = NearestNeighbors(n_neighbors=max(min_samples - 1, 1)).fit(standard.T)
+        distances, _ = neighbours.kneighbors()  # of the balls themselves: each one's own distance of zero is left out
+        eps = EPS_FACTOR * float(np.median(distances[:, -1]))
     outlier = DBSCAN(eps=eps, min_samples=min_samples).fit_predict(standard.T) == -1
     if np.all(outlier):
         raise ValueError(f"DBSCAN with eps={eps}, min_samples={min_samples} calls all {outlier.size} balls outliers; raise eps")

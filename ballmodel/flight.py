@@ -1,7 +1,9 @@
 """One integration step of a ball, with impacts solved inside the step.
 
-Free flight is the paper's step: x += dt (v + dt a / 2), v += dt a, with a taken at the step's start (first order: 0.9 mm
-of landing point at 300 Hz) or, with the integrator "midpoint", at its middle (second order). An impact is placed at its own time within the step:
+Free flight is the paper's step: x += dt (v + dt a / 2), v += dt a, with a taken at the step's start, or, with the
+integrator "midpoint", at its middle. The paper's step is first order: halving it from 300 Hz moves landing points by 0.4 to
+1.5 mm in the median, more than 1 mm on six of the paper's 19 ball distributions (from 450 Hz on none); midpoint is second
+order and moves them by less than 0.01 mm. An impact is placed at its own time within the step:
 on a box by the root of the step's parabola (exact on the table's top), on the paddle where ball and blade, each moving
 steadily within the step, come within touching distance. After the impact the rest of the step is free flight.
 """
@@ -75,7 +77,8 @@ def _free_step(params, state, dt):
 def _step_acceleration(params, state, dt):
     a = acceleration(params, state.velocity, state.spin)
     if params.integrator == "midpoint":
-        a = acceleration(params, state.velocity + a * (0.5 * dt), state.spin)
+        spin = state.spin * jnp.exp(-0.5 * dt * params.spin_decay)
+        a = acceleration(params, state.velocity + a * (0.5 * dt), spin)
     elif params.integrator != "paper":
         raise ValueError(f"integrator {params.integrator!r} is not one of {INTEGRATORS}")
     return a

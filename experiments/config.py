@@ -7,24 +7,21 @@ to are looked up by ``experiments.build``.
 from __future__ import annotations
 
 import difflib
-import json
 import os
 import re
-import types
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from experiments import mistakes
+from experiments.errors import ConfigError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
-
-
-class ConfigError(ValueError):
-    """A configuration cannot be used: the message names file, dotted path, what was given and what is allowed."""
 
 
 class Section(BaseModel):
@@ -216,7 +213,7 @@ def parse(data: dict[str, Any], where: str) -> Config:
     try:
         return Config.model_validate(data)
     except ValidationError as error:
-        raise ConfigError("\n".join(_line(where, mistake) for mistake in error.errors())) from None
+        raise ConfigError("\n".join(f"{where}: {line}" for line in mistakes.lines(error, Config))) from None
 
 
 def shipped() -> dict[str, Path]:
@@ -274,82 +271,3 @@ def _shipped_hint(path: Path) -> str:
     names = shipped()
     near = difflib.get_close_matches(path.stem, names, 1)
     return f"; did you mean {names[near[0]]}?" if near else ""
-
-
-def _line(where: str, mistake: dict[str, Any]) -> str:
-    """One mistake as "file: dotted.path: what was given, what is allowed"."""
-    path, section = _walk(mistake["loc"])
-    kind, given = mistake["type"], mistake["input"]
-    if kind == "extra_forbidden":
-        parent, _, name = path.rpartition(".")
-        allowed = list(section.model_fields) if section else []
-        near = difflib.get_close_matches(name, allowed, 1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
-        owner = f" in {parent}" if parent else ""
-        return f"{where}: {path}: unknown key; {hint}Allowed{owner}: {', '.join(allowed)}"
-    if kind == "missing":
-        return f"{where}: {path}: missing, it has no default"
-    if kind == "union_tag_invalid" or kind == "union_tag_not_found":
-        return f"{where}: {path}.kind: {_tag(given)}, allowed: {mistake.get('ctx', {}).get('expected_tags', 'a kind')}"
-    message = mistake["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    if kind == "literal_error":
-        options = re.findall(r"'([^']*)'", mistake["ctx"]["expected"])
-        near = difflib.get_close_matches(str(given), options, 1)
-        message += f"; did you mean {near[0]!r}?" if near else ""
-    return f"{where}: {path}: got {given!r}, allowed: {message}"
-
-
-def _tag(given: Any) -> str:
-    return f"got {given['kind']!r}" if isinstance(given, dict) and "kind" in given else "missing"
-
-
-def _walk(location: tuple[str | int, ...]) -> tuple[str, type[Section] | None]:
-    """The dotted path that a reader of the YAML sees, without pydantic's names of union members, and its section.
-
-    The section is the innermost one that encloses the last key.
-    """
-    path, section, choices = "", Config, [Config]
-    for part in location:
-        if isinstance(part, int):
-            path += f"[{part}]"
-            continue
-        member = next((c for c in choices if part in _names(c)), None)
-        if len(choices) > 1 or not any(_is_section(c) for c in choices):
-            if member is not None or part not in getattr(section, "model_fields", {}):
-                choices = [member] if member is not None else choices
-                section = member if _is_section(member) else section
-                continue
-        section = next((c for c in choices if _is_section(c)), section)
-        path += f".{part}" if path else str(part)
-        field = section.model_fields.get(part)
-        choices = _members(field.annotation) if field else []
-    return path, section
-
-
-def _members(annotation: Any) -> list[Any]:
-    """Types that a field's value may have; a list counts as its items."""
-    origin = get_origin(annotation)
-    if origin is Annotated:
-        return _members(get_args(annotation)[0])
-    if origin in (Union, types.UnionType):
-        return [m for argument in get_args(annotation) for m in _members(argument)]
-    if origin is list:
-        return _members(get_args(annotation)[0])
-    return [annotation]
-
-
-def _is_section(candidate: Any) -> bool:
-    return isinstance(candidate, type) and issubclass(candidate, Section)
-
-
-def _names(candidate: Any) -> set[str]:
-    """How pydantic names a member of a union in an error's location."""
-    if not _is_section(candidate):
-        return set()
-    kind = candidate.model_fields.get("kind")
-    return {candidate.__name__, *(get_args(kind.annotation) if kind else ())}
-
-
-def write_schema(path: str | os.PathLike | None = None) -> str:
-    """The schema as indented JSON text."""
-    return json.dumps(json_schema(), indent=2)

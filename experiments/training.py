@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.sharding import PartitionSpec
 
 from ballmodel.pool import BallPool
 from bgs import normalizer, strategy
@@ -18,7 +20,7 @@ from bgs.strategy import BGSConfig, BGSState
 from mjx_tt import rewards
 from mjx_tt.model import Range, SimModel
 from mjx_tt.policy import initial_theta
-from mjx_tt.rollout import RolloutResult, Simulator
+from mjx_tt.rollout import AXIS, RESULT_SPECS, RolloutResult, Simulator
 from mjx_tt.task import MISSED, RETURNED
 from robot_io.contract import N_OBSERVATION
 
@@ -56,10 +58,10 @@ class Trainer:
     ) -> None:
         if repeats < 1:
             raise ValueError(f"repeats is {repeats}, at least 1 is needed")
-        self.simulator, self.bgs_config, self.pool = simulator, bgs_config, pool
+        self.simulator, self.bgs_config, self.pool = simulator, bgs_config, simulator.replicate(pool)
         self._model, self._randomise = model, randomise
         self._repeats, self._crn, self._initial_scale = repeats, common_random_numbers, initial_scale
-        self._update = jax.jit(self._update_on)
+        self._update = jax.jit(simulator.on_devices(self._update_local, out_specs=PartitionSpec()))
 
     @property
     def episodes_per_update(self) -> int:
@@ -70,7 +72,7 @@ class Trainer:
         theta_key, run_key = jax.random.split(key)
         theta = initial_theta(theta_key, self._initial_scale) if theta is None else jnp.asarray(theta)
         statistics = normalizer.empty(N_OBSERVATION) if statistics is None else statistics
-        return TrainState(strategy.init(theta, self.bgs_config), statistics, run_key)
+        return self.simulator.replicate(TrainState(strategy.init(theta, self.bgs_config), statistics, run_key))
 
     def update(self, state: TrainState) -> tuple[TrainState, dict]:
         """One update and its metrics (scalars on the device; fetch them rarely)."""
@@ -80,7 +82,7 @@ class Trainer:
         """The update, lowered for ahead-of-time compilation (``.compile()``)."""
         return self._update.lower(state, self.pool)
 
-    def _update_on(self, state: TrainState, pool: BallPool):
+    def _update_local(self, state: TrainState, pool: BallPool):
         config, pairs = self.bgs_config, self.bgs_config.pairs
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
         directions = strategy.ask(direction_key, state.bgs, config)
@@ -92,20 +94,27 @@ class Trainer:
         if self._crn:
             episodes = jax.tree.map(lambda x: jnp.concatenate([x, x], -1) if x.ndim >= 2 else x, episodes)
         mean, inverse_scale = normalizer.normaliser(state.statistics)
-        result = self.simulator.rollout(theta, mean, inverse_scale, episodes)
+        simulator = self.simulator
+        result = simulator.rollout(simulator.local(theta), mean, inverse_scale, simulator.local(episodes))
+        # Everything that the devices have to share, in one sum: each fills in its own members.
         member = result.returns.mean(axis=0)  # NaN when one of its episodes was not finite
+        failed = ~jnp.isfinite(member)
+        place = jax.lax.axis_index(AXIS) * member.shape[0]
+        members = jnp.zeros((2, 2 * pairs)).at[:, place + jnp.arange(member.shape[0])].set(
+            jnp.stack([jnp.where(failed, 0.0, member), failed])
+        )
+        sums, counts = result.observation_sums.sum(axis=-1), result.observation_counts.sum()
+        shared = (members, sums, counts.astype(jnp.float32), totals(result))
+        flat, unravel = ravel_pytree(shared)
+        members, sums, counts, total = unravel(jax.lax.psum(flat, AXIS))
+        member = jnp.where(members[1] > 0, jnp.nan, members[0])
         bgs, info = strategy.tell(state.bgs, directions, member[:pairs], member[pairs:], config)
-        seen = observed(result, mean)
-        statistics = normalizer.merge(state.statistics, seen)
+        seen = normalizer.from_sums(counts.astype(jnp.int32), mean, sums[0], sums[1])
         metrics = {
             **{name: getattr(info, name) for name in ("gradient_norm", "update_norm", "failed_pairs", "elite_std")},
-            **summary(result),
+            **means(total),
         }
-        return TrainState(bgs, statistics, state.key), metrics
-
-    def evaluate(self, theta, statistics, key, pool: BallPool, model: SimModel, episodes: int) -> RolloutResult:
-        """Plays at least ``episodes`` episodes of one policy theta (976,) with frozen statistics; NumPy arrays (R, P)."""
-        return evaluate(self.simulator, theta, *normalizer.normaliser(statistics), key, pool, model, episodes)
+        return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
 
 
 def evaluate(
@@ -121,30 +130,33 @@ def evaluate(
 
     def play(theta, mean, inverse_scale, key, pool):
         drawn = simulator.draw(key, pool, model, randomise, repeats, columns)
-        return simulator.rollout(jnp.repeat(theta[:, None], columns, 1), mean, inverse_scale, drawn)
+        copies = jnp.repeat(theta[:, None], columns // simulator.devices, 1)
+        return simulator.rollout(copies, mean, inverse_scale, simulator.local(drawn))
 
-    return jax.tree.map(np.asarray, jax.jit(play)(theta, mean, inverse_scale, key, pool))
-
-
-def observed(result: RolloutResult, shift) -> normalizer.ObservationStatistics:
-    """Statistics of the observations of a rollout whose sums are about ``shift`` (11,)."""
-    sums = result.observation_sums.sum(axis=-1)
-    return normalizer.from_sums(result.observation_counts.sum(), shift, sums[0], sums[1])
+    spread = simulator.on_devices(play, out_specs=RESULT_SPECS)
+    return jax.tree.map(np.asarray, jax.jit(spread)(theta, mean, inverse_scale, key, pool))
 
 
-def summary(result: RolloutResult) -> dict:
-    """Scalars over all finite episodes of a rollout."""
-    count = jnp.maximum(result.finite.sum(), 1)
+def totals(result: RolloutResult) -> dict:
+    """Sums over the finite episodes of a rollout, from which ``means`` makes metrics; sums of parts add up."""
 
-    def over_finite(x):
-        return jnp.where(result.finite, x, 0.0).sum(axis=(-2, -1)) / count
+    def total(x):
+        return jnp.where(result.finite, x, 0.0).sum(axis=(-2, -1)).astype(jnp.float32)
 
-    terms = over_finite(result.terms)
     return {
-        "mean_return": over_finite(jnp.nan_to_num(result.returns)),
-        "return_rate": over_finite(result.outcome == RETURNED),
-        "hit_rate": over_finite(result.outcome != MISSED),
-        "non_finite": (~result.finite).sum(),
-        "steps": over_finite(result.steps),
-        **{f"reward/{name}": terms[i] for i, name in enumerate(rewards.TERMS)},
+        "episodes": total(jnp.ones_like(result.returns)),
+        "non_finite": (~result.finite).sum().astype(jnp.float32),
+        "mean_return": total(result.returns),
+        "return_rate": total(result.outcome == RETURNED),
+        "hit_rate": total(result.outcome != MISSED),
+        "steps": total(result.steps),
+        "terms": total(result.terms),
     }
+
+
+def means(total: dict) -> dict:
+    """Metrics of finite episodes (scalars) from ``totals``; the reward terms are unweighted."""
+    count = jnp.maximum(total["episodes"], 1.0)
+    over = {k: total[k] / count for k in ("mean_return", "return_rate", "hit_rate", "steps")}
+    terms = {f"reward/{name}": total["terms"][i] / count for i, name in enumerate(rewards.TERMS)}
+    return {**over, "non_finite": total["non_finite"], **terms}

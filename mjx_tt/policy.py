@@ -3,8 +3,8 @@
 Architecture and parameter order: ``robot_io.contract``. Streaming keeps one past input, two past outputs of layer 1 and
 four of layer 2, which is all that the dilations 1, 2, 4 reach back to: 928 multiply-adds a control step instead of 4,576.
 
-Parameters may differ along the last axis (perturbations): kernels are (2, in, out, P), activations (channels, R, P).
-Sums over channels are written out so that each layer is one vector loop over the batch.
+Parameters may differ along a last axis of P perturbations: kernels are (2, in, out, P) and the batch of activations
+(channels, B) is R repeats of them, B = R x P with P the faster index. Sums over channels are written out so that each layer is one vector loop over the batch.
 """
 
 from __future__ import annotations
@@ -42,18 +42,19 @@ def _sizes():
 
 
 def _layer(kernel, bias, older, newer, gated: bool):
-    """One tap pair of a layer: older, newer (in, ...) -> (out, ...)."""
-    extra = (1,) * (older.ndim - 1 - (kernel.ndim - 3))
+    """One tap pair of a layer: older, newer (in, B) -> (out, B), with B = R x P for kernels of P perturbations."""
+    columns = kernel.shape[3] if kernel.ndim == 4 else 1
+    shape = (-1, columns) if kernel.ndim == 4 else newer.shape[1:]
 
-    def column(w):  # (out, P...) -> (out, 1..., P...)
-        return w.reshape(w.shape[:1] + extra + w.shape[1:])
+    def spread(w):  # (out, P) -> (out, 1, P)
+        return w[:, None] if kernel.ndim == 4 else w.reshape(w.shape + (1,) * (newer.ndim - 1))
 
-    z = column(bias)
+    z = spread(bias)
     for c in range(older.shape[0]):
-        z = z + column(kernel[0, c]) * older[c][None] + column(kernel[1, c]) * newer[c][None]
+        z = z + spread(kernel[0, c]) * older[c].reshape(shape) + spread(kernel[1, c]) * newer[c].reshape(shape)
+    z = materialise(z.reshape(-1, *newer.shape[1:]))
     if not gated:
         return jnp.tanh(z)
-    z = materialise(z)
     half = z.shape[0] // 2
     return jnp.tanh(z[:half]) * jax.nn.sigmoid(z[half:])
 

@@ -2,7 +2,7 @@
 
 Arrays are (component, repeat R, perturbation P). Repeats are sorted by the ball's time of arrival and run in blocks, each
 until its last live episode: blocks keep the working set in the cache and let fast balls end early. The perturbation
-axis is split over the devices.
+axis can be split over devices (jax.sharding): every device runs its share, with no communication.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from ballmodel.pool import BallPool
 from ballmodel.state import where
@@ -22,6 +22,7 @@ from mjx_tt.model import Range, SimModel
 from mjx_tt.task import HIT, MISSED, RETURNED, Episodes, Task, TaskConfig
 from robot_io.contract import unflatten
 
+AXIS = "perturbation"
 CPU_BLOCK = 768  # episodes per block that keep the state inside a core's cache
 
 
@@ -41,6 +42,18 @@ class RolloutResult:
     observation_counts: jax.Array  # (P,) int32
 
 
+def _by_perturbation(rank: int) -> PartitionSpec:
+    return PartitionSpec(*[None] * (rank - 1), AXIS)
+
+
+# How a result that is left on the devices is laid out: split along P.
+RESULT_SPECS = RolloutResult(
+    terms=_by_perturbation(3), returns=_by_perturbation(2), outcome=_by_perturbation(2), landing=_by_perturbation(3),
+    finite=_by_perturbation(2), steps=_by_perturbation(2), peak_velocity=_by_perturbation(3),
+    observation_sums=_by_perturbation(3), observation_counts=_by_perturbation(1),
+)  # fmt: skip
+
+
 class Simulator:
     """Draws and runs episodes of one task on ``devices`` devices.
 
@@ -54,7 +67,7 @@ class Simulator:
         self.config = config
         self.task = Task(config)
         self.devices = devices
-        self._mesh = Mesh(np.array(available[:devices]), ("perturbation",))
+        self._mesh = Mesh(np.array(available[:devices]), (AXIS,))
         self._cpu = available[0].platform == "cpu"
 
     def draw(
@@ -78,46 +91,56 @@ class Simulator:
             model=jax.tree.map(jnp.asarray, drawn),
         )
 
+    def on_devices(self, function, **specs):
+        """``function`` run on every device at once, on the same arguments; inside it ``local`` picks a device's share.
+
+        specs: ``out_specs`` of jax.shard_map. What a function combines over devices it should combine in one collective:
+        several at a time starve the few threads that host devices share, and hang.
+        """
+        return jax.shard_map(function, mesh=self._mesh, in_specs=PartitionSpec(), check_vma=False, **specs)
+
+    def replicate(self, tree):
+        """The arrays of ``tree`` on every device: the layout that ``on_devices`` takes and returns."""
+        return jax.device_put(tree, NamedSharding(self._mesh, PartitionSpec()))
+
+    def local(self, tree):
+        """This device's share of arrays (..., P) along the last axis; only inside ``on_devices``. Scalars are shared."""
+        return jax.tree.map(lambda x: self._share(x) if x.ndim else x, tree)
+
+    def _share(self, x):
+        width = x.shape[-1] // self.devices
+        if width * self.devices != x.shape[-1]:
+            raise ValueError(f"{x.shape[-1]} perturbations cannot be split evenly over {self.devices} devices")
+        return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * width, width, axis=-1)
+
     def rollout(self, theta, mean, inverse_scale, episodes: Episodes) -> RolloutResult:
-        """Runs theta (976, P), one column per perturbation, on episodes (R, P), with the normaliser (11,) frozen."""
+        """Runs theta (976, P), one column per perturbation, on episodes (R, P), with the normaliser (11,) frozen.
+
+        Runs on the device it is called for; ``on_devices`` and ``local`` spread it.
+        """
         columns = theta.shape[-1]
         if columns != episodes.seed.shape[-1]:
             raise ValueError(f"theta has {columns} columns, the episodes {episodes.seed.shape[-1]}")
-        if columns % self.devices:
-            raise ValueError(f"{columns} perturbations cannot be split evenly over {self.devices} devices")
-        split, whole = PartitionSpec("perturbation"), PartitionSpec()
-
-        def last_axis(x):
-            return PartitionSpec(*[None] * (x.ndim - 1), "perturbation") if x.ndim >= 2 else whole
-
-        specs = (last_axis(theta), whole, whole, jax.tree.map(last_axis, episodes))
-        shapes = jax.eval_shape(self._rollout_local, theta, mean, inverse_scale, episodes)
-        out_specs = jax.tree.map(lambda x: split if x.ndim == 1 else last_axis(x), shapes)
-        run = jax.shard_map(self._rollout_local, mesh=self._mesh, in_specs=specs, out_specs=out_specs, check_vma=False)
-        return run(theta, mean, inverse_scale, episodes)
-
-    def _rollout_local(self, theta, mean, inverse_scale, episodes: Episodes) -> RolloutResult:
         parameters, normaliser = unflatten(theta), (mean, inverse_scale)
         repeats, columns = episodes.seed.shape
         rows = self._block_rows(repeats, columns)
         blocks = repeats // rows
 
-        def cut(x):  # (..., R, P) -> (blocks, ..., rows, P); scalars are shared
+        # Inside a block rows and columns are one axis: one long loop per operation instead of many short ones.
+        def cut(x):  # (..., R, P) -> (blocks, ..., rows x P); scalars are shared
             if x.ndim < 2:
                 return jnp.broadcast_to(x, (blocks, *x.shape))
-            parts = x.reshape(*x.shape[:-2], blocks, rows, columns)
-            return jnp.moveaxis(parts, -3, 0)
+            return jnp.moveaxis(x.reshape(*x.shape[:-2], blocks, rows * columns), -2, 0)
 
-        def join(x):  # (blocks, ..., rows, P) -> (..., R, P)
-            x = jnp.moveaxis(x, 0, -3)
-            return x.reshape(*x.shape[:-3], repeats, columns)
+        def join(x):  # (blocks, ..., rows x P) -> (..., R, P)
+            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], repeats, columns)
 
         run = partial(self._block, parameters=parameters, normaliser=normaliser)
         result, sums, counts = jax.lax.map(run, jax.tree.map(cut, episodes))
         return RolloutResult(
             **{name: join(value) for name, value in result.items()},
-            observation_sums=sums.sum(axis=0),
-            observation_counts=counts.sum(axis=0),
+            observation_sums=sums.reshape(blocks, 2, -1, rows, columns).sum(axis=(0, 3)),
+            observation_counts=counts.reshape(blocks, rows, columns).sum(axis=(0, 1)),
         )
 
     def _block_rows(self, repeats: int, columns: int) -> int:
@@ -159,7 +182,7 @@ class Simulator:
             steps=steps,
             peak_velocity=state.sums.peak_velocity,
         )
-        return result, observed.sum(axis=-2), jnp.where(finite, steps, 0).sum(axis=-2)
+        return result, observed, jnp.where(finite, steps, 0)
 
     def replay(self, theta, mean, inverse_scale, episodes: Episodes):
         """Plays single episodes for the camera: theta (976,), episodes (R, 1).

@@ -1,0 +1,132 @@
+"""Measured ball trajectories: validation, the free flight before the first bounce, resampling."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from ballmodel.constants import BALL_RADIUS
+
+LARGEST_COORDINATE = 30.0  # [m] from the table's centre; beyond it the numbers are no metres
+LONGEST = 60.0  # [s]; beyond it the time stamps are no seconds
+BOUNCE_HEIGHT = 0.10  # [m] of the ball's lowest point above the table up to which a reversal is a bounce
+BOUNCE_KICK = 0.5  # [m/s] least change of the vertical velocity at a bounce
+BOUNCE_WINDOW = 5  # samples on each side that tell the vertical velocity
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One ball as it was measured, in the table frame.
+
+    Raises ValueError, naming session and trajectory, for shapes that do not match, numbers that are not finite, time that
+    does not increase, and numbers too large to be metres and seconds.
+    """
+
+    session: str
+    name: str
+    time: np.ndarray  # (n,) [s]
+    position: np.ndarray  # (3, n) [m] ball centre
+
+    def __post_init__(self) -> None:
+        time, position = np.asarray(self.time, np.float64), np.asarray(self.position, np.float64)
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "position", position)
+        if time.ndim != 1 or time.size == 0 or position.shape != (3, time.size):
+            raise ValueError(f"{self.label}: time (n,) and position (3, n) are wanted, got {time.shape} and {position.shape}")
+        if not (np.all(np.isfinite(time)) and np.all(np.isfinite(position))):
+            sample = int(np.argmax(~np.isfinite(time) | ~np.all(np.isfinite(position), axis=0)))
+            raise ValueError(f"{self.label}: sample {sample} is not finite: t={time[sample]}, position={position[:, sample]}")
+        if np.any(np.diff(time) <= 0.0):
+            sample = int(np.argmax(np.diff(time) <= 0.0)) + 1
+            raise ValueError(
+                f"{self.label}: time must increase, sample {sample} has t={time[sample]} after t={time[sample - 1]}"
+            )
+        farthest = np.abs(position).max()
+        if farthest > LARGEST_COORDINATE:
+            raise ValueError(
+                f"{self.label}: a coordinate of {farthest:g} is no place near a table; metres are wanted (are these millimetres?)"
+            )
+        if time[-1] - time[0] > LONGEST:
+            raise ValueError(
+                f"{self.label}: lasts {time[-1] - time[0]:g}, one ball's flight in seconds is wanted (are these milliseconds?)"
+            )
+
+    @property
+    def label(self) -> str:
+        """Session and name, for messages."""
+        return f"trajectory {self.session}/{self.name}" if self.session else f"trajectory {self.name}"
+
+    def __len__(self) -> int:
+        return self.time.size
+
+    def part(self, start: int, stop: int) -> Trajectory:
+        """Samples start to stop - 1."""
+        return Trajectory(self.session, self.name, self.time[start:stop], self.position[:, start:stop])
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Trajectories read from one source."""
+
+    trajectories: tuple[Trajectory, ...]
+    source: str
+
+    def __len__(self) -> int:
+        return len(self.trajectories)
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return iter(self.trajectories)
+
+    @property
+    def sessions(self) -> tuple[str, ...]:
+        """Session names in the order of their first trajectory."""
+        return tuple(dict.fromkeys(t.session for t in self.trajectories))
+
+
+def first_bounce(trajectory: Trajectory) -> int | None:
+    """Index of the lowest sample at the first bounce, or None where the ball does not bounce.
+
+    A bounce is a sample, the lowest among its neighbours, where the vertical velocity changes from falling to rising by
+    at least BOUNCE_KICK while the ball is within BOUNCE_HEIGHT of the table: gravity alone only ever makes it fall faster.
+    The velocities are slopes of straight lines through up to BOUNCE_WINDOW samples on each side, so noise of a few
+    millimetres does not fake one.
+    """
+    time, z = trajectory.time, trajectory.position[2]
+
+    def slope(samples: slice) -> float:
+        t = time[samples] - time[samples].mean()
+        return float(t @ z[samples] / (t @ t))
+
+    for k in np.flatnonzero(z < BALL_RADIUS + BOUNCE_HEIGHT):
+        before, after = slice(max(0, k + 1 - BOUNCE_WINDOW), k + 1), slice(k, k + BOUNCE_WINDOW)
+        lowest = z[k] <= z[before.start : k + BOUNCE_WINDOW].min()
+        if not lowest or k == before.start or k == len(trajectory) - 1:
+            continue
+        falling, rising = slope(before), slope(after)
+        if falling < 0.0 < rising and rising - falling >= BOUNCE_KICK:
+            return int(k)
+    return None
+
+
+def free_flight(trajectory: Trajectory) -> Trajectory:
+    """The samples before the first bounce; the lowest sample, which may lie on either side of it, is left out."""
+    bounce = first_bounce(trajectory)
+    return trajectory if bounce is None else trajectory.part(0, bounce)
+
+
+def resample(trajectory: Trajectory, rate: float) -> Trajectory:
+    """The trajectory at ``rate`` [Hz] from its first sample on, by monotone cubic interpolation (no overshoot at a bounce).
+
+    Raises ValueError for a rate that is not positive or a trajectory of fewer than two samples.
+    """
+    if not rate > 0.0:
+        raise ValueError(f"rate is {rate}; a positive number of samples per second is wanted")
+    if len(trajectory) < 2:
+        raise ValueError(f"{trajectory.label}: two samples at least are wanted to interpolate, it has {len(trajectory)}")
+    start, end = trajectory.time[[0, -1]]
+    time = start + np.arange(int(np.floor((end - start) * rate * (1.0 + 1e-12))) + 1) / rate
+    position = PchipInterpolator(trajectory.time, trajectory.position, axis=1)(np.minimum(time, end))
+    return Trajectory(trajectory.session, trajectory.name, time, position)

@@ -1,0 +1,328 @@
+"""The command line ``mjx-tt``. What a command needs is imported when it runs, so that --help answers at once."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from experiments.errors import ConfigError, checked, explained
+
+DESCRIPTION = """\
+From measured human balls to a trained, evaluated and exported table-tennis policy.
+
+The usual way:
+  mjx-tt balls                          which players and distributions there are
+  mjx-tt train quickstart.yaml          train, evaluate, export: everything lands in runs/quickstart/
+  mjx-tt evaluate runs/quickstart       play it again, on other balls if you like
+  mjx-tt fit-human rallies.csv --out anna.yaml     a distribution of your own, for an experiment's key "balls"
+"""
+SHIPPED_HINT = "\nA file name without a folder that is not in the current folder is looked up among the shipped experiments.\n"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs one command; returns the exit status: 0 done, 1 failed with a message, 130 interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.command(options)
+    except KeyboardInterrupt as interruption:
+        print(interruption or "interrupted", file=sys.stderr)
+        return 130
+    except Exception as error:
+        if not explained(error):
+            raise
+        print(f"mjx-tt: error: {error}", file=sys.stderr)
+        return 1
+
+
+def train(options: argparse.Namespace) -> int:
+    from experiments import config
+
+    configs = [(str(path), config.load(path, tuple(options.set))) for path in map(_experiment, options.experiments)]
+    _start_jax(options.devices or _most_devices(configs))
+    from rich.console import Console
+
+    from experiments import jobs
+
+    console = Console()
+    planned = jobs.plan(configs, options.seeds, Path(options.out))
+    ok = jobs.run_all(planned, console)
+    if options.select:
+        for name in dict.fromkeys(job.config.name for job in planned):
+            mine = [job for job in planned if job.config.name == name]
+            jobs.select(Path(options.out) / name, mine, console)
+    return 0 if ok else 1
+
+
+def evaluate(options: argparse.Namespace) -> int:
+    _start_jax(options.devices)
+    from rich.console import Console
+
+    from experiments import evaluate as evaluation
+    from experiments import finish, policy
+
+    console = Console()
+    trained = policy.load(options.policy)
+    experiment = _experiment_of(trained, options)
+    settings = experiment.config.evaluation
+    episodes, seed = options.episodes or settings.episodes, settings.seed if options.seed is None else options.seed
+    played = evaluation.evaluate(experiment, trained, episodes, seed)
+    folder = Path(options.out) if options.out else _evaluation_folder(options)
+    finish.save_evaluation(folder, played, experiment.task.reward_weights)
+    finish.print_report(console, played.report, str(trained.source))
+    console.print(f"  {folder}/evaluation.json, pictures in {folder}/plots", highlight=False, soft_wrap=True)
+    return 0
+
+
+def export(options: argparse.Namespace) -> int:
+    _start_jax(1)
+    from rich.console import Console
+
+    from experiments import finish, policy
+    from experiments.runs import Run
+
+    console, run = Console(), Run(options.run)
+    trained = policy.load(options.run)
+    experiment = _experiment_of(trained, options)
+    report = run.read_evaluation() if run.evaluation.exists() else None
+    folder = Path(options.out) if options.out else run.artefact
+    written = finish.export_policy(folder, trained, experiment, report, console)
+    if written:
+        console.print(f"artefact: {folder}", highlight=False)
+    return 0 if written else 1
+
+
+def fit_human(options: argparse.Namespace) -> int:
+    _start_jax(None)
+    from rich.console import Console
+
+    from experiments import measurements
+
+    measurements.fit(
+        options.data, options.format, Path(options.out), options.name, options.eps, options.min_samples, Console()
+    )
+    return 0
+
+
+def import_(options: argparse.Namespace) -> int:
+    _start_jax(1)
+    from rich.console import Console
+
+    from experiments import measurements
+
+    measurements.convert(options.data, options.format, Path(options.out), Console())
+    return 0
+
+
+def render(options: argparse.Namespace) -> int:
+    _start_jax(1)
+    from rich.console import Console
+
+    from experiments import episodes, policy
+
+    console = Console()
+    trained = policy.load(options.policy)
+    experiment = _experiment_of(trained, options)
+    seed = experiment.config.evaluation.seed if options.seed is None else options.seed
+    played = episodes.replay(experiment, trained, options.episodes, seed)
+    for path in options.out:
+        checked("", episodes.draw, Path(path), played, experiment.task.control_rate, options.camera)
+        console.print(path, highlight=False)
+    return 0
+
+
+def bench(options: argparse.Namespace) -> int:
+    _start_jax(options.devices)
+    from benchmarks.bench import main as run_benchmarks
+
+    return run_benchmarks(json_path=options.json)
+
+
+def schema(options: argparse.Namespace) -> int:
+    import json
+
+    from experiments import config
+
+    print(json.dumps(config.json_schema(), indent=2))
+    return 0
+
+
+def balls(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from experiments import measurements
+
+    measurements.print_catalogue(Console())
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("mjx-tt", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    p = _command(commands, "train", train, "train experiments, evaluate them and export their policies", """\
+  mjx-tt train quickstart.yaml
+  mjx-tt train narrow.yaml medium.yaml --seeds 0,1,2        six runs: runs/narrow/seed0/ ... runs/medium/seed2/
+  mjx-tt train player3_m2.yaml --seeds 0,1,2 --select       and name the best seed, as the paper does
+  mjx-tt train my.yaml --set training.updates=500 --set balls=player1/M0
+
+Run the same command again after an interruption: finished runs are skipped, others continue from their last
+checkpoint, bit for bit. Ctrl-C saves a checkpoint first.
+""" + SHIPPED_HINT)  # fmt: skip
+    p.add_argument("experiments", nargs="+", metavar="YAML")
+    p.add_argument("--seeds", type=_seeds, default=(), metavar="0,1,2", help="one run per seed, in a folder of its own")
+    p.add_argument("--select", action="store_true", help="play 50 episodes per seed and mark the best (needs --seeds)")
+    p.add_argument("--out", default="runs", metavar="FOLDER", help="where runs go (default: runs)")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one key of every file")
+    _add_devices(p)
+
+    p = _command(commands, "evaluate", evaluate, "play a policy on fresh balls: rates, interval, pictures", """\
+  mjx-tt evaluate runs/quickstart
+  mjx-tt evaluate runs/quickstart --balls player1/M1 --episodes 5000
+  mjx-tt evaluate artefacts/anna --model measured.yaml --out anna-on-measured
+
+Without --out, a run on its own balls and model writes into its own folder; anything else into a folder beside it.
+""")  # fmt: skip
+    _add_policy(p)
+    p.add_argument("--episodes", type=_count, metavar="N", help="balls to play (default: the experiment's)")
+    p.add_argument("--seed", type=int, metavar="K", help="another seed means other balls")
+    p.add_argument("--out", metavar="FOLDER", help="for evaluation.json and plots/")
+    _add_devices(p)
+
+    p = _command(commands, "export", export, "write a run's policy as an artefact that a robot can run", """\
+  mjx-tt export runs/quickstart
+  mjx-tt export runs/quickstart --out artefacts/anna
+""")  # fmt: skip
+    p.add_argument("run", metavar="RUN", help="folder of a run")
+    p.add_argument("--out", metavar="FOLDER", help="default: RUN/artefact")
+    p.set_defaults(balls=None, model=None)
+
+    p = _command(commands, "fit-human", fit_human, "a human ball distribution from measured balls", """\
+  mjx-tt fit-human rallies.csv --out anna.yaml
+  mjx-tt fit-human monday.mcap tuesday.mcap --out anna.yaml --name anna
+  mjx-tt fit-human rallies.json --out deepmind.yaml          (DeepMind's ball states)
+
+Then write "balls: anna.yaml" in an experiment.
+""")  # fmt: skip
+    p.add_argument("data", nargs="+", metavar="DATA", help=".csv, .mcap, .json (DeepMind) or .hdf5 (AIMY launcher)")
+    p.add_argument("--out", required=True, metavar="YAML")
+    p.add_argument("--name", default="", help="of the distribution (default: the name of the file written)")
+    p.add_argument("--eps", type=float, metavar="R", help="radius of DBSCAN in robust standard deviations (default: from the data)")
+    p.add_argument("--min-samples", type=_count, default=5, metavar="N", help="balls that make a cluster (default: 5)")
+    _add_format(p)
+
+    p = _command(commands, "import", import_, "convert measured trajectories to CSV or MCAP", """\
+  mjx-tt import launcher.hdf5 --out launcher.csv
+  mjx-tt import rallies.csv --out rallies.mcap
+""")  # fmt: skip
+    p.add_argument("data", metavar="DATA")
+    p.add_argument("--out", required=True, metavar="FILE", help=".csv or .mcap")
+    _add_format(p)
+
+    p = _command(commands, "render", render, "a picture or a video of a policy at play, without a display", """\
+  mjx-tt render runs/quickstart --out episode.png --out episode.mp4
+  mjx-tt render runs/quickstart --out rally.gif --episodes 4 --camera human
+""")  # fmt: skip
+    _add_policy(p)
+    p.add_argument("--out", action="append", required=True, metavar="FILE", help=".png, .mp4 or .gif; may be repeated")
+    p.add_argument("--episodes", type=_count, default=2, metavar="N", help="episodes in a video (default: 2)")
+    p.add_argument("--camera", default="side", help="side, robot_back, human or top (default: side)")
+    p.add_argument("--seed", type=int, metavar="K", help="another seed means other balls")
+
+    p = _command(commands, "bench", bench, "measure this machine: physics steps per second, time per update", """\
+  mjx-tt bench
+  mjx-tt bench --json bench.json
+""")  # fmt: skip
+    p.add_argument("--json", metavar="FILE", help="write the figures as JSON")
+    _add_devices(p)
+
+    _command(commands, "schema", schema, "print the JSON schema of an experiment YAML, for your editor", """\
+  mjx-tt schema > schema.json
+and as the first line of a YAML:
+  # yaml-language-server: $schema=schema.json
+""")  # fmt: skip
+    _command(commands, "balls", balls, "list the paper's players and ball distributions", "  mjx-tt balls\n")
+    return parser
+
+
+def _command(commands, name: str, function, summary: str, examples: str) -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    p = commands.add_parser(name, help=summary, description=summary, epilog=f"examples:\n{examples}", formatter_class=raw)
+    p.set_defaults(command=function)
+    return p
+
+
+def _add_devices(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--devices", type=_count, metavar="N", help="host devices to make (default: one per processor core)")
+
+
+def _add_policy(p: argparse.ArgumentParser) -> None:
+    p.add_argument("policy", metavar="RUN_OR_ARTEFACT", help="folder of a run or of an exported policy")
+    p.add_argument("--balls", metavar="NAME_OR_YAML", help="other balls, such as player1/M1")
+    p.add_argument("--model", metavar="YAML", help="another simulation model")
+
+
+def _add_format(p: argparse.ArgumentParser) -> None:
+    p.add_argument("--format", metavar="NAME", help="csv, mcap, deepmind or aimy (default: from the suffix)")
+
+
+def _count(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r}: a whole number of at least 1 is needed")
+    return int(text)
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    parts = text.split(",")
+    if not all(part.strip().isdigit() for part in parts) or len(set(map(int, parts))) < len(parts):
+        raise argparse.ArgumentTypeError(f"{text!r}: different whole numbers separated by commas are needed, such as 0,1,2")
+    return tuple(map(int, parts))
+
+
+def _experiment(name: str) -> Path:
+    """The file of that name, or the experiment of that name that comes with the program."""
+    from experiments import config
+
+    path = Path(name)
+    return path if path.exists() or path.parent != Path() else config.shipped().get(path.stem, path)
+
+
+def _most_devices(configs) -> int | None:
+    """As many host devices as the experiment with the most asks for; None where all leave it open."""
+    return max((c.training.devices for _, c in configs if c.training.devices != "auto"), default=None)
+
+
+def _start_jax(devices: int | None) -> None:
+    from mjx_tt import platform
+
+    platform.configure(devices)
+
+
+def _experiment_of(trained, options: argparse.Namespace):
+    """The experiment that trained a policy, with the balls and model of the command line in place of its own."""
+    from experiments import build
+
+    config = trained.config
+    if config is None:
+        raise ConfigError(f"{trained.source}: does not say how it was trained; evaluate the run that it came from")
+    if options.balls:
+        config = config.model_copy(update={"balls": options.balls})
+    if options.model:
+        config = config.model_copy(update={"model": options.model})
+    return build.experiment(config.model_copy(update={"initial_policy": None}), str(trained.source))
+
+
+def _evaluation_folder(options: argparse.Namespace) -> Path:
+    from experiments.runs import CONFIG
+
+    policy = Path(options.policy)
+    changed = [Path(text).with_suffix("").as_posix().replace("/", "-") for text in (options.balls, options.model) if text]
+    if changed and (policy / CONFIG).exists():
+        return policy / f"evaluation-{'-'.join(changed)}"
+    if (policy / CONFIG).exists():
+        return policy
+    return policy.with_name("-".join([f"{policy.name}-evaluation", *changed]))  # an artefact holds its own files only
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,34 @@
+"""Errors whose message is all that the person at the terminal needs; anything else is a bug and keeps its traceback."""
+
+from __future__ import annotations
+
+
+class ExperimentError(Exception):
+    """The message names the file or folder, what is wrong, and what to do."""
+
+
+class ConfigError(ExperimentError):
+    """What was asked for cannot be: the message names file, dotted path, what was given and what is allowed."""
+
+
+class RunError(ExperimentError):
+    """A run folder cannot be used as asked."""
+
+
+class CheckpointError(ExperimentError):
+    """A checkpoint cannot be written or read: the message says which, why, and what is left."""
+
+
+def explained(error: Exception) -> bool:
+    """Whether the error's message is enough."""
+    from robot_io.artefact import ArtefactError  # needs NumPy, which --help should not wait for
+
+    return isinstance(error, (ExperimentError, ArtefactError, OSError))
+
+
+def checked(where: str, function, *arguments):
+    """What ``function`` returns; what it says about its arguments as a ConfigError that begins with ``where``."""
+    try:
+        return function(*arguments)
+    except (ValueError, OSError, RuntimeError) as error:
+        raise ConfigError(f"{where}: {error}" if where else str(error)) from None

@@ -1,0 +1,154 @@
+"""How good a policy is: played on fresh balls, counted with an interval, written as evaluation.json."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import PartitionSpec
+
+from ballmodel.pool import BallPool
+from experiments import build
+from experiments.build import Experiment
+from experiments.policy import Policy
+from experiments.training import EVALUATION_COLUMNS
+from mjx_tt import rewards
+from mjx_tt.model import ModelFile
+from mjx_tt.rollout import RESULT_SPECS, RolloutResult, Simulator
+from mjx_tt.task import HIT, MISSED, RETURNED, Episodes
+
+CONFIDENCE_Z = 1.959963984540054  # normal quantile of a two-sided 95 % interval
+OUTCOMES = {"missed": MISSED, "hit": HIT, "returned": RETURNED}
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A share with its 95 % Wilson interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+class Evaluator:
+    """Plays one policy at a time on a fixed set of episodes, compiled once.
+
+    The number of episodes is rounded up to whole rows of up to ``EVALUATION_COLUMNS`` played side by side.
+    """
+
+    def __init__(self, simulator: Simulator, balls: BallPool, model: ModelFile, episodes: int) -> None:
+        columns = -(-min(EVALUATION_COLUMNS, episodes) // simulator.devices) * simulator.devices
+        rows = -(-episodes // columns)
+
+        def play(theta, mean, inverse_scale, key, balls):
+            drawn = simulator.draw(key, balls, model.model, model.randomise, rows, columns)
+            copies = jnp.repeat(theta[:, None], columns // simulator.devices, axis=1)
+            return simulator.rollout(copies, mean, inverse_scale, simulator.local(drawn)), drawn
+
+        self._balls = balls
+        self._play = jax.jit(simulator.on_devices(play, out_specs=(RESULT_SPECS, PartitionSpec())))
+
+    def play(self, theta, mean, inverse_scale, key) -> tuple[RolloutResult, Episodes]:
+        """theta (976,), frozen normaliser (11,), (11,); results and episodes as NumPy arrays (..., R, P)."""
+        return jax.tree.map(np.asarray, self._play(theta, mean, inverse_scale, key, self._balls))
+
+
+@dataclass(frozen=True)
+class Played:
+    """One policy's evaluation.
+
+    report    what evaluation.json holds
+    result    per episode, NumPy arrays (..., R, P)
+    incoming  (2, R, P) [m] where each ball bounced on the robot's side
+    """
+
+    report: dict[str, Any]
+    result: RolloutResult
+    incoming: np.ndarray
+
+
+def evaluate(
+    experiment: Experiment, policy: Policy, episodes: int, seed: int, reachable: dict[str, Any] | None = None
+) -> Played:
+    """Plays the policy on at least ``episodes`` balls that training has not seen.
+
+    reachable: a lower bound on the return rate that any policy could have on these balls, kept in the report.
+    """
+    config = experiment.config
+    task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
+    simulator = Simulator(task, len(jax.devices()))
+    balls = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), episodes)
+    key = build.key(seed, build.EVALUATION_EPISODES)
+    result, drawn = Evaluator(simulator, balls, experiment.model, episodes).play(
+        policy.theta, policy.mean, policy.inverse_scale, key
+    )
+    index = {position.tobytes(): i for i, position in enumerate(np.asarray(balls.state.position).T)}
+    starts = drawn.ball.position.reshape(3, -1).T
+    order = [index[np.ascontiguousarray(start).tobytes()] for start in starts]
+    incoming = np.asarray(balls.landing)[:, order].reshape(2, *result.outcome.shape)
+    conditions = {
+        "balls": experiment.distribution.to_dict(),
+        "acceptance": float(balls.acceptance),
+        "engine": task.engine,
+        "sim_rate": task.sim_rate,
+        "randomise": {r.path: [r.low, r.high] for r in experiment.model.randomise},
+        "seed": seed,
+        "policy": str(policy.source),
+        "update": policy.notes.get("update"),
+        "training_seconds": policy.notes.get("seconds"),
+    }
+    return Played(summary(result) | {"reachable": reachable} | conditions, result, incoming)
+
+
+def summary(result: RolloutResult) -> dict[str, Any]:
+    """Rates over all episodes, a non-finite one counting as missed; means of return and terms over the finite ones."""
+    rate = return_rate(result)
+    counts = {name: int(np.sum(result.outcome == outcome)) for name, outcome in OUTCOMES.items()}
+    finite = result.finite
+    some = bool(finite.any())
+    return {
+        "return_rate": rate.value,
+        "low": rate.low,
+        "high": rate.high,
+        "hit_rate": 1.0 - counts["missed"] / finite.size,
+        "episodes": int(finite.size),
+        "outcomes": counts,
+        "non_finite": int(np.sum(~finite)),
+        "mean_return": float(result.returns[finite].mean()) if some else None,
+        "terms": {name: float(result.terms[i][finite].mean()) if some else None for i, name in enumerate(rewards.TERMS)},
+    }
+
+
+def return_rate(result: RolloutResult) -> Rate:
+    """Share of all episodes that were returned; a non-finite one was not."""
+    returned = result.finite & (result.outcome == RETURNED)
+    low, high = wilson(int(returned.sum()), returned.size)
+    return Rate(float(returned.mean()), low, high)
+
+
+def wilson(successes: int, trials: int, z: float = CONFIDENCE_Z) -> tuple[float, float]:
+    """Wilson's score interval of a share (Wilson 1927): it stays within [0, 1] and holds near both ends.
+
+    Raises ValueError without trials or with more successes than trials.
+    """
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(f"{successes} successes in {trials} trials; at least one trial and no more successes are allowed")
+    share, spread = successes / trials, z * z / trials
+    centre = (share + spread / 2) / (1 + spread)
+    half = z * math.sqrt(share * (1 - share) / trials + spread / (4 * trials)) / (1 + spread)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def selection_score(result: RolloutResult) -> float:
+    """The paper's sparse reward: +1 hit, +1 landed on the human's side, -2 fault; mean over the episodes.
+
+    A simulated robot faults when it touches itself or the table, or when the episode is not finite.
+    """
+    collision = result.terms[rewards.TERMS.index("collision")]
+    fault = ~result.finite | (collision < 0)
+    score = (result.outcome != MISSED).astype(float) + (result.outcome == RETURNED)
+    return float(np.mean(np.where(fault, -2.0, score)))

@@ -1,0 +1,93 @@
+"""What pydantic found wrong with a mapping, in the words of the person who wrote it."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import types
+from typing import Annotated, Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+
+def lines(error: ValidationError, model: type[BaseModel]) -> list[str]:
+    """One line per mistake: "dotted.path: what was given, what is allowed, the nearest valid name"."""
+    found: dict[str, tuple[str, list[str]]] = {}  # path -> beginning of the line, what is allowed there
+    for mistake in error.errors():
+        path, owner = _walk(mistake, model)
+        beginning, allowed = _describe(mistake, path, owner)
+        found.setdefault(path, (beginning, []))[1].append(allowed)
+    return [
+        f"{path}: {beginning}{' or '.join(allowed)}"
+        for path, (beginning, allowed) in found.items()
+        # A mapping that fits one member of a union fails as every other one; only the mistake inside it helps.
+        if not any(deeper.startswith(f"{path}.") for deeper in found)
+    ]
+
+
+def nearest(name: str, known) -> str:
+    """"did you mean 'x'? " or nothing."""
+    close = difflib.get_close_matches(name, list(known), 1)
+    return f"did you mean {close[0]!r}? " if close else ""
+
+
+def _describe(mistake: dict[str, Any], path: str, owner: type[BaseModel]) -> tuple[str, str]:
+    kind, given = mistake["type"], mistake["input"]
+    if kind == "extra_forbidden":
+        parent, _, name = path.rpartition(".")
+        names = list(owner.model_fields)
+        return f"unknown key; {nearest(name, names)}allowed{f' in {parent}' if parent else ''}: ", ", ".join(names)
+    if kind == "missing":
+        return "missing, it has no default", ""
+    if kind == "union_tag_not_found":
+        return "missing, it says which kind of mapping this is", ""
+    if kind == "union_tag_invalid":
+        tags = mistake["ctx"]["expected_tags"]
+        return f"got {given['kind']!r}; {nearest(given['kind'], re.findall(r'[a-z_]+', tags))}allowed: ", tags
+    if kind == "literal_error":
+        options = mistake["ctx"]["expected"]
+        return f"got {given!r}; {nearest(str(given), re.findall(r'[a-z_]+', options))}allowed: ", options
+    if kind in ("model_type", "dict_type"):
+        return f"got {given!r}; allowed: ", "a mapping"
+    message = mistake["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return f"got {given!r}; allowed: ", message
+
+
+def _walk(mistake: dict[str, Any], model: type[BaseModel]) -> tuple[str, type[BaseModel]]:
+    """The dotted path as it stands in the file, and the model whose key it ends with.
+
+    Pydantic's location also holds names of union members, which the writer of the file has never seen.
+    """
+    path, owner, candidates = "", model, [model]
+    for part in mistake["loc"]:
+        sections = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
+        holder = next((s for s in sections if part in s.model_fields), None)
+        member = next((s for s in sections if part in _tags(s)), None)
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif len(candidates) > 1 and member:
+            candidates = [member]
+        elif holder:
+            path, owner = f"{path}.{part}", holder
+            candidates = _members(holder.model_fields[part].annotation)
+        elif mistake["type"] == "extra_forbidden" and sections:
+            path, owner = f"{path}.{part}", sections[0]
+    if mistake["type"].startswith("union_tag"):
+        path += ".kind"
+    return path.removeprefix("."), owner
+
+
+def _members(annotation: Any) -> list[Any]:
+    """The types that a field may have; a list counts as its items."""
+    origin = get_origin(annotation)
+    if origin is Annotated or origin is list:
+        return _members(get_args(annotation)[0])
+    if origin in (Union, types.UnionType):
+        return [member for argument in get_args(annotation) for member in _members(argument)]
+    return [annotation]
+
+
+def _tags(section: type[BaseModel]) -> set[str]:
+    """How pydantic names this member of a union."""
+    kind = section.model_fields.get("kind")
+    return {section.__name__, *(get_args(kind.annotation) if kind else ())}

@@ -1,0 +1,170 @@
+"""Trains one run: the loop around the compiled update with its measurements, checkpoints, stops and resumption."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from rich.console import Console
+
+from bgs import normalizer
+from experiments import build, checkpoint, policy, runs
+from experiments.build import Experiment
+from experiments.errors import RunError
+from experiments.evaluate import Evaluator, return_rate
+from experiments.metrics import MetricsLog
+from experiments.progress import TrainingProgress
+from experiments.runs import Run
+from experiments.training import Trainer, TrainState
+from mjx_tt.rollout import AXIS
+
+FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
+
+
+def train(experiment: Experiment, run: Run, console: Console) -> str:
+    """Trains until the configuration says stop, continuing from the last checkpoint; returns the setting that ended it.
+
+    Ctrl-C or SIGTERM saves a checkpoint first and then raises KeyboardInterrupt. Raises RunError, ConfigError or
+    CheckpointError with a message for the person at the terminal.
+    """
+    run.open(experiment.config)
+    with run.locked():
+        try:
+            return Session(experiment, run, console).train()
+        except OSError as error:  # of the measurements; checkpoints raise their own
+            raise RunError(f"{error.filename or run.folder}: cannot be written: {error.strerror or error}") from error
+
+
+class Session:
+    """A run between two starts of the program.
+
+    state        after ``update`` updates
+    seconds      of training in all sessions, without compilation and evaluations
+    return_rate  of the last evaluation during training, None before the first
+    """
+
+    def __init__(self, experiment: Experiment, run: Run, console: Console) -> None:
+        self._config, self._run, self._console = experiment.config, run, console
+        self._trainer = build.trainer(experiment)
+        self.state, notes = _start(self._config, run, self._trainer)
+        self.update, self.seconds, self.return_rate = notes["update"], notes["seconds"], notes["return_rate"]
+        self._saved = (self.update, time.monotonic())
+        self._batch = 1  # updates between fetches, from the measured rate
+        self._evaluator = self._make_evaluator(experiment)
+
+    def train(self) -> str:
+        name, training = str(self._run.folder), self._config.training
+        log = MetricsLog(self._run.metrics, self._run.tensorboard, self.update)
+        progress = TrainingProgress(
+            self._console, name, training.updates, self.update, self._trainer.episodes_per_update
+        )
+        try:
+            with progress, _stop_requests() as stop_wanted:
+                if self.update:
+                    progress.note(f"continues after update {self.update}")
+                compiled = self._trainer.lower(self.state).compile()
+                while (reason := self._ended()) is None and not stop_wanted():
+                    self._advance(compiled, log, progress, stop_wanted)
+                self._save(log)
+        finally:
+            log.close()
+        if reason is None:
+            raise KeyboardInterrupt(f"{name}: stopped after update {self.update}; the same command continues it")
+        runs.write_json(self._run.status, {"reason": reason, **self._notes()})
+        return reason
+
+    def _ended(self) -> str | None:
+        return runs.training_ended(self._config, self.update, self.seconds, self.return_rate)
+
+    def _advance(self, compiled, log: MetricsLog, progress: TrainingProgress, stop_wanted: Callable[[], bool]) -> None:
+        """Updates until it is time to look at them; then measurements, evaluation and checkpoint as they are due."""
+        training, every = self._config.training, self._config.training.evaluate_every
+        first, began, waiting = self.update + 1, time.monotonic(), []
+        while True:
+            self.state, measured = compiled(self.state, self._trainer.pool)
+            waiting.append(measured)
+            self.update += 1
+            evaluation_due = every is not None and self.update % every == 0
+            if evaluation_due or self.update == training.updates or len(waiting) >= self._batch or stop_wanted():
+                break
+        fetched = jax.device_get(waiting)
+        took = time.monotonic() - began
+        share = took / len(fetched)
+        rows = [
+            {"update": first + i, "seconds": round(self.seconds + (i + 1) * share, 4)}
+            | {name: _short(value) for name, value in row.items()}
+            for i, row in enumerate(fetched)
+        ]
+        self.seconds += took
+        self._batch = max(1, round(FETCH_SECONDS / share))
+        if evaluation_due:
+            rows[-1] |= self._evaluate()
+        log.write(rows)
+        progress.show(self.update, len(rows), took, rows[-1]["return_rate"])
+        if time.monotonic() - self._saved[1] >= training.checkpoint_seconds:
+            self._save(log)
+
+    def _make_evaluator(self, experiment: Experiment) -> Evaluator | None:
+        training = self._config.training
+        if training.evaluate_every is None:
+            return None
+        balls = build.pool(experiment, build.key(training.seed, build.PROGRESS_BALLS), training.evaluate_episodes)
+        return Evaluator(self._trainer.simulator, balls, experiment.model, training.evaluate_episodes)
+
+    def _evaluate(self) -> dict[str, float]:
+        """The averaged parameters on the run's own set of fresh balls."""
+        key = build.key(self._config.training.seed, build.PROGRESS_EPISODES)
+        result, _ = self._evaluator.play(self.state.bgs.average, *normalizer.normaliser(self.state.statistics), key)
+        rate = return_rate(result)
+        self.return_rate = rate.value
+        return {"evaluation/return_rate": rate.value, "evaluation/low": rate.low, "evaluation/high": rate.high}
+
+    def _notes(self) -> dict:
+        return {"update": self.update, "seconds": round(self.seconds, 4), "return_rate": self.return_rate}
+
+    def _save(self, log: MetricsLog) -> None:
+        if self._saved[0] != self.update or not self.update:
+            log.sync()
+            checkpoint.save(self._run.checkpoints, self.update, self.state, self._notes())
+        self._saved = (self.update, time.monotonic())
+
+
+def _start(config, run: Run, trainer: Trainer) -> tuple[TrainState, dict]:
+    """The last checkpoint's state and notes, or the first ones."""
+    theta = statistics = None
+    if config.initial_policy is not None:
+        theta, statistics = policy.load_statistics(config.initial_policy)
+    state = trainer.init(build.key(config.training.seed, build.INITIAL_STATE), theta, statistics)
+    notes = {"update": 0, "seconds": 0.0, "return_rate": None}
+    state, notes = checkpoint.load_latest(run.checkpoints, state) or (state, notes)
+    # Where the update leaves its results: compiled for this placement, it can be fed what it returns.
+    mesh = Mesh(np.array(jax.devices()[: trainer.simulator.devices]), (AXIS,))
+    return jax.device_put(state, NamedSharding(mesh, PartitionSpec())), notes
+
+
+def _short(value) -> float | None:
+    """Six digits, None where not finite: JSON has no NaN."""
+    number = float(value)
+    return float(f"{number:.6g}") if np.isfinite(number) else None
+
+
+@contextmanager
+def _stop_requests() -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C or SIGTERM has come: the first asks for a stop, a second one acts at once."""
+    received = []
+
+    def note(number, _frame) -> None:
+        received.append(number)
+        signal.signal(number, previous[number])
+
+    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
