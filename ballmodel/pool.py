@@ -39,7 +39,7 @@ OUTCOMES = (
     "start inside or under the table or in the net",
     "hit the net",
     "bounce on the human's side",
-    "miss the table",
+    "miss the table's top",
     "land outside the landing box",
     "bounce on the table a second time",
 )
@@ -106,6 +106,8 @@ def throw(params: BallParams, state: BallState, landing_min, landing_max, dt: fl
         outcome = jnp.where(active & events.net, HITS_NET, outcome)
         outcome = jnp.where(active & events.table & bounced, SECOND_BOUNCE, outcome)
         outcome = jnp.where(first & ~in_box, jnp.where(y < 0.0, OUTSIDE_BOX, OWN_SIDE), outcome)
+        from_below = events.position[2] < params.table.height  # underside or side face
+        outcome = jnp.where(first & from_below, MISSES, outcome)
         return time + dt, new, outcome, bounced | first, x, y, arrival, y_now
 
     zero = jnp.zeros_like(state.position[0])

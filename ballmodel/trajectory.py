@@ -89,24 +89,28 @@ class Dataset:
 def first_bounce(trajectory: Trajectory) -> int | None:
     """Index of the lowest sample at the first bounce, or None where the ball does not bounce.
 
-    A bounce is a sample, the lowest among its neighbours, where the vertical velocity changes from falling to rising by
-    at least BOUNCE_KICK while the ball is within BOUNCE_HEIGHT of the table: gravity alone only ever makes it fall faster.
-    The velocities are slopes of straight lines through up to BOUNCE_WINDOW samples on each side, so noise of a few
-    millimetres does not fake one.
+    A bounce is a sample, the lowest among its neighbours, where the vertical velocity changes from falling to rising while
+    the ball is within BOUNCE_HEIGHT of the table: gravity alone only ever makes it fall faster. The velocities are slopes
+    of straight lines through up to BOUNCE_WINDOW samples on each side. Their change must be at least BOUNCE_KICK and four
+    times what the trajectory's own noise would give, so that noise does not fake a bounce.
     """
     time, z = trajectory.time, trajectory.position[2]
+    # Third differences of a smooth flight are noise alone, with 1 + 9 + 9 + 1 times its variance; 0.6745: normal quartile.
+    noise = np.median(np.abs(np.diff(z, 3))) / (0.6745 * np.sqrt(20.0)) if z.size > 3 else 0.0
 
-    def slope(samples: slice) -> float:
+    def slope(samples: slice) -> tuple[float, float]:
+        """Slope and the inverse of its variance per unit of noise."""
         t = time[samples] - time[samples].mean()
-        return float(t @ z[samples] / (t @ t))
+        return float(t @ z[samples] / (t @ t)), float(t @ t)
 
     for k in np.flatnonzero(z < BALL_RADIUS + BOUNCE_HEIGHT):
         before, after = slice(max(0, k + 1 - BOUNCE_WINDOW), k + 1), slice(k, k + BOUNCE_WINDOW)
         lowest = z[k] <= z[before.start : k + BOUNCE_WINDOW].min()
         if not lowest or k == before.start or k == len(trajectory) - 1:
             continue
-        falling, rising = slope(before), slope(after)
-        if falling < 0.0 < rising and rising - falling >= BOUNCE_KICK:
+        (falling, information_before), (rising, information_after) = slope(before), slope(after)
+        least = max(BOUNCE_KICK, 4.0 * noise * np.sqrt(1.0 / information_before + 1.0 / information_after))
+        if falling < 0.0 < rising and rising - falling >= least:
             return int(k)
     return None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import warnings
 from pathlib import Path
 
 from experiments.errors import ConfigError, checked, explained
@@ -296,6 +297,8 @@ def _start_jax(devices: int | None) -> None:
     from mjx_tt import platform
 
     platform.configure(devices)
+    # JAX warns of every fork, but git and ffmpeg are started by fork and exec at once, which its threads do not mind.
+    warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
 
 
 def _experiment_of(trained, options: argparse.Namespace):

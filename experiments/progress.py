@@ -47,8 +47,8 @@ class TrainingProgress:
             self._live.update(self._bar, completed=update, text=text)
         elif time.monotonic() - self._last_line >= PLAIN_SECONDS or update == self._updates:
             self._last_line = time.monotonic()
-            self._console.print(f"{self._name}: {update}/{self._updates}  {text}", highlight=False)
+            self._console.print(f"{self._name}: {update}/{self._updates}  {text}", highlight=False, soft_wrap=True)
 
     def note(self, text: str) -> None:
         """A line that stays."""
-        self._console.print(f"{self._name}: {text}", highlight=False)
+        self._console.print(f"{self._name}: {text}", highlight=False, soft_wrap=True)

@@ -88,3 +88,22 @@ def apply(theta, history):
     for (kernel, bias, gated), dilation in zip(_layers(unflatten(theta)), DILATIONS):
         rows = jnp.stack([_layer(kernel, bias, rows[t], rows[t + dilation], gated) for t in range(len(rows) - dilation)])
     return rows[0]
+
+
+@dataclass(frozen=True)
+class PolicyController:
+    """The streaming policy as a ``task.Controller``: parameters of P perturbations and a frozen normaliser (11,)."""
+
+    parameters: dict
+    mean: jax.Array
+    inverse_scale: jax.Array
+
+    def start(self, observation) -> PolicyState:
+        return start(self.parameters, self._normalised(observation))
+
+    def act(self, tick, state: PolicyState, observation):
+        return stream(self.parameters, state, self._normalised(observation))
+
+    def _normalised(self, x):
+        column = (-1,) + (1,) * (x.ndim - 1)
+        return (x - self.mean.reshape(column)) * self.inverse_scale.reshape(column)

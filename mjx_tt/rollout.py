@@ -19,7 +19,8 @@ from ballmodel.pool import BallPool
 from ballmodel.state import where
 from mjx_tt import model as models
 from mjx_tt.model import Range, SimModel
-from mjx_tt.task import HIT, MISSED, RETURNED, Episodes, Task, TaskConfig
+from mjx_tt.policy import PolicyController
+from mjx_tt.task import HIT, MISSED, RETURNED, Controller, Episodes, Task, TaskConfig
 from robot_io.contract import unflatten
 
 AXIS = "perturbation"
@@ -121,7 +122,11 @@ class Simulator:
         columns = theta.shape[-1]
         if columns != episodes.seed.shape[-1]:
             raise ValueError(f"theta has {columns} columns, the episodes {episodes.seed.shape[-1]}")
-        parameters, normaliser = unflatten(theta), (mean, inverse_scale)
+        controller = PolicyController(unflatten(theta), mean, inverse_scale)
+        return self.play(controller, episodes)
+
+    def play(self, controller: Controller, episodes: Episodes) -> RolloutResult:
+        """Runs any controller on episodes (R, P), in blocks of whole rows."""
         repeats, columns = episodes.seed.shape
         rows = self._block_rows(repeats, columns)
         blocks = repeats // rows
@@ -135,7 +140,7 @@ class Simulator:
         def join(x):  # (blocks, ..., rows x P) -> (..., R, P)
             return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], repeats, columns)
 
-        run = partial(self._block, parameters=parameters, normaliser=normaliser)
+        run = partial(self._block, controller=controller)
         result, sums, counts = jax.lax.map(run, jax.tree.map(cut, episodes))
         return RolloutResult(
             **{name: join(value) for name, value in result.items()},
@@ -150,7 +155,7 @@ class Simulator:
         wanted = max(1, CPU_BLOCK // columns)
         return max(d for d in range(1, repeats + 1) if repeats % d == 0 and d <= wanted)
 
-    def _block(self, episodes: Episodes, parameters, normaliser):
+    def _block(self, episodes: Episodes, controller: Controller):
         task, config = self.task, self.config
         delays = task.delays(episodes.latency)
 
@@ -160,9 +165,9 @@ class Simulator:
 
         def advance(carry):
             tick, state = carry
-            return tick + 1, task.control_step(tick, state, episodes, delays, parameters, normaliser)
+            return tick + 1, task.control_step(tick, state, episodes, delays, controller)
 
-        state = task.reset(episodes, parameters, normaliser)
+        state = task.reset(episodes, controller)
         _, state = jax.lax.while_loop(running, advance, (jnp.int32(0), state))
         back = task.fly_out(state.ball, state.hit & state.finite, episodes.model)
         terms = task.reward_terms(state, back)
@@ -191,9 +196,9 @@ class Simulator:
         ticks (R,) until the ball came down.
         """
         task = self.task
-        parameters, normaliser = unflatten(theta[:, None]), (mean, inverse_scale)
+        controller = PolicyController(unflatten(theta[:, None]), mean, inverse_scale)
         delays = task.delays(episodes.latency)
-        state = task.reset(episodes, parameters, normaliser)
+        state = task.reset(episodes, controller)
         grounded = jnp.zeros_like(state.live)
         outcome = task.fly_out(state.ball, grounded, episodes.model)
         flight = replace(episodes.model.ball.flight, integrator="midpoint")
@@ -202,7 +207,7 @@ class Simulator:
         def advance(carry, tick):
             state, ball, flying, outcome, length = carry
             shown = (state.qpos[..., 0], ball.position[..., 0])
-            new = task.control_step(tick, state, episodes, delays, parameters, normaliser)
+            new = task.control_step(tick, state, episodes, delays, controller)
             out, outcome, still = task.fly_out_step(params, ball, flying, outcome)
             ball = where(state.hit, out, new.ball)
             flying = still | (new.hit & ~state.hit)

@@ -7,6 +7,7 @@ reach. Phase 2 flies the outgoing ball alone: as at the real robot, the policy's
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from ballmodel import flight
 from ballmodel.flight import PaddlePose
 from ballmodel.state import BallState, where
 from ballmodel.vec import norm
-from mjx_tt import latency, noise, policy, rewards, robot
+from mjx_tt import latency, noise, rewards, robot
 from mjx_tt.clearance import CapsuleClearance
 from mjx_tt.dynamics.fold import materialise
 from mjx_tt.dynamics.fused import FusedEngine
@@ -67,6 +68,18 @@ class TaskConfig:
     def period(self) -> float:
         """Control period [s]."""
         return 1.0 / self.control_rate
+
+
+class Controller(Protocol):
+    """What decides about the robot's velocities; batch axes last."""
+
+    mean: jax.Array  # (11,) about which the observations' statistics are summed
+
+    def start(self, observation):
+        """State before the first control step, from the first observation (11, ...)."""
+
+    def act(self, tick, state, observation):
+        """Action (8, ...) in [-1, 1] at control step ``tick`` and the next state."""
 
 
 @jax.tree_util.register_dataclass
@@ -122,7 +135,7 @@ class EpisodeState:
     reference: jax.Array  # (8, ...) sum of commands
     commands: jax.Array  # (depth, 8, ...) ring by control period
     observations: jax.Array  # (depth, 11, ...) ring by control period, captured at the delays' phases
-    policy: policy.PolicyState
+    controller: object  # pytree, whatever the controller remembers
     ball: BallState
     bounced: jax.Array  # (...) bool
     hit: jax.Array  # (...) bool
@@ -173,7 +186,7 @@ class Task:
             latency.action_delay(actions, period),
         )
 
-    def reset(self, episodes: Episodes, parameters, normaliser) -> EpisodeState:
+    def reset(self, episodes: Episodes, controller: Controller) -> EpisodeState:
         """Robot at home and at rest, ball at its start; before that moment everything is taken to have been so."""
         batch, dtype = episodes.ball.position.shape[1:], episodes.ball.position.dtype
 
@@ -185,7 +198,6 @@ class Task:
         seen = jnp.concatenate([episodes.ball.position, home])
         zero, false = full(0.0), jnp.broadcast_to(False, batch)
         first = self._noisy(episodes, seen, 0)
-        mean, inverse_scale = normaliser
         return EpisodeState(
             qpos=home,
             qvel=zeros,
@@ -195,7 +207,7 @@ class Task:
             reference=home,
             commands=full(0.0, self._action_depth, N_JOINTS),
             observations=jnp.broadcast_to(seen, (self._observation_depth, *seen.shape)),
-            policy=policy.start(parameters, _normalise(first, mean, inverse_scale)),
+            controller=controller.start(first),
             ball=episodes.ball,
             bounced=false,
             hit=false,
@@ -212,14 +224,13 @@ class Task:
         ball = jnp.stack([seen[i] + sensing.ball_noise * u[i] + offset[i] for i in range(3)])
         return jnp.concatenate([ball, seen[3:]])
 
-    def control_step(self, tick, s: EpisodeState, episodes: Episodes, delays: Delays, parameters, normaliser):
+    def control_step(self, tick, s: EpisodeState, episodes: Episodes, delays: Delays, controller: Controller):
         """One control period: observe, act, advance robot and ball by the substeps."""
         period = self.config.period
-        mean, inverse_scale = normaliser
         ball_seen = latency.ring_read(s.observations[:, :3], tick - delays.ball.periods)
         joints_seen = latency.ring_read(s.observations[:, 3:], tick - delays.joints.periods)
         observation = materialise(self._noisy(episodes, jnp.concatenate([ball_seen, joints_seen]), tick))
-        action, policy_state = policy.stream(parameters, s.policy, _normalise(observation, mean, inverse_scale))
+        action, controller_state = controller.act(tick, s.controller, observation)
         scale = np.asarray(LIMITS.policy_velocity, action.dtype).reshape((-1,) + (1,) * (action.ndim - 1))
         # After the contact the robot is only braked: what the real one does before it returns home.
         request = jnp.where(s.live, action * scale, 0.0)
@@ -231,12 +242,12 @@ class Task:
         qpos, qvel, pose, ball, flags, closest, captured = self._substeps(s, episodes, delays, old, new)
         bounced, hit, live = flags
         command_acceleration = (command - s.command) / period
-        sums = self._accumulate(s, observation, mean, command, command_acceleration, qpos, pose, closest)
+        sums = self._accumulate(s, observation, controller.mean, command, command_acceleration, qpos, pose, closest)
         ok = jnp.isfinite(sum(qpos[i] for i in range(N_JOINTS)) + sum(ball.position[i] for i in range(3)))
         return EpisodeState(
             qpos, qvel, pose, command, command_acceleration, reference, commands,
             latency.ring_write(s.observations, tick, captured),
-            policy_state, ball, bounced, hit, live & ok, s.finite & (ok | ~s.live), sums,
+            controller_state, ball, bounced, hit, live & ok, s.finite & (ok | ~s.live), sums,
         )  # fmt: skip
 
     def _substeps(self, s: EpisodeState, episodes: Episodes, delays: Delays, old, new):
@@ -373,9 +384,3 @@ class Task:
         }
         return jnp.stack([terms[name] for name in rewards.TERMS])
 
-
-def _normalise(x, mean, inverse_scale):
-    def column(v):
-        return v.reshape((-1,) + (1,) * (x.ndim - 1))
-
-    return (x - column(mean)) * column(inverse_scale)

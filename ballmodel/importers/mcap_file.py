@@ -11,9 +11,10 @@ import os
 
 import numpy as np
 from mcap.exceptions import McapError
-from mcap.stream_reader import StreamReader
 from mcap.records import Channel, Footer, Message
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
+from zstandard import ZstdError
 
 from ballmodel.files import replacing
 from ballmodel.trajectory import Dataset, Trajectory
@@ -73,11 +74,11 @@ def read_mcap(path: str | os.PathLike, salvage: bool = False) -> Dataset:
     topics: dict[int, str] = {}
     complete, count, cause = False, 0, "it ends without a footer"
     with open(path, "rb") as stream:
-        records = iter(StreamReader(stream).records)
+        records = iter(StreamReader(stream, validate_crcs=True).records)
         while True:
             try:
                 record = next(records, None)
-            except (McapError, EOFError, ValueError, OSError) as error:
+            except (McapError, ZstdError, ValueError, OSError) as error:
                 cause = f"{type(error).__name__}: {error}"
                 break
             if record is None:
