@@ -3,7 +3,7 @@
 Tangential part, with the slip velocity v_s of the contact point and a thin shell, I = 2/3 m r^2:
     dv_t = -alpha v_s,   d omega = -3 / (2 r) n x dv_t
 so the slip after the impact is (1 - 5/2 alpha) v_s.
-    table and net: alpha = min(mu (1 + e) |v_n| / |v_s|, 2/5): sliding by Coulomb friction or sticking (Nakashima et al.)
+    table and net: alpha = min(mu (1 + e) |v_n| / |v_s|, 2/5): sliding by Coulomb friction, or sticking (Nakashima)
     rubber:        alpha = k_v, tangential impulse proportional to slip; k_v > 2/5 reverses the slip, which Coulomb
                    friction cannot (numbers: github.com/gossardt/tt_rackets)
 Normal part: v_n' = -e v_n, e = restitution - slope |v_n| kept within [0, 1].
@@ -89,8 +89,8 @@ def surface_impact(params: SurfaceParams, velocity, spin, normal, radius) -> tup
 def paddle_impact(params: PaddleParams, velocity, spin, normal, paddle_velocity, radius) -> tuple[Vec, Vec]:
     """Velocity and spin after an impact on the moving paddle.
 
-    velocity, paddle_velocity (of the contact point) [m/s], spin [rad/s] and the unit normal pointing to the ball are Vecs
-    or (3, ...) arrays; radius [m].
+    velocity, paddle_velocity (of the contact point) [m/s], spin [rad/s] and the unit normal pointing to the ball are
+    Vecs or (3, ...) arrays; radius [m].
     The arm is so much heavier than the ball (60 kg to 2.7 g) that the paddle keeps its speed.
     """
     return _apply(

@@ -1,8 +1,8 @@
 """The human ball distribution: 16 numbers that bound where balls start, how fast, and where they land.
 
-Abeyruwan et al. 2022, "Modeling Human Ball Distributions": the minima and maxima of initial position (6), initial velocity
-(6) and landing x and y on the robot's side (4), after DBSCAN took the outliers away. Velocities are signed and in the
-table frame, so a ball towards the robot has vy < 0.
+Abeyruwan et al. 2022, "Modeling Human Ball Distributions": the minima and maxima of initial position (6), initial
+velocity (6) and landing x and y on the robot's side (4), after DBSCAN took the outliers away. Velocities are signed
+and in the table frame, so a ball towards the robot has vy < 0.
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ class BallDistribution:
                 raise ValueError(f"{self.name}: {part} needs {len(axes)} numbers at each end, got {low} and {high}")
             for axis, a, b in zip(axes, low, high):
                 if not (np.isfinite(a) and np.isfinite(b) and a <= b):
-                    raise ValueError(f"{self.name}: {part}.{axis} is [{a}, {b}]; finite numbers with min <= max are allowed")
+                    raise ValueError(
+                        f"{self.name}: {part}.{axis} is [{a}, {b}]; finite numbers with min <= max are allowed"
+                    )
             object.__setattr__(self, f"{part}_min", low)
             object.__setattr__(self, f"{part}_max", high)
 
@@ -63,7 +65,7 @@ class BallDistribution:
 
 
 def check_keys(data, allowed, where: str) -> None:
-    """Raises ValueError where ``data`` is no mapping of exactly the keys ``allowed``; notes such as ``name`` may be absent."""
+    """Raises ValueError where ``data`` is no mapping of exactly the keys ``allowed``; notes (NOTES) may be absent."""
     if not isinstance(data, dict):
         raise ValueError(f"{where}: a mapping with the keys {', '.join(allowed)} is wanted, got {data!r}")
     for key in data:
@@ -76,7 +78,7 @@ def check_keys(data, allowed, where: str) -> None:
 
 
 def parse_distribution(data, where: str, name: str = "", source: str = "") -> BallDistribution:
-    """Builds a distribution from its YAML form; ``where`` (file and key) opens every error message. Raises ValueError."""
+    """Builds a distribution from its YAML form; ``where`` (file and key) opens every message. Raises ValueError."""
     check_keys(data, (*NOTES, *AXES), where)
     ends = {}
     for part, axes in AXES.items():
@@ -136,8 +138,8 @@ def fit_distribution(
     states: position [m] and velocity [m/s] of the balls' starts, (3, n); landing: (2, n) [m].
     A ball is an outlier when DBSCAN puts it into no cluster. Its eight coordinates are first centred on the median and
     divided by a robust standard deviation (interquartile range / 1.349), so that outliers do not set their own scale.
-    The paper gives neither eps nor min_samples. Without ``eps`` it is EPS_FACTOR times the median distance of a ball to its
-    (min_samples - 1)-th neighbour, after Ester et al. 1996's k-distance, so that it follows the number of balls.
+    The paper gives neither eps nor min_samples. Without ``eps`` it is EPS_FACTOR times the median distance of a ball
+    to its (min_samples - 1)-th neighbour, after Ester et al. 1996's k-distance, so that it follows the number of balls.
     Raises ValueError for non-finite input, unequal lengths, fewer than min_samples balls, or when all are outliers.
     """
     from sklearn.cluster import DBSCAN  # sklearn takes about a second to import; only this function needs it
@@ -146,7 +148,9 @@ def fit_distribution(
     position, velocity, landing = (np.asarray(a, float) for a in (states.position, states.velocity, landing))
     points = np.concatenate([position, velocity, landing])
     if points.shape[0] != 8 or not np.all(np.isfinite(points)):
-        raise ValueError(f"finite position (3, n), velocity (3, n) and landing (2, n) are wanted, got a stack of {points.shape}")
+        raise ValueError(
+            f"finite position (3, n), velocity (3, n) and landing (2, n) are wanted, got a stack of {points.shape}"
+        )
     if points.shape[1] < max(min_samples, 2):
         raise ValueError(f"{points.shape[1]} balls are too few for clusters of min_samples={min_samples}")
     low, middle, high = np.percentile(points, [25, 50, 75], axis=1, keepdims=True)
@@ -158,7 +162,9 @@ def fit_distribution(
         eps = EPS_FACTOR * float(np.median(distances[:, -1]))
     outlier = DBSCAN(eps=eps, min_samples=min_samples).fit_predict(standard.T) == -1
     if np.all(outlier):
-        raise ValueError(f"DBSCAN with eps={eps}, min_samples={min_samples} calls all {outlier.size} balls outliers; raise eps")
+        raise ValueError(
+            f"DBSCAN with eps={eps}, min_samples={min_samples} calls all {outlier.size} balls outliers; raise eps"
+        )
     inside = points[:, ~outlier]
     low, high = inside.min(axis=1), inside.max(axis=1)
     distribution = BallDistribution(low[:3], high[:3], low[3:6], high[3:6], low[6:], high[6:], name, source)

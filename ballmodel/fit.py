@@ -27,7 +27,7 @@ from ballmodel.trajectory import Trajectory
 
 DT = 1.0 / 300.0  # [s] longest step of the simulated flight
 MIN_SAMPLES = 4  # 12 numbers for 6 unknowns
-PAD = 32  # sample counts are rounded up to a multiple of it, so that similar batches share one compiled fit
+PAD = 32  # numbers of samples and of trajectories are rounded up to it, so that similar batches share one compiled fit
 MAX_ITERATIONS = 50
 STEP_TOLERANCE = 1e-9  # [m], [m/s] change below which a fit has converged
 
@@ -50,7 +50,7 @@ class _Padded:
     mask: np.ndarray  # (T, n) 1 for a sample, 0 for padding
 
 
-def _pad(trajectories: Sequence[Trajectory]) -> _Padded:
+def _check(trajectories: Sequence[Trajectory]) -> None:
     if not trajectories:
         raise ValueError("no trajectory to fit")
     short = [t for t in trajectories if len(t) < MIN_SAMPLES]
@@ -59,6 +59,9 @@ def _pad(trajectories: Sequence[Trajectory]) -> _Padded:
             f"{len(short)} of {len(trajectories)} trajectories have fewer than {MIN_SAMPLES} samples of free flight, "
             f"the first is {short[0].label} with {len(short[0])}"
         )
+
+
+def _pad(trajectories: Sequence[Trajectory]) -> _Padded:
     n = len(trajectories)
     length = -(-max(map(len, trajectories)) // PAD) * PAD
     time, position, mask = np.zeros((n, length)), np.zeros((n, 3, length)), np.zeros((n, length))
@@ -184,18 +187,20 @@ def fit_gauss_newton(
     trajectories: free flights (see ``trajectory.free_flight``) of any lengths, each with at least MIN_SAMPLES samples.
     spin: known spins (3, n) [rad/s] at the first sample; without it the balls do not rotate.
     huber: distance [m] beyond which a sample counts linearly instead of by its square; None for plain least squares.
-    Compiles once for each number of trajectories, padded length and number of steps between samples.
+    Compiles once for each padded number of trajectories and samples and each number of steps between samples.
     Raises ValueError for too few samples or a spin of the wrong shape.
     """
-    padded = _pad(trajectories)
-    n = len(trajectories)
+    _check(trajectories)
+    n, extra = len(trajectories), -len(trajectories) % PAD
     spin = np.zeros((3, n)) if spin is None else np.asarray(spin, np.float64)
     if spin.shape != (3, n):
         raise ValueError(f"spin has shape {spin.shape}, (3, {n}) is wanted: one spin for each trajectory")
+    padded = _pad([*trajectories, *[trajectories[-1]] * extra])
+    spins = np.pad(spin, ((0, 0), (0, extra)), mode="edge")
     with jax.enable_x64(True):
         x0, v0 = _initial_guess(padded)
-        result = _levenberg_marquardt(flight, x0, v0, spin, padded.steps, padded.position, padded.mask, huber)
-        x0, v0, rms, covariance, converged = (np.asarray(a) for a in result)
+        result = _levenberg_marquardt(flight, x0, v0, spins, padded.steps, padded.position, padded.mask, huber)
+        x0, v0, rms, covariance, converged = (np.asarray(a)[..., :n] for a in result)
     return FitResult(BallState(x0, v0, spin), rms, covariance, converged)
 
 
@@ -211,6 +216,7 @@ def fit_nelder_mead(trajectory: Trajectory, flight: FlightParams, spin=None) -> 
 
     spin: (3,) [rad/s], zero without it. Raises ValueError when there are fewer than MIN_SAMPLES samples.
     """
+    _check([trajectory])
     padded = _pad([trajectory])
     spin = np.zeros(3) if spin is None else np.asarray(spin, np.float64)
     start = np.concatenate(_initial_guess(padded))[:, 0]

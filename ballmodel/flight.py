@@ -1,9 +1,9 @@
 """One integration step of a ball, with impacts solved inside the step.
 
 Free flight is the paper's step: x += dt (v + dt a / 2), v += dt a, with a taken at the step's start, or, with the
-integrator "midpoint", at its middle. The paper's step is first order: halving it from 300 Hz moves landing points by 0.4 to
-1.5 mm in the median, more than 1 mm on six of the paper's 19 ball distributions (from 450 Hz on none); midpoint is second
-order and moves them by less than 0.01 mm. An impact is placed at its own time within the step:
+integrator "midpoint", at its middle. The paper's step is first order: halving it from 300 Hz moves landing points by
+0.4 to 1.5 mm in the median, more than 1 mm on six of the paper's 19 ball distributions (from 450 Hz on none); midpoint
+is second order and moves them by less than 0.01 mm. An impact is placed at its own time within the step:
 on a box by the root of the step's parabola (exact on the table's top), on the paddle where ball and blade, each moving
 steadily within the step, come within touching distance. After the impact the rest of the step is free flight.
 """
@@ -100,7 +100,7 @@ def _box_time(box: Box, surface: SurfaceParams, state, a, end_position, radius, 
     """Time of touching the box within the step, ``dt`` + 1 where it does not."""
     gap0, distance0 = box_gap(box, surface.height, state.position)
     _, distance1 = box_gap(box, surface.height, end_position)
-    # A fast ball crosses the net's 45 mm (tape and two radii) within one step: look also where it crosses the mid-plane.
+    # A fast ball crosses the net's 45 mm (tape and two radii) within one step: look also at its mid-plane.
     thin = min(range(3), key=lambda i: box.half[i])
     middle = box.centre[thin] + (surface.height if thin == 2 else 0.0) - state.position[thin]
     travel = end_position[thin] - state.position[thin]
@@ -131,7 +131,7 @@ def _mix(start, end, w):
 
 
 def _paddle_time(params: PaddleParams, radius, state, end_position, start: PaddlePose, end: PaddlePose, dt):
-    """Time of touching the blade within the step (``dt`` + 1 where it does not) and which face, +1 or -1 of the normal."""
+    """Time of touching the blade within the step (``dt`` + 1 where it does not), and the face: +1 or -1 of the normal."""
     s0 = dot(start.normal, state.position - start.position)
     s1 = dot(end.normal, end_position - end.position)
     side = jnp.where(s0 >= 0.0, 1.0, -1.0)

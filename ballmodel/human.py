@@ -57,7 +57,7 @@ def fit_human(
     state = jax.tree.map(np.asarray, state)
     towards = (state.position[1] > 0.0) & (state.velocity[1] < 0.0)
     state = jax.tree.map(lambda a: a[:, towards], state)
-    thrown = jax.jit(throw)(params, jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), state), *ROBOT_SIDE)
+    thrown = throw(params, jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), state), *ROBOT_SIDE)
     outcome = np.asarray(thrown.outcome)
     good = (outcome == KEPT) | (outcome == SECOND_BOUNCE)
     counts = np.bincount(outcome, minlength=len(OUTCOMES))

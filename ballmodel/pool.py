@@ -1,9 +1,10 @@
 """Balls drawn from a human ball distribution.
 
-A proposal is uniform in the box of start positions and velocities, without spin. It is kept when, in the full simulation,
-it clears the net, bounces exactly once on the table, inside the landing box on the robot's side, and then crosses the
-robot's end line. "Bounces once" ends there: a second bounce on the table rejects the ball, the floor behind it does not
-count. A ball that leaves over the side after its bounce is kept, and arrives when it meets the floor.
+A proposal is uniform in the box of start positions and velocities, without spin. It is kept when, in the full
+simulation, it clears the net, bounces exactly once on the table, inside the landing box on the robot's side, and then
+crosses the robot's end line. "Bounces once" ends there: a second bounce on the table rejects the ball, the floor
+behind it does not count. A ball that leaves over the side after its bounce is kept, and arrives when it meets the
+floor.
 
 Wide distributions keep few proposals, so a coarse flight first throws out those that miss net or landing box by a
 margin larger than its own error; the full simulation alone decides about all others. Keeping the first n accepted
@@ -78,10 +79,11 @@ def _bad_start(position, params: BallParams):
     return inside | (over_footprint & (position[2] < params.table.height))
 
 
+@jax.jit
 def throw(params: BallParams, state: BallState, landing_min, landing_max, dt: float = DT) -> Throw:
     """Follows balls, (3, n), through the full simulation until each is kept or has failed a constraint.
 
-    landing_min, landing_max: (2,) [m] corners of the landing box; dt [s]. Not jitted.
+    landing_min, landing_max: (2,) [m] corners of the landing box; dt [s].
     """
     end, floor = -c.TABLE_LENGTH / 2, params.flight.radius - c.TABLE_HEIGHT
 
@@ -116,9 +118,6 @@ def throw(params: BallParams, state: BallState, landing_min, landing_max, dt: fl
     _, _, outcome, bounced, x, y, arrival, _ = jax.lax.while_loop(flying, advance, carry)
     outcome = jnp.where(outcome == UNDECIDED, jnp.where(bounced, SECOND_BOUNCE, MISSES), outcome)
     return Throw(outcome, jnp.stack([x, y]), arrival)
-
-
-_throw = jax.jit(throw)
 
 
 def coarse_outcome(params: BallParams, state: BallState, landing_min, landing_max):
@@ -213,7 +212,7 @@ def sample_pool(
             chunk, waiting = waiting[:, :CHUNK], waiting[:, CHUNK:]
             size = chunk.shape[1]
             padded = np.pad(chunk, ((0, 0), (0, CHUNK - size)), mode="edge")
-            result = _throw(params, ball_state(padded[:3], padded[3:]), *landing_box, dt)
+            result = throw(params, ball_state(padded[:3], padded[3:]), *landing_box, dt)
             outcome = np.asarray(result.outcome)[:size]
             good = outcome == KEPT
             full_counts += np.bincount(outcome, minlength=len(OUTCOMES))
@@ -224,7 +223,8 @@ def sample_pool(
 
     table = jnp.asarray(np.concatenate(kept, axis=1)[:, :n])
     share = shares()
-    return BallPool(ball_state(table[:3], table[3:6]), table[6], table[7:9], jnp.asarray(share[KEPT]), jnp.asarray(share))
+    state = ball_state(table[:3], table[3:6])
+    return BallPool(state, table[6], table[7:9], jnp.asarray(share[KEPT]), jnp.asarray(share))
 
 
 def _complaint(distribution, proposals, shares):

@@ -21,8 +21,8 @@ BOUNCE_WINDOW = 5  # samples on each side that tell the vertical velocity
 class Trajectory:
     """One ball as it was measured, in the table frame.
 
-    Raises ValueError, naming session and trajectory, for shapes that do not match, numbers that are not finite, time that
-    does not increase, and numbers too large to be metres and seconds.
+    Raises ValueError, naming session and trajectory, for shapes that do not match, numbers that are not finite, time
+    that does not increase, and numbers too large to be metres and seconds.
     """
 
     session: str
@@ -35,10 +35,14 @@ class Trajectory:
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "position", position)
         if time.ndim != 1 or time.size == 0 or position.shape != (3, time.size):
-            raise ValueError(f"{self.label}: time (n,) and position (3, n) are wanted, got {time.shape} and {position.shape}")
+            raise ValueError(
+                f"{self.label}: time (n,) and position (3, n) are wanted, got {time.shape} and {position.shape}"
+            )
         if not (np.all(np.isfinite(time)) and np.all(np.isfinite(position))):
             sample = int(np.argmax(~np.isfinite(time) | ~np.all(np.isfinite(position), axis=0)))
-            raise ValueError(f"{self.label}: sample {sample} is not finite: t={time[sample]}, position={position[:, sample]}")
+            raise ValueError(
+                f"{self.label}: sample {sample} is not finite: t={time[sample]}, position={position[:, sample]}"
+            )
         if np.any(np.diff(time) <= 0.0):
             sample = int(np.argmax(np.diff(time) <= 0.0)) + 1
             raise ValueError(
@@ -47,11 +51,13 @@ class Trajectory:
         farthest = np.abs(position).max()
         if farthest > LARGEST_COORDINATE:
             raise ValueError(
-                f"{self.label}: a coordinate of {farthest:g} is no place near a table; metres are wanted (are these millimetres?)"
+                f"{self.label}: a coordinate of {farthest:g} is no place near a table; "
+                "metres are wanted (are these millimetres?)"
             )
         if time[-1] - time[0] > LONGEST:
             raise ValueError(
-                f"{self.label}: lasts {time[-1] - time[0]:g}, one ball's flight in seconds is wanted (are these milliseconds?)"
+                f"{self.label}: lasts {time[-1] - time[0]:g}, one ball's flight in seconds is wanted "
+                "(are these milliseconds?)"
             )
 
     @property
@@ -89,13 +95,14 @@ class Dataset:
 def first_bounce(trajectory: Trajectory) -> int | None:
     """Index of the lowest sample at the first bounce, or None where the ball does not bounce.
 
-    A bounce is a sample, the lowest among its neighbours, where the vertical velocity changes from falling to rising while
-    the ball is within BOUNCE_HEIGHT of the table: gravity alone only ever makes it fall faster. The velocities are slopes
-    of straight lines through up to BOUNCE_WINDOW samples on each side. Their change must be at least BOUNCE_KICK and four
-    times what the trajectory's own noise would give, so that noise does not fake a bounce.
+    A bounce is a sample, the lowest among its neighbours, where the vertical velocity changes from falling to rising
+    while the ball is within BOUNCE_HEIGHT of the table: gravity alone only ever makes it fall faster. The velocities
+    are slopes of straight lines through up to BOUNCE_WINDOW samples on each side. Their change must be at least
+    BOUNCE_KICK and four times what the trajectory's own noise would give, so that noise does not fake a bounce.
     """
     time, z = trajectory.time, trajectory.position[2]
-    # Third differences of a smooth flight are noise alone, with 1 + 9 + 9 + 1 times its variance; 0.6745: normal quartile.
+    # Third differences of a smooth flight are noise alone, with 1 + 9 + 9 + 1 times its variance; 0.6745: normal
+    # quartile.
     noise = np.median(np.abs(np.diff(z, 3))) / (0.6745 * np.sqrt(20.0)) if z.size > 3 else 0.0
 
     def slope(samples: slice) -> tuple[float, float]:
@@ -122,14 +129,16 @@ def free_flight(trajectory: Trajectory) -> Trajectory:
 
 
 def resample(trajectory: Trajectory, rate: float) -> Trajectory:
-    """The trajectory at ``rate`` [Hz] from its first sample on, by monotone cubic interpolation (no overshoot at a bounce).
+    """The trajectory at ``rate`` [Hz] from its first sample on, by monotone cubic interpolation: no overshoot.
 
     Raises ValueError for a rate that is not positive or a trajectory of fewer than two samples.
     """
     if not rate > 0.0:
         raise ValueError(f"rate is {rate}; a positive number of samples per second is wanted")
     if len(trajectory) < 2:
-        raise ValueError(f"{trajectory.label}: two samples at least are wanted to interpolate, it has {len(trajectory)}")
+        raise ValueError(
+            f"{trajectory.label}: two samples at least are wanted to interpolate, it has {len(trajectory)}"
+        )
     start, end = trajectory.time[[0, -1]]
     time = start + np.arange(int(np.floor((end - start) * rate * (1.0 + 1e-12))) + 1) / rate
     position = PchipInterpolator(trajectory.time, trajectory.position, axis=1)(np.minimum(time, end))

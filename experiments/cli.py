@@ -67,7 +67,8 @@ def evaluate(options: argparse.Namespace) -> int:
     experiment = _experiment_of(trained, options)
     settings = experiment.config.evaluation
     episodes, seed = options.episodes or settings.episodes, settings.seed if options.seed is None else options.seed
-    played = evaluation.evaluate(experiment, trained, episodes, seed)
+    bound = None if options.no_reachable else settings.reachable_balls
+    played = evaluation.evaluate(experiment, trained, episodes, seed, bound)
     folder = Path(options.out) if options.out else _evaluation_folder(options)
     finish.save_evaluation(folder, played, experiment.task.reward_weights)
     finish.print_report(console, played.report, str(trained.source))
@@ -187,6 +188,7 @@ Without --out, a run on its own balls and model writes into its own folder; anyt
     _add_policy(p)
     p.add_argument("--episodes", type=_count, metavar="N", help="balls to play (default: the experiment's)")
     p.add_argument("--seed", type=int, metavar="K", help="another seed means other balls")
+    p.add_argument("--no-reachable", action="store_true", help="skip the minute that the bound on what is in reach takes")
     p.add_argument("--out", metavar="FOLDER", help="for evaluation.json and plots/")
     _add_devices(p)
 

@@ -163,6 +163,8 @@ class Evaluation(Section):
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1000
     sim_rate: Positive | None = None
     """[Hz] of the physics; null: that of the task."""
+    reachable_balls: Count | None = 128
+    """Balls for which a motion is optimised, one by one, for a lower bound on the return rate in reach; null: none."""
 
 
 class Config(Section):

@@ -16,7 +16,7 @@ from experiments import build
 from experiments.build import Experiment
 from experiments.policy import Policy
 from experiments.training import EVALUATION_COLUMNS
-from mjx_tt import rewards
+from mjx_tt import reach, rewards
 from mjx_tt.model import ModelFile
 from mjx_tt.rollout import RESULT_SPECS, RolloutResult, Simulator
 from mjx_tt.task import HIT, MISSED, RETURNED, Episodes
@@ -72,11 +72,11 @@ class Played:
 
 
 def evaluate(
-    experiment: Experiment, policy: Policy, episodes: int, seed: int, reachable: dict[str, Any] | None = None
+    experiment: Experiment, policy: Policy, episodes: int, seed: int, reachable_balls: int | None = None
 ) -> Played:
     """Plays the policy on at least ``episodes`` balls that training has not seen.
 
-    reachable: a lower bound on the return rate that any policy could have on these balls, kept in the report.
+    reachable_balls: on how many of these balls to seek a lower bound of the return rate that is in reach; None: no bound.
     """
     config = experiment.config
     task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
@@ -101,7 +101,15 @@ def evaluate(
         "update": policy.notes.get("update"),
         "training_seconds": policy.notes.get("seconds"),
     }
+    reachable = None if reachable_balls is None else _reachable(experiment, simulator, balls, key, reachable_balls)
     return Played(summary(result) | {"reachable": reachable} | conditions, result, incoming)
+
+
+def _reachable(experiment: Experiment, simulator: Simulator, balls: BallPool, key, count: int) -> dict[str, Any]:
+    """What motions optimised ball by ball return, knowing the ball and without noise: policies can do at least that."""
+    found = reach.reachable(simulator, balls, experiment.model.model, key, count)
+    low, high = wilson(found.returned, found.balls)
+    return {"return_rate": found.rate, "low": low, "high": high, "balls": found.balls}
 
 
 def summary(result: RolloutResult) -> dict[str, Any]:

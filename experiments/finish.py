@@ -25,7 +25,9 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
     """
     trained, evaluation = policy.load(run.folder), experiment.config.evaluation
     console.print(f"{run.folder}: evaluating on {evaluation.episodes:,} fresh balls ...", highlight=False)
-    played = evaluate.evaluate(experiment, trained, evaluation.episodes, evaluation.seed)
+    played = evaluate.evaluate(
+        experiment, trained, evaluation.episodes, evaluation.seed, evaluation.reachable_balls
+    )
     pictures = plots.draw_evaluation(run.plots, played, experiment.task.reward_weights)
     title = f"{experiment.config.name}: training on {experiment.distribution.name}"
     pictures.append(plots.draw_training(run.plots / "training.png", metrics.read(run.metrics), title))
@@ -85,7 +87,9 @@ def print_report(console: Console, report: dict[str, Any], title: str) -> None:
     rate = f"{report['return_rate']:.1%}  (95 % interval {report['low']:.1%} to {report['high']:.1%})"
     table.add_row("return rate", rate, style="bold")
     if report["reachable"] is not None:
-        table.add_row("reachable, at least", f"{report['reachable']['return_rate']:.1%}")
+        bound = report["reachable"]
+        text = f"{bound['return_rate']:.1%}  ({bound['balls']} balls, interval {bound['low']:.1%} to {bound['high']:.1%})"
+        table.add_row("reachable, at least", text)
     table.add_row("hit rate", f"{report['hit_rate']:.1%}")
     counts = ", ".join(f"{count:,} {name}" for name, count in report["outcomes"].items())
     table.add_row("episodes", f"{report['episodes']:,}: {counts}; {report['non_finite']} not finite")

@@ -21,7 +21,7 @@ class MetricsLog:
     def __init__(self, path: Path, tensorboard: Path, update: int) -> None:
         _truncate(path, update)
         self._file = open(path, "a", encoding="utf-8")
-        self._board = SummaryWriter(str(tensorboard), purge_step=update + 1)
+        self._board = SummaryWriter(str(tensorboard), purge_step=update + 1, filename_suffix=f".{update}")
 
     def write(self, rows: list[dict[str, Any]]) -> None:
         """Adds rows {"update": int, name: number}, oldest first; they are in the file when this returns."""

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from rich.console import Console
 
 from bgs import normalizer
@@ -21,7 +20,6 @@ from experiments.metrics import MetricsLog
 from experiments.progress import TrainingProgress
 from experiments.runs import Run
 from experiments.training import Trainer, TrainState
-from mjx_tt.rollout import AXIS
 
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
 
@@ -37,7 +35,10 @@ def train(experiment: Experiment, run: Run, console: Console) -> str:
         try:
             return Session(experiment, run, console).train()
         except OSError as error:  # of the measurements; checkpoints raise their own
-            raise RunError(f"{error.filename or run.folder}: cannot be written: {error.strerror or error}") from error
+            raise RunError(
+                f"{error.filename or run.metrics}: cannot be written: {error.strerror or error}; the last checkpoint is "
+                "whole. Make room or repair the folder, then run the same command again to continue"
+            ) from error
 
 
 class Session:
@@ -143,8 +144,7 @@ def _start(config, run: Run, trainer: Trainer) -> tuple[TrainState, dict]:
     notes = {"update": 0, "seconds": 0.0, "return_rate": None}
     state, notes = checkpoint.load_latest(run.checkpoints, state) or (state, notes)
     # Where the update leaves its results: compiled for this placement, it can be fed what it returns.
-    mesh = Mesh(np.array(jax.devices()[: trainer.simulator.devices]), (AXIS,))
-    return jax.device_put(state, NamedSharding(mesh, PartitionSpec())), notes
+    return trainer.simulator.replicate(state), notes
 
 
 def _short(value) -> float | None:

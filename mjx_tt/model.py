@@ -70,12 +70,18 @@ class ActuationParams:
     velocity_gain: jax.Array | float = 1.0  # reached over commanded velocity
 
 
+def _ball() -> BallParams:
+    # The paper's first-order step at 300 Hz moves landing points by up to 1.5 mm when it is halved; this one by 0.01 mm.
+    ball = ball_params()
+    return dataclasses.replace(ball, flight=dataclasses.replace(ball.flight, integrator="midpoint"))
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SimModel:
-    """The simulation's parameters."""
+    """The simulation's parameters; the paper's drag-only ball, integrated to second order."""
 
-    ball: BallParams = field(default_factory=ball_params)
+    ball: BallParams = field(default_factory=_ball)
     latency: LatencyParams = field(default_factory=LatencyParams)
     sensing: SensingParams = field(default_factory=SensingParams)
     actuation: ActuationParams = field(default_factory=ActuationParams)

@@ -23,10 +23,10 @@ from robot_io.contract import N_JOINTS, N_OBSERVATION
 
 KNOTS = 5
 HORIZON = 1.0  # [s] after the ball's arrival at the table's end within which a motion may act
-CANDIDATES = 64  # motions per ball and iteration
-ELITES = 8
-ITERATIONS = 25
-FIRST_STD = 0.35  # of an action
+CANDIDATES = 128  # motions per ball and iteration
+ELITES = 12
+ITERATIONS = 50
+FIRST_STD = 0.5  # of an action
 
 
 @dataclass(frozen=True)

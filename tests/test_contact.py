@@ -105,7 +105,8 @@ def test_rubber_scales_the_slip_by_one_minus_five_halves_of_its_gain():
     for velocity, spin, normal in random_impacts(50):
         paddle_velocity = np.array([0.5, 1.0, -0.3])
         v, w = paddle_impact(PaddleParams(), velocity, spin, normal, paddle_velocity, R)
-        before, after = slip(velocity - paddle_velocity, spin, normal), slip(np.array(v) - paddle_velocity, np.array(w), normal)
+        before = slip(velocity - paddle_velocity, spin, normal)
+        after = slip(np.array(v) - paddle_velocity, np.array(w), normal)
         np.testing.assert_allclose(after, (1 - 2.5 * 0.68) * before, atol=1e-10)
 
 

@@ -157,7 +157,8 @@ def test_ball_dropped_from_30_cm_rebounds_23_cm():
     params = replace(ball_params(), flight=VACUUM, table=SurfaceParams(0.876, 0.0, 0.25, 0.0))
     drop = 0.30
     fall, rise = np.sqrt(2 * drop / 9.81), 0.876 * np.sqrt(2 * drop / 9.81)
-    state, touched = run(params, ball_state(np.array([0.1, -0.5, c.BALL_RADIUS + drop]), np.zeros(3)), (fall + rise) / 100, 100)
+    start = ball_state(np.array([0.1, -0.5, c.BALL_RADIUS + drop]), np.zeros(3))
+    state, touched = run(params, start, (fall + rise) / 100, 100)
     assert bool(touched[0])
     assert float(state.position[2]) - c.BALL_RADIUS == pytest.approx(drop * 0.876**2, rel=1e-9)
     assert drop * 0.876**2 == pytest.approx(0.23, abs=0.001)

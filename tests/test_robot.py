@@ -5,71 +5,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from chains import CRANE, SKEW, pendulum
 from scipy.optimize import linprog
 
 from mjx_tt import robot
 from mjx_tt.chain import chain_from_model, site_frame
 from robot_io.contract import JOINT_NAMES, LIMITS
-
-OPTION = """<option integrator="implicitfast"><flag contact="disable" constraint="disable"/></option>"""
-
-SKEW = """
-<mujoco>
-  {option}
-  <default><geom contype="0" conaffinity="0"/></default>
-  <worldbody>
-    <body pos=".3 -.2 .5" euler="20 -35 50">
-      <geom type="box" size=".1 .2 .1"/>
-      <body name="a" pos=".1 0 .2" euler="10 20 30">
-        <joint name="a" axis="1 2 -1" pos=".05 -.1 .02" armature=".2" damping=".7" ref="25"/>
-        <inertial pos=".1 .05 -.02" quat=".9 .1 -.3 .2" mass="2" diaginertia=".02 .03 .04"/>
-        <body name="a_fixed" pos=".2 .1 0" euler="0 45 10">
-          <inertial pos="0 .1 0" quat=".8 -.1 .3 .2" mass=".7" diaginertia=".002 .004 .003"/>
-          <body name="b" pos="0 .3 .1" euler="-40 5 60" gravcomp=".5">
-            <joint name="b1" type="slide" axis="0 3 1" ref=".2"/>
-            <joint name="b2" axis="1 -1 1" pos="0 .1 .1"/>
-            <joint name="b3" axis="0 1 0" pos=".1 0 0"/>
-            <inertial pos="0 0 .1" mass="1.1" fullinertia=".03 .02 .025 .001 -.002 .003"/>
-            <body name="b_fixed" pos="0 0 .4" euler="90 0 30" gravcomp=".5">
-              <geom type="capsule" size=".03 .2"/>
-              <site name="tip" pos=".1 .2 .3" euler="15 25 35"/>
-            </body>
-          </body>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position name="b1" joint="b1" kp="30" kv="4" gear="-2"/>
-    <motor name="a" joint="a" gear="3"/>
-    <velocity name="b3" joint="b3" kv="5" gear="1.5"/>
-  </actuator>
-</mujoco>
-""".format(option=OPTION)
-
-PENDULUM = """
-<mujoco>
-  {option}
-  <default><geom contype="0" conaffinity="0"/></default>
-  {extra}
-  <worldbody>
-    {world}
-    <body name="arm" {body}>
-      <joint name="hinge" type="hinge" {joint}/>
-      <geom name="rod" type="capsule" size=".02" fromto="0 0 0 0 0 -.4" {geom}/>
-      <site name="end" pos="0 0 -.4"/>
-      {child}
-    </body>
-  </worldbody>
-  <actuator>{actuator}</actuator>
-</mujoco>
-"""
-
-
-def pendulum(option=OPTION, **parts) -> mujoco.MjModel:
-    defaults = dict.fromkeys(("extra", "world", "body", "joint", "geom", "child", "actuator"), "")
-    return mujoco.MjModel.from_xml_string(PENDULUM.format(option=option, **(defaults | parts)))
-
 
 @pytest.fixture(scope="module")
 def model():
@@ -102,6 +43,7 @@ def chain_models():
     return [
         pytest.param(robot.load_model(), robot.PADDLE_SITE, id="robot"),
         pytest.param(mujoco.MjModel.from_xml_string(SKEW), "tip", id="skew"),
+        pytest.param(mujoco.MjModel.from_xml_string(CRANE), "tip", id="crane"),
         pytest.param(pendulum(child='<body pos="0 .1 0" euler="0 9 0"><geom size=".1"/></body>'), "end", id="pendulum"),
     ]
 

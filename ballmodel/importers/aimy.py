@@ -1,10 +1,10 @@
-"""Launcher trajectories of Intelligent Soft Robots, Max Planck Institute (github.com/intelligent-soft-robots, BSD-3-Clause).
+"""Launcher trajectories of Intelligent Soft Robots, Max Planck Institute (BSD-3-Clause).
 
 HDF5 with ``/originals/<i>/{time_stamps [s] (n,), positions [m] (n, 3), velocities, launch_param}``. Their x is the
 direction of flight, y points to its left, z up; they name no origin. Into the table frame (balls fly towards -y):
 
     x = y_aimy                     the lateral origin is kept
-    y = TABLE_LENGTH / 2 - x_aimy  recorded x runs from 0.00 to 2.74 m, the table's length: the launcher stands at its end
+    y = TABLE_LENGTH / 2 - x_aimy  recorded x runs from 0.00 to 2.74 m, the table's length: launcher at its end
     z = z_aimy - 0.740             the lowest ball centre of all recordings is 0.760 m, one radius above the table
 
 Spin was not measured; the filtered ``velocities`` are not used.

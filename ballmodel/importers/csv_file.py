@@ -20,7 +20,7 @@ NUMBERS = ("t", "x", "y", "z")
 
 
 def read_csv(path: str | os.PathLike) -> Dataset:
-    """Reads trajectories from CSV. Raises ValueError naming file, row (the header is row 1) and column of what is wrong."""
+    """Reads trajectories from CSV. Raises ValueError naming file, row (the header is row 1) and column at fault."""
     with open(path, newline="", encoding="utf-8-sig") as file:
         reader = csv.reader(file)
         try:

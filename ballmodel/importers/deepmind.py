@@ -1,4 +1,4 @@
-"""Ball states of D'Ambrosio et al., "Achieving Human Level Competitive Robot Table Tennis", ICRA 2025 (data: CC-BY-4.0).
+"""Ball states of D'Ambrosio et al., "Achieving Human Level Competitive Robot Table Tennis", ICRA 2025 (CC-BY-4.0).
 
 A JSON list of states right after a hit, with position [m], velocity [m/s] and the authors' estimate of spin [rad/s], in
 the table frame. The spin rests on their own fluid model and is probably about twice the true one.
@@ -32,7 +32,7 @@ class MeasuredStates:
 
 
 def read_deepmind(path: str | os.PathLike) -> MeasuredStates:
-    """Reads the JSON. Raises ValueError naming file, entry (from 0) and field of what is missing or no finite number."""
+    """Reads the JSON. Raises ValueError naming file, entry (from 0) and field that is missing or no finite number."""
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -25,7 +25,9 @@ def read(path: str | os.PathLike, format: str | None = None) -> Dataset | Measur
     if format is None:
         format = SUFFIXES.get(path.suffix.lower())
         if format is None:
-            raise ValueError(f"{path}: suffix {path.suffix!r} is unknown; known: {', '.join(SUFFIXES)}, or name the format")
+            raise ValueError(
+                f"{path}: suffix {path.suffix!r} is unknown; known: {', '.join(SUFFIXES)}, or name the format"
+            )
     if format not in FORMATS:
         raise ValueError(f"{path}: format {format!r} is unknown; known: {', '.join(FORMATS)}")
     if not path.is_file():

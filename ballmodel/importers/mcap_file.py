@@ -50,7 +50,9 @@ def write_mcap(path: str | os.PathLike, dataset: Dataset) -> None:
         channel = writer.register_channel(TOPIC, "json", schema)
         for trajectory in dataset:
             if trajectory.time[0] < 0.0:
-                raise ValueError(f"{trajectory.label}: starts at t={trajectory.time[0]}; MCAP holds no time before zero")
+                raise ValueError(
+                    f"{trajectory.label}: starts at t={trajectory.time[0]}; MCAP holds no time before zero"
+                )
             for i, (t, (x, y, z)) in enumerate(zip(trajectory.time, trajectory.position.T)):
                 stamp = round(float(t) * NANO)
                 message = {
@@ -92,7 +94,9 @@ def read_mcap(path: str | os.PathLike, salvage: bool = False) -> Dataset:
                 samples.setdefault((session, name), []).append(sample)
                 count += 1
     if not complete and not salvage:
-        raise ValueError(f"{path}: damaged or cut short ({cause}); its complete chunks hold {count} samples, read them with salvage")
+        raise ValueError(
+            f"{path}: damaged or cut short ({cause}); its complete chunks hold {count} samples, read them with salvage"
+        )
     if not samples:
         listed = ", ".join(sorted(set(topics.values()))) or "none"
         raise ValueError(f"{path}: no sample on the topic {TOPIC}; topics in the file: {listed}")

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from mujoco import mjx
 
 
 class MjxEngine:
-    """``step(qpos, qvel, ctrl) -> (qpos, qvel)`` for arrays (n, ...) of any batch shape, over ``timestep`` seconds."""
+    """``step(qpos, qvel, ctrl) -> (qpos, qvel)`` for arrays (n, ...) of any batch shape, over ``timestep`` seconds.
+
+    Raises ValueError for a model with fluid forces: MJX computes some of them and drops the others without a word.
+    """
 
     name = "mjx"
 
     def __init__(self, model: mujoco.MjModel, timestep: float | None = None) -> None:
-        model = _copy(model)
+        for option in ("density", "viscosity"):
+            if getattr(model.opt, option):
+                raise ValueError(f"option {option}: must be 0 (no fluid forces), got {getattr(model.opt, option)}")
+        model = copy.deepcopy(model)
         if timestep is not None:
             model.opt.timestep = timestep
         self.timestep = float(model.opt.timestep)
@@ -33,9 +40,3 @@ class MjxEngine:
         flat = (jnp.moveaxis(x.reshape(x.shape[0], -1), 0, -1) for x in (qpos, qvel, ctrl))
         q, v = jax.vmap(one)(*flat)
         return tuple(jnp.moveaxis(x, -1, 0).reshape((-1, *batch)).astype(qpos.dtype) for x in (q, v))
-
-
-def _copy(model: mujoco.MjModel) -> mujoco.MjModel:
-    import copy
-
-    return copy.deepcopy(model)

@@ -1,0 +1,140 @@
+"""Where the time of a control step goes: its parts one by one, on one core, at the size of a block of episodes.
+
+Each part runs in a loop of its own whose state depends on its results, so that nothing is hoisted or dropped.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from ballmodel import flight, players
+from ballmodel.flight import ball_params
+from ballmodel.pool import sample_pool
+from mjx_tt import latency, noise
+from mjx_tt.dynamics.fold import materialise
+from mjx_tt.model import SimModel
+from mjx_tt.policy import PolicyController, initial_theta
+from mjx_tt.rollout import Simulator
+from mjx_tt.task import TaskConfig
+from robot_io.contract import LIMITS, N_JOINTS, N_OBSERVATION, unflatten
+from robot_io.limits import limit_velocity
+
+WHOLE = "control step"
+RUNS = 5  # of each part, of which the fastest counts: the others were disturbed
+
+
+def time_parts(lanes: int, ticks: int) -> Callable[[], list[dict]]:
+    """Compiles the parts; the function returned measures them.
+
+    Its rows: part, calls per control step, ns per episode and control step, share of the whole. "rest" is the whole less
+    the parts, and can be negative where a part alone costs more than in its place.
+    """
+    config = TaskConfig()
+    loops = {name: (calls, *_compiled(step, start, ticks)) for name, (calls, step, start) in _parts(config, lanes).items()}
+
+    def measure() -> list[dict]:
+        nanoseconds = {}
+        for name, (calls, run, start) in loops.items():
+            fastest = min(_seconds(run, start) for _ in range(RUNS))
+            nanoseconds[name] = calls * fastest / ticks / lanes * 1e9
+        whole = nanoseconds.pop(WHOLE)
+        rows = [{"part": name, "calls": loops[name][0], "ns": ns} for name, ns in nanoseconds.items()]
+        rows.append({"part": "rest", "calls": 1, "ns": whole - sum(nanoseconds.values())})
+        rows.append({"part": WHOLE, "calls": 1, "ns": whole})
+        return [row | {"share": row["ns"] / whole} for row in rows]
+
+    return measure
+
+
+def _compiled(step, start, ticks: int):
+    def loop(state):
+        return jax.lax.fori_loop(0, ticks, lambda tick, s: materialise(step(tick, s)), state)
+
+    start = jax.block_until_ready(jax.tree.map(jnp.asarray, start))
+    run = jax.jit(loop).lower(start).compile()
+    _seconds(run, start)
+    return run, start
+
+
+def _seconds(run, start) -> float:
+    began = time.perf_counter()
+    jax.block_until_ready(run(start))
+    return time.perf_counter() - began
+
+
+def _parts(config: TaskConfig, lanes: int) -> dict[str, tuple[int, Callable, object]]:
+    """By name: calls per control step, a step (tick, state) -> state, its first state."""
+    simulator = Simulator(config)
+    task, timestep = simulator.task, 1.0 / config.sim_rate
+    pool = sample_pool(jax.random.key(0), players.resolve("player3/M0"), ball_params(), 1024)
+    episodes = jax.tree.map(
+        lambda x: x.reshape(*x.shape[:-2], lanes) if x.ndim >= 2 else x,
+        simulator.draw(jax.random.key(1), pool, SimModel(), (), 1, lanes),
+    )
+    theta = initial_theta(jax.random.key(2))[:, None] + 0.025 * jax.random.normal(jax.random.key(3), (976, lanes))
+    controller = PolicyController(unflatten(theta), jnp.zeros(N_OBSERVATION), jnp.ones(N_OBSERVATION))
+    delays, first = task.delays(episodes.latency), task.reset(episodes, controller)
+    speeds = 0.1 * jax.random.normal(jax.random.key(4), (N_JOINTS, lanes))
+    pose = task.kinematics.pose(first.qpos, speeds)
+    observation = jnp.concatenate([first.ball.position, first.qpos])
+    nothing = 1e-9  # couples a result to the next call without moving it
+
+    def kinematics(_, state):
+        qpos, last = state
+        return qpos + nothing * last.position[0], task.kinematics.pose(qpos, speeds)
+
+    def ball(_, state):
+        moved, events = flight.step(episodes.model.ball, state, timestep, (pose, pose))
+        events = materialise(events)
+        return jax.tree.map(lambda x: x + nothing * events.time, moved)
+
+    def policy(tick, state):
+        memory, seen = state
+        action, memory = controller.act(tick, memory, seen)
+        return memory, seen.at[:N_JOINTS].add(nothing * action)
+
+    def clearance(_, qpos):
+        gaps = task.clearance(materialise(task.kinematics.links(qpos)), qpos[0])
+        return qpos + nothing * (gaps.table + gaps.own + gaps.blade)
+
+    def signals(tick, state):
+        """Delayed, noisy observation; limited, delayed command."""
+        seen, sent, reference, previous, captured = state
+        delayed = jnp.concatenate([
+            latency.ring_read(seen[:, :3], tick - delays.ball.periods),
+            latency.ring_read(seen[:, 3:], tick - delays.joints.periods),
+        ])  # fmt: skip
+        u = noise.symmetric_uniform(episodes.seed, tick, 3)
+        observed = materialise(jnp.concatenate([delayed[:3] + 0.08 * u, delayed[3:]]))
+        request = observed[3:] * jnp.asarray(LIMITS.policy_velocity)[:, None]
+        command = materialise(limit_velocity(request, previous, reference, config.period, xp=jnp))
+        sent = latency.ring_write(sent, tick, command)
+        old = latency.ring_read(sent, tick - delays.action.periods - 1)
+        new = latency.ring_read(sent, tick - delays.action.periods)
+        for i in range(config.substeps):
+            share = latency.old_command_share(delays.action, i, timestep)
+            control = materialise(new + share * (old - new))
+            weight = latency.capture_weight(delays.joints, i, config.substeps, timestep)
+            captured = captured.at[3:].add(weight * control)
+        return latency.ring_write(seen, tick, nothing * captured), sent, reference, command, captured
+
+    def whole(tick, state):
+        return task.control_step(tick, state, episodes, delays, controller)
+
+    zeros = jnp.zeros_like(first.qpos)
+    n = config.substeps
+    return {
+        "arm dynamics": (n, lambda _, state: task.engine.step(*state, speeds), (first.qpos, first.qvel)),
+        "paddle kinematics": (n, kinematics, (first.qpos, pose)),
+        "ball": (n, ball, first.ball),
+        "policy": (1, policy, (first.controller, observation)),
+        "clearances": (1, clearance, first.qpos),
+        "delays, noise, limits": (
+            1, signals, (first.observations, first.commands, first.reference, zeros, jnp.zeros_like(observation))
+        ),
+        WHOLE: (1, whole, first),
+    }  # fmt: skip

@@ -1,0 +1,195 @@
+"""What is measured. Each function prepares one side and returns (what it says about itself, its work).
+
+The work is a function without arguments that returns how much it did: physics steps, episodes or lines of a table.
+
+All robot-only sides do the same: the robot of the MJCF from its home pose, 300 physics steps per second, new random
+velocity commands 75 times per second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+Side = tuple[dict, Callable[[], float | list]]
+
+SIM_RATE = 300.0
+SUBSTEPS = 4  # physics steps per command
+COMMAND = 0.2  # largest command, as a share of each joint's speed limit: no joint leaves its range within a run
+
+
+def fused(lanes: int, chunks: int, steps: int) -> Side:
+    """The fused engine in float32: on every device ``chunks`` batches of ``lanes`` robots, one after the other."""
+    return _jax_engine("fused", lanes, chunks, steps)
+
+
+def mjx(lanes: int, chunks: int, steps: int) -> Side:
+    """MuJoCo MJX in float32, likewise."""
+    return _jax_engine("mjx", lanes, chunks, steps)
+
+
+def _jax_engine(name: str, lanes: int, chunks: int, steps: int) -> Side:
+    from mjx_tt import platform
+
+    platform.configure()
+    import jax
+    import jax.numpy as jnp
+    from jax.sharding import Mesh, PartitionSpec
+
+    from mjx_tt.dynamics.fold import materialise
+    from mjx_tt.task import Task, TaskConfig
+
+    task = Task(TaskConfig(engine=name, sim_rate=SIM_RATE))
+    devices = jax.devices()
+    home = jnp.broadcast_to(jnp.asarray(task.home, jnp.float32)[:, None], (8, lanes))
+
+    def period(state, control):
+        def step(_, s):
+            return materialise(task.engine.step(*s, control))
+
+        return jax.lax.fori_loop(0, SUBSTEPS, step, state), None
+
+    def chunk(controls):  # (steps / SUBSTEPS, 8, lanes)
+        return jax.lax.scan(period, (home, jnp.zeros_like(home)), controls)[0]
+
+    def device(controls):  # (chunks, steps / SUBSTEPS, 8, lanes)
+        return jax.lax.map(chunk, controls)
+
+    mesh = Mesh(np.array(devices), ("device",))
+    split = PartitionSpec("device")
+    run = jax.jit(jax.shard_map(device, mesh=mesh, in_specs=split, out_specs=split, check_vma=False))
+    controls = commands((len(devices) * chunks, steps // SUBSTEPS, 8, lanes), axis=2)
+    controls = jax.device_put(controls, jax.sharding.NamedSharding(mesh, split))
+
+    def work() -> float:
+        jax.block_until_ready(run(controls))
+        return len(devices) * chunks * lanes * steps
+
+    return about_jax(), work
+
+
+def mujoco_rollout(robots: int, steps: int, threads: int) -> Side:
+    """MuJoCo C's own batch roll-out in float64 with a pool of threads that stays alive."""
+    import mujoco
+    from mujoco import rollout
+
+    from mjx_tt import robot
+
+    model = robot.load_model()
+    model.opt.timestep = 1.0 / SIM_RATE
+    data = [mujoco.MjData(model) for _ in range(threads)]
+    mujoco.mj_resetDataKeyframe(model, data[0], 0)
+    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    first = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data[0], first, kind)
+    start = np.tile(first, (robots, 1))
+    controls = np.repeat(commands((robots, steps // SUBSTEPS, 8), axis=2).astype(float), SUBSTEPS, axis=1)
+    states = np.empty((robots, steps, len(first)))
+    sensors = np.empty((robots, steps, model.nsensordata))
+    pool = rollout.Rollout(nthread=threads)
+
+    def work() -> float:
+        pool.rollout(model, data, start, controls, nstep=steps, state=states, sensordata=sensors)
+        return robots * steps
+
+    return {"version": mujoco.__version__}, work
+
+
+def pybullet(steps: int, seed: int) -> Side:
+    """PyBullet in one process: one robot with velocity motors on its eight joints."""
+    from benchmarks.pybullet_robot import PyBulletRobot
+
+    robot = PyBulletRobot(1.0 / SIM_RATE)
+    controls = commands((steps // SUBSTEPS, 8), axis=1, seed=seed).astype(float)
+
+    def work() -> float:
+        robot.reset()
+        for control in controls:
+            robot.run(control, SUBSTEPS)
+        return steps
+
+    return {"version": robot.version}, work
+
+
+def update(changes: list[str], devices: int | None = None) -> Side:
+    """One training update of the paper's settings, experiments/paper.yaml, with some of its keys changed."""
+    from mjx_tt import platform
+
+    platform.configure(devices)
+    import jax
+
+    trainer, state = _paper_trainer(changes)
+    compiled = trainer.lower(state).compile()
+
+    def work() -> float:
+        nonlocal state
+        state, _ = jax.block_until_ready(compiled(state, trainer.pool))
+        return trainer.episodes_per_update
+
+    return about_jax(), work
+
+
+def rollout(changes: list[str], devices: int | None = None) -> Side:
+    """The roll-outs of such an update alone, on episodes already drawn."""
+    from mjx_tt import platform
+
+    platform.configure(devices)
+    import jax
+    import jax.numpy as jnp
+
+    from mjx_tt.model import SimModel
+    from mjx_tt.rollout import RESULT_SPECS
+
+    trainer, state = _paper_trainer(changes)
+    simulator, columns = trainer.simulator, 2 * trainer.bgs_config.pairs
+    repeats = trainer.episodes_per_update // columns
+    episodes = simulator.draw(jax.random.key(2), trainer.pool, SimModel(), (), repeats, columns)
+    theta = state.bgs.theta[:, None] + 0.025 * jax.random.normal(jax.random.key(3), (state.bgs.theta.shape[0], columns))
+
+    def play(theta, episodes):
+        mean, inverse_scale = jnp.zeros(11), jnp.ones(11)
+        return simulator.rollout(simulator.local(theta), mean, inverse_scale, simulator.local(episodes))
+
+    arguments = simulator.replicate((theta, episodes))
+    compiled = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS)).lower(*arguments).compile()
+
+    def work() -> float:
+        jax.block_until_ready(compiled(*arguments))
+        return trainer.episodes_per_update
+
+    return about_jax(), work
+
+
+def _paper_trainer(changes: list[str]):
+    import jax
+
+    from experiments import build, config
+
+    trainer = build.trainer(build.experiment(config.load(config.shipped()["paper"], tuple(changes)), "paper"))
+    return trainer, trainer.init(jax.random.key(0))
+
+
+def breakdown(lanes: int, ticks: int) -> Side:
+    """The parts of a control step one by one; the work returns their times instead of an amount."""
+    from mjx_tt import platform
+
+    platform.configure(1)
+    from benchmarks.breakdown import time_parts
+
+    return about_jax(), time_parts(lanes, ticks)
+
+
+def about_jax() -> dict:
+    import jax
+
+    devices = jax.devices()
+    return {"device": f"{len(devices)} x {devices[0].device_kind} ({devices[0].platform})", "version": jax.__version__}
+
+
+def commands(shape: tuple[int, ...], axis: int, seed: int = 0) -> np.ndarray:
+    """Random joint velocities [m/s], [rad/s], float32, of this shape; ``axis`` counts the joints."""
+    from robot_io.contract import LIMITS
+
+    largest = COMMAND * np.asarray(LIMITS.velocity, np.float32).reshape((-1,) + (1,) * (len(shape) - axis - 1))
+    return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32) * largest

@@ -1,0 +1,126 @@
+"""One side of a comparison in processes of its own: started, warmed up, then run when told.
+
+Fresh processes give every side its own memory and its own processor cores, and let sides take turns. A side is a
+function of ``benchmarks.sides`` that prepares everything and returns its work; the process answers each line on its
+standard input with one run of that work.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+from statistics import median
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class WorkerError(RuntimeError):
+    """A side that could not be prepared or died."""
+
+
+class Worker:
+    """A process that runs ``side`` with the given sizes on ``cpus`` (all cores when None).
+
+    After ``close``, ``peak_memory`` [MB] holds its largest resident memory.
+    """
+
+    def __init__(self, side: str, cpus: set[int] | None = None, environment: dict[str, str] | None = None, **sizes) -> None:
+        request = json.dumps({"side": side, "cpus": sorted(cpus) if cpus else None, "sizes": sizes})
+        path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.worker", request],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env=os.environ | {"PYTHONPATH": path} | (environment or {}),
+        )  # fmt: skip
+        self.side = side
+        self.peak_memory: float | None = None
+
+    def wait_ready(self) -> dict:
+        """What the side says about itself, once it is warm. Raises WorkerError."""
+        return self._answer()
+
+    def start(self) -> None:
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+
+    def finish(self) -> float:
+        """Amount of work done by the run that ``start`` began. Raises WorkerError."""
+        return self._answer()["amount"]
+
+    def close(self) -> None:
+        if not self._process.stdin.closed:
+            self._process.stdin.close()  # the process answers with its memory and ends
+            self.peak_memory = self._answer()["peak_memory_mb"]
+            self._process.wait()
+            self._process.stdout.close()
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, kind, *_) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._process.kill()
+            self._process.wait()
+
+    def _answer(self) -> dict:
+        line = self._process.stdout.readline()
+        if not line:
+            raise WorkerError(f"{self.side}: its process ended with status {self._process.wait()}; see above for why")
+        return json.loads(line)
+
+
+def run_once(workers: list[Worker]) -> tuple[float, float]:
+    """Starts one run of all the workers of a side at once; seconds until the last is done and the sum of their work."""
+    began = time.perf_counter()
+    for worker in workers:
+        worker.start()
+    amount = sum(worker.finish() for worker in workers)
+    return time.perf_counter() - began, amount
+
+
+def take_turns(sides: dict[str, list[Worker]], rounds: int) -> dict[str, list[tuple[float, float]]]:
+    """``rounds`` runs of every side, A B C A B C ..., so that other load on the machine meets all alike.
+
+    Returns (seconds, amount) of each run, by side.
+    """
+    measured: dict[str, list[tuple[float, float]]] = {name: [] for name in sides}
+    for _ in range(rounds):
+        for name, workers in sides.items():
+            measured[name].append(run_once(workers))
+    return measured
+
+
+def summary(seconds: list[float]) -> dict[str, float]:
+    return {"median": median(seconds), "min": min(seconds), "max": max(seconds), "n": len(seconds)}
+
+
+def serve(request: str) -> None:
+    """The process behind a ``Worker``. Only its answers go to standard output."""
+    answers, sys.stdout = sys.stdout, sys.stderr
+    order = json.loads(request)
+    if order["cpus"] and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, order["cpus"])  # before anything starts threads
+    from benchmarks import sides
+
+    about, work = getattr(sides, order["side"])(**order["sizes"])
+    work()  # warm
+
+    def answer(content: dict) -> None:
+        print(json.dumps(content), file=answers, flush=True)
+
+    answer(about)
+    for _ in sys.stdin:
+        answer({"amount": work()})
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    answer({"peak_memory_mb": peak / (1024.0 if sys.platform == "linux" else 1024.0**2)})
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1])

@@ -1,0 +1,115 @@
+"""Counting: rates, intervals, the paper's selection score, and pictures that show what was counted."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.stats import binomtest
+
+from experiments import evaluate, plots
+from experiments.evaluate import Played
+from mjx_tt import rewards
+from mjx_tt.rollout import RolloutResult
+from mjx_tt.task import HIT, MISSED, RETURNED
+from robot_io.contract import LIMITS
+
+N_TERMS = len(rewards.TERMS)
+
+
+def result(outcome: list[int], finite: list[bool] | None = None, collision: list[float] | None = None) -> RolloutResult:
+    """Episodes (N, 1) with these outcomes."""
+    shape = (len(outcome), 1)
+    finite = np.ones(shape, bool) if finite is None else np.array(finite).reshape(shape)
+    terms = np.zeros((N_TERMS, *shape))
+    terms[rewards.TERMS.index("collision")] = 0 if collision is None else np.array(collision).reshape(shape)
+    terms[0] = np.where(finite, 2.0, np.nan)
+    rng = np.random.default_rng(0)
+    return RolloutResult(
+        terms=terms,
+        returns=np.where(finite, 3.0, np.nan),
+        outcome=np.array(outcome).reshape(shape),
+        landing=rng.uniform([[[-0.7]], [[0.1]]], [[[0.7]], [[1.3]]], (2, *shape)),
+        finite=finite,
+        steps=np.full(shape, 80),
+        peak_velocity=np.array(LIMITS.velocity)[:, None, None] * rng.uniform(0.2, 1, (8, *shape)),
+        observation_sums=np.zeros((2, 11, 1)),
+        observation_counts=np.zeros(1, int),
+    )
+
+
+@pytest.mark.parametrize("successes, trials", [(0, 10), (10, 10), (1, 3), (1871, 2000), (1, 100_000)])
+def test_wilson_interval_is_scipys(successes, trials):
+    expected = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
+    assert evaluate.wilson(successes, trials) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+@pytest.mark.parametrize("successes, trials", [(1, 0), (3, 2), (-1, 2)])
+def test_wilson_refuses_impossible_counts(successes, trials):
+    with pytest.raises(ValueError, match=f"{successes} successes in {trials} trials"):
+        evaluate.wilson(successes, trials)
+
+
+def test_summary_counts_a_non_finite_episode_as_missed_and_leaves_it_out_of_means():
+    report = evaluate.summary(result([RETURNED, RETURNED, HIT, MISSED, MISSED], [True, True, True, True, False]))
+    assert report["return_rate"] == pytest.approx(2 / 5)
+    assert report["hit_rate"] == pytest.approx(3 / 5)
+    assert report["episodes"] == 5
+    assert report["outcomes"] == {"missed": 2, "hit": 1, "returned": 2}
+    assert report["non_finite"] == 1
+    assert report["mean_return"] == 3.0
+    assert report["terms"]["state_transition"] == 2.0
+    assert list(report["terms"]) == list(rewards.TERMS)
+    json.dumps(report, allow_nan=False)
+
+
+def test_summary_of_nothing_finite_is_still_json():
+    report = evaluate.summary(result([MISSED, MISSED], [False, False]))
+    assert (report["return_rate"], report["mean_return"], report["non_finite"]) == (0.0, None, 2)
+    json.dumps(report, allow_nan=False)
+
+
+def test_selection_score_is_the_papers_sparse_reward():
+    """Missed 0, hit +1, landed +1 more; a touch of robot or table, or a failed episode, -2 whatever the ball did."""
+    played = result(
+        [MISSED, HIT, RETURNED, RETURNED, MISSED],
+        finite=[True, True, True, True, False],
+        collision=[0.0, 0.0, 0.0, -1.0, 0.0],
+    )
+    assert evaluate.selection_score(played) == pytest.approx((0 + 1 + 2 - 2 - 2) / 5)
+
+
+def share(path, colour) -> float:
+    """Share of a picture's pixels within 12 levels of a colour "#rrggbb"."""
+    wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
+    pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    return float((np.abs(pixels - wanted).max(axis=-1) <= 12).mean())
+
+
+def test_pictures_show_what_was_counted(tmp_path):
+    def draw(folder, outcome):
+        played = result([outcome] * 400)
+        rng = np.random.default_rng(1)
+        incoming = rng.uniform([[[-0.7]], [[-1.3]]], [[[0.7]], [[-0.1]]], (2, 400, 1))
+        return plots.draw_evaluation(tmp_path / folder, Played(evaluate.summary(played), played, incoming), (1.0,) * N_TERMS)
+
+    returned, missed = draw("returned", RETURNED), draw("missed", MISSED)
+    assert [path.name for path in returned] == ["landing_map.png", "return_rate_map.png", "rewards.png", "joint_speeds.png"]
+    assert share(returned[0], "#000000") < 0.5  # a picture, not a black frame
+    dots = [np.asarray(Image.open(paths[0]).convert("RGB")).astype(int) for paths in (returned, missed)]
+    green = [((d[..., 1] > d[..., 0] + 25) & (d[..., 1] > d[..., 2] + 25)).mean() for d in dots]
+    assert green[0] > 10 * green[1]
+    assert share(returned[1], "#006837") > 0.05  # the colour map's green end fills the robot's half
+    assert share(missed[1], "#a50026") > 0.05  # and its red end
+
+
+def test_training_curve_survives_missing_values(tmp_path):
+    rows = [
+        {"update": i + 1, "seconds": 0.1 * i, "return_rate": i / 60, "hit_rate": None if i < 3 else 0.5, "mean_return": None}
+        for i in range(60)
+    ]
+    rows[29] |= {"evaluation/return_rate": 0.4, "evaluation/low": 0.3, "evaluation/high": 0.5}
+    path = plots.draw_training(tmp_path / "training.png", rows, "a title")
+    assert share(path, plots.RETURNED_COLOUR) > 0.0005
