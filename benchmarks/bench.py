@@ -36,7 +36,7 @@ class Sizes:
     pybullet     physics steps of one robot per core
     pairs, repeats   of the update
     scaling      (pairs, repeats) of updates from small to large
-    lanes, ticks     episodes and control steps of the breakdown
+    block, ticks     rows x columns of episodes and control steps of the breakdown
     """
 
     rounds: int = 7
@@ -47,7 +47,7 @@ class Sizes:
     pairs: int = 200
     repeats: int = 15
     scaling: tuple[tuple[int, int], ...] = ((2, 15), (8, 15), (20, 15), (50, 15), (200, 15), (800, 15))
-    lanes: int = 800
+    block: tuple[int, int] = (3, 200)  # as two devices run the update
     ticks: int = 100
 
 
@@ -80,7 +80,8 @@ def measure(sizes: Sizes, console: Console) -> dict:
     console.print(f"one update: {2 * sizes.pairs} perturbations x {sizes.repeats} episodes ...")
     report |= measure_update(sizes, cores)
     console.print("parts of a control step ...")
-    with Worker("breakdown", {cores[0]}, lanes=sizes.lanes, ticks=sizes.ticks) as worker:
+    rows, columns = sizes.block
+    with Worker("breakdown", {cores[0]}, rows=rows, columns=columns, ticks=sizes.ticks) as worker:
         worker.wait_ready()
         report["breakdown"] = _run(worker)
     report["batch_scaling"] = []

@@ -27,25 +27,25 @@ WHOLE = "control step"
 RUNS = 5  # of each part, of which the fastest counts: the others were disturbed
 
 
-def time_parts(lanes: int, ticks: int) -> Callable[[], list[dict]]:
-    """Compiles the parts; the function returned measures them.
+def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], list[dict]]:
+    """Compiles the parts for a block of rows x columns episodes; the function returned measures them.
 
-    Its rows: part, calls per control step, ns per episode and control step, share of the whole. "rest" is the whole less
+    Each line: part, calls per control step, ns per episode and control step, share of the whole. "rest" is the whole less
     the parts, and can be negative where a part alone costs more than in its place.
     """
-    config = TaskConfig()
-    loops = {name: (calls, *_compiled(step, start, ticks)) for name, (calls, step, start) in _parts(config, lanes).items()}
+    parts = _parts(TaskConfig(), rows, columns)
+    loops = {name: (calls, *_compiled(step, start, ticks)) for name, (calls, step, start) in parts.items()}
 
     def measure() -> list[dict]:
         nanoseconds = {}
         for name, (calls, run, start) in loops.items():
             fastest = min(_seconds(run, start) for _ in range(RUNS))
-            nanoseconds[name] = calls * fastest / ticks / lanes * 1e9
+            nanoseconds[name] = calls * fastest / ticks / (rows * columns) * 1e9
         whole = nanoseconds.pop(WHOLE)
-        rows = [{"part": name, "calls": loops[name][0], "ns": ns} for name, ns in nanoseconds.items()]
-        rows.append({"part": "rest", "calls": 1, "ns": whole - sum(nanoseconds.values())})
-        rows.append({"part": WHOLE, "calls": 1, "ns": whole})
-        return [row | {"share": row["ns"] / whole} for row in rows]
+        table = [{"part": name, "calls": loops[name][0], "ns": ns} for name, ns in nanoseconds.items()]
+        table.append({"part": "rest", "calls": 1, "ns": whole - sum(nanoseconds.values())})
+        table.append({"part": WHOLE, "calls": 1, "ns": whole})
+        return [row | {"share": row["ns"] / whole} for row in table]
 
     return measure
 
@@ -66,16 +66,16 @@ def _seconds(run, start) -> float:
     return time.perf_counter() - began
 
 
-def _parts(config: TaskConfig, lanes: int) -> dict[str, tuple[int, Callable, object]]:
+def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, Callable, object]]:
     """By name: calls per control step, a step (tick, state) -> state, its first state."""
-    simulator = Simulator(config)
+    simulator, lanes = Simulator(config), rows * columns
     task, timestep = simulator.task, 1.0 / config.sim_rate
     pool = sample_pool(jax.random.key(0), players.resolve("player3/M0"), ball_params(), 1024)
     episodes = jax.tree.map(
         lambda x: x.reshape(*x.shape[:-2], lanes) if x.ndim >= 2 else x,
-        simulator.draw(jax.random.key(1), pool, SimModel(), (), 1, lanes),
+        simulator.draw(jax.random.key(1), pool, SimModel(), (), rows, columns),
     )
-    theta = initial_theta(jax.random.key(2))[:, None] + 0.025 * jax.random.normal(jax.random.key(3), (976, lanes))
+    theta = jnp.stack([initial_theta(key) for key in jax.random.split(jax.random.key(2), columns)], axis=-1)
     controller = PolicyController(unflatten(theta), jnp.zeros(N_OBSERVATION), jnp.ones(N_OBSERVATION))
     delays, first = task.delays(episodes.latency), task.reset(episodes, controller)
     speeds = 0.1 * jax.random.normal(jax.random.key(4), (N_JOINTS, lanes))

@@ -170,14 +170,14 @@ def _paper_trainer(changes: list[str]):
     return trainer, trainer.init(jax.random.key(0))
 
 
-def breakdown(lanes: int, ticks: int) -> Side:
+def breakdown(rows: int, columns: int, ticks: int) -> Side:
     """The parts of a control step one by one; the work returns their times instead of an amount."""
     from mjx_tt import platform
 
     platform.configure(1)
     from benchmarks.breakdown import time_parts
 
-    return about_jax(), time_parts(lanes, ticks)
+    return about_jax(), time_parts(rows, columns, ticks)
 
 
 def about_jax() -> dict:

@@ -103,7 +103,8 @@ def summary(seconds: list[float]) -> dict[str, float]:
 
 def serve(request: str) -> None:
     """The process behind a ``Worker``. Only its answers go to standard output."""
-    answers, sys.stdout = sys.stdout, sys.stderr
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # some libraries greet from C
     order = json.loads(request)
     if order["cpus"] and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, order["cpus"])  # before anything starts threads

@@ -23,6 +23,7 @@ from robot_io.contract import JOINT_NAMES, JOINT_UNITS, LIMITS
 
 RETURNED_COLOUR, HIT_COLOUR, MISSED_COLOUR = "#1b7837", "#e08214", "#b2182b"
 TABLE_COLOUR, INK = "#e9eff7", "#303030"
+LANDING_FRAME = (-1.5, 1.5), (-1.45, 2.3)  # [m] x and y shown
 FEWEST_BALLS = 5  # in a cell whose rate is shown
 SMOOTHING = 25  # updates
 
@@ -62,17 +63,18 @@ def draw_training(path: Path, rows: list[dict[str, Any]], title: str) -> Path:
 
 def _landing_map(played: Played) -> Figure:
     result, report = played.result, played.report
-    figure, axes = plt.subplots(figsize=(5.6, 6.4))
+    figure, axes = plt.subplots(figsize=(5.8, 6.6))
     _table(axes)
     for outcome, colour, label in ((HIT, HIT_COLOUR, "touched, not returned"), (RETURNED, RETURNED_COLOUR, "returned")):
         chosen = (result.outcome == outcome) & result.finite
-        x, y = result.landing[:, chosen]
+        x, y = (np.clip(v, *frame) for v, frame in zip(result.landing[:, chosen], LANDING_FRAME))
         axes.scatter(x, y, s=9, color=colour, alpha=0.55, linewidth=0, label=f"{label} ({chosen.sum():,})")
     missed = int(np.sum(result.outcome == MISSED))
-    axes.set_xlim(-1.5, 1.5)
-    axes.set_ylim(-1.45, 2.3)
-    axes.set_title(f"Where the returns come down: {_rate(report)}\n{missed:,} of {report['episodes']:,} balls were not touched")
-    axes.legend(loc="upper left", markerscale=2)
+    axes.set_xlim(*LANDING_FRAME[0])
+    axes.set_ylim(*LANDING_FRAME[1])
+    axes.set_title(f"Where {report['episodes']:,} balls come down\n{_rate(report)}")
+    axes.legend(loc="upper left", markerscale=2, title=f"not touched ({missed:,})", title_fontsize=10, alignment="left")
+    axes.text(0.99, 0.98, "dots on the frame: beyond it", transform=axes.transAxes, ha="right", va="top", fontsize=8, color=INK)
     return figure
 
 
@@ -88,7 +90,8 @@ def _return_rate_map(played: Played) -> Figure:
     mesh = axes.pcolormesh(*edges, shown.T, cmap="RdYlGn", vmin=0, vmax=1, edgecolor="white", linewidth=0.6, zorder=2)
     for i, j in zip(*np.nonzero(count >= FEWEST_BALLS)):
         centre = (edges[0][i] + edges[0][i + 1]) / 2, (edges[1][j] + edges[1][j + 1]) / 2
-        axes.text(*centre, f"{100 * rate[i, j]:.0f}", ha="center", va="center", fontsize=7, color=INK, zorder=3)
+        colour = INK if 0.15 < rate[i, j] < 0.88 else "white"
+        axes.text(*centre, f"{100 * rate[i, j]:.0f}", ha="center", va="center", fontsize=7, color=colour, zorder=3)
     figure.colorbar(mesh, ax=axes, label="return rate", shrink=0.8, format=lambda v, _: f"{v:.0%}")
     axes.set_xlim(-0.95, 0.95)
     axes.set_ylim(-1.5, 0.15)
@@ -150,7 +153,11 @@ def _training(rows: list[dict[str, Any]], title: str) -> Figure:
     upper.grid(axis="y", alpha=0.25)
     upper.legend(loc="lower right")
     upper.set_title(title)
-    lower.plot(minutes, _smooth(rows, "mean_return"), color="#4575b4")
+    mean_return = _smooth(rows, "mean_return")
+    lower.plot(minutes, mean_return, color="#4575b4")
+    if np.isfinite(mean_return).any():  # the first, random policies would take all the room
+        bottom, top = np.nanpercentile(mean_return, (5, 100))
+        lower.set_ylim(bottom - 0.1, top + 0.1)
     lower.grid(axis="y", alpha=0.25)
     lower.set_ylabel("mean return")
     lower.set_xlabel("training time [min]")
@@ -173,14 +180,14 @@ def _table(axes: Axes) -> None:
     axes.add_patch(Rectangle((-width / 2, -length / 2), width, length, facecolor=TABLE_COLOUR, edgecolor=INK, zorder=0))
     axes.plot([0, 0], [-length / 2, length / 2], color="white", linewidth=1.5, zorder=1)
     reach = width / 2 + c.NET_OVERHANG
-    axes.plot([-reach, reach], [0, 0], color=INK, linewidth=2.5, zorder=1)
+    axes.plot([-reach, reach], [0, 0], color=INK, linewidth=2.5, zorder=3)
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m], robot below, human above")
 
 
 def _rate(report: dict[str, Any]) -> str:
-    return f"{report['return_rate']:.1%} returned ({report['low']:.1%} to {report['high']:.1%})"
+    return f"{report['return_rate']:.1%} returned (95 % interval {report['low']:.1%} to {report['high']:.1%})"
 
 
 def _save(path: Path, figure: Figure) -> Path:

@@ -172,7 +172,7 @@ def from_dict(data, where: str) -> ModelFile:
     if not isinstance(data, dict):
         raise ValueError(f"{where}: a model is a mapping of parameter groups, got {type(data).__name__}")
     data = dict(data)
-    ranges, provenance = data.pop("randomise", None) or {}, data.pop("provenance", None) or {}
+    ranges, provenance = (_mapping(data.pop(key, None), f"{where}: {key}") for key in ("randomise", "provenance"))
     known = paths()
     values = {}
     for path, value in _flatten(data, where, known):
@@ -185,7 +185,7 @@ def from_dict(data, where: str) -> ModelFile:
     parsed = []
     for path, bounds in ranges.items():
         if path not in known or isinstance(known[path], str):
-            raise ValueError(f"{where}: randomise.{path}: unknown parameter{nearest(path, known)}")
+            raise ValueError(f"{where}: randomise.{path}: unknown parameter{nearest(str(path), known)}")
         if not isinstance(bounds, list | tuple) or len(bounds) != 2:
             raise ValueError(f"{where}: randomise.{path} = {bounds!r}, a range is [low, high]")
         low, high = (_number(b, f"{where}: randomise.{path}") for b in bounds)
@@ -218,8 +218,16 @@ def _flatten(data: dict, where: str, known, prefix: str = ""):
             yield from _flatten(value, where, known, f"{path}.")
         elif path in known:
             yield path, value
+        elif any(name.startswith(f"{path}.") for name in known):
+            raise ValueError(f"{where}: {path} = {value!r}, a mapping of its parameters is needed")
         else:
             raise ValueError(f"{where}: unknown parameter {path!r}{nearest(path, known)}")
+
+
+def _mapping(value, where: str) -> dict:
+    if value is not None and not isinstance(value, dict):
+        raise ValueError(f"{where} = {value!r}, a mapping is needed")
+    return value or {}
 
 
 def _number(value, where: str) -> float:

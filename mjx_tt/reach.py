@@ -8,7 +8,7 @@ still be returned by a better motion, so the rate is a lower bound on the best, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import jax
@@ -17,12 +17,12 @@ import numpy as np
 
 from ballmodel.pool import BallPool
 from mjx_tt.model import SimModel
-from mjx_tt.rollout import Simulator
+from mjx_tt.rollout import AXIS, Simulator
 from mjx_tt.task import RETURNED
 from robot_io.contract import N_JOINTS, N_OBSERVATION
 
 KNOTS = 5
-HORIZON = 1.0  # [s] after the ball's arrival at the table's end within which a motion may act
+LONGEST = 1.5  # [s] after which a motion repeats its last knot
 CANDIDATES = 128  # motions per ball and iteration
 ELITES = 12
 ITERATIONS = 50
@@ -71,12 +71,10 @@ def reachable(simulator: Simulator, pool: BallPool, model: SimModel, key, balls:
 
 def _search(simulator: Simulator, balls: int, model: SimModel, key, pool: BallPool):
     draw_key, search_key = jax.random.split(key)
-    from dataclasses import replace
-
     quiet = replace(model, sensing=replace(model.sensing, ball_noise=0.0))
     episodes = simulator.local(simulator.draw(draw_key, pool, quiet, (), 1, balls))
     mine = episodes.seed.shape[-1]
-    search_key = jax.random.fold_in(search_key, jax.lax.axis_index("perturbation"))
+    search_key = jax.random.fold_in(search_key, jax.lax.axis_index(AXIS))
 
     def spread(x):  # (..., 1, balls) -> (..., 1, CANDIDATES x balls)
         return jnp.tile(x, CANDIDATES) if x.ndim >= 2 else x
@@ -84,11 +82,15 @@ def _search(simulator: Simulator, balls: int, model: SimModel, key, pool: BallPo
     many = jax.tree.map(spread, episodes)
     # The ball's speed along the table tells when it is there: 1.4 covers drag and the bounce.
     flight_time = 1.4 * (episodes.ball.position[1] + 1.8) / -episodes.ball.velocity[1]
-    duration = jnp.minimum(flight_time[0] + 0.1, HORIZON + 0.5)
+    duration = jnp.minimum(flight_time[0] + 0.1, LONGEST)
 
-    def iterate(carry, key):
-        mean, std, best_return, solved = carry
-        noise = jax.random.normal(key, (KNOTS, N_JOINTS, CANDIDATES, mine))
+    def searching(carry):
+        iteration, _, _, solved = carry
+        return (iteration < ITERATIONS) & ~jnp.all(solved)
+
+    def iterate(carry):
+        iteration, mean, std, solved = carry
+        noise = jax.random.normal(jax.random.fold_in(search_key, iteration), (KNOTS, N_JOINTS, CANDIDATES, mine))
         knots = mean[:, :, None] + std[:, :, None] * noise
         knots = jnp.clip(knots, -1.0, 1.0).at[:, :, 0].set(mean)
         controller = MotionController(
@@ -101,11 +103,9 @@ def _search(simulator: Simulator, balls: int, model: SimModel, key, pool: BallPo
         _, elite = jax.lax.top_k(score.T, ELITES)  # (mine, ELITES)
         chosen = jnp.take_along_axis(knots, elite.T[None, None], axis=2)
         mean, std = chosen.mean(axis=2), chosen.std(axis=2) + 0.02
-        return (mean, std, jnp.maximum(best_return, score.max(axis=0)), solved | returned.any(axis=0)), None
+        return iteration + 1, mean, std, solved | returned.any(axis=0)
 
-    start = (
-        jnp.zeros((KNOTS, N_JOINTS, mine)), jnp.full((KNOTS, N_JOINTS, mine), FIRST_STD),
-        jnp.full(mine, -jnp.inf), jnp.zeros(mine, bool),
-    )  # fmt: skip
-    (_, _, _, solved), _ = jax.lax.scan(iterate, start, jax.random.split(search_key, ITERATIONS))
-    return jax.lax.all_gather(solved, "perturbation", tiled=True)
+    knots = (KNOTS, N_JOINTS, mine)
+    start = (jnp.int32(0), jnp.zeros(knots), jnp.full(knots, FIRST_STD), jnp.zeros(mine, bool))
+    *_, solved = jax.lax.while_loop(searching, iterate, start)
+    return jax.lax.all_gather(solved, AXIS, tiled=True)

@@ -1,0 +1,117 @@
+"""The simulation model: YAML there and back, drawing per episode, and errors that name what is wrong."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+import yaml
+from scipy import stats
+
+from mjx_tt import model
+from mjx_tt.model import LATENCIES, LatencyParams, ModelFile, Range, SimModel
+
+
+def test_yaml_keeps_every_parameter(tmp_path):
+    """Every leaf gets its own value, so none can be lost or swapped."""
+    values = {path: 0.001 * i + 0.1 for i, path in enumerate(model.paths()) if not path.endswith("integrator")}
+    values["ball.flight.integrator"] = "midpoint"
+    ranges = (Range("ball.table.restitution", 0.85, 0.95), Range("latency.abb_action", 0.06, 0.08))
+    file = ModelFile(model.with_values(SimModel(), values), ranges, {"source": "diagnosis of session 3", "gain": 0.12})
+    model.save(tmp_path / "a.yaml", file)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.yaml"]
+    read = model.load(tmp_path / "a.yaml")
+    assert read == file
+    assert model.paths(read.model) == values
+    assert len(values) > 40 and len(set(values.values())) == len(values)
+
+
+def test_what_is_left_out_is_nominal(tmp_path):
+    (tmp_path / "a.yaml").write_text("ball: {table: {restitution: 0.9}}\nsensing:\n  ball_offset_x: 0.01\n")
+    read = model.load(tmp_path / "a.yaml")
+    expected = model.paths() | {"ball.table.restitution": 0.9, "sensing.ball_offset_x": 0.01}
+    assert model.paths(read.model) == expected
+    assert read.randomise == () and read.provenance == {}
+    (tmp_path / "empty.yaml").write_text("")
+    assert model.load(tmp_path / "empty.yaml").model == SimModel()
+
+
+def test_nominal_latencies_are_the_papers():
+    """Means and deviations in ms of the paper's table: ball, ABB and Festo observation, ABB and Festo action."""
+    nominal = LatencyParams()
+    means = [getattr(nominal, name) * 1e3 for name in LATENCIES]
+    deviations = [getattr(nominal, f"{name}_std") * 1e3 for name in LATENCIES]
+    np.testing.assert_allclose(means, [40, 29, 33, 71, 64.5])
+    np.testing.assert_allclose(deviations, [8.2, 8.2, 9.0, 5.7, 11.5])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("ball: {table: {restituton: 0.9}}", r"unknown parameter 'ball.table.restituton'; did you mean 'ball.table.restitution'\?"),
+        ("zzz: 1", "unknown parameter 'zzz'; known are .*ball.flight.drag_coefficient"),
+        ("ball: {table: {restitution: high}}", "ball.table.restitution = 'high', a finite number is needed"),
+        ("ball: {table: {restitution: .nan}}", "ball.table.restitution = nan, a finite number is needed"),
+        ("ball: {table: {restitution: true}}", "ball.table.restitution = True, a finite number is needed"),
+        ("ball: {flight: {integrator: rk4}}", r"ball.flight.integrator = 'rk4', allowed are \('paper', 'midpoint'\)"),
+        ("ball: {flight: {integrator: [paper]}}", "ball.flight.integrator = .*allowed are"),
+        ("ball: 3", "ball = 3, a mapping of its parameters is needed"),
+        ("[1, 2]", "a model is a mapping of parameter groups, got list"),
+        ("ball: [", "not valid YAML"),
+        ("1: {}\n2: 3", "unknown parameter '2'"),
+        ("randomise: {ball.table.restitution: 0.9}", r"randomise.ball.table.restitution = 0.9, a range is \[low, high\]"),
+        ("randomise: {ball.table.restitution: [0.9, 0.8]}", "low must not exceed high"),
+        ("randomise: {ball.table.friktion: [0.1, 0.2]}", r"randomise.ball.table.friktion: unknown .* 'ball.table.friction'\?"),
+        ("randomise: {ball.flight.integrator: [0, 1]}", "randomise.ball.flight.integrator: unknown parameter"),
+        ("randomise: [1]", r"randomise = \[1\], a mapping is needed"),
+        ("randomise: {1: [0, 1]}", "randomise.1: unknown parameter"),
+        ("provenance: hello", "provenance = 'hello', a mapping is needed"),
+    ],
+)
+def test_mistakes_are_named_with_file_and_key(tmp_path, text, message):
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as error:
+        model.load(path)
+    assert str(error.value).startswith(str(path))
+
+
+def test_an_unknown_path_is_refused():
+    with pytest.raises(ValueError, match=r"'ball.table.restitutio'; did you mean 'ball.table.restitution'\?"):
+        model.with_values(SimModel(), {"ball.table.restitutio": 0.9})
+
+
+def test_ranges_are_drawn_uniformly_and_apart():
+    ranges = (Range("ball.table.restitution", 0.85, 0.95), Range("sensing.ball_offset_x", -0.01, 0.01))
+    drawn = model.draw(jax.random.key(0), SimModel(), ranges, (50, 40))
+    restitution, offset = np.asarray(drawn.ball.table.restitution), np.asarray(drawn.sensing.ball_offset_x)
+    assert restitution.shape == offset.shape == (50, 40)
+    assert stats.kstest(restitution.ravel(), "uniform", (0.85, 0.1)).pvalue > 1e-3
+    assert stats.kstest(offset.ravel(), "uniform", (-0.01, 0.02)).pvalue > 1e-3
+    assert abs(np.corrcoef(restitution.ravel(), offset.ravel())[0, 1]) < 4.5 / np.sqrt(2000)
+    untouched = model.paths() | {"ball.table.restitution": None, "sensing.ball_offset_x": None}
+    assert {k: None if np.ndim(v) else v for k, v in model.paths(drawn).items()} == untouched
+
+
+def test_latencies_are_gaussian_in_seconds_and_cut():
+    nominal = LatencyParams()
+    seconds = np.asarray(model.draw_latencies(jax.random.key(1), nominal, (4000,), 1.0))
+    assert seconds.shape == (5, 4000)
+    for name, values in zip(LATENCIES, seconds):
+        gaussian = stats.norm(getattr(nominal, name), getattr(nominal, f"{name}_std"))
+        assert stats.kstest(values, gaussian.cdf).pvalue > 1e-3
+    assert np.abs(np.corrcoef(seconds) - np.eye(5)).max() < 4.5 / np.sqrt(4000)
+    cut = np.asarray(model.draw_latencies(jax.random.key(1), nominal, (4000,), 0.05))
+    np.testing.assert_array_equal(cut, np.clip(seconds, 0, np.float32(0.05)))
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    """The new content goes to another name first: a write that fails half way destroys nothing."""
+    path = tmp_path / "a.yaml"
+    model.save(path, ModelFile(SimModel()))
+    before = path.read_text()
+    (tmp_path / "a.yaml.tmp").mkdir()  # where the temporary file would go
+    with pytest.raises(OSError):
+        model.save(path, ModelFile(SimModel(), provenance={"new": True}))
+    assert path.read_text() == before
+    assert yaml.safe_load(before)["provenance"] == {}
