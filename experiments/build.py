@@ -49,7 +49,9 @@ def experiment(config: Config, where: str) -> Experiment:
     model_data = _mapping(config.model, f"{where}: model")
     model = checked(f"{where}: model", models.from_dict, model_data, "model")
     if config.initial_policy is not None and not Path(config.initial_policy).is_dir():
-        raise ConfigError(f"{where}: initial_policy: {config.initial_policy} is no folder; allowed: a run or an artefact")
+        raise ConfigError(
+            f"{where}: initial_policy: {config.initial_policy} is no folder; allowed: a run or an artefact"
+        )
     named = isinstance(config.balls, str) and config.balls in players.names()
     alone = config.model_copy(update={"balls": config.balls if named else balls.to_dict(), "model": model_data})
     return Experiment(

@@ -18,7 +18,9 @@ The usual way:
   mjx-tt evaluate runs/quickstart       play it again, on other balls if you like
   mjx-tt fit-human rallies.csv --out anna.yaml     a distribution of your own, for an experiment's key "balls"
 """
-SHIPPED_HINT = "\nA file name without a folder that is not in the current folder is looked up among the shipped experiments.\n"
+SHIPPED_HINT = (
+    "\nA file name without a folder that is not in the current folder is looked up among the shipped experiments.\n"
+)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -39,6 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
 def train(options: argparse.Namespace) -> int:
     from experiments import config
 
+    if options.select and not options.seeds:
+        raise ConfigError("--select chooses among seeds: give them with --seeds, such as --seeds 0,1,2")
+
     configs = [(str(path), config.load(path, tuple(options.set))) for path in map(_experiment, options.experiments)]
     _start_jax(options.devices or _most_devices(configs))
     from rich.console import Console
@@ -48,7 +53,7 @@ def train(options: argparse.Namespace) -> int:
     console = Console()
     planned = jobs.plan(configs, options.seeds, Path(options.out))
     ok = jobs.run_all(planned, console)
-    if options.select:
+    if options.select and ok:
         for name in dict.fromkeys(job.config.name for job in planned):
             mine = [job for job in planned if job.config.name == name]
             jobs.select(Path(options.out) / name, mine, console)
@@ -159,7 +164,9 @@ def balls(options: argparse.Namespace) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("mjx-tt", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        "mjx-tt", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
     p = _command(commands, "train", train, "train experiments, evaluate them and export their policies", """\
@@ -188,7 +195,9 @@ Without --out, a run on its own balls and model writes into its own folder; anyt
     _add_policy(p)
     p.add_argument("--episodes", type=_count, metavar="N", help="balls to play (default: the experiment's)")
     p.add_argument("--seed", type=int, metavar="K", help="another seed means other balls")
-    p.add_argument("--no-reachable", action="store_true", help="skip the minute that the bound on what is in reach takes")
+    p.add_argument(
+        "--no-reachable", action="store_true", help="skip the minute that the bound on what is in reach takes"
+    )
     p.add_argument("--out", metavar="FOLDER", help="for evaluation.json and plots/")
     _add_devices(p)
 
@@ -210,7 +219,9 @@ Then write "balls: anna.yaml" in an experiment.
     p.add_argument("data", nargs="+", metavar="DATA", help=".csv, .mcap, .json (DeepMind) or .hdf5 (AIMY launcher)")
     p.add_argument("--out", required=True, metavar="YAML")
     p.add_argument("--name", default="", help="of the distribution (default: the name of the file written)")
-    p.add_argument("--eps", type=float, metavar="R", help="radius of DBSCAN in robust standard deviations (default: from the data)")
+    p.add_argument(
+        "--eps", type=float, metavar="R", help="radius of DBSCAN in robust standard deviations (default: from the data)"
+    )
     p.add_argument("--min-samples", type=_count, default=5, metavar="N", help="balls that make a cluster (default: 5)")
     _add_format(p)
 
@@ -250,7 +261,9 @@ and as the first line of a YAML:
 
 def _command(commands, name: str, function, summary: str, examples: str) -> argparse.ArgumentParser:
     raw = argparse.RawDescriptionHelpFormatter
-    p = commands.add_parser(name, help=summary, description=summary, epilog=f"examples:\n{examples}", formatter_class=raw)
+    p = commands.add_parser(
+        name, help=summary, description=summary, epilog=f"examples:\n{examples}", formatter_class=raw
+    )
     p.set_defaults(command=function)
     return p
 
@@ -278,7 +291,9 @@ def _count(text: str) -> int:
 def _seeds(text: str) -> tuple[int, ...]:
     parts = text.split(",")
     if not all(part.strip().isdigit() for part in parts) or len(set(map(int, parts))) < len(parts):
-        raise argparse.ArgumentTypeError(f"{text!r}: different whole numbers separated by commas are needed, such as 0,1,2")
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: different whole numbers separated by commas are needed, such as 0,1,2"
+        )
     return tuple(map(int, parts))
 
 
@@ -321,7 +336,9 @@ def _evaluation_folder(options: argparse.Namespace) -> Path:
     from experiments.runs import CONFIG
 
     policy = Path(options.policy)
-    changed = [Path(text).with_suffix("").as_posix().replace("/", "-") for text in (options.balls, options.model) if text]
+    changed = [
+        Path(text).with_suffix("").as_posix().replace("/", "-") for text in (options.balls, options.model) if text
+    ]
     if changed and (policy / CONFIG).exists():
         return policy / f"evaluation-{'-'.join(changed)}"
     if (policy / CONFIG).exists():

@@ -1,7 +1,7 @@
 """The typed experiment YAML: what may stand in it, what is left out means, and errors that say what to change.
 
-Needs neither JAX nor NumPy, so that a mistake in a file is reported at once. Names and files that a configuration refers
-to are looked up by ``experiments.build``.
+Needs neither JAX nor NumPy, so that a mistake in a file is reported at once. Names and files that a configuration
+refers to are looked up by ``experiments.build``.
 """
 
 from __future__ import annotations
@@ -73,9 +73,9 @@ class Cosine(Section):
     """The learning rate holds, then falls along half a cosine until the last update."""
 
     kind: Literal["cosine"]
-    final: Positive = 0.001
+    final: Positive = 0.0005
     """Learning rate after the last update."""
-    hold: Annotated[float, Field(ge=0, lt=1)] = 0.3
+    hold: Annotated[float, Field(ge=0, lt=1)] = 0.1
     """Share of the updates before the fall."""
 
 
@@ -104,7 +104,7 @@ class Step(Section):
     """From a gradient estimate to a change of the parameters."""
 
     kind: Literal["adam", "sgd"] = "adam"
-    learning_rate: Positive = 0.02
+    learning_rate: Positive = 0.015
     b1: Decay = 0.9
     """Adam's decay of the first moment; sgd does not use it."""
     b2: Decay = 0.99

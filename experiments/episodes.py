@@ -34,7 +34,7 @@ def replay(experiment: Experiment, policy: Policy, count: int, seed: int) -> lis
 def draw(path: Path, episodes: list[tuple[np.ndarray, np.ndarray]], rate: float, camera: str = "side") -> Path:
     """Writes a picture (.png) of the first episode's moment of contact, or a video (.mp4, .gif) of all in real time.
 
-    rate: control rate [Hz] of the episodes. Raises ValueError for another suffix or camera, RuntimeError without OpenGL.
+    rate: control rate [Hz]. Raises ValueError for a wrong suffix or camera, RuntimeError without OpenGL.
     """
     if path.suffix == ".png":
         qpos, ball = episodes[0]

@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import PartitionSpec
 
 from ballmodel.pool import BallPool
 from experiments import build
@@ -17,9 +16,8 @@ from experiments.build import Experiment
 from experiments.policy import Policy
 from experiments.training import EVALUATION_COLUMNS
 from mjx_tt import reach, rewards
-from mjx_tt.model import ModelFile
 from mjx_tt.rollout import RESULT_SPECS, RolloutResult, Simulator
-from mjx_tt.task import HIT, MISSED, RETURNED, Episodes
+from mjx_tt.task import HIT, MISSED, RETURNED
 
 CONFIDENCE_Z = 1.959963984540054  # normal quantile of a two-sided 95 % interval
 OUTCOMES = {"missed": MISSED, "hit": HIT, "returned": RETURNED}
@@ -35,26 +33,35 @@ class Rate:
 
 
 class Evaluator:
-    """Plays one policy at a time on a fixed set of episodes, compiled once.
+    """Plays one policy at a time on a fixed set of balls, each of them once; compiled once.
 
-    The number of episodes is rounded up to whole rows of up to ``EVALUATION_COLUMNS`` played side by side.
+    balls     the pool: ``episodes`` balls or more, up to whole rows of at most ``EVALUATION_COLUMNS`` side by side
+    incoming  (2, R, P) [m] where the ball of each episode bounces on the robot's side
+
+    Drawing every ball once keeps the episodes independent, which their interval relies on.
     """
 
-    def __init__(self, simulator: Simulator, balls: BallPool, model: ModelFile, episodes: int) -> None:
+    def __init__(self, simulator: Simulator, experiment: Experiment, episodes: int, balls_key) -> None:
         columns = -(-min(EVALUATION_COLUMNS, episodes) // simulator.devices) * simulator.devices
         rows = -(-episodes // columns)
+        self.balls = build.pool(experiment, balls_key, rows * columns)
+        # Balls of similar arrival in one row: rows run together until their last episode ends.
+        order = np.argsort(np.asarray(self.balls.arrival)).reshape(rows, columns)
+        self.incoming = np.asarray(self.balls.landing)[:, order]
+        thrown = jax.tree.map(lambda x: x[:, order], self.balls.state)
+        model = experiment.model
 
-        def play(theta, mean, inverse_scale, key, balls):
-            drawn = simulator.draw(key, balls, model.model, model.randomise, rows, columns)
+        def play(theta, mean, inverse_scale, key, pool, thrown):
+            drawn = simulator.draw(key, pool, model.model, model.randomise, rows, columns)
             copies = jnp.repeat(theta[:, None], columns // simulator.devices, axis=1)
-            return simulator.rollout(copies, mean, inverse_scale, simulator.local(drawn)), drawn
+            return simulator.rollout(copies, mean, inverse_scale, simulator.local(replace(drawn, ball=thrown)))
 
-        self._balls = balls
-        self._play = jax.jit(simulator.on_devices(play, out_specs=(RESULT_SPECS, PartitionSpec())))
+        spread = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
+        self._play = lambda *policy_and_key: spread(*policy_and_key, self.balls, thrown)
 
-    def play(self, theta, mean, inverse_scale, key) -> tuple[RolloutResult, Episodes]:
-        """theta (976,), frozen normaliser (11,), (11,); results and episodes as NumPy arrays (..., R, P)."""
-        return jax.tree.map(np.asarray, self._play(theta, mean, inverse_scale, key, self._balls))
+    def play(self, theta, mean, inverse_scale, key) -> RolloutResult:
+        """theta (976,), frozen normaliser (11,), (11,), key of latencies and noise; arrays are NumPy, (..., R, P)."""
+        return jax.tree.map(np.asarray, self._play(theta, mean, inverse_scale, key))
 
 
 @dataclass(frozen=True)
@@ -76,23 +83,17 @@ def evaluate(
 ) -> Played:
     """Plays the policy on at least ``episodes`` balls that training has not seen.
 
-    reachable_balls: on how many of these balls to seek a lower bound of the return rate that is in reach; None: no bound.
+    reachable_balls: on how many of the balls to seek a lower bound of the return rate in reach; None: no bound.
     """
     config = experiment.config
     task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
     simulator = Simulator(task, len(jax.devices()))
-    balls = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), episodes)
+    evaluator = Evaluator(simulator, experiment, episodes, build.key(seed, build.EVALUATION_BALLS))
     key = build.key(seed, build.EVALUATION_EPISODES)
-    result, drawn = Evaluator(simulator, balls, experiment.model, episodes).play(
-        policy.theta, policy.mean, policy.inverse_scale, key
-    )
-    index = {position.tobytes(): i for i, position in enumerate(np.asarray(balls.state.position).T)}
-    starts = drawn.ball.position.reshape(3, -1).T
-    order = [index[np.ascontiguousarray(start).tobytes()] for start in starts]
-    incoming = np.asarray(balls.landing)[:, order].reshape(2, *result.outcome.shape)
+    result = evaluator.play(policy.theta, policy.mean, policy.inverse_scale, key)
     conditions = {
         "balls": experiment.distribution.to_dict(),
-        "acceptance": float(balls.acceptance),
+        "acceptance": float(evaluator.balls.acceptance),
         "engine": task.engine,
         "sim_rate": task.sim_rate,
         "randomise": {r.path: [r.low, r.high] for r in experiment.model.randomise},
@@ -101,8 +102,10 @@ def evaluate(
         "update": policy.notes.get("update"),
         "training_seconds": policy.notes.get("seconds"),
     }
-    reachable = None if reachable_balls is None else _reachable(experiment, simulator, balls, key, reachable_balls)
-    return Played(summary(result) | {"reachable": reachable} | conditions, result, incoming)
+    reachable = None
+    if reachable_balls is not None:
+        reachable = _reachable(experiment, simulator, evaluator.balls, key, reachable_balls)
+    return Played(summary(result) | {"reachable": reachable} | conditions, result, evaluator.incoming)
 
 
 def _reachable(experiment: Experiment, simulator: Simulator, balls: BallPool, key, count: int) -> dict[str, Any]:
@@ -127,7 +130,9 @@ def summary(result: RolloutResult) -> dict[str, Any]:
         "outcomes": counts,
         "non_finite": int(np.sum(~finite)),
         "mean_return": float(result.returns[finite].mean()) if some else None,
-        "terms": {name: float(result.terms[i][finite].mean()) if some else None for i, name in enumerate(rewards.TERMS)},
+        "terms": {
+            name: float(result.terms[i][finite].mean()) if some else None for i, name in enumerate(rewards.TERMS)
+        },
     }
 
 
@@ -144,7 +149,9 @@ def wilson(successes: int, trials: int, z: float = CONFIDENCE_Z) -> tuple[float,
     Raises ValueError without trials or with more successes than trials.
     """
     if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(f"{successes} successes in {trials} trials; at least one trial and no more successes are allowed")
+        raise ValueError(
+            f"{successes} successes in {trials} trials; at least one trial and no more successes are allowed"
+        )
     share, spread = successes / trials, z * z / trials
     centre = (share + spread / 2) / (1 + spread)
     half = z * math.sqrt(share * (1 - share) / trials + spread / (4 * trials)) / (1 + spread)

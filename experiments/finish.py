@@ -21,13 +21,11 @@ EPISODES_SHOWN = 2
 def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]:
     """Evaluates, draws and exports the run's policy; evaluation.json, written last, marks the run as done.
 
-    Returns the report. Raises ArtefactError when the exported forms of the policy disagree, OSError when the disk refuses.
+    Returns the report. Raises ArtefactError when the policy's exported forms disagree, OSError when the disk refuses.
     """
     trained, evaluation = policy.load(run.folder), experiment.config.evaluation
     console.print(f"{run.folder}: evaluating on {evaluation.episodes:,} fresh balls ...", highlight=False)
-    played = evaluate.evaluate(
-        experiment, trained, evaluation.episodes, evaluation.seed, evaluation.reachable_balls
-    )
+    played = evaluate.evaluate(experiment, trained, evaluation.episodes, evaluation.seed, evaluation.reachable_balls)
     pictures = plots.draw_evaluation(run.plots, played, experiment.task.reward_weights)
     title = f"{experiment.config.name}: training on {experiment.distribution.name}"
     pictures.append(plots.draw_training(run.plots / "training.png", metrics.read(run.metrics), title))
@@ -88,7 +86,9 @@ def print_report(console: Console, report: dict[str, Any], title: str) -> None:
     table.add_row("return rate", rate, style="bold")
     if report["reachable"] is not None:
         bound = report["reachable"]
-        text = f"{bound['return_rate']:.1%}  ({bound['balls']} balls, interval {bound['low']:.1%} to {bound['high']:.1%})"
+        text = (
+            f"{bound['return_rate']:.1%}  ({bound['balls']} balls, interval {bound['low']:.1%} to {bound['high']:.1%})"
+        )
         table.add_row("reachable, at least", text)
     table.add_row("hit rate", f"{report['hit_rate']:.1%}")
     counts = ", ".join(f"{count:,} {name}" for name, count in report["outcomes"].items())

@@ -36,16 +36,18 @@ def plan(configs: list[tuple[str, Config]], seeds: tuple[int, ...], out: Path) -
     owners: dict[str, str] = {}
     for where, config in configs:
         if config.name in owners:
-            raise ConfigError(f"{where}: name: {config.name!r} is also the name of {owners[config.name]}; give it another")
+            raise ConfigError(
+                f"{where}: name: {config.name!r} is also the name of {owners[config.name]}; give it another"
+            )
         owners[config.name] = where
     jobs = []
     for where, config in configs:
-        for seed in seeds or (None,):
-            folder = out / config.name
-            if seed is not None:
-                training = config.training.model_copy(update={"seed": seed})
-                config, folder = config.model_copy(update={"training": training}), folder / f"seed{seed}"
+        folder = out / config.name
+        if not seeds:
             jobs.append(Job(config, Run(folder), where))
+        for seed in seeds:
+            seeded = config.training.model_copy(update={"seed": seed})
+            jobs.append(Job(config.model_copy(update={"training": seeded}), Run(folder / f"seed{seed}"), where))
     return jobs
 
 
@@ -79,9 +81,16 @@ def select(folder: Path, jobs: list[Job], console: Console) -> None:
         played = evaluate.evaluate(experiment, trained, SELECTION_EPISODES, job.config.evaluation.seed + 1)
         scores[job.run.folder.name] = evaluate.selection_score(played.result)
     best = max(scores, key=scores.get)
-    selection = {"episodes": SELECTION_EPISODES, "reward": {"hit": 1, "landed": 1, "fault": -2}, "scores": scores, "best": best}
+    selection = {
+        "episodes": SELECTION_EPISODES,
+        "reward": {"hit": 1, "landed": 1, "fault": -2},
+        "scores": scores,
+        "best": best,
+    }
     runs.write_json(folder / "selection.json", selection)
-    console.print(f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)", highlight=False)
+    console.print(
+        f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)", highlight=False
+    )
 
 
 def _run(job: Job, console: Console) -> str:

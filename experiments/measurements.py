@@ -28,11 +28,15 @@ def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
         return Dataset(tuple(trajectory for part in parts for trajectory in part), source)
     if len(parts) == 1:
         return parts[0]
-    kinds = ", ".join(f"{path}: {'trajectories' if isinstance(p, Dataset) else 'states'}" for path, p in zip(paths, parts))
+    kinds = ", ".join(
+        f"{path}: {'trajectories' if isinstance(p, Dataset) else 'states'}" for path, p in zip(paths, parts)
+    )
     raise ConfigError(f"several files must all hold trajectories ({kinds}); fit the others one by one")
 
 
-def fit(paths: list[str], format: str | None, out: Path, name: str, eps: float | None, min_samples: int, console: Console) -> None:
+def fit(
+    paths: list[str], format: str | None, out: Path, name: str, eps: float | None, min_samples: int, console: Console
+) -> None:
     """Fits a distribution, writes its YAML and prints its 16 numbers beside those of the paper's players."""
     measured = read_all(paths, format)
     distribution, report = checked("", fit_human, measured, ball_params(), eps, min_samples, name or out.stem)
@@ -44,7 +48,7 @@ def fit(paths: list[str], format: str | None, out: Path, name: str, eps: float |
 
 
 def convert(path: str, format: str | None, out: Path, console: Console) -> None:
-    """Writes trajectories as .csv or .mcap. Raises ConfigError for another suffix or for a file without trajectories."""
+    """Writes trajectories as .csv or .mcap. Raises ConfigError for another suffix or without trajectories."""
     data = checked("", read, path, format)
     if not isinstance(data, Dataset):
         raise ConfigError(f"{path}: holds start states, not trajectories; mjx-tt fit-human takes it as it is")
@@ -69,7 +73,9 @@ def write_csv(path: Path, dataset: Dataset) -> None:
 def print_catalogue(console: Console) -> None:
     """The paper's distributions with their 16 numbers, and the players' skill."""
     _print_numbers(None, console, players.names())
-    table = Table("player", "level", "mean rally", "std", "min", "max", title="Skill (hits per rally)", title_justify="left")
+    table = Table(
+        "player", "level", "mean rally", "std", "min", "max", title="Skill (hits per rally)", title_justify="left"
+    )
     for player in sorted({name.split("/")[0] for name in players.names() if "/" in name}):
         skill = players.skill(player)
         table.add_row(player, skill.level, *(f"{v:g}" for v in (skill.mean, skill.std, skill.min, skill.max)))
@@ -77,7 +83,9 @@ def print_catalogue(console: Console) -> None:
 
 
 def _print_report(report: HumanReport, console: Console) -> None:
-    console.print(f"{report.measured:,} balls measured, {report.too_short} too short, {report.elsewhere} not towards the robot")
+    console.print(
+        f"{report.measured:,} balls measured, {report.too_short} too short, {report.elsewhere} not towards the robot"
+    )
     for outcome, count in report.outcomes.items():
         if count:
             console.print(f"  {count:,} {outcome}", highlight=False)
@@ -86,15 +94,25 @@ def _print_report(report: HumanReport, console: Console) -> None:
         console.print(f"residual of the fitted flights: {middle} mm in the median, {low} to {high} mm in 90 % of them")
     outliers = report.outliers
     count = int(outliers.outlier.sum())
-    console.print(f"{count} of {outliers.n} left out as outliers (DBSCAN, eps {outliers.eps:.3g}, min_samples {outliers.min_samples})")
+    console.print(
+        f"{count} of {outliers.n} left out as outliers "
+        f"(DBSCAN, eps {outliers.eps:.3g}, min_samples {outliers.min_samples})"
+    )
 
 
-def _print_numbers(distribution: BallDistribution | None, console: Console, names: tuple[str, ...] | None = None) -> None:
+def _print_numbers(
+    distribution: BallDistribution | None, console: Console, names: tuple[str, ...] | None = None
+) -> None:
     shown = [] if distribution is None else [(distribution.name, distribution)]
     chosen = names if names is not None else tuple(n for n in players.names() if n.endswith("/M2"))
     shown += [(name, players.load(name)) for name in chosen]
     columns = [f"{part[0]}{axis}" for part, axes in AXES.items() for axis in axes]
-    table = Table("balls", *columns, title="Start position p [m], velocity v [m/s], landing point l [m]: min ... max", title_justify="left")
+    table = Table(
+        "balls",
+        *columns,
+        title="Start position p [m], velocity v [m/s], landing point l [m]: min ... max",
+        title_justify="left",
+    )
     for name, each in shown:
         pairs = [
             f"{low:.2f}\n{high:.2f}"

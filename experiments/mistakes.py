@@ -26,7 +26,7 @@ def lines(error: ValidationError, model: type[BaseModel]) -> list[str]:
 
 
 def nearest(name: str, known) -> str:
-    """"did you mean 'x'? " or nothing."""
+    """ "did you mean 'x'? " or nothing."""
     close = difflib.get_close_matches(name, list(known), 1)
     return f"did you mean {close[0]!r}? " if close else ""
 

@@ -74,7 +74,16 @@ def _landing_map(played: Played) -> Figure:
     axes.set_ylim(*LANDING_FRAME[1])
     axes.set_title(f"Where {report['episodes']:,} balls come down\n{_rate(report)}")
     axes.legend(loc="upper left", markerscale=2, title=f"not touched ({missed:,})", title_fontsize=10, alignment="left")
-    axes.text(0.99, 0.98, "dots on the frame: beyond it", transform=axes.transAxes, ha="right", va="top", fontsize=8, color=INK)
+    axes.text(
+        0.99,
+        0.98,
+        "dots on the frame: beyond it",
+        transform=axes.transAxes,
+        ha="right",
+        va="top",
+        fontsize=8,
+        color=INK,
+    )
     return figure
 
 
@@ -123,7 +132,12 @@ def _joint_speeds(played: Played) -> Figure:
     figure, grid = plt.subplots(2, 4, figsize=(10.5, 4.6), sharey=True)
     for i, axes in enumerate(grid.flat):
         limit = LIMITS.velocity[i]
-        axes.hist(peaks[i], bins=np.linspace(0, limit, 31), color="#4575b4", weights=np.full(peaks.shape[1], 1 / peaks.shape[1]))
+        axes.hist(
+            peaks[i],
+            bins=np.linspace(0, limit, 31),
+            color="#4575b4",
+            weights=np.full(peaks.shape[1], 1 / peaks.shape[1]),
+        )
         axes.axvline(limit, color=MISSED_COLOUR, linewidth=1.5)
         axes.set_xlim(0, 1.06 * limit)
         axes.set_title(JOINT_NAMES[i])
@@ -131,7 +145,9 @@ def _joint_speeds(played: Played) -> Figure:
         axes.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
     for axes in grid[:, 0]:
         axes.set_ylabel("episodes")
-    figure.suptitle("Highest commanded speed of each episode (red: the joint's limit)", x=0.01, ha="left", fontweight="bold")
+    figure.suptitle(
+        "Highest commanded speed of each episode (red: the joint's limit)", x=0.01, ha="left", fontweight="bold"
+    )
     return figure
 
 
@@ -143,7 +159,9 @@ def _training(rows: list[dict[str, Any]], title: str) -> Figure:
     evaluated = [row for row in rows if "evaluation/return_rate" in row]
     if evaluated:
         at = [row["seconds"] / 60 for row in evaluated]
-        rate, low, high = (np.array([row[f"evaluation/{k}"] for row in evaluated]) for k in ("return_rate", "low", "high"))
+        rate, low, high = (
+            np.array([row[f"evaluation/{k}"] for row in evaluated]) for k in ("return_rate", "low", "high")
+        )
         upper.errorbar(
             at, rate, (rate - low, high - rate), color=INK, fmt="o-", markersize=4, linewidth=1, capsize=2,
             label="evaluated policy: returned, 95 %",

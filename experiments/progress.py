@@ -21,7 +21,12 @@ class TrainingProgress:
         self._last_line = -PLAIN_SECONDS
         self._live = None
         if console.is_terminal:
-            columns = (TextColumn("{task.description}"), BarColumn(None), MofNCompleteColumn(), TextColumn("{task.fields[text]}"))
+            columns = (
+                TextColumn("{task.description}"),
+                BarColumn(None),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[text]}"),
+            )
             self._live = Progress(*columns, console=console, expand=True)
             self._bar = self._live.add_task(name, total=updates, completed=done, text="compiling ...")
 

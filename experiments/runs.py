@@ -77,7 +77,9 @@ class Run:
             for mark in (self.status, self.evaluation):  # of an earlier end, which this session moves
                 mark.unlink(missing_ok=True)
         except OSError as error:
-            raise RunError(f"{self.folder}: cannot be written: {error.strerror or error}; choose another --out") from error
+            raise RunError(
+                f"{self.folder}: cannot be written: {error.strerror or error}; choose another --out"
+            ) from error
 
     def check(self, config: Config) -> None:
         """Raises RunError naming every key in which a run that is already here differs; nothing for a new folder."""
@@ -106,7 +108,9 @@ class Run:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise RunError(f"{self.folder}: another process is training here; wait for it or choose another --out") from None
+                raise RunError(
+                    f"{self.folder}: another process is training here; wait for it or choose another --out"
+                ) from None
             yield
 
     def trained(self, config: Config) -> bool:

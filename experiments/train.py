@@ -36,8 +36,8 @@ def train(experiment: Experiment, run: Run, console: Console) -> str:
             return Session(experiment, run, console).train()
         except OSError as error:  # of the measurements; checkpoints raise their own
             raise RunError(
-                f"{error.filename or run.metrics}: cannot be written: {error.strerror or error}; the last checkpoint is "
-                "whole. Make room or repair the folder, then run the same command again to continue"
+                f"{error.filename or run.metrics}: cannot be written: {error.strerror or error}; "
+                "the last checkpoint is whole. Make room or repair the folder, then run the same command again to continue"
             ) from error
 
 
@@ -114,13 +114,13 @@ class Session:
         training = self._config.training
         if training.evaluate_every is None:
             return None
-        balls = build.pool(experiment, build.key(training.seed, build.PROGRESS_BALLS), training.evaluate_episodes)
-        return Evaluator(self._trainer.simulator, balls, experiment.model, training.evaluate_episodes)
+        key = build.key(training.seed, build.PROGRESS_BALLS)
+        return Evaluator(self._trainer.simulator, experiment, training.evaluate_episodes, key)
 
     def _evaluate(self) -> dict[str, float]:
         """The averaged parameters on the run's own set of fresh balls."""
         key = build.key(self._config.training.seed, build.PROGRESS_EPISODES)
-        result, _ = self._evaluator.play(self.state.bgs.average, *normalizer.normaliser(self.state.statistics), key)
+        result = self._evaluator.play(self.state.bgs.average, *normalizer.normaliser(self.state.statistics), key)
         rate = return_rate(result)
         self.return_rate = rate.value
         return {"evaluation/return_rate": rate.value, "evaluation/low": rate.low, "evaluation/high": rate.high}

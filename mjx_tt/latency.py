@@ -10,6 +10,7 @@ of tick n - m after them; a substep in which it changes gets the time-weighted m
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import jax
@@ -71,4 +72,4 @@ def ring_read(ring, tick):
 
 def ring_depth(longest: float, period: float) -> int:
     """Slots needed for delays up to ``longest`` seconds: one more than the periods that have to be remembered."""
-    return int(jnp.ceil(longest / period)) + 2
+    return math.ceil(longest / period) + 2

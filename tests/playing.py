@@ -15,6 +15,9 @@ from mjx_tt.task import Episodes, EpisodeState, Return, Task, TaskConfig
 from robot_io.contract import N_JOINTS, N_OBSERVATION
 
 
+P, TICKS = 8, 100  # episodes and control periods of most tests: one size, so that they share one compilation
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Script:
@@ -45,7 +48,7 @@ class Record:
     terms: np.ndarray  # (11, P)
 
 
-def script(ticks: int, p: int, actions=0.0) -> Script:
+def script(actions=0.0, ticks: int = TICKS, p: int = P) -> Script:
     """``actions`` is anything that broadcasts to (ticks, 8, P)."""
     return Script(jnp.broadcast_to(jnp.asarray(actions, float), (ticks, N_JOINTS, p)), jnp.zeros(N_OBSERVATION))
 
@@ -59,19 +62,19 @@ def model(ball_noise: float = 0.0, gravity: float = 9.81) -> SimModel:
     )
 
 
-def episodes(position, velocity, delays=None, simulation: SimModel | None = None) -> Episodes:
-    """One episode per column of position and velocity (3, P); delays {name of model.LATENCIES: seconds or (P,)}."""
+def episodes(position, velocity, delays=None, simulation: SimModel | None = None, p: int = P) -> Episodes:
+    """P episodes from position and velocity (3,) or (3, P); delays {name of model.LATENCIES: seconds or (P,)}."""
     delays = delays or {}
     unknown = delays.keys() - set(LATENCIES)
     if unknown:
         raise ValueError(f"no latencies {unknown}, there are {LATENCIES}")
-    p = np.shape(position)[1]
+    position, velocity = (np.array(np.broadcast_to(np.reshape(x, (3, -1)), (3, p)), float) for x in (position, velocity))
     seconds = jnp.asarray([np.broadcast_to(delays.get(name, 0.0), p) for name in LATENCIES])
     return Episodes(
         ball=ball_state(jnp.asarray(position), jnp.asarray(velocity)),
         latency=seconds,
         seed=jnp.arange(p, dtype=jnp.uint32) * 7919 + 1,
-        model=jax.tree.map(lambda x: jnp.asarray(x, float), simulation or model()),
+        model=jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, float), p), simulation or model()),
     )
 
 
@@ -97,7 +100,7 @@ def _player(task: Task, ticks: int):
     return jax.jit(play)
 
 
-def play(task: Task, episodes: Episodes, controller=None, ticks: int = 100) -> Record:
+def play(task: Task, episodes: Episodes, controller=None, ticks: int = TICKS) -> Record:
     """Plays ``ticks`` control periods; without a controller the robot stands still."""
-    controller = controller or script(ticks, episodes.seed.shape[0])
+    controller = controller or script(0.0, ticks, episodes.seed.shape[0])
     return Record(*jax.tree.map(np.asarray, _player(task, ticks)(controller, episodes)))

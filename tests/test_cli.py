@@ -54,7 +54,7 @@ def test_help_teaches_by_examples(command, capsys):
 
 
 def test_help_does_not_wait_for_jax():
-    check = "import sys; from experiments import cli; cli._parser(); sys.exit('jax' in sys.modules or 'numpy' in sys.modules)"
+    check = "import sys; from experiments import cli; cli._parser(); sys.exit(not {'jax', 'numpy'}.isdisjoint(sys.modules))"
     assert subprocess.run([sys.executable, "-c", check], cwd=ROOT).returncode == 0
 
 
@@ -121,7 +121,9 @@ def test_mistake_in_a_yaml_ends_with_one_line(tmp_path):
     (tmp_path / "a.yaml").write_text("name: a\nballs: narrow\ntrainin: {}\n")
     refused = mjx_tt("train", tmp_path / "a.yaml")
     assert refused.returncode == 1
-    assert refused.stderr.startswith(f"mjx-tt: error: {tmp_path / 'a.yaml'}: trainin: unknown key; did you mean 'training'?")
+    assert refused.stderr.startswith(
+        f"mjx-tt: error: {tmp_path / 'a.yaml'}: trainin: unknown key; did you mean 'training'?"
+    )
     assert len(refused.stderr.splitlines()) == 1
 
 
@@ -134,6 +136,22 @@ def test_evaluate_artefact_on_other_balls_leaves_the_artefact_alone(trained):
     report = json.loads((runs / "tiny" / "artefact-evaluation-narrow" / "evaluation.json").read_text())
     assert report["balls"]["name"] == "narrow"
     artefact.load(folder)
+
+
+def test_seeds_start_from_a_trained_policy_and_the_best_is_selected(trained, tmp_path):
+    """An update of 1e-30 leaves each seed with the policy it started from, so both play the same 50 balls alike."""
+    yaml, runs, _ = trained
+    start, settings = runs / "tiny", ("training.updates=1", "optimiser.step={kind: sgd, learning_rate: 1.0e-30}")
+    changes = [x for value in (*settings, f"initial_policy={start}", "training.evaluate_every=null") for x in ("--set", value)]
+    done = mjx_tt("train", yaml, "--out", tmp_path, "--seeds", "4,5", "--select", "--devices", 1, *changes)
+    assert done.returncode == 0, done.stdout + done.stderr
+    selection = json.loads((tmp_path / "tiny" / "selection.json").read_text())
+    assert selection["scores"].keys() == {"seed4", "seed5"} and selection["best"] in selection["scores"]
+    theta, _ = checkpoint.read_latest(start / "checkpoints")
+    for seed in ("seed4", "seed5"):
+        arrays, _ = checkpoint.read_latest(tmp_path / "tiny" / seed / "checkpoints")
+        np.testing.assert_array_equal(arrays["bgs.theta"], theta["bgs.average"])
+        assert arrays["statistics.count"][1] > theta["statistics.count"][1]  # continues the statistics, too
 
 
 def test_render(trained, tmp_path):
@@ -174,7 +192,9 @@ def test_import_and_fit_human(tmp_path):
     assert fitted.returncode == 0, fitted.stdout + fitted.stderr
     assert "player3/M2" in fitted.stdout and "anna" in fitted.stdout
     distribution = load_distribution(tmp_path / "anna.yaml")
-    box = np.array([distribution.position_min + distribution.velocity_min, distribution.position_max + distribution.velocity_max])
+    box = np.array(
+        [distribution.position_min + distribution.velocity_min, distribution.position_max + distribution.velocity_max]
+    )
     np.testing.assert_allclose(box, [starts.min(axis=0), starts.max(axis=0)], atol=0.01)
     malformed = mjx_tt("import", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
     assert malformed.returncode == 1 and ".csv, .mcap" in malformed.stderr

@@ -60,8 +60,18 @@ def test_schema_refuses_what_the_program_refuses():
         ("optimiser.pairs", True, "optimiser.pairs: got True", "integer"),
         ("optimiser.sigma", float("nan"), "optimiser.sigma: got nan", "finite"),
         ("optimiser.rank", "singed", "optimiser.rank: got 'singed'", "did you mean 'signed'?"),
-        ("optimiser.step.schedule", {"kind": "cosin"}, "optimiser.step.schedule.kind: got 'cosin'", "did you mean 'cosine'?"),
-        ("optimiser.step.schedule", {"kind": "cosine", "fin": 1.0}, "optimiser.step.schedule.fin: unknown", "did you mean 'final'?"),
+        (
+            "optimiser.step.schedule",
+            {"kind": "cosin"},
+            "optimiser.step.schedule.kind: got 'cosin'",
+            "did you mean 'cosine'?",
+        ),
+        (
+            "optimiser.step.schedule",
+            {"kind": "cosine", "fin": 1.0},
+            "optimiser.step.schedule.fin: unknown",
+            "did you mean 'final'?",
+        ),
         ("optimiser.step.schedule", {"hold": 0.5}, "optimiser.step.schedule.kind: missing", ""),
         (
             "optimiser.step.schedule",
@@ -70,17 +80,32 @@ def test_schema_refuses_what_the_program_refuses():
             "learning_rate",
         ),
         ("task.rewards", {"styl": 1.0}, "task.rewards.styl: unknown key", "did you mean 'style'?"),
-        ("task.rewards", "simm", "task.rewards: got 'simm'", "did you mean 'sim'? allowed: 'sim' or 'real' or a mapping"),
+        (
+            "task.rewards",
+            "simm",
+            "task.rewards: got 'simm'",
+            "did you mean 'sim'? allowed: 'sim' or 'real' or a mapping",
+        ),
         ("task", 4, "task: got 4", "a mapping"),
         ("name", "two words", "name: got 'two words'", "pattern"),
         ("task.sim_rate", 310.0, "task: sim_rate 310.0 Hz", "whole multiple"),
         ("balls", "player6/M0", "balls: no distribution is called 'player6/M0'", "did you mean 'player"),
         ("balls", {"position": {}}, "balls: content", "velocity"),
-        ("model", {"ball": {"table": {"restitutio": 0.9}}}, "model: unknown parameter 'ball.table.restitutio'", "'ball.table.restitution'"),
-        ("model", {"randomise": {"ball.table.restitution": [1, 0]}}, "randomise.ball.table.restitution", "low must not exceed high"),
+        (
+            "model",
+            {"ball": {"table": {"restitutio": 0.9}}},
+            "model: unknown parameter 'ball.table.restitutio'",
+            "'ball.table.restitution'",
+        ),
+        (
+            "model",
+            {"randomise": {"ball.table.restitution": [1, 0]}},
+            "randomise.ball.table.restitution",
+            "low must not exceed high",
+        ),
         ("initial_policy", "nowhere", "initial_policy: nowhere", "a run or an artefact"),
     ],
-)  # fmt: skip
+)
 def test_a_mistake_is_named_with_file_path_and_hint(path, value, place, hint):
     text = complaint(with_value(path, value))
     assert text.startswith("my.yaml: ")
@@ -125,7 +150,9 @@ def test_a_looked_up_experiment_stands_alone(tmp_path):
     """Files that it names are taken in, relative to its own folder, so that a run can be read anywhere."""
     balls = players.load("player2/M1").to_dict() | {"name": "anna"}
     (tmp_path / "anna.yaml").write_text(yaml.safe_dump(balls))
-    (tmp_path / "model.yaml").write_text("sensing: {ball_noise: 0.02}\nrandomise: {ball.table.restitution: [0.9, 0.95]}\n")
+    (tmp_path / "model.yaml").write_text(
+        "sensing: {ball_noise: 0.02}\nrandomise: {ball.table.restitution: [0.9, 0.95]}\n"
+    )
     file = tmp_path / "a.yaml"
     file.write_text("name: a\nballs: anna.yaml\nmodel: model.yaml\n")
     first = build.experiment(config.load(file), str(file))

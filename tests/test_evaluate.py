@@ -93,10 +93,17 @@ def test_pictures_show_what_was_counted(tmp_path):
         played = result([outcome] * 400)
         rng = np.random.default_rng(1)
         incoming = rng.uniform([[[-0.7]], [[-1.3]]], [[[0.7]], [[-0.1]]], (2, 400, 1))
-        return plots.draw_evaluation(tmp_path / folder, Played(evaluate.summary(played), played, incoming), (1.0,) * N_TERMS)
+        return plots.draw_evaluation(
+            tmp_path / folder, Played(evaluate.summary(played), played, incoming), (1.0,) * N_TERMS
+        )
 
     returned, missed = draw("returned", RETURNED), draw("missed", MISSED)
-    assert [path.name for path in returned] == ["landing_map.png", "return_rate_map.png", "rewards.png", "joint_speeds.png"]
+    assert [path.name for path in returned] == [
+        "landing_map.png",
+        "return_rate_map.png",
+        "rewards.png",
+        "joint_speeds.png",
+    ]
     assert share(returned[0], "#000000") < 0.5  # a picture, not a black frame
     dots = [np.asarray(Image.open(paths[0]).convert("RGB")).astype(int) for paths in (returned, missed)]
     green = [((d[..., 1] > d[..., 0] + 25) & (d[..., 1] > d[..., 2] + 25)).mean() for d in dots]
@@ -107,7 +114,13 @@ def test_pictures_show_what_was_counted(tmp_path):
 
 def test_training_curve_survives_missing_values(tmp_path):
     rows = [
-        {"update": i + 1, "seconds": 0.1 * i, "return_rate": i / 60, "hit_rate": None if i < 3 else 0.5, "mean_return": None}
+        {
+            "update": i + 1,
+            "seconds": 0.1 * i,
+            "return_rate": i / 60,
+            "hit_rate": None if i < 3 else 0.5,
+            "mean_return": None,
+        }
         for i in range(60)
     ]
     rows[29] |= {"evaluation/return_rate": 0.4, "evaluation/low": 0.3, "evaluation/high": 0.5}

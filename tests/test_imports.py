@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -60,6 +62,12 @@ def test_the_robots_side_needs_no_jax():
             wrong = [name for name in imported(path) if within(name, JAX)]
             assert not wrong, f"{path.relative_to(ROOT)} imports {wrong}"
     assert any(within(name, JAX) for name in imported(ROOT / JAX_ALLOWED[0])), "the walk finds nothing"
+
+
+def test_the_robots_side_loads_without_jax():
+    modules = [module_name(p) for p in sources("robot_io") if str(p.relative_to(ROOT)) not in JAX_ALLOWED]
+    code = f"import sys, {', '.join(modules)}; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
 def test_there_are_no_import_cycles_between_modules():

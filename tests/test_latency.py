@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import playing
 import pytest
-from playing import episodes, model, play, script, task
+from playing import P, episodes, model, play, script, task
 
 from mjx_tt import latency, robot
 from mjx_tt.model import LATENCIES
@@ -105,20 +106,18 @@ def test_longest_delay_fits_the_ring():
 
 
 def test_the_task_delays_every_device_by_its_own_time():
-    """Eight episodes with random latencies. The robot's path is MuJoCo C's under the ideally delayed commands; the ball
+    """Episodes with random latencies. The robot's path is MuJoCo C's under the ideally delayed commands; the ball
     flies straight, without gravity, so that its path under drag has a closed form."""
     rng = np.random.default_rng(3)
-    p, ticks = 8, 60
-    delays = {name: rng.uniform(0.0, 0.1, p) for name in LATENCIES}
-    actions = np.repeat(rng.uniform(-0.3, 0.3, (ticks // 10, N_JOINTS, 1)), 10, axis=0)
+    delays = {name: rng.uniform(0.0, 0.1, P) for name in LATENCIES}
+    actions = np.repeat(rng.uniform(-0.3, 0.3, (playing.TICKS // 10, N_JOINTS, 1)), 10, axis=0)
     start, velocity = np.array([0.2, 1.0, 0.4]), np.array([0.1, -1.5, 0.05])
     with jax.enable_x64(True):
-        batch = episodes(np.tile(start[:, None], p), np.tile(velocity[:, None], p), delays, model(gravity=0.0))
-        record = play(task(), batch, script(ticks, p, actions), ticks)
+        record = play(task(), episodes(start, velocity, delays, model(gravity=0.0)), script(actions))
     assert record.live.all()
-    ticked, times = np.arange(ticks) * T, np.arange(ticks * SUBSTEPS + 1) * H
+    ticked, times = np.arange(playing.TICKS) * T, np.arange(playing.TICKS * SUBSTEPS + 1) * H
     mj, speed = robot.load_model(), np.linalg.norm(velocity)
-    for i in range(p):
+    for i in range(P):
         moments = np.maximum(ticked - delays["ball_observation"][i], 0.0)
         way = np.log1p(DRAG * speed * moments) / DRAG
         np.testing.assert_allclose(

@@ -88,7 +88,9 @@ def uninterrupted(yaml, tmp_path_factory) -> Path:
 
 def assert_same_run(folder: Path, reference: Path) -> None:
     """The last checkpoints agree in every bit of every array, and the measurements of every update agree."""
-    (arrays, notes), (expected, expected_notes) = (checkpoint.read_latest(f / "checkpoints") for f in (folder, reference))
+    (arrays, notes), (expected, expected_notes) = (
+        checkpoint.read_latest(f / "checkpoints") for f in (folder, reference)
+    )
     assert notes["update"] == expected_notes["update"] == UPDATES
     assert arrays.keys() == expected.keys()
     assert {"bgs.theta", "bgs.average", "statistics.mean", "statistics.count", "key"} <= arrays.keys()
@@ -180,7 +182,9 @@ def test_full_disk_leaves_the_last_checkpoint_whole(tmp_path):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:
-        with pytest.raises(CheckpointError, match="00000002.npz: cannot be written: File too large; the last checkpoint is whole"):
+        with pytest.raises(
+            CheckpointError, match="00000002.npz: cannot be written: File too large; the last checkpoint is whole"
+        ):
             checkpoint.save(tmp_path, 2, state(2.0), {})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
