@@ -75,7 +75,7 @@ class Cosine(Section):
     kind: Literal["cosine"]
     final: Positive = 0.0005
     """Learning rate after the last update."""
-    hold: Annotated[float, Field(ge=0, lt=1)] = 0.1
+    hold: Annotated[float, Field(ge=0, lt=1)] = 0.3
     """Share of the updates before the fall."""
 
 
@@ -104,7 +104,7 @@ class Step(Section):
     """From a gradient estimate to a change of the parameters."""
 
     kind: Literal["adam", "sgd"] = "adam"
-    learning_rate: Positive = 0.015
+    learning_rate: Positive = 0.01
     b1: Decay = 0.9
     """Adam's decay of the first moment; sgd does not use it."""
     b2: Decay = 0.99

@@ -90,6 +90,7 @@ def apply(theta, history):
     return rows[0]
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PolicyController:
     """The streaming policy as a ``task.Controller``: parameters of P perturbations and a frozen normaliser (11,)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import mujoco
 import numpy as np
+import playing
 import pytest
 from chains import CRANE, SKEW, pendulum
 
@@ -12,6 +13,9 @@ from mjx_tt import robot
 from mjx_tt.chain import chain_from_model
 from mjx_tt.dynamics.fused import FusedEngine
 from mjx_tt.dynamics.mjx import MjxEngine
+from mjx_tt.model import LATENCIES, LatencyParams
+from mjx_tt.policy import PolicyController, initial_theta
+from robot_io.contract import N_OBSERVATION, unflatten
 
 FLUID = '<option integrator="implicitfast" {}="1.2"><flag contact="disable" constraint="disable"/></option>'
 
@@ -78,6 +82,23 @@ def test_any_batch_shape_gives_the_same_numbers(batch):
     for mine, theirs in zip(after, flat):
         assert mine.shape == (model.nq, *batch)
         np.testing.assert_allclose(mine.reshape(model.nq, -1), theirs, rtol=1e-9, atol=1e-9)
+
+
+def test_whole_episodes_agree_with_mjx_in_float32():
+    """200 control steps of four random policies in closed loop, with noise and the paper's latencies. The ball flies
+    slowly, without gravity, so that the episode lasts; the paddle travels decimetres and stays within 0.5 mm."""
+    theta = np.stack([initial_theta(jax.random.key(i)) for i in range(4)], axis=1)
+    policy = PolicyController(unflatten(theta), np.zeros(N_OBSERVATION, np.float32), np.ones(N_OBSERVATION, np.float32))
+    delays = {name: getattr(LatencyParams(), name) for name in LATENCIES}
+    batch = playing.episodes(
+        [0.2, 1.2, 0.4], [0.0, -1.2, 0.0], delays, playing.model(ball_noise=0.04, gravity=0.0), p=4
+    )
+    fused, mjx = (playing.play(playing.task(engine), batch, policy, ticks=200) for engine in ("fused", "mjx"))
+    assert fused.paddle.dtype == mjx.paddle.dtype == np.float32
+    assert fused.live.all() and mjx.live.all()
+    assert np.linalg.norm(fused.paddle - mjx.paddle, axis=1).max() < 0.5e-3
+    np.testing.assert_allclose(fused.qpos, mjx.qpos, rtol=0, atol=1e-3)
+    assert np.ptp(fused.paddle, axis=0).max(axis=0).min() > 0.2
 
 
 @pytest.mark.parametrize("option", ["density", "viscosity"])
