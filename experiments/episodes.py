@@ -23,11 +23,13 @@ def replay(experiment: Experiment, policy: Policy, count: int, seed: int) -> lis
     balls = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), count)
     model = experiment.model
 
-    def play(key):
+    def play(theta, mean, inverse_scale, key, balls):
         drawn = simulator.draw(key, balls, model.model, model.randomise, count, 1)
-        return simulator.replay(policy.theta, policy.mean, policy.inverse_scale, drawn)
+        return simulator.replay(theta, mean, inverse_scale, drawn)
 
-    qpos, ball, length = (np.asarray(a) for a in jax.jit(play)(build.key(seed, build.EVALUATION_EPISODES)))
+    key = build.key(seed, build.EVALUATION_EPISODES)
+    played = jax.jit(play)(policy.theta, policy.mean, policy.inverse_scale, key, balls)
+    qpos, ball, length = (np.asarray(a) for a in played)
     return [(qpos[: length[i], :, i], ball[: length[i], :, i]) for i in range(count)]
 
 

@@ -7,6 +7,7 @@ convex along the segment, its derivative is found zero by bisection.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -105,4 +106,9 @@ class CapsuleClearance:
         p2, q2, radius2 = gather([other for _, others in SELF_PAIRS for other in others])
         own = segment_distance(p1, q1, p2, q2) - radius1 - radius2
         blade = [TABLE_CAPSULES.index(name) for name in BLADE_CAPSULES]
-        return Clearances(to_table.min(axis=0), own.min(axis=0), to_table[jnp.array(blade)].min(axis=0))
+        return Clearances(_least(to_table), _least(own), _least([to_table[i] for i in blade]))
+
+
+def _least(gaps):
+    """Minimum over the first axis, element-wise: as a reduction it would leave the vector loops."""
+    return reduce(jnp.minimum, list(gaps))

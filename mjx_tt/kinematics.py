@@ -31,7 +31,8 @@ def joint_transform(link: Link, q):
     if link.slide:
         along = f.matvec(link.rot, link.axis)
         return link.rot, f.vadd(link.pos, f.vscale(along, q))
-    rotation = f.axis_rotation(link.axis, jnp.cos(q), jnp.sin(q))
+    sin, cos = f.sin_cos(q)
+    rotation = f.axis_rotation(link.axis, cos, sin)
     return f.matmul(link.rot, rotation), link.pos
 
 

@@ -52,7 +52,7 @@ def _layer(kernel, bias, older, newer, gated: bool):
     z = spread(bias)
     for c in range(older.shape[0]):
         z = z + spread(kernel[0, c]) * older[c].reshape(shape) + spread(kernel[1, c]) * newer[c].reshape(shape)
-    z = materialise(z.reshape(-1, *newer.shape[1:]))
+    z = materialise(z).reshape(-1, *newer.shape[1:])
     if not gated:
         return jnp.tanh(z)
     half = z.shape[0] // 2
