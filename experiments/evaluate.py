@@ -57,7 +57,9 @@ class Evaluator:
             return simulator.rollout(copies, mean, inverse_scale, simulator.local(replace(drawn, ball=thrown)))
 
         spread = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
-        self._play = lambda *policy_and_key: spread(*policy_and_key, self.balls, thrown)
+        fixed = simulator.replicate((self.balls, thrown))
+        # One layout for arrays from training and from files: one compilation.
+        self._play = lambda *policy_and_key: spread(*simulator.replicate(policy_and_key), *fixed)
 
     def play(self, theta, mean, inverse_scale, key) -> RolloutResult:
         """theta (976,), frozen normaliser (11,), (11,), key of latencies and noise; arrays are NumPy, (..., R, P)."""

@@ -56,7 +56,7 @@ def test_full_equals_streaming(x64, atol):
         theta, mean, inverse_scale, observations = draw(x64)
         theta = theta[:, 0]
         x = (observations - mean[:, None]) * inverse_scale[:, None]
-        full = jax.jit(jax.vmap(policy.apply, (None, 0)))(theta, histories(x))
+        full = np.asarray(jax.jit(jax.vmap(policy.apply, (None, 0)))(theta, histories(x)))
         stream = streamed(theta, mean, inverse_scale, observations)
     assert full.shape == (TICKS, N_JOINTS, R * P) and full.dtype == theta.dtype
     np.testing.assert_allclose(stream, full, rtol=0, atol=atol)
@@ -70,7 +70,7 @@ def test_both_forms_equal_numpy_for_every_perturbation(x64, atol):
         theta, mean, inverse_scale, observations = draw(x64, seed=1)
         actions = np.asarray(streamed(theta, mean, inverse_scale, observations))
         x = (observations - mean[:, None]) * inverse_scale[:, None]
-        full = jax.jit(jax.vmap(policy.apply, (None, 0)))(theta, histories(x))
+        full = np.asarray(jax.jit(jax.vmap(policy.apply, (None, 0)))(theta, histories(x)))
     for b in range(R * P):
         parameters = unflatten(theta[:, b % P])
         exact = [policy_numpy.forward(parameters, mean, inverse_scale, h) for h in histories(observations[..., b])]
