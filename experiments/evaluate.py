@@ -14,12 +14,12 @@ from ballmodel.pool import BallPool
 from experiments import build
 from experiments.build import Experiment
 from experiments.policy import Policy
-from experiments.training import EVALUATION_COLUMNS
 from mjx_tt import reach, rewards
 from mjx_tt.rollout import RESULT_SPECS, RolloutResult, Simulator
 from mjx_tt.task import HIT, MISSED, RETURNED
 
 CONFIDENCE_Z = 1.959963984540054  # normal quantile of a two-sided 95 % interval
+EVALUATION_COLUMNS = 256  # copies of one policy side by side, to fill the vector loops
 OUTCOMES = {"missed": MISSED, "hit": HIT, "returned": RETURNED}
 
 

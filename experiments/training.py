@@ -1,4 +1,4 @@
-"""One update of Blackbox Gradient Sensing on the simulator, compiled as a whole, and evaluation of a policy.
+"""One update of Blackbox Gradient Sensing on the simulator, compiled as a whole.
 
 Nothing crosses to the host inside an update: directions, balls, rollouts, the step and the merged observation statistics
 are one compiled call from a ``TrainState`` to the next.
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.sharding import PartitionSpec
 
@@ -20,11 +19,10 @@ from bgs.strategy import BGSConfig, BGSState
 from mjx_tt import rewards
 from mjx_tt.model import Range, SimModel
 from mjx_tt.policy import initial_theta
-from mjx_tt.rollout import AXIS, RESULT_SPECS, RolloutResult, Simulator
+from mjx_tt.rollout import AXIS, RolloutResult, Simulator
 from mjx_tt.task import MISSED, RETURNED
 from robot_io.contract import N_OBSERVATION
 
-EVALUATION_COLUMNS = 256  # copies of one policy side by side, to fill the vector loops
 
 
 @jax.tree_util.register_dataclass
@@ -115,26 +113,6 @@ class Trainer:
             **means(total),
         }
         return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
-
-
-def evaluate(
-    simulator: Simulator, theta, mean, inverse_scale, key, pool: BallPool, model: SimModel, episodes: int,
-    randomise: tuple[Range, ...] = (),
-) -> RolloutResult:  # fmt: skip
-    """Plays one policy theta (976,) on at least ``episodes`` balls of the pool; the result's arrays are NumPy, (R, P)."""
-    if episodes < 1:
-        raise ValueError(f"episodes is {episodes}, at least 1 is needed")
-    columns = min(EVALUATION_COLUMNS, episodes)
-    columns = -(-columns // simulator.devices) * simulator.devices
-    repeats = -(-episodes // columns)
-
-    def play(theta, mean, inverse_scale, key, pool):
-        drawn = simulator.draw(key, pool, model, randomise, repeats, columns)
-        copies = jnp.repeat(theta[:, None], columns // simulator.devices, 1)
-        return simulator.rollout(copies, mean, inverse_scale, simulator.local(drawn))
-
-    spread = simulator.on_devices(play, out_specs=RESULT_SPECS)
-    return jax.tree.map(np.asarray, jax.jit(spread)(theta, mean, inverse_scale, key, pool))
 
 
 def totals(result: RolloutResult) -> dict:
