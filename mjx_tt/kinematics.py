@@ -26,14 +26,19 @@ def centred_on_anchors(chain: Chain) -> Chain:
     return replace(chain, links=tuple(links))
 
 
-def joint_transform(link: Link, q):
-    """Rotation and origin of a link (anchor at zero) in its parent's frame at joint position ``q``, folded scalars."""
-    if link.slide:
-        along = f.matvec(link.rot, link.axis)
-        return link.rot, f.vadd(link.pos, f.vscale(along, q))
-    sin, cos = f.sin_cos(q)
-    rotation = f.axis_rotation(link.axis, cos, sin)
-    return f.matmul(link.rot, rotation), link.pos
+def joint_transforms(chain: Chain, q) -> list:
+    """Rotation and origin of every link in its parent's frame at joint positions q (n, ...), folded scalars."""
+    sin, cos = f.materialise(f.sin_cos(q))  # of slides too: one loop over all joints is the cheapest
+    transforms = []
+    for i, link in enumerate(chain.links):
+        if link.slide:
+            along = f.matvec(link.rot, link.axis)
+            transforms.append((link.rot, f.vadd(link.pos, f.vscale(along, q[i]))))
+            continue
+        rot = f.matmul(link.rot, f.axis_rotation(link.axis, cos[i], sin[i]))
+        # Where the entries are sine, cosine and their negatives there is nothing to store.
+        transforms.append((rot if f.are_signs(link.rot, link.axis) else f.materialise(rot), link.pos))
+    return transforms
 
 
 @jax.tree_util.register_dataclass
@@ -54,8 +59,7 @@ def forward(chain: Chain, q, qd=None) -> list[LinkMotion]:
     """
     motions: list[LinkMotion] = []
     rot, pos, v, w = f.EYE3, f.ZERO3, f.ZERO3, f.ZERO3
-    for i, link in enumerate(chain.links):
-        r, p = f.materialise(joint_transform(link, q[i]))
+    for i, (link, (r, p)) in enumerate(zip(chain.links, joint_transforms(chain, q))):
         offset = f.matvec(rot, p)
         if qd is not None:
             v = f.vadd(v, f.cross(w, offset))

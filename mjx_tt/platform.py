@@ -8,11 +8,9 @@ from pathlib import Path
 # XLA's CPU pipeline throws optimisation barriers away before it fuses. Keeping them lets ``fold.materialise`` stop the
 # compiler from computing shared terms again in every fusion: 3 x the speed of the arm's dynamics. Unknown names are
 # ignored, so a future release that renames the pass loses the speed and nothing else.
-# Multi-output fusion, off by default, lets one loop write several results of common inputs: half the arm's time again.
-_XLA_FLAGS = (
-    "--xla_disable_hlo_passes=cse_barrier_expander",
-    "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true",
-)
+# (XLA's optional multi-output fusion, xla_cpu_use_multi_output_fusion, would bring a fifth more, but in jaxlib 0.10 it
+# aborts the process while compiling MJX.)
+_XLA_FLAGS = ("--xla_disable_hlo_passes=cse_barrier_expander",)
 
 
 def configure(devices: int | None = None, cache: str | os.PathLike | None = None) -> None:

@@ -3,6 +3,7 @@
 SKEW   skew axes, anchors off the origin, joint references, three joints on one body, fixed child bodies, different
        gravity compensation along the chain; position, motor and velocity actuators with gears, in another order
 CRANE  the same with one gravity compensation for all bodies and gravity that is not along z
+CART   several slides before the first hinge, and slides after it
 """
 
 from __future__ import annotations
@@ -75,6 +76,39 @@ CRANE = """
   </actuator>
 </mujoco>
 """
+
+CART = """
+<mujoco>
+  {option}
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="rail" pos=".2 0 .3" euler="5 -25 40" gravcomp=".3">
+      <joint name="rail" type="slide" axis="1 2 0" armature=".4" damping="3"/>
+      <inertial pos="0 .1 -.1" quat=".6 .3 -.2 .7" mass="4" diaginertia=".05 .03 .06"/>
+      <body name="cart" pos="-.1 .2 .1" euler="-30 15 20">
+        <joint name="cart_1" type="slide" axis="0 1 -2" ref="-.1"/>
+        <joint name="cart_2" type="slide" axis="3 1 1" damping="1"/>
+        <inertial pos=".05 0 .02" mass="2" fullinertia=".03 .02 .025 .001 -.002 .003"/>
+        <body name="mast" pos="0 .1 .2" euler="10 60 -5" gravcomp=".8">
+          <joint name="mast" axis="1 -2 2" pos=".02 .1 -.05" damping=".2"/>
+          <geom type="capsule" size=".04 .2" pos="0 .05 .2"/>
+          <body name="plunger" pos=".1 0 .4" euler="0 35 15" gravcomp="1">
+            <joint name="plunger" type="slide" axis="-1 1 4" armature=".1"/>
+            <joint name="twist" axis="2 0 1" pos="0 .03 .04"/>
+            <geom type="box" size=".05 .1 .02" euler="20 0 10"/>
+            <site name="tip" pos="0 .2 .1" euler="40 -10 5"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <velocity name="cart_1" joint="cart_1" kv="20"/>
+    <motor name="mast" joint="mast" gear="4"/>
+    <position name="plunger" joint="plunger" kp="80" kv="6"/>
+  </actuator>
+</mujoco>
+""".format(option=OPTION)
 
 PENDULUM = """
 <mujoco>

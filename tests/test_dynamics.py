@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import playing
 import pytest
-from chains import CRANE, SKEW, pendulum
+from chains import CART, CRANE, SKEW, pendulum
 
 from mjx_tt import robot
 from mjx_tt.chain import chain_from_model
@@ -41,7 +41,9 @@ def a_pendulum():
         pytest.param(robot.load_model(), None, id="robot"),
         pytest.param(mujoco.MjModel.from_xml_string(SKEW), 1 / 300, id="skew"),
         pytest.param(mujoco.MjModel.from_xml_string(CRANE), None, id="crane"),
+        pytest.param(mujoco.MjModel.from_xml_string(CART), 1 / 300, id="cart"),
         pytest.param(a_pendulum(), 0.01, id="pendulum"),
+        pytest.param(pendulum(joint='type="slide" axis="1 2 3" damping="2"'), 0.01, id="slide"),
     ],
 )
 def test_fused_equals_mujoco_c_in_float64(model, timestep):

@@ -6,7 +6,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from chains import CRANE, SKEW
+from chains import CART, CRANE, SKEW
 
 from mjx_tt import robot
 from mjx_tt.chain import chain_from_model, site_frame
@@ -17,6 +17,7 @@ MODELS = [
     pytest.param(robot.load_model(), robot.PADDLE_SITE, id="robot"),
     pytest.param(mujoco.MjModel.from_xml_string(SKEW), "tip", id="skew"),
     pytest.param(mujoco.MjModel.from_xml_string(CRANE), "tip", id="crane"),
+    pytest.param(mujoco.MjModel.from_xml_string(CART), "tip", id="cart"),
 ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
-from chains import CRANE, SKEW, pendulum
+from chains import CART, CRANE, SKEW, pendulum
 from scipy.optimize import linprog
 
 from mjx_tt import robot
@@ -44,6 +44,7 @@ def chain_models():
         pytest.param(robot.load_model(), robot.PADDLE_SITE, id="robot"),
         pytest.param(mujoco.MjModel.from_xml_string(SKEW), "tip", id="skew"),
         pytest.param(mujoco.MjModel.from_xml_string(CRANE), "tip", id="crane"),
+        pytest.param(mujoco.MjModel.from_xml_string(CART), "tip", id="cart"),
         pytest.param(pendulum(child='<body pos="0 .1 0" euler="0 9 0"><geom size=".1"/></body>'), "end", id="pendulum"),
     ]
 

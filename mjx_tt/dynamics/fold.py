@@ -132,6 +132,11 @@ def axis_rotation(axis, cos, sin):
     return tuple(tuple(entry(i, j) for j in range(3)) for i in range(3))
 
 
+def are_signs(*nested) -> bool:
+    """Whether nothing but -1, 0 and 1 stands in nested floats: products with them cost nothing."""
+    return all(entry in (-1.0, 0.0, 1.0) for entry in jax.tree.leaves(nested))
+
+
 def sin_cos(angle):
     """Sine and cosine of angles [rad], |angle| < 8192, to rounding.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from mjx_tt.chain import Chain, Link
 from mjx_tt.dynamics import fold as f
-from mjx_tt.kinematics import centred_on_anchors, joint_transform, stack
+from mjx_tt.kinematics import centred_on_anchors, joint_transforms, stack
 
 
 class FusedEngine:
@@ -56,12 +56,11 @@ def _articulated_body(chain: Chain, h: float, uniform_gravcomp: float | None, qp
     A, B, C = [None] * n, [None] * n, [None] * n  # articulated inertia: rotational, coupling, translational blocks
     pw, pv = [None] * n, [None] * n  # bias force: moment, force
     cw, cv = [None] * n, [None] * n  # velocity-product acceleration
-    rot, pos = [None] * n, [None] * n
+    rot, pos = zip(*joint_transforms(chain, qpos))
     w_parent, v_parent = f.ZERO3, f.ZERO3
     gravity = chain.gravity
 
     for i, link in enumerate(links):
-        rot[i], pos[i] = f.materialise(joint_transform(link, qpos[i]))
         to_link = f.transpose(rot[i])
         w = f.matvec(to_link, w_parent)
         v = f.matvec(to_link, f.vadd(v_parent, f.cross(w_parent, pos[i])))
