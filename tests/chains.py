@@ -118,7 +118,7 @@ PENDULUM = """
   <worldbody>
     {world}
     <body name="arm" {body}>
-      <joint name="hinge" type="hinge" {joint}/>
+      <joint name="hinge" {joint}/>
       <geom name="rod" type="capsule" size=".02" fromto="0 0 0 0 0 -.4" {geom}/>
       <site name="end" pos="0 0 -.4"/>
       {child}

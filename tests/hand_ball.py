@@ -36,7 +36,7 @@ def _solve(start: Touch, until, **options):
 
 
 def fly(start: Touch, distance, seconds=3.0):
-    """Flight until ``distance(position)`` falls to zero: time, and position and velocity (6,); None when it never does."""
+    """Flight until ``distance(position)`` falls to zero: time, position and velocity (6,); None if it never does."""
 
     def event(t, y):
         return distance(y[:3])

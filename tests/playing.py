@@ -68,7 +68,7 @@ def episodes(position, velocity, delays=None, simulation: SimModel | None = None
     unknown = delays.keys() - set(LATENCIES)
     if unknown:
         raise ValueError(f"no latencies {unknown}, there are {LATENCIES}")
-    position, velocity = (np.array(np.broadcast_to(np.reshape(x, (3, -1)), (3, p)), float) for x in (position, velocity))
+    position, velocity = (np.broadcast_to(np.reshape(x, (3, -1)), (3, p)).astype(float) for x in (position, velocity))
     seconds = jnp.asarray([np.broadcast_to(delays.get(name, 0.0), p) for name in LATENCIES])
     return Episodes(
         ball=ball_state(jnp.asarray(position), jnp.asarray(velocity)),

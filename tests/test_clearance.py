@@ -110,8 +110,8 @@ def agree(ours, mujocos):
 
 @pytest.mark.parametrize(("quantity", "capsules"), [("table", TABLE_CAPSULES), ("blade", BLADE_CAPSULES)])
 def test_clearance_of_the_table(clearances, mujocos, quantity, capsules):
-    """MuJoCo's capsule-box distance is wrong, at times even positive, where the capsule's axis itself passes through the
-    box (version 4.0.0); such poses are in contact by at least the capsule's radius."""
+    """MuJoCo's capsule-box distance is wrong, at times even positive, where the capsule's axis itself passes through
+    the box (version 4.0.0); such poses are in contact by at least the capsule's radius."""
     distances, pierced = mujocos
     ours = getattr(clearances, quantity)
     through = np.any([pierced[name] for name in capsules], axis=0)

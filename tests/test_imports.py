@@ -53,7 +53,7 @@ def test_imports_point_one_way(package):
     for path in sources(package):
         for name in imported(path):
             if within(name, PACKAGES) and not within(name, (package, *ALLOWED[package])):
-                raise AssertionError(f"{path.relative_to(ROOT)} imports {name}; {package} may import {ALLOWED[package]}")
+                pytest.fail(f"{path.relative_to(ROOT)} imports {name}; {package} may import {ALLOWED[package]}")
 
 
 def test_the_robots_side_needs_no_jax():

@@ -48,7 +48,7 @@ def test_nominal_latencies_are_the_papers():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("ball: {table: {restituton: 0.9}}", r"unknown parameter 'ball.table.restituton'; did you mean 'ball.table.restitution'\?"),
+        ("ball: {table: {restituton: 0.9}}", r"'ball.table.restituton'; did you mean 'ball.table.restitution'\?"),
         ("zzz: 1", "unknown parameter 'zzz'; known are .*ball.flight.drag_coefficient"),
         ("ball: {table: {restitution: high}}", "ball.table.restitution = 'high', a finite number is needed"),
         ("ball: {table: {restitution: .nan}}", "ball.table.restitution = nan, a finite number is needed"),
@@ -59,9 +59,9 @@ def test_nominal_latencies_are_the_papers():
         ("[1, 2]", "a model is a mapping of parameter groups, got list"),
         ("ball: [", "not valid YAML"),
         ("1: {}\n2: 3", "unknown parameter '2'"),
-        ("randomise: {ball.table.restitution: 0.9}", r"randomise.ball.table.restitution = 0.9, a range is \[low, high\]"),
+        ("randomise: {ball.table.restitution: 0.9}", r"ball.table.restitution = 0.9, a range is \[low, high\]"),
         ("randomise: {ball.table.restitution: [0.9, 0.8]}", "low must not exceed high"),
-        ("randomise: {ball.table.friktion: [0.1, 0.2]}", r"randomise.ball.table.friktion: unknown .* 'ball.table.friction'\?"),
+        ("randomise: {ball.table.friktion: [0, 1]}", r"randomise.ball.table.friktion: .* 'ball.table.friction'\?"),
         ("randomise: {ball.flight.integrator: [0, 1]}", "randomise.ball.flight.integrator: unknown parameter"),
         ("randomise: [1]", r"randomise = \[1\], a mapping is needed"),
         ("randomise: {1: [0, 1]}", "randomise.1: unknown parameter"),

@@ -15,8 +15,10 @@ SEEDS, STEPS = 400, 75
 @pytest.fixture(scope="module", params=["random seeds", "consecutive seeds"])
 def noise(request):
     """(step, axis, seed)."""
-    random = request.param == "random seeds"
-    seeds = np.asarray(jax.random.bits(jax.random.key(0), (SEEDS,), np.uint32)) if random else np.arange(SEEDS, dtype=np.uint32)
+    if request.param == "random seeds":
+        seeds = jax.random.bits(jax.random.key(0), (SEEDS,), np.uint32)
+    else:
+        seeds = np.arange(SEEDS, dtype=np.uint32)
     return np.asarray(jax.jit(jax.vmap(lambda n: symmetric_uniform(seeds, n, 3)))(np.arange(STEPS)), np.float64)
 
 

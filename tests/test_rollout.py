@@ -119,7 +119,9 @@ def test_block_size_does_not_change_the_result(result, theta, episodes, monkeypa
         np.testing.assert_allclose(getattr(blocks, name), getattr(result, name), rtol=1e-4, atol=1e-3, err_msg=name)
 
 
-@pytest.mark.parametrize(("repeats", "columns", "rows"), [(15, 400, 1), (15, 40, 15), (10, 200, 2), (7, 200, 1), (7, 100, 7)])
+@pytest.mark.parametrize(
+    ("repeats", "columns", "rows"), [(15, 400, 1), (15, 40, 15), (10, 200, 2), (7, 200, 1), (7, 100, 7)]
+)
 def test_blocks_are_whole_rows_that_divide_the_repeats(simulator, repeats, columns, rows):
     assert simulator._block_rows(repeats, columns) == rows
 

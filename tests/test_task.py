@@ -147,7 +147,7 @@ def test_reward_terms_of_a_still_robot_by_hand(serves, record, blade):
     assert terms["state_transition"][short] == pytest.approx(3 + 0.5 * near, abs=1e-3)
     assert terms["net_clearance"][short] == 0
 
-    # How near the missed ball came after its bounce: the simulation looks at substeps, at most 10 mm along the path away.
+    # How near the missed ball came after its bounce: the simulation looks at substeps, at most 10 mm of path away.
     missed, first = index(serves, "past the paddle"), on_table(serves["past the paddle"])
     ball = path(first, np.linspace(first.time, first.time + 0.5, 2000))
     closest = np.linalg.norm(ball - blade[0][:, None], axis=0).min()
@@ -262,10 +262,12 @@ def test_velocity_gain_scales_what_the_drives_do():
     half = replace(nominal, actuation=replace(nominal.actuation, velocity_gain=0.5))
     actions = np.zeros((TICKS, N_JOINTS, P))
     actions[:, 0] = 0.3  # of 2 m/s along the gantry
+
+    def driven(simulation):
+        return play(task(), episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=simulation), script(actions))
+
     with jax.enable_x64(True):
-        full, slow = (
-            play(task(), episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=m), script(actions)) for m in (nominal, half)
-        )
+        full, slow = driven(nominal), driven(half)
     start = task().home[0]
     np.testing.assert_allclose(slow.qpos[40:, 0] - start, 0.5 * (full.qpos[40:, 0] - start), rtol=1e-6)
     np.testing.assert_array_equal(slow.command, full.command)
