@@ -19,7 +19,7 @@ from ballmodel import contact
 from ballmodel.aero import INTEGRATORS, FlightParams, acceleration
 from ballmodel.contact import NET, TABLE, Box, PaddleParams, SurfaceParams, box_gap
 from ballmodel.state import BallState
-from ballmodel.vec import TINY, components, cross, dot, select, stack
+from ballmodel.vec import TINY, components, cross, dot, select, stack, stored
 
 
 @jax.tree_util.register_dataclass
@@ -165,6 +165,7 @@ def step(params: BallParams, state: BallState, dt: float, paddle=None) -> tuple[
     hit_any = t_first <= dt
     t = jnp.where(hit_any, t_first, dt)
     at = _move(state, a, flight, t)
+    at, t, t_first, hit_any = stored((at, t, t_first, hit_any))
 
     hit_paddle = jnp.zeros_like(hit_any) if paddle is None else hit_any & (t_paddle == t_first)
     hit_table = hit_any & (t_table == t_first) & ~hit_paddle
@@ -173,7 +174,7 @@ def step(params: BallParams, state: BallState, dt: float, paddle=None) -> tuple[
     # One evaluation of the Coulomb impact serves table and net: only the surface and the normal differ.
     gap_table, distance_table = box_gap(TABLE, params.table.height, at.position)
     gap_net, distance_net = box_gap(NET, params.net.height, at.position)
-    normal = select(hit_table, gap_table / distance_table, gap_net / distance_net)
+    normal = stored(select(hit_table, gap_table / distance_table, gap_net / distance_net))
     surface = jax.tree.map(lambda x, y: jnp.where(hit_table, x, y), params.table, params.net)
     velocity, spin = contact.surface_impact(surface, at.velocity, at.spin, normal, radius)
     if paddle is not None:
@@ -184,11 +185,13 @@ def step(params: BallParams, state: BallState, dt: float, paddle=None) -> tuple[
         blade_velocity = _mix(start.velocity, end.velocity, w) + cross(
             _mix(start.angular_velocity, end.angular_velocity, w), arm
         )
+        blade_normal, blade_velocity = stored((blade_normal, blade_velocity))
         v_paddle, w_paddle = contact.paddle_impact(
             params.paddle, at.velocity, at.spin, blade_normal, blade_velocity, radius
         )
         velocity = select(hit_paddle, v_paddle, velocity)
         spin = select(hit_paddle, w_paddle, spin)
+    velocity, spin = stored((velocity, spin))
     after = _free_step(flight, BallState(at.position, velocity, spin), dt - t)
     events = Events(hit_table, hit_net, hit_paddle, t, stack(at.position))
     new = jax.tree.map(lambda x, y: jnp.where(hit_any, x, y), after, free)

@@ -48,6 +48,14 @@ def stack(vector: Vec):
     return jnp.where(row == 0, x, jnp.where(row == 1, y, z))
 
 
+def stored(tree):
+    """The same arrays, each computed once and kept: what several results share is otherwise computed for every one.
+
+    Takes effect where ``mjx_tt.platform`` has set XLA's flags; elsewhere it changes nothing.
+    """
+    return jax.lax.optimization_barrier(tree)
+
+
 def dot(a, b):
     """a . b of Vecs or (3, ...) arrays: (...)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -43,47 +43,56 @@ def joint_transforms(chain: Chain, q) -> list:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class LinkMotion:
-    """World pose and velocity of one link's frame, folded scalars."""
+class LinkPose:
+    """World pose of one link's frame, folded scalars."""
 
     rot: tuple
     pos: tuple
-    velocity: tuple | None
-    angular_velocity: tuple | None
 
 
-def forward(chain: Chain, q, qd=None) -> list[LinkMotion]:
-    """World motion of every link of a chain that is ``centred_on_anchors``.
+def forward(chain: Chain, q) -> list[LinkPose]:
+    """World pose of every link of a chain that is ``centred_on_anchors``, at joint positions q (n, ...)."""
+    poses: list[LinkPose] = []
+    rot, pos = f.EYE3, f.ZERO3
+    for r, p in joint_transforms(chain, q):
+        pos = f.vadd(pos, f.matvec(rot, p))
+        rot, pos = f.materialise((f.matmul(rot, r), pos))
+        poses.append(LinkPose(rot, pos))
+    return poses
 
-    q, qd: (n, ...) joint positions and velocities; without ``qd`` only poses are computed.
+
+def point_motion(chain: Chain, link: int, point, direction, q, qd) -> tuple:
+    """World position and velocity of a point, direction and angular velocity of the link that it is fixed to.
+
+    chain: ``centred_on_anchors``; point, direction: constants in the link's frame; q, qd: (n, ...).
+    Goes from the link to the base, seen from each joint in turn: four vectors a joint, where going outwards takes a
+    rotation matrix more. Folded scalars: position, direction, velocity, angular velocity.
     """
-    motions: list[LinkMotion] = []
-    rot, pos, v, w = f.EYE3, f.ZERO3, f.ZERO3, f.ZERO3
-    for i, (link, (r, p)) in enumerate(zip(chain.links, joint_transforms(chain, q))):
-        offset = f.matvec(rot, p)
-        if qd is not None:
-            v = f.vadd(v, f.cross(w, offset))
-        pos = f.vadd(pos, offset)
-        rot = f.matmul(rot, r)
-        if qd is not None:
-            axis = f.matvec(rot, link.axis)
-            if link.slide:
-                v = f.vadd(v, f.vscale(axis, qd[i]))
-            else:
-                w = f.vadd(w, f.vscale(axis, qd[i]))
-        rot, pos, v, w = f.materialise((rot, pos, v, w))
-        motions.append(LinkMotion(rot, pos, v if qd is not None else None, w if qd is not None else None))
-    return motions
+    transforms = joint_transforms(chain, q)
+    velocity, spin = f.ZERO3, f.ZERO3
+    for i in reversed(range(link + 1)):
+        joint_velocity = f.vscale(chain.links[i].axis, qd[i])
+        if chain.links[i].slide:
+            velocity = f.vadd(velocity, joint_velocity)
+        else:
+            velocity = f.vadd(velocity, f.cross(joint_velocity, point))
+            spin = f.vadd(spin, joint_velocity)
+        rot, pos = transforms[i]
+        point = f.vadd(f.matvec(rot, point), pos)
+        direction, velocity, spin = (f.matvec(rot, x) for x in (direction, velocity, spin))
+        if i % 3 == 0:  # storing every third is the cheapest
+            point, direction, velocity, spin = f.materialise((point, direction, velocity, spin))
+    return point, direction, velocity, spin
 
 
-def to_world(chain: Chain, motions: list[LinkMotion], frame: Frame, point) -> tuple:
+def to_world(chain: Chain, poses: list[LinkPose], frame: Frame, point) -> tuple:
     """World coordinates, as folded scalars, of a point given in ``frame`` (fixed to a link of the original chain)."""
     local = np.asarray(frame.pos) + np.asarray(frame.rot) @ np.asarray(point, float)
     if frame.link == WORLD:
         return f.constants(local)
     local = local - np.array(chain.links[frame.link].anchor)
-    motion = motions[frame.link]
-    return f.vadd(motion.pos, f.matvec(motion.rot, f.constants(local)))
+    pose = poses[frame.link]
+    return f.vadd(pose.pos, f.matvec(pose.rot, f.constants(local)))
 
 
 class PaddleKinematics:
@@ -94,23 +103,19 @@ class PaddleKinematics:
         self._centred = centred_on_anchors(chain)
         self._site = site
 
-    def links(self, q, qd=None) -> list[LinkMotion]:
-        return forward(self._centred, q, qd)
+    def links(self, q) -> list[LinkPose]:
+        return forward(self._centred, q)
 
-    def point(self, motions: list[LinkMotion], frame: Frame, point) -> tuple:
-        return to_world(self._chain, motions, frame, point)
+    def point(self, poses: list[LinkPose], frame: Frame, point) -> tuple:
+        return to_world(self._chain, poses, frame, point)
 
     def pose(self, q, qd) -> PaddlePose:
         """Blade centre [m], unit normal (the site's z axis), velocity [m/s] and angular velocity [rad/s], each (3, ...)."""
-        return self.pose_of(forward(self._centred, q, qd), like=q[0])
-
-    def pose_of(self, motions: list[LinkMotion], like) -> PaddlePose:
-        """The same from links already computed; ``like`` gives the batch shape."""
-        motion = motions[self._site.link]
-        centre = to_world(self._chain, motions, self._site, np.zeros(3))
-        normal = f.matvec(motion.rot, f.constants(np.asarray(self._site.rot)[:, 2]))
-        velocity = f.vadd(motion.velocity, f.cross(motion.angular_velocity, f.vsub(centre, motion.pos)))
-        return PaddlePose(*(stack(v, like) for v in (centre, normal, velocity, motion.angular_velocity)))
+        link = self._site.link
+        centre = f.constants(np.asarray(self._site.pos) - np.array(self._chain.links[link].anchor))
+        normal = f.constants(np.asarray(self._site.rot)[:, 2])
+        position, normal, velocity, spin = point_motion(self._centred, link, centre, normal, q, qd)
+        return PaddlePose(*(stack(v, q[0]) for v in (position, normal, velocity, spin)))
 
 
 def stack(values, like):

@@ -81,7 +81,8 @@ def _articulated_body(chain: Chain, h: float, uniform_gravcomp: float | None, qp
             weight = f.vscale(gravity, link.mass * (1.0 - link.gravcomp))
             pw[i] = f.vsub(pw[i], f.cross(link.com, weight))
             pv[i] = f.vsub(pv[i], weight)
-        w, v, pw[i], pv[i], cw[i], cv[i], gravity = f.materialise((w, v, pw[i], pv[i], cw[i], cv[i], gravity))
+        # The bias terms are used once or twice: computing them there costs less than storing them here.
+        w, v, gravity = f.materialise((w, v, gravity))
         w_parent, v_parent = w, v
 
     U, inverse_d, u = [None] * n, [None] * n, [None] * n
@@ -138,5 +139,6 @@ def _articulated_body(chain: Chain, h: float, uniform_gravcomp: float | None, qp
             a_v = f.vadd(a_v, f.vscale(link.axis, qacc[i]))
         else:
             a_w = f.vadd(a_w, f.vscale(link.axis, qacc[i]))
-        aw, av, qacc[i] = f.materialise((a_w, a_v, qacc[i]))
+        qacc[i] = f.materialise(qacc[i])
+        aw, av = f.materialise((a_w, a_v)) if i % 2 else (a_w, a_v)  # storing every second is the cheapest
     return qacc
