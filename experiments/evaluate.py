@@ -106,15 +106,18 @@ def evaluate(
     }
     reachable = None
     if reachable_balls is not None:
-        reachable = _reachable(experiment, simulator, evaluator.balls, key, reachable_balls)
+        reachable = _reachable(experiment, simulator, evaluator.balls, key, reachable_balls, policy)
     return Played(summary(result) | {"reachable": reachable} | conditions, result, evaluator.incoming)
 
 
-def _reachable(experiment: Experiment, simulator: Simulator, balls: BallPool, key, count: int) -> dict[str, Any]:
-    """What motions optimised ball by ball return, knowing the ball and without noise: policies can do at least that."""
-    found = reach.reachable(simulator, balls, experiment.model.model, key, count)
+def _reachable(
+    experiment: Experiment, simulator: Simulator, balls: BallPool, key, count: int, policy: Policy
+) -> dict[str, Any]:
+    """What the policy or motions optimised ball by ball return, the balls known and without noise."""
+    known = (policy.theta, policy.mean, policy.inverse_scale)
+    found = reach.reachable(simulator, balls, experiment.model.model, key, count, known)
     low, high = wilson(found.returned, found.balls)
-    return {"return_rate": found.rate, "low": low, "high": high, "balls": found.balls}
+    return {"return_rate": found.rate, "low": low, "high": high, "balls": found.balls, "by_policy": found.by_policy}
 
 
 def summary(result: RolloutResult) -> dict[str, Any]:
