@@ -25,9 +25,9 @@ from robot_io.contract import N_JOINTS, N_OBSERVATION
 BATCH = 32  # balls searched at a time
 KNOTS = 5
 LONGEST = 1.5  # [s] after which a motion repeats its last knot
-CANDIDATES = 128  # motions per ball and iteration
-ELITES = 12
-ITERATIONS = 50
+CANDIDATES = 256  # motions per ball and iteration
+ELITES = 24
+ITERATIONS = 150
 FIRST_STD = 0.5  # of an action
 
 
@@ -68,7 +68,7 @@ def reachable(
     """A lower bound of the return rate on balls of the pool: optimises a motion for each that the policy misses.
 
     policy: theta (976,), mean (11,) and inverse_scale (11,) of the frozen normaliser; None: every ball is searched.
-    About 10 s on two cores for every ``BATCH`` balls that are searched. Raises ValueError for less than one ball.
+    About 20 s on two cores for every ``BATCH`` balls that are searched. Raises ValueError for less than one ball.
     """
     if balls < 1:
         raise ValueError(f"balls is {balls}, at least 1 is needed")

@@ -1,0 +1,80 @@
+"""Logs of sessions at the robot on the command line: list, check, salvage, export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from experiments.errors import ConfigError, checked
+from robot_io import log
+from robot_io.log.scan import glance
+from robot_io.log.writer import SUFFIX, UNFINISHED
+
+
+def list_logs(folder: Path, console: Console) -> None:
+    """Prints the logs of a folder, the oldest first; finished ones are not read through. Raises ConfigError for none."""
+    paths = _logs_in(folder)
+    table = Table("log", "started (UTC)", "duration", "messages", "lost", "state", title_justify="left")
+    for path in sorted(paths, key=lambda path: path.stat().st_mtime):
+        overview = checked("", glance, path)
+        session, end = overview.metadata.get("session", {}), overview.metadata.get("end", {})
+        table.add_row(
+            path.name,
+            session.get("started_utc", "-")[:19].replace("T", " "),
+            f"{overview.duration:.1f} s",
+            f"{overview.messages:,}",
+            end.get("dropped", "unknown"),
+            "finished" if overview.state == "sound" else overview.state,
+        )
+    console.print(table)
+
+
+def check(paths: list[Path], console: Console) -> int:
+    """Reads logs through, checks every checksum and prints what is wrong; returns how many are not sound."""
+    faulty = 0
+    for path in paths:
+        overview = checked("", log.check, path)
+        faulty += overview.state != "sound"
+        console.print(
+            f"{path}: {overview.state}, {overview.messages:,} messages in {overview.duration:.1f} s",
+            highlight=False, soft_wrap=True, markup=False,
+        )  # fmt: skip
+        for fault in overview.faults:
+            console.print(f"  {fault}", highlight=False, soft_wrap=True, markup=False)
+        for topic, count in sorted(overview.counts.items()):
+            console.print(f"  {topic:20} {count:>10,}", highlight=False)
+    return faulty
+
+
+def salvage(path: Path, out: Path | None, console: Console) -> Path:
+    """Writes what is sound of a damaged or unfinished log as a proper file, and returns its path."""
+    overview = checked("", log.salvage, path, out)
+    console.print(
+        f"{overview.path}: {overview.messages:,} messages, {overview.duration:.1f} s",
+        highlight=False, soft_wrap=True, markup=False,
+    )  # fmt: skip
+    for line in overview.metadata["salvage"]["faults"].splitlines():
+        console.print(f"  lost: {line}", highlight=False, soft_wrap=True, markup=False)
+    return overview.path
+
+
+def export(path: Path, out: Path | None, console: Console) -> list[Path]:
+    """Writes the tables of a log into a folder (its name without the suffix, if not given); returns their paths."""
+    session = checked("", log.read, path)
+    written = checked("", log.export, session, out or path.with_name(path.name.removesuffix(SUFFIX)))
+    for table in written:
+        console.print(table, highlight=False, soft_wrap=True, markup=False)
+    balls = len(log.trajectories(session.ball))
+    console.print(f"{balls:,} balls; mjx-tt fit-human {written[0]} makes a distribution of them", highlight=False)
+    return written
+
+
+def _logs_in(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder")
+    paths = [path for path in folder.iterdir() if path.name.endswith((SUFFIX, UNFINISHED)) and path.is_file()]
+    if not paths:
+        raise ConfigError(f"{folder}: no logs ({SUFFIX} or {UNFINISHED}) in it")
+    return paths
