@@ -14,7 +14,7 @@ from robot_io.log.writer import SUFFIX, UNFINISHED
 
 
 def list_logs(folder: Path, console: Console) -> None:
-    """Prints the logs of a folder, the oldest first; finished ones are not read through. Raises ConfigError for none."""
+    """Prints the logs of a folder, oldest first; finished ones are not read through. Raises ConfigError for none."""
     paths = _logs_in(folder)
     table = Table("log", "started (UTC)", "duration", "messages", "lost", "state", title_justify="left")
     for path in sorted(paths, key=lambda path: path.stat().st_mtime):

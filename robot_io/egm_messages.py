@@ -1,0 +1,249 @@
+"""ABB EGM on the wire: the message schema and the codec between its degrees and our radians.
+
+The schema is ABB's egm.proto (proto2; field numbers as in abb_libegm, the newer fields as in ABBRobotEGM 1.0.7), built
+here in a private descriptor pool: another library that registers its own egm.proto in the process-wide pool does not
+clash with it.
+
+proto2 parses an empty datagram into a valid message in which everything is absent, so the codec requires every field it
+reads. What it cannot accept raises ``EgmError`` and nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
+
+N_ARM_JOINTS = 6
+MAX_DATAGRAM = 1472  # [bytes], what fits one Ethernet frame; ABB's messages are a few hundred
+UINT32 = 1 << 32
+
+# Enumeration values count from 0.
+_ENUMS = {
+    "EgmHeader": (
+        "MessageType", "MSGTYPE_UNDEFINED MSGTYPE_COMMAND MSGTYPE_DATA MSGTYPE_CORRECTION MSGTYPE_PATH_CORRECTION",
+    ),
+    "EgmMotorState": ("MotorStateType", "MOTORS_UNDEFINED MOTORS_ON MOTORS_OFF"),
+    "EgmMCIState": ("MCIStateType", "MCI_UNDEFINED MCI_ERROR MCI_STOPPED MCI_RUNNING"),
+    "EgmRapidCtrlExecState": ("RapidCtrlExecStateType", "RAPID_UNDEFINED RAPID_STOPPED RAPID_RUNNING"),
+}
+# Fields count from 1 in the order given; ! required, * repeated, else optional.
+_FIELDS = {
+    "EgmHeader": "seqno:uint32 tm:uint32 mtype:MessageType",
+    "EgmCartesian": "x:double! y:double! z:double!",
+    "EgmQuaternion": "u0:double! u1:double! u2:double! u3:double!",
+    "EgmEuler": "x:double! y:double! z:double!",
+    "EgmClock": "sec:uint64! usec:uint64!",
+    "EgmTimestamp": "sec:uint64 nsec:uint64",
+    "EgmPose": "pos:EgmCartesian orient:EgmQuaternion euler:EgmEuler",
+    "EgmCartesianSpeed": "value:double*",
+    "EgmJoints": "joints:double*",
+    "EgmPlanned": "joints:EgmJoints cartesian:EgmPose externalJoints:EgmJoints time:EgmClock timeStamp:EgmTimestamp",
+    "EgmFeedBack": "joints:EgmJoints cartesian:EgmPose externalJoints:EgmJoints time:EgmClock timeStamp:EgmTimestamp",
+    "EgmSpeedRef": "joints:EgmJoints cartesians:EgmCartesianSpeed externalJoints:EgmJoints",
+    "EgmPathCorr": "pos:EgmCartesian! age:uint32!",
+    "EgmMotorState": "state:MotorStateType!",
+    "EgmMCIState": "state:MCIStateType!",
+    "EgmRapidCtrlExecState": "state:RapidCtrlExecStateType!",
+    "EgmTestSignals": "signals:double*",
+    "EgmMeasuredForce": "fcActive:bool force:double*",
+    "EgmCollisionInfo": "collsionTriggered:bool collDetQuota:double*",
+    "EgmRAPIDdata": "digVal:bool dnum:double*",
+    "EgmRobot": (
+        "header:EgmHeader feedBack:EgmFeedBack planned:EgmPlanned motorState:EgmMotorState mciState:EgmMCIState "
+        "mciConvergenceMet:bool testSignals:EgmTestSignals rapidExecState:EgmRapidCtrlExecState "
+        "measuredForce:EgmMeasuredForce utilizationRate:double moveIndex:uint32 CollisionInfo:EgmCollisionInfo "
+        "RAPIDfromRobot:EgmRAPIDdata torqueRef:EgmJoints"
+    ),
+    "EgmSensor": "header:EgmHeader planned:EgmPlanned speedRef:EgmSpeedRef RAPIDtoRobot:EgmRAPIDdata",
+    "EgmSensorPathCorr": "header:EgmHeader pathCorr:EgmPathCorr",
+}
+
+
+def _schema() -> descriptor_pb2.FileDescriptorProto:
+    field_proto = descriptor_pb2.FieldDescriptorProto
+    file = descriptor_pb2.FileDescriptorProto(name="egm.proto", package="abb.egm", syntax="proto2")
+    for message_name, fields in _FIELDS.items():
+        message = file.message_type.add(name=message_name)
+        enum_name, values = _ENUMS.get(message_name, ("", ""))
+        if enum_name:
+            enum = message.enum_type.add(name=enum_name)
+            for number, value in enumerate(values.split()):
+                enum.value.add(name=value, number=number)
+        for number, text in enumerate(fields.split(), start=1):
+            name, kind = text.rstrip("!*").split(":")
+            labels = {"!": field_proto.LABEL_REQUIRED, "*": field_proto.LABEL_REPEATED}
+            label = labels.get(text[-1], field_proto.LABEL_OPTIONAL)
+            field = message.field.add(name=name, number=number, label=label)
+            if kind == enum_name:
+                field.type, field.type_name = field_proto.TYPE_ENUM, f".abb.egm.{message_name}.{kind}"
+            elif kind in _FIELDS:
+                field.type, field.type_name = field_proto.TYPE_MESSAGE, f".abb.egm.{kind}"
+            else:
+                field.type = field_proto.Type.Value(f"TYPE_{kind.upper()}")
+    return file
+
+
+_pool = descriptor_pool.DescriptorPool()
+_pool.AddSerializedFile(_schema().SerializeToString())
+
+
+def message_class(name: str):
+    """The protobuf class of an EGM message, e.g. ``EgmRobot``."""
+    if name not in _FIELDS:
+        raise ValueError(f"no EGM message {name!r}; there are {', '.join(_FIELDS)}")
+    return message_factory.GetMessageClass(_pool.FindMessageTypeByName(f"abb.egm.{name}"))
+
+
+EgmRobot = message_class("EgmRobot")
+EgmSensor = message_class("EgmSensor")
+_HEADER = message_class("EgmHeader")
+_MOTORS = message_class("EgmMotorState")
+_MCI = message_class("EgmMCIState")
+_RAPID = message_class("EgmRapidCtrlExecState")
+
+
+class EgmError(ValueError):
+    """An EGM datagram or endpoint cannot be used. ``reason`` is a short name for counting, the message a sentence."""
+
+    def __init__(self, reason: str, message: str):
+        super().__init__(message)
+        self.reason = reason
+
+
+@dataclass(frozen=True, eq=False)
+class RobotMessage:
+    """What the controller reports (EgmRobot).
+
+    sequence         header.seqno, modulo 2**32
+    time_ms          header.tm, the controller's clock [ms], modulo 2**32
+    position         (6,) measured joint positions [rad], read-only
+    motors_on        MOTORS_ON; undefined counts as off
+    egm_running      MCI_RUNNING
+    rapid_running    RAPID_RUNNING, or RAPID_UNDEFINED: some controllers report that after a restart while RAPID runs
+    """
+
+    sequence: int
+    time_ms: int
+    position: np.ndarray
+    motors_on: bool
+    egm_running: bool
+    rapid_running: bool
+
+
+@dataclass(frozen=True, eq=False)
+class SensorMessage:
+    """What the controller is asked to do (EgmSensor): position (6,) [rad] and velocity (6,) [rad/s], read-only."""
+
+    sequence: int
+    position: np.ndarray
+    velocity: np.ndarray
+
+
+def decode_robot(datagram: bytes) -> RobotMessage:
+    """Reads an EgmRobot. Raises EgmError where it is not one, or not a complete one."""
+    message = _parse(EgmRobot, datagram)
+    _require(message, "header", "feedBack", "motorState", "mciState", "rapidExecState")
+    _require(message.header, "seqno", "tm", "mtype")
+    _require_type(message.header, _HEADER.MSGTYPE_DATA)
+    _require(message.feedBack, "joints")
+    return RobotMessage(
+        sequence=message.header.seqno,
+        time_ms=message.header.tm,
+        position=_radians(message.feedBack.joints, "EgmRobot.feedBack.joints"),
+        motors_on=message.motorState.state == _MOTORS.MOTORS_ON,
+        egm_running=message.mciState.state == _MCI.MCI_RUNNING,
+        rapid_running=message.rapidExecState.state in (_RAPID.RAPID_RUNNING, _RAPID.RAPID_UNDEFINED),
+    )
+
+
+def encode_robot(
+    sequence: int, time_ms: int, position, planned, motors_on: bool, egm_running: bool, rapid_running: bool
+) -> bytes:
+    """An EgmRobot with measured and planned joint positions, both (6,) [rad]."""
+    message = EgmRobot()
+    message.header.seqno, message.header.tm = sequence % UINT32, time_ms % UINT32
+    message.header.mtype = _HEADER.MSGTYPE_DATA
+    message.feedBack.joints.joints.extend(_degrees(position, "position"))
+    message.planned.joints.joints.extend(_degrees(planned, "planned"))
+    message.motorState.state = _MOTORS.MOTORS_ON if motors_on else _MOTORS.MOTORS_OFF
+    message.mciState.state = _MCI.MCI_RUNNING if egm_running else _MCI.MCI_STOPPED
+    message.mciConvergenceMet = False
+    message.rapidExecState.state = _RAPID.RAPID_RUNNING if rapid_running else _RAPID.RAPID_STOPPED
+    return message.SerializeToString()
+
+
+def decode_sensor(datagram: bytes) -> SensorMessage:
+    """Reads an EgmSensor that has joint positions and joint speeds. Raises EgmError where it has not."""
+    message = _parse(EgmSensor, datagram)
+    _require(message, "header", "planned", "speedRef")
+    _require(message.header, "seqno", "mtype")  # tm is left out by several clients
+    _require_type(message.header, _HEADER.MSGTYPE_CORRECTION)
+    _require(message.planned, "joints")
+    _require(message.speedRef, "joints")
+    return SensorMessage(
+        sequence=message.header.seqno,
+        position=_radians(message.planned.joints, "EgmSensor.planned.joints"),
+        velocity=_radians(message.speedRef.joints, "EgmSensor.speedRef.joints"),
+    )
+
+
+def encode_sensor(sequence: int, time_ms: int, position, velocity) -> bytes:
+    """An EgmSensor: position (6,) [rad], velocity (6,) [rad/s]. Raises ValueError where one is not six finite ones."""
+    message = EgmSensor()
+    message.header.seqno, message.header.tm = sequence % UINT32, time_ms % UINT32
+    message.header.mtype = _HEADER.MSGTYPE_CORRECTION
+    message.planned.joints.joints.extend(_degrees(position, "position"))
+    message.speedRef.joints.joints.extend(_degrees(velocity, "velocity"))
+    return message.SerializeToString()
+
+
+def _parse(kind, datagram: bytes):
+    name = kind.DESCRIPTOR.name
+    if len(datagram) > MAX_DATAGRAM:
+        raise EgmError("oversized", f"a datagram of more than {MAX_DATAGRAM} bytes is no {name}")
+    message = kind()
+    try:
+        message.ParseFromString(datagram)
+    except DecodeError as error:
+        raise EgmError("malformed", f"{len(datagram)} bytes do not parse as {name}: {error}") from error
+    if not message.IsInitialized():
+        missing = ", ".join(message.FindInitializationErrors())
+        raise EgmError("incomplete", f"{name} without its required {missing}")
+    return message
+
+
+def _require(message, *names: str) -> None:
+    for name in names:
+        if not message.HasField(name):
+            raise EgmError("incomplete", f"{message.DESCRIPTOR.name} without {name}; it needs {', '.join(names)}")
+
+
+def _require_type(header, wanted: int) -> None:
+    if header.mtype != wanted:
+        name = _HEADER.MessageType.Name
+        raise EgmError("wrong_type", f"message type {name(header.mtype)}, expected {name(wanted)}")
+
+
+def _radians(joints, name: str) -> np.ndarray:
+    degrees = joints.joints
+    if len(degrees) != N_ARM_JOINTS:
+        raise EgmError("joint_count", f"{name} has {len(degrees)} numbers, the arm has {N_ARM_JOINTS} joints")
+    radians = np.deg2rad(degrees)
+    if not np.isfinite(radians).all():
+        raise EgmError("not_finite", f"{name} has a non-finite number: {list(degrees)}")
+    radians.setflags(write=False)
+    return radians
+
+
+def _degrees(radians, name: str) -> list[float]:
+    values = np.asarray(radians, np.float64)
+    if values.shape != (N_ARM_JOINTS,):
+        raise ValueError(f"{name} has shape {values.shape}, the arm needs ({N_ARM_JOINTS},)")
+    with np.errstate(over="ignore"):  # a finite number may leave the range of float64 here
+        degrees = np.rad2deg(values)
+    if not np.isfinite(degrees).all():
+        raise ValueError(f"{name} has a non-finite number: {values.tolist()}; nothing is sent")
+    return degrees.tolist()

@@ -1,0 +1,11 @@
+"""What goes wrong at the robot before anything moves."""
+
+from __future__ import annotations
+
+
+class DeviceError(RuntimeError):
+    """A device cannot be reached or opened; the message says what to do."""
+
+
+class RefusedError(RuntimeError):
+    """The robot was asked for something that is not safe now; the message names the reason."""

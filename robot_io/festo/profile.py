@@ -1,0 +1,104 @@
+"""What a positioning axis is told and what it answers, whatever registers carry it.
+
+Positions are in the drive's own coordinate, in metres; only the codecs (``cmmt``, ``fhpp``) know bits and counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+INT32 = (-(2**31), 2**31 - 1)
+
+
+@dataclass(frozen=True)
+class AxisCommand:
+    """One cycle's command.
+
+    enable        power the drive; without, the drive ramps to a stop and switches off
+    acknowledge   a rising edge clears a fault
+    home          a rising edge starts homing, held until the axis is homed
+    move          go to ``position`` at up to ``speed``; without, the drive brakes, drops the task and holds
+    position      target [m]
+    speed         highest speed on the way [m/s], not negative
+    acceleration  of speeding up and braking [m/s^2]
+    sequence      grows with every cycle: profiles that mark new targets with an alternating bit take its parity
+    """
+
+    enable: bool = False
+    acknowledge: bool = False
+    home: bool = False
+    move: bool = False
+    position: float = 0.0
+    speed: float = 0.0
+    acceleration: float = 0.0
+    sequence: int = 0
+
+
+@dataclass(frozen=True)
+class AxisStatus:
+    """One cycle's answer.
+
+    ready         may be enabled now
+    enabled       powered and following commands
+    fault         the drive has stopped for a reason of its own; ``fault_code`` is 0 where the profile carries no number
+    warning_code  0 for none
+    homing, homed
+    position      actual position [m]; means nothing before ``homed``
+    velocity      actual velocity [m/s], as fine as the profile carries it
+    """
+
+    ready: bool
+    enabled: bool
+    fault: bool
+    fault_code: int
+    warning_code: int
+    homing: bool
+    homed: bool
+    position: float
+    velocity: float
+
+
+class AxisProfile(Protocol):
+    """Registers of one kind of drive.
+
+    write_address  first register of the process data that the drive takes
+    read_address   first register of the process data that it gives
+    read_count     how many of those
+    """
+
+    write_address: int
+    read_address: int
+    read_count: int
+
+    def encode(self, command: AxisCommand) -> list[int]:
+        """Registers to write; ValueError when a number does not fit."""
+
+    def decode(self, registers: list[int]) -> AxisStatus:
+        """Status from ``read_count`` registers; ValueError on another length."""
+
+    def node_guard(self, seconds: float) -> tuple[int, list[int]] | None:
+        """Address and registers that set the drive's own time-out; None when its set-up tool sets it."""
+
+    def fault_text(self, code: int) -> str:
+        """The drive's fault number in words."""
+
+
+def count_of(value: float, unit: float, bounds: tuple[int, int], what: str) -> int:
+    """``value`` in whole units of ``unit``; ValueError when not within ``bounds``."""
+    scaled = value / unit
+    if not bounds[0] <= scaled <= bounds[1]:
+        low, high = (b * unit for b in bounds)
+        raise ValueError(f"{what} {value} does not fit its register, allowed is {low:g} to {high:g} at {unit:g} a unit")
+    return round(scaled)
+
+
+def expect_count(registers: list[int], count: int) -> None:
+    if len(registers) != count:
+        raise ValueError(f"{len(registers)} registers arrived, the profile has {count}")
+
+
+def signed(value: int, bits: int) -> int:
+    """The two's complement number held in the lowest ``bits`` bits."""
+    half = 1 << (bits - 1)
+    return (value & (2 * half - 1)) - ((value & half) << 1)

@@ -1,0 +1,73 @@
+"""Timestamped samples of one device, read back at any moment between them.
+
+The simulator's delayed observations interpolate linearly between the states around the wanted moment
+(``mjx_tt.latency``); so does this.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+
+class History:
+    """The newest ``length`` samples of a vector; times must grow.
+
+    longest_hold [s]: how far beyond its newest sample, which then is held, the history still answers.
+    """
+
+    def __init__(self, length: int = 64, longest_hold: float = 0.05) -> None:
+        self._times: deque[float] = deque(maxlen=length)
+        self._values: deque[np.ndarray] = deque(maxlen=length)
+        self._longest_hold = longest_hold
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def clear(self) -> None:
+        self._times.clear()
+        self._values.clear()
+
+    @property
+    def newest(self) -> tuple[float, np.ndarray] | None:
+        """Time [s] and value (n,) of the newest sample."""
+        return (self._times[-1], self._values[-1]) if self._times else None
+
+    def add(self, time: float, value: np.ndarray) -> bool:
+        """Takes a sample; False, and nothing is kept, when it is not newer than the newest."""
+        if self._times and time <= self._times[-1]:
+            return False
+        self._times.append(time)
+        self._values.append(np.asarray(value, np.float64))
+        return True
+
+    def at(self, time: float) -> np.ndarray | None:
+        """The value (n,) at ``time`` [s]: interpolated, the oldest before all samples, the newest for a short while after.
+
+        None without samples or when the newest is older than ``longest_hold``.
+        """
+        times, values = self._times, self._values
+        if not times or time > times[-1] + self._longest_hold:
+            return None
+        if time >= times[-1]:
+            return values[-1]
+        i = len(times) - 1
+        while i > 0 and times[i - 1] > time:  # what is wanted is among the newest
+            i -= 1
+        if i == 0:
+            return values[0]
+        share = (time - times[i - 1]) / (times[i] - times[i - 1])
+        return values[i - 1] + share * (values[i] - values[i - 1])
+
+    def slope(self, span: float) -> np.ndarray | None:
+        """Rate of change (n,) per second by least squares over the last ``span`` seconds; None with under three samples."""
+        if not self._times:
+            return None
+        chosen = [i for i, t in enumerate(self._times) if t >= self._times[-1] - span]
+        if len(chosen) < 3:
+            return None
+        t = np.array([self._times[i] for i in chosen])
+        x = np.stack([self._values[i] for i in chosen])
+        t = t - t.mean()
+        return t @ (x - x.mean(axis=0)) / (t @ t)

@@ -1,0 +1,316 @@
+"""The control side of the log: recorders that the control thread hands its records to.
+
+``Recorder`` packs a record in a few microseconds and puts it into a pipe without waiting; a process of its own
+(``robot_io.log.__main__``) encodes it and writes the file. A full pipe drops the record and counts it.
+A pipe rather than a socket pair: it takes frames of up to 4 KiB whole or not at all, and holds 1 MiB where
+unprivileged sockets hold a few hundred records.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import select
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from robot_io.log.records import LARGEST, End, Event, Level, LogError, Metadata, Record
+from robot_io.log.writer import Session, SessionWriter, sample_clock_offset, session
+
+PIPE_SIZE = 1 << 20  # bytes, what Linux grants without privileges: more than five seconds of a session
+START_TIMEOUT = 30.0  # [s] for the recorder process to import its libraries and open the file
+FRAME = struct.Struct("<H")  # length of the packed record that follows
+SETUP = struct.Struct("<I")  # length of the session description that comes before all frames
+_ATOMIC = LARGEST + FRAME.size
+
+
+class SessionRecorder(Protocol):
+    """What the bridge asks of a recorder."""
+
+    dropped: int  # records lost so far
+
+    @property
+    def failure(self) -> str | None:
+        """Why nothing is recorded any more; None while all is well."""
+
+    def put(self, *records: Record) -> None:
+        """Takes records."""
+
+    def close(self) -> Path | None:
+        """Finishes the log and returns its path."""
+
+
+class Recorder:
+    """Records a session through a process of its own. Used by one thread, the control thread."""
+
+    def __init__(self, session: Session, process: subprocess.Popen) -> None:
+        self.dropped = 0
+        self.malformed = 0
+        self._session = session
+        self._process = process
+        self._pipe = process.stdin.fileno()
+        self._unreported = 0  # dropped since the log was told last
+        self._reason = ""  # why the first malformed record was refused
+        self._malformed_reported = 0
+        self._broken = False
+        self._last_words: dict[str, Any] | None = None
+        self._result: Path | None = None
+
+    @classmethod
+    def start(
+        cls,
+        folder: str | Path,
+        name: str,
+        metadata: Mapping[str, Any],
+        attachments: Mapping[str, str | bytes] | None = None,
+    ) -> Recorder:
+        """Starts the recorder process and returns when its file ``folder/name.mcap.part`` is open.
+
+        metadata     facts about the session, such as the artefact's digest and the git state; what is no string is
+                     kept as JSON
+        attachments  contents of files to be kept whole, such as robot.yaml, by name
+
+        To be called before the control thread takes real-time priority. Raises LogError when the file exists or cannot
+        be made, with the reason.
+        """
+        made = session(folder, name, metadata, attachments or {}, sample_clock_offset(), time.monotonic(), host=True)
+        root = str(Path(__file__).resolve().parents[2])
+        path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
+        process = subprocess.Popen(
+            [sys.executable, "-m", "robot_io.log"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C in the terminal ends the control process only
+            env={**os.environ, "PYTHONPATH": path},
+            bufsize=0,
+        )
+        try:
+            pipe = process.stdin.fileno()
+            setup = made.to_json()
+            process.stdin.write(SETUP.pack(len(setup)))
+            for start in range(0, len(setup), 1 << 16):
+                process.stdin.write(setup[start : start + (1 << 16)])
+            answer = _line(process, START_TIMEOUT)
+            if answer is None:
+                raise LogError(f"{made.unfinished}: the recorder process does not start within {START_TIMEOUT:g} s")
+            if "error" in answer:
+                raise LogError(answer["error"])
+            try:
+                fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_SIZE)
+            except OSError:
+                pass  # the default still holds a third of a second
+            os.set_blocking(pipe, False)
+        except BaseException as error:
+            process.kill()
+            process.wait()
+            process.stdin.close()
+            process.stdout.close()
+            if isinstance(error, BrokenPipeError):
+                raise LogError(f"{made.unfinished}: the recorder process ended at once") from error
+            raise
+        return cls(made, process)
+
+    @property
+    def path(self) -> Path:
+        """Where the finished log will be."""
+        return self._session.path
+
+    @property
+    def failure(self) -> str | None:
+        if not self._broken:
+            return None
+        words = self._hear(0.0) or {}
+        reason = "it was asked to" if "path" in words else words.get("error", "without a word")
+        return f"{self._session.unfinished}: the recorder process has ended ({reason}), nothing is recorded any more"
+
+    def put(self, *records: Record) -> None:
+        """Hands records over without ever waiting or raising.
+
+        Several records in one call cost one system call, and are kept or dropped together while they fit into 4 KiB.
+        What a full pipe or a dead recorder loses is counted in ``dropped``; records that cannot be packed, a mistake of
+        the program, in ``malformed``. Both counts get into the log as events and at its end.
+        """
+        if self._broken:
+            self.dropped += len(records)
+            return
+        frames, size = [], 0
+        for record in records:
+            try:
+                packed = record.pack()
+                frame = FRAME.pack(len(packed)) + packed
+            except Exception as error:  # whatever is wrong with a record, the robot must go on
+                self._count_malformed(error)
+                continue
+            if size + len(frame) > _ATOMIC:
+                self._send(frames)
+                frames, size = [], 0
+            frames.append(frame)
+            size += len(frame)
+        if frames and self._send(frames) and (self._unreported or self.malformed > self._malformed_reported):
+            self._report(records[-1].log_time)
+
+    def close(self, timeout: float = 10.0) -> Path:
+        """Ends the recording and waits until the file is complete; returns its path. May be called again.
+
+        Raises LogError when the log could not be finished, with what is left of it.
+        """
+        if self._result is not None:
+            return self._result
+        if self._process.stdout.closed:
+            raise LogError(f"{self._session.unfinished}: not finished, and closed before")
+        self._send_last(End(self.dropped, self.malformed), timeout)
+        self._process.stdin.close()
+        answer = self._hear(timeout) or {"error": f"the recorder process did not answer in {timeout:g} s"}
+        try:
+            self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+        self._broken = True
+        if "error" in answer:
+            left = self._session.unfinished
+            raise LogError(f"{left}: not finished ({answer['error']}); mjx-tt log salvage {left} saves what it holds")
+        self._result = Path(answer["path"])
+        return self._result
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _send(self, frames: list[bytes]) -> bool:
+        try:
+            os.write(self._pipe, b"".join(frames))
+            return True
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._broken = True
+        self.dropped += len(frames)
+        self._unreported += len(frames)
+        return False
+
+    def _report(self, time: float | None) -> None:
+        """Tells the log what it missed, now that there is room again."""
+        if time is None:
+            return
+        dropped, malformed = self._unreported, self.malformed - self._malformed_reported
+        text = {"dropped": dropped, "malformed": malformed, "total_dropped": self.dropped, "reason": self._reason[:500]}
+        packed = Event(time, Level.WARNING, "log_dropped", json.dumps(text)).pack()
+        try:
+            os.write(self._pipe, FRAME.pack(len(packed)) + packed)
+        except OSError:
+            return  # next time
+        self._unreported, self._malformed_reported = 0, self.malformed
+
+    def _hear(self, timeout: float) -> dict[str, Any] | None:
+        """The recorder process's last words, None before it said any."""
+        if self._last_words is None:
+            self._last_words = _line(self._process, timeout)
+        return self._last_words
+
+    def _count_malformed(self, error: Exception) -> None:
+        self.malformed += 1
+        self._reason = self._reason or f"{type(error).__name__}: {error}"
+
+    def _send_last(self, end: End, timeout: float) -> None:
+        packed = end.pack()
+        poll = select.poll()
+        poll.register(self._pipe, select.POLLOUT)
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0 and poll.poll(left * 1000):
+            try:
+                os.write(self._pipe, FRAME.pack(len(packed)) + packed)
+                return
+            except BlockingIOError:
+                time.sleep(0.001)  # there is room, but not enough
+            except OSError:
+                return
+
+
+class FileRecorder:
+    """The same log written in the calling process: for lock-step runs, where time stands still while it writes."""
+
+    def __init__(self, session: Session) -> None:
+        self.dropped = 0
+        self._writer = SessionWriter(session)
+        self._result: Path | None = None
+
+    @classmethod
+    def start(
+        cls,
+        folder: str | Path,
+        name: str,
+        metadata: Mapping[str, Any],
+        attachments: Mapping[str, str | bytes] | None = None,
+        start_time: float = 0.0,
+        clock_offset_ns: int = 0,
+    ) -> FileRecorder:
+        """As ``Recorder.start``. Reads no clock and names no host, so that equal runs give equal files.
+
+        ``start_time`` [s] is the session's start on the scheduler's clock, ``clock_offset_ns`` puts that clock's zero
+        somewhere else than at the start of 1970.
+        """
+        return cls(session(folder, name, metadata, attachments or {}, clock_offset_ns, start_time, host=False))
+
+    @property
+    def failure(self) -> None:
+        return None
+
+    def put(self, *records: Record) -> None:
+        """Writes records. Raises LogError for a malformed one, OSError when the disk refuses."""
+        for record in records:
+            self._writer.write(record.pack())
+
+    def close(self) -> Path:
+        """Completes the file and returns its path."""
+        if self._result is None:
+            self._writer.write(End(0, 0).pack())
+            self._result = self._writer.finish()
+        return self._result
+
+    def __enter__(self) -> FileRecorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class NullRecorder:
+    """Keeps nothing."""
+
+    dropped = 0
+    failure = None
+
+    def put(self, *records: Record) -> None:
+        pass
+
+    def close(self) -> None:
+        return None
+
+    def __enter__(self) -> NullRecorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def _line(process: subprocess.Popen, timeout: float) -> dict[str, Any] | None:
+    """The next line that the recorder process says, None when it says nothing in time."""
+    line, deadline = b"", time.monotonic() + timeout
+    while not line.endswith(b"\n"):
+        if not select.select([process.stdout], [], [], max(0.0, deadline - time.monotonic()))[0]:
+            return None
+        part = os.read(process.stdout.fileno(), 1 << 16)
+        if not part:
+            return {"error": "the recorder process has ended"}
+        line += part
+    return json.loads(line)

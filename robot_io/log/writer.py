@@ -1,0 +1,235 @@
+"""Packed records into an MCAP file."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+import os
+import platform
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from mcap.writer import CompressionType, Writer
+
+from robot_io import contract
+from robot_io.log import messages
+from robot_io.log.records import End, LogError, Metadata, as_strings, unpack
+
+FORMAT = "mjx-tt session log"
+FORMAT_VERSION = 1
+SUFFIX = ".mcap"
+UNFINISHED = ".mcap.part"
+CHUNK_SIZE = 64 * 1024  # bytes; a recorder's flushes usually end a chunk earlier
+FORBIDDEN = frozenset('/\\:*?"<>|\0')  # in a file's name, somewhere
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a recorder is started with, all of it ready to be written.
+
+    folder, name     the file is folder/name.mcap, and folder/name.mcap.part until it is finished
+    metadata         entries of the MCAP metadata record "session"
+    attachments      files kept whole, by name
+    clock_offset_ns  added to times of the control process's clock gives nanoseconds since 1970
+    """
+
+    folder: Path
+    name: str
+    metadata: dict[str, str]
+    attachments: dict[str, bytes]
+    clock_offset_ns: int
+
+    @property
+    def path(self) -> Path:
+        return self.folder / f"{self.name}{SUFFIX}"
+
+    @property
+    def unfinished(self) -> Path:
+        return self.folder / f"{self.name}{UNFINISHED}"
+
+    def to_json(self) -> bytes:
+        attachments = {name: base64.b64encode(content).decode() for name, content in self.attachments.items()}
+        return json.dumps(
+            [str(self.folder), self.name, self.metadata, attachments, self.clock_offset_ns]
+        ).encode()  # fmt: skip
+
+    @classmethod
+    def from_json(cls, data: bytes) -> Session:
+        folder, name, metadata, attachments, clock_offset_ns = json.loads(data)
+        contents = {name: base64.b64decode(content) for name, content in attachments.items()}
+        return cls(Path(folder), name, metadata, contents, clock_offset_ns)
+
+
+def session(
+    folder: str | Path,
+    name: str,
+    metadata: Mapping[str, Any],
+    attachments: Mapping[str, str | bytes],
+    clock_offset_ns: int,
+    start_time: float,
+    host: bool,
+) -> Session:
+    """Adds what every log says of itself to ``metadata``.
+
+    ``start_time`` [s] is the session's start on the control process's clock; ``host`` adds the machine and the date.
+    Raises LogError for names that cannot be, an entry that would hide one of the log's own, and a file that exists.
+    """
+    if not name or name.startswith(".") or FORBIDDEN & set(name):
+        raise LogError(f"{name!r}: no name of a log; letters, digits, dots, dashes and underscores are safe")
+    own = {
+        "format": FORMAT,
+        "format_version": FORMAT_VERSION,
+        "name": name,
+        "contract_version": contract.CONTRACT_VERSION,
+        "control_rate_hz": contract.CONTROL_RATE,
+        "joint_names": list(contract.JOINT_NAMES),
+        "joint_units": list(contract.JOINT_UNITS),
+        "observation_names": list(contract.OBSERVATION_NAMES),
+        "clock_offset_ns": clock_offset_ns,
+        "start_time": start_time,
+    }
+    if host:
+        started = datetime.fromtimestamp(start_time + clock_offset_ns / messages.NANO, timezone.utc)
+        own |= {
+            "started_utc": started.isoformat(timespec="milliseconds"),
+            "host": platform.node(),
+            "system": platform.platform(),
+            "python": platform.python_version(),
+        }
+    hidden = sorted({*own, "checksum"} & set(metadata))
+    if hidden:
+        raise LogError(f"metadata {', '.join(hidden)}: written by the log itself, choose another key")
+    made = Session(
+        Path(folder).absolute(),
+        name,
+        as_strings({**own, **metadata}),
+        {key: value.encode() if isinstance(value, str) else bytes(value) for key, value in attachments.items()},
+        clock_offset_ns,
+    )
+    for path in (made.path, made.unfinished):
+        if path.exists():
+            raise LogError(f"{path}: exists; choose another name, or salvage and remove it")
+    return made
+
+
+def sample_clock_offset() -> int:
+    """Nanoseconds since 1970 minus nanoseconds of the monotonic clock, from the quickest of five looks at both."""
+    looks = []
+    for _ in range(5):
+        before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        looks.append((after - before, wall - (before + after) // 2))
+    return min(looks)[1]
+
+
+def checksum(name: str, entries: Mapping[str, str]) -> str:
+    """SHA-256 of a metadata record, which MCAP protects with no CRC until the file is complete."""
+    kept = {key: value for key, value in entries.items() if key != "checksum"}
+    return hashlib.sha256(json.dumps([name, kept], sort_keys=True).encode()).hexdigest()
+
+
+class SessionWriter:
+    """Writes one session. Not for the control thread: it encodes, compresses and waits for the disk.
+
+    Raises OSError when the file cannot be made or the disk is full.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._end: End | None = None
+        self._unflushed = False
+        self.messages = 0
+        session.folder.mkdir(parents=True, exist_ok=True)
+        self._file = open(session.unfinished, "xb")
+        self._writer = Writer(
+            self._file, chunk_size=CHUNK_SIZE, compression=CompressionType.ZSTD, enable_data_crcs=True
+        )
+        self._writer.start(profile="", library=f"robot_io.log {FORMAT_VERSION}")
+        self._add_metadata("session", session.metadata)
+        start = round(float(session.metadata["start_time"]) * messages.NANO) + session.clock_offset_ns
+        for name, content in session.attachments.items():
+            media_type = "application/octet-stream" if b"\0" in content else "text/plain"
+            self._writer.add_attachment(start, start, name, media_type, content)
+        schemas: dict[str, int] = {}
+        self._channels = {}
+        for topic in messages.TOPICS.values():
+            schema_name = topic.message.DESCRIPTOR.full_name
+            if schema_name not in schemas:
+                schemas[schema_name] = self._writer.register_schema(schema_name, "protobuf", topic.schema())
+            self._channels[topic.name] = self._writer.register_channel(
+                topic.name, "protobuf", schemas[schema_name], topic.metadata
+            )
+        self._file.flush()
+
+    def write(self, packed: bytes) -> None:
+        """Takes a packed record. Raises LogError for one that is malformed; nothing of it is written then."""
+        record = unpack(packed)
+        if isinstance(record, Metadata):
+            self._add_metadata(record.name, record.entries)
+        elif isinstance(record, End):
+            self._end = record
+        else:
+            for encoded in messages.encode(record):
+                published, logged = self._nanoseconds(encoded.publish_time), self._nanoseconds(encoded.log_time)
+                stamp = encoded.message.timestamp
+                stamp.seconds, stamp.nanos = divmod(published, messages.NANO)
+                self._writer.add_message(
+                    self._channels[encoded.topic.name],
+                    log_time=logged,
+                    data=encoded.message.SerializeToString(),
+                    publish_time=published,
+                    sequence=encoded.sequence % messages.SEQUENCE,
+                )
+                self.messages += 1
+        self._unflushed = True
+
+    def flush(self) -> None:
+        """Ends the chunk and brings everything so far to the disk."""
+        if self._unflushed:
+            self._writer.flush()
+            os.fdatasync(self._file.fileno())
+            self._unflushed = False
+
+    def finish(self, malformed: int = 0) -> Path:
+        """Completes the file and gives it its name; ``malformed`` records were refused by ``write``."""
+        end = self._end or End(0, 0)
+        self._add_metadata("end", as_strings({
+            "closed": self._end is not None,
+            "dropped": end.dropped if self._end else "unknown",
+            "malformed": end.malformed + malformed,
+            "messages": self.messages,
+        }))  # fmt: skip
+        self._writer.finish()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        path = self._session.path
+        if path.exists():
+            raise FileExistsError(f"{path} appeared meanwhile; the log is complete as {self._session.unfinished}")
+        os.rename(self._session.unfinished, path)
+        _sync_folder(path.parent)
+        return path
+
+    def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        self._writer.add_metadata(name, {**entries, "checksum": checksum(name, entries)})
+
+    def _nanoseconds(self, seconds: float) -> int:
+        if not math.isfinite(seconds):
+            raise LogError(f"time {seconds}: a finite number of seconds is needed")
+        nanoseconds = round(seconds * messages.NANO) + self._session.clock_offset_ns
+        if not 0 <= nanoseconds < 1 << 63:
+            raise LogError(f"time {seconds}: is {nanoseconds} ns since 1970, MCAP holds no time before that")
+        return nanoseconds
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

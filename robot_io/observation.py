@@ -1,0 +1,60 @@
+"""The observation that the policy sees, built from what came over the wire.
+
+The simulator reads every quantity as it was a fixed delay ago, interpolated between the states around that moment; with
+the same delays and the same motion this gives the same numbers. On a robot whose feedback is late by itself, the delay
+to add is what is missing to the one in training.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from robot_io.contract import N_JOINTS
+from robot_io.history import History
+
+
+@dataclass(frozen=True)
+class ObservationDelays:
+    """Age [s] of what the policy sees: of the ball's capture, and of joint feedback since it was received."""
+
+    ball: float = 0.040
+    arm: float = 0.0
+    axes: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("ball", "arm", "axes"):
+            if not 0 <= getattr(self, name) <= 0.1:
+                raise ValueError(f"observation delay {name} = {getattr(self, name)} s, allowed is 0 to 0.1")
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """Histories of the three devices: ball (3,), axes (2,) [m], arm (6,) [rad]."""
+
+    ball: History
+    axes: History
+    arm: History
+
+
+def observe(feedback: Feedback, delays: ObservationDelays, now: float) -> np.ndarray | None:
+    """The observation (11,) at ``now`` in the order of the contract; None while a device has nothing recent to say."""
+    parts = (
+        feedback.ball.at(now - delays.ball),
+        feedback.axes.at(now - delays.axes),
+        feedback.arm.at(now - delays.arm),
+    )
+    return None if any(part is None for part in parts) else np.concatenate(parts)
+
+
+def joints(feedback: Feedback) -> tuple[np.ndarray, np.ndarray]:
+    """Newest joint positions and velocities (8,); NaN and zero for what has not reported."""
+    position, velocity = np.full(N_JOINTS, np.nan), np.zeros(N_JOINTS)
+    for history, rows in ((feedback.axes, slice(0, 2)), (feedback.arm, slice(2, 8))):
+        if history.newest is not None:
+            position[rows] = history.newest[1]
+            slope = history.slope(0.04)
+            if slope is not None:
+                velocity[rows] = slope
+    return position, velocity

@@ -1,0 +1,65 @@
+"""A bad network between two ends: loss, delay and jitter (hence reordering), duplication, flipped bits."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class NetworkFaults:
+    """Probabilities per datagram, times in seconds. Raises ValueError for what is no probability or time."""
+
+    loss: float = 0.0
+    duplication: float = 0.0
+    bit_flip: float = 0.0
+    reordering: float = 0.0  # probability of being held back by ``hold``
+    hold: float = 0.006
+    delay: float = 0.0
+    jitter: float = 0.0  # standard deviation of an additional half-normal delay
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value, share = getattr(self, f.name), f.name in ("loss", "duplication", "bit_flip", "reordering")
+            if not 0 <= value <= (1.0 if share else 10.0):
+                raise ValueError(f"network.{f.name} = {value}, allowed is 0 to {1 if share else 10}")
+
+
+class Network:
+    """Carries datagrams one way. Deterministic for a seed."""
+
+    def __init__(self, faults: NetworkFaults, seed: int) -> None:
+        self._faults, self._random = faults, np.random.default_rng(seed)
+        self._heap: list[tuple[float, int, bytes]] = []
+        self._count = 0
+        self._perfect = faults == NetworkFaults()
+
+    def send(self, datagram: bytes, now: float) -> None:
+        if self._perfect:
+            return self._put(now, datagram)
+        f, random = self._faults, self._random
+        if random.random() < f.loss:
+            return None
+        for _ in range(2 if random.random() < f.duplication else 1):
+            content = datagram
+            if datagram and random.random() < f.bit_flip:
+                place = int(random.integers(8 * len(datagram)))
+                flipped = bytearray(datagram)
+                flipped[place // 8] ^= 1 << place % 8
+                content = bytes(flipped)
+            late = f.delay + abs(random.normal()) * f.jitter + (f.hold if random.random() < f.reordering else 0.0)
+            self._put(now + late, content)
+        return None
+
+    def _put(self, when: float, datagram: bytes) -> None:
+        heapq.heappush(self._heap, (when, self._count, datagram))
+        self._count += 1
+
+    def due(self, now: float) -> list[bytes]:
+        """The datagrams that have arrived by ``now``, in order of arrival."""
+        arrived = []
+        while self._heap and self._heap[0][0] <= now:
+            arrived.append(heapq.heappop(self._heap)[2])
+        return arrived

@@ -1,0 +1,32 @@
+"""Everything about the emulated robot, in one place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from robot_io.rig.arm import ArmParams
+from robot_io.rig.axis_drive import DriveParams
+from robot_io.rig.network import NetworkFaults
+from robot_io.rig.tracker import TrackerParams
+from robot_io.rig.world import WorldParams
+
+AXIS_FEEDBACK_DELAY = 0.033  # [s], paper: latency of the linear axes' observation
+
+
+@dataclass(frozen=True)
+class RigParams:
+    """The rig. ``action_delay`` [s] comes on top of the dead times of arm and axes."""
+
+    world: WorldParams = WorldParams()
+    arm: ArmParams = field(default_factory=lambda: ArmParams(comm_timeout=0.06))
+    axis_profile: str = "cmmt"
+    axis_dead_time: float = 0.050
+    # A position controller as stiff as the carriage, a velocity servo with a lag of 35 ms, bears without overshoot.
+    drive: DriveParams = DriveParams(switch_on_time=0.02, homing_time=0.1, position_gain=5.0, following_error=0.15)
+    node_guard: float = 0.1
+    tracker: TrackerParams = TrackerParams()
+    action_delay: float = 0.0
+    arm_network: NetworkFaults = NetworkFaults()  # both ways
+    tracker_network: NetworkFaults = NetworkFaults()
+    pause: float = 0.6  # [s] of the thrower
+    seed: int = 0

@@ -1,0 +1,279 @@
+"""The rig's world: one MuJoCo C simulation of robot, table, net and a ball, with contacts.
+
+Another physics than the training's on purpose. The ball is a free body: MuJoCo integrates its flight and its impacts are
+MuJoCo contacts that last about 2 ms. The air's drag and the tangential impulses are applied here: MuJoCo has no drag for
+such a ball and no rubber, and the friction of its soft contacts takes from the bounce when a ball slides. The robot's
+drives follow velocity set-points, as in the training's model.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from robot_io.contract import JOINT_NAMES
+
+BALL_RADIUS, BALL_MASS = 0.020, 0.0027  # [m], [kg], ITTF
+SHELL_INERTIA = 2.0 / 3.0 * BALL_MASS * BALL_RADIUS**2
+SOLIMP = [0.95, 0.95, 0.001, 0.5, 2.0]  # the same impedance at any depth: a linear spring
+CONTACT_TIME = 0.002  # [s] half a period of the contact's spring; measured ones last 1 ms and need smaller steps
+PARKED = (0.0, 6.0, -0.5)  # [m] where the ball waits, out of everybody's sight
+PADDLE_RADIUS, PADDLE_HALF_THICKNESS = 0.076, 0.006
+FLOOR = -0.74  # [m] height of the ball's centre on the floor
+STICKING = 2.0 / 5.0  # share of the slip that brings the contact point of a thin shell to rest
+NET = (0.1, 0.3)  # restitution and friction
+FINE = 4  # steps instead of one near a surface
+NEAR = 0.06  # [m] from the ball's centre: a ball at 20 m/s moves 0.02 m in a step
+
+
+@dataclass(frozen=True)
+class WorldParams:
+    """Physics of the rig.
+
+    timestep              [s] longest; near a surface the ball is integrated with a quarter of it
+    drag                  K_d [1/m] in the deceleration K_d v^2 (paper's ball: 0.47 x 1.29 x 1.256e-3 / (2 x 0.0027))
+    magnus                K_m in K_m omega x v
+    table_restitution     at table_speed
+    table_friction        Coulomb
+    paddle_restitution    at 5 m/s
+    rubber_gain           tangential impulse of the rubber over slip and mass
+    """
+
+    timestep: float = 0.001
+    drag: float = 0.141
+    magnus: float = 0.0
+    table_restitution: float = 0.93
+    table_friction: float = 0.25
+    paddle_restitution: float = 0.81
+    rubber_gain: float = 0.68
+
+
+class World:
+    """Robot and ball; positions in the table frame, SI units."""
+
+    def __init__(self, scene: str | Path, params: WorldParams | None = None) -> None:
+        self.params = params or WorldParams()
+        robot = mujoco.MjModel.from_xml_path(str(scene))
+        self.model = _model(str(scene), robot, self.params)
+        self.data = mujoco.MjData(self.model)
+        joint = [self.model.joint(name) for name in JOINT_NAMES]
+        self._q = np.array([j.qposadr[0] for j in joint])
+        self._v = np.array([j.dofadr[0] for j in joint])
+        free = self.model.joint("ball_free")
+        self._ball_q, self._ball_v = int(free.qposadr[0]), int(free.dofadr[0])
+        self._ball_body = self.model.body("ball").id
+        self._ball_geom, self._paddle_geom = self.model.geom("ball").id, self.model.geom("rig_paddle").id
+        self._site = self.model.site("paddle").id
+        self.home = robot.key("home").qpos[[robot.joint(name).qposadr[0] for name in JOINT_NAMES]].copy()
+        self.in_play = False
+        self.number = 0  # of the ball in play
+        self._touching: set[int] = set()  # geoms
+        self._surfaces = {
+            self.model.geom("col_table").id: (self.params.table_restitution, self.params.table_friction),
+            self.model.geom("net").id: NET,
+        }
+        self.collisions = 0  # steps in which robot and table touched
+        self.reset()
+
+    def reset(self) -> None:
+        """Robot at home and at rest, ball away, time zero."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self._q] = self.home
+        self.park()
+        mujoco.mj_forward(self.model, self.data)
+
+    @property
+    def time(self) -> float:
+        return self.data.time
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Joint positions (8,)."""
+        return self.data.qpos[self._q]
+
+    @property
+    def qvel(self) -> np.ndarray:
+        return self.data.qvel[self._v]
+
+    @property
+    def ball(self) -> np.ndarray:
+        """Position (3,) [m] of the ball, wherever it is."""
+        return self.data.qpos[self._ball_q : self._ball_q + 3].copy()
+
+    @property
+    def ball_velocity(self) -> np.ndarray:
+        return self.data.qvel[self._ball_v : self._ball_v + 3].copy()
+
+    def throw(self, position, velocity, spin=(0.0, 0.0, 0.0)) -> None:
+        """Puts a new ball into play."""
+        self._place(position, velocity, spin)
+        self.in_play, self._touching = True, set()
+        self.number += 1
+
+    def park(self) -> None:
+        """Takes the ball out of play."""
+        self._place(PARKED, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self.in_play = False
+
+    def _place(self, position, velocity, spin) -> None:
+        q, v = self._ball_q, self._ball_v
+        self.data.qpos[q : q + 7] = [*position, 1.0, 0.0, 0.0, 0.0]
+        self.data.qvel[v : v + 6] = [*velocity, *spin]
+        self.data.xfrc_applied[self._ball_body] = 0.0
+
+    def advance(self, setpoint: np.ndarray, duration: float) -> None:
+        """Moves on by ``duration`` [s] with the drives' velocity set-points (8,)."""
+        self.data.ctrl[:] = setpoint
+        steps = max(1, math.ceil(duration / self.params.timestep - 1e-9))
+        for _ in range(steps):
+            self._step(duration / steps)
+
+    def _step(self, duration: float) -> None:
+        if not self.in_play:
+            self._place(PARKED, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            self._integrate(1, duration)
+            return
+        steps = FINE if self._near_surface() else 1
+        self._integrate(steps, duration / steps)
+        if self.data.qpos[self._ball_q + 2] < FLOOR or abs(self.data.qpos[self._ball_q + 1]) > 5.0:
+            self.park()
+
+    def _near_surface(self) -> bool:
+        x, y, z = self.data.qpos[self._ball_q : self._ball_q + 3]
+        if z < NEAR and abs(x) < 0.8 and abs(y) < 1.45:
+            return True
+        if abs(y) < NEAR and z < 0.25:
+            return True
+        arm = self.data.qpos[self._ball_q : self._ball_q + 3] - self.data.site_xpos[self._site]
+        return bool(arm @ arm < (PADDLE_RADIUS + NEAR) ** 2)
+
+    def _integrate(self, steps: int, timestep: float) -> None:
+        data, v = self.data, self._ball_v
+        self.model.opt.timestep = timestep
+        for _ in range(steps):
+            if self.in_play:
+                velocity = data.qvel[v : v + 3]
+                # A free joint's angular velocity is in the body's frame.
+                spin = data.xmat[self._ball_body].reshape(3, 3) @ data.qvel[v + 3 : v + 6]
+                drag = self.params.drag * np.sqrt(velocity @ velocity) * velocity
+                data.xfrc_applied[self._ball_body, :3] = BALL_MASS * (self.params.magnus * np.cross(spin, velocity) - drag)
+            before = data.qvel[v : v + 3].copy()
+            mujoco.mj_step(self.model, data)
+            if self.in_play:
+                self._contacts(before)
+
+    def _contacts(self, before: np.ndarray) -> None:
+        """Tangential impulse at the first touch of each surface; robot against table is counted."""
+        touching = set()
+        for i in range(self.data.ncon):
+            pair = set(self.data.contact.geom[i].tolist())
+            if self._ball_geom in pair:
+                other = (pair - {self._ball_geom}).pop()
+                touching.add(other)
+                if other not in self._touching:
+                    self._grip(other, self.data.contact.frame[i, :3].copy(), self.data.contact.pos[i].copy(), before)
+            else:
+                self.collisions += 1
+        self._touching = touching
+
+    def _grip(self, surface: int, normal: np.ndarray, place: np.ndarray, before: np.ndarray) -> None:
+        """dv = -alpha slip, by the velocity before the touch, with the spin that goes with it: Coulomb on table and net, the rubber's gain on the paddle."""
+        data, q, v = self.data, self._ball_q, self._ball_v
+        position = data.qpos[q : q + 3]
+        if normal @ (position - place) < 0:
+            normal = -normal
+        blade = np.zeros(3)
+        if surface == self._paddle_geom:
+            motion = np.zeros(6)  # angular, linear
+            mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_SITE, self._site, motion, 0)
+            blade = motion[3:] + np.cross(motion[:3], place - data.site_xpos[self._site])
+        rotation = data.xmat[self._ball_body].reshape(3, 3)
+        spin = rotation @ data.qvel[v + 3 : v + 6]
+        slip = before + np.cross(spin, -BALL_RADIUS * normal) - blade
+        normal_speed = slip @ normal
+        slip -= normal * normal_speed
+        alpha = self.params.rubber_gain
+        if surface != self._paddle_geom:
+            restitution, friction = self._surfaces[surface]
+            limit = friction * (1.0 + restitution) * abs(normal_speed) / max(np.sqrt(slip @ slip), 1e-9)
+            alpha = min(limit, STICKING)
+        change = -alpha * slip
+        data.qvel[v : v + 3] += change
+        spin = spin - BALL_MASS * BALL_RADIUS / SHELL_INERTIA * np.cross(normal, change)
+        data.qvel[v + 3 : v + 6] = rotation.T @ spin
+
+
+def _model(scene: str, robot: mujoco.MjModel, params: WorldParams) -> mujoco.MjModel:
+    rotation = np.zeros(9)
+    mujoco.mju_quat2Mat(rotation, robot.site("paddle").quat)
+    spec = mujoco.MjSpec.from_file(scene)
+    spec.option.timestep = params.timestep
+    spec.option.disableflags &= ~(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    spec.delete(spec.body("ball"))
+    ball = spec.worldbody.add_body(name="ball", pos=PARKED)
+    ball.add_freejoint(name="ball_free")
+    ball.mass, ball.inertia, ball.ipos = BALL_MASS, [SHELL_INERTIA] * 3, [0.0, 0.0, 0.0]
+    ball.explicitinertial = True
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    ball.add_geom(name="ball", type=sphere, size=[BALL_RADIUS, 0, 0], contype=0, conaffinity=0, rgba=[1, 0.55, 0.1, 1])
+    site = spec.site("paddle")
+    hand = site.parent
+    # The disc's axis is the site's z axis.
+    half = rotation.reshape(3, 3)[:, 2] * PADDLE_HALF_THICKNESS
+    centre = np.array(site.pos)
+    hand.add_geom(
+        name="rig_paddle", type=mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=[*(centre - half), *(centre + half)],
+        size=[PADDLE_RADIUS, 0, 0], contype=0, conaffinity=0, mass=0.0, group=3,
+    )  # fmt: skip
+    stiffness = (np.pi / CONTACT_TIME) ** 2
+    restitutions = {
+        "col_table": params.table_restitution, "net": NET[0], "rig_paddle": params.paddle_restitution,
+    }  # fmt: skip
+    for name, restitution in restitutions.items():
+        damping = damping_for(restitution, stiffness, params.timestep / FINE)
+        spec.add_pair(geomname1="ball", geomname2=name, condim=1, solref=[-stiffness, -damping], solimp=SOLIMP)
+    for geom in spec.geoms:
+        # The robot meets the table as a solid thing; what the safety layer prevents must be visible here if it fails.
+        if geom.name == "col_table":
+            geom.contype, geom.conaffinity = 1, 0
+        elif geom.name.startswith("col_") and geom.type == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            geom.contype, geom.conaffinity = 0, 1
+    for key in spec.keys:  # their positions lack the ball's
+        spec.delete(key)
+    return spec.compile()
+
+
+def damping_for(restitution: float, stiffness: float, timestep: float, speed: float = 5.0) -> float:
+    """The contact's damping [1/s] that gives a ball dropped at ``speed`` [m/s] the wanted restitution, by bisection.
+
+    Found by experiment in MuJoCo itself, so that its softness and the finite time step are in it.
+    """
+    low, high = 0.0, 4.0 * np.sqrt(stiffness)
+    for _ in range(24):
+        middle = 0.5 * (low + high)
+        if _bounce(middle, stiffness, timestep, speed) > restitution:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+def _bounce(damping: float, stiffness: float, timestep: float, speed: float) -> float:
+    """Restitution of one drop."""
+    model = mujoco.MjModel.from_xml_string(f"""
+<mujoco><option timestep="{timestep}" gravity="0 0 0" integrator="implicitfast"/>
+<worldbody><geom name="plane" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
+<body pos="0 0 {BALL_RADIUS + 1e-4}"><freejoint/><inertial pos="0 0 0" mass="{BALL_MASS}"
+ diaginertia="{SHELL_INERTIA} {SHELL_INERTIA} {SHELL_INERTIA}"/>
+<geom name="ball" size="{BALL_RADIUS}" contype="0" conaffinity="0"/></body></worldbody>
+<contact><pair geom1="ball" geom2="plane" condim="1" solref="{-stiffness} {-damping}"
+ solimp="{' '.join(map(str, SOLIMP))}"/></contact></mujoco>""")
+    data = mujoco.MjData(model)
+    data.qvel[2] = -speed
+    for _ in range(int(0.02 / timestep)):
+        mujoco.mj_step(model, data)
+    return data.qvel[2] / speed

@@ -1,0 +1,66 @@
+"""The numbers of the safety gate that are not the joints' limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from robot_io.contract import JOINT_UNITS, N_JOINTS
+
+SLACK = 5e-4  # [m] by which margins may be missed between two ticks
+
+
+def _each(slide: float, hinge: float) -> tuple[float, ...]:
+    return tuple(slide if unit == "m" else hinge for unit in JOINT_UNITS)
+
+
+@dataclass(frozen=True)
+class SafetyConfig:
+    """What the gate allows; lengths in m, angles in rad, times in s, tuples in ``JOINT_NAMES`` order.
+
+    speed_scale      (0, 1], share of every requested velocity and of every velocity limit
+    table_margin     smallest gap of arm and paddle to the table and to everything under it
+    self_margin      smallest gap of the watched pairs of the robot's own parts
+    floor_margin     smallest gap of arm and paddle to the floor; the rails of the gantry end 0.15 m above it
+    escape_speed     share of the velocity limits while a gap is smaller than its margin
+    still            measured speed (8,) above which the robot counts as moving and is not armed
+    overspeed        measured speed over its limit that is a fault
+    following_error  distance (8,) of a measured position from where the reference was between ``delay`` before
+    delay            shortest and longest time from a command to the measurement of its effect
+    following_ticks  commands in a row after which a following error is a fault
+    late             longest time between two commands
+    stale_*          longest age of what was last heard of a device, and of the policy's request
+    """
+
+    speed_scale: float = 1.0
+    table_margin: float = 0.02
+    self_margin: float = 0.02
+    floor_margin: float = 0.17
+    escape_speed: float = 0.05
+    still: tuple[float, ...] = _each(0.02, 0.05)
+    overspeed: float = 1.5
+    following_error: tuple[float, ...] = _each(0.06, 0.2)
+    delay: tuple[float, float] = (0.0, 0.2)
+    following_ticks: int = 3
+    late: float = 0.05
+    stale_arm: float = 0.05
+    stale_axes: float = 0.05
+    stale_tracker: float = 0.1
+    stale_policy: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("speed_scale", "escape_speed"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)}, allowed is more than 0 and at most 1")
+        for name in ("table_margin", "self_margin", "floor_margin"):
+            if not SLACK < getattr(self, name) < 1.0:
+                raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)} m, allowed is {SLACK} m to 1 m")
+        for name in ("overspeed", "late", "stale_arm", "stale_axes", "stale_tracker", "stale_policy", "following_ticks"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)}, it must be positive and finite")
+        for name in ("still", "following_error"):
+            values = getattr(self, name)
+            if len(values) != N_JOINTS or not all(0.0 < v < math.inf for v in values):
+                raise ValueError(f"SafetyConfig.{name} is {values}, {N_JOINTS} positive numbers are needed")
+        if not 0.0 <= self.delay[0] < self.delay[1] < math.inf:
+            raise ValueError(f"SafetyConfig.delay is {self.delay}, needed is (shortest, longest) in seconds")

@@ -1,0 +1,52 @@
+"""Festo's own client against our emulated axis: run by the Python that has festo-edcon, with the port to talk to.
+
+    python interop_festo.py 127.0.0.1 PORT
+
+Prints one line of JSON with what the drive said after each step.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import sys
+import time
+
+from edcon.edrive import com_modbus
+from edcon.edrive.motion_handler import MotionHandler
+
+TARGET, SPEED = 150_000, 500  # [um], [mm/s]
+
+
+def main(address: str, port: int) -> None:
+    com_modbus.ModbusClient = functools.partial(com_modbus.ModbusClient, port=port)  # festo-edcon only knows port 502
+    com = com_modbus.ComModbus(address, cycle_time=5, timeout_ms=500)
+    told = {"device": com.device_info["product_code"]}
+    with MotionHandler(com, config_mode="write") as motion:
+        motion.base_velocity = 2.0
+        told["acknowledged"] = motion.acknowledge_faults()
+        told["enabled"] = motion.enable_powerstage()
+        told["homed"] = motion.referencing_task() and motion.referenced()
+        told["start"] = motion.current_position()
+        told["moved"] = motion.position_task(TARGET, SPEED, absolute=True)
+        time.sleep(0.2)
+        told["position"] = motion.current_position()
+        told["back"] = motion.position_task(-50_000, 2 * SPEED, nonblocking=True)
+        time.sleep(0.15)
+        told["velocity"] = motion.current_velocity()
+        motion.stop_motion_task()
+        time.sleep(0.4)
+        told["stopped"] = motion.stopped()
+        told["between"] = motion.current_position()
+        motion.configure_continuous_update(True)
+        motion.position_task(0, SPEED, absolute=True, nonblocking=True)
+        time.sleep(0.1)
+        told["updated"] = motion.position_task(TARGET, SPEED, absolute=True)
+        time.sleep(0.2)
+        told["final"] = motion.current_position()
+        told["disabled"] = motion.disable_powerstage()
+    print(json.dumps(told))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]))
