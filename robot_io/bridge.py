@@ -130,6 +130,7 @@ class Bridge:
         self._feedback = Feedback(ball=tracker.track, axes=History(), arm=History())
         self._state = State.DISARMED
         self._arm_session_id = 0
+        self._arm_sequence, self._arm_restarted = -1, False  # packets of the arm's; anew since it was armed
         self._axes_received = -math.inf
         self._tick_time = -math.inf
         self._last_tick = -math.inf
@@ -142,6 +143,8 @@ class Bridge:
         self._last_ball = -1  # number of the ball that was played last
         self._stop_wanted = False
         self.paused = False
+        self._tracks: dict[int, list[tuple[float, ...]]] = {}  # incoming samples by episode
+        self.policy_seconds = 0.0  # of the last tick; 0 when the policy was not asked
 
     # The operator
 
@@ -176,6 +179,7 @@ class Bridge:
         measured, velocity = joints(self._feedback)
         self.gate.arm(measured, now, velocity)
         self._arm_session_id = self.arm_session.session_id
+        self._arm_restarted = False
         self._start = measured
         self._change(State.READY, now, "armed by the operator")
 
@@ -188,7 +192,9 @@ class Bridge:
             self._change(State.STOPPING, now, "stopped by the operator")
 
     def reset(self, now: float) -> None:
-        """FAULT to DISARMED. Raises RefusedError while a cause is present or the robot still moves."""
+        """FAULT to DISARMED. Raises RefusedError without a fault, while a cause is present or the robot still moves."""
+        if self.state is not State.FAULT:
+            raise RefusedError(f"nothing to reset: the state is {self.state.value}, without a fault")
         self.gate.reset(now)
         self._logged_faults = 0
         self._change(State.DISARMED, now, "fault reset by the operator")
@@ -214,7 +220,10 @@ class Bridge:
         if self._feedback.arm.add(feedback.received, feedback.position):
             position, velocity = joints(self._feedback)
             self.recorder.put(Joints(feedback.received, position, velocity))
-        if self.gate.state is GateState.DISARMED or not np.isfinite(self._start).all():
+        # Where the old reference would lead a controller that was started anew, nobody has asked for.
+        self._arm_restarted |= feedback.sequence < self._arm_sequence
+        self._arm_sequence = feedback.sequence
+        if self.gate.state is GateState.DISARMED or self._arm_restarted or not np.isfinite(self._start).all():
             return self.arm_session.reply(feedback.position, np.zeros(len(ABB_JOINTS)), now)
         rows = list(ABB_JOINTS)
         velocity = self.gate.velocity[rows]
@@ -228,6 +237,8 @@ class Bridge:
         if sample is None or sample.position is None:
             return
         self.recorder.put(Ball(sample.captured, now, sample.position, sample.ball))
+        if self.episode is not None and not self.episode.over and sample.ball == self.episode.ball:
+            self._tracks[self.episode.number].append((sample.captured, *sample.position))
         following = [e for e in (self.episode, *self._waiting) if e is not None]
         if following:
             blade = self._blade(sample.captured)
@@ -258,9 +269,9 @@ class Bridge:
         if self.state is State.READY and not self.paused and self.at_home and in_play(self.tracker, now):
             if self.tracker.ball != self._last_ball:
                 self._begin(now)
-        policy_seconds, request = 0.0, np.zeros(N_JOINTS)
+        self.policy_seconds, request = 0.0, np.zeros(N_JOINTS)
         if self.state is State.ACTIVE:
-            request, policy_seconds = self._play(now)
+            request = self._play(now)
         elif self.state is State.READY:
             request = self._homeward()
         self._start = self.gate.reference if np.isfinite(self.gate.reference).all() else measured
@@ -274,7 +285,7 @@ class Bridge:
         self._after(sent, now)
         ages = self._ages(now)
         self.recorder.put(
-            Tick(self.counts.ticks, now, now - deadline, policy_seconds, ages["ball"], ages["axes"], ages["arm"]),
+            Tick(self.counts.ticks, now, now - deadline, self.policy_seconds, ages["ball"], ages["axes"], ages["arm"]),
             Command(self.counts.ticks, now, request, sent.velocity, self._start),
         )
         return sent.velocity
@@ -308,25 +319,33 @@ class Bridge:
         self.counts.balls += 1
         self._last_ball = self.tracker.ball
         self.episode = Episode(self.counts.balls, self.tracker.ball, now)
+        self._tracks[self.counts.balls] = [(t, *x) for t, x in self.tracker.track.samples()]
         self._policy.reset()
         self.recorder.put(episode_start(now, self.episode.number, ball=self.episode.ball))
         self._change(State.ACTIVE, now, f"ball {self.episode.ball}")
 
-    def _play(self, now: float) -> tuple[np.ndarray, float]:
-        """The policy's request (8,) and the seconds that it took."""
+    def _play(self, now: float) -> np.ndarray:
+        """The policy's request (8,)."""
         episode = self.episode
         observation = observe(self._feedback, self.config.delays, now)
         if observation is None:
-            self.gate.fault(Cause.STALE_TRACKER, "no recent observation while a ball is in play", now)
-            return np.zeros(N_JOINTS), 0.0
+            if self._feedback.ball.at(now - self.config.delays.ball) is None:
+                episode.over = True  # frames come, as the gate has checked, but the ball is out of sight
+            else:
+                self.gate.fault(Cause.INTERNAL, "no joint positions to observe while a ball is in play", now)
+            return np.zeros(N_JOINTS)
         began = perf_counter()
-        action = self._policy.step(observation)
-        seconds = perf_counter() - began
+        try:
+            action = np.asarray(self._policy.step(observation), float)
+            if action.shape != (N_JOINTS,):
+                raise ValueError(f"an action of shape {action.shape}, needed is ({N_JOINTS},)")
+        except Exception as error:  # whatever a policy does, the robot is braked
+            self.gate.fault(Cause.MALFORMED_COMMAND, f"the policy failed: {type(error).__name__}: {error}", now)
+            return np.zeros(N_JOINTS)
+        self.policy_seconds = perf_counter() - began
         episode.steps += 1
-        self.recorder.put(
-            Observation(self.counts.ticks, now, observation), Action(self.counts.ticks, now, np.asarray(action, float))
-        )
-        return np.asarray(action, float) * self._policy_limit, seconds
+        self.recorder.put(Observation(self.counts.ticks, now, observation), Action(self.counts.ticks, now, action))
+        return action * self._policy_limit
 
     def _homeward(self) -> np.ndarray:
         """Velocity (8,) towards the home pose: as fast as it can still be braked, and slower than the policy may."""
@@ -361,6 +380,7 @@ class Bridge:
         self.recorder.put(episode_end(now, summary.number, summary.outcome, {}, **details))
         if self._on_episode is not None:
             self._on_episode(summary)
+        self._tracks.pop(summary.number, None)
 
     def _abort_episodes(self, cause: str, now: float) -> None:
         for episode in (self.episode, *self._waiting):
@@ -391,6 +411,10 @@ class Bridge:
 
     def _event(self, now: float, level: Level, name: str, text: str) -> None:
         self.recorder.put(Event(now, level, name, text))
+
+    def ball_track(self, summary: EpisodeSummary) -> np.ndarray:
+        """(n, 4) t [s], x, y, z [m] of the incoming ball, from its first sight until it was played; while ``on_episode``."""
+        return np.array(self._tracks.get(summary.number, [])).reshape(-1, 4)
 
     def joint_table(self) -> list[tuple[str, float, float]]:
         """Name, measured position and commanded velocity of every joint, for the view."""

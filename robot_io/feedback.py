@@ -1,4 +1,4 @@
-"""What the robot's measured positions and velocities say: are they numbers, within limits, clear, and where it was sent."""
+"""What measured positions and velocities say: are they numbers, within limits, clear, and where the robot was sent."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from robot_io.contract import JOINT_NAMES, JOINT_UNITS, N_JOINTS, JointLimits
 from robot_io.faults import Cause
 from robot_io.geometry import RobotGeometry
 from robot_io.safety_config import SafetyConfig
+
+EARLY = 0.1  # [s] by which a measurement may be looked at before the end of the newest period
 
 
 class FeedbackMonitor:
@@ -30,6 +32,7 @@ class FeedbackMonitor:
     def sent(self, reference: np.ndarray, time: float) -> None:
         """The reference (8,) will be here at ``time``, on a straight way from the one before."""
         self._past.append((time, reference))
+        self._forget(time - self._config.delay[1] - EARLY)
 
     def conditions(self, position: np.ndarray, velocity: np.ndarray) -> dict[Cause, str]:
         """What is wrong with a measurement of finite numbers, each (8,); an empty sentence: nothing."""
@@ -45,8 +48,7 @@ class FeedbackMonitor:
     def following_error(self, position: np.ndarray, now: float) -> str:
         """How the measured position (8,) misses every place where the reference was while its effect was under way."""
         shortest, longest = self._config.delay
-        while len(self._past) > 1 and self._past[1][0] <= now - longest:
-            self._past.popleft()
+        self._forget(now - longest)
         if not self._past:
             return ""
         seen = [r for i, (_, r) in enumerate(self._past) if i == 0 or self._past[i - 1][0] < now - shortest]
@@ -55,6 +57,10 @@ class FeedbackMonitor:
         if self._off < self._config.following_ticks:
             return ""
         return f"away from the reference: {worst(np.maximum(error, 0.0), self._tolerance)}"
+
+    def _forget(self, time: float) -> None:
+        while len(self._past) > 1 and self._past[1][0] <= time:
+            self._past.popleft()
 
     def _limit(self, position: np.ndarray, velocity: np.ndarray) -> str:
         outside = np.maximum(self._lower - position, position - self._upper)

@@ -81,7 +81,10 @@ class Box:
 
 
 def segment_distance(p1, q1, p2, q2) -> np.ndarray:
-    """Distance [m], (n, B), of segments p1-q1 and p2-q2, each end (3, n, B). Ericson, Real-Time Collision Detection, 5.1.9."""
+    """Distance [m], (n, B), of segments p1-q1 and p2-q2, each end (3, n, B).
+
+    Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
+    """
     d1, d2, r = q1 - p1, q2 - p2, p1 - p2
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
     f, c = _dot(d2, r), _dot(d1, r)
@@ -118,7 +121,8 @@ class RobotGeometry:
             raise GeometryError(f"{where}: no capsules named {unknown}; it has {sorted(capsules)}")
         order = self._names = list(capsules)
         self._joint = np.array([JOINT_NAMES.index(capsules[n]["joint"]) for n in order])
-        self._local = np.array([[[*capsules[n][end], 1.0] for end in ("p0", "p1")] for n in order]).swapaxes(1, 2)[:, None]
+        local = np.array([[[*capsules[n][end], 1.0] for end in ("p0", "p1")] for n in order])
+        self._local = local.swapaxes(1, 2)[:, None]  # (capsules, 1, 4, 2)
         self._radius = np.array([capsules[n]["radius"] for n in order], float)[:, None]
         self._table_rows = np.array([order.index(n) for n in watched])
         self._blade_rows = np.array([watched.index(n) for n in data["blade_capsules"]])
@@ -144,7 +148,8 @@ class RobotGeometry:
         try:
             data = json.loads(source.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise GeometryError(f"{source}: cannot be read ({error}); write it with python -m mjx_tt.geometry") from error
+            remedy = "write it with python -m mjx_tt.geometry"
+            raise GeometryError(f"{source}: cannot be read ({error}); {remedy}") from error
         return cls(data, str(source))
 
     def ends(self, q: np.ndarray) -> np.ndarray:
@@ -164,7 +169,7 @@ class RobotGeometry:
         return self.ends(q[:, None])[:, :, self._names.index(capsule), 0].mean(axis=0)
 
     def clearances(self, q: np.ndarray) -> Clearances:
-        """The simulation's clearances at joint positions q (8, B), float64: a NamedTuple (table, own, blade), each (B,)."""
+        """The simulation's clearances at joint positions q (8, B)."""
         ends = self.ends(np.asarray(q, float))
         table = self._to_box(self._top, ends)
         return Clearances(table.min(0), self._own(ends).min(0), table[self._blade_rows].min(0))
@@ -228,14 +233,14 @@ class RobotGeometry:
         return np.concatenate([self._to_box(self._block, ends), self._own(ends), floor])
 
     def _chord(self, moved: np.ndarray) -> np.ndarray:
-        """Largest way (R, B) along the chord of any point of what a row is between, from the ends' ways (2, 3, n, B)."""
+        """Longest chord (R, B) of any point of what a row is between, from the ends' ways (2, 3, n, B)."""
         alone = np.sqrt(np.einsum("exnb,exnb->enb", moved, moved).max(0))[self._table_rows]
         relative = moved[:, None, :, self._first] - moved[None, :, :, self._second]
         pairs = np.sqrt(np.einsum("efxnb,efxnb->efnb", relative, relative).max((0, 1)))
         return np.concatenate([alone, pairs, alone])
 
     def _bulge(self, dq: np.ndarray) -> np.ndarray:
-        """How far (R, B) a row's gap can differ from that along the chords when the joints move straight by dq (8, B)."""
+        """How far (R, B) a row's gap can differ from that along the chords, for joints moving straight by dq (8, B)."""
         size = np.abs(dq) * self._hinge
         inner = np.cumsum(size, axis=0) - size
         bulge = self._levers @ (size * (size + 2.0 * inner)) / 8.0  # (capsules, B)

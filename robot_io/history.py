@@ -34,6 +34,10 @@ class History:
         """Time [s] and value (n,) of the newest sample."""
         return (self._times[-1], self._values[-1]) if self._times else None
 
+    def samples(self) -> list[tuple[float, np.ndarray]]:
+        """All that is kept, oldest first."""
+        return list(zip(self._times, self._values))
+
     def add(self, time: float, value: np.ndarray) -> bool:
         """Takes a sample; False, and nothing is kept, when it is not newer than the newest."""
         if self._times and time <= self._times[-1]:

@@ -1,10 +1,10 @@
-"""The last gate that every velocity command passes on its way to the robot, once per control period. See docs/safety.md.
+"""The last gate that every velocity command passes on its way to the robot, once per control period: docs/safety.md.
 
 The gate keeps a reference: the joint positions that its commands add up to. What it has accepted so far can always be
 braked: from the reference and the last velocity every joint, slowing down at its acceleration limit, comes to rest
-inside its range and, as a whole, without coming closer to table, floor or itself than the margins. A request is accepted
-only when the same holds after it; otherwise the gate brakes, along the way that was proven before. Any doubt means the
-same: brake, hold, and remember why.
+inside its range, and the robot on its way keeps its margins to table, floor and itself. A request is accepted only when
+the same holds after it; otherwise the gate brakes, along the way that was proven before. Any doubt means the same:
+brake, hold, and remember why.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from robot_io.safety_config import SafetyConfig as SafetyConfig
 SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
 INSIDE = 1e-6  # [m] by which a gap must miss its margin to count as inside: more than rounding
 ROUNDING = 1e-9  # of each limit, allowed in the check of our own results
-LONGEST_LEAD = 2.5  # control periods that commands may come ahead of the clock
+LONGEST_LEAD = 3.0  # control periods that commands may come ahead of the clock
 
 
 class State(Enum):
@@ -110,6 +110,11 @@ class SafetyGate:
         return not self._velocity.any()
 
     @property
+    def engaged(self) -> bool:
+        """Whether the reference is the gate's: from arming to disarming or reset. Otherwise nothing may be sent."""
+        return self._engaged
+
+    @property
     def velocity(self) -> np.ndarray:
         """Velocity (8,) that was sent last."""
         return self._velocity.copy()
@@ -151,7 +156,8 @@ class SafetyGate:
         if outside.any():
             i = int(outside.argmax())
             allowed = f"[{self._low[i]:.4f}, {self._high[i]:.4f}] {JOINT_UNITS[i]}"
-            raise RefusedError(f"not armed: {JOINT_NAMES[i]} is at {position[i]:.4f}, allowed is {allowed}; jog it back")
+            found = f"{JOINT_NAMES[i]} is at {position[i]:.4f}"
+            raise RefusedError(f"not armed: {found}, allowed is {allowed}; jog it back")
         touching = self._monitor.contact(position)
         if touching:
             raise RefusedError(f"not armed: {touching}; jog it away")
@@ -199,8 +205,10 @@ class SafetyGate:
         self.condition(Cause.ESTOP, pressed, "the emergency stop is pressed", now)
 
     def reset(self, now: float) -> None:
-        """The operator's: forgets the faults; the gate is disarmed then. Raises RefusedError, and forgets nothing, while
-        the robot is commanded to move or a cause is present. Without a fault it does nothing."""
+        """The operator's: forgets the faults; the gate is disarmed then. Without a fault it does nothing.
+
+        Raises RefusedError, and forgets nothing, while the robot is commanded to move or a cause is present.
+        """
         if not self._latch:
             return
         if not self.at_rest:
@@ -226,7 +234,8 @@ class SafetyGate:
             (Cause.STALE_TRACKER, "the tracker", tracker_age if ball_in_play else 0.0, c.stale_tracker),
             (Cause.STALE_POLICY, "the policy", policy_age, c.stale_policy),
         ):
-            self.condition(cause, not age <= allowed, f"{what} is silent for {age:.3f} s, allowed is {allowed} s", now)
+            sentence = f"nothing heard from {what} for {age:.3f} s, allowed is {allowed} s"
+            self.condition(cause, not age <= allowed, sentence, now)
 
     def command(self, request, measured, measured_velocity, now: float) -> Sent:
         """One control tick: requested, measured velocity and measured position, each (8,), to what has to be sent.
@@ -238,7 +247,8 @@ class SafetyGate:
         wanted = self._request(request, now)
         if not self._engaged:
             return Sent(np.zeros(N_JOINTS), self._reference.copy(), (self.state.value,), self.state)
-        braked = self._velocity - np.clip(self._velocity, -self._step, self._step)
+        left = np.abs(self._velocity) - self._step
+        braked = np.where(left > ROUNDING * self._step, np.copysign(left, self._velocity), 0.0)
         velocity, changed = braked, (self.state.value,)
         if self.state is State.ARMED:
             try:
@@ -256,7 +266,7 @@ class SafetyGate:
         return Sent(velocity.copy(), self._reference.copy(), changed, self.state)
 
     def _allowed(self, wanted: np.ndarray, braked: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-        """The velocity (8,) closest to the wanted one that the gate accepts, and the rules that changed it."""
+        """The first velocity (8,) on the way from the limited request to braking that is clear, and the rules."""
         rules = []
         scaled = wanted * self.config.speed_scale
         if (scaled != wanted).any():
@@ -277,10 +287,10 @@ class SafetyGate:
         ):  # fmt: skip
             if (before != after).any():
                 rules.append(name)
-        if not velocity.any() and self.at_rest:
+        if (velocity == braked).all():  # cleared before, or at rest
             return velocity, tuple(rules)
         for share in SHARES:
-            # Between two velocities that keep the kinematic limits every velocity does: they bound each joint by itself.
+            # Between two velocities that keep the kinematic limits every one does: they bound each joint by itself.
             tried = velocity if share == 1.0 else braked + share * (velocity - braked)
             if self._clear(tried):
                 return tried, tuple(rules if share == 1.0 else [*rules, "clearance"])

@@ -55,7 +55,8 @@ class SafetyConfig:
         for name in ("table_margin", "self_margin", "floor_margin"):
             if not SLACK < getattr(self, name) < 1.0:
                 raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)} m, allowed is {SLACK} m to 1 m")
-        for name in ("overspeed", "late", "stale_arm", "stale_axes", "stale_tracker", "stale_policy", "following_ticks"):
+        ages = ("stale_arm", "stale_axes", "stale_tracker", "stale_policy")
+        for name in ("overspeed", "late", "following_ticks", *ages):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)}, it must be positive and finite")
         for name in ("still", "following_error"):

@@ -134,8 +134,8 @@ def test_segment_distance_by_hand():
 
 
 def test_a_cleared_motion_is_clear_between_its_points(ours):
-    """Straight ways near the table: whatever is cleared keeps its margin at hundreds of places between the points, where
-    looking at the points alone would have let contact pass; and most of what is clear is cleared."""
+    """Straight ways near the table: whatever is cleared keeps its margin at hundreds of places between the points,
+    where looking at the points alone would not have been enough; and what is clear by far is cleared."""
     rng = np.random.default_rng(2)
     margin, slack = np.full(len(ours.rows), 0.02), 5e-4
     start = rng.uniform(LOWER, UPPER, (8, 3000))

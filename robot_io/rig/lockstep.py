@@ -14,35 +14,26 @@ from pathlib import Path
 import numpy as np
 
 from robot_io.bridge import Bridge, BridgeConfig, Policy, State
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, LIMITS, N_JOINTS
+from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_JOINTS
 from robot_io.egm import EgmConfig, EgmSession
 from robot_io.errors import RefusedError
-from robot_io.festo import AxesConfig, Axis, CmmtProfile, DirectLink, FestoAxes, FhppProfile
+from robot_io.festo import Axis, DirectLink, FestoAxes
 from robot_io.log.recorder import SessionRecorder
 from robot_io.play import EpisodeSummary
 from robot_io.rig.arm import ArmController
 from robot_io.rig.axes import AxisEmulator
 from robot_io.rig.network import Network
-from robot_io.rig.params import AXIS_FEEDBACK_DELAY, RigParams
+from robot_io.rig.params import AXES_CONFIG, AXIS_FEEDBACK_DELAY, RigParams
 from robot_io.rig.thrower import Thrower, Throws
 from robot_io.rig.tracker import TrackerEmulator
 from robot_io.rig.world import World
+from robot_io.robot_config import PROFILES, axis_range
 from robot_io.safety import SafetyConfig, SafetyGate
 from robot_io.tracker import Tracker, TrackerConfig
 
 GRID = 3000  # ticks a second of the clock, so that 75, 125 and 250 Hz are whole numbers of them
 ARM, AXES, TRACK, CONTROL = GRID // 250, GRID // 125, GRID // 125, GRID // 75
 BRIDGE, CONTROLLER = ("127.0.0.1", 6510), ("127.0.0.1", 6511)
-PROFILES = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
-
-
-# The latency that training knows and the lag of the carriage's servo behind it.
-AXES_CONFIG = AxesConfig(latency=0.0645 + 0.033 + 0.035, gain=2.0)
-
-
-def axis_range(i: int) -> tuple[float, float]:
-    """Range [m] that is ever commanded to linear axis ``i``: the limiter's."""
-    return LIMITS.lower[i] + LIMITS.margin[i], LIMITS.upper[i] - LIMITS.margin[i]
 
 
 class LockStep:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from robot_io.festo import AxesConfig
 from robot_io.rig.arm import ArmParams
 from robot_io.rig.axis_drive import DriveParams
 from robot_io.rig.network import NetworkFaults
 from robot_io.rig.tracker import TrackerParams
 from robot_io.rig.world import WorldParams
 
+# The latency that training knows and the lag of the carriage's servo behind it.
+AXES_CONFIG = AxesConfig(latency=0.0645 + 0.033 + 0.035, gain=2.0)
 AXIS_FEEDBACK_DELAY = 0.033  # [s], paper: latency of the linear axes' observation
 
 

@@ -1,0 +1,76 @@
+"""The state that the rig's processes share: the world writes it, the emulators of arm and axes write set-points.
+
+One block of float64 in shared memory. The world counts a version up before and after it writes, so a reader knows when it
+has read half of two states and reads again.
+"""
+
+from __future__ import annotations
+
+from multiprocessing import shared_memory
+
+import numpy as np
+
+from robot_io.contract import N_JOINTS
+
+_FIELDS = {
+    "version": 1, "time": 1, "qpos": N_JOINTS, "qvel": N_JOINTS, "ball": 3, "ball_number": 1, "ball_in_play": 1,
+    "collisions": 1, "setpoint": N_JOINTS, "throwing": 1, "thrown": 1, "finish": 1, "estop": 1, "silent_until": 1,
+}  # fmt: skip
+
+
+class Shared:
+    """Views into the block by name; ``Shared()`` makes one, ``Shared(name)`` attaches to it."""
+
+    def __init__(self, name: str | None = None) -> None:
+        size = 8 * sum(_FIELDS.values())
+        self._owner = name is None
+        self._memory = shared_memory.SharedMemory(name=name, create=name is None, size=size, **_untracked(name))
+        self._block = np.ndarray((sum(_FIELDS.values()),), np.float64, self._memory.buf)
+        if self._owner:
+            self._block[:] = 0.0
+        start = 0
+        self.views: dict[str, np.ndarray] = {}
+        for field, count in _FIELDS.items():
+            self.views[field] = self._block[start : start + count]
+            start += count
+
+    @property
+    def name(self) -> str:
+        return self._memory.name
+
+    def __getitem__(self, field: str) -> np.ndarray:
+        return self.views[field]
+
+    def value(self, field: str) -> float:
+        return float(self.views[field][0])
+
+    def publish(self, time: float, qpos, qvel, ball, number: int, in_play: bool, collisions: int, thrown: int) -> None:
+        """The world's state at ``time`` [s]."""
+        views = self.views
+        views["version"][0] += 1
+        views["time"][0], views["qpos"][:], views["qvel"][:], views["ball"][:] = time, qpos, qvel, ball
+        views["ball_number"][0], views["ball_in_play"][0] = number, in_play
+        views["collisions"][0], views["thrown"][0] = collisions, thrown
+        views["version"][0] += 1
+
+    def read(self, *fields: str) -> list[np.ndarray]:
+        """Copies of fields that belong to one state."""
+        while True:
+            before = self.value("version")
+            copies = [self.views[field].copy() for field in fields]
+            if before % 2 == 0 and self.value("version") == before:
+                return copies
+
+    def close(self) -> None:
+        self.views.clear()
+        del self._block
+        self._memory.close()
+        if self._owner:
+            self._memory.unlink()
+
+
+def _untracked(name: str | None) -> dict:
+    """Python 3.13 can attach without its resource tracker, which otherwise unlinks the block when one process ends."""
+    import sys
+
+    return {"track": False} if name is not None and sys.version_info >= (3, 13) else {}
