@@ -145,6 +145,44 @@ def bench(options: argparse.Namespace) -> int:
     return run_benchmarks(json_path=options.json)
 
 
+def run(options: argparse.Namespace) -> int:
+    _start_jax(1)
+    from rich.console import Console
+
+    from experiments import play
+
+    return play.run(
+        Path(options.artefact), options.robot, options.balls, options.distribution, options.backend, Path(options.log),
+        options.rig, options.seed, options.seconds, Console(),
+    )  # fmt: skip
+
+
+def rig(options: argparse.Namespace) -> int:
+    _start_jax(1)
+    from rich.console import Console
+
+    from experiments import play
+
+    return play.rig(options.distribution, options.rig, options.seed, options.ports, Path(options.out), Console())
+
+
+def log(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from experiments import logs
+
+    console = Console()
+    if options.action == "list":
+        logs.list_logs(Path(options.paths[0]), console)
+    elif options.action == "check":
+        return 1 if logs.check([Path(p) for p in options.paths], console) else 0
+    else:
+        act = logs.salvage if options.action == "salvage" else logs.export
+        for path in options.paths:
+            act(Path(path), Path(options.out) if options.out else None, console)
+    return 0
+
+
 def schema(options: argparse.Namespace) -> int:
     import json
 
@@ -243,6 +281,39 @@ Then write "balls: anna.yaml" in an experiment.
     p.add_argument("--camera", default="side", help="side, robot_back, human or top (default: side)")
     p.add_argument("--seed", type=int, metavar="K", help="another seed means other balls")
 
+    p = _command(commands, "run", run, "play: an exported policy on a robot, real or emulated", """\
+  mjx-tt run runs/quickstart/artefact --robot rig --balls 30
+  mjx-tt run runs/quickstart/artefact --robot robot.yaml
+  mjx-tt run runs/quickstart/artefact --robot rig --rig worn.yaml --distribution player1/M1
+
+The robot needs the operator: p prepares the axes, a arms, the space bar stops. The rig is switched on, armed and fed
+with balls by itself. Read docs/safety.md and docs/hardware.md before a real arm moves.
+""")  # fmt: skip
+    p.add_argument("artefact", metavar="ARTEFACT", help="folder of an exported policy")
+    p.add_argument("--robot", required=True, metavar="YAML", help='a robot.yaml, or "rig" for the emulated robot')
+    p.add_argument("--balls", type=_count, metavar="N", help="end after N balls (default: when the operator quits)")
+    p.add_argument("--seconds", type=float, metavar="S", help="end after S seconds")
+    p.add_argument("--backend", choices=("numpy", "jit"), default="numpy", help="what computes the policy")
+    p.add_argument("--log", default="runs/robot", metavar="FOLDER", help="for the MCAP log and the summary")
+    _add_rig(p, None)
+
+    p = _command(commands, "rig", rig, "the emulated robot alone, on real sockets", """\
+  mjx-tt rig --out rig.yaml          and in another terminal:  mjx-tt run ARTEFACT --robot rig.yaml
+""")  # fmt: skip
+    p.add_argument("--ports", type=_ports, default=(6510, 6520, 5021, 5022), metavar="ARM,TRACKER,X,Y")
+    p.add_argument("--out", default="rig-robot.yaml", metavar="YAML", help="where its robot.yaml is written")
+    _add_rig(p, "player3/M0")
+
+    p = _command(commands, "log", log, "list, check, salvage or export the logs of a robot", """\
+  mjx-tt log list runs/robot
+  mjx-tt log check runs/robot/20261121-153000.mcap
+  mjx-tt log salvage runs/robot/20261121-153000.mcap.part
+  mjx-tt log export runs/robot/20261121-153000.mcap --out tables/
+""")  # fmt: skip
+    p.add_argument("action", choices=("list", "check", "salvage", "export"))
+    p.add_argument("paths", nargs="+", metavar="LOG", help="an .mcap or .mcap.part; for list a folder")
+    p.add_argument("--out", metavar="PATH", help="of salvage: the file; of export: the folder")
+
     p = _command(commands, "bench", bench, "measure this machine: physics steps per second, time per update", """\
   mjx-tt bench
   mjx-tt bench --json bench.json
@@ -278,6 +349,13 @@ def _add_policy(p: argparse.ArgumentParser) -> None:
     p.add_argument("--model", metavar="YAML", help="another simulation model")
 
 
+def _add_rig(p: argparse.ArgumentParser, distribution: str | None) -> None:
+    trained = "the policy's" if distribution is None else distribution
+    p.add_argument("--distribution", default=distribution, metavar="NAME", help=f"balls that are thrown (default: {trained})")
+    p.add_argument("--rig", metavar="YAML", help="another rig: world, delays, network faults")
+    p.add_argument("--seed", type=int, default=0, metavar="K", help="of the balls that are thrown")
+
+
 def _add_format(p: argparse.ArgumentParser) -> None:
     p.add_argument("--format", metavar="NAME", help="csv, mcap, deepmind or aimy (default: from the suffix)")
 
@@ -286,6 +364,13 @@ def _count(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r}: a whole number of at least 1 is needed")
     return int(text)
+
+
+def _ports(text: str) -> tuple[int, ...]:
+    parts = text.split(",")
+    if len(parts) != 4 or not all(part.isdigit() and 0 < int(part) < 65536 for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r}: four ports are needed, such as 6510,6520,5021,5022")
+    return tuple(map(int, parts))
 
 
 def _seeds(text: str) -> tuple[int, ...]:

@@ -21,9 +21,13 @@ class CheckpointError(ExperimentError):
 
 def explained(error: Exception) -> bool:
     """Whether the error's message is enough."""
-    from robot_io.artefact import ArtefactError  # needs NumPy, which --help should not wait for
+    # These need NumPy, which --help should not wait for.
+    from robot_io.artefact import ArtefactError
+    from robot_io.egm_messages import EgmError
+    from robot_io.errors import DeviceError, RefusedError
+    from robot_io.log.records import LogError
 
-    return isinstance(error, (ExperimentError, ArtefactError, OSError))
+    return isinstance(error, (ExperimentError, ArtefactError, OSError, RefusedError, DeviceError, EgmError, LogError))
 
 
 def checked(where: str, function, *arguments):

@@ -64,29 +64,27 @@ class Journal:
         self.path = path
         self.entries: list[Entry] = []
         whole = self._read() if path.exists() else 0
-        self._file = open(path, "ab")
-        self._file.truncate(whole)
-        self._sync()
+        self._file = open(path, "ab", buffering=0)
+        os.ftruncate(self._file.fileno(), whole)
+        os.fsync(self._file.fileno())
         _sync_folder(path.parent)
 
     def append(self, entry: Entry) -> None:
         """Adds an entry; it is on the disk when this returns. Raises OSError when the disk refuses."""
-        line = json.dumps(_to_json(entry), allow_nan=False) + "\n"
-        start = self._file.tell()
+        line = (json.dumps(_to_json(entry), allow_nan=False) + "\n").encode()
+        handle = self._file.fileno()
+        start = os.fstat(handle).st_size
         try:
-            self._file.write(line.encode())
-            self._sync()
+            while line:
+                line = line[os.write(handle, line) :]
+            os.fsync(handle)
         except OSError:
-            os.ftruncate(self._file.fileno(), start)  # no half a line in the middle, should there be room again
+            os.ftruncate(handle, start)  # no half a line in the middle, should there be room again
             raise
         self.entries.append(entry)
 
     def close(self) -> None:
         self._file.close()
-
-    def _sync(self) -> None:
-        self._file.flush()
-        os.fsync(self._file.fileno())
 
     def _read(self) -> int:
         """Reads the entries; length [bytes] of the whole lines."""

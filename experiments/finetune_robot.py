@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+import mjx_tt
 from experiments.errors import RunError
-from mjx_tt.model import SCENE
 from robot_io import contract
 from robot_io.log.records import Ball
 from robot_io.log.recorder import NullRecorder
@@ -20,6 +20,7 @@ from robot_io.rig.params import RigParams
 from robot_io.rig.thrower import Throws
 from robot_io.rig.world import World
 
+SCENE = Path(mjx_tt.__file__).parent / "assets" / "scene.xml"
 REPORTING = 1.0  # [s] within which the outcome of an episode that a fault ended is known
 
 

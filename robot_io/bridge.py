@@ -243,7 +243,7 @@ class Bridge:
         if following:
             blade = self._blade(sample.captured)
             for episode in following:
-                episode.follow(sample, self.tracker, blade, now)
+                episode.follow(sample, blade, now)
 
     def axes_received(self, position: np.ndarray, received: float) -> None:
         """The linear axes' newest position (2,) [m], as it was at ``received``."""

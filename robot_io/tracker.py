@@ -33,6 +33,7 @@ _CRC = struct.Struct("<I")
 SIZE = _BODY.size + _CRC.size
 SEQUENCE = 1 << 32
 NANO = 1_000_000_000
+MAX_DRAIN = 1000  # datagrams per call: a flood must not keep the caller from its control tick
 REACH = 10.0  # [m] from the table's centre, beyond which a position is nonsense
 
 
@@ -68,6 +69,8 @@ def decode(datagram: bytes) -> BallSample:
     if magic != MAGIC or version != VERSION or flags & ~SEEN:
         raise ValueError(f"format: magic {magic!r}, version {version}, flags {flags}")
     if not flags & SEEN:
+        if any(position):
+            raise ValueError(f"position: {position} of no ball")
         return BallSample(sequence, ball, captured / NANO, None)
     point = np.array(position)
     if not np.isfinite(point).all() or np.abs(point).max() > REACH:
@@ -128,6 +131,9 @@ class Tracker:
             if not 0 < ahead < SEQUENCE // 2 and not restarted:
                 self.counts["duplicate" if ahead == 0 else "out of order"] += 1
                 return None
+            if not restarted and captured <= self.newest.captured:
+                self.counts["out of order"] += 1
+                return None
             self.counts["lost"] += 0 if restarted else ahead - 1
         self._sequence = sample.sequence
         self.counts["accepted"] += 1
@@ -162,8 +168,8 @@ class TrackerSocket:
         return self._socket.fileno()
 
     def drain(self):
-        """Every datagram that waits, as (bytes, IP address)."""
-        while True:
+        """The datagrams that wait, as (bytes, IP address)."""
+        for _ in range(MAX_DRAIN):
             try:
                 datagram, address = self._socket.recvfrom(2048)
             except BlockingIOError:

@@ -71,9 +71,9 @@ class LockStep:
 class Stream:
     """Commands of a policy at 75 Hz that make ``velocity(t)`` (2,), integrated from ``start``."""
 
-    def __init__(self, rig, velocity, rate=75.0):
+    def __init__(self, rig, velocity, rate=75.0, offset=0.0):
         self.rig, self.velocity, self.period = rig, velocity, 1.0 / rate
-        self.origin = self.next = rig.now
+        self.origin = self.next = rig.now + offset
         self.reference, self.current = rig.position.copy(), np.zeros(2)
         self.log: list[tuple] = []
 

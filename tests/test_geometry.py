@@ -12,6 +12,7 @@ import pytest
 
 from mjx_tt import clearance, geometry, robot
 from mjx_tt.kinematics import PaddleKinematics
+from robot_io import geometry as shipped
 from robot_io.contract import LIMITS
 from robot_io.geometry import Box, GeometryError, RobotGeometry, segment_distance
 
@@ -156,6 +157,25 @@ def test_a_cleared_motion_is_clear_between_its_points(ours):
             missed += dense > 0.035
         dips += dense < 0.02 - slack
     assert dips > 3 and cleared > 80 and missed < 0.05 * cleared
+
+
+@pytest.mark.parametrize(("levels", "size"), [(0, 0.3), (2, 1.0)])
+def test_the_bound_between_points_holds_for_every_gap(ours, monkeypatch, levels, size):
+    """Each gap by itself, with a margin just above its true minimum on the way: never cleared."""
+    monkeypatch.setattr(shipped, "LEVELS", levels)
+    rng = np.random.default_rng(4)
+    s = np.linspace(0, 1, 301)
+    dips = 0
+    for _ in range(150):
+        a = rng.uniform(LOWER, UPPER)[:, 0]
+        b = a + rng.uniform(-size, size, 8) * rng.integers(0, 2, 8)
+        gaps = ours.gaps(a[:, None] + s * (b - a)[:, None])
+        for row in np.flatnonzero((gaps.min(1) < np.minimum(gaps[:, 0], gaps[:, -1]) - 1e-3) & (gaps.min(1) > 0)):
+            margin = np.full(len(ours.rows), -1.0)
+            margin[row] = gaps[row].min() + 1e-5
+            assert ours.first_too_close(np.stack([a, b], axis=1), margin, 0.0) == row
+            dips += 1
+    assert dips > 100
 
 
 def test_what_is_inside_its_margin_must_not_lose_anything(ours):

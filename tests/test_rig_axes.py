@@ -186,9 +186,9 @@ class TestDrive:
             bench.run(0.3, **MOVE, position=-0.4)
             before = bench.x
             status = bench.run(0.2, **command)
-            assert bench.v == 0.0 and status.enabled == enabled and not status.fault
+            assert abs(bench.v) < 0.002 and status.enabled == enabled and not status.fault
             assert bench.x - before == pytest.approx(-1.0 / (2 * A), abs=0.002)
-            assert bench.run(0.2, **command).enabled == enabled and bench.v == 0.0  # the task is gone
+            assert bench.run(0.3, **command).enabled == enabled and abs(bench.v) < 1e-5  # the task is gone
 
     def test_an_axis_that_is_blocked_faults(self, profile):
         bench = Bench(profile).operate()
@@ -224,24 +224,19 @@ class TestDrive:
 
 @pytest.mark.parametrize("profile", ["cmmt", "fhpp continuous"])
 def test_latency_of_a_velocity_change(profile):
-    """64.5 ms on average from the command to the middle of the change, over all phases of policy and bus."""
-    rig = LockStep(profile, start=(-0.8, 0.0)).start()
-    period = 0.2
-    stream = Stream(rig, lambda t: (min(15.0 * t, 0.5) + (0.2 if t % period >= period / 2 and t > 0.5 else 0.0), 0.0))
-    rig.run(2.6, stream)
-    trace, given = rig.trace, stream.trace
-    changes = np.flatnonzero(np.abs(np.diff(given[:, 3])) > 0.19) + 1
-    changes = changes[(given[changes, 0] < rig.now - 0.12) & (given[changes, 0] > given[0, 0] + 0.4)]
+    """64.5 ms from the command to the middle of the change, on average over where in the bus's cycle the command falls."""
     latencies = []
-    for t in given[changes, 0]:
-        window = (trace[:, 0] >= t + 0.03) & (trace[:, 0] < t + 0.11)
-        times, v = trace[window, 0], trace[window, 3]
-        middle = 0.5 * (v[0] + v[-1])
-        i = np.flatnonzero((v[:-1] - middle) * (v[1:] - middle) <= 0)[0]
-        latencies.append(times[i] + 0.001 * (middle - v[i]) / (v[i + 1] - v[i]) - t)
-    assert len(latencies) > 15
-    assert np.mean(latencies) == pytest.approx(0.0645, abs=0.0015)
-    assert np.ptp(latencies) < 0.010  # a cycle of the bus, a step
+    for offset in np.linspace(0.0005, 0.0075, 8):
+        rig = LockStep(profile, start=(-0.8, 0.0)).start()
+        stream = Stream(rig, lambda t: (0.4 if t < 0.5 else 0.6, 0.0), offset=offset)
+        rig.run(0.75, stream)
+        given = stream.trace[np.flatnonzero(stream.trace[:, 3] > 0.5)[0], 0]
+        trace = rig.trace[rig.trace[:, 0] >= given + 0.03]
+        times, v = trace[:, 0], trace[:, 3]
+        i = np.flatnonzero((v[:-1] < 0.5) & (v[1:] >= 0.5))[0]
+        latencies.append(times[i] + 0.001 * (0.5 - v[i]) / (v[i + 1] - v[i]) - given)
+    assert np.mean(latencies) == pytest.approx(0.0645, abs=0.001)
+    assert np.ptp(latencies) < 0.008  # a cycle of the bus
 
 
 # Golden status words: PROFIdrive's states S1 (inhibited), S2 (ready), S4 (operating) and a fault.
@@ -261,7 +256,7 @@ def test_status_words_of_telegram_111():
     bench.run(0.1, **MOVE, position=-0.4)
     # A task (12), neither at its target (10) nor stopped (13).
     assert bench.emulator.read(100, 1) == [0x1B37]
-    bench.run(0.9, **MOVE, position=-0.4)
+    bench.run(1.5, **MOVE, position=-0.4)
     assert bench.emulator.read(105, 2) == [0xFFFF & -400_000, 0xFFFF & (-400_000 >> 16)]
     bench.emulator.inject_fault(51)
     bench.run(0.01)

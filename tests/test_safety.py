@@ -319,6 +319,8 @@ def test_arming_is_refused_while_armed_moving_faulty_or_pressed():
     with pytest.raises(RefusedError, match="still moves"):
         ideal.gate.disarm(ideal.now)
     ideal.gate.fault(Cause.OPERATOR, "asked to", ideal.now)
+    with pytest.raises(RefusedError, match="cannot reset: it still moves"):
+        ideal.gate.reset(ideal.now)
     with pytest.raises(RefusedError, match="OPERATOR at .* asked to; reset it first"):
         ideal.gate.arm(HOME, 0.0, ZERO)
     pressed = Ideal(arm=False)
@@ -378,6 +380,7 @@ def test_inside_a_margin_only_motion_out_of_it_passes():
         assert "escape" in sent.changed and (np.abs(sent.velocity) <= 0.05 * V_MAX + 1e-12).all()
         assert sent.velocity.any() <= (gap() > before)
         before = gap()
+    assert not ideal.tick(np.eye(8)[0]).velocity.any() and gap() == before  # along the table is not out of it
     up = np.array([0, 0, 0, -1.0, 0, 0, 0, 0]) * V_MAX
     for _ in range(60):
         ideal.tick(up)

@@ -32,7 +32,7 @@ class DriveParams:
 
     speed: float = 2.0
     acceleration: float = 15.0
-    smoothing: float = 0.007
+    smoothing: float = 0.008
     position_gain: float = 20.0
     following_error: float = 0.1
     switch_on_time: float = 0.05

@@ -99,6 +99,7 @@ class AxisServer:
             while not self._finish.is_set():
                 server.closed = self._bank.disconnected
                 if self._bank.disconnected or self._bank.guard_tripped:
+                    self._bank.guard_tripped = False
                     server.drop()
                 self.refused = server.refused
                 await _wait(self._finish, WATCH)

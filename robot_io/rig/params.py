@@ -25,7 +25,7 @@ class RigParams:
     axis_profile: str = "cmmt"
     axis_dead_time: float = 0.050
     # A position controller as stiff as the carriage, a velocity servo with a lag of 35 ms, bears without overshoot.
-    drive: DriveParams = DriveParams(switch_on_time=0.02, homing_time=0.1, position_gain=5.0, following_error=0.15)
+    drive: DriveParams = DriveParams(switch_on_time=0.02, homing_time=0.1, position_gain=2.0, following_error=0.15)
     node_guard: float = 0.1
     tracker: TrackerParams = TrackerParams()
     action_delay: float = 0.0

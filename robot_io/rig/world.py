@@ -72,6 +72,7 @@ class World:
         self.in_play = False
         self.number = 0  # of the ball in play
         self._touching: set[int] = set()  # geoms
+        self.touches: list[tuple[float, str, np.ndarray]] = []  # of the ball in play: time, geom, ball's position
         self._surfaces = {
             self.model.geom("col_table").id: (self.params.table_restitution, self.params.table_friction),
             self.model.geom("net").id: NET,
@@ -111,7 +112,7 @@ class World:
     def throw(self, position, velocity, spin=(0.0, 0.0, 0.0)) -> None:
         """Puts a new ball into play."""
         self._place(position, velocity, spin)
-        self.in_play, self._touching = True, set()
+        self.in_play, self._touching, self.touches = True, set(), []
         self.number += 1
 
     def park(self) -> None:
@@ -175,6 +176,7 @@ class World:
                 other = (pair - {self._ball_geom}).pop()
                 touching.add(other)
                 if other not in self._touching:
+                    self.touches.append((self.data.time, self.model.geom(other).name, self.ball))
                     self._grip(other, self.data.contact.frame[i, :3].copy(), self.data.contact.pos[i].copy(), before)
             else:
                 self.collisions += 1

@@ -1,0 +1,108 @@
+"""The operator's terminal at the robot: keys in, a live view out."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import tty
+from typing import Any
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+COLOURS = {"disarmed": "white", "ready": "green", "active": "bold green", "stopping": "yellow", "fault": "bold red"}
+KEYS = {
+    "p": ("prepare", "switch on and home the linear axes"),
+    "a": ("arm", "arm: the robot goes to its home pose"),
+    " ": ("stop", "stop"),
+    "r": ("reset", "reset a fault"),
+    "d": ("discard", "discard this ball"),
+    "h": ("pause", "hold: take no new balls, or go on"),
+    "q": ("quit", "stop and end"),
+}
+
+
+class Keyboard:
+    """Single keys without Enter; nothing where the input is no terminal. Use as a context manager."""
+
+    def __enter__(self) -> Keyboard:
+        self._terminal = sys.stdin.isatty()
+        if self._terminal:
+            self._before = termios.tcgetattr(sys.stdin)
+            tty.setcbreak(sys.stdin)
+        return self
+
+    def __exit__(self, *exc_info) -> None:
+        if self._terminal:
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
+
+    def pressed(self) -> str | None:
+        """The next key that waits."""
+        if not self._terminal or not select.select([sys.stdin], [], [], 0.0)[0]:
+            return None
+        return os.read(sys.stdin.fileno(), 1).decode(errors="ignore")
+
+
+class View:
+    """The status of the control process, redrawn in place; on a terminal only."""
+
+    def __init__(self, console: Console, title: str, keys: dict = KEYS) -> None:
+        self._title, self._keys = title, keys
+        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
+        self._last = ""
+
+    def __enter__(self) -> View:
+        if self._live:
+            self._live.start()
+        return self
+
+    def __exit__(self, *exc_info) -> None:
+        if self._live:
+            self._live.stop()
+
+    def say(self, text: str) -> None:
+        """The last line of the view: what was refused, what was asked for."""
+        self._last = text
+
+    def show(self, status: dict[str, Any]) -> None:
+        if self._live:
+            self._live.update(self._draw(status), refresh=True)
+
+    def _draw(self, s: dict[str, Any]) -> Group:
+        head = Text.assemble(
+            (f"{self._title}  ", "bold"), (s["state"].upper(), COLOURS[s["state"]]),
+            "  holding" if s["paused"] else "", "  at home" if s["at_home"] else "",
+        )  # fmt: skip
+        lines = [head]
+        lines += [Text(f"FAULT {f['cause']}: {f['text']}", "red") for f in s["faults"]]
+        if not s["faults"]:
+            lines += [Text(f"waiting: {text}", "yellow") for text in s["present"].values()]
+        outcomes = ", ".join(f"{n} {name}" for name, n in s["outcomes"].items()) or "none yet"
+        lines.append(Text(f"balls {s['balls']}: {outcomes}; in a row {s['rally']}, longest {s['longest_rally']}"))
+        joints = Table(box=None, pad_edge=False)
+        for name in ("joint", "position", "command"):
+            joints.add_column(name, justify="left" if name == "joint" else "right")
+        for name, position, velocity in s["joints"]:
+            unit = "m" if name.startswith("gantry") else "rad"
+            joints.add_row(name, f"{position:+.3f} {unit}", f"{velocity:+.2f} {unit}/s")
+        timing = Table(box=None, pad_edge=False)
+        for name in ("", "p50", "p99", "max [ms]"):
+            timing.add_column(name, justify="left" if not name else "right")
+        for name, t in s["timings"].items():
+            if isinstance(t, dict):
+                timing.add_row(name, f"{t['p50_ms']:.3f}", f"{t['p99_ms']:.3f}", f"{t['max_ms']:.3f}")
+        missed = s["timings"].get("missed_ticks", 0)
+        egm, frames = s["egm"], s["tracker_counts"]
+        wire = Text(
+            f"EGM {egm['accepted']:,} taken, {sum(egm['rejected'].values()):,} refused, {egm['lost']:,} lost; "
+            f"tracker {frames.get('accepted', 0):,} taken, {frames.get('lost', 0):,} lost; "
+            f"axes {s['axes_cycles']:,} cycles, {s['axes_late']:,} late; ticks missed {missed}; log lost {s['log_dropped']}"
+        )
+        grid = Table.grid(padding=(0, 4))
+        grid.add_row(joints, timing)
+        keys = "   ".join(f"[{'space' if k == ' ' else k}] {text}" for k, (_, text) in self._keys.items())
+        return Group(*lines, grid, wire, Text(keys, "dim"), Text(self._last, "yellow"))

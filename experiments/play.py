@@ -1,0 +1,301 @@
+"""``mjx-tt run`` and ``mjx-tt rig``: an exported policy on a robot, real or emulated, through the same bridge."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from experiments import robots, runs
+from experiments.console import KEYS, Keyboard, View
+from experiments.errors import ConfigError
+from experiments.evaluate import wilson
+from robot_io import artefact as artefacts
+from robot_io import control
+from robot_io.errors import RefusedError
+from robot_io.rig.processes import Ports, Rig
+from robot_io.robot_config import RobotConfig
+
+RIG = "rig"
+THROWS = 4096  # balls that the rig can throw before it begins anew
+READY_TIME = 60.0  # [s] for the control process to start
+PREPARE_TIME = 40.0  # [s] for the axes to home and the arm to report
+QUIET = 30.0  # [s] without a ball on the rig, after which something is wrong
+
+
+def scene() -> str:
+    """Path of the robot's MJCF."""
+    from importlib import resources
+
+    return str(resources.files("mjx_tt") / "assets" / "scene.xml")
+
+
+def rig_for(artefact: artefacts.Artefact, balls: str | None, params_path: str | None, seed: int) -> Rig:
+    """A rig that throws balls of a distribution: the named one, or that of the policy's training."""
+    from experiments import build, config
+    from mjx_tt.model import SimModel
+
+    chosen = balls or _trained_on(artefact)
+    distribution = build.distribution(chosen, "--balls")
+    throws = robots.throws_of(distribution, SimModel(), THROWS, seed)
+    return Rig(scene(), throws, robots.load_rig(params_path))
+
+
+def _trained_on(artefact: artefacts.Artefact):
+    config = (artefact.manifest.get("provenance") or {}).get("config") or {}
+    if "balls" not in config:
+        raise ConfigError(f"{artefact.folder}: does not say on which balls it was trained; name some with --balls")
+    return config["balls"]
+
+
+class Session:
+    """One control process with its console, from start to end; use as a context manager.
+
+    Raises RefusedError when it does not start, with the reason.
+    """
+
+    def __init__(self, robot: RobotConfig, options: control.ControlOptions, console: Console) -> None:
+        self.console = console
+        self.process, self.pipe = control.start(robot, options)
+        try:
+            _, self.report = control.wait_for(self.pipe, "ready", READY_TIME)
+        except (RefusedError, TimeoutError, EOFError) as error:
+            self.process.join(2.0)
+            self.process.kill()
+            raise RefusedError(str(error) or "the control process ended at once") from None
+        self.status: dict[str, Any] | None = None
+        self.timings: dict[str, Any] = {}
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *exc_info) -> None:
+        self.close()
+
+    def ask(self, *message) -> None:
+        """Sends a request; refusals come as messages."""
+        try:
+            self.pipe.send(message)
+        except OSError:
+            pass  # it has ended: the next message says so
+
+    def messages(self, seconds: float):
+        """What the control process says within that time. Raises RefusedError when it has ended."""
+        end = time.monotonic() + seconds
+        while self.pipe.poll(max(end - time.monotonic(), 0.0)):
+            try:
+                message = self.pipe.recv()
+            except (EOFError, OSError):
+                raise RefusedError(f"the control process has ended (status {self.process.exitcode})") from None
+            if message[0] == "status":
+                self.status = message[1]
+            yield message
+
+    def prepare(self, rig: Rig | None) -> None:
+        """Axes on and homed, and on the rig the arm switched on: until nothing is missing. Raises RefusedError."""
+        self.ask("prepare")
+        if rig is not None:
+            rig.switch_on()
+        end = time.monotonic() + PREPARE_TIME
+        while time.monotonic() < end:
+            for message in self.messages(0.3):
+                if message[0] == "status" and not (message[1]["arm"] or message[1]["axes"] or message[1]["tracker"]):
+                    return
+        status = self.status or {}
+        missing = "; ".join(f"{k}: {status[k]}" for k in ("arm", "axes", "tracker") if status.get(k))
+        raise RefusedError(f"the robot does not get ready within {PREPARE_TIME:g} s: {missing or 'no status'}")
+
+    def arm(self) -> None:
+        """Arms and waits for the home pose. Raises RefusedError."""
+        self.ask("arm")
+        end = time.monotonic() + PREPARE_TIME
+        while time.monotonic() < end:
+            for message in self.messages(0.3):
+                if message[0] == "refused":
+                    raise RefusedError(message[1])
+                if message[0] == "status" and message[1]["faults"]:
+                    raise RefusedError(message[1]["faults"][0]["text"])
+                if message[0] == "status" and message[1]["at_home"]:
+                    return
+        raise RefusedError(f"the robot does not reach its home pose within {PREPARE_TIME:g} s")
+
+    def close(self) -> None:
+        """Stops the robot in order, then the process."""
+        if self.process.is_alive():
+            self.ask("quit")
+            try:
+                self.timings = control.wait_for(self.pipe, "ended", 10.0)[1]
+            except (RefusedError, TimeoutError, EOFError, OSError):
+                pass
+        self.process.join(10.0)
+        if self.process.is_alive():
+            self.process.kill()
+        self.pipe.close()
+
+
+def run(
+    artefact: Path, robot: str, balls: int | None, distribution: str | None, backend: str, log_folder: Path,
+    rig_params: str | None, seed: int, seconds: float | None, console: Console,
+) -> int:  # fmt: skip
+    """Plays until ``balls`` outcomes are known, ``seconds`` have passed, or the operator quits; 0 when all went well."""
+    loaded = artefacts.load(artefact)
+    with ExitStack() as stack:
+        rig = None
+        if robot == RIG:
+            console.print("starting the rig ...", highlight=False)
+            rig = stack.enter_context(rig_for(loaded, distribution, rig_params, seed))
+            config, text = rig.robot, robots.to_yaml(rig.robot)
+        else:
+            config = robots.load_robot(robot)
+            text = Path(robot).read_text(encoding="utf-8")
+        name = time.strftime("%Y%m%d-%H%M%S")
+        git = runs.git_state()
+        options = control.ControlOptions(
+            str(artefact), backend, str(log_folder), name, (("git", json.dumps(git)),), (("robot.yaml", text),)
+        )
+        log_folder.mkdir(parents=True, exist_ok=True)
+        session = stack.enter_context(Session(config, options, console))
+        for line in session.report:
+            console.print(f"  {line}", highlight=False)
+        if rig is not None:
+            session.prepare(rig)
+            session.arm()
+            rig.throw(True)
+        else:
+            console.print("press p to prepare the axes, a to arm; space stops", highlight=False)
+        with Keyboard() as keyboard, View(console, f"{artefact} on {config.name}") as view:
+            episodes, problem = _watch(session, rig, keyboard, view, balls, seconds, console)
+        session.close()
+    summary = _summary(loaded, config, episodes, session, control.log_path(options))
+    runs.write_json(log_folder / f"{name}.json", summary)
+    _print(console, summary, log_folder / f"{name}.json")
+    if problem:
+        console.print(problem, style="red", highlight=False)
+    return 1 if problem else 0
+
+
+def _watch(session: Session, rig: Rig | None, keyboard: Keyboard, view: View, balls, seconds, console):
+    """The episodes played and why it ended early, or None."""
+    episodes: list = []
+    end = time.monotonic() + (float("inf") if seconds is None else seconds)
+    heard = time.monotonic()
+    paused = False
+    while time.monotonic() < end and (balls is None or len(episodes) < balls):
+        for message in session.messages(0.1):
+            if message[0] == "status":
+                view.show(message[1])
+            elif message[0] == "episode":
+                heard = time.monotonic()
+                episodes.append(message[1])
+                if not console.is_terminal:
+                    console.print(f"ball {len(episodes)}: {message[1].outcome}", highlight=False)
+            elif message[0] == "refused":
+                view.say(message[1])
+        key = keyboard.pressed()
+        if key in KEYS:
+            request = KEYS[key][0]
+            if request == "quit":
+                break
+            paused = not paused if request == "pause" else paused
+            session.ask(*((request, paused) if request == "pause" else (request,)))
+            view.say(request)
+        if rig is not None:
+            rig.check()
+            status = session.status
+            if status and status["faults"]:
+                fault = status["faults"][0]
+                return episodes, f"stopped by a fault, {fault['cause']}: {fault['text']}"
+            if time.monotonic() - heard > QUIET:
+                return episodes, f"no ball was played for {QUIET:g} s"
+    return episodes, None
+
+
+def _summary(loaded, config: RobotConfig, episodes: list, session: Session, log_file) -> dict[str, Any]:
+    returned = sum(e.outcome == "returned" for e in episodes)
+    hit = sum(e.outcome != "missed" for e in episodes)
+    report: dict[str, Any] = {
+        "artefact": str(loaded.folder), "artefact_sha256": loaded.digest, "robot": config.name,
+        "episodes": len(episodes), "returned": returned, "hit": hit,
+    }  # fmt: skip
+    if episodes:
+        low, high = wilson(returned, len(episodes))
+        report |= {"return_rate": returned / len(episodes), "low": low, "high": high, "hit_rate": hit / len(episodes)}
+    evaluation = (loaded.manifest.get("provenance") or {}).get("evaluation")
+    if evaluation:
+        report["simulation"] = {k: evaluation[k] for k in ("return_rate", "low", "high", "episodes")}
+        report["simulation"]["balls"] = evaluation["balls"]["name"]
+    status = session.status or {}
+    report |= {"timings": session.timings or status.get("timings", {}), "egm": status.get("egm", {})}
+    report |= {k: status.get(k) for k in ("axes_cycles", "axes_late", "tracker_counts", "log_dropped")}
+    report["log"] = None if log_file is None else str(log_file)
+    return report
+
+
+def _print(console: Console, report: dict[str, Any], path: Path) -> None:
+    table = Table(title=f"{report['artefact']} on {report['robot']}", title_justify="left", show_header=False)
+    if report["episodes"]:
+        text = f"{report['return_rate']:.1%}  ({report['returned']} of {report['episodes']}, 95 % interval "
+        table.add_row("return rate", text + f"{report['low']:.1%} to {report['high']:.1%})", style="bold")
+    if "simulation" in report:
+        s = report["simulation"]
+        table.add_row(
+            "in simulation",
+            f"{s['return_rate']:.1%}  ({s['episodes']:,} balls of {s['balls']}, {s['low']:.1%} to {s['high']:.1%})",
+        )
+    for name, t in report["timings"].items():
+        if isinstance(t, dict):
+            table.add_row(
+                f"{name}, ms",
+                f"p50 {t['p50_ms']:.3f}   p99 {t['p99_ms']:.3f}   p99.9 {t['p99.9_ms']:.3f}   max {t['max_ms']:.3f}",
+            )
+    table.add_row("ticks missed", str(report["timings"].get("missed_ticks", 0)))
+    if report["egm"]:
+        egm = report["egm"]
+        table.add_row("EGM", f"{egm['accepted']:,} packets, {egm['replies']:,} answers, {egm['lost']:,} lost")
+    table.add_row("linear axes", f"{report['axes_cycles']:,} exchanges, {report['axes_late']:,} late")
+    console.print(table)
+    for name, value in {"summary": path, "log": report["log"]}.items():
+        if value:
+            console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
+
+
+def rig(balls: str, rig_params: str | None, seed: int, ports: tuple[int, ...], out: Path, console: Console) -> int:
+    """The rig alone, for a bridge that runs elsewhere; until the operator quits."""
+    from experiments import build
+    from mjx_tt.model import SimModel
+
+    throws = robots.throws_of(build.distribution(balls, "--balls"), SimModel(), THROWS, seed)
+    chosen = Ports(ports[0], ports[1], (ports[2], ports[3]))
+    keys = {
+        "o": ("switch_on", "switch the arm on"), "b": ("throw", "throw balls, or stop"), "e": ("motors_off", "emergency stop"),
+        "f": ("fault", "drive fault"), "t": ("drop_out", "tracker silent for 1 s"), "q": ("quit", "end"),
+    }  # fmt: skip
+    with Rig(scene(), throws, robots.load_rig(rig_params), chosen) as running, Keyboard() as keyboard:
+        out.write_text(robots.to_yaml(running.robot), encoding="utf-8")
+        console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}", highlight=False)
+        console.print("   ".join(f"\\[{k}] {text}" for k, (_, text) in keys.items()), highlight=False)
+        throwing = False
+        while True:
+            time.sleep(0.1)
+            running.check()
+            request = keys.get(keyboard.pressed() or "", ("",))[0]
+            if request == "quit":
+                return 0
+            if request == "throw":
+                throwing = not throwing
+                running.throw(throwing)
+            elif request == "fault":
+                running.drive_fault(0, 0x31)
+            elif request == "drop_out":
+                running.drop_out(1.0)
+            elif request:
+                getattr(running, request)()
+            if request:
+                qpos, _ = running.state()
+                console.print(f"{request}; {running.thrown} balls thrown; joints {np.round(qpos, 3)}", highlight=False)
