@@ -1,4 +1,5 @@
 # make demo   set up, train the quickstart, evaluate it, export it
+# make rig-demo  the same policy on the emulated robot, over real sockets in real time (trains it first if need be)
 # make test   set up and run the tests
 # make bench  set up and measure speed against MJX, MuJoCo C and PyBullet
 PYTHON ?= python3
@@ -7,10 +8,14 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test bench setup clean
+.PHONY: demo rig-demo test bench setup clean
 
 demo: $(READY)
 	$(BIN)/mjx-tt train quickstart.yaml --out runs
+
+rig-demo: $(READY)
+	test -e runs/quickstart/artefact/manifest.json || $(BIN)/mjx-tt train quickstart.yaml --out runs
+	$(BIN)/mjx-tt run runs/quickstart/artefact --robot rig --balls 30 --log runs/rig-demo
 
 test: $(READY)
 	$(BIN)/python -m pytest

@@ -11,6 +11,7 @@ from robot_io.safety_config import SafetyConfig
 from robot_io.tracker import TrackerConfig
 
 PROFILES = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
+ANSWER_TIME = 0.035  # [s] for an axis to answer: less than the age at which its state counts as stale
 AXIS_NAMES = ("gantry_x", "gantry_y")
 
 
@@ -77,7 +78,7 @@ def linear_axes(config: RobotConfig) -> FestoAxes:
     """The axes behind their Modbus connections, which the first exchange opens."""
     axes = []
     for i, axis in enumerate(config.axes):
-        link = ModbusLink(axis.host, axis.port, device_id=axis.device_id)
+        link = ModbusLink(axis.host, axis.port, ANSWER_TIME, axis.device_id)
         profile = PROFILES[config.axis_profile]()
         axes.append(Axis(AXIS_NAMES[i], link, profile, *axis_range(i), zero=axis.zero, direction=axis.direction))
     return FestoAxes(axes, config.axes_motion)

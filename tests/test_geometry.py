@@ -159,23 +159,54 @@ def test_a_cleared_motion_is_clear_between_its_points(ours):
     assert dips > 3 and cleared > 80 and missed < 0.05 * cleared
 
 
-@pytest.mark.parametrize(("levels", "size"), [(0, 0.3), (2, 1.0)])
-def test_the_bound_between_points_holds_for_every_gap(ours, monkeypatch, levels, size):
-    """Each gap by itself, with a margin just above its true minimum on the way: never cleared."""
+def never_cleared(ours, a, b):
+    """How many gaps are smaller on the straight way from a to b (8,) than at its ends. Each by itself, with a margin
+    just above its smallest value, must be found too close."""
+    gaps = ours.gaps(a[:, None] + np.linspace(0, 1, 1001) * (b - a)[:, None])
+    rows = np.flatnonzero((gaps.min(1) < np.minimum(gaps[:, 0], gaps[:, -1]) - 0.01) & (gaps.min(1) > 0))
+    for row in rows:
+        margin = np.full(len(ours.rows), -1e3)
+        margin[row] = gaps[row].min() + 1e-5
+        assert ours.first_too_close(np.stack([a, b], axis=1), margin, 0.0) == row
+    return len(rows)
+
+
+@pytest.mark.parametrize("levels", [0, 5])
+def test_a_whole_turn_is_not_taken_for_standing_still(ours, monkeypatch, levels):
+    """Every point is where it was: its way is all curvature."""
     monkeypatch.setattr(shipped, "LEVELS", levels)
     rng = np.random.default_rng(4)
-    s = np.linspace(0, 1, 301)
-    dips = 0
-    for _ in range(150):
-        a = rng.uniform(LOWER, UPPER)[:, 0]
-        b = a + rng.uniform(-size, size, 8) * rng.integers(0, 2, 8)
-        gaps = ours.gaps(a[:, None] + s * (b - a)[:, None])
-        for row in np.flatnonzero((gaps.min(1) < np.minimum(gaps[:, 0], gaps[:, -1]) - 1e-3) & (gaps.min(1) > 0)):
-            margin = np.full(len(ours.rows), -1.0)
-            margin[row] = gaps[row].min() + 1e-5
-            assert ours.first_too_close(np.stack([a, b], axis=1), margin, 0.0) == row
-            dips += 1
-    assert dips > 100
+    turns = [(rng.uniform(LOWER, UPPER)[:, 0], joint) for joint in range(2, 8) for _ in range(10)]
+    assert sum(never_cleared(ours, a, a + 2 * np.pi * np.eye(8)[joint]) for a, joint in turns) > 50
+
+
+def test_no_point_leaves_its_chord_farther_than_allowed_for(ours):
+    """Half way between two poses, where small motions leave it the farthest; the stretched arm folding up comes close to
+    the bound."""
+    rng = np.random.default_rng(5)
+    a = rng.uniform(LOWER, UPPER, (8, 3000))
+    d = rng.uniform(-0.3, 0.3, a.shape) * rng.integers(0, 2, a.shape)
+    a[:, 0], d[:, 0] = [0, 0, 0, 0, np.arctan(0.302 / 0.07), 0, 0, 0], [0, 0, 0, 0.1, 0.1, 0, 0, 0]
+    away = ours.ends(a + d / 2) - 0.5 * (ours.ends(a) + ours.ends(a + d))
+    away = np.linalg.norm(away, axis=1).max(0)[ours._table_rows]  # the farther end of each capsule
+    allowed = ours._bulge(d)[: len(away)]
+    assert (away <= allowed + 1e-12).all()
+    assert (away / np.maximum(allowed, 1e-9))[:, 0].max() > 0.8
+
+
+def test_passing_the_tables_corner_is_seen(ours, monkeypatch):
+    """The gantry slides the arm past the corner at 45 degrees: the gap falls and rises as fast as anything moves."""
+    monkeypatch.setattr(shipped, "LEVELS", 0)
+    slide = np.array([1.0, 1.0, 0, 0, 0, 0, 0, 0])
+    for bend in (1.8, 2.1, 2.4):
+        low, high = 0.0, 3.0  # of x, where it touches and where it does not
+        for _ in range(30):
+            q = np.array([0.5 * (low + high), 0.0, 0.0, bend, 0.0, 0.0, 0.0, 0.0])
+            gaps = ours.gaps(q[:, None] + np.linspace(-1, 1, 2001) * slide[:, None])[ours.kinds == "table"]
+            low, high = (low, q[0]) if gaps.min() > 0.01 else (q[0], high)
+        assert 0.0 < gaps.min() < 0.02
+        closest = np.linspace(-1, 1, 2001)[gaps.min(0).argmin()]
+        assert never_cleared(ours, q + (closest - 0.5) * slide, q + (closest + 0.5) * slide)
 
 
 def test_what_is_inside_its_margin_must_not_lose_anything(ours):

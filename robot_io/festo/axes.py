@@ -242,6 +242,17 @@ class FestoAxes:
             return f"{self._names(lambda s: not s.homed)} not homed: home the axes."
         return None
 
+    def switch_off(self) -> None:
+        """Last words: tells each drive to brake and switch off, whatever fails with another."""
+        for channel in self._channels:
+            profile = channel.axis.profile
+            try:
+                channel.axis.link.exchange(
+                    profile.write_address, profile.encode(AxisCommand()), profile.read_address, profile.read_count
+                )
+            except Exception:  # nothing is left to do but the same for the others; the drive has its node guard
+                continue
+
     def close(self) -> None:
         for channel in self._channels:
             channel.axis.link.close()

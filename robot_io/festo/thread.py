@@ -111,9 +111,8 @@ class AxesThread:
             self.axes.stop()
             self.axes.cycle(time.monotonic())  # at least this one stop command
             self._loop(lambda: self.axes.standing() or time.monotonic() > limit)
-            self.axes.disable()
-            self.axes.cycle(time.monotonic())
         except Exception as error:
             self._failure = self._failure or f"The linear axes could not be stopped in order ({type(error).__name__}: {error})."
         finally:
+            self.axes.switch_off()
             self.axes.close()

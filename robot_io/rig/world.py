@@ -83,6 +83,7 @@ class World:
     def reset(self) -> None:
         """Robot at home and at rest, ball away, time zero."""
         mujoco.mj_resetData(self.model, self.data)
+        self.number, self.collisions, self.touches, self._touching = 0, 0, [], set()
         self.data.qpos[self._q] = self.home
         self.park()
         mujoco.mj_forward(self.model, self.data)
