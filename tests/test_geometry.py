@@ -195,7 +195,7 @@ def test_no_point_leaves_its_chord_farther_than_allowed_for(ours):
 
 
 def test_passing_the_tables_corner_is_seen(ours, monkeypatch):
-    """The gantry slides the arm past the corner at 45 degrees: the gap falls and rises as fast as anything moves."""
+    """The gantry slides the arm past the corner at 45 degrees: of all motions near a box the sharpest fall and rise."""
     monkeypatch.setattr(shipped, "LEVELS", 0)
     slide = np.array([1.0, 1.0, 0, 0, 0, 0, 0, 0])
     for bend in (1.8, 2.1, 2.4):

@@ -6,8 +6,6 @@ devices send it: tracker datagrams, EGM packets, Modbus registers. The fixed del
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import numpy as np
 import pytest
@@ -77,59 +75,102 @@ def played():
     return motion[:-1], seen[:, :, SUBSTEPS:], record
 
 
-def to_bridge(motion, delays, unit):
-    """The motion as bytes through the bridge's own receivers; what its policy was shown and the tick of the first."""
-    units = AxisUnits(position=unit)
-    emulators = [AxisEmulator("cmmt", 0.0, 0.0, 10.0, DriveParams(), units) for _ in FESTO_JOINTS]
-    # A drive reads zero where it was switched on.
+def to_bridge(motion, delays, unit=FINEST):
+    """The motion as bytes through the bridge's own receivers: first tick of the policy, what it was shown, the bridge."""
+    drive = DriveParams(switch_on_time=0.01, homing_time=0.01, following_error=9.0)  # somebody else moves the carriage
+    emulators = [AxisEmulator("cmmt", 0.0, 0.0, 10.0, drive, AxisUnits(position=unit)) for _ in FESTO_JOINTS]
+    profile = CmmtProfile(position_unit=unit)
     axes = FestoAxes(
-        [
-            Axis(name, DirectLink(emulator), CmmtProfile(position_unit=unit), -0.9, 0.9, zero=float(motion[0, 3 + i]))
-            for i, (name, emulator) in enumerate(zip("xy", emulators))
-        ],
-        AxesConfig(),
+        [Axis(name, DirectLink(emulator), profile, -0.99, 0.99) for name, emulator in zip("xy", emulators)],
+        AxesConfig(max_error=9.0),
     )
-    session = EgmSession(EgmConfig(controller_address=HOME, timeout=0.1))
+    session = EgmSession(EgmConfig(controller_address=HOME))
     loose = SafetyConfig(following_error=(9.0,) * N_JOINTS)  # the robot moves as it was recorded, not as it is told
     policy = Recording()
     config = BridgeConfig(delays=ObservationDelays(**delays))
     bridge = Bridge(session, axes, Tracker(TrackerConfig()), SafetyGate(config=loose), policy, config)
-
-    def devices(i, ball):
+    first, warm_up = None, -200
+    axes.enable()
+    for i in range(warm_up, len(motion)):
         now, state = START + i * H, motion[max(i, 0)]
         for j, emulator in zip(FESTO_JOINTS, emulators):
             emulator.step(now, float(state[3 + j]), 0.0)
         position = state[[3 + j for j in ABB_JOINTS]]
-        packet = encode_robot(i + 1000, round(now * 1000), position, position, True, True, True)
-        assert session.receive(packet, ADDRESS, now)
+        assert session.receive(encode_robot(i - warm_up, round(now * 1000), position, position, True, True, True), ADDRESS, now)
         assert bridge.arm_received(now) is not None
-        bridge.tracker_received(encode(BallSample(i + 1000, ball, now, state[:3] if ball else None)), HOME, now)
+        frame = BallSample(i - warm_up, 1, now, None if i < 0 else state[:3])
+        bridge.tracker_received(encode(frame), HOME, now)
+        if i == -150:
+            axes.home()
         axes.cycle(now)
         bridge.axes_received(axes.state.position, axes.state.received)
+        if i == -2:
+            bridge.arm(now)
         if i % SUBSTEPS == 0:
             bridge.tick(now, now)
-
-    for i in range(-600, 0):
-        devices(i, 0)
-        if i == -580:
-            axes.enable()
-        if i == -60:
-            axes._channels[0].status, axes._channels[1].status  # noqa: B018
-    return bridge, policy, devices, axes
-
-
-def run(motion, delays, unit=FINEST):
-    bridge, policy, devices, axes = to_bridge(motion, delays, unit)
-    # Homing would move the drives' zero; their state is what counts here.
-    axes.problem = lambda now: None
-    devices(-600 + 600 - 0, 0) if False else None
-    for name in ("_watch",):
-        assert hasattr(bridge, name)
-    bridge.tick(START - 1e-3, START - 1e-3)
-    bridge.arm(START - 1e-3)
-    first = None
-    for i in range(len(motion)):
-        devices(i, 1)
-        if first is None and bridge.state is State.ACTIVE:
-            first = i // SUBSTEPS
+            if first is None and bridge.state is State.ACTIVE:
+                first = i // SUBSTEPS
     return first, np.array(policy.seen), bridge
+
+
+@pytest.mark.parametrize("which", range(len(DELAYS)))
+def test_the_bridge_shows_what_the_simulator_shows(played, which):
+    motion, shown, _ = played
+    assert np.ptp(motion, axis=0).min() > 0.02  # everything moves
+    first, seen, bridge = to_bridge(motion, DELAYS[which])
+    assert first <= 5 and len(seen) >= 60 and not bridge.gate.faults
+    expected = shown[first : first + len(seen), :, which]
+    error = np.abs(seen - expected).max(axis=0)
+    assert error.max() < 1e-6, error
+    assert error[:3].max() < 1e-7 and error[3:5].max() < 2e-9 and error[5:].max() < 1e-9
+
+
+def test_what_the_axes_usual_resolution_costs(played):
+    """Half a micrometre of rounding, which the bar of 1e-6 just leaves room for."""
+    motion, shown, _ = played
+    first, seen, _ = to_bridge(motion, DELAYS[0], MICROMETRE)
+    error = np.abs(seen - shown[first : first + len(seen), :, 0]).max(axis=0)
+    assert 1e-7 < error[3:5].max() < 0.51e-6
+
+
+def test_a_wrong_delay_would_be_noticed(played):
+    motion, shown, _ = played
+    for name, columns, least in (("ball", slice(0, 3), 1e-2), ("arm", slice(5, 11), 1e-3), ("axes", slice(3, 5), 1e-4)):
+        wrong = DELAYS[0] | {name: DELAYS[0][name] - 0.004}
+        first, seen, _ = to_bridge(motion, wrong)
+        error = np.abs(seen - shown[first : first + len(seen), :, 0]).max(axis=0)
+        assert error[columns].max() > least, name
+
+
+def test_history_interpolates_holds_and_forgets():
+    history = History(length=4, longest_hold=0.05)
+    assert history.at(0.0) is None and history.newest is None and history.slope(1.0) is None
+    for time, value in ((1.0, 0.0), (1.1, 1.0), (1.3, 5.0)):
+        assert history.add(time, np.array([value, -value]))
+    assert not history.add(1.3, np.zeros(2)) and not history.add(1.2, np.zeros(2))
+    for time, value in ((0.0, 0.0), (1.0, 0.0), (1.05, 0.5), (1.1, 1.0), (1.2, 3.0), (1.3, 5.0), (1.34, 5.0)):
+        np.testing.assert_allclose(history.at(time), [value, -value], atol=1e-12)
+    assert history.at(1.3501) is None
+    np.testing.assert_allclose(history.slope(1.0), np.polyfit([1.0, 1.1, 1.3], [0, 1, 5], 1)[0] * np.array([1, -1]))
+    assert history.slope(0.15) is None  # one sample alone
+    for time in (1.4, 1.5):
+        history.add(time, np.zeros(2))
+    assert len(history) == 4
+    np.testing.assert_allclose(history.at(0.0), [1.0, -1.0])  # the oldest that is left
+
+
+def test_nothing_is_observed_while_a_device_is_silent():
+    feedback = Feedback(ball=History(longest_hold=0.06), axes=History(), arm=History())
+    position, velocity = joints(feedback)
+    assert np.isnan(position).all() and not velocity.any()
+    feedback.ball.add(1.0, np.zeros(3))
+    feedback.axes.add(1.0, np.ones(2))
+    assert observe(feedback, ObservationDelays(), 1.0) is None
+    feedback.arm.add(1.0, np.full(6, 2.0))
+    delays = ObservationDelays(ball=0.04)
+    np.testing.assert_array_equal(observe(feedback, delays, 1.04), [0, 0, 0, 1, 1, *[2] * 6])
+    assert observe(feedback, delays, 1.051) is None  # the joints' are too old
+    for name in ("ball", "arm", "axes"):
+        for seconds in (-0.001, 0.2, np.nan):
+            with pytest.raises(ValueError, match=f"observation delay {name}"):
+                ObservationDelays(**{name: seconds})
