@@ -157,6 +157,24 @@ def run(options: argparse.Namespace) -> int:
     )  # fmt: skip
 
 
+def finetune(options: argparse.Namespace) -> int:
+    from experiments import finetune_settings
+
+    settings = finetune_settings.load(options.settings, options.recipe, tuple(options.set))
+    _start_jax(1)
+    from rich.console import Console
+
+    from experiments import play
+    from experiments.runs import Run
+
+    run = Run(options.out or f"{Path(options.policy).resolve().name}-finetuned")
+    report = play.finetune(
+        options.policy, settings, run, options.robot, options.distribution, options.rig, options.backend, options.seed,
+        Console(),
+    )  # fmt: skip
+    return 0 if report is not None else 130
+
+
 def rig(options: argparse.Namespace) -> int:
     _start_jax(1)
     from rich.console import Console
@@ -295,6 +313,22 @@ with balls by itself. Read docs/safety.md and docs/hardware.md before a real arm
     p.add_argument("--seconds", type=float, metavar="S", help="end after S seconds")
     p.add_argument("--backend", choices=("numpy", "jit"), default="numpy", help="what computes the policy")
     p.add_argument("--log", default="runs/robot", metavar="FOLDER", help="for the MCAP log and the summary")
+    _add_rig(p, None)
+
+    p = _command(commands, "finetune", finetune, "fine-tune a policy on a robot while a person plays", """\
+  mjx-tt finetune runs/quickstart --robot robot.yaml --out runs/anna
+  mjx-tt finetune runs/quickstart --robot rig --out runs/rig             the emulated robot, in real time
+  mjx-tt finetune runs/quickstart --robot lockstep --rig worn.yaml       as fast as this machine allows
+
+Every ball is on disk before the next begins: the same command continues after an interruption, a crash or a power cut.
+""")  # fmt: skip
+    p.add_argument("policy", metavar="RUN_OR_ARTEFACT", help="what to start from")
+    p.add_argument("--robot", required=True, metavar="YAML", help='a robot.yaml, "rig" or "lockstep"')
+    p.add_argument("--settings", metavar="YAML", help="of the fine-tuning (default: the recipe's)")
+    p.add_argument("--recipe", metavar="NAME", help="settings by name, docs/finetuning.md")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one setting")
+    p.add_argument("--out", metavar="FOLDER", help="of the run (default: POLICY-finetuned)")
+    p.add_argument("--backend", choices=("numpy", "jit"), default="numpy", help="what computes the policy")
     _add_rig(p, None)
 
     p = _command(commands, "rig", rig, "the emulated robot alone, on real sockets", """\

@@ -80,10 +80,12 @@ def finetune(
                 f"{error.filename or run.folder}: cannot be written: {error.strerror or error}; every episode before "
                 "is kept. Make room or repair the folder, then run the same command again to continue"
             ) from error
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"{run.folder}: stopped; the same command continues it") from None
         finally:
             session.close()
         if not finished:
-            console.print(f"{run.folder}: stopped; the same command continues", highlight=False)
+            console.print(f"{run.folder}: stopped; the same command continues it", highlight=False)
             return None
         return conclude(experiment, settings, run, robot, console, session.journal.entries)
 
@@ -137,19 +139,12 @@ class Session:
         self._normaliser = tuple(np.asarray(a) for a in normalizer.normaliser(first.statistics))
         self.journal = Journal(run.folder / JOURNAL)
         self._played = {entry.place: entry for entry in self.journal.entries if not entry.discarded}
-        self._check_updates()
+        if self.update > settings.updates:
+            raise RunError(f"{run.folder}: has {self.update} updates already, updates = {settings.updates} does not fit")
         self._log = MetricsLog(run.metrics, run.tensorboard, self.update)
         planned = 2 * settings.evaluation_balls + settings.updates * settings.episodes_per_update
         self._progress = FineTuningProgress(console, str(run.folder), planned, settings)
         self._moment = time.monotonic()
-
-    def _check_updates(self) -> None:
-        wanted, over = self._settings.updates, any(entry.phase == AFTER for entry in self.journal.entries)
-        if self.update > wanted or (over and self.update < wanted):
-            raise RunError(
-                f"{self._run.folder}: has {self.update} updates{' and its last evaluation' if over else ''}, "
-                f"updates = {wanted} does not fit; restore the value or fine-tune this run's policy in a new run"
-            )
 
     def close(self) -> None:
         self.journal.close()
@@ -168,12 +163,12 @@ class Session:
 
     def _evaluate(self, phase: str) -> list[Entry] | None:
         """Episodes of the unperturbed policy."""
-        theta = np.asarray(self.state.bgs.average)
+        theta, update = np.asarray(self.state.bgs.average), 0 if phase == BEFORE else self.update
         if phase == BEFORE and self.update:
             theta = None  # played before the first update: only read
         entries = []
         for ball in range(self._settings.evaluation_balls):
-            entry = self._episode((phase, 0, 0, ball), theta)
+            entry = self._episode((phase, update, 0, ball), theta)
             if entry is None:
                 return None
             entries.append(entry)
@@ -222,7 +217,7 @@ class Session:
                     f"{self.journal.path}: an episode of the evaluation before fine-tuning is missing, though updates "
                     "are done; restore the file or start a new run"
                 )
-            number = self._next_number(place[0])
+            number = self._next_number(*place[:2])
             played = self._robot.play(np.ascontiguousarray(theta), *self._normaliser, number)
             entry = self._entry(place, number, played)
             self.journal.append(entry)
@@ -231,11 +226,11 @@ class Session:
             self._progress.played(entry)
         return self._played[place]
 
-    def _next_number(self, phase: str) -> int:
-        """A ball that is played again is another one: numbers count every attempt of a phase."""
-        attempts = sum(entry.phase == phase for entry in self.journal.entries)
+    def _next_number(self, phase: str, update: int) -> int:
+        """A ball that is played again is another one: every attempt counts."""
         if phase == TRAINING:
-            return attempts
+            return sum(entry.phase == TRAINING for entry in self.journal.entries)
+        attempts = sum(entry.phase == phase and entry.update == update for entry in self.journal.entries)
         return EVALUATION_EPISODES + attempts  # the same balls before and after, where the robot can
 
     def _entry(self, place: tuple[str, int, int, int], number: int, played: PlayedBall) -> Entry:

@@ -25,7 +25,7 @@ class Entry:
     """One episode.
 
     phase       "training", or the evaluation "before" or "after" it
-    update      whose members are compared, from 1; 0 in an evaluation
+    update      whose members are compared, from 1; in an evaluation the updates done before it
     member      0..2N-1: theta + sigma delta_i for i < N, theta - sigma delta_(i - N) above; 0 in an evaluation
     repeat      of the member; in an evaluation the number of the ball
     episode     number given to the robot; it never comes twice in a phase

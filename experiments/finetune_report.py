@@ -79,7 +79,9 @@ def evaluated(entries: list[Entry]) -> dict[str, Any]:
 def compare(entries: list[Entry], repeatable: bool) -> dict[str, Any]:
     """What evaluation.json holds. Where both evaluations met the same balls, the difference is taken ball by ball."""
     kept = [entry for entry in entries if not entry.discarded]
-    before, after = ([e for e in kept if e.phase == phase] for phase in (BEFORE, AFTER))
+    updates = max(e.update for e in kept if e.phase == AFTER)  # a run that was continued has several evaluations
+    before = [e for e in kept if e.phase == BEFORE]
+    after = [e for e in kept if e.phase == AFTER and e.update == updates]
     a, b = {e.episode: e.returns for e in before}, {e.episode: e.returns for e in after}
     paired = repeatable and set(a) == set(b)
     if paired:
@@ -94,7 +96,7 @@ def compare(entries: list[Entry], repeatable: bool) -> dict[str, Any]:
             "mean_return": difference, "low": low, "high": high, "paired": paired,
             "significant": low > 0.0 or high < 0.0,
         },
-        "updates": max((e.update for e in training), default=0),
+        "updates": updates,
         "episodes": sum(not e.discarded for e in training),
         "discarded": sum(e.discarded for e in entries),
     }  # fmt: skip

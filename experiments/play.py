@@ -16,16 +16,18 @@ from experiments import robots, runs
 from experiments.console import KEYS, Keyboard, View
 from experiments.errors import ConfigError
 from experiments.evaluate import wilson
+from experiments.finetune_settings import FineTuning
 from robot_io import artefact as artefacts
 from robot_io import control
 from robot_io.errors import RefusedError
 from robot_io.rig.processes import Ports, Rig
 from robot_io.robot_config import RobotConfig
 
-RIG = "rig"
+RIG, LOCK_STEP = "rig", "lockstep"
 THROWS = 4096  # balls that the rig can throw before it begins anew
 READY_TIME = 60.0  # [s] for the control process to start
 PREPARE_TIME = 40.0  # [s] for the axes to home and the arm to report
+RESET_TIME = 5.0  # [s]
 QUIET = 30.0  # [s] without a ball on the rig, after which something is wrong
 
 
@@ -110,6 +112,18 @@ class Session:
         status = self.status or {}
         missing = "; ".join(f"{k}: {status[k]}" for k in ("arm", "axes", "tracker") if status.get(k))
         raise RefusedError(f"the robot does not get ready within {PREPARE_TIME:g} s: {missing or 'no status'}")
+
+    def reset(self) -> None:
+        """Resets a fault and waits until it is gone. Raises RefusedError."""
+        self.ask("reset")
+        end = time.monotonic() + RESET_TIME
+        while time.monotonic() < end:
+            for message in self.messages(0.3):
+                if message[0] == "refused":
+                    raise RefusedError(message[1])
+                if message[0] == "status" and not message[1]["faults"]:
+                    return
+        raise RefusedError("the fault is not reset")
 
     def arm(self) -> None:
         """Arms and waits for the home pose. Raises RefusedError."""
@@ -263,6 +277,52 @@ def _print(console: Console, report: dict[str, Any], path: Path) -> None:
     for name, value in {"summary": path, "log": report["log"]}.items():
         if value:
             console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
+
+
+def finetune(
+    source: str, settings: FineTuning, run: runs.Run, robot: str, distribution: str | None, rig_params: str | None,
+    backend: str, seed: int, console: Console,
+) -> dict[str, Any] | None:  # fmt: skip
+    """Fine-tunes on a robot, the rig in real time, or the rig in lock-step; None when the operator stopped it."""
+    from experiments import finetune as tuning
+    from experiments.finetune_bridge import BridgeRobot
+
+    experiment = tuning.experiment_of(source, distribution)
+    if robot == LOCK_STEP:
+        emulated = tuning.lock_step_robot(experiment, robots.load_rig(rig_params), seed)
+        return tuning.finetune(source, settings, run, emulated, console, None, experiment)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    artefact = _artefact_of(source, experiment, run.folder, console)
+    loaded = artefacts.load(artefact)
+    with ExitStack() as stack:
+        emulated = None
+        if robot == RIG:
+            emulated = stack.enter_context(rig_for(loaded, distribution, rig_params, seed))
+        config = emulated.robot if emulated else robots.load_robot(robot)
+        text = robots.to_yaml(config)
+        name = time.strftime("%Y%m%d-%H%M%S")
+        options = control.ControlOptions(
+            str(artefact), backend, str(run.folder), name, (("git", json.dumps(runs.git_state())),), (("robot.yaml", text),)
+        )
+        session = stack.enter_context(Session(config, options, console))
+        keyboard, view = stack.enter_context(Keyboard()), stack.enter_context(View(console, f"{source} on {config.name}"))
+        bridge = BridgeRobot(session, emulated, keyboard, view, config.name)
+        if emulated:
+            session.prepare(emulated)
+            session.arm()
+            emulated.throw(True)
+        return tuning.finetune(source, settings, run, bridge, console, bridge, experiment)
+
+
+def _artefact_of(source: str, experiment, folder: Path, console: Console) -> Path:
+    """The source itself when it is an artefact; else its policy, exported beside the run."""
+    from experiments import finish, policy
+
+    if (Path(source) / artefacts.MANIFEST).exists():
+        return Path(source)
+    target = folder / "start"
+    finish.export_policy(target, policy.load(source), experiment, None, console)
+    return target
 
 
 def rig(balls: str, rig_params: str | None, seed: int, ports: tuple[int, ...], out: Path, console: Console) -> int:

@@ -266,6 +266,8 @@ class Bridge:
         measured, measured_velocity = joints(self._feedback)
         self._watch(now)
         self._settle_episodes(now)
+        if self.paused:
+            self._last_ball = self.tracker.ball  # a ball that came while it held is not taken in mid-flight
         if self.state is State.READY and not self.paused and self.at_home and in_play(self.tracker, now):
             if self.tracker.ball != self._last_ball:
                 self._begin(now)
@@ -277,7 +279,7 @@ class Bridge:
         self._start = self.gate.reference if np.isfinite(self.gate.reference).all() else measured
         sent = self.gate.command(request, measured, measured_velocity, now)
         self._tick_time = now
-        if self.gate.state is GateState.DISARMED:
+        if not self.gate.engaged:
             self._start = measured
         else:
             festo = list(FESTO_JOINTS)

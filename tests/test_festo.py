@@ -26,7 +26,7 @@ from robot_io.festo import (
     FhppProfile,
     ModbusLink,
 )
-from robot_io.rig.axes import AxisEmulator, serve
+from robot_io.rig.axes import AxisEmulator, DriveParams, serve
 
 A = 15.0  # [m/s^2]
 EDCON_PYTHON = "MJX_TT_FESTO_EDCON_PYTHON"
@@ -64,7 +64,13 @@ def test_input_registers_of_telegram_111():
     assert (status.fault_code, status.warning_code) == (0, 12)
     # Fault, inhibited; homing active; fault 126.
     status = CmmtProfile().decode([0x0248, 0x0800, 0, 0, 0, 0, 0, 0, 0, 126, 0] + [0] * 17)
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (False, False, True, False, True)
+    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (
+        False,
+        False,
+        True,
+        False,
+        True,
+    )
     assert status.fault_code == 126 and "following error" in CmmtProfile().fault_text(126)
     assert CmmtProfile().fault_text(999).startswith("999: look")
 
@@ -105,7 +111,13 @@ def test_input_registers_of_fhpp():
     assert status.position == pytest.approx(-0.25, abs=1e-12) and status.velocity == pytest.approx(-1.0, abs=1e-12)
     assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (True, True, False, True, False)
     status = FhppProfile().decode([0x1800, 0, 0, 0])  # load voltage, fault
-    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (False, False, True, False, False)
+    assert (status.ready, status.enabled, status.fault, status.homed, status.homing) == (
+        False,
+        False,
+        True,
+        False,
+        False,
+    )
     assert not FhppProfile().decode([0x3000, 0, 0, 0]).ready  # the set-up tool has control
 
 
@@ -201,10 +213,10 @@ def test_modbus_link_survives_any_answer():
 def test_follows_a_stream_of_velocities(profile):
     """Within a bound from the delays' spread and the registers' resolution.
 
-    A change of the velocity acts 64.5 ms after its command give or take delta: half a bus cycle (a whole one where START
-    marks targets), and 6.7 ms for ramps shorter than a whole period's. So at an acceleration a the speed is off by at most
-    a delta, plus q for the rounding of its register; the correction's loop holds the position to (a delta + q) / k, its
-    impulse response being positive; within one 13.3 ms period another a 13.3 ms delta.
+    A change of the velocity acts 64.5 ms after its command give or take delta: half a bus cycle (one and a half where
+    START marks targets), and 6.7 ms for ramps shorter than a whole period's. So at an acceleration a the speed is off
+    by at most a delta, plus q for the rounding of its register; the correction's loop holds the position to
+    (a delta + q) / k, its impulse response being positive; within one 13.3 ms period another a 13.3 ms delta.
     """
     delta = 0.0067 + (0.012 if profile == "fhpp" else 0.004)
     q = 0.0005 if profile == "cmmt" else 0.01
@@ -270,8 +282,11 @@ def test_axes_may_count_the_other_way_round():
     np.testing.assert_allclose(rig.axes.state.position, [0.3, -0.1], atol=1e-6)  # 0.5 - 0.2
     stream = Stream(rig, lambda t: (0.2 * (t < 0.5), 0.0))
     stream.reference = np.array([0.3, -0.1])
-    rig.run(1.0, stream)
+    rig.run(0.4, stream)
+    moving_velocity = rig.axes.state.velocity
+    rig.run(0.6, stream)
     assert rig.axes.problem(rig.now) is None
+    assert moving_velocity[0] == pytest.approx(0.2, abs=0.01)
     assert rig.position[0] == pytest.approx(0.5 - stream.trace[-1, 1], abs=1e-4)
     assert stream.trace[-1, 1] == pytest.approx(0.4, abs=0.005)
 
@@ -353,6 +368,20 @@ def test_a_fault_stops_both_and_stays_until_acknowledged(profile):
     rig.axes.enable()
     rig.run(0.3)
     assert rig.axes.problem(rig.now) is None  # still homed
+
+
+def test_acknowledging_while_the_drive_still_brakes():
+    """The drive ignores that edge; it gets another one."""
+    rig = LockStep(start=(-0.8, 0.0)).start()
+    stream = Stream(rig, lambda t: (min(15.0 * t, 1.8), 0.0))
+    rig.run(0.4, stream)
+    rig.emulators[0].drive.params = DriveParams(acceleration=3.0)  # brakes for half a second
+    rig.emulators[0].inject_fault(51)
+    rig.run(0.02, stream)
+    assert rig.axes.fault.cause == "drive_fault"
+    rig.axes.acknowledge()
+    rig.run(0.9)
+    assert rig.axes.fault is None and rig.emulators[0].drive.fault_code == 0
 
 
 def test_a_fault_that_does_not_go_away():
@@ -452,7 +481,7 @@ def test_problems_before_the_first_motion():
     assert rig.axes.fault.cause == "homing_timeout"
     rig = LockStep(config=AxesConfig(enable_timeout=0.5))
     for emulator in rig.emulators:
-        emulator.drive.params = type(emulator.drive.params)(switch_on_time=10.0)
+        emulator.drive.params = DriveParams(switch_on_time=10.0)
     rig.axes.enable()
     rig.run(0.7)
     assert rig.axes.fault.cause == "enable_timeout" and "load voltage" in rig.axes.problem(rig.now)
@@ -563,7 +592,7 @@ def test_over_tcp_in_real_time(profile):
 
 @pytest.mark.parametrize("broken", [0, 1])
 def test_thread_stops_the_axes_when_it_breaks(broken):
-    """An error that nobody thought of, in one axis's exchange: the other is stopped and switched off, and it is told."""
+    """An error that nobody thought of, in one axis's exchange: the other is stopped and switched off."""
     with RealTime() as rig:
         axes = rig.axes()
         with AxesThread(axes) as thread:
@@ -592,7 +621,10 @@ def test_festos_own_client_runs_the_emulator():
         )
         assert done.returncode == 0, done.stderr
         told = loads(done.stdout.splitlines()[-1])
-        assert all(told[k] is True for k in ("acknowledged", "enabled", "homed", "moved", "back", "stopped", "updated", "disabled"))
+        assert all(
+            told[k] is True
+            for k in ("acknowledged", "enabled", "homed", "moved", "back", "stopped", "updated", "disabled")
+        )
         assert told["device"] == "RIG-AXIS"
         assert told["start"] == pytest.approx(50_000, abs=100)  # [um]
         assert told["position"] == pytest.approx(150_000, abs=100)

@@ -181,7 +181,7 @@ def test_a_whole_turn_is_not_taken_for_standing_still(ours, monkeypatch, levels)
 
 
 def test_no_point_leaves_its_chord_farther_than_allowed_for(ours):
-    """Half way between two poses, where small motions leave it the farthest; the stretched arm folding up comes close to
+    """Half way between two poses, where small motions leave it the farthest; the stretched arm folding up comes near
     the bound."""
     rng = np.random.default_rng(5)
     a = rng.uniform(LOWER, UPPER, (8, 3000))
@@ -195,7 +195,7 @@ def test_no_point_leaves_its_chord_farther_than_allowed_for(ours):
 
 
 def test_passing_the_tables_corner_is_seen(ours, monkeypatch):
-    """The gantry slides the arm past the corner at 45 degrees: of all motions near a box the sharpest fall and rise."""
+    """The gantry slides the arm past the corner at 45 degrees: nothing near a box dips more sharply."""
     monkeypatch.setattr(shipped, "LEVELS", 0)
     slide = np.array([1.0, 1.0, 0, 0, 0, 0, 0, 0])
     for bend in (1.8, 2.1, 2.4):

@@ -31,7 +31,7 @@ HOME, ADDRESS = "127.0.0.1", ("127.0.0.1", 6511)
 START = 1000.0  # [s] of the bridge's clock at the episode's first tick
 DELAYS = (  # of ball, arm, axes [s]
     {"ball": 0.040, "arm": 0.029, "axes": 0.033},  # the nominal ones
-    {"ball": 0.0, "arm": 0.0, "axes": 0.0},
+    {"ball": 1e-6, "arm": 1e-6, "axes": 1e-6},  # the simulator takes none for this
     {"ball": 0.0417, "arm": 0.0033, "axes": 0.0271},
     {"ball": 0.0123, "arm": 0.0467, "axes": 0.0081},
 )

@@ -1,4 +1,4 @@
-"""The emulated linear axes: motion against closed forms, drive states, delays, and the Modbus server over real sockets."""
+"""The emulated linear axes: motion against closed forms, states, delays, the Modbus server over real sockets."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ class TestDrive:
 
 @pytest.mark.parametrize("profile", ["cmmt", "fhpp continuous"])
 def test_latency_of_a_velocity_change(profile):
-    """64.5 ms from the command to the middle of the change, on average over where in the bus's cycle the command falls."""
+    """64.5 ms from the command to the middle of the change, averaged over where in the bus cycle the command falls."""
     latencies = []
     for offset in np.linspace(0.0005, 0.0075, 8):
         rig = LockStep(profile, start=(-0.8, 0.0)).start()
@@ -283,7 +283,12 @@ def test_registers_that_there_are():
     ]:
         with pytest.raises(AxisLost, match="illegal data address"):
             cmmt.exchange(write, values, read, count)
-    for write, values, read, count in [(0, zeros[:3], 0, 4), (0, zeros[:5], 0, 4), (0, zeros[:4], 0, 5), (400, [1], 0, 4)]:
+    for write, values, read, count in [
+        (0, zeros[:3], 0, 4),
+        (0, zeros[:5], 0, 4),
+        (0, zeros[:4], 0, 5),
+        (400, [1], 0, 4),
+    ]:
         with pytest.raises(AxisLost, match="illegal data address"):
             fhpp.exchange(write, values, read, count)
     assert cmmt.images == fhpp.images == 0
@@ -391,7 +396,9 @@ def is_sound(data):
         return False
     if function == 0x17 and len(body) >= 9:
         read, read_count, write, count, size = struct.unpack(">HHHHB", body[:9])
-        if not any(low <= read and read + read_count <= high for low, high in ((0, 28), (100, 128), (400, 402), (500, 574))):
+        if not any(
+            low <= read and read + read_count <= high for low, high in ((0, 28), (100, 128), (400, 402), (500, 574))
+        ):
             return False
         return read_count > 0 and write == 0 and 11 <= count <= 28 and size == 2 * count == len(body) - 9
     if function == 0x10 and len(body) >= 5:

@@ -1,9 +1,5 @@
 """Two linear axes of Festo over Modbus TCP."""
 
-from robot_io.festo.axes import AxesConfig as AxesConfig
-from robot_io.festo.axes import AxesFault as AxesFault
-from robot_io.festo.axes import AxesState as AxesState
-from robot_io.festo.axes import Axis as Axis
 from robot_io.festo.axes import FestoAxes as FestoAxes
 from robot_io.festo.cmmt import CmmtProfile as CmmtProfile
 from robot_io.festo.fhpp import FhppProfile as FhppProfile
@@ -14,4 +10,8 @@ from robot_io.festo.link import RegisterLink as RegisterLink
 from robot_io.festo.profile import AxisCommand as AxisCommand
 from robot_io.festo.profile import AxisProfile as AxisProfile
 from robot_io.festo.profile import AxisStatus as AxisStatus
+from robot_io.festo.settings import AxesConfig as AxesConfig
+from robot_io.festo.settings import AxesFault as AxesFault
+from robot_io.festo.settings import AxesState as AxesState
+from robot_io.festo.settings import Axis as Axis
 from robot_io.festo.thread import AxesThread as AxesThread

@@ -82,7 +82,9 @@ class PosZSW1(IntFlag):
     MDI = 1 << 15
 
 
-POWERED = STW1.NO_COAST_STOP | STW1.NO_QUICK_STOP | STW1.ENABLE_OPERATION | STW1.CONTROL_BY_PLC | STW1.NO_INTERMEDIATE_STOP
+POWERED = (
+    STW1.NO_COAST_STOP | STW1.NO_QUICK_STOP | STW1.ENABLE_OPERATION | STW1.CONTROL_BY_PLC | STW1.NO_INTERMEDIATE_STOP
+)
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,9 @@ class CmmtProfile:
     def __post_init__(self) -> None:
         for name in ("position_unit", "velocity_unit", "base_velocity", "base_acceleration"):
             if not 0 < getattr(self, name) < 1e6:
-                raise ValueError(f"CmmtProfile.{name} is {getattr(self, name)}, it must be a positive number as in the drive's set-up")
+                raise ValueError(
+                    f"CmmtProfile.{name} is {getattr(self, name)}, it must be positive, as in the drive's set-up"
+                )
 
     def encode(self, command: AxisCommand) -> list[int]:
         stw1 = POWERED

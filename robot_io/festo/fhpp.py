@@ -78,8 +78,8 @@ class FhppProfile:
 
     position_unit  [m] a count of the position
     base_velocity  [m/s] that 100 % stand for
-    continuous     mark new targets by CONT and an alternating CONTT, as SFC-LACI documents it; else by an edge of START,
-                   which every FHPP drive knows and which takes a new target in every second cycle
+    continuous     mark new targets by CONT and an alternating CONTT, as SFC-LACI documents it; else by an edge of
+                   START, which every FHPP drive knows and which takes a new target in every second cycle
     Direct mode carries no acceleration and no fault number; they, and the node guard (100 to 5000 ms), are set and read
     with Festo's Configuration Tool.
     """
@@ -95,7 +95,9 @@ class FhppProfile:
     def __post_init__(self) -> None:
         for name in ("position_unit", "base_velocity"):
             if not 0 < getattr(self, name) < 1e6:
-                raise ValueError(f"FhppProfile.{name} is {getattr(self, name)}, it must be a positive number as in the drive's set-up")
+                raise ValueError(
+                    f"FhppProfile.{name} is {getattr(self, name)}, it must be positive, as in the drive's set-up"
+                )
 
     def encode(self, command: AxisCommand) -> list[int]:
         ccon = CCON.STOP | CCON.BRAKE | CCON.LOCK | CCON.OPM1

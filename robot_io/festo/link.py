@@ -56,7 +56,7 @@ class DirectLink:
 
 
 class ModbusLink:
-    """A Modbus TCP connection, opened by the first exchange and closed by any failure, so that no late answer is mixed up.
+    """A Modbus TCP connection, opened by the first exchange and closed by any failure: no late answer is mixed up.
 
     address    of the drive
     timeout    longest wait for an answer, and for a connection [s]
@@ -94,11 +94,15 @@ class ModbusLink:
                 answer = self._client.write_registers(write_address, values, device_id=self._device_id)
                 if not answer.isError():
                     answer = self._client.read_holding_registers(read_address, count=count, device_id=self._device_id)
-        except Exception as error:  # whatever a damaged answer or a dying socket raises inside pymodbus: the axis is lost
+        except (
+            Exception
+        ) as error:  # whatever a damaged answer or a dying socket raises inside pymodbus: the axis is lost
             raise self._lost(str(error) or type(error).__name__) from error
         if isinstance(answer, ExceptionResponse) or answer.isError():
             code = getattr(answer, "exception_code", 0)
-            raise self._lost(f"it refused registers {write_address} and {read_address}: {EXCEPTIONS.get(code, f'exception {code}')}")
+            raise self._lost(
+                f"it refused registers {write_address} and {read_address}: {EXCEPTIONS.get(code, f'exception {code}')}"
+            )
         registers = getattr(answer, "registers", None) or []
         if len(registers) != count:
             raise self._lost(f"it sent {len(registers)} registers, wanted were {count}")
@@ -113,7 +117,9 @@ class ModbusLink:
             raise AxisLost(f"{self._where}: not connected")
         self._next_attempt = now + RETRY
         if not self._client.connect():
-            raise self._lost("no connection: is it powered, is the cable in, does another program hold its only connection?")
+            raise self._lost(
+                "no connection: is it powered, is the cable in, does another program hold its only connection?"
+            )
 
     def _lost(self, reason: str) -> AxisLost:
         self._client.close()

@@ -11,10 +11,10 @@ STOPPING = 1.0  # [s] for coming to rest at the end
 
 
 class AxesThread:
-    """Calls ``axes.cycle`` at ``rate`` [Hz] by absolute deadlines, from ``start`` (or entering) to ``close`` (or leaving).
+    """Calls ``axes.cycle`` at ``rate`` [Hz] by absolute deadlines, from ``start`` (entering) to ``close`` (leaving).
 
-    The axes hand over commands, requests and state as single immutable objects, so no lock is held across an exchange and
-    nobody waits for one.
+    The axes hand over commands, requests and state as single immutable objects, so no lock is held across an exchange
+    and nobody waits for one.
 
     cycles    done
     late      deadlines that had passed by a whole period when their cycle would have begun; those are left out
@@ -84,7 +84,9 @@ class AxesThread:
         try:
             self._loop(self._finish.is_set)
         except Exception as error:  # a mistake of ours must stop the axes and be told, not vanish with the thread
-            self._failure = f"The exchange with the linear axes broke off ({type(error).__name__}: {error}): restart the program."
+            self._failure = (
+                f"The exchange with the linear axes broke off ({type(error).__name__}: {error}): restart the program."
+            )
         finally:
             self._end()
 
@@ -112,7 +114,9 @@ class AxesThread:
             self.axes.cycle(time.monotonic())  # at least this one stop command
             self._loop(lambda: self.axes.standing() or time.monotonic() > limit)
         except Exception as error:
-            self._failure = self._failure or f"The linear axes could not be stopped in order ({type(error).__name__}: {error})."
+            self._failure = (
+                self._failure or f"The linear axes could not be stopped in order ({type(error).__name__}: {error})."
+            )
         finally:
             self.axes.switch_off()
             self.axes.close()

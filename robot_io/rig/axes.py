@@ -1,11 +1,11 @@
 """An emulated Festo axis: a register bank, a drive behind it, the delays of both.
 
-``AxisEmulator`` has no socket and no clock: the rig steps it with the plant's position and moves the plant by the velocity
-it gives; ``DirectLink`` or ``serve`` brings the registers to the computer that is being tested.
+``AxisEmulator`` has no socket and no clock: the rig steps it with the plant's position and moves the plant by the
+velocity it gives; ``DirectLink`` or ``serve`` brings the registers to the computer that is being tested.
 
-Latency of a change of the commanded velocity, seen at the set-point for the plant, with the defaults: half a cycle of the
-bus (4 ms), the dead time (50 ms), half of the acceleration's ramp over one policy period (6.7 ms), half of the smoothing
-window (4 ms): 64.7 ms.
+Latency of a change of the commanded velocity, seen at the set-point for the plant, with the defaults: half a cycle of
+the bus (4 ms), the dead time (50 ms), half of the acceleration's ramp over one policy period (6.7 ms), half of the
+smoothing window (4 ms): 64.7 ms.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class AxisEmulator:
         self._parameters: dict[tuple[int, int], list[int]] = {}
 
     def step(self, now: float, position: float, velocity: float) -> float:
-        """Moves on to ``now`` [s], where the plant is at ``position`` [m] with ``velocity`` [m/s]; its new velocity [m/s]."""
+        """Moves on to ``now`` [s], the plant being at ``position`` [m] with ``velocity`` [m/s]; its new one [m/s]."""
         with self._lock:
             drive = self.drive
             drive.measure(position)
@@ -102,8 +102,8 @@ class AxisEmulator:
                 raise AxisLost("the emulated axis is disconnected")
             if not self.readable(read_address, count) or not self.writable(write_address, values):
                 raise IllegalAddress(
-                    f"illegal data address: writing {len(values)} registers from {write_address} on, reading {count} from "
-                    f"{read_address} on; there are {self._bank.ranges}"
+                    f"illegal data address: writing {len(values)} registers from {write_address} on, reading {count} "
+                    f"from {read_address} on; there are {self._bank.ranges}"
                 )
             self._write(write_address, list(values))
             return self._read(read_address, count)

@@ -1,4 +1,4 @@
-"""The emulated drive behind an axis's registers: power, faults, homing, positioning. SI units, no clock, no registers."""
+"""The emulated drive behind an axis's registers: power, faults, homing, positioning. SI units, no registers."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class Drive:
         self.homing = False
 
     def position(self, target: float, speed: float, acceleration: float, relative: bool = False) -> bool:
-        """A positioning task (reported coordinate); False when refused: not operating, homing, or not homed and absolute."""
+        """A positioning task (reported coordinate); False if refused: not operating, homing, absolute and not homed."""
         if not self.operating or self.homing or not (self.homed or relative) or acceleration <= 0.0:
             return False
         self.target = self.x + target if relative else target + (self.origin or 0.0)

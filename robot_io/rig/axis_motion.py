@@ -11,8 +11,8 @@ TOUCH = 1e-10  # [m] a stopping point that near to the target is the target
 def advance(x: float, v: float, target: float, speed: float, acceleration: float, dt: float) -> tuple[float, float]:
     """Position and velocity after ``dt`` seconds of the fastest motion to rest at ``target``.
 
-    Within ``acceleration``, and ``speed`` once reached from a higher one. Piecewise exact: many short steps give what one
-    long step gives.
+    Within ``acceleration``, and ``speed`` once reached from a higher one. Piecewise exact: many short steps give what
+    one long step gives.
     """
     while dt > 0.0:
         gap = target - x

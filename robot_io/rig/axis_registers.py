@@ -1,6 +1,6 @@
-"""Emulated register banks: how words written to an axis move its drive, and what it reports. Units of the drive's set-up.
+"""Emulated register banks: how words written to an axis move its drive, and what it reports.
 
-Written from the registers' side and without the computer's codecs (``robot_io.festo``), whose bit names alone are shared.
+Written from the registers' side and without the computer's codecs (``robot_io.festo``): only bits' names are shared.
 """
 
 from __future__ import annotations
@@ -95,7 +95,9 @@ class CmmtRegisters:
         zsw1 = ZSW1.FOLLOWING | ZSW1.CONTROL_REQUESTED
         zsw1 |= ZSW1.READY_TO_SWITCH_ON * (power is not Power.INHIBITED) | ZSW1.READY_TO_OPERATE * powered
         zsw1 |= ZSW1.OPERATION_ENABLED * drive.operating | ZSW1.FAULT * bool(drive.fault_code)
-        zsw1 |= ZSW1.NO_COAST_STOP * bool(last & STW1.NO_COAST_STOP) | ZSW1.NO_QUICK_STOP * bool(last & STW1.NO_QUICK_STOP)
+        zsw1 |= ZSW1.NO_COAST_STOP * bool(last & STW1.NO_COAST_STOP) | ZSW1.NO_QUICK_STOP * bool(
+            last & STW1.NO_QUICK_STOP
+        )
         zsw1 |= ZSW1.INHIBITED * (power is Power.INHIBITED) | ZSW1.TARGET_REACHED * (drive.reached and not drive.homing)
         zsw1 |= ZSW1.HOME_SET * drive.homed | ZSW1.STOPPED * (drive.v == 0.0)
         zsw1 |= ZSW1.TASK_ACKNOWLEDGED * bool(drive.task and last & STW1.ACTIVATE_TASK)

@@ -83,7 +83,9 @@ class AxisServer:
     async def _serve(self) -> None:
         device = SimDevice(
             id=self._device_id,
-            simdata=[SimData(low, values=[0] * (high - low), datatype=DataType.REGISTERS) for low, high in self._bank.ranges],
+            simdata=[
+                SimData(low, values=[0] * (high - low), datatype=DataType.REGISTERS) for low, high in self._bank.ranges
+            ],
             action=self._action,
         )
         server = _SingleConnectionServer(
@@ -112,7 +114,11 @@ class AxisServer:
 
         pymodbus would write first and complain about the address to read afterwards.
         """
-        if not sending and pdu.function_code == READ_WRITE and not self._bank.readable(pdu.read_address, pdu.read_count):
+        if (
+            not sending
+            and pdu.function_code == READ_WRITE
+            and not self._bank.readable(pdu.read_address, pdu.read_count)
+        ):
             pdu.write_registers = []
         return pdu
 
@@ -156,7 +162,7 @@ class _Refusal(asyncio.Protocol):
 async def _wait(event: asyncio.Event, seconds: float) -> None:
     try:
         await asyncio.wait_for(event.wait(), seconds)
-    except asyncio.TimeoutError:
+    except TimeoutError:
         pass
 
 

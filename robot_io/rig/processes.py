@@ -159,7 +159,7 @@ def _run(job: Callable, name: str, params: RigParams, ports: Ports, pipe, argume
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     shared = Shared(name)
     # These stand for hardware, which nothing else on this machine can delay; below the bridge's priority.
-    realtime.prepare(PRIORITY, lock_memory=False)
+    realtime.prepare(PRIORITY)
     try:
         job(shared, params, ports, pipe, *arguments)
     except (KeyboardInterrupt, BrokenPipeError, EOFError):
