@@ -29,7 +29,8 @@ class SafetyConfig:
     delay            shortest and longest time from a command to the measurement of its effect
     following_ticks  commands in a row after which a following error is a fault
     late             longest time between two commands
-    stale_*          longest age of what was last heard of a device, and of the policy's request
+    stale_*          longest age of what was last heard of a device, and of the policy's request; the tracker's is over
+                     four frames: more would leave no time to stop within 0.15 s behind the arm's dead time
     """
 
     speed_scale: float = 1.0
@@ -45,7 +46,7 @@ class SafetyConfig:
     late: float = 0.05
     stale_arm: float = 0.05
     stale_axes: float = 0.05
-    stale_tracker: float = 0.1
+    stale_tracker: float = 0.035
     stale_policy: float = 0.05
 
     def __post_init__(self) -> None:

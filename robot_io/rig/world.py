@@ -115,6 +115,7 @@ class World:
     def throw(self, position, velocity, spin=(0.0, 0.0, 0.0)) -> None:
         """Puts a new ball into play."""
         self._place(position, velocity, spin)
+        mujoco.mj_kinematics(self.model, self.data)  # the ball's orientation is looked at before the next step
         self.in_play, self._touching, self.touches = True, set(), []
         self.number += 1
 
@@ -167,7 +168,7 @@ class World:
                 data.xfrc_applied[self._ball_body, :3] = BALL_MASS * (self.params.magnus * np.cross(spin, velocity) - drag)
             before = data.qvel[v : v + 3].copy()
             mujoco.mj_step(self.model, data)
-            if self.in_play:
+            if data.ncon or self._touching:
                 self._contacts(before)
 
     def _contacts(self, before: np.ndarray) -> None:
