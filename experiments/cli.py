@@ -160,7 +160,7 @@ def run(options: argparse.Namespace) -> int:
 def finetune(options: argparse.Namespace) -> int:
     from experiments import finetune_settings
 
-    settings = finetune_settings.load(options.settings, options.recipe, tuple(options.set))
+    settings = finetune_settings.load(options.settings, tuple(options.set))
     _start_jax(1)
     from rich.console import Console
 
@@ -324,8 +324,7 @@ Every ball is on disk before the next begins: the same command continues after a
 """)  # fmt: skip
     p.add_argument("policy", metavar="RUN_OR_ARTEFACT", help="what to start from")
     p.add_argument("--robot", required=True, metavar="YAML", help='a robot.yaml, "rig" or "lockstep"')
-    p.add_argument("--settings", metavar="YAML", help="of the fine-tuning (default: the recipe's)")
-    p.add_argument("--recipe", metavar="NAME", help="settings by name, docs/finetuning.md")
+    p.add_argument("--settings", metavar="YAML", help="of the fine-tuning (default: the paper's), docs/finetuning.md")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one setting")
     p.add_argument("--out", metavar="FOLDER", help="of the run (default: POLICY-finetuned)")
     p.add_argument("--backend", choices=("numpy", "jit"), default="numpy", help="what computes the policy")

@@ -202,7 +202,7 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: an experiment is a mapping with the keys {', '.join(Config.model_fields)}")
     for override in overrides:
-        _override(data, override)
+        apply_override(data, override)
     for key in ("balls", "model", "initial_policy"):
         value = data.get(key)
         if isinstance(value, str) and (key != "balls" or Path(value).suffix in (".yaml", ".yml")):
@@ -257,7 +257,8 @@ def read_yaml(text: str, where: str) -> Any:
         raise ConfigError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from None
 
 
-def _override(data: dict[str, Any], override: str) -> None:
+def apply_override(data: dict[str, Any], override: str) -> None:
+    """Sets one value of parsed YAML, given as "dotted.path=value" with a YAML value. Raises ConfigError."""
     path, sign, value = override.partition("=")
     if not sign or not path:
         raise ConfigError(f"--set {override}: needs the form dotted.path=value, such as training.updates=500")

@@ -8,7 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError
 
 from experiments import mistakes
-from experiments.config import Constant, Count, Decay, Optimiser, Positive, Rewards, Section, Step, read_yaml
+from experiments.config import (
+    Constant, Count, Decay, Optimiser, Positive, Rewards, Section, Step, apply_override, read_yaml,
+)  # fmt: skip
 from experiments.errors import ConfigError
 
 MEASURED = ("state_transition", "net_clearance", "hit_and_land", "fault")  # terms that a real episode tells
@@ -52,21 +54,9 @@ class FineTuning(Section):
         return Optimiser(**{name: getattr(self, name) for name in names}, common_random_numbers=False)
 
 
-# Same robot time for all. Figures for each: docs/finetuning.md.
-RECIPES: dict[str, dict[str, Any]] = {
-    "paper": {},
-}
-DEFAULT_RECIPE = "paper"
-
-
-def load(path: str | Path | None = None, recipe: str | None = None, overrides: tuple[str, ...] = ()) -> FineTuning:
-    """A recipe, changed by a YAML of ``FineTuning``'s keys and then by "dotted.path=value". Raises ConfigError."""
-    from experiments.config import _override
-
-    recipe = recipe or DEFAULT_RECIPE
-    if recipe not in RECIPES:
-        raise ConfigError(f"--recipe {recipe}: no such recipe; allowed: {', '.join(RECIPES)}")
-    data, where = FineTuning(**RECIPES[recipe]).model_dump(mode="json"), f"recipe {recipe}"
+def load(path: str | Path | None = None, overrides: tuple[str, ...] = ()) -> FineTuning:
+    """The defaults, changed by a YAML of ``FineTuning``'s keys and then by "dotted.path=value". Raises ConfigError."""
+    data, where = FineTuning().model_dump(mode="json"), "--set"
     if path is not None:
         try:
             given = read_yaml(Path(path).read_text(encoding="utf-8"), str(path))
@@ -76,7 +66,7 @@ def load(path: str | Path | None = None, recipe: str | None = None, overrides: t
             raise ConfigError(f"{path}: fine-tuning is a mapping with the keys {', '.join(FineTuning.model_fields)}")
         data, where = data | given, str(path)
     for override in overrides:
-        _override(data, override)
+        apply_override(data, override)
     return parse(data, where)
 
 

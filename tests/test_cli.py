@@ -18,7 +18,8 @@ from experiments import checkpoint, cli, policy
 from robot_io import artefact, contract
 
 ROOT = Path(__file__).parent.parent
-COMMANDS = ("train", "evaluate", "export", "fit-human", "import", "render", "bench", "schema", "balls")
+COMMANDS = ("train", "evaluate", "export", "fit-human", "import", "render", "bench", "schema", "balls",
+            "run", "rig", "finetune", "log")  # fmt: skip
 EXPERIMENT = """
 name: tiny
 balls: player5/M0

@@ -113,7 +113,7 @@ def last_theta(folder: Path) -> np.ndarray:
 
 
 def test_the_defaults_are_the_papers_real_settings():
-    chosen = finetune_settings.load(recipe="paper")
+    chosen = finetune_settings.load()
     assert (chosen.step.learning_rate, chosen.sigma, chosen.pairs, chosen.repeats, chosen.keep) == (
         0.00375, 0.025, 5, 3, 0.6,
     )  # fmt: skip
@@ -125,10 +125,10 @@ def test_the_defaults_are_the_papers_real_settings():
     }  # fmt: skip
 
 
-def test_settings_come_from_recipe_then_file_then_command_line(tmp_path):
+def test_settings_come_from_file_then_command_line(tmp_path):
     path = tmp_path / "tuning.yaml"
     path.write_text("updates: 12\npairs: 7\n")
-    chosen = finetune_settings.load(path, "paper", ("pairs=9", "step.learning_rate=0.001"))
+    chosen = finetune_settings.load(path, ("pairs=9", "step.learning_rate=0.001"))
     assert (chosen.updates, chosen.pairs, chosen.repeats, chosen.step.learning_rate) == (12, 9, 3, 0.001)
 
 

@@ -561,7 +561,7 @@ FRESH = dict(arm_age=0.0, axes_age=0.0, tracker_age=0.0, ball_in_play=True, poli
     [
         ("arm_age", Cause.STALE_ARM, 0.05),
         ("axes_age", Cause.STALE_AXES, 0.05),
-        ("tracker_age", Cause.STALE_TRACKER, 0.1),
+        ("tracker_age", Cause.STALE_TRACKER, 0.035),
         ("policy_age", Cause.STALE_POLICY, 0.05),
     ],
 )
