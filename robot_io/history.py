@@ -66,12 +66,13 @@ class History:
 
     def slope(self, span: float) -> np.ndarray | None:
         """Rate of change (n,) per second by least squares over the last ``span`` seconds; None with under three samples."""
-        if not self._times:
+        times, values = self._times, self._values
+        n, first = 0, times[-1] - span if times else 0.0
+        while n < len(times) and times[-1 - n] >= first:
+            n += 1
+        if n < 3:
             return None
-        chosen = [i for i, t in enumerate(self._times) if t >= self._times[-1] - span]
-        if len(chosen) < 3:
-            return None
-        t = np.array([self._times[i] for i in chosen])
-        x = np.stack([self._values[i] for i in chosen])
-        t = t - t.mean()
-        return t @ (x - x.mean(axis=0)) / (t @ t)
+        t = np.array([times[-1 - i] for i in range(n)])
+        t -= t.sum() / n
+        x = np.array([values[-1 - i] - values[-1] for i in range(n)])  # differences: exact for what does not move
+        return t @ x / (t @ t)

@@ -162,10 +162,11 @@ class World:
         for _ in range(steps):
             if self.in_play:
                 velocity = data.qvel[v : v + 3]
-                # A free joint's angular velocity is in the body's frame.
-                spin = data.xmat[self._ball_body].reshape(3, 3) @ data.qvel[v + 3 : v + 6]
-                drag = self.params.drag * np.sqrt(velocity @ velocity) * velocity
-                data.xfrc_applied[self._ball_body, :3] = BALL_MASS * (self.params.magnus * np.cross(spin, velocity) - drag)
+                acceleration = -self.params.drag * np.sqrt(velocity @ velocity) * velocity
+                if self.params.magnus:  # a free joint's angular velocity is in the body's frame
+                    spin = data.xmat[self._ball_body].reshape(3, 3) @ data.qvel[v + 3 : v + 6]
+                    acceleration += self.params.magnus * np.cross(spin, velocity)
+                data.xfrc_applied[self._ball_body, :3] = BALL_MASS * acceleration
             before = data.qvel[v : v + 3].copy()
             mujoco.mj_step(self.model, data)
             if data.ncon or self._touching:
