@@ -13,7 +13,7 @@ from ballmodel.distribution import BallDistribution, parse_distribution
 from ballmodel.pool import BallPool, sample_pool
 from bgs import step
 from bgs.strategy import BGSConfig
-from experiments.config import Config, Optimiser, Rewards, Task, read_yaml
+from experiments.config import Config, Optimiser, Rewards, Task, Training, read_yaml
 from experiments.errors import ConfigError, checked
 from experiments.training import Trainer
 from mjx_tt import model as models
@@ -89,6 +89,12 @@ def reward_weights(chosen: str | Rewards) -> tuple[float, ...]:
     return tuple(float(changed.get(name, weights[name])) for name in rewards.TERMS)
 
 
+def later_weights(training: Training) -> tuple[int, tuple[float, ...]] | None:
+    """The number of updates after which the reward weights change, and those weights."""
+    later = training.later_rewards
+    return later and (round(later.after * training.updates), reward_weights(later.rewards))
+
+
 def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:
     """``updates`` is the length of the run, which a cosine schedule needs. Raises ValueError."""
     chosen = optimiser.step
@@ -142,6 +148,7 @@ def trainer(experiment: Experiment) -> Trainer:
         config.optimiser.repeats,
         config.optimiser.common_random_numbers,
         config.optimiser.initial_scale,
+        later_weights(config.training),
     )
 
 

@@ -137,10 +137,20 @@ class Optimiser(Section):
     """Standard deviation of the random first parameters."""
 
 
+class LaterRewards(Section):
+    """Other reward weights for the rest of a training."""
+
+    after: Annotated[float, Field(ge=0, le=1)]
+    """Share of the updates that are trained with the weights of the task."""
+    rewards: Literal["sim", "real"] | Rewards
+
+
 class Training(Section):
     """How long to train and what to keep of it."""
 
     updates: Count = 2000
+    later_rewards: LaterRewards | None = None
+    """First learn to hit with the weights of the task, then with these; null: the same weights throughout."""
     max_minutes: Positive | None = None
     """Stop after this much training time, all sessions of the run together; a larger value continues the run."""
     stop_at_return_rate: Annotated[float, Field(gt=0, le=1)] | None = None

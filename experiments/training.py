@@ -6,7 +6,7 @@ are one compiled call from a ``TrainState`` to the next.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +41,7 @@ class Trainer:
     repeats                episodes per perturbation
     common_random_numbers  both members of a pair meet the same balls, latencies and noise
     initial_scale          standard deviation of the random first weights
+    later_weights          after how many updates the rewards get other weights, and these (11,); None: never
     """
 
     def __init__(
@@ -53,12 +54,14 @@ class Trainer:
         repeats: int = 15,
         common_random_numbers: bool = False,
         initial_scale: float = 0.1,
+        later_weights: tuple[int, tuple[float, ...]] | None = None,
     ) -> None:
         if repeats < 1:
             raise ValueError(f"repeats is {repeats}, at least 1 is needed")
         self.simulator, self.bgs_config, self.pool = simulator, bgs_config, simulator.replicate(pool)
         self._model, self._randomise = model, randomise
         self._repeats, self._crn, self._initial_scale = repeats, common_random_numbers, initial_scale
+        self._later = later_weights
         self._update = jax.jit(simulator.on_devices(self._update_local, out_specs=PartitionSpec()))
 
     @property
@@ -94,6 +97,7 @@ class Trainer:
         mean, inverse_scale = normalizer.normaliser(state.statistics)
         simulator = self.simulator
         result = simulator.rollout(simulator.local(theta), mean, inverse_scale, simulator.local(episodes))
+        result = self._weighed(result, state.bgs.updates)
         # Everything that the devices have to share, in one sum: each fills in its own members.
         member = result.returns.mean(axis=0)  # NaN when one of its episodes was not finite
         failed = ~jnp.isfinite(member)
@@ -113,6 +117,15 @@ class Trainer:
             **means(total),
         }
         return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
+
+    def _weighed(self, result: RolloutResult, updates) -> RolloutResult:
+        """The result with the returns that the weights of this update give."""
+        if self._later is None:
+            return result
+        after, weights = self._later
+        returns = jnp.tensordot(jnp.array(weights, jnp.float32), jnp.where(result.finite, result.terms, 0.0), 1)
+        later = jnp.where(result.finite, returns, jnp.nan)
+        return replace(result, returns=jnp.where(updates >= after, later, result.returns))
 
 
 def totals(result: RolloutResult) -> dict:

@@ -16,6 +16,7 @@ from bgs import normalizer, step, strategy
 from bgs.strategy import BGSConfig
 from experiments import build, config
 from experiments.training import Trainer
+from mjx_tt import rewards
 from mjx_tt.model import SimModel
 from mjx_tt.rollout import Simulator
 from mjx_tt.task import TaskConfig
@@ -163,3 +164,19 @@ def test_the_same_yaml_trains_under_both_engines():
 def test_mistakes_are_named(pool):
     with pytest.raises(ValueError, match="repeats is 0, at least 1 is needed"):
         Trainer(Simulator(TaskConfig()), BGS, pool, SimModel(), repeats=0)
+
+
+def test_later_weights_take_over_after_their_update(trainer, run, pool):
+    """Before it nothing changes; from then on the step is that of a task with these weights."""
+    weights = tuple(5.0 if name == "velocity" else weight for name, weight in rewards.SIM_WEIGHTS.items())
+    changing = Trainer(Simulator(TaskConfig()), BGS, pool, SimModel(), repeats=REPEATS, later_weights=(2, weights))
+    other = Trainer(Simulator(TaskConfig(reward_weights=weights)), BGS, pool, SimModel(), repeats=REPEATS)
+    states, metrics = updates(changing)
+    for i in (1, 2):
+        np.testing.assert_allclose(states[i].bgs.theta, run[0][i].bgs.theta, rtol=0, atol=1e-6)
+    expected, _ = other.update(states[2])
+    np.testing.assert_allclose(states[3].bgs.theta, expected.bgs.theta, rtol=0, atol=1e-6)
+    assert np.abs(np.asarray(states[3].bgs.theta - trainer.update(states[2])[0].bgs.theta)).max() > 1e-4
+    for measured, used in zip(metrics, (tuple(rewards.SIM_WEIGHTS.values()),) * 2 + (weights,)):
+        terms = [measured[f"reward/{name}"] for name in rewards.TERMS]
+        assert measured["mean_return"] == pytest.approx(np.dot(used, terms), rel=1e-5)
