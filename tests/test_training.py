@@ -168,7 +168,7 @@ def test_mistakes_are_named(pool):
 
 def test_later_weights_take_over_after_their_update(trainer, run, pool):
     """Before it nothing changes; from then on the step is that of a task with these weights."""
-    weights = tuple(5.0 if name == "velocity" else weight for name, weight in rewards.SIM_WEIGHTS.items())
+    weights = tuple(0.0 if name == "state_transition" else weight for name, weight in rewards.SIM_WEIGHTS.items())
     changing = Trainer(Simulator(TaskConfig()), BGS, pool, SimModel(), repeats=REPEATS, later_weights=(2, weights))
     other = Trainer(Simulator(TaskConfig(reward_weights=weights)), BGS, pool, SimModel(), repeats=REPEATS)
     states, metrics = updates(changing)
