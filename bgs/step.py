@@ -19,9 +19,18 @@ PAPER_LEARNING_RATE = 0.00375  # Abeyruwan et al. 2022, appendix, table of BGS h
 
 @lru_cache(maxsize=None)
 def make(
-    kind: str = "sgd", learning_rate: float | Schedule = PAPER_LEARNING_RATE, b1: float = 0.9, b2: float = 0.999
+    kind: str = "sgd",
+    learning_rate: float | Schedule = PAPER_LEARNING_RATE,
+    b1: float = 0.9,
+    b2: float = 0.999,
+    weight_decay: float = 0.0,
 ) -> optax.GradientTransformation:
     """The transformation of kind "sgd" (plain step, the paper's) or "adam" (decay rates b1 and b2; unused by "sgd").
+
+    weight_decay: every update also shrinks the parameters by learning_rate x weight_decay (Loshchilov & Hutter 2019,
+    "Decoupled weight decay regularization"). Without it the noise of the gradient estimates lets their norm grow for
+    ever, until perturbations of a fixed sigma change little (Salimans et al. 2017, "Evolution strategies as a scalable
+    alternative to reinforcement learning").
 
     ``learning_rate`` is a positive number or a schedule: ``cosine``, ``piecewise`` or any optax schedule over updates.
     Raises ValueError naming the argument, what was given and what is allowed.
@@ -33,7 +42,11 @@ def make(
     for name, value in (("b1", b1), ("b2", b2)):
         if not 0 <= value < 1:
             raise ValueError(f"step.make: {name} = {value}, allowed is [0, 1)")
-    return optax.sgd(learning_rate) if kind == "sgd" else optax.adam(learning_rate, b1=b1, b2=b2)
+    if not 0 <= weight_decay < float("inf"):
+        raise ValueError(f"step.make: weight_decay = {weight_decay}, allowed are finite numbers from 0 on")
+    direction = optax.identity() if kind == "sgd" else optax.scale_by_adam(b1=b1, b2=b2)
+    decay = [optax.add_decayed_weights(weight_decay)] if weight_decay else []
+    return optax.chain(direction, *decay, optax.scale_by_learning_rate(learning_rate))
 
 
 @lru_cache(maxsize=None)

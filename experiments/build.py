@@ -112,7 +112,7 @@ def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:
         normalise=optimiser.normalise,
         orthogonal=optimiser.orthogonal,
         scale=optimiser.scale,
-        step=step.make(chosen.kind, rate, chosen.b1, chosen.b2),
+        step=step.make(chosen.kind, rate, chosen.b1, chosen.b2, chosen.weight_decay),
         average=optimiser.average,
     )
 

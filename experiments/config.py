@@ -109,6 +109,8 @@ class Step(Section):
     """Adam's decay of the first moment; sgd does not use it."""
     b2: Decay = 0.99
     """Adam's decay of the second moment; sgd does not use it."""
+    weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Share by which an update shrinks the parameters, over the learning rate."""
     schedule: Annotated[Constant | Cosine | Piecewise, Field(discriminator="kind")] = Cosine(kind="cosine")
 
 

@@ -199,6 +199,14 @@ def test_adam_is_the_textbook_step_uphill():
     np.testing.assert_allclose(state.theta, [1.0 - 0.01, -1.0 + 0.01], rtol=1e-5)
 
 
+@pytest.mark.parametrize("kind", step.KINDS)
+def test_weight_decay_shrinks_by_rate_times_decay(kind):
+    plain, _ = _tell(_config(step=step.make(kind, 0.01)))
+    decayed, _ = _tell(_config(step=step.make(kind, 0.01, weight_decay=0.5)))
+    before = np.array([1.0, -1.0])  # see the test above
+    np.testing.assert_allclose(np.asarray(decayed.theta) - np.asarray(plain.theta), -0.005 * before, rtol=1e-3)
+
+
 def test_cosine_schedule_in_closed_form():
     schedule = step.cosine(0.01, 0.001, updates=200, hold=0.25)
     for update in (0, 10, 49, 50, 51, 100, 150, 200, 1000):
@@ -251,6 +259,7 @@ def test_bad_configuration_names_key_value_and_choice(key, value):
         (lambda: step.make("rmsprop"), "kind = 'rmsprop'.*sgd.*adam"),
         (lambda: step.make("sgd", -1.0), "learning_rate = -1.0"),
         (lambda: step.make("adam", b2=1.0), "b2 = 1.0"),
+        (lambda: step.make("adam", weight_decay=-0.1), "weight_decay = -0.1"),
         (lambda: step.cosine(0.1, 0.0, 10), "final = 0.0"),
         (lambda: step.cosine(0.1, 0.01, 10, hold=1.0), "hold = 1.0"),
         (lambda: step.cosine(0.1, 0.01, 0), "updates = 0"),
