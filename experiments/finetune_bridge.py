@@ -9,12 +9,9 @@ import numpy as np
 
 from experiments.console import KEYS, Keyboard, View
 from experiments.finetune_robot import PlayedBall
-from experiments.play import Session
+from experiments.play import RECOVERIES, Session
 from robot_io.errors import RefusedError
 from robot_io.rig.processes import Rig
-
-RECOVERIES = 3  # times in a row that the rig is brought back after a fault before it counts as broken
-SETTLE = 1.0  # [s] for the robot to come to rest after a fault
 
 
 class BridgeRobot:
@@ -45,7 +42,7 @@ class BridgeRobot:
                     session.ask("pause", True)
                     summary, track = message[1:]
                     if summary.fault and self._rig is not None:
-                        self._recover()
+                        self._session.recover(self._rig)
                     return PlayedBall(summary, track)
                 if message[0] == "status":
                     self._view.show(message[1])
@@ -58,19 +55,12 @@ class BridgeRobot:
                     failures += 1
                     if failures > RECOVERIES:
                         raise RefusedError(f"the rig does not recover: {session.status['faults'][0]['text']}")
-                    self._recover()
+                    self._session.recover(self._rig)
                     session.ask("pause", False)
 
     def _ask_policy(self, theta, mean, inverse_scale) -> None:
         """Hands the policy over; the robot may still be on its way home from the last ball."""
         self._session.ask("policy", np.asarray(theta), np.asarray(mean), np.asarray(inverse_scale))
-
-    def _recover(self) -> None:
-        """On the rig: what an operator would do after a fault."""
-        time.sleep(SETTLE)
-        self._session.prepare(self._rig)
-        self._session.reset()
-        self._session.arm()
 
     def _keys(self) -> None:
         key = self._keyboard.pressed()

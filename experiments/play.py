@@ -28,6 +28,8 @@ THROWS = 4096  # balls that the rig can throw before it begins anew
 READY_TIME = 60.0  # [s] for the control process to start
 PREPARE_TIME = 40.0  # [s] for the axes to home and the arm to report
 RESET_TIME = 5.0  # [s]
+SETTLE = 1.0  # [s] for the robot to come to rest after a fault
+RECOVERIES = 3  # times in a row that the rig is brought back after a fault before it counts as broken
 QUIET = 30.0  # [s] without a ball on the rig, after which something is wrong
 
 
@@ -139,6 +141,13 @@ class Session:
                     return
         raise RefusedError(f"the robot does not reach its home pose within {PREPARE_TIME:g} s")
 
+    def recover(self, rig: Rig) -> None:
+        """What an operator does after a fault, on the rig. Raises RefusedError."""
+        time.sleep(SETTLE)
+        self.prepare(rig)
+        self.reset()
+        self.arm()
+
     def close(self) -> None:
         """Stops the robot in order, then the process."""
         if self.process.is_alive():
@@ -184,9 +193,9 @@ def run(
         else:
             console.print("press p to prepare the axes, a to arm; space stops", highlight=False)
         with Keyboard() as keyboard, View(console, f"{artefact} on {config.name}") as view:
-            episodes, problem = _watch(session, rig, keyboard, view, balls, seconds, console)
+            episodes, faults, problem = _watch(session, rig, keyboard, view, balls, seconds, console)
         session.close()
-    summary = _summary(loaded, config, episodes, session, control.log_path(options))
+    summary = _summary(loaded, config, episodes, session, control.log_path(options)) | {"faults": faults}
     runs.write_json(log_folder / f"{name}.json", summary)
     _print(console, summary, log_folder / f"{name}.json")
     if problem:
@@ -195,8 +204,10 @@ def run(
 
 
 def _watch(session: Session, rig: Rig | None, keyboard: Keyboard, view: View, balls, seconds, console):
-    """The episodes played and why it ended early, or None."""
+    """The episodes played, the faults after which the rig was brought back, and why it ended early, or None."""
     episodes: list = []
+    faults: list[dict] = []
+    in_a_row = 0
     end = time.monotonic() + (float("inf") if seconds is None else seconds)
     heard = time.monotonic()
     paused = False
@@ -207,6 +218,7 @@ def _watch(session: Session, rig: Rig | None, keyboard: Keyboard, view: View, ba
             elif message[0] == "episode":
                 heard = time.monotonic()
                 episodes.append(message[1])
+                in_a_row = in_a_row if message[1].fault else 0
                 if not console.is_terminal:
                     console.print(f"ball {len(episodes)}: {message[1].outcome}", highlight=False)
             elif message[0] == "refused":
@@ -223,11 +235,16 @@ def _watch(session: Session, rig: Rig | None, keyboard: Keyboard, view: View, ba
             rig.check()
             status = session.status
             if status and status["faults"]:
-                fault = status["faults"][0]
-                return episodes, f"stopped by a fault, {fault['cause']}: {fault['text']}"
+                fault, in_a_row = status["faults"][0], in_a_row + 1
+                text = f"{fault['cause']}: {fault['text']}"
+                if in_a_row > RECOVERIES:
+                    return episodes, faults, f"stopped by {in_a_row} faults in a row, the last: {text}"
+                faults.append(fault)
+                console.print(f"fault, reset and gone on: {text}", style="red", highlight=False)
+                session.recover(rig)
             if time.monotonic() - heard > QUIET:
-                return episodes, f"no ball was played for {QUIET:g} s"
-    return episodes, None
+                return episodes, faults, f"no ball was played for {QUIET:g} s"
+    return episodes, faults, None
 
 
 def _summary(loaded, config: RobotConfig, episodes: list, session: Session, log_file) -> dict[str, Any]:
@@ -268,6 +285,8 @@ def _print(console: Console, report: dict[str, Any], path: Path) -> None:
                 f"{name}, ms",
                 f"p50 {t['p50_ms']:.3f}   p99 {t['p99_ms']:.3f}   p99.9 {t['p99.9_ms']:.3f}   max {t['max_ms']:.3f}",
             )
+    if report["faults"]:
+        table.add_row("faults, reset", ", ".join(fault["cause"] for fault in report["faults"]))
     table.add_row("ticks missed", str(report["timings"].get("missed_ticks", 0)))
     if report["egm"]:
         egm = report["egm"]

@@ -185,6 +185,8 @@ def test_emergency_stop_of_the_arm_is_a_latched_fault(playing):
     assert "motors are off" in session.status["faults"][0]["text"] or session.status["faults"][0]["cause"] == "arm_not_ready"
     with pytest.raises(RefusedError, match="cannot reset"):
         session.reset()
+    session.recover(rig)
+    assert session.status["state"] in ("ready", "active") and not session.status["faults"]
 
 
 def test_rig_that_cannot_start_says_why():
