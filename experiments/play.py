@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import deque
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -75,6 +76,7 @@ class Session:
             raise RefusedError(str(error) or "the control process ended at once") from None
         self.status: dict[str, Any] | None = None
         self.timings: dict[str, Any] = {}
+        self._episodes: deque[tuple] = deque()  # that came while an answer was waited for
 
     def __enter__(self) -> Session:
         return self
@@ -91,6 +93,19 @@ class Session:
 
     def messages(self, seconds: float):
         """What the control process says within that time. Raises RefusedError when it has ended."""
+        while self._episodes:
+            yield self._episodes.popleft()
+        yield from self._received(seconds)
+
+    def _answers(self, seconds: float):
+        """``messages`` without the episodes, which are kept for it."""
+        for message in self._received(seconds):
+            if message[0] == "episode":
+                self._episodes.append(message)
+            else:
+                yield message
+
+    def _received(self, seconds: float):
         end = time.monotonic() + seconds
         while self.pipe.poll(max(end - time.monotonic(), 0.0)):
             try:
@@ -108,7 +123,7 @@ class Session:
             rig.switch_on()
         end = time.monotonic() + PREPARE_TIME
         while time.monotonic() < end:
-            for message in self.messages(0.3):
+            for message in self._answers(0.3):
                 if message[0] == "status" and not (message[1]["arm"] or message[1]["axes"] or message[1]["tracker"]):
                     return
         status = self.status or {}
@@ -120,7 +135,7 @@ class Session:
         self.ask("reset")
         end = time.monotonic() + RESET_TIME
         while time.monotonic() < end:
-            for message in self.messages(0.3):
+            for message in self._answers(0.3):
                 if message[0] == "refused":
                     raise RefusedError(message[1])
                 if message[0] == "status" and not message[1]["faults"]:
@@ -132,7 +147,7 @@ class Session:
         self.ask("arm")
         end = time.monotonic() + PREPARE_TIME
         while time.monotonic() < end:
-            for message in self.messages(0.3):
+            for message in self._answers(0.3):
                 if message[0] == "refused":
                     raise RefusedError(message[1])
                 if message[0] == "status" and message[1]["faults"]:
@@ -144,6 +159,8 @@ class Session:
     def recover(self, rig: Rig) -> None:
         """What an operator does after a fault, on the rig. Raises RefusedError."""
         time.sleep(SETTLE)
+        for _ in self._answers(0.0):  # what was said before: not how things are now
+            pass
         self.prepare(rig)
         self.reset()
         self.arm()
@@ -241,7 +258,10 @@ def _watch(session: Session, rig: Rig | None, keyboard: Keyboard, view: View, ba
                     return episodes, faults, f"stopped by {in_a_row} faults in a row, the last: {text}"
                 faults.append(fault)
                 console.print(f"fault, reset and gone on: {text}", style="red", highlight=False)
-                session.recover(rig)
+                try:
+                    session.recover(rig)
+                except RefusedError as error:
+                    return episodes, faults, f"not brought back after {text}: {error}"
             if time.monotonic() - heard > QUIET:
                 return episodes, faults, f"no ball was played for {QUIET:g} s"
     return episodes, faults, None
