@@ -31,11 +31,11 @@ from robot_io.festo import AxesThread
 from robot_io.policy_numpy import StreamingPolicy
 from robot_io.robot_config import RobotConfig, linear_axes
 from robot_io.safety import SafetyGate
+from robot_io.timings import Timings
 from robot_io.tracker import Tracker, TrackerSocket
 
 STATUS_PERIOD = 0.2  # [s]
 STOP_TIME = 2.0  # [s] for coming to rest before the process ends
-KEPT = 100_000  # samples of each timing
 
 
 @dataclass(frozen=True)
@@ -48,30 +48,6 @@ class ControlOptions:
     log_name: str = "session"
     metadata: tuple[tuple[str, str], ...] = ()
     attachments: tuple[tuple[str, str], ...] = ()
-
-
-class Timings:
-    """Samples [s] of what has to be on time."""
-
-    def __init__(self) -> None:
-        self.lateness: deque[float] = deque(maxlen=KEPT)
-        self.policy: deque[float] = deque(maxlen=KEPT)
-        self.reply: deque[float] = deque(maxlen=KEPT)
-        self.tick: deque[float] = deque(maxlen=KEPT)
-        self.missed = 0  # ticks left out: their whole period had passed
-
-    def summary(self) -> dict[str, Any]:
-        """Percentiles in milliseconds."""
-        found: dict[str, Any] = {"missed_ticks": self.missed}
-        for name in ("lateness", "policy", "reply", "tick"):
-            samples = getattr(self, name)
-            if samples:
-                p50, p99, p999 = np.percentile(np.array(samples), [50, 99, 99.9]) * 1e3
-                found[name] = {
-                    "p50_ms": float(p50), "p99_ms": float(p99), "p99.9_ms": float(p999),
-                    "max_ms": max(samples) * 1e3, "count": len(samples),
-                }  # fmt: skip
-        return found
 
 
 def make_policy(backend: str, parameters, mean, inverse_scale):
@@ -216,17 +192,17 @@ class Control:
             reply = self.bridge.arm_received(began)
             if reply is not None:
                 self._arm_socket.send(reply, self._session.endpoint)
-                self.timings.reply.append(time.monotonic() - began)
+                self.timings.reply.add(time.monotonic() - began)
 
     def _tick(self, deadline: float, now: float) -> None:
         state = self._axes.state
         if state is not None:
             self.bridge.axes_received(state.position, state.received)
         self.bridge.tick(deadline, now)
-        self.timings.lateness.append(now - deadline)
+        self.timings.lateness.add(now - deadline)
         if self.bridge.policy_seconds:
-            self.timings.policy.append(self.bridge.policy_seconds)
-        self.timings.tick.append(time.monotonic() - now)
+            self.timings.policy.add(self.bridge.policy_seconds)
+        self.timings.tick.add(time.monotonic() - now)
         if now >= self._status_at:
             self._status_at = now + STATUS_PERIOD
             if not self._unsent:
@@ -312,7 +288,7 @@ class Control:
             "axes_cycles": self._axes.cycles,
             "axes_late": self._axes.late,
             "log_dropped": self._recorder.dropped,
-            "timings": self.timings.summary() if self.timings.lateness else {},
+            "timings": self.timings.summary(),
         }
 
 
