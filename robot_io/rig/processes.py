@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import random
 import signal
 import socket
 import time
@@ -30,6 +31,7 @@ from robot_io.tracker import TrackerConfig
 HOST = "127.0.0.1"
 WORLD_STEP = 0.002  # [s]
 START_TIME = 20.0  # [s]
+PORT_RANGE = 20000, 32000
 PRIORITY = 40  # of SCHED_FIFO, where it is allowed
 
 
@@ -43,16 +45,20 @@ class Ports:
 
 
 def free_ports() -> Ports:
-    """Ports that nobody uses now."""
-    found = []
-    for kind in (socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM, socket.SOCK_STREAM):
-        probe = socket.socket(socket.AF_INET, kind)
-        probe.bind((HOST, 0))
-        found.append(probe)
-    ports = [probe.getsockname()[1] for probe in found]
-    for probe in found:
-        probe.close()
-    return Ports(ports[0], ports[1], (ports[2], ports[3]))
+    """Ports that nobody uses now, below those that the system gives to sockets without one of their own: between this
+    look and their use it would give them away. Raises DeviceError when there are too few."""
+    found: list[int] = []
+    for port in random.SystemRandom().sample(range(*PORT_RANGE), 200):
+        kind = socket.SOCK_DGRAM if len(found) < 2 else socket.SOCK_STREAM
+        with socket.socket(socket.AF_INET, kind) as probe:
+            try:
+                probe.bind((HOST, port))
+            except OSError:
+                continue
+        found.append(port)
+        if len(found) == 4:
+            return Ports(found[0], found[1], (found[2], found[3]))
+    raise DeviceError(f"no free ports for the rig between {PORT_RANGE[0]} and {PORT_RANGE[1]}")
 
 
 class Rig:
