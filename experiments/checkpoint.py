@@ -17,6 +17,7 @@ import numpy as np
 
 from ballmodel.files import replacing
 from experiments.errors import CheckpointError
+from robot_io.files import sync_folder
 
 NOTES = "notes"
 KEPT = 2
@@ -37,7 +38,7 @@ def save(folder: Path, update: int, tree: Any, notes: dict[str, Any]) -> Path:
             np.savez(file, **arrays, **{NOTES: np.array(text)})
             file.flush()
             os.fsync(file.fileno())
-        _sync_folder(folder)
+        sync_folder(folder)
     except OSError as error:
         left = _paths(folder)
         kept = f"the last checkpoint is whole: {left[-1]}" if left else "there is no earlier checkpoint"
@@ -107,12 +108,3 @@ def _is_key(leaf: Any) -> bool:
 
 def _data(leaf: Any) -> Any:
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes the rename itself survive a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

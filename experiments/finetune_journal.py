@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from experiments.errors import RunError
+from robot_io.files import sync_folder
 from robot_io.play import EpisodeSummary
 
 BEFORE, TRAINING, AFTER = "before", "training", "after"
@@ -67,7 +68,7 @@ class Journal:
         self._file = open(path, "ab", buffering=0)
         os.ftruncate(self._file.fileno(), whole)
         os.fsync(self._file.fileno())
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
 
     def append(self, entry: Entry) -> None:
         """Adds an entry; it is on the disk when this returns. Raises OSError when the disk refuses."""
@@ -121,12 +122,3 @@ def _from_json(data: dict[str, Any]) -> Entry:
     summary["landing"] = tuple(summary["landing"])
     trajectory = np.array(data.pop("trajectory"), float).reshape(-1, 4)
     return Entry(summary=EpisodeSummary(**summary), returns=data.pop("return"), trajectory=trajectory, **data)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes a new file's name survive a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ballmodel.flight import PaddlePose
-from mjx_tt.chain import WORLD, Chain, Frame, Link
+from mjx_tt.chain import WORLD, Chain, Frame
 from mjx_tt.dynamics import fold as f
 
 

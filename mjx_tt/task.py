@@ -23,7 +23,7 @@ from mjx_tt.dynamics.fold import materialise
 from mjx_tt.dynamics.fused import FusedEngine
 from mjx_tt.kinematics import PaddleKinematics
 from mjx_tt.model import SimModel
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, LIMITS, N_JOINTS, N_OBSERVATION
+from robot_io.contract import FESTO_JOINTS, LIMITS, N_JOINTS, N_OBSERVATION
 from robot_io.limits import limit_velocity
 
 ENGINES = ("fused", "mjx")

@@ -22,7 +22,7 @@ from typing import Protocol
 
 import numpy as np
 
-from robot_io.contract import ABB_JOINTS, CONTROL_RATE, FESTO_JOINTS, JOINT_NAMES, LIMITS, N_JOINTS
+from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, JOINT_NAMES, LIMITS, N_JOINTS
 from robot_io.egm import EgmSession
 from robot_io.errors import RefusedError
 from robot_io.faults import Cause

@@ -1,4 +1,5 @@
-"""Writing files so that a reader never meets half of one."""
+"""Writing files so that a reader never meets half of one, nor loses one. ``ballmodel.files`` is the same for a package
+that knows nothing of this one."""
 
 from __future__ import annotations
 
@@ -25,3 +26,12 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     except BaseException:
         os.unlink(temporary)
         raise
+
+
+def sync_folder(folder: str | os.PathLike) -> None:
+    """Makes the names of new and renamed files in a folder survive a power cut. Raises OSError."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

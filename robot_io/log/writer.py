@@ -18,6 +18,7 @@ from typing import Any
 from mcap.writer import CompressionType, Writer
 
 from robot_io import contract
+from robot_io.files import sync_folder
 from robot_io.log import messages
 from robot_io.log.records import End, LogError, Metadata, as_strings, unpack
 
@@ -212,7 +213,7 @@ class SessionWriter:
         if path.exists():
             raise FileExistsError(f"{path} appeared meanwhile; the log is complete as {self._session.unfinished}")
         os.rename(self._session.unfinished, path)
-        _sync_folder(path.parent)
+        sync_folder(path.parent)
         return path
 
     def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
@@ -225,11 +226,3 @@ class SessionWriter:
         if not 0 <= nanoseconds < 1 << 63:
             raise LogError(f"time {seconds}: is {nanoseconds} ns since 1970, MCAP holds no time before that")
         return nanoseconds
-
-
-def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
