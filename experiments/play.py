@@ -373,13 +373,14 @@ def rig(balls: str, rig_params: str | None, seed: int, ports: tuple[int, ...], o
     chosen = Ports(ports[0], ports[1], (ports[2], ports[3]))
     keys = {
         "o": ("switch_on", "switch the arm on"), "b": ("throw", "throw balls, or stop"), "e": ("motors_off", "emergency stop"),
-        "f": ("fault", "drive fault"), "t": ("drop_out", "tracker silent for 1 s"), "q": ("quit", "end"),
+        "f": ("fault", "drive fault"), "c": ("cable", "pull or plug an axis's cable"),
+        "t": ("drop_out", "tracker silent for 1 s"), "q": ("quit", "end"),
     }  # fmt: skip
     with Rig(scene(), throws, robots.load_rig(rig_params), chosen) as running, Keyboard() as keyboard:
         out.write_text(robots.to_yaml(running.robot), encoding="utf-8")
         console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}", highlight=False)
         console.print("   ".join(f"\\[{k}] {text}" for k, (_, text) in keys.items()), highlight=False)
-        throwing = False
+        throwing, connected = False, True
         while True:
             time.sleep(0.1)
             running.check()
@@ -391,6 +392,9 @@ def rig(balls: str, rig_params: str | None, seed: int, ports: tuple[int, ...], o
                 running.throw(throwing)
             elif request == "fault":
                 running.drive_fault(0, 0x31)
+            elif request == "cable":
+                connected = not connected
+                running.connect_axis(0, connected)
             elif request == "drop_out":
                 running.drop_out(1.0)
             elif request:

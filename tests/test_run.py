@@ -189,6 +189,20 @@ def test_emergency_stop_of_the_arm_is_a_latched_fault(playing):
     assert session.status["state"] in ("ready", "active") and not session.status["faults"]
 
 
+def test_pulled_cable_of_an_axis_is_a_latched_fault_and_can_be_mended(playing):
+    rig, session, _ = playing
+    rig.connect_axis(0, False)
+    end = time.monotonic() + 5
+    while time.monotonic() < end and not (session.status or {}).get("faults"):
+        list(session.messages(0.1))
+    assert session.status["faults"][0]["cause"] == "axis_lost"
+    with pytest.raises(RefusedError, match="cannot reset"):
+        session.reset()
+    rig.connect_axis(0, True)
+    session.recover(rig)
+    assert session.status["state"] in ("ready", "active") and not session.status["faults"]
+
+
 def test_rig_that_cannot_start_says_why():
     ports = free_ports()
     throws = robots.throws_of(build.distribution("narrow", "test"), SimModel(), 8, 0)

@@ -117,8 +117,9 @@ class Rig:
         """A fault of one linear axis's drive."""
         self._pipes["axes"].send(("fault", axis, code))
 
-    def disconnect_axis(self, axis: int) -> None:
-        self._pipes["axes"].send(("disconnect", axis))
+    def connect_axis(self, axis: int, connected: bool) -> None:
+        """Pulls a linear axis's network cable or plugs it in again."""
+        self._pipes["axes"].send(("reconnect" if connected else "disconnect", axis))
 
     def drop_out(self, seconds: float) -> None:
         """The tracker sends nothing for a while."""
@@ -274,7 +275,11 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
         for _ in _paced(shared, pipe, 0.004):
             while pipe.poll():
                 kind, axis, *rest = pipe.recv()
-                emulators[axis].disconnect() if kind == "disconnect" else emulators[axis].inject_fault(*rest)
+                {
+                    "disconnect": emulators[axis].disconnect,
+                    "reconnect": emulators[axis].reconnect,
+                    "fault": emulators[axis].inject_fault,
+                }[kind](*rest)
             now = time.monotonic()
             qpos, qvel = shared.read("qpos", "qvel")
             for i, emulator in zip(FESTO_JOINTS, emulators):
