@@ -1,7 +1,8 @@
 """The control process: one thread around select() for the arm, the tracker, the operator and the 75 Hz tick.
 
 Started by ``start``; it talks with its owner over a pipe:
-    to it    ("arm",) ("stop",) ("reset",) ("discard",) ("pause", bool) ("policy", theta, mean, inverse_scale) ("quit",)
+    to it    ("prepare",) ("arm",) ("stop",) ("reset",) ("discard",) ("pause", bool)
+             ("policy", theta, mean, inverse_scale) ("quit",)
     from it  ("ready", report) ("status", dict) ("episode", EpisodeSummary, ball (n, 4)) ("refused", sentence)
              ("failed", sentence) ("ended", statistics)
 When the owner goes away, the robot is stopped and the process ends.

@@ -16,7 +16,7 @@ class Timing:
 
     def __init__(self) -> None:
         self.count, self.max = 0, 0.0
-        self._bins = [0] * (BINS + 1)
+        self._bins = np.zeros(BINS + 1, np.int64)
 
     def add(self, seconds: float) -> None:
         """Counts a duration; what is below 0.1 us or negative counts as 0.1 us."""
