@@ -11,6 +11,7 @@ from mjx_tt import policy
 from mjx_tt.policy import PolicyController
 from robot_io import policy_numpy
 from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION, n_parameters, unflatten
+from robot_io.policy_jit import JitPolicy
 
 TICKS, P, R = 12, 5, 3
 PRECISION = pytest.mark.parametrize(("x64", "atol"), [(True, 1e-12), (False, 1e-6)], ids=["float64", "float32"])
@@ -95,3 +96,27 @@ def test_sees_exactly_the_last_eight_observations():
     before, after = (streamed(theta, mean, inverse_scale, o) for o in (observations, changed))
     differs = (np.abs(before - after) > 1e-6).any(axis=(1, 2))
     assert differs.tolist() == [2 <= t < 2 + HISTORY for t in range(TICKS)]
+
+
+@pytest.fixture
+def control_process():
+    """Undoes what the compiled policy sets for the process that it runs in."""
+    before = jax.config.jax_cpu_enable_async_dispatch
+    yield
+    jax.config.update("jax_cpu_enable_async_dispatch", before)
+
+
+def test_the_compiled_policy_of_the_control_loop_equals_the_streaming_one(control_process):
+    random = np.random.default_rng(3)
+    parameters = unflatten(0.3 * random.standard_normal(n_parameters()))
+    mean, inverse_scale = random.standard_normal((2, N_OBSERVATION))
+    kinds = JitPolicy, policy_numpy.StreamingPolicy
+    compiled, streaming = (kind(parameters, mean, inverse_scale) for kind in kinds)
+    for _ in range(3):
+        compiled.reset()
+        streaming.reset()
+        for observation in random.standard_normal((20, N_OBSERVATION)):
+            np.testing.assert_allclose(compiled.step(observation), streaming.step(observation), rtol=0, atol=1e-5)
+    for wrong in (np.zeros(10), np.full(N_OBSERVATION, np.nan)):
+        with pytest.raises(ValueError, match="11 finite numbers"):
+            compiled.step(wrong)
