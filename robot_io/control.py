@@ -10,6 +10,7 @@ When the owner goes away, the robot is stopped and the process ends.
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import select
 import signal
@@ -182,6 +183,7 @@ class Control:
             if missed > 0:
                 self.timings.missed += missed
                 deadline += missed * self._period
+                self._recorder.put(log.Event(now, log.Level.WARNING, "ticks_missed", json.dumps({"missed": missed})))
             if self._done:
                 end = min(end, now + STOP_TIME)
                 if now >= end or bridge.gate.at_rest:
