@@ -59,9 +59,8 @@ QUICK = Sizes(
 TRAINED = Path("runs/quickstart")  # measured too when it is there
 
 
-def main(json_path: str | None = None, quick: bool = False) -> int:
+def main(console: Console, json_path: str | None = None, quick: bool = False) -> int:
     """Measures, prints the tables and writes the JSON; returns the exit status."""
-    console = Console()
     report = measure(QUICK if quick else FULL, console)
     show(report, console)
     if json_path is not None:
@@ -233,4 +232,4 @@ if __name__ == "__main__":
     parser.add_argument("--json", metavar="FILE", help="write the figures as JSON")
     parser.add_argument("--quick", action="store_true", help="fewer and shorter runs: a first impression in two minutes")
     options = parser.parse_args()
-    sys.exit(main(options.json, options.quick))
+    sys.exit(main(Console(), options.json, options.quick))

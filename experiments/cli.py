@@ -6,8 +6,12 @@ import argparse
 import sys
 import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from experiments.errors import ConfigError, checked, explained
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 DESCRIPTION = """\
 From measured human balls to a trained, evaluated and exported table-tennis policy.
@@ -46,11 +50,9 @@ def train(options: argparse.Namespace) -> int:
 
     configs = [(str(path), config.load(path, tuple(options.set))) for path in map(_experiment, options.experiments)]
     _start_jax(options.devices or _most_devices(configs))
-    from rich.console import Console
-
     from experiments import jobs
 
-    console = Console()
+    console = _console()
     planned = jobs.plan(configs, options.seeds, Path(options.out))
     ok = jobs.run_all(planned, console)
     if options.select and ok:
@@ -62,12 +64,10 @@ def train(options: argparse.Namespace) -> int:
 
 def evaluate(options: argparse.Namespace) -> int:
     _start_jax(options.devices)
-    from rich.console import Console
-
     from experiments import evaluate as evaluation
     from experiments import finish, policy
 
-    console = Console()
+    console = _console()
     trained = policy.load(options.policy)
     experiment = _experiment_of(trained, options)
     settings = experiment.config.evaluation
@@ -83,12 +83,10 @@ def evaluate(options: argparse.Namespace) -> int:
 
 def export(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from rich.console import Console
-
     from experiments import finish, policy
     from experiments.runs import Run
 
-    console, run = Console(), Run(options.run)
+    console, run = _console(), Run(options.run)
     trained = policy.load(options.run)
     experiment = _experiment_of(trained, options)
     report = run.read_evaluation() if run.evaluation.exists() else None
@@ -101,33 +99,27 @@ def export(options: argparse.Namespace) -> int:
 
 def fit_human(options: argparse.Namespace) -> int:
     _start_jax(None)
-    from rich.console import Console
-
     from experiments import measurements
 
     measurements.fit(
-        options.data, options.format, Path(options.out), options.name, options.eps, options.min_samples, Console()
+        options.data, options.format, Path(options.out), options.name, options.eps, options.min_samples, _console()
     )
     return 0
 
 
 def import_(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from rich.console import Console
-
     from experiments import measurements
 
-    measurements.convert(options.data, options.format, Path(options.out), Console())
+    measurements.convert(options.data, options.format, Path(options.out), _console())
     return 0
 
 
 def render(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from rich.console import Console
-
     from experiments import episodes, policy
 
-    console = Console()
+    console = _console()
     trained = policy.load(options.policy)
     experiment = _experiment_of(trained, options)
     seed = experiment.config.evaluation.seed if options.seed is None else options.seed
@@ -142,18 +134,16 @@ def bench(options: argparse.Namespace) -> int:
     _start_jax(options.devices)
     from benchmarks.bench import main as run_benchmarks
 
-    return run_benchmarks(json_path=options.json)
+    return run_benchmarks(_console(), json_path=options.json)
 
 
 def run(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from rich.console import Console
-
     from experiments import play
 
     return play.run(
         Path(options.artefact), options.robot, options.balls, options.distribution, options.backend, Path(options.log),
-        options.rig, options.seed, options.seconds, Console(),
+        options.rig, options.seed, options.seconds, _console(),
     )  # fmt: skip
 
 
@@ -162,34 +152,28 @@ def finetune(options: argparse.Namespace) -> int:
 
     settings = finetune_settings.load(options.settings, tuple(options.set))
     _start_jax(1)
-    from rich.console import Console
-
     from experiments import play
     from experiments.runs import Run
 
     run = Run(options.out or f"{Path(options.policy).resolve().name}-finetuned")
     report = play.finetune(
         options.policy, settings, run, options.robot, options.distribution, options.rig, options.backend, options.seed,
-        Console(),
+        _console(),
     )  # fmt: skip
     return 0 if report is not None else 130
 
 
 def rig(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from rich.console import Console
-
     from experiments import play
 
-    return play.rig(options.distribution, options.rig, options.seed, options.ports, Path(options.out), Console())
+    return play.rig(options.distribution, options.rig, options.seed, options.ports, Path(options.out), _console())
 
 
 def log(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from experiments import logs
 
-    console = Console()
+    console = _console()
     if options.action == "list":
         logs.list_logs(Path(options.paths[0]), console)
     elif options.action == "check":
@@ -211,12 +195,17 @@ def schema(options: argparse.Namespace) -> int:
 
 
 def balls(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from experiments import measurements
 
-    measurements.print_catalogue(Console())
+    measurements.print_catalogue(_console())
     return 0
+
+
+def _console() -> Console:
+    """Where a command writes. A file or a pipe gets whole lines: only a terminal's width is one to break them at."""
+    from rich.console import Console
+
+    return Console(soft_wrap=not sys.stdout.isatty())
 
 
 def _parser() -> argparse.ArgumentParser:
