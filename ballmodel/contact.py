@@ -12,11 +12,13 @@ Normal part: v_n' = -e v_n, e = restitution - slope |v_n| kept within [0, 1].
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from ballmodel import constants as c
+from ballmodel.optional import optional, value_or
 from ballmodel.vec import TINY, Vec, components, cross, dot, norm
 
 STICKING = 2.0 / 5.0  # alpha that brings the contact point of a thin shell to rest
@@ -31,6 +33,8 @@ class SurfaceParams:
     restitution_slope: jax.Array | float  # [s/m], loss of e per normal speed
     friction: jax.Array | float  # mu
     height: jax.Array | float  # [m], shift of the surface along z from its nominal place
+    tilt_x: jax.Array | float | None = optional(0.0)  # slope dz/dx of the surface, about the table's centre
+    tilt_y: jax.Array | float | None = optional(0.0)  # slope dz/dy
 
 
 @jax.tree_util.register_dataclass
@@ -43,6 +47,9 @@ class PaddleParams:
     tangential_gain: jax.Array | float = c.RUBBER_TANGENTIAL_GAIN  # k_v
     radius: jax.Array | float = c.PADDLE_RADIUS  # [m]
     thickness: jax.Array | float = c.PADDLE_THICKNESS  # [m]
+    # [rad], turns the blade's normal about the blade's horizontal in-plane axis; positive turns it downwards (closes)
+    tilt: jax.Array | float | None = optional(0.0)
+    offset: jax.Array | float | None = optional(0.0)  # [m], shift of the blade along its (turned) normal
 
 
 def table_params() -> SurfaceParams:
@@ -113,13 +120,67 @@ NET = Box(
 )
 
 
+class Frame(NamedTuple):
+    """Axes of a tilted surface, as Vecs in world coordinates."""
+
+    x: Vec
+    y: Vec
+    z: Vec  # the surface's normal
+
+    def to_surface(self, v) -> Vec:
+        """A world vector (a Vec or a (3, ...) array) in the surface's axes."""
+        return Vec(dot(self.x, v), dot(self.y, v), dot(self.z, v))
+
+    def to_world(self, v) -> Vec:
+        return self.x * v[0] + self.y * v[1] + self.z * v[2]
+
+    def place(self, surface: SurfaceParams, position) -> Vec:
+        """A world position as the surface's own axes have it, its height taken off."""
+        return self.to_surface((position[0], position[1], position[2] - surface.height))
+
+
+def surface_frame(surface: SurfaceParams) -> Frame | None:
+    """The axes of a surface that is turned about the origin by its slopes; None where tilts were left out.
+
+    The rotation is the least one that brings z to the normal (-tilt_x, -tilt_y, 1) / sqrt(1 + tilt_x^2 + tilt_y^2);
+    it is smooth at zero. Axis-aligned in these axes is the box with its faces, edges and cord.
+    """
+    if surface.tilt_x is None and surface.tilt_y is None:
+        return None
+    a, b = value_or(surface.tilt_x, 0.0), value_or(surface.tilt_y, 0.0)
+    nz = 1.0 / jnp.sqrt(1.0 + a * a + b * b)
+    nx, ny = -a * nz, -b * nz
+    s = 1.0 / (1.0 + nz)
+    return Frame(
+        Vec(1.0 - nx * nx * s, -nx * ny * s, -nx), Vec(-nx * ny * s, 1.0 - ny * ny * s, -ny), Vec(nx, ny, nz)
+    )
+
+
+def elevation(surface: SurfaceParams, position):
+    """Height [m] of a position (a Vec or a (3, ...) array) over the surface, straight up: (...)."""
+    z = position[2] - surface.height
+    for slope, along in ((surface.tilt_x, position[0]), (surface.tilt_y, position[1])):
+        z = z if slope is None else z - slope * along
+    return z
+
+
 def box_gap(box: Box, height, position) -> tuple[Vec, jax.Array]:
     """Vector from the nearest point of the box to ``position`` (a Vec or a (3, ...) array) and its length [m], (...).
 
-    ``height`` shifts the box along z. The vector is zero for a point inside the box.
+    ``height`` shifts the box along z. The vector is zero for a point inside the box. A tilted box takes and returns
+    vectors in the axes of its ``surface_frame``.
     """
     centre = (box.centre[0], box.centre[1], box.centre[2] + height)
     gap = Vec(
         *(position[i] - jnp.clip(position[i], centre[i] - box.half[i], centre[i] + box.half[i]) for i in range(3))
     )
     return gap, norm(gap)
+
+
+def surface_gap(box: Box, surface: SurfaceParams, position) -> tuple[Vec, jax.Array]:
+    """``box_gap`` of a box with its surface's height and tilt, in world axes."""
+    frame = surface_frame(surface)
+    if frame is None:
+        return box_gap(box, surface.height, position)
+    gap, distance = box_gap(box, 0.0, frame.place(surface, position))
+    return frame.to_world(gap), distance

@@ -10,16 +10,17 @@ steadily within the step, come within touching distance. After the impact the re
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 
 from ballmodel import contact
 from ballmodel.aero import INTEGRATORS, FlightParams, acceleration
-from ballmodel.contact import NET, TABLE, Box, PaddleParams, SurfaceParams, box_gap
+from ballmodel.contact import NET, TABLE, Box, PaddleParams, SurfaceParams, box_gap, surface_frame, surface_gap
+from ballmodel.optional import value_or
 from ballmodel.state import BallState
-from ballmodel.vec import TINY, components, cross, dot, select, stack, stored
+from ballmodel.vec import TINY, Vec, components, cross, dot, select, stack, stored
 
 
 @jax.tree_util.register_dataclass
@@ -98,6 +99,12 @@ def _move(state, a, params, dt):
 
 def _box_time(box: Box, surface: SurfaceParams, state, a, end_position, radius, dt):
     """Time of touching the box within the step, ``dt`` + 1 where it does not."""
+    frame = surface_frame(surface)
+    if frame is not None:  # the same question in the surface's own axes, where the box is aligned
+        start = BallState(frame.place(surface, state.position), frame.to_surface(state.velocity), state.spin)
+        end_position = frame.place(surface, end_position)
+        state, a, end_position = stored((start, frame.to_surface(a), end_position))
+        surface = replace(surface, height=0.0, tilt_x=None, tilt_y=None)
     gap0, distance0 = box_gap(box, surface.height, state.position)
     _, distance1 = box_gap(box, surface.height, end_position)
     # A fast ball crosses the net's 45 mm (tape and two radii) within one step: look also at its mid-plane.
@@ -130,6 +137,26 @@ def _mix(start, end, w):
     return start * (1.0 - w) + end * w
 
 
+def _mounted(params: PaddleParams, pose: PaddlePose) -> PaddlePose:
+    """The pose of the blade as it is mounted: turned and shifted from where the kinematics has it.
+
+    The axis of the turn is horizontal and in the blade, z x n / |z x n|; a blade that lies flat has no such axis and is
+    not turned.
+    """
+    if params.tilt is None and params.offset is None:
+        return pose
+    n, tilt = pose.normal, value_or(params.tilt, 0.0)
+    # The in-plane direction that the normal turns to, axis x n = (n_z n - z) / |z x n|: down along the blade.
+    flat = jnp.sqrt(jnp.maximum(n[0] * n[0] + n[1] * n[1], 1e-12))
+    down = Vec(n[2] * n[0] / flat, n[2] * n[1] / flat, -flat)
+    lies = flat <= 1e-5
+    cos, sin = jnp.where(lies, 1.0, jnp.cos(tilt)), jnp.where(lies, 0.0, jnp.sin(tilt))
+    normal = Vec(*(n[i] * cos + down[i] * sin for i in range(3)))
+    shift = normal * value_or(params.offset, 0.0)
+    velocity = pose.velocity + cross(pose.angular_velocity, shift)
+    return stored(PaddlePose(pose.position + shift, normal, velocity, pose.angular_velocity))
+
+
 def _paddle_time(params: PaddleParams, radius, state, end_position, start: PaddlePose, end: PaddlePose, dt):
     """Time of touching the blade within the step (``dt`` + 1 where it does not), and the face: +1 or -1 of the normal."""
     s0 = dot(start.normal, state.position - start.position)
@@ -159,7 +186,7 @@ def step(params: BallParams, state: BallState, dt: float, paddle=None) -> tuple[
     t_net = _box_time(NET, params.net, state, a, free.position, radius, dt)
     t_first = jnp.minimum(t_table, t_net)
     if paddle is not None:
-        start, end = paddle
+        start, end = (_mounted(params.paddle, pose) for pose in paddle)
         t_paddle, side = _paddle_time(params.paddle, radius, state, free.position, start, end, dt)
         t_first = jnp.minimum(t_first, t_paddle)
     hit_any = t_first <= dt
@@ -172,10 +199,12 @@ def step(params: BallParams, state: BallState, dt: float, paddle=None) -> tuple[
     hit_net = hit_any & ~hit_table & ~hit_paddle
 
     # One evaluation of the Coulomb impact serves table and net: only the surface and the normal differ.
-    gap_table, distance_table = box_gap(TABLE, params.table.height, at.position)
-    gap_net, distance_net = box_gap(NET, params.net.height, at.position)
+    gap_table, distance_table = surface_gap(TABLE, params.table, at.position)
+    gap_net, distance_net = surface_gap(NET, params.net, at.position)
     normal = stored(select(hit_table, gap_table / distance_table, gap_net / distance_net))
-    surface = jax.tree.map(lambda x, y: jnp.where(hit_table, x, y), params.table, params.net)
+    chosen = ("restitution", "restitution_slope", "friction")  # what the impact itself depends on
+    of_surface = {name: jnp.where(hit_table, getattr(params.table, name), getattr(params.net, name)) for name in chosen}
+    surface = replace(params.table, **of_surface)
     velocity, spin = contact.surface_impact(surface, at.velocity, at.spin, normal, radius)
     if paddle is not None:
         w = t / dt

@@ -21,9 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ballmodel import constants as c
-from ballmodel.contact import NET, TABLE, box_gap
+from ballmodel.contact import NET, TABLE, elevation, surface_gap
 from ballmodel.distribution import BallDistribution
 from ballmodel.flight import BallParams, free_step, step
+from ballmodel.optional import without_nominal
 from ballmodel.state import BallState, ball_state
 
 DT = 1.0 / 300.0  # [s] simulation step
@@ -72,11 +73,11 @@ class BallPool:
 
 def _bad_start(position, params: BallParams):
     radius = params.flight.radius
-    inside = (box_gap(TABLE, params.table.height, position)[1] <= radius) | (
-        box_gap(NET, params.net.height, position)[1] <= radius
+    inside = (surface_gap(TABLE, params.table, position)[1] <= radius) | (
+        surface_gap(NET, params.net, position)[1] <= radius
     )
     over_footprint = (jnp.abs(position[0]) < c.TABLE_WIDTH / 2) & (jnp.abs(position[1]) < c.TABLE_LENGTH / 2)
-    return inside | (over_footprint & (position[2] < params.table.height))
+    return inside | (over_footprint & (elevation(params.table, position) < 0.0))
 
 
 @jax.jit
@@ -108,7 +109,7 @@ def throw(params: BallParams, state: BallState, landing_min, landing_max, dt: fl
         outcome = jnp.where(active & events.net, HITS_NET, outcome)
         outcome = jnp.where(active & events.table & bounced, SECOND_BOUNCE, outcome)
         outcome = jnp.where(first & ~in_box, jnp.where(y < 0.0, OUTSIDE_BOX, OWN_SIDE), outcome)
-        from_below = events.position[2] < params.table.height  # underside or side face
+        from_below = elevation(params.table, events.position) < 0.0  # underside or side face
         outcome = jnp.where(first & from_below, MISSES, outcome)
         return time + dt, new, outcome, bounced | first, x, y, arrival, y_now
 
@@ -126,9 +127,11 @@ def coarse_outcome(params: BallParams, state: BallState, landing_min, landing_ma
     Flies COARSE_STEPS second-order steps over a little more than each ball's fall time without air.
     """
     flight = replace(params.flight, integrator="midpoint")
-    ground = params.table.height + flight.radius
+    # Heights and climbs are those over the table, which may be tilted.
+    table = replace(params.table, height=params.table.height + flight.radius)
+    slopes = replace(params.table, height=0.0)
     gravity = -flight.gravity_z
-    height, vz = state.position[2] - ground, state.velocity[2]
+    height, vz = elevation(table, state.position), elevation(slopes, state.velocity)
     fall = (vz + jnp.sqrt(jnp.maximum(vz * vz + 2.0 * gravity * height, 0.0))) / gravity
     dt = jnp.maximum(1.25 * fall, 0.1) / COARSE_STEPS
     net_x = NET.half[0] - NET_MARGIN
@@ -137,9 +140,10 @@ def coarse_outcome(params: BallParams, state: BallState, landing_min, landing_ma
     def advance(carry, _):
         state, outcome = carry
         new = free_step(flight, state, dt)
-        # An unfinished ball that passes z = ground downwards lands; the step's parabola says when.
-        h, vz, az = state.position[2] - ground, state.velocity[2], (new.velocity[2] - state.velocity[2]) / dt
-        lands = (h > 0.0) & (new.position[2] <= ground)
+        # An unfinished ball that comes down to the table lands; the step's parabola says when.
+        h, vz = elevation(table, state.position), elevation(slopes, state.velocity)
+        az = (elevation(slopes, new.velocity) - vz) / dt
+        lands = (h > 0.0) & (elevation(table, new.position) <= 0.0)
         t = 2.0 * h / jnp.maximum(jnp.sqrt(jnp.maximum(vz * vz - 2.0 * az * h, 0.0)) - vz, 1e-9)
         w = jnp.clip(t / dt, 0.0, 1.0)
         x, y = (state.position[i] * (1.0 - w) + new.position[i] * w for i in (0, 1))
@@ -152,7 +156,8 @@ def coarse_outcome(params: BallParams, state: BallState, landing_min, landing_ma
         u = jnp.clip(y0 / jnp.where(y0 > y1, y0 - y1, 1.0), 0.0, 1.0)
         at_net = (y0 > 0.0) & (y1 <= 0.0) & (~lands | (u < w))
         x_net = state.position[0] * (1.0 - u) + new.position[0] * u
-        z_net = state.position[2] + u * dt * (vz + 0.5 * u * dt * az)
+        climb, gain = state.velocity[2], (new.velocity[2] - state.velocity[2]) / dt
+        z_net = state.position[2] + u * dt * (climb + 0.5 * u * dt * gain)
         blocked = at_net & (jnp.abs(x_net) < net_x) & (z_net < net_z) & (z_net > 0.0)
         verdict = jnp.where(lands, jnp.where(x_out | y_out, miss, KEPT), UNDECIDED)
         verdict = jnp.where(blocked, HITS_NET, verdict)
@@ -187,6 +192,7 @@ def sample_pool(
     ends = [f"{part}_{end}" for part in ("position", "velocity", "landing") for end in ("min", "max")]
     box = {end: jnp.asarray(getattr(distribution, end))[:, None] for end in ends}
     landing_box = (box["landing_min"][:, 0], box["landing_max"][:, 0])
+    params = without_nominal(params)
     fewest_proposals = int(np.ceil(10.0 / min_acceptance))
 
     waiting = np.empty((6, 0), np.float32)  # passed the coarse flight, not yet simulated

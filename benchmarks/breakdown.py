@@ -77,7 +77,7 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
     )
     theta = jnp.stack([initial_theta(key) for key in jax.random.split(jax.random.key(2), columns)], axis=-1)
     controller = PolicyController(unflatten(theta), jnp.zeros(N_OBSERVATION), jnp.ones(N_OBSERVATION))
-    delays, first = task.delays(episodes.latency), task.reset(episodes, controller)
+    prepared, first = task.prepare(episodes), task.reset(episodes, controller)
     speeds = 0.1 * jax.random.normal(jax.random.key(4), (N_JOINTS, lanes))
     pose = task.kinematics.pose(first.qpos, speeds)
     observation = jnp.concatenate([first.ball.position, first.qpos])
@@ -105,25 +105,25 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
         """Delayed, noisy observation; limited, delayed command."""
         seen, sent, reference, previous, captured = state
         delayed = jnp.concatenate([
-            latency.ring_read(seen[:, :3], tick - delays.ball.periods),
-            latency.ring_read(seen[:, 3:], tick - delays.joints.periods),
+            latency.ring_read(seen[:, :3], tick - prepared.ball.periods),
+            latency.ring_read(seen[:, 3:], tick - prepared.joints.periods),
         ])  # fmt: skip
         u = noise.symmetric_uniform(episodes.seed, tick, 3)
         observed = materialise(jnp.concatenate([delayed[:3] + 0.08 * u, delayed[3:]]))
         request = observed[3:] * jnp.asarray(LIMITS.policy_velocity)[:, None]
         command = materialise(limit_velocity(request, previous, reference, config.period, xp=jnp))
         sent = latency.ring_write(sent, tick, command)
-        old = latency.ring_read(sent, tick - delays.action.periods - 1)
-        new = latency.ring_read(sent, tick - delays.action.periods)
+        old = latency.ring_read(sent, tick - prepared.action.periods - 1)
+        new = latency.ring_read(sent, tick - prepared.action.periods)
         for i in range(config.substeps):
-            share = latency.old_command_share(delays.action, i, timestep)
+            share = latency.old_command_share(prepared.action, i, timestep)
             control = materialise(new + share * (old - new))
-            weight = latency.capture_weight(delays.joints, i, config.substeps, timestep)
+            weight = latency.capture_weight(prepared.joints, i, config.substeps, timestep)
             captured = captured.at[3:].add(weight * control)
         return latency.ring_write(seen, tick, nothing * captured), sent, reference, command, captured
 
     def whole(tick, state):
-        return task.control_step(tick, state, episodes, delays, controller)
+        return task.control_step(tick, state, episodes, prepared, controller)
 
     zeros = jnp.zeros_like(first.qpos)
     n = config.substeps

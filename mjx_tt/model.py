@@ -5,6 +5,7 @@ A diagnosis extends it, training consumes it. Fields are scalars, or arrays of t
 
 YAML: the tree of field names, all of them optional, plus
     randomise: {"ball.table.restitution": [0.85, 0.95], ...}   uniform ranges, drawn anew for every episode
+               (a range of a drive, "drives.joint_2.lag", gives the model drives)
     provenance: {...}                                          free text, kept as it is
 """
 
@@ -24,6 +25,8 @@ import yaml
 from ballmodel import constants as c
 from ballmodel.aero import INTEGRATORS
 from ballmodel.flight import BallParams, ball_params
+from ballmodel.optional import optional
+from mjx_tt.drives import DriveParams
 
 
 @jax.tree_util.register_dataclass
@@ -53,13 +56,28 @@ LATENCIES = ("ball_observation", "abb_observation", "festo_observation", "abb_ac
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SensingParams:
-    """What the ball tracker adds to the truth."""
+    """What the ball tracker makes of the truth.
+
+    measured = camera_scale R (1 + camera_distortion |p|^2) p + offset + noise,   R = Rz Ry Rx
+    with p the ball's position, delayed by ``latency.ball_observation`` times ``clock_rate`` and, with ``smoothing``,
+    filtered: df/dt = (p - f) / smoothing. (Filter and camera commute but for the distortion's change along the flight;
+    the noise is added behind both.)
+    """
 
     # Half width of the uniform noise on each coordinate, per control step [m]: "2 x the diameter" is its whole width.
     ball_noise: jax.Array | float = c.BALL_DIAMETER
     ball_offset_x: jax.Array | float = 0.0  # [m], calibration bias
     ball_offset_y: jax.Array | float = 0.0
     ball_offset_z: jax.Array | float = 0.0
+    camera_scale: jax.Array | float | None = optional(1.0)
+    camera_rotation_x: jax.Array | float | None = optional(0.0)  # [rad] about the table frame's axes
+    camera_rotation_y: jax.Array | float | None = optional(0.0)
+    camera_rotation_z: jax.Array | float | None = optional(0.0)
+    camera_distortion: jax.Array | float | None = optional(0.0)  # [1/m^2]
+    # Measured over true time. A policy reads no clock: all that this can do to it is to stretch the tracker's latency.
+    clock_rate: jax.Array | float | None = optional(1.0)
+    smoothing: jax.Array | float | None = optional(0.0)  # [s] time constant of the tracker's filter
+    jitter: jax.Array | float | None = optional(0.0)  # [s] deviation of the moment of each measurement, Gaussian
 
 
 @jax.tree_util.register_dataclass
@@ -68,6 +86,22 @@ class ActuationParams:
     """What the drives make of a velocity command before the servo of the MJCF follows it."""
 
     velocity_gain: jax.Array | float = 1.0  # reached over commanded velocity
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class BallSpinParams:
+    """Spin of the incoming balls at their start [rad/s], Gaussian and drawn per episode.
+
+    The pool of balls is chosen without spin: those that spin much need not land where their distribution says.
+    """
+
+    mean_x: jax.Array | float = 0.0
+    mean_y: jax.Array | float = 0.0
+    mean_z: jax.Array | float = 0.0
+    std_x: jax.Array | float = 0.0
+    std_y: jax.Array | float = 0.0
+    std_z: jax.Array | float = 0.0
 
 
 def _ball() -> BallParams:
@@ -79,12 +113,17 @@ def _ball() -> BallParams:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SimModel:
-    """The simulation's parameters; the paper's drag-only ball, integrated to second order."""
+    """The simulation's parameters; the paper's drag-only ball, integrated to second order.
+
+    ``drives`` None is the nominal robot; its paths, such as drives.joint_2.lag, exist all the same.
+    """
 
     ball: BallParams = field(default_factory=_ball)
+    ball_spin: BallSpinParams = field(default_factory=BallSpinParams)
     latency: LatencyParams = field(default_factory=LatencyParams)
     sensing: SensingParams = field(default_factory=SensingParams)
     actuation: ActuationParams = field(default_factory=ActuationParams)
+    drives: DriveParams | None = None
 
 
 @dataclass(frozen=True)
@@ -106,8 +145,10 @@ class ModelFile:
 
 
 def paths(node=None, prefix: str = "") -> dict[str, float | str]:
-    """Every leaf of a SimModel by its dotted path; of the nominal model by default."""
+    """Every leaf of a SimModel by its dotted path; of the nominal model by default. Absent drives are nominal ones."""
     node = SimModel() if node is None else node
+    if isinstance(node, SimModel) and node.drives is None:
+        node = dataclasses.replace(node, drives=DriveParams())
     leaves: dict[str, float | str] = {}
     for f in dataclasses.fields(node):
         value = getattr(node, f.name)
@@ -119,11 +160,16 @@ def paths(node=None, prefix: str = "") -> dict[str, float | str]:
 
 
 def with_values(model: SimModel, values: dict) -> SimModel:
-    """The model with the leaves at the given dotted paths replaced. Raises ValueError for a path that does not exist."""
+    """The model with the leaves at the given dotted paths replaced; a path of the drives gives it drives.
+
+    Raises ValueError for a path that does not exist.
+    """
     known = paths()
     for path in values:
         if path not in known:
             raise ValueError(f"unknown parameter {path!r}{nearest(path, known)}")
+    if model.drives is None and any(path.startswith("drives.") for path in values):
+        model = dataclasses.replace(model, drives=DriveParams())
     return _with_values(model, values)
 
 
@@ -150,6 +196,15 @@ def draw_latencies(key, latency: LatencyParams, shape: tuple[int, ...], longest:
     mean = jnp.stack([jnp.broadcast_to(getattr(latency, n), shape) for n in LATENCIES])
     std = jnp.stack([jnp.broadcast_to(getattr(latency, f"{n}_std"), shape) for n in LATENCIES])
     return jnp.clip(mean + std * jax.random.normal(key, mean.shape), 0.0, longest)
+
+
+def draw_spin(key, spin: BallSpinParams, shape: tuple[int, ...]):
+    """Spin (3, *shape) [rad/s] of incoming balls; None where no ball spins, so that nothing is added."""
+    values = dataclasses.astuple(spin)
+    if all(isinstance(value, int | float) and value == 0.0 for value in values):
+        return None
+    mean, std = (jnp.stack([jnp.broadcast_to(v, shape) for v in part]) for part in (values[:3], values[3:]))
+    return mean + std * jax.random.normal(key, mean.shape)
 
 
 def nearest(name: str, known) -> str:
@@ -196,9 +251,14 @@ def from_dict(data, where: str) -> ModelFile:
 
 
 def save(path: str | os.PathLike, file: ModelFile) -> None:
-    """Writes every parameter, the ranges and the provenance; to a temporary file first, so nothing is half-written."""
+    """Writes every parameter, the ranges and the provenance; to a temporary file first, so nothing is half-written.
+
+    Drives are written if the model has them.
+    """
     tree: dict = {}
     for name, value in paths(file.model).items():
+        if name.startswith("drives.") and file.model.drives is None:
+            continue
         *groups, leaf = name.split(".")
         node = tree
         for group in groups:

@@ -6,6 +6,7 @@ needs no state in the loop. Finaliser "lowbias32": Wellons, hash prospector, bia
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 
 
@@ -23,3 +24,10 @@ def symmetric_uniform(seed, counter, n: int):
     bits = [_hash(base + jnp.uint32((i + 1) * 0x85EBCA6B & 0xFFFFFFFF)) for i in range(n)]
     # 24 bits fill a float32 mantissa; the half step keeps the mean at zero.
     return jnp.stack([((b >> 8).astype(jnp.float32) + 0.5) * (2.0**-23) - 1.0 for b in bits])
+
+
+def normal(seed, counter, skip: int):
+    """A standard normal number per episode (...): the normal quantile of the uniform number after ``skip`` others."""
+    u = symmetric_uniform(seed, counter, skip + 1)[skip]
+    largest = 1.0 - 2.0**-24  # rounding may make it 1, whose normal number is infinite
+    return jnp.sqrt(2.0) * jax.scipy.special.erfinv(jnp.clip(u, -largest, largest))

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from ballmodel.optional import without_nominal
 from ballmodel.pool import BallPool
-from ballmodel.state import where
+from ballmodel.state import BallState, where
 from mjx_tt import model as models
 from mjx_tt.model import Range, SimModel
 from mjx_tt.policy import PolicyController
@@ -76,7 +77,8 @@ class Simulator:
     ) -> Episodes:
         """Balls, latencies, noise seeds and randomised parameters of repeats x columns episodes.
 
-        Within each column the episodes are in the order of the balls' arrival.
+        Within each column the episodes are in the order of the balls' arrival. What the model leaves at its nominal
+        value and a program can do without is None in the episodes' model.
         """
         balls_key, latency_key, seed_key, model_key = jax.random.split(key, 4)
         shape = (repeats, columns)
@@ -84,12 +86,16 @@ class Simulator:
         order = jnp.argsort(pool.arrival[index], axis=0)
         index = jnp.take_along_axis(index, order, axis=0)
         drawn = models.draw(model_key, model, randomise, shape)
+        ball: BallState = jax.tree.map(lambda x: x[:, index], pool.state)
+        spin = models.draw_spin(jax.random.fold_in(balls_key, 1), drawn.ball_spin, shape)
+        if spin is not None:
+            ball = replace(ball, spin=ball.spin + spin)
         longest = jnp.array([self.config.max_observation_latency] * 3 + [self.config.max_action_latency] * 2)
         return Episodes(
-            ball=jax.tree.map(lambda x: x[:, index], pool.state),
+            ball=ball,
             latency=models.draw_latencies(latency_key, drawn.latency, shape, longest[:, None, None]),
             seed=jax.random.bits(seed_key, shape, jnp.uint32),
-            model=jax.tree.map(jnp.asarray, drawn),
+            model=jax.tree.map(jnp.asarray, without_nominal(drawn)),
         )
 
     def on_devices(self, function, **specs):
@@ -157,7 +163,7 @@ class Simulator:
 
     def _block(self, episodes: Episodes, controller: Controller):
         task, config = self.task, self.config
-        delays = task.delays(episodes.latency)
+        prepared = task.prepare(episodes)
 
         def running(carry):
             tick, state = carry
@@ -165,7 +171,7 @@ class Simulator:
 
         def advance(carry):
             tick, state = carry
-            return tick + 1, task.control_step(tick, state, episodes, delays, controller)
+            return tick + 1, task.control_step(tick, state, episodes, prepared, controller)
 
         state = task.reset(episodes, controller)
         _, state = jax.lax.while_loop(running, advance, (jnp.int32(0), state))
@@ -197,7 +203,7 @@ class Simulator:
         """
         task = self.task
         controller = PolicyController(unflatten(theta[:, None]), mean, inverse_scale)
-        delays = task.delays(episodes.latency)
+        prepared = task.prepare(episodes)
         state = task.reset(episodes, controller)
         grounded = jnp.zeros_like(state.live)
         outcome = task.fly_out(state.ball, grounded, episodes.model)
@@ -207,7 +213,7 @@ class Simulator:
         def advance(carry, tick):
             state, ball, flying, outcome, length = carry
             shown = (state.qpos[..., 0], ball.position[..., 0])
-            new = task.control_step(tick, state, episodes, delays, controller)
+            new = task.control_step(tick, state, episodes, prepared, controller)
             out, outcome, still = task.fly_out_step(params, ball, flying, outcome)
             ball = where(state.hit, out, new.ball)
             flying = still | (new.hit & ~state.hit)

@@ -17,7 +17,7 @@ from ballmodel import flight
 from ballmodel.flight import PaddlePose
 from ballmodel.state import BallState, where
 from ballmodel.vec import norm
-from mjx_tt import latency, noise, rewards, robot
+from mjx_tt import drives, latency, noise, rewards, robot, sensing
 from mjx_tt.clearance import CapsuleClearance
 from mjx_tt.dynamics.fold import materialise
 from mjx_tt.dynamics.fused import FusedEngine
@@ -95,12 +95,14 @@ class Episodes:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Delays:
-    """The five delays, split for use in the loop."""
+class Prepared:
+    """What the loop needs of the episodes' delays, drives and tracker: computed once, before it."""
 
     ball: latency.Delay
     joints: latency.Delay  # (8, ...)
     action: latency.Delay  # (8, ...)
+    drives: drives.Drives
+    camera: sensing.Camera | None
 
 
 @jax.tree_util.register_dataclass
@@ -134,8 +136,11 @@ class EpisodeState:
     command_acceleration: jax.Array  # (8, ...)
     reference: jax.Array  # (8, ...) sum of commands
     commands: jax.Array  # (depth, 8, ...) ring by control period
-    observations: jax.Array  # (depth, 11, ...) ring by control period, captured at the delays' phases
+    # (depth, 11, ...) ring by control period, captured at the delays' phases; with jitter also the ball's velocity
+    observations: jax.Array
     controller: object  # pytree, whatever the controller remembers
+    drive: drives.DriveState
+    filtered: jax.Array | None  # (3, ...) [m] the ball's position as the tracker smooths it; None: it does not
     ball: BallState
     bounced: jax.Array  # (...) bool
     hit: jax.Array  # (...) bool
@@ -175,15 +180,25 @@ class Task:
         self._observation_depth = latency.ring_depth(config.max_observation_latency, config.period)
         self._action_depth = latency.ring_depth(config.max_action_latency, config.period)
 
-    def delays(self, seconds) -> Delays:
-        """Splits latencies (5, ...) [s] in the order of ``model.LATENCIES``."""
-        period = self.config.period
+    def prepare(self, episodes: Episodes) -> Prepared:
+        """Splits the episodes' latencies, with what clock and drives add to them, and sorts drives and camera."""
+        config, model, seconds = self.config, episodes.model, episodes.latency
+        period, batch = config.period, seconds.shape[1:]
         joints = jnp.stack([seconds[2 if i in FESTO_JOINTS else 1] for i in range(N_JOINTS)])
         actions = jnp.stack([seconds[4 if i in FESTO_JOINTS else 3] for i in range(N_JOINTS)])
-        return Delays(
-            latency.observation_delay(seconds[0], period),
+        ball, by_effect = seconds[0], drives.by_effect(model.drives, batch, seconds.dtype)
+        if model.sensing.clock_rate is not None:
+            ball = jnp.clip(ball * model.sensing.clock_rate, 0.0, config.max_observation_latency)
+        if by_effect.observation_delay is not None:
+            joints = jnp.clip(joints + by_effect.observation_delay, 0.0, config.max_observation_latency)
+        if by_effect.action_delay is not None:
+            actions = jnp.clip(actions + by_effect.action_delay, 0.0, config.max_action_latency)
+        return Prepared(
+            latency.observation_delay(ball, period),
             latency.observation_delay(joints, period),
             latency.action_delay(actions, period),
+            by_effect,
+            sensing.camera(model.sensing),
         )
 
     def reset(self, episodes: Episodes, controller: Controller) -> EpisodeState:
@@ -197,7 +212,9 @@ class Task:
         home = jnp.broadcast_to(jnp.asarray(self.home, dtype).reshape((N_JOINTS,) + (1,) * len(batch)), zeros.shape)
         seen = jnp.concatenate([episodes.ball.position, home])
         zero, false = full(0.0), jnp.broadcast_to(False, batch)
-        first = self._noisy(episodes, seen, 0)
+        prepared, tracker = self.prepare(episodes), episodes.model.sensing
+        captured = seen if tracker.jitter is None else jnp.concatenate([seen, episodes.ball.velocity])
+        first = self._measured(episodes, prepared, captured, 0)
         return EpisodeState(
             qpos=home,
             qvel=zeros,
@@ -206,8 +223,10 @@ class Task:
             command_acceleration=zeros,
             reference=home,
             commands=full(0.0, self._action_depth, N_JOINTS),
-            observations=jnp.broadcast_to(seen, (self._observation_depth, *seen.shape)),
+            observations=jnp.broadcast_to(captured, (self._observation_depth, *captured.shape)),
             controller=controller.start(first),
+            drive=drives.at_rest(prepared.drives, home),
+            filtered=None if tracker.smoothing is None else episodes.ball.position,
             ball=episodes.ball,
             bounced=false,
             hit=false,
@@ -216,20 +235,33 @@ class Task:
             sums=Sums(full(3.0), *[zero] * 8, zeros, full(0.0, N_OBSERVATION), full(0.0, N_OBSERVATION)),
         )
 
-    def _noisy(self, episodes: Episodes, seen, tick):
-        """The observation (11, ...) from the true delayed quantities."""
-        sensing = episodes.model.sensing
-        u = noise.symmetric_uniform(episodes.seed, tick, 3).astype(seen.dtype)
-        offset = (sensing.ball_offset_x, sensing.ball_offset_y, sensing.ball_offset_z)
-        ball = jnp.stack([seen[i] + sensing.ball_noise * u[i] + offset[i] for i in range(3)])
-        return jnp.concatenate([ball, seen[3:]])
+    def _measured(self, episodes: Episodes, prepared: Prepared, captured, tick):
+        """The observation (11, ...) from the true delayed quantities, as the ring keeps them."""
+        tracker, joints = episodes.model.sensing, captured[3 : 3 + N_JOINTS]
+        ball = captured[:3]
+        if tracker.jitter is not None:
+            late = tracker.jitter * noise.normal(episodes.seed, tick, 3).astype(ball.dtype)
+            ball = ball + late * captured[3 + N_JOINTS :]
+        if prepared.camera is not None:
+            ball = prepared.camera.seen(ball)
+        u = noise.symmetric_uniform(episodes.seed, tick, 3).astype(captured.dtype)
+        offset = (tracker.ball_offset_x, tracker.ball_offset_y, tracker.ball_offset_z)
+        ball = jnp.stack([ball[i] + tracker.ball_noise * u[i] + offset[i] for i in range(3)])
+        if prepared.drives.joint_offset is not None:
+            joints = joints + prepared.drives.joint_offset
+        return jnp.concatenate([ball, joints])
 
-    def control_step(self, tick, s: EpisodeState, episodes: Episodes, delays: Delays, controller: Controller):
+    def control_step(self, tick, s: EpisodeState, episodes: Episodes, prepared: Prepared, controller: Controller):
         """One control period: observe, act, advance robot and ball by the substeps."""
         period = self.config.period
-        ball_seen = latency.ring_read(s.observations[:, :3], tick - delays.ball.periods)
-        joints_seen = latency.ring_read(s.observations[:, 3:], tick - delays.joints.periods)
-        observation = materialise(self._noisy(episodes, jnp.concatenate([ball_seen, joints_seen]), tick))
+        joints = slice(3, 3 + N_JOINTS)
+        captured = [
+            latency.ring_read(s.observations[:, :3], tick - prepared.ball.periods),
+            latency.ring_read(s.observations[:, joints], tick - prepared.joints.periods),
+        ]
+        if episodes.model.sensing.jitter is not None:
+            captured.append(latency.ring_read(s.observations[:, joints.stop :], tick - prepared.ball.periods))
+        observation = materialise(self._measured(episodes, prepared, jnp.concatenate(captured), tick))
         action, controller_state = controller.act(tick, s.controller, observation)
         scale = np.asarray(LIMITS.policy_velocity, action.dtype).reshape((-1,) + (1,) * (action.ndim - 1))
         # After the contact the robot is only braked: what the real one does before it returns home.
@@ -237,39 +269,53 @@ class Task:
         command = materialise(limit_velocity(request, s.command, s.reference, period, xp=jnp))
         reference = s.reference + command * period
         commands = latency.ring_write(s.commands, tick, command)
-        old = latency.ring_read(commands, tick - delays.action.periods - 1)
-        new = latency.ring_read(commands, tick - delays.action.periods)
-        qpos, qvel, pose, ball, flags, closest, captured = self._substeps(s, episodes, delays, old, new)
+        old = latency.ring_read(commands, tick - prepared.action.periods - 1)
+        new = latency.ring_read(commands, tick - prepared.action.periods)
+        (qpos, qvel, pose, drive, filtered, ball, flags, closest), captured = self._substeps(
+            s, episodes, prepared, old, new
+        )
         bounced, hit, live = flags
         command_acceleration = (command - s.command) / period
-        sums = self._accumulate(s, observation, controller.mean, command, command_acceleration, qpos, pose, closest)
+        carried = qpos if drive.output is None else drive.output
+        sums = self._accumulate(s, observation, controller.mean, command, command_acceleration, carried, pose, closest)
         ok = jnp.isfinite(sum(qpos[i] for i in range(N_JOINTS)) + sum(ball.position[i] for i in range(3)))
         return EpisodeState(
             qpos, qvel, pose, command, command_acceleration, reference, commands,
             latency.ring_write(s.observations, tick, captured),
-            controller_state, ball, bounced, hit, live & ok, s.finite & (ok | ~s.live), sums,
+            controller_state, drive, filtered, ball, bounced, hit, live & ok, s.finite & (ok | ~s.live), sums,
         )  # fmt: skip
 
-    def _substeps(self, s: EpisodeState, episodes: Episodes, delays: Delays, old, new):
+    def _substeps(self, s: EpisodeState, episodes: Episodes, prepared: Prepared, old, new):
         """Robot and ball through one control period, with what the delayed sensors capture on the way."""
         n, timestep = self.config.substeps, 1.0 / self.config.sim_rate
         params, gain = episodes.model.ball, episodes.model.actuation.velocity_gain
-        captured = jnp.concatenate(
-            [
-                latency.capture_weight(delays.ball, 0, n, timestep) * s.ball.position,
-                latency.capture_weight(delays.joints, 0, n, timestep) * s.qpos,
+        tracker, drive_params = episodes.model.sensing, prepared.drives
+        old, new = drives.reachable(drive_params, old), drives.reachable(drive_params, new)
+
+        def capture(i, ball, filtered, joints):
+            """Share of the state at substep boundary i in what the delayed sensors see: (11, ...), or (14, ...)."""
+            seen_at = latency.capture_weight(prepared.ball, i, n, timestep)
+            parts = [
+                seen_at * (ball.position if filtered is None else filtered),
+                latency.capture_weight(prepared.joints, i, n, timestep) * joints,
             ]
-        )
+            if tracker.jitter is not None:
+                parts.append(seen_at * ball.velocity)
+            return jnp.concatenate(parts)
 
         def substep(i, carry):
-            qpos, qvel, pose, ball, (bounced, hit, live), closest, captured = carry
-            share = latency.old_command_share(delays.action, i, timestep)
-            control = materialise(gain * (new + share * (old - new)))
+            (qpos, qvel, pose, drive, filtered, ball, (bounced, hit, live), closest), captured = carry
+            share = latency.old_command_share(prepared.action, i, timestep)
+            velocity, drive = drives.follow(drive_params, drive, new + share * (old - new), timestep)
+            control = materialise(gain * velocity)
             qpos, qvel = self.engine.step(qpos, qvel, control)
-            after = materialise(self.kinematics.pose(qpos, qvel))
+            carried, carried_velocity, drive = drives.carry(drive_params, drive, qpos, qvel, timestep)
+            after = materialise(self.kinematics.pose(carried, carried_velocity))
             moved, events = flight.step(params, ball, timestep, (pose, after))
             moved, events = materialise((moved, events))
-            ball = where(live, moved, ball)
+            before, ball = ball, where(live, moved, ball)
+            if filtered is not None:
+                filtered = sensing.smoothed(tracker.smoothing, filtered, before.position, ball.position, timestep)
             own_side = events.table & (events.position[1] < 0.0)
             over = (events.table & (bounced | ~own_side)) | events.net | events.paddle
             y_min, z_min = OUT_OF_REACH
@@ -280,16 +326,12 @@ class Task:
             distance = norm(ball.position - after.position)
             closest = jnp.where(live & bounced, jnp.minimum(closest, distance), closest)
             live = live & ~over
-            captured = captured + jnp.concatenate(
-                [
-                    latency.capture_weight(delays.ball, i + 1, n, timestep) * ball.position,
-                    latency.capture_weight(delays.joints, i + 1, n, timestep) * qpos,
-                ]
-            )
-            return materialise((qpos, qvel, after, ball, (bounced, hit, live), closest, captured))
+            captured = captured + capture(i + 1, ball, filtered, carried)
+            return materialise(((qpos, qvel, after, drive, filtered, ball, (bounced, hit, live), closest), captured))
 
-        carry = (s.qpos, s.qvel, s.pose, s.ball, (s.bounced, s.hit, s.live), s.sums.closest, captured)
-        return jax.lax.fori_loop(0, n, substep, carry)
+        start = (s.qpos, s.qvel, s.pose, s.drive, s.filtered, s.ball, (s.bounced, s.hit, s.live), s.sums.closest)
+        captured = capture(0, s.ball, s.filtered, s.qpos if s.drive.output is None else s.drive.output)
+        return jax.lax.fori_loop(0, n, substep, (start, captured))
 
     def _accumulate(self, s, observation, shift, command, command_acceleration, qpos, pose, closest) -> Sums:
         sums, alive = s.sums, s.live.astype(command.dtype)

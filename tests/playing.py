@@ -86,10 +86,10 @@ def task(engine: str = "fused", sim_rate: float = 300.0) -> Task:
 @cache
 def _player(task: Task, ticks: int):
     def play(controller, episodes):
-        delays = task.delays(episodes.latency)
+        prepared = task.prepare(episodes)
 
         def advance(state, tick):
-            new = task.control_step(tick, state, episodes, delays, controller)
+            new = task.control_step(tick, state, episodes, prepared, controller)
             return new, (new.qpos, new.pose.position, new.ball.position, new.command, new.controller, new.live)
 
         state = task.reset(episodes, controller)

@@ -13,10 +13,14 @@ from ballmodel.contact import (
     PaddleParams,
     SurfaceParams,
     box_gap,
+    elevation,
     paddle_impact,
     restitution_at,
+    surface_frame,
+    surface_gap,
     surface_impact,
 )
+from ballmodel.optional import without_nominal
 
 UP = np.array([0.0, 0.0, 1.0])
 R, M = c.BALL_RADIUS, c.BALL_MASS
@@ -130,3 +134,27 @@ def test_box_gap_is_the_nearest_points_distance():
 def test_a_raised_table_is_met_earlier():
     gap, distance = box_gap(TABLE, 0.01, np.array([0.0, 0.5, 0.1]))
     assert float(distance) == pytest.approx(0.09)
+
+
+@pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.02, -0.01), (-0.3, 0.4)])
+def test_a_tilted_surface_has_the_slopes_and_the_distance_of_its_plane(slopes):
+    a, b = slopes
+    surface = SurfaceParams(0.9, 0.0, 0.2, 0.05, a, b)
+    frame = np.array(surface_frame(surface))
+    np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(frame) == pytest.approx(1.0)
+    np.testing.assert_allclose(frame[2], np.array([-a, -b, 1]) / np.sqrt(1 + a * a + b * b), atol=1e-12)
+    rng = np.random.default_rng(5)
+    for x, y, z in zip(*rng.uniform(-0.5, 0.5, (2, 20)), rng.uniform(0.6, 1.0, 20)):
+        gap, distance = surface_gap(TABLE, surface, np.array([x, y, z]))
+        over = z - 0.05 - a * x - b * y
+        assert float(elevation(surface, np.array([x, y, z]))) == pytest.approx(over, abs=1e-12)
+        assert float(distance) == pytest.approx(over / np.sqrt(1 + a * a + b * b), abs=1e-12)
+        np.testing.assert_allclose(np.array(gap), frame[2] * float(distance), atol=1e-12)
+
+
+def test_a_level_surface_is_left_as_it_is():
+    level = without_nominal(SurfaceParams(0.9, 0.0, 0.2, 0.05))
+    assert level.tilt_x is None and level.tilt_y is None and surface_frame(level) is None
+    assert without_nominal(SurfaceParams(0.9, 0.0, 0.2, 0.05, 0.0, 0.01)).tilt_y == 0.01
+    assert without_nominal(SurfaceParams(0.9, 0.0, 0.2, 0.05, np.zeros(3))).tilt_x is not None  # may become anything

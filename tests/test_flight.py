@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 from ballmodel import constants as c
 from ballmodel import players
 from ballmodel.aero import FlightParams, drag_factor, magnus_factor
 from ballmodel.contact import PaddleParams, SurfaceParams
 from ballmodel.flight import PaddlePose, ball_params, free_step, step
+from ballmodel.optional import without_nominal
 from ballmodel.pool import sample_pool, throw
 from ballmodel.state import ball_state
 
@@ -298,3 +300,104 @@ def test_a_turning_paddle_moves_its_contact_point():
     assert bool(events.paddle)
     # An elastic wall that moves at rate * offset towards the ball.
     assert float(new.velocity[1]) == pytest.approx(5.0 + 2 * rate * offset, rel=1e-9)
+
+
+TILT = (0.04, -0.07)  # dz/dx, dz/dy
+
+
+def tilted_and_level(n=300):
+    """Balls over and beside a tilted, raised table with its net; the same turned until they are level; the rotation."""
+    a, b = TILT
+    normal = np.array([-a, -b, 1.0]) / np.sqrt(1 + a * a + b * b)
+    axis = np.cross([0, 0, 1.0], normal)
+    angle = np.arctan2(np.linalg.norm(axis), normal[2])
+    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * angle).as_matrix()
+    rng = np.random.default_rng(7)
+    position = np.stack([rng.uniform(-0.8, 0.8, n), rng.uniform(-1.42, 0.3, n), rng.uniform(0.15, 0.4, n)])
+    velocity = np.stack([rng.normal(0, 1, n), rng.normal(0, 1, n), rng.uniform(-4, 1, n)])
+    spin = rng.normal(0, 60, (3, n))
+    flight = FlightParams(magnus_coefficient=0.5, integrator="midpoint")
+    nominal = replace(ball_params(), flight=flight)
+    table, net = (replace(surface, height=0.03, tilt_x=a, tilt_y=b) for surface in (nominal.table, nominal.net))
+    tilted = replace(nominal, table=table, net=net)
+    g = turn.T @ [0.0, 0.0, -9.81]
+    level = replace(nominal, flight=replace(flight, gravity_x=g[0], gravity_y=g[1], gravity_z=g[2]))
+    raised = np.array([0.0, 0.0, 0.03])[:, None]
+    turned = ball_state(turn.T @ (position - raised), turn.T @ velocity, turn.T @ spin)
+    return tilted, ball_state(position, velocity, spin), level, turned, turn, raised
+
+
+def test_a_tilted_table_is_a_level_one_in_a_turned_world():
+    tilted, state, level, turned, turn, raised = tilted_and_level()
+    end, touched = run(tilted, state, 1 / 300, 90)
+    other, touched_too = run(level, turned, 1 / 300, 90)
+    np.testing.assert_array_equal(touched, touched_too)
+    assert 100 < int(touched[0].sum()) < 300 and int(touched[1].sum()) > 5  # tops, edges, misses; the net
+    np.testing.assert_allclose(end.position, turn @ np.array(other.position) + raised, atol=1e-9)
+    np.testing.assert_allclose(end.velocity, turn @ np.array(other.velocity), atol=1e-7)
+    np.testing.assert_allclose(end.spin, turn @ np.array(other.spin), atol=1e-5)
+    flat = run(replace(tilted, table=replace(tilted.table, tilt_x=0.0, tilt_y=0.0)), state, 1 / 300, 90)[0]
+    assert np.abs(np.asarray(end.position - flat.position)).max() > 0.05
+
+
+def test_tilts_of_zero_change_nothing_and_can_be_differentiated():
+    nominal = replace(ball_params(), flight=FlightParams(integrator="midpoint"))
+    state = ball_state(np.array([0.2, -0.3, 0.2]), np.array([0.5, -2.0, -1.0]))
+
+    @jax.jit
+    def end(tilts):
+        table = replace(nominal.table, tilt_x=tilts[0], tilt_y=tilts[1])
+        return run(replace(nominal, table=table), state, 1 / 300, 60)[0].position
+
+    def left_out():
+        return run(without_nominal(nominal), state, 1 / 300, 60)[0].position
+
+    np.testing.assert_allclose(end(jnp.zeros(2)), left_out(), atol=1e-14)
+    slope_along = jax.jit(lambda direction: jax.jvp(end, (jnp.zeros(2),), (direction,))[1])
+    for direction in jnp.eye(2):
+        slope = slope_along(direction)
+        difference = (end(1e-6 * direction) - end(-1e-6 * direction)) / 2e-6
+        assert np.abs(difference).max() > 0.1
+        np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-6)
+
+
+def test_a_turned_and_shifted_blade_reflects_from_where_it_is():
+    """An elastic blade without friction, whose normal SciPy turns about the horizontal line in it."""
+    tilt, offset, normal = 0.1, 0.008, np.array([0.3, 0.9, 0.2])
+    normal /= np.linalg.norm(normal)
+    elastic = PaddleParams(restitution=1.0, restitution_slope=0.0, tangential_gain=0.0, tilt=tilt, offset=offset)
+    params = replace(ball_params(), flight=replace(VACUUM, gravity_z=0.0), paddle=elastic)
+    axis = np.cross([0, 0, 1.0], normal)
+    turned = Rotation.from_rotvec(tilt * axis / np.linalg.norm(axis)).apply(normal)
+    assert turned[2] < normal[2] - 0.09  # closed
+    assert turned[2] == pytest.approx(np.sin(np.arcsin(normal[2]) - tilt))
+    velocity = np.array([-1.0, -5.0, 0.5])
+    reach = c.BALL_RADIUS + c.PADDLE_THICKNESS / 2 + offset
+    time = 0.006
+    start = np.array([0, 0, 0.5]) + turned * reach - velocity * time
+    new, events = step(params, ball_state(start, velocity), 0.01, still_pose([0, 0, 0.5], normal))
+    assert bool(events.paddle)
+    assert float(events.time) == pytest.approx(time, rel=1e-9)
+    np.testing.assert_allclose(new.velocity, velocity - 2 * turned * (velocity @ turned), atol=1e-9)
+
+
+def test_a_shifted_blade_turns_about_the_unshifted_centre():
+    """Rubber that stops the slip leaves the ball's contact point with the speed of the blade's."""
+    sticking = PaddleParams(restitution=0.0, restitution_slope=0.0, tangential_gain=0.4, offset=0.03)
+    params = replace(ball_params(), flight=replace(VACUUM, gravity_z=0.0), paddle=sticking)
+    spin = jnp.array([0.0, 0.0, 6.0])
+    pose = tuple(replace(p, angular_velocity=spin) for p in still_pose([0, 0, 0.5], [0, 1, 0]))
+    new, events = step(params, ball_state(np.array([0.02, 0.07, 0.5]), np.array([0, -5.0, 0])), 0.01, pose)
+    assert bool(events.paddle)
+    contact_point = np.array([0.02, 0.03 + c.PADDLE_THICKNESS / 2, 0.0])
+    ball_point = np.array(new.velocity) + np.cross(new.spin, [0, -c.BALL_RADIUS, 0])
+    np.testing.assert_allclose(ball_point, np.cross(spin, contact_point), atol=1e-9)
+
+
+def test_a_blade_that_lies_flat_is_not_turned():
+    params = replace(ball_params(), flight=replace(VACUUM, gravity_z=0.0))
+    state, pose = ball_state(np.array([0, 0, 0.54]), np.array([0.3, 0, -5.0])), still_pose([0, 0, 0.5], [0, 0, 1])
+    nominal, _ = step(params, state, 0.01, pose)
+    tilted, events = step(replace(params, paddle=PaddleParams(tilt=0.1)), state, 0.01, pose)
+    assert bool(events.paddle)
+    np.testing.assert_allclose(tilted.velocity, nominal.velocity, atol=1e-12)

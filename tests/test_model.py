@@ -9,7 +9,8 @@ import yaml
 from scipy import stats
 
 from mjx_tt import model
-from mjx_tt.model import LATENCIES, LatencyParams, ModelFile, Range, SimModel
+from mjx_tt.drives import JointDrive
+from mjx_tt.model import LATENCIES, BallSpinParams, LatencyParams, ModelFile, Range, SimModel
 
 
 def test_yaml_keeps_every_parameter(tmp_path):
@@ -23,7 +24,7 @@ def test_yaml_keeps_every_parameter(tmp_path):
     read = model.load(tmp_path / "a.yaml")
     assert read == file
     assert model.paths(read.model) == values
-    assert len(values) > 40 and len(set(values.values())) == len(values)
+    assert len(values) > 140 and len(set(values.values())) == len(values)
 
 
 def test_what_is_left_out_is_nominal(tmp_path):
@@ -45,6 +46,35 @@ def test_nominal_latencies_are_the_papers():
     np.testing.assert_allclose(deviations, [8.2, 8.2, 9.0, 5.7, 11.5])
 
 
+def test_some_drives_of_some_joints_are_enough(tmp_path):
+    text = "drives: {joint_2: {lag: 0.02}, gantry_x: {backlash: 0.001, velocity_gain: 0.9}}\n"
+    (tmp_path / "a.yaml").write_text(text)
+    read = model.load(tmp_path / "a.yaml")
+    given = {"drives.joint_2.lag": 0.02, "drives.gantry_x.backlash": 0.001, "drives.gantry_x.velocity_gain": 0.9}
+    assert model.paths(read.model) == model.paths() | given
+    assert read.model.drives.joint_1 == JointDrive()
+    model.save(tmp_path / "b.yaml", read)
+    assert model.load(tmp_path / "b.yaml") == read
+
+
+def test_a_model_without_drives_stays_without(tmp_path):
+    model.save(tmp_path / "a.yaml", ModelFile(SimModel()))
+    assert "drives" not in yaml.safe_load((tmp_path / "a.yaml").read_text())
+    assert model.load(tmp_path / "a.yaml").model == SimModel() and SimModel().drives is None
+    assert model.paths()["drives.joint_6.lag"] == 0.0
+
+
+@pytest.mark.parametrize("mean", [0.0, 30.0], ids=str)
+def test_spin_is_gaussian_about_its_mean(mean):
+    spin = BallSpinParams(mean_x=mean, mean_y=-5.0, std_x=20.0, std_z=2.0)
+    drawn = np.asarray(model.draw_spin(jax.random.key(2), spin, (50, 80))).reshape(3, -1)
+    assert stats.kstest(drawn[0], stats.norm(mean, 20.0).cdf).pvalue > 1e-3
+    np.testing.assert_array_equal(drawn[1], -5.0)
+    assert stats.kstest(drawn[2], stats.norm(0.0, 2.0).cdf).pvalue > 1e-3
+    assert abs(np.corrcoef(drawn[0], drawn[2])[0, 1]) < 4.5 / np.sqrt(4000)
+    assert model.draw_spin(jax.random.key(2), BallSpinParams(), (50, 80)) is None
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -55,6 +85,9 @@ def test_nominal_latencies_are_the_papers():
         ("ball: {table: {restitution: true}}", "ball.table.restitution = True, a finite number is needed"),
         ("ball: {flight: {integrator: rk4}}", r"ball.flight.integrator = 'rk4', allowed are \('paper', 'midpoint'\)"),
         ("ball: {flight: {integrator: [paper]}}", "ball.flight.integrator = .*allowed are"),
+        ("drives: {joint_7: {lag: 0.02}}", r"'drives.joint_7.lag'; did you mean 'drives.joint_[1-6].lag'"),
+        ("drives: {joint_2: {lagg: 0.02}}", r"'drives.joint_2.lagg'; did you mean 'drives.joint_2.lag'"),
+        ("drives: {joint_2: 0.02}", "drives.joint_2 = 0.02, a mapping of its parameters is needed"),
         ("ball: 3", "ball = 3, a mapping of its parameters is needed"),
         ("[1, 2]", "a model is a mapping of parameter groups, got list"),
         ("ball: [", "not valid YAML"),

@@ -12,6 +12,7 @@ import pytest
 
 from ballmodel import players
 from ballmodel.pool import sample_pool
+from mjx_tt import model as models
 from mjx_tt import rewards, rollout
 from mjx_tt.model import Range, SimModel
 from mjx_tt.policy import PolicyController, initial_theta
@@ -164,6 +165,42 @@ def test_every_episode_draws_its_own_chance(episodes):
     assert restitution.shape == (R, P) and len(np.unique(restitution)) == R * P
     assert 0.88 <= restitution.min() and restitution.max() <= 0.97
     assert np.shape(episodes.model.ball.net.restitution) == ()
+
+
+def test_spin_of_the_balls_changes_nothing_else_that_is_drawn(simulator, pool, episodes):
+    spinning = models.with_values(SimModel(), {"ball_spin.mean_x": 80.0, "ball_spin.std_y": 10.0})
+    drawn = jax.jit(lambda key: simulator.draw(key, pool, spinning, RANDOMISE, R, P))(jax.random.key(1))
+    spin = np.asarray(drawn.ball.spin)
+    np.testing.assert_array_equal(spin[[0, 2]], np.array([80.0, 0.0])[:, None, None] + np.zeros((2, R, P)))
+    assert len(np.unique(spin[1])) == R * P and 3 < spin[1].std() < 20
+    assert not np.asarray(episodes.ball.spin).any()
+    with_old_spin = replace(drawn, ball=replace(drawn.ball, spin=episodes.ball.spin), model=episodes.model)
+    jax.tree.map(np.testing.assert_array_equal, with_old_spin, episodes)
+
+
+def test_nominal_effects_are_no_part_of_the_program(simulator, pool, episodes):
+    """Only what departs from nominal, or may, costs anything in the loop."""
+    left_out = {path for path, value in models.paths(episodes.model).items() if value is None}
+    assert {"ball.table.tilt_x", "ball.paddle.offset", "sensing.jitter", "sensing.camera_scale"} <= left_out
+    assert episodes.model.drives is None
+    values = {"drives.joint_2.lag": 0.02, "drives.joint_3.lag": 0.0, "sensing.jitter": 1e-3}
+    some = models.with_values(SimModel(), values)
+    drawn = simulator.draw(jax.random.key(1), pool, some, (), R, P).model
+    kept = {path for path, value in models.paths(drawn).items() if value is not None}
+    nominal = {path for path, value in models.paths(episodes.model).items() if value is not None} - {
+        path for path in models.paths() if path.startswith("drives.")
+    }
+    assert kept == nominal | {"drives.joint_2.lag", "sensing.jitter"}
+
+
+def test_a_randomised_drive_shows_in_the_rollout(simulator, pool, theta, episodes, result):
+    """The same episodes with one joint slowed down: the same balls and delays, another way to meet them."""
+    ranges = (*RANDOMISE, Range("drives.joint_1.lag", 0.05, 0.1))
+    slow = jax.jit(lambda key: simulator.draw(key, pool, SimModel(), ranges, R, P))(jax.random.key(1))
+    np.testing.assert_array_equal(slow.ball.position, episodes.ball.position)
+    found = jax.jit(lambda theta, episodes: simulator.rollout(theta, MEAN, INVERSE_SCALE, episodes))(theta, slow)
+    assert np.asarray(found.finite).all()
+    assert (np.abs(np.asarray(found.returns) - result.returns) > 1e-4).mean() > 0.5
 
 
 def test_replay_shows_the_same_episode(simulator, theta, episodes, played):
