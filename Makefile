@@ -1,6 +1,7 @@
 # make demo   set up, train the quickstart, evaluate it, export it
 # make rig-demo  the same policy on the emulated robot, over real sockets in real time (trains it first if need be)
 # make test   set up and run the tests
+# make exam   hide causes in logs and let the diagnosis find them: the large examination (hours; resumable)
 # make bench  set up and measure speed against MJX, MuJoCo C and PyBullet
 PYTHON ?= python3
 VENV   := .venv
@@ -8,7 +9,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo rig-demo test bench setup clean
+.PHONY: demo rig-demo test exam bench setup clean
 
 demo: $(READY)
 	$(BIN)/mjx-tt train quickstart.yaml --out runs
@@ -19,6 +20,9 @@ rig-demo: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest
+
+exam: $(READY)
+	$(BIN)/python -m tests.exam
 
 bench: $(READY)
 	$(BIN)/pip install -q --disable-pip-version-check -e ".[bench]" || echo "PyBullet has no wheel for this Python: measured without it"

@@ -185,6 +185,25 @@ def log(options: argparse.Namespace) -> int:
     return 0
 
 
+def diagnose(options: argparse.Namespace) -> int:
+    _start_jax(1)
+    from experiments import diagnosis
+
+    console, out = _console(), Path(options.out)
+    without = tuple(name for part in options.without for name in part.split(",") if name)
+    request = diagnosis.Request(
+        tuple(options.logs), out, options.model, options.spin, without, options.seed, options.randomise
+    )
+    found = diagnosis.diagnose(request, console)
+    extended = diagnosis.save(found, out)
+    diagnosis.show(found, console)
+    cost = None
+    if options.policy:
+        cost = diagnosis.play(extended, request, options.policy, options.retrain, options.episodes, console)
+    diagnosis.draw(found, out, ", ".join(Path(p).name for p in options.logs), console, cost)
+    return 0
+
+
 def schema(options: argparse.Namespace) -> int:
     import json
 
@@ -335,6 +354,26 @@ Every ball is on disk before the next begins: the same command continues after a
     p.add_argument("action", choices=("list", "check", "salvage", "export"))
     p.add_argument("paths", nargs="+", metavar="LOG", help="an .mcap or .mcap.part; for list a folder")
     p.add_argument("--out", metavar="PATH", help="of salvage: the file; of export: the folder")
+
+    p = _command(commands, "diagnose", diagnose, "say what the simulation gets wrong about measured logs", """\
+  mjx-tt diagnose session1.csv session2.mcap --out diagnosis
+  mjx-tt diagnose robot/ --out diagnosis                    a folder with command.csv and state.csv
+  mjx-tt diagnose session1.csv --policy runs/quickstart --out diagnosis          what the defect costs in play
+  mjx-tt train my.yaml --set model=diagnosis/extended.yaml                       train with what was found
+
+Writes report.html (look at it first), verdict.json, extended.yaml and plots. Ball logs: session,trajectory,t,x,y,z as
+CSV, MCAP, or the launcher's HDF5; robot logs: command.csv (t,joint,velocity) and state.csv (t,joint,position).
+""")  # fmt: skip
+    p.add_argument("logs", nargs="+", metavar="LOG", help="a file, or a folder of files")
+    p.add_argument("--out", required=True, metavar="DIR", help="where report, verdict and extended model go")
+    p.add_argument("--model", metavar="YAML", help="the model to judge; the nominal one by default")
+    p.add_argument("--spin", choices=("none", "free"), default="none", help="whether the model's ball may spin (none)")
+    p.add_argument("--without", action="append", default=[], metavar="NAMES", help="effects to leave out of the catalogue")
+    p.add_argument("--randomise", action="store_true", help="extended.yaml draws what was fitted from its intervals")
+    p.add_argument("--seed", type=int, default=0, help="of the bootstraps (0)")
+    p.add_argument("--policy", metavar="POLICY", help="a run or artefact: what the defect costs it in play")
+    p.add_argument("--retrain", type=int, default=0, metavar="UPDATES", help="and what this much retraining brings back")
+    p.add_argument("--episodes", type=int, default=2000, help="of each evaluation (2000)")
 
     p = _command(commands, "bench", bench, "measure this machine: physics steps per second, time per update", """\
   mjx-tt bench

@@ -1,0 +1,168 @@
+"""From scores to causes: the smallest set of effects that explains the data, and what cannot be told from it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjx_tt.gap import evidence
+from mjx_tt.gap.catalogue import Effect
+from mjx_tt.gap.evidence import LARGEST_SUBSET, Scores, SpinPrior
+from mjx_tt.gap.linear import Projected
+
+FLOOR = 0.003  # [m] shift of the last sample below which an effect is of no practical interest
+LEAST_GAIN = 14.0  # evidence that one more effect must bring at least
+SPIN_GAIN = 30.0  # and a spread of spins, which has six numbers
+LEAST_SHARE = 0.01  # of the whole gain that a member must bring: linearisation errors of a large effect are no cause
+WIDEST = 10.0  # scales of an effect beyond which it is no explanation: beside others it may be all but invisible
+LEAST_Z = 3.5  # estimate over its ball-to-ball standard error
+ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
+TIE = 10.0  # gain by which the chosen set must beat a substitute
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A set of causes and how it was chosen."""
+
+    effects: tuple[int, ...]
+    spin: bool  # per-ball spin is part of the model
+    theta: np.ndarray  # (len(effects),)
+    error: np.ndarray  # (len(effects),) standard errors, ball to ball
+    gain: float
+    prior: SpinPrior | None
+    magnus: float | None  # change of the Magnus coefficient that came along with spin
+    threshold: float
+    groups: tuple[tuple[int, ...], ...]  # for each chosen effect: what can stand in for it, itself first
+    runners_up: tuple[tuple[tuple[int, ...], bool, float], ...]  # other sets with their gains
+
+
+def named(choice: Choice, trial: Trial) -> tuple[bool, ...]:
+    """For each chosen effect whether it passes the second gate too: a size that matters."""
+    return tuple(bool(abs(t) * trial.shift[j] >= FLOOR) for t, j in zip(choice.theta, choice.effects))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What may be chosen."""
+
+    effects: Sequence[Effect]
+    shift: np.ndarray  # (K,) [m] median shift of the last sample per unit of the effect
+    spin_shift: float  # [m] the same per rad/s of spin
+    spin: str  # "none": spin is a cause; "free": every ball may spin; "never": neither
+    seed: int = 0
+    spinning: bool = False  # linearised about spinning balls: effects that need spin mean nothing without it
+
+
+def visible(p: Projected, trial: Trial, spin: bool, std: np.ndarray | None) -> np.ndarray:
+    """(K,) True where the data could show the effect: twice FLOOR would bring LEAST_GAIN."""
+    scores = evidence.with_spin(p, std) if spin else evidence.without_spin(p)
+    k = len(trial.effects)
+    gram = np.diagonal(scores.gram)[:k].copy()
+    if scores.always:
+        a = list(scores.always)
+        cross = scores.gram[np.ix_(range(k), a)]
+        gram -= np.einsum("ka,ab,kb->k", cross, np.linalg.pinv(scores.gram[np.ix_(a, a)]), cross)
+    size = np.where(trial.shift > 1e-9, 2.0 * FLOOR / np.maximum(trial.shift, 1e-9), 0.0)
+    return gram * size**2 > LEAST_GAIN
+
+
+def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
+    """The smallest set that explains what can be explained."""
+    rng = np.random.default_rng(trial.seed)
+    prior = None
+    sets: list[tuple[bool, Scores]] = []
+    if trial.spin != "free":
+        sets.append((False, evidence.without_spin(p)))
+    if trial.spin != "never":
+        prior = hint
+        if prior is None:
+            plain = evidence.without_spin(p)
+            first = max(evidence.all_gains(plain, _candidates(p, trial, False, None), 1).items(), key=lambda x: x[1])[0]
+            prior = evidence.fit_spin(p, first)
+        sets.append((True, evidence.with_spin(p, prior.std)))
+    found, all_plain = [], {}
+    threshold = LEAST_GAIN
+    for spin, scores in sets:
+        candidates = _candidates(p, trial, spin, None if prior is None else prior.std)
+        gains = evidence.all_gains(scores, candidates)
+        # What chance reaches beside the best set: with a cause left out, its own signal would count as noise.
+        best = max(gains, key=lambda s: gains[s] - LEAST_GAIN * len(s))
+        rest = [c for c in candidates if c not in best]
+        if rest:
+            threshold = max(threshold, evidence.flip_threshold(scores, (*best, *scores.always), rest, rng))
+        cost = SPIN_GAIN if spin and trial.spin == "none" else 0.0
+        if not spin:
+            all_plain = gains
+        found += [(gain - cost - threshold * len(s), s, spin, gain) for s, gain in gains.items()]
+    found.sort(key=lambda f: (-f[0], len(f[1])))
+    by_spin = dict(sets)
+    top = found[0][3]
+    for value, subset, spin, gain in found:
+        plain = all_plain.get(tuple(sorted({*subset, p.coefficient} - {None}))[:LARGEST_SUBSET], -np.inf)
+        if _holds(by_spin[spin], subset, gain, trial, threshold, spin, prior, top, plain):
+            break
+    scores = by_spin[spin]
+    theta = evidence.solve(scores, (*subset, *scores.always))
+    error = np.sqrt(np.diagonal(evidence.sandwich(scores, (*subset, *scores.always))))
+    magnus = None
+    if spin:
+        prior = SpinPrior(theta[len(subset) : len(subset) + 3], prior.std)
+        magnus = None if p.coefficient is None else float(theta[-1])
+    groups = tuple(_group(scores, subset, i, gain, trial, _candidates(p, trial, spin, None if prior is None else prior.std)) for i in range(len(subset)))
+    others = tuple((s, sp, g) for v, s, sp, g in found[:200] if (s, sp) != (subset, spin))[:8]
+    return Choice(
+        subset, spin, theta[: len(subset)], error[: len(subset)], gain, prior if spin else None, magnus,
+        threshold, groups, others
+    )
+
+
+def _candidates(p, trial: Trial, spin: bool, std) -> tuple[int, ...]:
+    ok = visible(p, trial, spin, np.full(3, 30.0) if spin and std is None else std)
+    bent = {p.coefficient} if spin else {i for i, e in enumerate(trial.effects) if e.needs_spin and trial.spinning}
+    return tuple(int(i) for i in np.flatnonzero(ok) if i not in bent)
+
+
+def _holds(
+    scores: Scores, subset, gain: float, trial: Trial, threshold: float, spin: bool, prior, top: float, plain: float
+) -> bool:
+    """Every member passes the gate of evidence. (Members too small to matter stay in the model without being named.)"""
+    if spin and trial.spin == "none":
+        rms = float(np.sqrt(np.mean(prior.std**2 + prior.mean**2))) * np.sqrt(3.0)
+        if rms * trial.spin_shift < FLOOR or gain - plain < SPIN_GAIN:
+            return False
+    if not subset:
+        return True
+    theta = evidence.solve(scores, (*subset, *scores.always))
+    error = np.sqrt(np.diagonal(evidence.sandwich(scores, (*subset, *scores.always))))
+    for i, j in enumerate(subset):
+        rest = subset[:i] + subset[i + 1 :]
+        brought = gain - evidence.gain(scores, rest)
+        if abs(theta[i]) < LEAST_Z * error[i]:
+            return False
+        if brought < max(threshold, LEAST_SHARE * top):
+            return False
+        if theta[i] < trial.effects[j].low or abs(theta[i]) > WIDEST * trial.effects[j].scale:
+            return False
+    return True
+
+
+def _group(scores: Scores, subset, i: int, gain: float, trial: Trial, candidates) -> tuple[int, ...]:
+    """Effects that explain the data as well in place of member i, the member first."""
+    rest = subset[:i] + subset[i + 1 :]
+    fixed = [*rest, *scores.always]
+    member = subset[i]
+    others = [c for c in candidates if c not in subset]
+    if not others:
+        return (member,)
+    _, gram = evidence.unexplained_scores(scores, fixed, [member, *others])
+    cosine = np.abs(gram[0, 1:]) / np.sqrt(np.maximum(gram[0, 0] * np.diagonal(gram)[1:], 1e-300))
+    alike = []
+    for c, cos in zip(others, cosine):
+        substitute = tuple(sorted((*rest, c)))
+        if (cos > ALIKE or gain - evidence.gain(scores, substitute) < TIE) and cos > 0.5:
+            theta = evidence.solve(scores, (*substitute, *scores.always))[substitute.index(c)]
+            if theta >= trial.effects[c].low:
+                alike.append((-cos, c))
+    return (member, *(c for _, c in sorted(alike)))
