@@ -28,6 +28,7 @@ import numpy as np
 from tests.hidden import cases as drawing
 from tests.hidden import heldout, scoring
 from tests.hidden.cases import BallCase, Case
+from tests.hidden.records import append, read_lines
 from tests.hidden.sessions import draw_balls, measure
 from tests.hidden.write import write
 
@@ -96,7 +97,7 @@ def examine(case: Case, folder: Path) -> dict:
         verdict = diagnose(files, folder / "out", _options(case))
     except (Exception, SystemExit) as error:
         (folder / "error.txt").write_text(traceback.format_exc())
-        record |= {"outcome": "error", "verdict": "error", "answer": "error", "twins": {}, "error": repr(error)[:500]}
+        record |= {"outcome": "error", "verdict": "error", "answer": "error", "twins": {}, "error": f"{type(error).__name__}: {error}"[:500]}
         return record | {"seconds": time.perf_counter() - started}
     record |= {"seconds": time.perf_counter() - started, "cpu_seconds": time.process_time() - worked}
     truth = json.loads(sealed.read_text())
@@ -172,7 +173,7 @@ def by_itself(run: Callable[[], dict]) -> dict:
     try:
         return run()
     except (Exception, SystemExit) as error:
-        return {"error": repr(error)[:500]}
+        return {"error": f"{type(error).__name__}: {error}"[:500]}
 
 
 def _bar_rows(alone: dict[str, dict]) -> list[str]:
@@ -227,15 +228,6 @@ def summarise(records: list[dict], alone: dict[str, dict], baselines: list[dict]
     return text
 
 
-def read_lines(path: Path) -> list[dict]:
-    """Records of a JSONL file; a line cut short by an interruption is left out."""
-    records = []
-    for line in path.read_text().splitlines() if path.exists() else ():
-        with contextlib.suppress(json.JSONDecodeError):
-            records.append(json.loads(line))
-    return records
-
-
 def run_all(cases: list[Case], folder: Path, keep: bool, part: tuple[int, int] = (1, 1)) -> list[dict]:
     """Examines what is not yet in OUT/cases.jsonl, or every n-th case of it; returns the records of all that are done.
 
@@ -248,8 +240,7 @@ def run_all(cases: list[Case], folder: Path, keep: bool, part: tuple[int, int] =
     began = time.perf_counter()
     for i, case in enumerate(left):
         record = examine(case, folder / "cases" / case.name)
-        with path.open("a") as stream:
-            stream.write(json.dumps(record) + "\n")
+        append(path, record)
         if not keep:
             shutil.rmtree(folder / "cases" / case.name)
         remaining = (time.perf_counter() - began) / (i + 1) * (len(left) - i - 1)

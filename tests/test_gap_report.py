@@ -17,9 +17,10 @@ from PIL import Image
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt import gap, model
-from mjx_tt.gap import catalogue, plots, report, robot
+from mjx_tt.gap import catalogue, plots, report
 from mjx_tt.gap.dataset import Logs
-from mjx_tt.gap.robot import JointRecord
+from mjx_tt.gap.joint import JointRecord
+from mjx_tt.gap.joint.effects import NAMES
 from mjx_tt.gap.verdict import Cause, Estimate, Unexplained
 
 PLAY = {
@@ -331,11 +332,10 @@ def test_every_name_of_the_catalogue_has_words():
     names = (
         effects
         | {t.name for e in catalogue.EFFECTS for t in e.twins}
-        | set(catalogue.PADDLE)
-        | {"latency_jitter", "ball_latency"}
+        | {"latency_jitter"}
     )
-    assert names | set(robot.NAMES) == set(report.MEANING)
-    assert set(robot.NAMES) == set(report.ROBOT_CLAIMS)
+    assert names | set(NAMES) == set(report.MEANING)
+    assert set(NAMES) == set(report.ROBOT_CLAIMS)
     assert effects - {"magnus"} <= set(report.CLAIMS)
 
 

@@ -25,6 +25,7 @@ from tests import baselines, exam  # noqa: E402
 from tests.hidden import cases, heldout, robot, scoring  # noqa: E402
 from tests.hidden.cases import EFFECTS, Case  # noqa: E402
 from tests.hidden.invented import INVENTED  # noqa: E402
+from tests.hidden.records import append, read_lines  # noqa: E402
 from tests.hidden.sessions import INTERVAL, SIGMA, draw_balls, measure, shift, with_spin  # noqa: E402
 from tests.hidden.world import World, camera, fly, seen  # noqa: E402
 from tests.hidden.write import write  # noqa: E402
@@ -397,7 +398,9 @@ def test_the_table_counts_against_the_bars():
 def test_an_examination_goes_on_where_it_was(tmp_path):
     path = tmp_path / "cases.jsonl"
     path.write_text('{"key": "a"}\n{"key": "b"}\n{"key": "c", "ca')
-    assert [r["key"] for r in exam.read_lines(path)] == ["a", "b"]
+    assert [r["key"] for r in read_lines(path)] == ["a", "b"]
+    append(path, {"key": "d"})
+    assert [r["key"] for r in read_lines(path)] == ["a", "b", "d"]
     plan = exam.plan(["1", "2", "8"], 20, 0)
     assert plan == exam.plan(["1", "2", "8"], 20, 0)
     assert {c.kind for c in plan[:8]} == {"none", "noise", "single", "invented"}  # the kinds take turns

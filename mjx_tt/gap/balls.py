@@ -10,11 +10,11 @@ from scipy.stats import chi2, f as f_distribution
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.gap import blocks, evidence, jitter, noise, select
-from mjx_tt.gap.catalogue import EFFECTS
+from mjx_tt.gap.catalogue import AT_THE_PADDLE, EFFECTS
 from mjx_tt.gap.dataset import before_racket
-from mjx_tt.gap.linear import SPIN, BallProblem, Linear, Projected, Situation, fit_starts, project, remove, rows
+from mjx_tt.gap.linear import SPIN, BallProblem, Linear, Projected, Situation, fit_starts, project, rows
 from mjx_tt.gap.predict import Grid, grid
-from mjx_tt.gap.select import FLOOR, Choice, Trial
+from mjx_tt.gap.select import Choice, Trial
 from mjx_tt.model import SimModel
 
 FEWEST_SAMPLES = 15  # of a flight
@@ -52,6 +52,7 @@ class BallFindings:
     noise: noise.Noise
     projected: Projected
     findings: tuple[Finding, ...]
+    survivors: tuple[str, ...]  # names that hold beside what is unexplained; all of them where nothing is
     start0: np.ndarray  # (9, n) starts under the nominal model
     residual0: np.ndarray  # (3, T, n) [m] under the nominal model
     trajectories: tuple[Trajectory, ...]
@@ -126,7 +127,7 @@ def _diagnose(
     if "magnus" in gone and model.ball.flight.magnus_coefficient == 0.0:
         gone |= {"magnus_coefficient", "spin_decay"}  # without the force the nominal model has no use for either
     effects = tuple(e for e in EFFECTS if e.name not in gone)
-    fitted = tuple(e for e in effects if e.fit)
+    fitted = tuple(e for e in effects if e.fit and e.group != AT_THE_PADDLE)
     mode = spin if spin == "free" or any(e.name == "magnus" for e in effects) else "never"
     names = list(dict.fromkeys(t.session for t in kept))
     sessions = np.array([names.index(t.session) for t in kept])
@@ -173,10 +174,10 @@ def _diagnose(
     weight = noise.robust_weights(linear.residual, own_noise, g)
     p = project(linear, at, own_noise, weight, g, problem.coefficient)
     say("looking for what no entry explains")
-    findings = unexplained(linear, at, p, choice, g, sessions, age, names)
+    findings, survivors = unexplained(linear, at, p, choice, trial, g, sessions, age, names)
     seen = select.visible(p, trial, choice.spin, None if choice.prior is None else choice.prior.std)
     return BallFindings(
-        problem, at, linear, choice, trial, own_noise, p, findings, start0, residual0, tuple(kept), sessions, age, seen
+        problem, at, linear, choice, trial, own_noise, p, findings, survivors, start0, residual0, tuple(kept), sessions, age, seen
     )
 
 
@@ -196,7 +197,7 @@ def _close(a: np.ndarray, b: np.ndarray, trial: Trial) -> bool:
 
 
 def _shifts(linear: Linear, g: Grid) -> tuple[np.ndarray, float]:
-    """Median shift [m] of the last sample per unit of each effect, and per rad/s of spin.
+    """Median shift [m] of the last sample of the balls concerned, per unit of each effect and per rad/s of spin.
 
     Against a nominal flight from the same measured start: what the effect does to the first samples is carried along.
     """
@@ -207,7 +208,9 @@ def _shifts(linear: Linear, g: Grid) -> tuple[np.ndarray, float]:
     carried = np.einsum("kjn,jcn->kcn", early, linear.starts[:6][:, :, last, balls])
     end = linear.effects[:, :, last, balls] - carried
     spin = linear.starts[SPIN][:, :, last, balls]
-    return np.median(np.linalg.norm(end, axis=1), axis=1), float(np.median(np.linalg.norm(spin, axis=1)))
+    size = np.linalg.norm(end, axis=1)
+    concerned = [s[s > 1e-3 * s.max()] for s in size]
+    return np.array([np.median(s) if s.size else 0.0 for s in concerned]), float(np.median(np.linalg.norm(spin, axis=1)))
 
 
 def left_over(found: BallFindings) -> np.ndarray:
@@ -255,11 +258,11 @@ def _move(problem, start, theta, choice: Choice, noise_now, g: Grid) -> Situatio
 
 
 def unexplained(
-    linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid, sessions: np.ndarray, age: np.ndarray,
-    called: Sequence[str],
-) -> tuple[Finding, ...]:
-    """Blocks that stay significant beside the chosen causes, the most important first."""
-    out = []
+    linear: Linear, at: Situation, p: Projected, choice: Choice, trial: Trial, g: Grid, sessions: np.ndarray,
+    age: np.ndarray, called: Sequence[str],
+) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
+    """Blocks that stay significant beside the chosen causes, the most important first; names that hold beside it."""
+    out, holding = [], []
     chosen = list(choice.effects)
     if choice.magnus is not None:
         chosen.append(p.coefficient)
@@ -283,11 +286,28 @@ def unexplained(
         axis = int(np.argmax([np.percentile(np.abs(np.where(g.mask, pattern[a], 0.0)).max(axis=0), 90) for a in range(3)]))
         importance = np.abs(beta) * np.sqrt(np.maximum(np.diagonal(gram), 0.0))
         best = int(np.argmax(importance))
+        change = evidence.solve(scores, (*base, *extra))[: len(chosen)]
+        error = np.sqrt(np.diagonal(evidence.sandwich(scores, (*base, *extra))))[: len(chosen)]
+        holding.append(_holding(choice, trial, change, error))
         out.append(Finding(block.name, block.labels[best], block.directions[best] or "xyz"[axis], size, p_value, _explained(own, gram)))
     odd = _odd_balls(linear, at, p, choice, g)
     if odd is not None:
         out.append(odd)
-    return tuple(sorted(out, key=lambda f: -f.gain))
+        holding.append({trial.effects[j].name for j in choice.effects})
+    if not out:
+        return (), tuple(e.name for e in trial.effects) + ("magnus", "latency_jitter")
+    order = np.argsort([-f.gain for f in out])
+    return tuple(out[i] for i in order), tuple(holding[order[0]])
+
+
+def _holding(choice: Choice, trial: Trial, change: np.ndarray, error: np.ndarray) -> set[str]:
+    """Chosen effects that keep at least half of their size, and significance, when a block may take over from them."""
+    names = set()
+    for j, before, moved, e in zip(choice.effects, choice.theta, change, error):
+        now = before + moved
+        if abs(now) > select.LEAST_Z * e and 0.5 < now / before < 2.0:
+            names.add(trial.effects[j].name)
+    return names
 
 
 def _with_columns(linear: Linear, at: Situation, p: Projected, columns: np.ndarray, g: Grid) -> Projected:

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+AT_THE_PADDLE = "paddle"  # group of the effects that only a hit shows, with the joints' log beside the ball's
 Values = Mapping[str, float]  # of SimModel's leaves by dotted path
-FLIGHT, TABLE, SENSING = "ball.flight.", "ball.table.", "sensing."
+FLIGHT, TABLE, PADDLE, SENSING = "ball.flight.", "ball.table.", "ball.paddle.", "sensing."
 
 
 @dataclass(frozen=True)
@@ -111,19 +112,20 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("camera_rotation_y", "sensing", SENSING + "camera_rotation_y", 0.01, "rad", "the table's corners"),
     Effect("camera_rotation_z", "sensing", SENSING + "camera_rotation_z", 0.01, "rad", "the table's edges", fit=False),
     Effect("camera_distortion", "sensing", SENSING + "camera_distortion", 0.005, "1/m^2", "balls laid on the table's lines"),
+    Effect("paddle_restitution", "paddle", PADDLE + "restitution", 0.05, "1", "balls dropped on the clamped paddle"),
+    Effect("paddle_friction", "paddle", PADDLE + "tangential_gain", 0.1, "1", "spinning balls dropped on the clamped paddle"),
+    Effect("paddle_tilt", "paddle", PADDLE + "tilt", 0.02, "rad", "a protractor on the blade in the home pose"),
+    Effect("paddle_offset", "paddle", PADDLE + "offset", 0.005, "m", "a ruler from the flange to the blade"),
+    Effect(
+        "ball_latency", "paddle", "latency.ball_observation", 0.01, "s", "a light that the camera and a joint's log both see"
+    ),
     Effect(
         "tracker_smoothing", "sensing", SENSING + "smoothing", 0.008, "s", "a ball stopped by hand", step=0.006, low=0.0
     ),
 )  # fmt: skip
 BY_NAME = {effect.name: effect for effect in EFFECTS}
-# Effects of the catalogue that a log of the ball's positions alone cannot show, with what would.
+# What no log of the ball's positions shows, with why; the last one only without the joints' log.
 INVISIBLE = {
     "camera_rotation_z": "a turn about the vertical changes no flight; the table's edges show it",
     "ball_latency": "every flight looks the same later; the joint log at a paddle contact shows it",
-}
-PADDLE = {
-    "paddle_restitution": "paddle_restitution",
-    "paddle_friction": "paddle_friction",
-    "paddle_tilt": "paddle_tilt",
-    "paddle_offset": "paddle_offset",
 }

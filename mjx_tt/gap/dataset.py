@@ -17,7 +17,7 @@ import numpy as np
 from ballmodel.constants import BALL_RADIUS
 from ballmodel.importers.formats import read
 from ballmodel.trajectory import Trajectory
-from mjx_tt.gap.robot_data import JointRecord, read_robot_csv
+from mjx_tt.gap.joint import JointRecord, read_robot_csv
 
 GRAVITY_RANGE = (5.0, 15.0)  # [m/s^2] that a fall in metres and seconds may show
 BOUNCE_RANGE = (-0.05, 0.12)  # [m] height of the ball's centre at a bounce in the table frame

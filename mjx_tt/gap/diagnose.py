@@ -16,12 +16,15 @@ from scipy.stats import t as student
 from mjx_tt import model as models
 from mjx_tt.gap import design, evidence, heldout, jitter, select
 from mjx_tt.gap.balls import BallFindings, diagnose_balls, left_over
-from mjx_tt.gap.catalogue import BY_NAME, EFFECTS, INVISIBLE, PADDLE, SENSING, Effect
+from mjx_tt.gap.catalogue import AT_THE_PADDLE, BY_NAME, EFFECTS, INVISIBLE, SENSING, Effect
 from mjx_tt.gap.dataset import Logs
 from mjx_tt.gap.heldout import Prediction
-from mjx_tt.gap.joints import diagnose_joints
+from mjx_tt.gap.hits import HitFindings, diagnose_hits
+from mjx_tt.gap.joint import RobotFindings
+from mjx_tt.gap.joint import effects as joint_effects
+from mjx_tt.gap.joint.nominal import diagnose_joints
 from mjx_tt.gap.linear import REFERENCE_MAGNUS
-from mjx_tt.gap.robot import RobotFindings
+from mjx_tt.gap.paddle import joint_path
 from mjx_tt.gap.verdict import Cause, Estimate, Experiment, Unexplained, Verdict
 from mjx_tt.model import ModelFile, Range, SimModel
 
@@ -38,6 +41,7 @@ class Diagnosis:
     extended: ModelFile
     balls: BallFindings | None
     prediction: Prediction | None  # held-out errors ball by ball
+    hits: HitFindings | None  # the robot's hits, where balls and all joints were logged by one clock
     robot: RobotFindings | None
 
 
@@ -54,36 +58,41 @@ def diagnose(
     model = SimModel() if model is None else model
     if spin not in SPINS:
         raise ValueError(f"spin is {spin!r}, allowed are {', '.join(SPINS)}")
-    ball_names = {e.name for e in EFFECTS} | {t.name for e in EFFECTS for t in e.twins} | set(PADDLE) | {"latency_jitter"}
+    ball_names = {e.name for e in EFFECTS} | {t.name for e in EFFECTS for t in e.twins} | {"latency_jitter"}
     for name in without:
-        if name not in ball_names and not name.split(".")[-1] in _robot_effects():
-            raise ValueError(f"no effect {name!r} to leave out{models.nearest(name, ball_names | set(_robot_effects()))}")
+        if name not in ball_names and name.split(".")[-1] not in joint_effects.NAMES:
+            raise ValueError(f"no effect {name!r} to leave out{models.nearest(name, ball_names | set(joint_effects.NAMES))}")
     if not logs.balls and not logs.joints:
         raise ValueError("the logs hold neither balls nor joints")
     say = progress or (lambda text: None)
-    found = prediction = robot = None
+    found = prediction = hits = robot = None
     if logs.balls:
         found = diagnose_balls(logs.balls, model, spin, [n for n in without if n in ball_names], seed, say)
         say("predicting balls that were not used")
         prediction = heldout.predictions(found, seed)
+        if found.choice.spin and spin == "none" and heldout.held_out(prediction, seed).high < 0.0:
+            say("spin predicts unseen balls worse: once more without it")
+            names = [n for n in without if n in ball_names] + ["magnus"]
+            other = diagnose_balls(logs.balls, model, spin, names, seed, say)
+            prediction_of_other = heldout.predictions(other, seed)
+            if np.nanmedian(prediction_of_other.after) < np.nanmedian(prediction.after):
+                found, prediction = other, prediction_of_other
+        say("judging the robot's hits")
+        hits = diagnose_hits(found, logs.balls, joint_path(logs.joints), without)
     if logs.joints:
         robot = diagnose_joints(logs.joints, model, seed, [n for n in without if n not in ball_names], say)
-    verdict, values, ranges = _verdict(found, prediction, robot, without, seed, say)
+    verdict, values, ranges = _verdict(found, prediction, hits, robot, without, seed, say)
+    if verdict.verdict in ("unexplained", "undetermined") and not (verdict.held_out and verdict.held_out.low > 0.0):
+        values, ranges = {}, []  # names that are not to be relied on change the model only if they predict better
     extended = ModelFile(
         models.with_values(model, values), tuple(ranges) if randomise else (),
         {**(provenance or {}), "logs": logs.sources, "verdict": verdict.verdict,
          "causes": {c.name: {p: [e.estimate, e.low, e.high] for p, e in c.parameters.items()} for c in verdict.causes}},
     )  # fmt: skip
-    return Diagnosis(verdict, extended, found, prediction, robot)
+    return Diagnosis(verdict, extended, found, prediction, hits, robot)
 
 
-def _robot_effects() -> tuple[str, ...]:
-    from mjx_tt.gap.robot import NAMES
-
-    return tuple(NAMES) + ("observation_delay",)
-
-
-def _verdict(found, prediction, robot, without, seed, say) -> tuple[Verdict, dict, list[Range]]:
+def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdict, dict, list[Range]]:
     causes: list[Cause] = []
     values: dict[str, float] = {}
     ranges: list[Range] = []
@@ -97,9 +106,16 @@ def _verdict(found, prediction, robot, without, seed, say) -> tuple[Verdict, dic
     if found is not None:
         say("confidence and intervals")
         causes, values, ranges = _ball_causes(found, without, seed)
-        hidden, excited = _unseen(found, without)
+        hidden, excited = _unseen(found, hits, without)
+        if hits is not None:
+            for cause, change, ends in _hit_causes(found, hits):
+                causes.append(cause)
+                values |= change
+                ranges += ends
         undetermined = _undetermined(found)
         if found.findings:
+            # A name that does not outlive the block beside it was a stand-in for what has none.
+            causes = [c for c in causes if c.name in found.survivors]
             top = found.findings[0]
             unexplained = Unexplained(top.block, top.where, top.direction, f"{1e3 * top.size:.1f} mm")
         held = heldout.held_out(prediction, seed)
@@ -204,6 +220,21 @@ def _ball_causes(found: BallFindings, without, seed: int) -> tuple[list[Cause], 
     return causes, values, ranges
 
 
+def _hit_causes(found: BallFindings, hits: HitFindings) -> list[tuple[Cause, dict, list[Range]]]:
+    """Causes at the paddle with the leaves and ranges that express them."""
+    nominal, out = found.problem.nominal, []
+    quantile = float(student.ppf(0.5 + LEVEL / 2, max(hits.hits - 6, 5)))
+    for c in hits.causes:
+        low, high = c.change - quantile * c.error, c.change + quantile * c.error
+        text = "; ".join(f"{e.name}: {e.reading}" for e in (c.effect, *c.rivals)) if c.rivals else ""
+        parameters = _parameters(c.effect, nominal, c.change, low, high)
+        sure = float(1.0 - 2.0 * student.sf(abs(c.change) / c.error, max(hits.hits - 6, 5)))
+        cause = Cause(c.effect.name, (c.effect.name, *(e.name for e in c.rivals)), sure, parameters, 1e3 * c.shift, text)
+        values = {path: e.estimate for path, e in parameters.items()}
+        out.append((cause, values, [Range(path, e.low, e.high) for path, e in parameters.items()]))
+    return out
+
+
 def _parameters(effect: Effect, nominal, theta, low, high) -> dict[str, Estimate]:
     out = {}
     for path, value in effect.values(nominal, theta).items():
@@ -276,15 +307,17 @@ def _confidence(found: BallFindings, seed: int) -> list[float]:
     return [float(h) / BOOTSTRAP for h in hits]
 
 
-def _unseen(found: BallFindings, without) -> tuple[list[str], list[str]]:
+def _unseen(found: BallFindings, hits: HitFindings | None, without) -> tuple[list[str], list[str]]:
     """Effects that no ball log shows, and effects that these balls do not excite."""
-    hidden = [f"{name}: {why}" for name, why in INVISIBLE.items() if name not in without]
+    invisible = {n: why for n, why in INVISIBLE.items() if n not in without and not (hits is not None and n == "ball_latency")}
+    hidden = [f"{name}: {why}" for name, why in invisible.items()]
     if found.problem.coefficient is not None and found.choice.spin:
         hidden.append("magnus_coefficient and spin: in flight only their product shows")
-    excited = [e.name for i, e in enumerate(found.trial.effects) if not found.seen[i] and e.name not in INVISIBLE]
+    excited = [e.name for i, e in enumerate(found.trial.effects) if not found.seen[i] and e.name not in invisible]
     if found.trial.spin == "none" and not found.choice.spin:
         excited = [name for name in excited if not BY_NAME[name].needs_spin]
-    return hidden, excited + [name for name in PADDLE if name not in without]
+    at_paddle = [e.name for e in EFFECTS if e.group == AT_THE_PADDLE and e.name not in without and e.name not in INVISIBLE]
+    return hidden, excited + (at_paddle if hits is None else list(hits.quiet))
 
 
 def _undetermined(found: BallFindings) -> bool:

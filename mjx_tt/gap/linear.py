@@ -8,7 +8,7 @@ again are compared on the same footing as those that keep it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -100,7 +100,8 @@ class BallProblem:
         transition = (state[:, :, 1:] - state[:, :, :1]) / START_STEPS[None, None, :6, None]
         residual = np.where(g.mask, g.measured - base, 0.0)
         one = Flown(*(x[..., :1, :] for x in (
-            flown.measured, flown.position, flown.velocity, flown.bounce_time, flown.bounce, flown.bounce_velocity
+            flown.measured, flown.position, flown.velocity, flown.bounce_time, flown.bounce, flown.bounce_velocity,
+            flown.hit_time,
         )))  # fmt: skip
         return Linear(residual, starts, effects, one, np.moveaxis(transition, (3, 1), (0, 1)))
 
@@ -164,7 +165,7 @@ def fit_starts(
 
     noise = nominal_noise(g) if noise is None else noise
     mask = g.mask if keep is None else g.mask & keep
-    g = Grid(g.steps, g.index, g.time, g.measured, mask)
+    g = replace(g, mask=mask)
     size = 6 if prior is None else 9
     damping = np.full(g.n, 1e-9)
     theta_v = np.repeat(theta[:, None], 1 + size, axis=1) if theta.ndim == 1 else theta[:, None]

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from mjx_tt.gap.balls import BallFindings, left_over
 from mjx_tt.gap.heldout import Prediction
-from mjx_tt.gap.robot import JointResidual, RobotFindings
+from mjx_tt.gap.joint import JointResidual, RobotFindings
 from mjx_tt.gap.verdict import Cause
 
 BEFORE, AFTER, INK, FAINT = "#c2410c", "#0b62a4", "#22272e", "#9aa3ad"

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ballmodel import flight
+from ballmodel.flight import PaddlePose
 from ballmodel.optional import value_or, without_nominal
 from ballmodel.state import BallState
 from ballmodel.trajectory import Trajectory
@@ -35,6 +36,7 @@ class Grid:
     time: np.ndarray  # (T, n) [s] since the first sample
     measured: np.ndarray  # (3, T, n) [m]
     mask: np.ndarray  # (T, n) True for a sample
+    paddle: PaddlePose | None = None  # the blade at the steps' ends, each quantity (3, L + 1, n)
 
     @property
     def n(self) -> int:
@@ -42,7 +44,8 @@ class Grid:
 
     def pick(self, which) -> Grid:
         """Some of the balls."""
-        return Grid(*(getattr(self, f)[..., which] for f in ("steps", "index", "time", "measured", "mask")))
+        paddle = self.paddle and jax.tree.map(lambda x: x[..., which], self.paddle)
+        return Grid(*(getattr(self, f)[..., which] for f in ("steps", "index", "time", "measured", "mask")), paddle)
 
 
 def grid(trajectories: Sequence[Trajectory]) -> Grid:
@@ -73,6 +76,7 @@ class Flown:
     bounce_time: np.ndarray  # (v, n) [s] of the first bounce since the first sample; inf without one
     bounce: np.ndarray  # (3, v, n) [m] where
     bounce_velocity: np.ndarray  # (3, v, n) [m/s] before it
+    hit_time: np.ndarray  # (v, n) [s] of the paddle's contact since the first sample; inf without one
 
 
 def heading_axes(velocity: np.ndarray) -> np.ndarray:
@@ -104,12 +108,13 @@ def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray
         return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, pad)], mode="edge") if pad else x
 
     steps, index = padded(g.steps), padded(g.index)
+    paddle = g.paddle and jax.tree.map(lambda x: np.moveaxis(padded(x), 1, 0)[:, :, None], g.paddle)
     with jax.enable_x64(True):
         for first in range(0, v, width):
             part = slice(first, min(first + width, v))
             extra = width - (part.stop - part.start) if v > width else 0
             chosen = {k: _widen(padded(x[part]), extra) for k, x in values.items()}
-            out = _fly(model, chosen, _widen(padded(start[:, part]), extra), steps, index)
+            out = _fly(model, chosen, _widen(padded(start[:, part]), extra), steps, index, paddle)
             keep = part.stop - part.start
             parts.append([np.asarray(x)[..., :keep, :n] for x in out])
     return Flown(*(np.concatenate(x, axis=-2) for x in zip(*parts)))
@@ -121,7 +126,8 @@ def _widen(x, extra: int):
 
 
 @jax.jit
-def _fly(model: SimModel, values: dict, start, steps, index):
+def _fly(model: SimModel, values: dict, start, steps, index, paddle):
+    nominal_latency = model.latency.ball_observation
     model = with_values(without_nominal(model), values)
     # What was measured flew on: a trial start that grazes the net must not be stopped by it.
     net = replace(model.ball.net, height=-1.0)
@@ -138,29 +144,41 @@ def _fly(model: SimModel, values: dict, start, steps, index):
         out = after - tau * slope + (filtered - before + tau * slope) * jnp.exp(-dt / tau)
         return jnp.where(dt > 0.0, out, filtered)
 
-    def advance(carry, dt):
-        state, filtered, elapsed, bounced, at, incoming = carry
+    # A ball that is stamped late meets the paddle of an earlier moment.
+    late = jnp.asarray(model.latency.ball_observation, start.dtype) - nominal_latency
+
+    def moved(pose):
+        turned = jnp.cross(pose.angular_velocity, pose.normal, axis=0)
+        return replace(pose, position=pose.position - late * pose.velocity, normal=pose.normal - late * turned)
+
+    def advance(carry, inputs):
+        state, filtered, elapsed, bounced, at, incoming, struck = carry
+        dt, *blade = inputs
         dt = dt / rate
-        new, events = flight.step(ball, state, dt)
+        pair = tuple(jax.tree.map(lambda x: jnp.broadcast_to(x, (3, *shape)), moved(pose)) for pose in blade) or None
+        new, events = flight.step(ball, state, dt, pair)
         moving = dt > 0.0
         new = jax.tree.map(lambda a, b: jnp.where(moving, a, b), new, state)
-        hit = events.table & moving & ~events.net
+        landed = events.table & moving
+        hit = landed | (events.paddle & moving)
         t = jnp.where(hit, events.time, dt)
         corner = jnp.where(hit, events.position, new.position)
         filtered = follow(follow(filtered, state.position, corner, t), corner, new.position, dt - t)
-        first = hit & (bounced == jnp.inf)
+        first = landed & (bounced == jnp.inf)
         bounced = jnp.where(first, (elapsed + t) * rate, bounced)
         at = jnp.where(first, events.position, at)
         incoming = jnp.where(first, state.velocity, incoming)
-        carry = (new, filtered, elapsed + dt, bounced, at, incoming)
+        struck = jnp.where(events.paddle & moving & (struck == jnp.inf), (elapsed + events.time) * rate, struck)
+        carry = (new, filtered, elapsed + dt, bounced, at, incoming, struck)
         return carry, (new.position, new.velocity, filtered)
 
     state = BallState(start[:3], start[3:6], start[6:])
     zero = jnp.zeros_like(start[0])
     # In steady motion the filter trails by tau v: it was running before the first sample.
     filtered = start[:3] - smoothing * start[3:6]
-    carry = (state, filtered, zero, zero + jnp.inf, start[:3] * 0.0, start[:3] * 0.0)
-    (_, _, _, bounced, at, incoming), (x, v, y) = jax.lax.scan(advance, carry, steps)
+    carry = (state, filtered, zero, zero + jnp.inf, start[:3] * 0.0, start[:3] * 0.0, zero + jnp.inf)
+    blades = () if paddle is None else tuple(jax.tree.map(lambda x: x[part], paddle) for part in (slice(None, -1), slice(1, None)))
+    (_, _, _, bounced, at, incoming, struck), (x, v, y) = jax.lax.scan(advance, carry, (steps, *blades))
 
     def sampled(first, later):
         every = jnp.moveaxis(jnp.concatenate([first[None], later]), 0, 1)  # (3, L + 1, v, n)
@@ -168,7 +186,7 @@ def _fly(model: SimModel, values: dict, start, steps, index):
 
     position, velocity = sampled(state.position, x), sampled(state.velocity, v)
     seen = jnp.where(smoothing > 0.0, sampled(filtered, y), position)
-    return _camera(sensing, seen), position, velocity, bounced, at, incoming
+    return _camera(sensing, seen), position, velocity, bounced, at, incoming, struck
 
 
 def _camera(sensing, p):

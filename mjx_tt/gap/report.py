@@ -231,6 +231,11 @@ CLAIMS: dict[str, tuple[str, str, str]] = {
     "camera_distortion": ("", "", "The camera distorts the picture, {instead}"),
     "latency_jitter": ("", "", "The time stamps of the ball's positions scatter by {value}"),
     "tracker_smoothing": ("", "", "The tracker smooths the ball's positions, time constant {instead}"),
+    "paddle_restitution": ("more", "less", "The paddle gives back {way} of the ball's speed than the model says, {instead}"),
+    "paddle_friction": ("more", "less", "The rubber grips {way} than the model says, tangential gain {instead}"),
+    "paddle_tilt": ("downwards", "upwards", "The blade looks {way} by {value}"),
+    "paddle_offset": ("ahead of", "behind", "The blade lies {way} where the model has it, by {size}"),
+    "ball_latency": ("later", "sooner", "The ball is measured {way} against the joints than the model says, {instead}"),
 }  # fmt: skip
 ROBOT_CLAIMS: dict[str, tuple[str, str, str]] = {
     "action_delay": ("later", "sooner", "acts {way} on a command than the model says, delay {instead}"),

@@ -15,6 +15,7 @@ from mjx_tt.gap.linear import Projected
 FLOOR = 0.003  # [m] shift of the last sample below which an effect is of no practical interest
 LEAST_GAIN = 14.0  # evidence that one more effect must bring at least
 SPIN_GAIN = 30.0  # and a spread of spins, which has six numbers
+MAGNUS_RANGE = (0.2, 2.0)  # of the coefficient k that any source reports, with a margin (0.3 to 1.5)
 LEAST_SHARE = 0.01  # of the whole gain that a member must bring: linearisation errors of a large effect are no cause
 WIDEST = 10.0  # scales of an effect beyond which it is no explanation: beside others it may be all but invisible
 LEAST_Z = 3.5  # estimate over its ball-to-ball standard error
@@ -132,6 +133,12 @@ def _holds(
         rms = float(np.sqrt(np.mean(prior.std**2 + prior.mean**2))) * np.sqrt(3.0)
         if rms * trial.spin_shift < FLOOR or gain - plain < SPIN_GAIN:
             return False
+        # Spin that bends flights without what the bounce does to spinning balls is another force under its name.
+        if len(scores.always) > 3:
+            k = evidence.solve(scores, (*subset, *scores.always))[-1]
+            error = np.sqrt(evidence.sandwich(scores, (*subset, *scores.always))[-1, -1])
+            if k + 2.0 * error < MAGNUS_RANGE[0] or k - 2.0 * error > MAGNUS_RANGE[1]:
+                return False
     if not subset:
         return True
     theta = evidence.solve(scores, (*subset, *scores.always))

@@ -119,7 +119,7 @@ EFFECTS: dict[str, Effect] = {
     ),
     "camera_distortion": Effect("camera_distortion", _plus, 0.004, _one("sensing.camera_distortion")),
     "latency_jitter": Effect("jitter", _plus, 0.005, _one("sensing.jitter"), (1,)),
-    "tracker_smoothing": Effect("smoothing", _plus, 0.0025, _one("sensing.smoothing"), (1,)),
+    "tracker_smoothing": Effect("smoothing", _plus, 0.008, _one("sensing.smoothing"), (1,)),
 }  # fmt: skip
 # Pairs whose effects on a log, the balls' states projected out, have a cosine above 0.97: measured with the generator's
 # own physics (tests/test_hidden.py). One of a pair in place of the other is a twin as the data can tell it.

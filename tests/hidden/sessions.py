@@ -177,7 +177,8 @@ def shift(world: World, balls: Balls, rng: np.random.Generator, step: float = 4e
     """Distance (B,) [m] of the last sample from the nominal flight with the same start, without noise.
 
     The start is what a perfect tracker sees: the camera's image of the true start and its velocity on the camera's
-    clock. Time-stamp errors and filtering come on top of it and count as they are.
+    clock. Time-stamp errors come on top of it and count as they are. Of a filter the constant delay shows in no log;
+    its shift is the largest distance from the unfiltered path at that delay, the corner cut at the bounce.
     """
     last = np.minimum(balls.samples - 1, 62) * INTERVAL
     flight = fly(world, balls.start, float(last.max() / np.min(world.clock_rate)) + 0.05, step)
@@ -189,6 +190,10 @@ def shift(world: World, balls: Balls, rng: np.random.Generator, step: float = 4e
     grid = np.arange(MOST)[:, None] * INTERVAL + 0.0 * last
     path = seen(world, flight, grid - world.jitter * rng.standard_normal(grid.shape))
     expected = nominal.at(grid)
+    if world.smoothing > 0.0:
+        late = seen(replace(world, smoothing=0.0), flight, grid - world.smoothing)
+        distance = np.sqrt(np.sum((path - late) ** 2, axis=0))
+        return np.nanmax(np.where(grid <= last + 1e-9, distance, 0.0), axis=0)
     valid = np.all(np.isfinite(path) & np.isfinite(expected), axis=0) & (grid <= last + 1e-9)
     final = np.where(valid, np.arange(MOST)[:, None], 0).max(axis=0)
     ball = np.arange(final.size)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from mjx_tt.gap.robot import JointResponse, diagnose_robot
-from mjx_tt.gap.robot_data import JointRecord, read_robot_folder
+from mjx_tt.gap.joint import JointRecord, JointResponse, diagnose_robot, read_robot_csv
 
 DT = 2e-4
 NOMINAL = JointResponse(action_delay=0.071, observation_delay=0.029)
@@ -223,6 +223,15 @@ def test_calls_an_effect_outside_the_catalogue_unexplained():
         assert findings.unexplained["size"] > 1.0  # mrad
 
 
+def test_calls_disturbances_now_and_then_unexplained():
+    record = slow()
+    since = record.state_time[:, None] - [3.0, 7.0, 12.0]
+    pushed = record.state_position + 0.03 * ((since > 0.0) & (since < 0.3)).any(axis=1)
+    findings = diagnose(replace(record, state_position=pushed))
+    assert findings.causes == () and "moments" in findings.unexplained["block"]
+    assert findings.unexplained["size"] > 3.0  # mrad
+
+
 def test_calls_a_cause_left_out_of_the_catalogue_unexplained(singles):
     record = singles[0][EFFECTS.index("velocity_limit")]
     findings = diagnose(record, without=["joint_2.velocity_limit"])
@@ -286,6 +295,8 @@ def test_refuses_what_it_does_not_know():
             diagnose_robot(*arguments)
     with pytest.raises(ValueError, match="lag must not be negative"):
         JointResponse(lag=-0.1)
+    with pytest.raises(ValueError, match="no joint 'joint_9'; joints are gantry_x"):
+        replace(record, joint="joint_9")
 
 
 def rows(time, values):
@@ -302,7 +313,8 @@ def test_reads_a_pair_of_files_and_names_what_is_wrong(tmp_path):
     commands = rows(record.command_time, record.command_velocity)
     states = rows(record.state_time, record.state_position)
     write(tmp_path, commands, states)
-    (read,) = read_robot_folder(tmp_path)
+    files = tmp_path / "command.csv", tmp_path / "state.csv"
+    (read,) = read_robot_csv(*files)
     np.testing.assert_array_equal(read.state_position, record.state_position)
     np.testing.assert_array_equal(read.command_time, record.command_time)
     degrees = rows(record.state_time, np.degrees(record.state_position))
@@ -318,7 +330,7 @@ def test_reads_a_pair_of_files_and_names_what_is_wrong(tmp_path):
     ):
         write(tmp_path, bad_commands, bad_states)
         with pytest.raises(ValueError, match=message):
-            read_robot_folder(tmp_path)
+            read_robot_csv(*files)
     write(tmp_path, commands, states, "time,joint,velocity")
     with pytest.raises(ValueError, match=r"no column \['t'\]"):
-        read_robot_folder(tmp_path)
+        read_robot_csv(*files)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 
-from mjx_tt.gap.robot import JointResponse, RobotFindings, diagnose_robot
-from mjx_tt.gap.robot_data import JointRecord
+from mjx_tt.gap.joint.diagnose import diagnose_robot
+from mjx_tt.gap.joint.findings import RobotFindings
+from mjx_tt.gap.joint.records import JointRecord
+from mjx_tt.gap.joint.response import JointResponse
 from mjx_tt.model import SimModel
 from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,8 +25,9 @@ SHORTEST = 1.0  # [s] of common time of commands and states that can tell anythi
 class JointRecord:
     """Commands and states of one joint, on one clock.
 
-    Raises ValueError, naming the joint, for arrays that do not match, numbers that are not finite, time that does not
-    increase, fewer than SHORTEST seconds of states after the first command, and numbers too large to be SI units.
+    Raises ValueError, naming the joint, for a joint that is not in JOINT_NAMES, arrays that do not match, numbers that
+    are not finite, time that does not increase, fewer than SHORTEST seconds of states after the first command, and
+    numbers too large to be SI units.
     """
 
     joint: str
@@ -37,6 +37,8 @@ class JointRecord:
     state_position: np.ndarray  # (m,) [rad], a gantry axis [m]
 
     def __post_init__(self) -> None:
+        if self.joint not in JOINT_NAMES:
+            raise ValueError(f"no joint {self.joint!r}; joints are {', '.join(JOINT_NAMES)}")
         for name in ("command_time", "command_velocity", "state_time", "state_position"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
         for kind, values in (("command", self.command_velocity), ("state", self.state_position)):
@@ -62,10 +64,9 @@ class JointRecord:
                 f"are wanted (commands {self.command_time[0]:.3f}..{self.command_time[-1]:.3f}, "
                 f"states {self.state_time[0]:.3f}..{self.state_time[-1]:.3f}: one clock?)"
             )
-        if self.joint in JOINT_NAMES:
-            i = JOINT_NAMES.index(self.joint)
-            _check_size(self.joint, "velocity", self.command_velocity, FASTEST * LIMITS.velocity[i])
-            _check_size(self.joint, "position", self.state_position, WIDEST * max(-LIMITS.lower[i], LIMITS.upper[i]))
+        i = JOINT_NAMES.index(self.joint)
+        _check_size(self.joint, "velocity", self.command_velocity, FASTEST * LIMITS.velocity[i])
+        _check_size(self.joint, "position", self.state_position, WIDEST * max(-LIMITS.lower[i], LIMITS.upper[i]))
         _check_units(self)
 
 
@@ -150,17 +151,3 @@ def read_robot_csv(command: str | os.PathLike, state: str | os.PathLike) -> tupl
         except ValueError as error:
             raise ValueError(f"{command}, {state}: {error}") from None
     return tuple(records)
-
-
-def read_robot_folder(folder: str | os.PathLike) -> tuple[JointRecord, ...]:
-    """``read_robot_csv`` of ``command.csv`` and ``state.csv`` in a folder."""
-    return read_robot_csv(Path(folder) / "command.csv", Path(folder) / "state.csv")
-
-
-def merge_names(records: Sequence[JointRecord]) -> tuple[str, ...]:
-    """Joints of the records. Raises ValueError when one occurs twice: one joint, one record."""
-    names = tuple(record.joint for record in records)
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"{', '.join(twice)}: more than one record; join the logs of one joint in order of time first")
-    return names
