@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import warnings
 from pathlib import Path
@@ -459,7 +460,9 @@ def _most_devices(configs) -> int | None:
 def _start_jax(devices: int | None) -> None:
     from mjx_tt import platform
 
-    platform.configure(devices)
+    # Called from a process that runs JAX already, a command takes the devices that are there.
+    with contextlib.suppress(RuntimeError):
+        platform.configure(devices)
     # JAX warns of every fork, but git and ffmpeg are started by fork and exec at once, which its threads do not mind.
     warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
 
