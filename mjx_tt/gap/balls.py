@@ -24,8 +24,8 @@ ROUNDS = 4  # of choosing and linearising again
 BLOCK_LEVEL = 2e-5  # chance of one block's false alarm
 BLOCK_FLOOR = 0.0025  # [m] shift that a block must cause on the balls it concerns
 VISIBLE_FLOOR = 2e-4  # [m] rms of what of it no other start of the ball could imitate, on one ball in twenty
-ODD_LEVEL = 1e-6  # chance with which one ball is called odd
-ODD_SHARE = 0.015  # of the balls that may be odd (mis-tracked) before they are a finding
+ODD_LEVEL = 1e-5  # chance with which one ball is called odd
+ODD_SHARE = 0.01  # of the balls that may be odd (mis-tracked) before they are a finding
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from ballmodel.trajectory import Trajectory
 from mjx_tt.model import SimModel, paths, with_values
 
 LONGEST_STEP = 0.01  # [s]; second order: 0.05 mm over a flight
-PAD = 16  # numbers of balls and steps are rounded up to it, so that similar logs share one compiled program
-CHUNK = 16_384  # balls x variants in one call
+PAD = 16  # numbers of steps are rounded up to it, so that similar logs share one compiled program
+WIDTH = 2048  # columns, balls x variants, of one call: always the same, for the same reason
 
 
 @dataclass(frozen=True)
@@ -98,35 +98,27 @@ def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray
     """
     start = np.concatenate([start[:6], np.einsum("can,avn->cvn", axes, start[6:])])
     v, n = start.shape[1:]
-    values = {k: np.broadcast_to(np.asarray(x, np.float64), (v, n)) for k, x in values.items()}
-    values = {k: values[k] for k in sorted(values)}
-    pad = -n % PAD
-    width = max(1, CHUNK // (n + pad))
+    ball = np.tile(np.arange(n), v)  # column -> ball
+    flat = {k: np.broadcast_to(np.asarray(values[k], np.float64), (v, n)).ravel() for k in sorted(values)}
+    columns = start.reshape(9, -1)
     parts = []
-
-    def padded(x):
-        return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, pad)], mode="edge") if pad else x
-
-    steps, index = padded(g.steps), padded(g.index)
-    paddle = g.paddle and jax.tree.map(lambda x: np.moveaxis(padded(x), 1, 0)[:, :, None], g.paddle)
     with jax.enable_x64(True):
-        for first in range(0, v, width):
-            part = slice(first, min(first + width, v))
-            extra = width - (part.stop - part.start) if v > width else 0
-            chosen = {k: _widen(padded(x[part]), extra) for k, x in values.items()}
-            out = _fly(model, chosen, _widen(padded(start[:, part]), extra), steps, index, paddle)
-            keep = part.stop - part.start
-            parts.append([np.asarray(x)[..., :keep, :n] for x in out])
-    return Flown(*(np.concatenate(x, axis=-2) for x in zip(*parts)))
-
-
-def _widen(x, extra: int):
-    """The last variant repeated, so that every call has one shape."""
-    return np.concatenate([x, np.repeat(x[..., -1:, :], extra, axis=-2)], axis=-2) if extra else x
+        for first in range(0, v * n, WIDTH):
+            # The last call is filled up with its last column: one shape, one compiled program.
+            mine = np.minimum(np.arange(first, first + WIDTH), v * n - 1)
+            some = ball[mine]
+            paddle = g.paddle and jax.tree.map(lambda x: np.moveaxis(x[..., some], 1, 0), g.paddle)
+            every, *rest = _fly(model, {k: x[mine] for k, x in flat.items()}, columns[:, mine], g.steps[:, some], paddle)
+            index = g.index[None, :, some]
+            sampled = [np.take_along_axis(np.asarray(x), index, axis=1) for x in every]
+            keep = min(WIDTH, v * n - first)
+            parts.append([x[..., :keep] for x in (*sampled, *map(np.asarray, rest))])
+    joined = (np.concatenate(x, axis=-1) for x in zip(*parts))
+    return Flown(*(x.reshape(*x.shape[:-1], v, n) for x in joined))
 
 
 @jax.jit
-def _fly(model: SimModel, values: dict, start, steps, index, paddle):
+def _fly(model: SimModel, values: dict, start, steps, paddle):
     nominal_latency = model.latency.ball_observation
     model = with_values(without_nominal(model), values)
     # What was measured flew on: a trial start that grazes the net must not be stopped by it.
@@ -180,13 +172,12 @@ def _fly(model: SimModel, values: dict, start, steps, index, paddle):
     blades = () if paddle is None else tuple(jax.tree.map(lambda x: x[part], paddle) for part in (slice(None, -1), slice(1, None)))
     (_, _, _, bounced, at, incoming, struck), (x, v, y) = jax.lax.scan(advance, carry, (steps, *blades))
 
-    def sampled(first, later):
-        every = jnp.moveaxis(jnp.concatenate([first[None], later]), 0, 1)  # (3, L + 1, v, n)
-        return jnp.take_along_axis(every, index[None, :, None, :], axis=1)
+    def whole(first, later):
+        return jnp.moveaxis(jnp.concatenate([first[None], later]), 0, 1)  # (3, L + 1, ...)
 
-    position, velocity = sampled(state.position, x), sampled(state.velocity, v)
-    seen = jnp.where(smoothing > 0.0, sampled(filtered, y), position)
-    return _camera(sensing, seen), position, velocity, bounced, at, incoming, struck
+    position, velocity = whole(state.position, x), whole(state.velocity, v)
+    seen = jnp.where(smoothing > 0.0, whole(filtered, y), position)
+    return (_camera(sensing, seen), position, velocity), bounced, at, incoming, struck
 
 
 def _camera(sensing, p):
