@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from experiments import build, evaluate, policy, session_logs, train
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, checked
 from experiments.runs import Run
 from mjx_tt import gap, model
 from mjx_tt.gap import report
@@ -52,9 +52,9 @@ def read_logs(paths: Sequence[str]) -> gap.Logs:
 
 
 def diagnose(request: Request, console: Console) -> gap.Diagnosis:
-    """Runs the diagnosis and writes its files. Raises ValueError for bad logs before anything is written."""
-    nominal = model.load(request.model) if request.model else ModelFile(model.SimModel())
-    logs = read_logs(request.logs)
+    """Runs the diagnosis and writes its files. Raises ConfigError for bad logs before anything is written."""
+    nominal = checked("", model.load, request.model) if request.model else ModelFile(model.SimModel())
+    logs = checked("", read_logs, request.logs)
     balls, joints = len(logs.balls), len(logs.joints)
     console.print(
         f"{balls} trajectories, {joints} joints from {', '.join(str(p) for p in request.logs)}", highlight=False
@@ -67,10 +67,10 @@ def diagnose(request: Request, console: Console) -> gap.Diagnosis:
     provenance = {"made_by": "mjx-tt diagnose", "model": request.model or "nominal", "seed": request.seed, "spin": request.spin}
     if request.model:
         provenance["model_sha256"] = hashlib.sha256(Path(request.model).read_bytes()).hexdigest()
-    found = gap.diagnose(
-        logs, nominal.model, request.spin, tuple(request.without), request.seed, say, provenance, request.randomise
-    )
-    return found
+    return checked(
+        ", ".join(request.logs), gap.diagnose, logs, nominal.model, request.spin, tuple(request.without), request.seed, say,
+        provenance, request.randomise,
+    )  # fmt: skip
 
 
 def play(
