@@ -17,8 +17,9 @@ from PIL import Image
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt import gap, model
-from mjx_tt.gap import catalogue, plots, report
+from mjx_tt.gap import catalogue, plots, report, words
 from mjx_tt.gap.dataset import Logs
+from mjx_tt.gap.hits import HitCause, HitFindings
 from mjx_tt.gap.joint import JointRecord
 from mjx_tt.gap.joint.effects import NAMES
 from mjx_tt.gap.verdict import Cause, Estimate, Unexplained
@@ -166,7 +167,7 @@ def test_sections_follow_the_readers_questions(windy_page):
 
 
 def test_sentence_names_the_cause_with_its_direction_and_size(windy, windy_page):
-    text = report.sentence(windy)
+    text = words.sentence(windy)
     assert windy.verdict.verdict == "named" and [c.name for c in windy.verdict.causes] == ["wind_x"]
     assert text.startswith("The air moves sideways, towards -x, at 0.3") and "named wind_x" in text
     low, high = (float(x) for x in text.split("(")[1].split(")")[0].split(" to "))
@@ -205,13 +206,13 @@ def test_curve_is_the_plain_quantile_of_each_bin():
 
 def test_smallest_visible_effect_falls_with_more_balls(windy):
     """Half the balls hold half the information: what shows grows by the square root of two, up to its own scatter."""
-    all_of_them = report.detectable(windy.balls)
+    all_of_them = words.detectable(windy.balls)
     assert set(all_of_them) >= {"table_restitution", "wind_y", "camera_scale"} and "wind_x" not in all_of_them
     p = windy.balls.projected
     half = replace(
         p, **{name: getattr(p, name)[::2] for name in ("gram", "right", "spin_gram", "spin_effect", "spin_right")}
     )
-    fewer = report.detectable(replace(windy.balls, projected=half))
+    fewer = words.detectable(replace(windy.balls, projected=half))
     ratio = [fewer[n] / all_of_them[n] for n in all_of_them if math.isfinite(all_of_them[n] + fewer[n])]
     assert 1.2 < np.median(ratio) < 1.7
 
@@ -228,7 +229,7 @@ def test_verdicts_validate_against_the_schema(windy, joints, tmp_path):
 
 def test_joints_are_named_and_drawn(joints, tmp_path):
     assert "joint_2.action_delay" in [c.name for c in joints.verdict.causes]
-    assert "joint_2 acts later on a command than the model says, delay 131" in report.sentence(joints)
+    assert "joint_2 acts later on a command than the model says, delay 131" in words.sentence(joints)
     page, files = written(tmp_path, joints)
     assert [f.name for f in files[1:]] == ["residuals_joints.png", "parameters.png", "held_out_joints.png"]
     assert "joint_2.action_delay" in page.sections["Parameters"] and "ball" not in page.sections["Data and noise"]
@@ -240,7 +241,7 @@ def test_nothing_wrong_says_what_would_have_been_seen(windy, tmp_path):
     path = "ball.flight.wind_x"
     right = gap.diagnose(Logs(flights(-WIND), (), {}), model.with_values(model.SimModel(), {path: -WIND}))
     assert right.verdict.verdict == "none"
-    text = report.sentence(right)
+    text = words.sentence(right)
     assert "agrees with 60 balls" in text and "mm" in text
     page, files = written(tmp_path, right)
     assert "not the nominal" not in page.text and "held_out.png" not in [f.name for f in files]
@@ -250,7 +251,7 @@ def test_nothing_wrong_says_what_would_have_been_seen(windy, tmp_path):
 def test_unexplained_says_where_and_how_much(windy, joints, tmp_path):
     odd = Unexplained("bounce over x", "x near -0.18 m", "z", "12.8 mm")
     v = replace(windy.verdict, verdict="unexplained", unexplained=odd)
-    text = report.sentence(replace(windy, verdict=v))
+    text = words.sentence(replace(windy, verdict=v))
     for part in (
         "no entry of the catalogue",
         "bounce that changes with x",
@@ -262,9 +263,55 @@ def test_unexplained_says_where_and_how_much(windy, joints, tmp_path):
     ):
         assert part in text
     subset = replace(v, unexplained=Unexplained("a subset of the balls", "5 of 60 balls", "z", "40.0 mm"))
-    assert "5 of 60 balls fly unlike the others" in report.sentence(replace(windy, verdict=subset))
+    assert "5 of 60 balls fly unlike the others" in words.sentence(replace(windy, verdict=subset))
     page, _ = written(tmp_path, replace(joints, verdict=v))
     assert ("span", {"class": "badge unexplained"}) in page.tags
+
+
+def hit_findings(names=("paddle_offset",)) -> HitFindings:
+    """Forty hits whose returns are 20 mm ahead along the table and 0.3 m/s too slow upwards, and right afterwards."""
+    scatter = np.random.default_rng(2).normal(size=(6, 40)) * np.array([[2e-3] * 3 + [0.04] * 3]).T
+    scatter -= np.median(scatter, axis=1, keepdims=True)
+    off = np.array([0.0, 0.020, 0.0, 0.0, 0.0, -0.3])[:, None]
+    causes = tuple(HitCause(catalogue.BY_NAME[n], (), 0.012, 0.001, 0.04) for n in names)
+    return HitFindings(causes, 40, ("paddle_friction", "paddle_offset"), scatter + off, scatter if names else scatter + off)
+
+
+def test_hits_show_where_the_returns_lie_off(windy, windy_page, tmp_path):
+    page, files = written(tmp_path, replace(windy, hits=hit_findings()))
+    assert [h for h in page.sections if h][1:4] == ["Verdict", "The robot's hits", "Other explanations, and why they lost"]
+    assert {f.name for f in files} == {f.name for f in windy_page[1]} - {"play.png"} | {"hits.png"}
+    text = page.sections["The robot's hits"]
+    assert "40 hits were judged: they name paddle_offset (not in the verdict). With it, the typical return lies where" in text
+    rows = {}
+    for line in text.split("place x [mm]")[1].split("Medians")[0].replace("place", "|place").split("|"):
+        if line.startswith("place"):
+            rows[line[:12]] = [float(x) for x in line[12:].split("velocity")[0].replace("(", " ").replace(")", " ").split() if x != "to"]
+    assert rows["place y [mm]"][0] == 20.0 and rows["place z [mm]"][0] == 0.0
+    assert "velocity z [m/s]-0.30 (" in text
+    low, high = rows["place y [mm]"][1:3]
+    assert low < 20.0 < high and high - low < 3.0
+    cannot = text.split("What these hits could not show")[1]
+    assert "grip of the paddle" in cannot and "paddle_offset" not in cannot, "what is named was shown"
+
+
+def test_hits_that_name_nothing_have_one_state(windy, tmp_path):
+    quiet = replace(windy, hits=hit_findings(()))
+    page, _ = written(tmp_path, quiet)
+    text = page.sections["The robot's hits"]
+    assert "name nothing at the paddle, and the typical return lies off in place y +20.0 mm, velocity z -0.30 m/s." in text
+    assert "after: median" not in text and "place of the paddle" in text
+    nothing = words.sentence(replace(quiet, verdict=replace(windy.verdict, verdict="none", causes=())))
+    assert "40 hits name nothing at the paddle either; paddle_friction, paddle_offset they could not show" in nothing
+
+
+def test_interval_of_a_median_covers_it():
+    """By the binomial law at least 90 %: of twelve numbers the third to the tenth, of twenty the sixth to the fifteenth."""
+    assert plots.median_interval(np.arange(12.0, 0.0, -1.0)) == (6.5, 3.0, 10.0)
+    assert plots.median_interval(np.arange(1.0, 21.0)) == (10.5, 6.0, 15.0)
+    draws = np.random.default_rng(5).exponential(size=(2000, 31))
+    inside = [low <= math.log(2.0) <= high for _, low, high in map(plots.median_interval, draws)]
+    assert 0.90 <= np.mean(inside) < 0.96
 
 
 def test_cost_in_play(windy_page, joints, tmp_path):
@@ -279,7 +326,7 @@ def test_cost_in_play(windy_page, joints, tmp_path):
 def test_spin_in_plain_words():
     spin = {f"ball_spin.mean_{a}": Estimate(0.0, m, m - 2, m + 2, "rad/s") for a, m in zip("xyz", (60.0, 1.0, -3.0))}
     spin |= {f"ball_spin.std_{a}": Estimate(0.0, s, s - 1, s + 1, "rad/s") for a, s in zip("xyz", (12.0, 5.0, 5.0))}
-    text = report.claim(
+    text = words.claim(
         Cause(
             "magnus",
             ("magnus",),
@@ -324,7 +371,7 @@ def test_spin_in_plain_words():
     ],
 )
 def test_claims_in_plain_words(name, estimate, text):
-    assert text in report.claim(Cause(name, (name,), 1.0, {"a.parameter": estimate}, 10.0, ""))
+    assert text in words.claim(Cause(name, (name,), 1.0, {"a.parameter": estimate}, 10.0, ""))
 
 
 def test_every_name_of_the_catalogue_has_words():
@@ -334,9 +381,9 @@ def test_every_name_of_the_catalogue_has_words():
         | {t.name for e in catalogue.EFFECTS for t in e.twins}
         | {"latency_jitter"}
     )
-    assert names | set(NAMES) == set(report.MEANING)
-    assert set(NAMES) == set(report.ROBOT_CLAIMS)
-    assert effects - {"magnus"} <= set(report.CLAIMS)
+    assert names | set(NAMES) == set(words.MEANING)
+    assert set(NAMES) == set(words.ROBOT_CLAIMS)
+    assert effects - {"magnus"} <= set(words.CLAIMS)
 
 
 def test_a_failed_write_leaves_the_old_report(joints, tmp_path, monkeypatch):
@@ -358,4 +405,4 @@ def test_an_effect_below_the_floor_is_mentioned_but_not_named(windy):
     found = replace(
         windy, balls=replace(windy.balls, choice=tiny), verdict=replace(windy.verdict, verdict="none", causes=())
     )
-    assert "too small to matter, wind_x (1.2 mm)" in report.sentence(found)
+    assert "too small to matter, wind_x (1.2 mm)" in words.sentence(found)

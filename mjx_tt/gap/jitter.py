@@ -12,6 +12,7 @@ import numpy as np
 from mjx_tt.gap.predict import Grid
 
 LEAST_Z = 4.5
+OUTLIER = 30.0  # times the median square beyond which a sample counts no more: a Gaussian's never is
 LEAST_SHARE = 0.7  # of the noise along the flight beyond that across it which must grow with the speed's square
 
 
@@ -35,7 +36,7 @@ def find(left: np.ndarray, velocity: np.ndarray, g: Grid) -> Jitter | None:
     square = (mean**2).sum(axis=0)
     along = (step * mean).sum(axis=0) / np.sqrt(np.maximum(square, 1e-9))
     across = 0.5 * ((step**2).sum(axis=0) - along**2)
-    cap = 9.0 * np.median((step**2).sum(axis=0)[near])
+    cap = OUTLIER * np.median((step**2).sum(axis=0)[near])
     excess = np.where(near, np.minimum(along**2, cap) - np.minimum(across, cap), 0.0)
     count = near.sum(axis=0)
     design = np.stack([count, np.where(near, square, 0.0).sum(axis=0)])

@@ -15,9 +15,11 @@ import matplotlib.ticker
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.stats import binom
 
 from mjx_tt.gap.balls import BallFindings, left_over
 from mjx_tt.gap.heldout import Prediction
+from mjx_tt.gap.hits import HitFindings
 from mjx_tt.gap.joint import JointResidual, RobotFindings
 from mjx_tt.gap.verdict import Cause
 
@@ -272,6 +274,59 @@ def _joint(left: Axes, right: Axes, r: JointResidual) -> None:
         left.plot(time, values, color=colour, linewidth=0.7)
         _bands(right, curve(velocity, values, usual, 17), colour, light=True)
     left.set_xlim(0.0, time[-1])
+
+
+def median_interval(values: np.ndarray) -> tuple[float, float, float]:
+    """Median of (n,) values with the 90 % interval that their order gives, whatever their distribution (n >= 5)."""
+    ordered = np.sort(values)
+    k = int(binom.ppf(0.05, ordered.size, 0.5))
+    return float(np.median(ordered)), float(ordered[k - 1]), float(ordered[ordered.size - k])
+
+
+def hits(found: HitFindings) -> Figure:
+    """Place and velocity behind the paddle, measured minus predicted, hit by hit, before and after."""
+    same = not found.causes
+    kinds = ((found.before, UNCHANGED),) if same else ((found.before, BEFORE), (found.after, AFTER))
+    jitter = 0.5 * np.random.default_rng(0).uniform(-1.0, 1.0, found.hits)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(10.0, 3.6 if same else 4.6), layout="constrained")
+        for ax, first, factor, what in zip(
+            figure.subplots(1, 2), (0, 3), (1e3, 1.0), ("place at the hit [mm]", "velocity behind the paddle [m/s]")
+        ):
+            both = factor * np.concatenate([values[first : first + 3] for values, _ in kinds], axis=1)
+            # A few wild hits stay on the edge and do not flatten the rest.
+            low = min(float(np.percentile(both, 2, axis=1).min()), 0.0)
+            high = max(float(np.percentile(both, 98, axis=1).max()), 0.0)
+            margin = max(0.08 * (high - low), 1e-3)
+            low, high = low - margin, high + margin
+            for a in range(3):
+                for k, (values, colour) in enumerate(kinds):
+                    mine, row = factor * values[first + a], a if same else a + 0.4 * k - 0.2
+                    width = 0.5 if same else 0.3
+                    at = row + width * jitter
+                    wild = (mine < low) | (mine > high)
+                    ax.scatter(mine[~wild], at[~wild], s=13, color=colour, alpha=0.5, linewidth=0)
+                    for edge, out, marker in ((low, mine < low, "<"), (high, mine > high, ">")):
+                        ax.scatter(np.full(out.sum(), edge), at[out], s=18, marker=marker, color=colour, linewidth=0)
+                    middle, *ends = median_interval(mine)
+                    ax.plot(ends, [row, row], color=INK, linewidth=1.6, marker="|", markersize=11, zorder=4)
+                    ax.plot([middle], [row], "D", color=colour, markersize=6, markeredgecolor="white", zorder=5)
+            ax.axvline(0.0, color=INK, linewidth=0.9, zorder=1)
+            for border in (0.5, 1.5):
+                ax.axhline(border, color="#e6e9ed", linewidth=1.0, zorder=0)
+            ax.grid(axis="x", color="#e6e9ed", linewidth=0.7)
+            ax.set_xlim(low - 0.3 * margin, high + 0.3 * margin)
+            ax.set_ylim(2.5, -0.5)
+            ax.set_yticks(range(3), [f"{name}\n{MEANING[name]}" for name in AXES] if first == 0 else AXES)
+            ax.tick_params(axis="y", length=0)
+            ax.set_xlabel(f"measured $-$ predicted {what}")
+        if same:
+            labels = ["nothing named at the paddle: before and after alike"]
+        else:
+            labels = ["before: nominal paddle", "after: with what the hits name"]
+        dots = [ax.plot([], [], "D", color=colour, markersize=6)[0] for _, colour in kinds]
+        figure.legend(dots, labels, loc="outside upper left", ncols=2)
+    return figure
 
 
 def runners(names: Sequence[str], behind: Sequence[float], chosen: str) -> Figure:
