@@ -58,7 +58,8 @@ class BallFindings:
     trajectories: tuple[Trajectory, ...]
     sessions: np.ndarray
     age: np.ndarray
-    seen: np.ndarray  # (K,) bool: the data could show the effect
+    seen: np.ndarray  # (K,) bool: the data could show the effect, and it was not left out
+    imitated: tuple[str, ...]  # effects that were left out, each of which would replace two of the causes
 
 
 def flights(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
@@ -126,9 +127,9 @@ def _diagnose(
     gone = set(without)
     if "magnus" in gone and model.ball.flight.magnus_coefficient == 0.0:
         gone |= {"magnus_coefficient", "spin_decay"}  # without the force the nominal model has no use for either
-    effects = tuple(e for e in EFFECTS if e.name not in gone)
-    fitted = tuple(e for e in effects if e.fit and e.group != AT_THE_PADDLE)
-    mode = spin if spin == "free" or any(e.name == "magnus" for e in effects) else "never"
+    fitted = tuple(e for e in EFFECTS if e.fit and e.group != AT_THE_PADDLE and not (e.needs_spin and e.name in gone))
+    left_out = tuple(i for i, e in enumerate(fitted) if e.name in gone)
+    mode = "never" if spin == "none" and "magnus" in gone else spin
     names = list(dict.fromkeys(t.session for t in kept))
     sessions = np.array([names.index(t.session) for t in kept])
     age = np.zeros(len(kept))
@@ -150,7 +151,7 @@ def _diagnose(
         linear = problem.linearise(at)
         if trial is None:
             residual0 = linear.residual
-            trial = Trial(fitted, *_shifts(linear, g), mode, seed)
+            trial = Trial(fitted, *_shifts(linear, g), mode, seed, left_out=left_out)
             frame = noise.flight_frame(linear.base.velocity[:, :, 0])
         say(f"round {round_ + 1}: choosing")
         for _ in range(2 if own_noise is not None else 3):
@@ -175,9 +176,12 @@ def _diagnose(
     p = project(linear, at, own_noise, weight, g, problem.coefficient)
     say("looking for what no entry explains")
     findings, survivors = unexplained(linear, at, p, choice, trial, g, sessions, age, names)
-    seen = select.visible(p, trial, choice.spin, None if choice.prior is None else choice.prior.std)
+    std = None if choice.prior is None else choice.prior.std
+    seen = select.visible(p, trial, choice.spin, std)
+    seen[list(left_out)] = False
+    imitated = select.imitated(p, trial, choice)
     return BallFindings(
-        problem, at, linear, choice, trial, own_noise, p, findings, survivors, start0, residual0, tuple(kept), sessions, age, seen
+        problem, at, linear, choice, trial, own_noise, p, findings, survivors, start0, residual0, tuple(kept), sessions, age, seen, imitated,
     )
 
 

@@ -112,7 +112,9 @@ def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdic
                 causes.append(cause)
                 values |= change
                 ranges += ends
-        undetermined = _undetermined(found)
+        undetermined = _undetermined(found) or bool(found.imitated)
+        for name in found.imitated:
+            warnings.append(f"two of the causes together are just what {name} alone would look like, which was left out")
         if found.findings:
             # A name that does not outlive the block beside it was a stand-in for what has none.
             causes = [c for c in causes if c.name in found.survivors]
@@ -313,7 +315,10 @@ def _unseen(found: BallFindings, hits: HitFindings | None, without) -> tuple[lis
     hidden = [f"{name}: {why}" for name, why in invisible.items()]
     if found.problem.coefficient is not None and found.choice.spin:
         hidden.append("magnus_coefficient and spin: in flight only their product shows")
-    excited = [e.name for i, e in enumerate(found.trial.effects) if not found.seen[i] and e.name not in invisible]
+    out = {found.trial.effects[i].name for i in found.trial.left_out}
+    excited = [
+        e.name for i, e in enumerate(found.trial.effects) if not found.seen[i] and e.name not in invisible and e.name not in out
+    ]
     if found.trial.spin == "none" and not found.choice.spin:
         excited = [name for name in excited if not BY_NAME[name].needs_spin]
     at_paddle = [e.name for e in EFFECTS if e.group == AT_THE_PADDLE and e.name not in without and e.name not in INVISIBLE]

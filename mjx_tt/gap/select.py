@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -53,6 +54,7 @@ class Trial:
     spin_shift: float  # [m] the same per rad/s of spin
     spin: str  # "none": spin is a cause; "free": every ball may spin; "never": neither
     seed: int = 0
+    left_out: tuple[int, ...] = ()  # effects that may not be chosen
     spinning: bool = False  # linearised about spinning balls: effects that need spin mean nothing without it
 
 
@@ -121,8 +123,9 @@ def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
 
 def _candidates(p, trial: Trial, spin: bool, std) -> tuple[int, ...]:
     ok = visible(p, trial, spin, np.full(3, 30.0) if spin and std is None else std)
+    out = set(trial.left_out)
     bent = {p.coefficient} if spin else {i for i, e in enumerate(trial.effects) if e.needs_spin and trial.spinning}
-    return tuple(int(i) for i in np.flatnonzero(ok) if i not in bent)
+    return tuple(int(i) for i in np.flatnonzero(ok) if i not in bent and i not in out)
 
 
 def _holds(
@@ -173,3 +176,22 @@ def _group(scores: Scores, subset, i: int, gain: float, trial: Trial, candidates
             if theta >= trial.effects[c].low:
                 alike.append((-cos, c))
     return (member, *(c for _, c in sorted(alike)))
+
+
+def imitated(p: Projected, trial: Trial, choice: Choice) -> tuple[str, ...]:
+    """Effects that were left out and would explain the data as well as two of the chosen ones together.
+
+    A camera that is turned tilts gravity and the table alike; one of another scale changes gravity and drag. Two causes
+    whose sizes happen to stand in such a ratio are a coincidence that has to be told.
+    """
+    if not trial.left_out or len(choice.effects) < 2:
+        return ()
+    scores = evidence.with_spin(p, choice.prior.std) if choice.spin else evidence.without_spin(p)
+    whole = evidence.gain(scores, choice.effects)
+    names = []
+    for r in trial.left_out:
+        for i, j in combinations(choice.effects, 2):
+            rest = tuple(e for e in choice.effects if e not in (i, j))
+            if whole - evidence.gain(scores, tuple(sorted((*rest, r)))) < TIE + choice.threshold:  # one number less
+                names.append(trial.effects[r].name)
+    return tuple(dict.fromkeys(names))

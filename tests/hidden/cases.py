@@ -100,11 +100,12 @@ EFFECTS: dict[str, Effect] = {
     "gravity_scale": _gravity_effect("gravity_scale", "gravity_z", _times),
     "buoyancy": _gravity_effect("buoyancy", "buoyancy", lambda b, a: b - a, (-1,)),
     "clock_rate": _gravity_effect("clock_rate", "clock_rate", lambda c, a: c * (1 + a) ** -0.5),
+    # A ball that gains energy at the table does not exist: only less restitution, and less of it at speed.
     "table_restitution": Effect(
-        "restitution", _plus, 0.015, _one("ball.table.restitution", 0.93), kin=_others(_BOUNCE, "table_restitution")
+        "restitution", _plus, 0.015, _one("ball.table.restitution", 0.93), (-1,), kin=_others(_BOUNCE, "table_restitution")
     ),
     "table_restitution_speed": Effect(
-        "restitution_slope", _plus, 0.005, _one("ball.table.restitution_slope"), kin=("table_restitution",)
+        "restitution_slope", _plus, 0.005, _one("ball.table.restitution_slope"), (1,), kin=("table_restitution",)
     ),
     "table_friction": Effect("friction", _plus, 0.03, _one("ball.table.friction", 0.25)),
     "table_height": Effect("height", _plus, 0.005, _one("ball.table.height")),
