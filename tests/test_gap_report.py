@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
@@ -274,23 +275,23 @@ def hit_findings(names=("paddle_offset",)) -> HitFindings:
     scatter -= np.median(scatter, axis=1, keepdims=True)
     off = np.array([0.0, 0.020, 0.0, 0.0, 0.0, -0.3])[:, None]
     causes = tuple(HitCause(catalogue.BY_NAME[n], (), 0.012, 0.001, 0.04) for n in names)
-    return HitFindings(causes, 40, ("paddle_friction", "paddle_offset"), scatter + off, scatter if names else scatter + off)
+    quiet = ("paddle_friction", "paddle_offset")
+    return HitFindings(causes, 40, quiet, scatter + off, scatter if names else scatter + off)
 
 
 def test_hits_show_where_the_returns_lie_off(windy, windy_page, tmp_path):
     page, files = written(tmp_path, replace(windy, hits=hit_findings()))
-    assert [h for h in page.sections if h][1:4] == ["Verdict", "The robot's hits", "Other explanations, and why they lost"]
+    headings = [h for h in page.sections if h]
+    assert headings[1:4] == ["Verdict", "The robot's hits", "Other explanations, and why they lost"]
     assert {f.name for f in files} == {f.name for f in windy_page[1]} - {"play.png"} | {"hits.png"}
     text = page.sections["The robot's hits"]
-    assert "40 hits were judged: they name paddle_offset (not in the verdict). With it, the typical return lies where" in text
-    rows = {}
-    for line in text.split("place x [mm]")[1].split("Medians")[0].replace("place", "|place").split("|"):
-        if line.startswith("place"):
-            rows[line[:12]] = [float(x) for x in line[12:].split("velocity")[0].replace("(", " ").replace(")", " ").split() if x != "to"]
-    assert rows["place y [mm]"][0] == 20.0 and rows["place z [mm]"][0] == 0.0
-    assert "velocity z [m/s]-0.30 (" in text
-    low, high = rows["place y [mm]"][1:3]
-    assert low < 20.0 < high and high - low < 3.0
+    assert "40 hits were judged: they name paddle_offset (not in the verdict). With it, the typical return" in text
+    assert "lies where the model puts it" in text
+    number = r"([+-][0-9.]+)"
+    cells = rf"<td>place y \[mm\]</td><td class=n><b>{number}</b> \({number} to {number}\)</td>.*?<b>{number}</b>"
+    middle, low, high, after = map(float, re.search(cells, files[0].read_text(encoding="utf-8")).groups())
+    assert (middle, after) == (20.0, 0.0) and 18.5 < low < 20.0 < high < 21.5
+    assert "velocity z [m/s]-0.30 (" in text and "-0.0 " not in text
     cannot = text.split("What these hits could not show")[1]
     assert "grip of the paddle" in cannot and "paddle_offset" not in cannot, "what is named was shown"
 
@@ -299,14 +300,15 @@ def test_hits_that_name_nothing_have_one_state(windy, tmp_path):
     quiet = replace(windy, hits=hit_findings(()))
     page, _ = written(tmp_path, quiet)
     text = page.sections["The robot's hits"]
-    assert "name nothing at the paddle, and the typical return lies off in place y +20.0 mm, velocity z -0.30 m/s." in text
+    assert "name nothing at the paddle, and the typical return" in text
+    assert "lies off in place y +20.0 mm, velocity z -0.30 m/s." in text
     assert "after: median" not in text and "place of the paddle" in text
     nothing = words.sentence(replace(quiet, verdict=replace(windy.verdict, verdict="none", causes=())))
     assert "40 hits name nothing at the paddle either; paddle_friction, paddle_offset they could not show" in nothing
 
 
 def test_interval_of_a_median_covers_it():
-    """By the binomial law at least 90 %: of twelve numbers the third to the tenth, of twenty the sixth to the fifteenth."""
+    """By the binomial law: of twelve numbers the third to the tenth, of twenty the sixth to the fifteenth."""
     assert plots.median_interval(np.arange(12.0, 0.0, -1.0)) == (6.5, 3.0, 10.0)
     assert plots.median_interval(np.arange(1.0, 21.0)) == (10.5, 6.0, 15.0)
     draws = np.random.default_rng(5).exponential(size=(2000, 31))

@@ -78,7 +78,7 @@ def diagnose(
             if np.nanmedian(prediction_of_other.after) < np.nanmedian(prediction.after):
                 found, prediction = other, prediction_of_other
         say("judging the robot's hits")
-        hits = diagnose_hits(found, logs.balls, joint_path(logs.joints), without)
+        hits = diagnose_hits(found, logs.balls, joint_path(logs.joints, model), without)
     if logs.joints:
         robot = diagnose_joints(logs.joints, model, seed, [n for n in without if n not in ball_names], say)
     verdict, values, ranges = _verdict(found, prediction, hits, robot, without, seed, say)
@@ -106,6 +106,11 @@ def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdic
     if found is not None:
         say("confidence and intervals")
         causes, values, ranges = _ball_causes(found, without, seed)
+        if found.findings:
+            # A name that does not outlive the block beside it was a stand-in for what has none.
+            causes = [c for c in causes if c.name in found.survivors]
+            kept = {path for c in causes for path in c.parameters}
+            values, ranges = {k: v for k, v in values.items() if k in kept}, [r for r in ranges if r.path in kept]
         hidden, excited = _unseen(found, hits, without)
         if hits is not None:
             for cause, change, ends in _hit_causes(found, hits):
@@ -116,8 +121,6 @@ def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdic
         for name in found.imitated:
             warnings.append(f"two of the causes together are just what {name} alone would look like, which was left out")
         if found.findings:
-            # A name that does not outlive the block beside it was a stand-in for what has none.
-            causes = [c for c in causes if c.name in found.survivors]
             top = found.findings[0]
             unexplained = Unexplained(top.block, top.where, top.direction, f"{1e3 * top.size:.1f} mm")
         held = heldout.held_out(prediction, seed)

@@ -100,8 +100,12 @@ def diagnose_hits(
             rivals = _rivals(scores, chosen, i, range(len(effects)))
             causes.append(HitCause(effects[i], tuple(effects[r] for r in rivals), float(value), float(error), float(abs(value) * shift[i])))
     could = np.diagonal(scores.gram) * (2.0 * LEAST_SHIFT / np.maximum(shift, 1e-9)) ** 2 > GAIN
-    quiet = tuple(e.name for e, ok in zip(effects, could) if not ok)
-    return HitFindings(tuple(causes), int(usable.sum()), quiet, first[:, usable], y[:, usable])
+    named = {c.effect.name for c in causes}
+    quiet = tuple(e.name for e, ok in zip(effects, could) if not ok and e.name not in named)
+    now = theta.copy()
+    now[-len(effects) :] = [c if e.name in named else 0.0 for c, e in zip(change, effects)]
+    after, _, _ = _compare(problem, now, start, incoming)
+    return HitFindings(tuple(causes), int(usable.sum()), quiet, first[:, usable], after[:, usable])
 
 
 def _starts(found: BallFindings, problem: BallProblem, g, incoming: np.ndarray) -> np.ndarray:

@@ -13,8 +13,10 @@ import numpy as np
 from ballmodel.flight import PaddlePose
 from ballmodel.trajectory import Trajectory
 from mjx_tt import robot
-from mjx_tt.gap.joint import JointRecord
+from mjx_tt.gap.joint.nominal import nominal_response
+from mjx_tt.gap.joint.records import JointRecord
 from mjx_tt.kinematics import PaddleKinematics
+from mjx_tt.model import SimModel
 from robot_io.contract import JOINT_NAMES
 
 HALF_WINDOW = 0.010  # [s] of the central difference that gives joint velocities: a few encoder samples
@@ -37,13 +39,17 @@ class JointPath:
         return np.stack([np.interp(time, t, q) for t, q in zip(self.time, self.position)])
 
 
-def joint_path(records: Sequence[JointRecord]) -> JointPath | None:
-    """The path of a log that has all eight joints, None otherwise."""
+def joint_path(records: Sequence[JointRecord], model: SimModel) -> JointPath | None:
+    """The path of a log that has all eight joints, None otherwise.
+
+    A position is as old as the model says that joint's measurement is when it is reported.
+    """
     by_name = {r.joint: r for r in records}
     if set(by_name) != set(JOINT_NAMES):
         return None
     mine = [by_name[name] for name in JOINT_NAMES]
-    return JointPath(tuple(r.state_time for r in mine), tuple(r.state_position for r in mine))
+    time = tuple(r.state_time - nominal_response(model, r.joint).observation_delay for r in mine)
+    return JointPath(time, tuple(r.state_position for r in mine))
 
 
 def watched(trajectory: Trajectory, path: JointPath | None) -> bool:

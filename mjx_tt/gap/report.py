@@ -260,27 +260,28 @@ def _hits(d: Diagnosis, pictures: _Pictures) -> str:
         what = f"{'place' if k < 3 else 'velocity'} {plots.AXES[k % 3]}"
         cells = []
         for values in states:
-            middle, low, high = (f"{x:+.{digits}f}" for x in plots.median_interval(factor * values[k]))
-            few, many = (f"{x:+.{digits}f}" for x in np.percentile(factor * values[k], (5, 95)))
+            numbers = [*plots.median_interval(factor * values[k]), *np.percentile(factor * values[k], (5, 95))]
+            middle, low, high, few, many = (f"{round(x, digits) + 0.0:+.{digits}f}" for x in numbers)
             cells += [f"<b>{middle}</b> ({low} to {high})", f"{few} to {many}"]
         rows.append((f"{what} [{unit}]", *cells))
         middle, low, high = plots.median_interval(factor * states[-1][k])
         if low > 0.0 or high < 0.0:
             off.append(f"{what} {middle:+.{digits}f} {unit}")
-    head = ["measured − predicted", "before: median", "hit to hit", "after: median", "hit to hit"][: 1 + 2 * len(states)]
+    head = ["measured − predicted", "before: median", "hit to hit"]
+    head += ["after: median", "hit to hit"] if found.causes else []
     out = [
         f"<p><b>{found.hits} hits</b> were judged: {_named_hits(d)} the typical return lies"
         f" {'off in ' + ', '.join(off) if off else 'where the model puts it, to within its error'}.</p>",
         pictures.add(
             "hits",
             plots.hits(found),
-            "<b>How to read it.</b> The model flies each ball to the racket, moves the blade as the joints were measured"
-            " and plays the return. A dot is a hit: how far the measured return lies from that one, left its place at"
-            " the moment of the hit, right its velocity. Diamonds: medians with their 90 % intervals; triangles on the"
-            " edge: hits farther out. What all hits share moves the diamonds: a return that starts too early is ahead in"
-            " place, a wrong rubber or a tilted blade shows in the velocity. The scatter is each hit's own (where on the"
-            " rubber, an encoder's tick, a millisecond) and is the noise that a cause has to stand out of. The ball's"
-            " own causes are settled before and after.",
+            "<b>How to read it.</b> The model flies each ball to the racket, moves the blade as the joints were"
+            " measured and plays the return. A dot is a hit: how far the measured return lies from that one, left its"
+            " place at the moment of the hit, right its velocity. Diamonds: medians with their 90 % intervals;"
+            " triangles on the edge: hits farther out. What all hits share moves the diamonds: a return that starts too"
+            " early is ahead in place, a wrong rubber or a tilted blade shows in the velocity. The scatter is each"
+            " hit's own (where on the rubber, an encoder's tick, a millisecond) and is the noise that a cause has to"
+            " stand out of. The ball's own causes are settled before and after.",
             "Place and velocity behind the paddle, measured minus predicted, hit by hit",
         ),
         _table(head, rows, right=range(1, len(head))),

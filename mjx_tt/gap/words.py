@@ -105,7 +105,7 @@ def detectable(found: BallFindings) -> dict[str, float]:
         evidence.with_spin(found.projected, choice.prior.std) if choice.spin else evidence.without_spin(found.projected)
     )
     base = [*choice.effects, *scores.always]
-    others = [j for j in range(len(trial.effects)) if j not in base]
+    others = [j for j in range(len(trial.effects)) if j not in base and j not in trial.left_out]
     own, gram = evidence.unexplained_scores(scores, base, others)
     out = {}
     for j, score, information in zip(others, own.T, np.diagonal(gram)):
@@ -197,7 +197,9 @@ CLAIMS: dict[str, tuple[str, str, str]] = {
     "camera_distortion": ("", "", "The camera distorts the picture, {instead}"),
     "latency_jitter": ("", "", "The time stamps of the ball's positions scatter by {value}"),
     "tracker_smoothing": ("", "", "The tracker smooths the ball's positions, time constant {instead}"),
-    "paddle_restitution": ("more", "less", "The paddle gives back {way} of the ball's speed than the model says, {instead}"),
+    "paddle_restitution": (
+        "more", "less", "The paddle gives back {way} of the ball's speed than the model says, {instead}",
+    ),
     "paddle_friction": ("more", "less", "The rubber grips {way} than the model says, tangential gain {instead}"),
     "paddle_tilt": ("downwards", "upwards", "The blade looks {way} by {value}"),
     "paddle_offset": ("ahead of", "behind", "The blade lies {way} where the model has it, by {size}"),
