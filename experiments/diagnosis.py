@@ -64,7 +64,12 @@ def diagnose(request: Request, console: Console) -> gap.Diagnosis:
     def say(text: str) -> None:
         console.print(f"  {time.perf_counter() - began:5.1f} s  {text}", highlight=False)
 
-    provenance = {"made_by": "mjx-tt diagnose", "model": request.model or "nominal", "seed": request.seed, "spin": request.spin}
+    provenance = {
+        "made_by": "mjx-tt diagnose",
+        "model": request.model or "nominal",
+        "seed": request.seed,
+        "spin": request.spin,
+    }
     if request.model:
         provenance["model_sha256"] = hashlib.sha256(Path(request.model).read_bytes()).hexdigest()
     return checked(
@@ -136,14 +141,24 @@ def show(found: gap.Diagnosis, console: Console) -> None:
         size = f"{unit} rms" if "." in c.name else "mm at the end of a flight"
         console.print(f"  {c.name}: {c.effect_mm:.1f} {size}, confidence {c.confidence:.0%}", highlight=False)
         for path, e in c.parameters.items():
-            console.print(f"    {path} {e.nominal:.6g} -> {e.estimate:.6g} ({e.low:.6g} to {e.high:.6g}) {e.unit}", highlight=False)
+            console.print(
+                f"    {path} {e.nominal:.6g} -> {e.estimate:.6g} ({e.low:.6g} to {e.high:.6g}) {e.unit}",
+                highlight=False,
+            )
         if len(c.group) > 1:
-            console.print(f"    cannot be told from {', '.join(c.group[1:])}: {c.separating_measurement}", highlight=False)
+            console.print(
+                f"    cannot be told from {', '.join(c.group[1:])}: {c.separating_measurement}", highlight=False
+            )
     if v.unexplained:
         u = v.unexplained
-        console.print(f"  no entry of the catalogue explains: {u.block}, {u.where}, along {u.direction}, {u.size}", highlight=False)
+        console.print(
+            f"  no entry of the catalogue explains: {u.block}, {u.where}, along {u.direction}, {u.size}",
+            highlight=False,
+        )
     if v.held_out:
         h = v.held_out
-        console.print(f"  held out: {h.before:.2f} -> {h.after:.2f} mm, gain {h.low:.2f} to {h.high:.2f}", highlight=False)
+        console.print(
+            f"  held out: {h.before:.2f} -> {h.after:.2f} mm, gain {h.low:.2f} to {h.high:.2f}", highlight=False
+        )
     for e in v.next_experiment[:2]:
         console.print(f"  next: {e.what}{' tells ' + ', '.join(e.separates) if e.separates else ''}", highlight=False)

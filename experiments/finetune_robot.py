@@ -11,8 +11,8 @@ import numpy as np
 import mjx_tt
 from experiments.errors import RunError
 from robot_io import contract
-from robot_io.log.records import Ball
 from robot_io.log.recorder import NullRecorder
+from robot_io.log.records import Ball
 from robot_io.play import EpisodeSummary
 from robot_io.policy_numpy import StreamingPolicy
 from robot_io.rig.lockstep import LockStep

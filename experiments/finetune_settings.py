@@ -9,7 +9,16 @@ from pydantic import Field, ValidationError
 
 from experiments import mistakes
 from experiments.config import (
-    Constant, Count, Decay, Optimiser, Positive, Rewards, Section, Step, apply_override, read_yaml,
+    Constant,
+    Count,
+    Decay,
+    Optimiser,
+    Positive,
+    Rewards,
+    Section,
+    Step,
+    apply_override,
+    read_yaml,
 )  # fmt: skip
 from experiments.errors import ConfigError
 

@@ -43,7 +43,7 @@ def scene() -> str:
 
 def rig_for(artefact: artefacts.Artefact, balls: str | None, params_path: str | None, seed: int) -> Rig:
     """A rig that throws balls of a distribution: the named one, or that of the policy's training."""
-    from experiments import build, config
+    from experiments import build
     from mjx_tt.model import SimModel
 
     chosen = balls or _trained_on(artefact)

@@ -24,7 +24,6 @@ from mjx_tt.task import MISSED, RETURNED
 from robot_io.contract import N_OBSERVATION
 
 
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class TrainState:

@@ -53,7 +53,9 @@ def problem_of(measured: np.ndarray) -> BallProblem:
     return BallProblem(grid(trajectories(measured)), SimModel(), FITTED, measured[:, 8] - measured[:, 0])
 
 
-@pytest.mark.parametrize("paths", [(), *((p,) for p in CHANGED), tuple(CHANGED)], ids=lambda p: "+".join(p)[-40:] or "nominal")
+@pytest.mark.parametrize(
+    "paths", [(), *((p,) for p in CHANGED), tuple(CHANGED)], ids=lambda p: "+".join(p)[-40:] or "nominal"
+)
 def test_predicts_what_other_code_flies(paths):
     start = starts(40)
     if "ball.flight.spin_decay" in paths:

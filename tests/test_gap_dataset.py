@@ -100,7 +100,9 @@ def test_what_cannot_be_is_refused_by_name(change, words, tmp_path):
     assert "log.csv" in str(refused.value)
 
 
-@pytest.mark.parametrize("balls, words", [(flights(0), "no traject|empty|no row"), (flights(1), "1 usable flights of 1")])
+@pytest.mark.parametrize(
+    "balls, words", [(flights(0), "no traject|empty|no row"), (flights(1), "1 usable flights of 1")]
+)
 def test_too_little_is_said_and_nothing_written(balls, words, tmp_path, capsys):
     path = write(tmp_path / "log.csv", balls)
     assert cli.main(["diagnose", str(path), "--out", str(tmp_path / "out")]) == 1

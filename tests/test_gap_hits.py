@@ -38,7 +38,9 @@ class Rubber:
 
 def drag(_, state):
     velocity = state[3:]
-    return np.concatenate([velocity, [0, 0, -9.81] - 0.47 * 1.29 * 1.256e-3 / 0.0054 * np.linalg.norm(velocity) * velocity])
+    return np.concatenate(
+        [velocity, [0, 0, -9.81] - 0.47 * 1.29 * 1.256e-3 / 0.0054 * np.linalg.norm(velocity) * velocity]
+    )
 
 
 class Swing:

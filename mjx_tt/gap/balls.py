@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2, f as f_distribution
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.gap import blocks, evidence, jitter, noise, select
@@ -103,7 +104,9 @@ def diagnose_balls(
     shaken = jitter.find(left_over(found), found.linear.base.velocity[:, :, 0], found.problem.grid)
     if shaken is None:
         return found
-    (progress or (lambda text: None))(f"time stamps shake by {1e3 * shaken.seconds:.1f} ms: once more without the bounce's samples")
+    (progress or (lambda text: None))(
+        f"time stamps shake by {1e3 * shaken.seconds:.1f} ms: once more without the bounce's samples"
+    )
     near = np.abs(found.problem.grid.time - found.linear.base.bounce_time[0]) < 3.0 * shaken.seconds
     return _diagnose(trajectories, model, spin, without, seed, progress, near)
 
@@ -181,7 +184,22 @@ def _diagnose(
     seen[list(left_out)] = False
     imitated = select.imitated(p, trial, choice)
     return BallFindings(
-        problem, at, linear, choice, trial, own_noise, p, findings, survivors, start0, residual0, tuple(kept), sessions, age, seen, imitated,
+        problem,
+        at,
+        linear,
+        choice,
+        trial,
+        own_noise,
+        p,
+        findings,
+        survivors,
+        start0,
+        residual0,
+        tuple(kept),
+        sessions,
+        age,
+        seen,
+        imitated,
     )
 
 
@@ -214,7 +232,9 @@ def _shifts(linear: Linear, g: Grid) -> tuple[np.ndarray, float]:
     spin = linear.starts[SPIN][:, :, last, balls]
     size = np.linalg.norm(end, axis=1)
     concerned = [s[s > 1e-3 * s.max()] for s in size]
-    return np.array([np.median(s) if s.size else 0.0 for s in concerned]), float(np.median(np.linalg.norm(spin, axis=1)))
+    return np.array([np.median(s) if s.size else 0.0 for s in concerned]), float(
+        np.median(np.linalg.norm(spin, axis=1))
+    )
 
 
 def left_over(found: BallFindings) -> np.ndarray:
@@ -262,8 +282,15 @@ def _move(problem, start, theta, choice: Choice, noise_now, g: Grid) -> Situatio
 
 
 def unexplained(
-    linear: Linear, at: Situation, p: Projected, choice: Choice, trial: Trial, g: Grid, sessions: np.ndarray,
-    age: np.ndarray, called: Sequence[str],
+    linear: Linear,
+    at: Situation,
+    p: Projected,
+    choice: Choice,
+    trial: Trial,
+    g: Grid,
+    sessions: np.ndarray,
+    age: np.ndarray,
+    called: Sequence[str],
 ) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
     """Blocks that stay significant beside the chosen causes, the most important first; names that hold beside it."""
     out, holding = [], []
@@ -287,13 +314,24 @@ def unexplained(
         size = float(np.percentile(worst, 90))
         if size < BLOCK_FLOOR or _visible(scores.ball_gram[:, extra][:, :, extra], beta, p, g) < VISIBLE_FLOOR:
             continue
-        axis = int(np.argmax([np.percentile(np.abs(np.where(g.mask, pattern[a], 0.0)).max(axis=0), 90) for a in range(3)]))
+        axis = int(
+            np.argmax([np.percentile(np.abs(np.where(g.mask, pattern[a], 0.0)).max(axis=0), 90) for a in range(3)])
+        )
         importance = np.abs(beta) * np.sqrt(np.maximum(np.diagonal(gram), 0.0))
         best = int(np.argmax(importance))
         change = evidence.solve(scores, (*base, *extra))[: len(chosen)]
         error = np.sqrt(np.diagonal(evidence.sandwich(scores, (*base, *extra))))[: len(chosen)]
         holding.append(_holding(choice, trial, change, error))
-        out.append(Finding(block.name, block.labels[best], block.directions[best] or "xyz"[axis], size, p_value, _explained(own, gram)))
+        out.append(
+            Finding(
+                block.name,
+                block.labels[best],
+                block.directions[best] or "xyz"[axis],
+                size,
+                p_value,
+                _explained(own, gram),
+            )
+        )
     odd = _odd_balls(linear, at, p, choice, g)
     if odd is not None:
         out.append(odd)
@@ -355,13 +393,21 @@ def _odd_balls(linear: Linear, at: Situation, p: Projected, choice: Choice, g: G
     """Balls of their own kind: a smooth misfit that the others do not have."""
     t = g.time / np.maximum(g.time.max(axis=0), 1e-9) * 2.0 - 1.0
     columns = []
-    for poly in (t**2, t**3, np.where(g.time > linear.base.bounce_time[0], g.time - np.where(np.isfinite(linear.base.bounce_time[0]), linear.base.bounce_time[0], 0.0), 0.0)):
+    for poly in (
+        t**2,
+        t**3,
+        np.where(
+            g.time > linear.base.bounce_time[0],
+            g.time - np.where(np.isfinite(linear.base.bounce_time[0]), linear.base.bounce_time[0], 0.0),
+            0.0,
+        ),
+    ):
         for a in range(3):
             column = np.zeros((3, *t.shape))
             column[a] = poly
             columns.append(column)
     both = _with_columns(linear, at, p, np.stack(columns), g)
-    gram, right, spread = both.gram, both.right, len(columns)
+    gram, right = both.gram, both.right
     if choice.spin:
         inner = both.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
         left = both.spin_right - both.spin_gram @ choice.prior.mean
@@ -385,4 +431,11 @@ def _odd_balls(linear: Linear, at: Situation, p: Projected, choice: Choice, g: G
     if size < BLOCK_FLOOR:
         return None
     axis = "xyz"[int(np.argmax(np.median(per_axis, axis=1)))]
-    return Finding("a subset of the balls", f"{int(odd.sum())} of {g.n} balls", axis, size, ODD_LEVEL, float(q[odd].sum() / inflation))
+    return Finding(
+        "a subset of the balls",
+        f"{int(odd.sum())} of {g.n} balls",
+        axis,
+        size,
+        ODD_LEVEL,
+        float(q[odd].sum() / inflation),
+    )

@@ -65,7 +65,14 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
 
     def spline(name, quantity, unit, respond, knots=KNOTS, along=(0, 1, 2)):
         basis, places = hats(quantity, g.mask, knots)
-        family(name, quantity_names[name.split(" over ")[1]], basis, [f"{name.split(' over ')[1]} near {p:.2f} {unit}" for p in places], respond, along)
+        family(
+            name,
+            quantity_names[name.split(" over ")[1]],
+            basis,
+            [f"{name.split(' over ')[1]} near {p:.2f} {unit}" for p in places],
+            respond,
+            along,
+        )
 
     quantity_names = {
         "x": "across the table", "y": "along the table", "z": "with height", "speed": "with speed",
@@ -94,7 +101,13 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
 
         def over(name, value, unit, knots=4):
             basis, places = hats(np.where(bounced, value, np.nan_to_num(value[bounced].mean())), bounced, knots)
-            family(f"bounce over {name}", f"at the bounce, with {name}", basis, [f"{name} near {p:.2f} {unit}" for p in places], kick)
+            family(
+                f"bounce over {name}",
+                f"at the bounce, with {name}",
+                basis,
+                [f"{name} near {p:.2f} {unit}" for p in places],
+                kick,
+            )
 
         over("x", bx, "m")
         over("y", np.abs(by), "m from the net")

@@ -52,7 +52,9 @@ def load(paths: Sequence[str | os.PathLike]) -> Logs:
     for file in (f for f in files if f.name not in ROBOT_FILES):
         data = read(file)
         if not hasattr(data, "trajectories"):
-            raise ValueError(f"{file}: holds single ball states, no trajectories: a diagnosis needs positions over time")
+            raise ValueError(
+                f"{file}: holds single ball states, no trajectories: a diagnosis needs positions over time"
+            )
         check(data.trajectories, str(file))
         balls += data.trajectories
     return Logs(tuple(balls), joints, {str(f): hashlib.sha256(f.read_bytes()).hexdigest() for f in files})

@@ -45,7 +45,9 @@ THROWS = (
 )
 
 
-def experiments(found: BallFindings, pairs: list[tuple[int, int]], hidden: list[int], most: int = 4) -> tuple[Experiment, ...]:
+def experiments(
+    found: BallFindings, pairs: list[tuple[int, int]], hidden: list[int], most: int = 4
+) -> tuple[Experiment, ...]:
     """The best throws to separate pairs (chosen effect, rival), and to show effects that nothing excited."""
     if not pairs and not hidden:
         return ()
@@ -85,7 +87,12 @@ def _gram(found: BallFindings, throw: Throw) -> np.ndarray:
     at = Situation(found.situation.theta, np.concatenate([position, velocity, spin]))
     linear = problem.linearise(at)
     frame = flight_frame(linear.base.velocity[:, :, 0])
-    noise = Noise(frame, np.repeat(np.median(found.noise.scale, axis=1, keepdims=True), BALLS, axis=1), found.noise.memory, found.noise.interval)
+    noise = Noise(
+        frame,
+        np.repeat(np.median(found.noise.scale, axis=1, keepdims=True), BALLS, axis=1),
+        found.noise.memory,
+        found.noise.interval,
+    )
     p = project(linear, at, noise, np.ones((BALLS, SAMPLES)), g, problem.coefficient)
     scores = evidence.with_spin(p, found.choice.prior.std) if found.choice.spin else evidence.without_spin(p)
     return scores.gram[: len(problem.effects), : len(problem.effects)]

@@ -1,8 +1,8 @@
 """The diagnosis: logs and a model in; the verdict, the extended model and all that a report draws out.
 
-    from mjx_tt import gap, model
-    found = gap.diagnose(gap.load(["session1.csv"]), model.SimModel())
-    found.verdict.causes, found.extended
+from mjx_tt import gap, model
+found = gap.diagnose(gap.load(["session1.csv"]), model.SimModel())
+found.verdict.causes, found.extended
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ def diagnose(
     ball_names = {e.name for e in EFFECTS} | {t.name for e in EFFECTS for t in e.twins} | {"latency_jitter"}
     for name in without:
         if name not in ball_names and name.split(".")[-1] not in joint_effects.NAMES:
-            raise ValueError(f"no effect {name!r} to leave out{models.nearest(name, ball_names | set(joint_effects.NAMES))}")
+            raise ValueError(
+                f"no effect {name!r} to leave out{models.nearest(name, ball_names | set(joint_effects.NAMES))}"
+            )
     if not logs.balls and not logs.joints:
         raise ValueError("the logs hold neither balls nor joints")
     say = progress or (lambda text: None)
@@ -119,7 +121,9 @@ def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdic
                 ranges += ends
         undetermined = _undetermined(found) or bool(found.imitated)
         for name in found.imitated:
-            warnings.append(f"two of the causes together are just what {name} alone would look like, which was left out")
+            warnings.append(
+                f"two of the causes together are just what {name} alone would look like, which was left out"
+            )
         if found.findings:
             top = found.findings[0]
             unexplained = Unexplained(top.block, top.where, top.direction, f"{1e3 * top.size:.1f} mm")
@@ -127,7 +131,12 @@ def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdic
         names = [e.name for e in found.trial.effects]
         best = found.choice.gain
         for subset, spun, gain in found.choice.runners_up:
-            runners.append({"effects": [names[i] for i in subset] + (["magnus"] if spun and found.trial.spin == "none" else []), "gain": float(gain - best)})
+            runners.append(
+                {
+                    "effects": [names[i] for i in subset] + (["magnus"] if spun and found.trial.spin == "none" else []),
+                    "gain": float(gain - best),
+                }
+            )
         pairs = [(group[0], rival) for group in found.choice.groups for rival in group[1:]]
         say("the next experiment")
         quiet = [i for i, e in enumerate(found.trial.effects) if not found.seen[i] and e.name in excited]
@@ -143,7 +152,9 @@ def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdic
         steps += tuple(Experiment(text, (), 0.0) for text in robot.next_experiment)
         if robot.unexplained and unexplained is None:
             u = robot.unexplained
-            unexplained = Unexplained(f"{u['joint']}: {u['block']}", str(u["where"]), str(u["direction"]), f"{u['size']:.2f} mrad or mm")
+            unexplained = Unexplained(
+                f"{u['joint']}: {u['block']}", str(u["where"]), str(u["direction"]), f"{u['size']:.2f} mrad or mm"
+            )
         if held is None and robot.held_out:
             unit = 1e3
             held = replace(
@@ -190,7 +201,11 @@ def _ball_causes(found: BallFindings, without, seed: int) -> tuple[list[Cause], 
         parameters = _parameters(effect, nominal, theta, low, high)
         rivals = [effects[k] for k in choice.groups[i][1:]]
         twins = [t for t in effect.twins if t.name not in without]
-        group = (effect.name, *(t.name for t in twins), *(name for r in rivals for name in (r.name, *(t.name for t in r.twins)) if name not in without))
+        group = (
+            effect.name,
+            *(t.name for t in twins),
+            *(name for r in rivals for name in (r.name, *(t.name for t in r.twins)) if name not in without),
+        )
         readings = [f"{t.name}: {t.reading}" for t in twins] + [f"{r.name}: {r.reading}" for r in rivals]
         text = f"{effect.name}: {effect.reading}; " + "; ".join(readings) if readings else ""
         # Of a pair with the same pattern the extended model needs one.
@@ -234,7 +249,9 @@ def _hit_causes(found: BallFindings, hits: HitFindings) -> list[tuple[Cause, dic
         text = "; ".join(f"{e.name}: {e.reading}" for e in (c.effect, *c.rivals)) if c.rivals else ""
         parameters = _parameters(c.effect, nominal, c.change, low, high)
         sure = float(1.0 - 2.0 * student.sf(abs(c.change) / c.error, max(hits.hits - 6, 5)))
-        cause = Cause(c.effect.name, (c.effect.name, *(e.name for e in c.rivals)), sure, parameters, 1e3 * c.shift, text)
+        cause = Cause(
+            c.effect.name, (c.effect.name, *(e.name for e in c.rivals)), sure, parameters, 1e3 * c.shift, text
+        )
         values = {path: e.estimate for path, e in parameters.items()}
         out.append((cause, values, [Range(path, e.low, e.high) for path, e in parameters.items()]))
     return out
@@ -279,8 +296,12 @@ def _spin_cause(found: BallFindings, confidence: float, values: dict, ranges: li
     n = problem.grid.n
     for axis, mean, std, e in zip("xyz", choice.prior.mean, choice.prior.std, error[len(choice.effects) :]):
         wide = quantile * std / np.sqrt(2.0 * n)
-        parameters[f"ball_spin.mean_{axis}"] = Estimate(0.0, float(mean), float(mean - quantile * e), float(mean + quantile * e), "rad/s")
-        parameters[f"ball_spin.std_{axis}"] = Estimate(0.0, float(std), float(max(std - wide, 0.0)), float(std + wide), "rad/s")
+        parameters[f"ball_spin.mean_{axis}"] = Estimate(
+            0.0, float(mean), float(mean - quantile * e), float(mean + quantile * e), "rad/s"
+        )
+        parameters[f"ball_spin.std_{axis}"] = Estimate(
+            0.0, float(std), float(max(std - wide, 0.0)), float(std + wide), "rad/s"
+        )
         values |= {f"ball_spin.mean_{axis}": float(mean), f"ball_spin.std_{axis}": float(std)}
     rms = float(np.sqrt(np.sum(choice.prior.std**2 + choice.prior.mean**2)))
     return Cause(
@@ -294,7 +315,10 @@ def _confidence(found: BallFindings, seed: int) -> list[float]:
     choice, rng = found.choice, np.random.default_rng(seed)
     n, k = found.problem.grid.n, len(found.trial.effects)
     spins = [choice.spin] if found.trial.spin == "free" or choice.prior is None else [True]
-    scores = {s: evidence.with_spin(found.projected, choice.prior.std) if s else evidence.without_spin(found.projected) for s in spins}
+    scores = {
+        s: evidence.with_spin(found.projected, choice.prior.std) if s else evidence.without_spin(found.projected)
+        for s in spins
+    }
     ok = {s: tuple(i for i in range(k) if found.seen[i] and not (s and i == found.problem.coefficient)) for s in spins}
     hits = np.zeros(len(choice.effects) + 1)
     for _ in range(BOOTSTRAP):
@@ -302,7 +326,9 @@ def _confidence(found: BallFindings, seed: int) -> list[float]:
         best = (-np.inf, (), False)
         for s in spins:
             q = scores[s]
-            drawn = evidence.Scores(np.tensordot(count, q.ball_gram, 1), count @ q.ball_right, q.ball_gram, q.ball_right, q.base, q.always)
+            drawn = evidence.Scores(
+                np.tensordot(count, q.ball_gram, 1), count @ q.ball_right, q.ball_gram, q.ball_right, q.base, q.always
+            )
             gains = evidence.all_gains(drawn, ok[s])
             top = max(gains, key=lambda x: gains[x] - choice.threshold * len(x))
             best = max(best, (gains[top] - choice.threshold * len(top), top, s))
@@ -314,17 +340,23 @@ def _confidence(found: BallFindings, seed: int) -> list[float]:
 
 def _unseen(found: BallFindings, hits: HitFindings | None, without) -> tuple[list[str], list[str]]:
     """Effects that no ball log shows, and effects that these balls do not excite."""
-    invisible = {n: why for n, why in INVISIBLE.items() if n not in without and not (hits is not None and n == "ball_latency")}
+    invisible = {
+        n: why for n, why in INVISIBLE.items() if n not in without and not (hits is not None and n == "ball_latency")
+    }
     hidden = [f"{name}: {why}" for name, why in invisible.items()]
     if found.problem.coefficient is not None and found.choice.spin:
         hidden.append("magnus_coefficient and spin: in flight only their product shows")
     out = {found.trial.effects[i].name for i in found.trial.left_out}
     excited = [
-        e.name for i, e in enumerate(found.trial.effects) if not found.seen[i] and e.name not in invisible and e.name not in out
+        e.name
+        for i, e in enumerate(found.trial.effects)
+        if not found.seen[i] and e.name not in invisible and e.name not in out
     ]
     if found.trial.spin == "none" and not found.choice.spin:
         excited = [name for name in excited if not BY_NAME[name].needs_spin]
-    at_paddle = [e.name for e in EFFECTS if e.group == AT_THE_PADDLE and e.name not in without and e.name not in INVISIBLE]
+    at_paddle = [
+        e.name for e in EFFECTS if e.group == AT_THE_PADDLE and e.name not in without and e.name not in INVISIBLE
+    ]
     return hidden, excited + (at_paddle if hits is None else list(hits.quiet))
 
 

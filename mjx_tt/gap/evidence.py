@@ -59,7 +59,14 @@ def with_spin(p: Projected, std: np.ndarray) -> Scores:
     explained = float((p.spin_right[..., None] * solved).sum())
     _, spread = np.linalg.slogdet(np.eye(3) + p.spin_gram * (np.maximum(std, 1e-6) ** 2)[None, None, :])
     k = p.gram.shape[1]
-    return Scores(gram.sum(axis=0), right.sum(axis=0), gram, right, explained - float(spread.sum()), (k, k + 1, k + 2) + (() if p.coefficient is None else (p.coefficient,)))
+    return Scores(
+        gram.sum(axis=0),
+        right.sum(axis=0),
+        gram,
+        right,
+        explained - float(spread.sum()),
+        (k, k + 1, k + 2) + (() if p.coefficient is None else (p.coefficient,)),
+    )
 
 
 def fit_spin(p: Projected, effects: tuple[int, ...], std: np.ndarray | None = None) -> SpinPrior:
@@ -97,7 +104,9 @@ def gain(scores: Scores, subset) -> float:
     return scores.base + (float(_sub(scores, chosen)[1] @ solve(scores, chosen)) if chosen else 0.0)
 
 
-def all_gains(scores: Scores, candidates: tuple[int, ...], largest: int = LARGEST_SUBSET) -> dict[tuple[int, ...], float]:
+def all_gains(
+    scores: Scores, candidates: tuple[int, ...], largest: int = LARGEST_SUBSET
+) -> dict[tuple[int, ...], float]:
     """Gains of all subsets of the candidates up to a size."""
     out = {(): gain(scores, ())}
     for size in range(1, min(largest, len(candidates)) + 1):
@@ -135,7 +144,9 @@ def unexplained_scores(scores: Scores, chosen, extra) -> tuple[np.ndarray, np.nd
     return own - left @ mix, gram
 
 
-def flip_threshold(scores: Scores, chosen, extra, rng: np.random.Generator, draws: int = 400, level: float = 0.995) -> float:
+def flip_threshold(
+    scores: Scores, chosen, extra, rng: np.random.Generator, draws: int = 400, level: float = 0.995
+) -> float:
     """Gain that the best single extra effect reaches by chance: scores of whole balls with random signs."""
     own, gram = unexplained_scores(scores, chosen, extra)
     own = own - own.mean(axis=0)

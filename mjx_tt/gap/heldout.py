@@ -84,9 +84,7 @@ def held_out(p: Prediction, seed: int = 0) -> HeldOut:
     index = rng.integers(0, len(before), (DRAWS, len(before)))
     gain = np.sqrt(before[index].mean(axis=1)) - np.sqrt(after[index].mean(axis=1))
     low, high = np.percentile(gain, [5, 95])
-    return HeldOut(
-        METRIC, *(float(1e3 * x) for x in (np.sqrt(before.mean()), np.sqrt(after.mean()), low, high))
-    )
+    return HeldOut(METRIC, *(float(1e3 * x) for x in (np.sqrt(before.mean()), np.sqrt(after.mean()), low, high)))
 
 
 def _folds(found: BallFindings, seed: int) -> np.ndarray:

@@ -98,7 +98,15 @@ def diagnose_hits(
     for i, value, error in zip(chosen, values, errors):
         if abs(value) * shift[i] >= LEAST_SHIFT:
             rivals = _rivals(scores, chosen, i, range(len(effects)))
-            causes.append(HitCause(effects[i], tuple(effects[r] for r in rivals), float(value), float(error), float(abs(value) * shift[i])))
+            causes.append(
+                HitCause(
+                    effects[i],
+                    tuple(effects[r] for r in rivals),
+                    float(value),
+                    float(error),
+                    float(abs(value) * shift[i]),
+                )
+            )
     could = np.diagonal(scores.gram) * (2.0 * LEAST_SHIFT / np.maximum(shift, 1e-9)) ** 2 > GAIN
     named = {c.effect.name for c in causes}
     quiet = tuple(e.name for e, ok in zip(effects, could) if not ok and e.name not in named)
@@ -172,7 +180,11 @@ def _choose(y: np.ndarray, jacobian: np.ndarray, effects: tuple[Effect, ...]):
             ):
                 chosen = subset
                 break
-        left = y - np.einsum("kcn,k->cn", jacobian[list(chosen)], values) if chosen else y - np.median(y, axis=1, keepdims=True)
+        left = (
+            y - np.einsum("kcn,k->cn", jacobian[list(chosen)], values)
+            if chosen
+            else y - np.median(y, axis=1, keepdims=True)
+        )
     return chosen, values, errors, scores
 
 
@@ -196,4 +208,8 @@ def _rivals(scores: Scores, chosen: tuple[int, ...], member: int, candidates) ->
     """Effects that explain the hits as well in place of a member."""
     rest = tuple(c for c in chosen if c != member)
     best = evidence.gain(scores, chosen)
-    return tuple(c for c in candidates if c not in chosen and best - evidence.gain(scores, tuple(sorted((*rest, c)))) < select.TIE)
+    return tuple(
+        c
+        for c in candidates
+        if c not in chosen and best - evidence.gain(scores, tuple(sorted((*rest, c)))) < select.TIE
+    )

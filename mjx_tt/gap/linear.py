@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjx_tt.gap.catalogue import FLIGHT, Effect
-from mjx_tt.gap.noise import Noise, whiten
+from mjx_tt.gap.noise import Noise, nominal_noise, robust_weights, whiten
 from mjx_tt.gap.predict import Flown, Grid, heading_axes, leaves, predict
 from mjx_tt.model import SimModel
 
@@ -161,8 +161,6 @@ def fit_starts(
     prior: mean and standard deviation (3,) of the spin; without it the balls do not spin (or keep the spin given).
     keep: (T, n) samples that count, all by default.
     """
-    from mjx_tt.gap.noise import nominal_noise, robust_weights
-
     noise = nominal_noise(g) if noise is None else noise
     mask = g.mask if keep is None else g.mask & keep
     g = replace(g, mask=mask)
@@ -176,7 +174,13 @@ def fit_starts(
         variants = np.repeat(start[:, None], 1 + size, axis=1)
         for i in range(size):
             variants[i, 1 + i] += START_STEPS[i]
-        flown = predict(problem.model, problem.values(np.broadcast_to(theta_v, (len(theta_v), 1 + size, g.n))), variants, g, problem.axes)
+        flown = predict(
+            problem.model,
+            problem.values(np.broadcast_to(theta_v, (len(theta_v), 1 + size, g.n))),
+            variants,
+            g,
+            problem.axes,
+        )
         base = flown.measured[:, :, 0]
         columns = np.moveaxis(flown.measured[:, :, 1:] - base[:, :, None], 2, 0) / START_STEPS[:size, None, None, None]
         residual = np.where(mask, g.measured - base, 0.0)

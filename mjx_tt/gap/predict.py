@@ -108,7 +108,9 @@ def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray
             mine = np.minimum(np.arange(first, first + WIDTH), v * n - 1)
             some = ball[mine]
             paddle = g.paddle and jax.tree.map(lambda x: np.moveaxis(x[..., some], 1, 0), g.paddle)
-            every, *rest = _fly(model, {k: x[mine] for k, x in flat.items()}, columns[:, mine], g.steps[:, some], paddle)
+            every, *rest = _fly(
+                model, {k: x[mine] for k, x in flat.items()}, columns[:, mine], g.steps[:, some], paddle
+            )
             index = g.index[None, :, some]
             sampled = [np.take_along_axis(np.asarray(x), index, axis=1) for x in every]
             keep = min(WIDTH, v * n - first)
@@ -169,7 +171,11 @@ def _fly(model: SimModel, values: dict, start, steps, paddle):
     # In steady motion the filter trails by tau v: it was running before the first sample.
     filtered = start[:3] - smoothing * start[3:6]
     carry = (state, filtered, zero, zero + jnp.inf, start[:3] * 0.0, start[:3] * 0.0, zero + jnp.inf)
-    blades = () if paddle is None else tuple(jax.tree.map(lambda x: x[part], paddle) for part in (slice(None, -1), slice(1, None)))
+    blades = (
+        ()
+        if paddle is None
+        else tuple(jax.tree.map(lambda x: x[part], paddle) for part in (slice(None, -1), slice(1, None)))
+    )
     (_, _, _, bounced, at, incoming, struck), (x, v, y) = jax.lax.scan(advance, carry, (steps, *blades))
 
     def whole(first, later):

@@ -113,11 +113,22 @@ def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
     if spin:
         prior = SpinPrior(theta[len(subset) : len(subset) + 3], prior.std)
         magnus = None if p.coefficient is None else float(theta[-1])
-    groups = tuple(_group(scores, subset, i, gain, trial, _candidates(p, trial, spin, None if prior is None else prior.std)) for i in range(len(subset)))
+    groups = tuple(
+        _group(scores, subset, i, gain, trial, _candidates(p, trial, spin, None if prior is None else prior.std))
+        for i in range(len(subset))
+    )
     others = tuple((s, sp, g) for v, s, sp, g in found[:200] if (s, sp) != (subset, spin))[:8]
     return Choice(
-        subset, spin, theta[: len(subset)], error[: len(subset)], gain, prior if spin else None, magnus,
-        threshold, groups, others
+        subset,
+        spin,
+        theta[: len(subset)],
+        error[: len(subset)],
+        gain,
+        prior if spin else None,
+        magnus,
+        threshold,
+        groups,
+        others,
     )
 
 
