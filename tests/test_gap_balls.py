@@ -136,7 +136,7 @@ def test_spins_are_estimated_as_a_distribution():
     target = np.einsum("nij,nj->ni", design, spins) + rng.normal(size=(n, 40))
     zero = np.zeros((n, 0, 0))
     p = Projected(
-        np.zeros((n, 40, 0)), np.ones((n, 40)), None, zero, np.zeros((n, 0)),
+        np.ones((n, 40)), None, zero, np.zeros((n, 0)),
         design.swapaxes(1, 2) @ design, np.zeros((n, 3, 0)), np.einsum("nij,ni->nj", design, target), None,
     )  # fmt: skip
     prior = evidence.fit_spin(p, ())

@@ -69,12 +69,20 @@ def flights(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     return [t for t in cut if len(t) >= FEWEST_SAMPLES]
 
 
-def first_fit(problem: BallProblem) -> np.ndarray:
-    """(9, n) starts under the nominal model: a parabola through the first samples, then ever longer parts of the flight.
+def first_fit(
+    problem: BallProblem,
+    theta: np.ndarray | None = None,
+    spin: np.ndarray | None = None,
+    part: np.ndarray | None = None,
+) -> np.ndarray:
+    """(9, n) starts: a parabola through the first samples, then ever longer parts of the flight.
 
     A flight that bounces has other minima for a start that is far off; growing windows keep the bounce where it is.
+    theta: (K,) changes of the effects, none by default. spin: (3,) [rad/s] of every ball, in its own axes. part: (T, n)
+    samples that count.
     """
-    g = problem.grid
+    g = problem.grid if part is None else replace(problem.grid, mask=problem.grid.mask & part)
+    theta = np.zeros(len(problem.effects)) if theta is None else theta
     early = g.mask & (g.time <= WINDOWS[0])
     early[:8] |= g.mask[:8]
     start = np.zeros((9, g.n))
@@ -83,11 +91,12 @@ def first_fit(problem: BallProblem) -> np.ndarray:
         fall = np.array([0.0, 0.0, -4.9])[:, None] * time**2
         line = np.polynomial.polynomial.polyfit(time, (place - fall).T, 1)
         start[:3, i], start[3:6, i] = line
-    zero = np.zeros(len(problem.effects))
+    if spin is not None:
+        start[SPIN] = spin[:, None]
     for window in WINDOWS:
         keep = (g.time <= window) | (np.arange(len(g.time)) < 8)[:, None]
-        start = fit_starts(problem, zero, start, g, rounds=2, keep=keep)
-    return fit_starts(problem, zero, start, g, rounds=4)
+        start = fit_starts(problem, theta, start, g, rounds=2, keep=keep)
+    return fit_starts(problem, theta, start, g, rounds=4)
 
 
 def diagnose_balls(
@@ -142,7 +151,7 @@ def _diagnose(
     g = grid(kept)
     if hidden is not None:
         g = replace(g, mask=g.mask & ~hidden)
-    problem = BallProblem(g, model, fitted, _heading(g))
+    problem = BallProblem(g, model, fitted, heading(g))
     zero = np.zeros(len(fitted))
     say(f"fitting {g.n} flights under the nominal model")
     start = first_fit(problem)
@@ -208,7 +217,7 @@ def _last(g: Grid) -> np.ndarray:
     return len(g.mask) - 1 - np.argmax(g.mask[::-1], axis=0)
 
 
-def _heading(g: Grid) -> np.ndarray:
+def heading(g: Grid) -> np.ndarray:
     """(3, n) way of each ball over its first samples."""
     k = np.minimum(_last(g), 8)
     return g.measured[:, k, np.arange(g.n)] - g.measured[:, 0]

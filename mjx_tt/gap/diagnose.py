@@ -8,7 +8,7 @@ found.verdict.causes, found.extended
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student
@@ -25,7 +25,7 @@ from mjx_tt.gap.joint import effects as joint_effects
 from mjx_tt.gap.joint.nominal import diagnose_joints
 from mjx_tt.gap.linear import REFERENCE_MAGNUS
 from mjx_tt.gap.paddle import joint_path
-from mjx_tt.gap.verdict import Cause, Estimate, Experiment, Unexplained, Verdict
+from mjx_tt.gap.verdict import Cause, Estimate, Experiment, HeldOut, Unexplained, Verdict
 from mjx_tt.model import ModelFile, Range, SimModel
 
 BOOTSTRAP = 100
@@ -156,12 +156,13 @@ def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdic
                 f"{u['joint']}: {u['block']}", str(u["where"]), str(u["direction"]), f"{u['size']:.2f} mrad or mm"
             )
         if held is None and robot.held_out:
-            unit = 1e3
-            held = replace(
-                heldout.HeldOut("", 0.0, 0.0, 0.0, 0.0), metric="rms of joint positions on windows not used, mean over joints [mrad], [mm]",
-                before=float(np.mean([g.before for g in robot.held_out]) * unit), after=float(np.mean([g.after for g in robot.held_out]) * unit),
-                low=float(np.mean([g.low for g in robot.held_out]) * unit), high=float(np.mean([g.high for g in robot.held_out]) * unit),
-            )  # fmt: skip
+            held = HeldOut(
+                "rms of joint positions on windows not used, mean over joints [mrad], [mm]",
+                *(
+                    float(1e3 * np.mean([getattr(g, n) for g in robot.held_out]))
+                    for n in ("before", "after", "low", "high")
+                ),
+            )
     if unexplained is not None:
         name = "unexplained"
     elif undetermined or (causes and held is not None and held.high < 0.0):

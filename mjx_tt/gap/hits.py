@@ -14,10 +14,10 @@ import numpy as np
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.gap import evidence, select
-from mjx_tt.gap.balls import BallFindings, flights
+from mjx_tt.gap.balls import BallFindings, first_fit, flights, heading
 from mjx_tt.gap.catalogue import AT_THE_PADDLE, EFFECTS, Effect
 from mjx_tt.gap.evidence import Scores
-from mjx_tt.gap.linear import BallProblem, fit_starts
+from mjx_tt.gap.linear import BallProblem
 from mjx_tt.gap.paddle import JointPath, poses, watched
 from mjx_tt.gap.predict import grid, predict
 
@@ -74,10 +74,9 @@ def diagnose_hits(
     g = replace(g, paddle=poses(whole, g.steps, joints))
     n0 = np.array([n for _, n in pairs])
     incoming = np.arange(len(g.time))[:, None] < n0[None]
-    velocity = g.measured[:, 8] - g.measured[:, 0]
-    problem = BallProblem(g, found.problem.model, (*found.problem.effects, *effects), velocity)
+    problem = BallProblem(g, found.problem.model, (*found.problem.effects, *effects), heading(g))
     theta = np.concatenate([found.situation.theta, np.zeros(len(effects))])
-    start = _starts(found, problem, g, incoming)
+    start = first_fit(problem, theta, found.choice.prior.mean if found.choice.spin else None, incoming)
     change = np.zeros(len(effects))
     first = usable = None
     for _ in range(ROUNDS):
@@ -114,22 +113,6 @@ def diagnose_hits(
     now[-len(effects) :] = [c if e.name in named else 0.0 for c, e in zip(change, effects)]
     after, _, _ = _compare(problem, now, start, incoming)
     return HitFindings(tuple(causes), int(usable.sum()), quiet, first[:, usable], after[:, usable])
-
-
-def _starts(found: BallFindings, problem: BallProblem, g, incoming: np.ndarray) -> np.ndarray:
-    """(9, n) starts from the samples before the hit under the causes that were found."""
-    start = np.zeros((9, g.n))
-    mean = found.choice.prior.mean if found.choice.spin else np.zeros(3)
-    time = g.time[:10]
-    for i in range(g.n):
-        place = g.measured[:, :10, i] - np.array([0.0, 0.0, -4.9])[:, None] * time[:, i] ** 2
-        line = np.polynomial.polynomial.polyfit(time[:, i], place.T, 1)
-        start[:3, i], start[3:6, i], start[6:, i] = line[0], line[1], mean
-    theta = np.concatenate([found.situation.theta, np.zeros(len(problem.effects) - len(found.situation.theta))])
-    for window in (0.1, 0.2, 0.3, 0.4, 10.0):
-        keep = incoming & ((g.time <= window) | (np.arange(len(g.time)) < 8)[:, None])
-        start = fit_starts(problem, theta, start, g, rounds=3, keep=keep)
-    return start
 
 
 def _compare(problem: BallProblem, theta: np.ndarray, start: np.ndarray, incoming: np.ndarray):

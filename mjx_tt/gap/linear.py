@@ -21,7 +21,6 @@ SPIN = slice(6, 9)
 MAGNUS = FLIGHT + "magnus_coefficient"
 START_STEPS = np.array([1e-6] * 3 + [1e-5] * 3 + [0.1] * 3)  # [m], [m/s], [rad/s] of the differences
 REFERENCE_MAGNUS = 0.6  # k used where the nominal model has none: in flight only k omega shows (PHYSICS: 0.3 to 1.5)
-SPIN_COMPONENTS = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,6 @@ class BallProblem:
 class Projected:
     """Whitened quantities ball by ball, starts projected out. K effects and their sums with the measured target."""
 
-    basis: np.ndarray  # (n, m, 6) orthonormal, what the start's position and velocity can explain
     weight: np.ndarray  # (n, T) square roots of the robust weights
     noise: Noise
     gram: np.ndarray  # (n, K, K)
@@ -142,7 +140,7 @@ def project(
     target = remove(basis, rows(np.where(g.mask, absolute, 0.0)[None], noise, weight, g))
     et, st = effects.swapaxes(1, 2), spins.swapaxes(1, 2)
     return Projected(
-        basis, weight, noise, et @ effects, (et @ target)[..., 0], st @ spins, st @ effects, (st @ target)[..., 0],
+        weight, noise, et @ effects, (et @ target)[..., 0], st @ spins, st @ effects, (st @ target)[..., 0],
         coefficient,
     )  # fmt: skip
 

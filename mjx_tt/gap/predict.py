@@ -42,11 +42,6 @@ class Grid:
     def n(self) -> int:
         return self.mask.shape[1]
 
-    def pick(self, which) -> Grid:
-        """Some of the balls."""
-        paddle = self.paddle and jax.tree.map(lambda x: x[..., which], self.paddle)
-        return Grid(*(getattr(self, f)[..., which] for f in ("steps", "index", "time", "measured", "mask")), paddle)
-
 
 def grid(trajectories: Sequence[Trajectory]) -> Grid:
     """Puts trajectories on one padded grid."""

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from ballmodel.files import replacing
 
-VERDICTS = ("named", "none", "unexplained", "undetermined")
-
 
 @dataclass(frozen=True)
 class Estimate:
