@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from mjx_tt.gap.predict import grid, heading_axes, leaves, predict
 from mjx_tt.model import SimModel
 from tests.hidden.world import World, camera, fly
 
+DATA = Path(__file__).parents[2] / "shared" / "data"
 FITTED = tuple(e for e in EFFECTS if e.fit and e.group != AT_THE_PADDLE)
 CHANGED = {
     "ball.flight.drag_coefficient": ("drag_coefficient", 0.55), "ball.flight.magnus_coefficient": ("magnus_coefficient", 0.6),
@@ -174,3 +176,34 @@ def test_the_extended_model_is_one_that_training_loads(tmp_path):
     assert loaded.model.ball.table.friction == pytest.approx(estimate.estimate)
     assert [r.path for r in loaded.randomise] == ["ball.table.friction"]
     assert loaded.provenance["logs"] == {"log": "0" * 64}
+
+
+@pytest.mark.parametrize(("spin", "k"), [((200.0, 0.0, 0.0), 0.3), ((-120.0, 0.0, 40.0), 0.6)])
+def test_names_a_spin_far_beyond_a_straight_line(spin, k):
+    """Balls of a launcher that spin fast, by the tests' own physics: out of reach of derivatives about resting balls."""
+    rng = np.random.default_rng(3)
+    n = 30
+    start = starts(n)
+    start[3] *= 0.3
+    start[4] = rng.normal(-5.0, 0.3, n)
+    start[6:] = np.array(spin)[:, None] + rng.normal(0.0, 5.0, (3, n))
+    measured = flown(World(magnus_coefficient=k), start, 64)
+    kept = np.isfinite(measured).all(axis=(0, 1))
+    measured = measured[:, :, kept] + rng.normal(0.0, 0.002, measured[:, :, kept].shape)
+    found = gap.diagnose(gap.Logs(tuple(trajectories(measured)), (), {}), SimModel())
+    (cause,) = found.verdict.causes
+    assert found.verdict.verdict == "named" and cause.name == "magnus"
+    means = np.array([cause.parameters[f"ball_spin.mean_{axis}"].estimate for axis in "xyz"])
+    fitted = cause.parameters["ball.flight.magnus_coefficient"].estimate
+    np.testing.assert_allclose(fitted * means[[0, 2]], k * np.array(spin)[[0, 2]], atol=0.05 * k * np.linalg.norm(spin))
+    assert found.verdict.held_out.low > 0.0
+
+
+@pytest.mark.parametrize(("session", "spins"), [("mn5008_topspin", True), ("no_spin_robot_simple", False)])
+def test_a_launchers_topspin_is_named_and_its_straight_balls_are_not(session, spins):
+    path = DATA / "aimy_launcher" / f"{session}.hdf5"
+    if not path.exists():
+        pytest.skip(f"{path} is not there: measured balls of a launcher")
+    verdict = gap.diagnose(gap.load([path])).verdict
+    assert ("magnus" in [c.name for c in verdict.causes]) == spins
+    assert verdict.held_out.low > 0.0

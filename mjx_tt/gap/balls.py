@@ -6,39 +6,33 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from ballmodel.trajectory import Trajectory
-from mjx_tt.gap import blocks, evidence, jitter, noise, select
+from mjx_tt.gap import jitter, noise, select
 from mjx_tt.gap.catalogue import AT_THE_PADDLE, EFFECTS
 from mjx_tt.gap.dataset import before_racket
+from mjx_tt.gap.evidence import SpinPrior
 from mjx_tt.gap.linear import SPIN, BallProblem, Linear, Projected, Situation, fit_starts, project, rows
-from mjx_tt.gap.predict import Grid, grid
+from mjx_tt.gap.predict import Grid, grid, picked
 from mjx_tt.gap.select import Choice, Trial
+from mjx_tt.gap.unexplained import Finding, unexplained
 from mjx_tt.model import SimModel
 
 FEWEST_SAMPLES = 15  # of a flight
 FEWEST_BALLS = 12
 WINDOWS = (0.1, 0.2, 0.3, 0.4)  # [s] of a flight that the first fit takes in turn
 ROUNDS = 4  # of choosing and linearising again
-BLOCK_LEVEL = 2e-5  # chance of one block's false alarm
-BLOCK_FLOOR = 0.0025  # [m] shift that a block must cause on the balls it concerns
-VISIBLE_FLOOR = 2e-4  # [m] rms of what of it no other start of the ball could imitate, on one ball in twenty
-ODD_LEVEL = 1e-5  # chance with which one ball is called odd
-ODD_SHARE = 0.01  # of the balls that may be odd (mis-tracked) before they are a finding
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A block that stays significant."""
-
-    block: str
-    where: str
-    direction: str
-    size: float  # [m]
-    p_value: float
-    gain: float  # squared error that it explains
+MAGNUS_KEPT = (0.2, 1.5)  # of the coefficient k about which derivatives are taken
+# Coefficient k and mean spin [rad/s] (topspin, gyro, side) to start from where balls may spin fast. In flight only their
+# product shows, at the bounce the spin alone.
+FAST_SPINS = tuple(
+    (k, tuple(sign * w * (a == axis) for a in range(3)))
+    for k, w in ((0.6, 100.0), (0.3, 200.0)) for axis in (0, 2) for sign in (1.0, -1.0)
+)  # fmt: skip
+FAST_STD = np.full(3, 80.0)  # [rad/s] how far a ball's own spin may then be from it
+FEW = 24  # balls on which the spins are tried
+CORNER = 5e-4  # [s] about the bounce of a spinning ball in which no sample counts
+SPIN_COST = 3.0  # squared error by which three more numbers of a ball must pay at least
 
 
 @dataclass(frozen=True)
@@ -78,8 +72,8 @@ def first_fit(
     """(9, n) starts: a parabola through the first samples, then ever longer parts of the flight.
 
     A flight that bounces has other minima for a start that is far off; growing windows keep the bounce where it is.
-    theta: (K,) changes of the effects, none by default. spin: (3,) [rad/s] of every ball, in its own axes. part: (T, n)
-    samples that count.
+    theta: (K,) or (K, n) changes of the effects, none by default. spin: (3,) or (3, n) [rad/s] of the balls, in their own
+    axes. part: (T, n) samples that count.
     """
     g = problem.grid if part is None else replace(problem.grid, mask=problem.grid.mask & part)
     theta = np.zeros(len(problem.effects)) if theta is None else theta
@@ -92,7 +86,7 @@ def first_fit(
         line = np.polynomial.polynomial.polyfit(time, (place - fall).T, 1)
         start[:3, i], start[3:6, i] = line
     if spin is not None:
-        start[SPIN] = spin[:, None]
+        start[SPIN] = spin[:, None] if spin.ndim == 1 else spin
     for window in WINDOWS:
         keep = (g.time <= window) | (np.arange(len(g.time)) < 8)[:, None]
         start = fit_starts(problem, theta, start, g, rounds=2, keep=keep)
@@ -107,27 +101,28 @@ def diagnose_balls(
 
     A jitter of the time stamps rounds the corner of the bounce as a tracker's filter does.
     """
-    found = _diagnose(trajectories, model, spin, without, seed, progress, None)
+    found = _diagnose(trajectories, model, spin, without, seed, progress)
     if "latency_jitter" in without:
         return found
-    shaken = jitter.find(left_over(found), found.linear.base.velocity[:, :, 0], found.problem.grid)
+    shaken = shaking(found)
     if shaken is None:
         return found
     (progress or (lambda text: None))(
         f"time stamps shake by {1e3 * shaken.seconds:.1f} ms: once more without the bounce's samples"
     )
     near = np.abs(found.problem.grid.time - found.linear.base.bounce_time[0]) < 3.0 * shaken.seconds
-    return _diagnose(trajectories, model, spin, without, seed, progress, near)
+    return _diagnose(trajectories, model, spin, without, seed, progress, near, found)
 
 
 def _diagnose(
     trajectories: Sequence[Trajectory], model: SimModel, spin: str, without: Sequence[str], seed: int,
-    progress: Callable[[str], None] | None, hidden: np.ndarray | None,
+    progress: Callable[[str], None] | None, hidden: np.ndarray | None = None, before: BallFindings | None = None,
 ) -> BallFindings:  # fmt: skip
     """Chooses the causes.
 
     spin: "none" when the nominal ball does not spin, so that spin is a cause; "free" when every ball may.
-    without: effects to leave out of the catalogue. Raises ValueError when there are too few flights.
+    without: effects to leave out of the catalogue. hidden: (T, n) samples that do not count. before: what was found with
+    them, whose spins are where the search starts. Raises ValueError when there are too few flights.
     """
     say = progress or (lambda text: None)
     kept = flights(trajectories)
@@ -152,64 +147,154 @@ def _diagnose(
     if hidden is not None:
         g = replace(g, mask=g.mask & ~hidden)
     problem = BallProblem(g, model, fitted, heading(g))
-    zero = np.zeros(len(fitted))
     say(f"fitting {g.n} flights under the nominal model")
     start = first_fit(problem)
-    at = Situation(zero, start)
-    start0, residual0, trial, frame, chosen_before, hint = start, None, None, None, None, None
-    own_noise = None
-    for round_ in range(ROUNDS):
-        say(f"round {round_ + 1}: derivatives")
-        linear = problem.linearise(at)
-        if trial is None:
-            residual0 = linear.residual
-            trial = Trial(fitted, *_shifts(linear, g), mode, seed, left_out=left_out)
-            frame = noise.flight_frame(linear.base.velocity[:, :, 0])
-        say(f"round {round_ + 1}: choosing")
-        for _ in range(2 if own_noise is not None else 3):
-            noise_now = own_noise or noise.estimate(linear.residual, frame, g)
-            weight = noise.robust_weights(linear.residual, noise_now, g)
-            p = project(linear, at, noise_now, weight, g, problem.coefficient)
-            choice = select.choose(p, replace(trial, spinning=bool(np.any(at.start[SPIN]))), hint)
-            left, moved = _left(linear, at, p, choice, g)
-            own_noise = noise.estimate(left, frame, g, 9 if choice.spin else 6)
-        theta = np.zeros(len(fitted))
-        theta[list(choice.effects)] = choice.theta
-        if choice.magnus is not None:
-            # In flight only k omega shows: a coefficient out of reason is kept within it, the spins take up the rest.
-            theta[problem.coefficient] = np.clip(choice.magnus, 0.2, 1.5)
-        settled = chosen_before == (choice.effects, choice.spin) and _close(theta, at.theta, trial)
-        chosen_before, hint = (choice.effects, choice.spin), choice.prior
-        at = _move(problem, moved, theta, choice, own_noise, g)
-        if settled:
-            break
-    linear = problem.linearise(at)
-    weight = noise.robust_weights(linear.residual, own_noise, g)
-    p = project(linear, at, own_noise, weight, g, problem.coefficient)
+    nominal = Situation(np.zeros(len(fitted)), start)
+    linear = problem.linearise(nominal)
+    trial = Trial(fitted, *_shifts(linear, g), mode, seed, left_out=left_out)
+
+    def judged(settled: Settled):
+        return unexplained(
+            settled.linear, settled.at, settled.projected, settled.choice, settled.trial, g, sessions, age, names
+        )
+
+    if before is not None and before.choice.spin:
+        best = search(problem, trial, before.situation, before.choice.prior, say)
+    else:
+        best = search(problem, trial, nominal, None, say, linear)
     say("looking for what no entry explains")
-    findings, survivors = unexplained(linear, at, p, choice, trial, g, sessions, age, names)
-    std = None if choice.prior is None else choice.prior.std
-    seen = select.visible(p, trial, choice.spin, std)
+    findings, survivors = judged(best)
+    if mode == "none" and (findings or _bent(best.choice)):
+        # Strong spin is out of reach of derivatives taken about balls that do not spin.
+        say("trying balls that spin fast")
+        other = search(problem, trial, *spinning(problem, start), say)
+        if other.choice.spin and _misfit(other, g) < _misfit(best, g):
+            best = other
+            findings, survivors = judged(best)
+    std = None if best.choice.prior is None else best.choice.prior.std
+    seen = select.visible(best.projected, best.trial, best.choice.spin, std)
     seen[list(left_out)] = False
-    imitated = select.imitated(p, trial, choice)
     return BallFindings(
         problem,
-        at,
-        linear,
-        choice,
-        trial,
-        own_noise,
-        p,
+        best.at,
+        best.linear,
+        best.choice,
+        best.trial,
+        best.noise,
+        best.projected,
         findings,
         survivors,
-        start0,
-        residual0,
+        start,
+        linear.residual,
         tuple(kept),
         sessions,
         age,
         seen,
-        imitated,
+        select.imitated(best.projected, best.trial, best.choice),
     )
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A choice of causes and the situation about which it was made."""
+
+    at: Situation
+    linear: Linear
+    choice: Choice
+    noise: noise.Noise
+    projected: Projected
+    trial: Trial
+
+
+def search(
+    problem: BallProblem, trial: Trial, at: Situation, prior: SpinPrior | None, say: Callable[[str], None],
+    linear: Linear | None = None,
+) -> Settled:  # fmt: skip
+    """Chooses causes and linearises about them until the choice settles.
+
+    prior: of the spins at the situation to start from, None where nothing spins. linear: the derivatives there.
+    """
+    g, own_noise, chosen_before, frame, bounces = problem.grid, None, None, None, None
+    for round_ in range(ROUNDS):
+        say(f"round {round_ + 1}: derivatives")
+        linear = problem.linearise(at) if linear is None else linear
+        spins = bool(np.any(at.start[SPIN]))
+        if frame is None:
+            frame = noise.flight_frame(linear.base.velocity[:, :, 0])
+            if spins:  # effects that show on spinning balls alone have a size there
+                trial = replace(trial, **dict(zip(("shift", "spin_shift"), _shifts(linear, g))))
+        say(f"round {round_ + 1}: choosing")
+        for _ in range(2 if own_noise is not None else 3):
+            noise_now = own_noise or noise.estimate(linear.residual, frame, g)
+            p = project(linear, at, noise_now, _weights(linear, noise_now, g, bounces), g, problem.coefficient)
+            choice = select.choose(p, replace(trial, spinning=spins), prior)
+            left, moved = _left(linear, at, p, choice, g)
+            own_noise = noise.estimate(left, frame, g, 9 if choice.spin else 6)
+        theta = np.zeros(len(problem.effects))
+        theta[list(choice.effects)] = choice.theta
+        if choice.magnus is not None:
+            # In flight only k omega shows: a coefficient out of reason is kept within it, the spins take up the rest.
+            theta[problem.coefficient] = np.clip(choice.magnus, *MAGNUS_KEPT)
+        settled = chosen_before == (choice.effects, choice.spin) and _close(theta, at.theta, trial)
+        chosen_before, prior = (choice.effects, choice.spin), choice.prior
+        (at, bounces), linear = _move(problem, moved, theta, choice, own_noise, g), None
+        if settled:
+            break
+    linear = problem.linearise(at)
+    p = project(linear, at, own_noise, _weights(linear, own_noise, g, bounces), g, problem.coefficient)
+    return Settled(at, linear, choice, own_noise, p, trial)
+
+
+def spinning(problem: BallProblem, start: np.ndarray) -> tuple[Situation, SpinPrior]:
+    """Situation and prior about the fast spin, common to all balls, under which the flights fit best.
+
+    From a few spins either way of topspin and sidespin, each with starts of its own, on some of the balls.
+    """
+    g = problem.grid
+    few = np.linspace(0, g.n - 1, min(g.n, FEW)).astype(int)
+    count = len(FAST_SPINS)
+    many = picked(g, np.tile(few, count))
+    tried = BallProblem(many, problem.model, problem.effects, heading(many))
+    theta = np.zeros((len(problem.effects), many.n))
+    theta[problem.coefficient] = np.repeat([k for k, _ in FAST_SPINS], len(few))
+    spin = np.repeat(np.array([w for _, w in FAST_SPINS], float).T, len(few), axis=1)
+    fitted = first_fit(tried, theta, spin)
+    left = many.measured - tried.fly(theta, fitted).measured[:, :, 0]
+    cost = np.sqrt(np.where(many.mask, (left**2).sum(axis=0), 0.0).sum(axis=0) / many.mask.sum(axis=0))
+    best = int(np.argmin(np.median(cost.reshape(count, -1), axis=1)))
+    k, mean = FAST_SPINS[best]
+    theta, mean = np.zeros(len(problem.effects)), np.array(mean, float)
+    theta[problem.coefficient] = k
+    start = first_fit(problem, theta, mean)
+    for _ in range(3):
+        frame = noise.flight_frame(problem.fly(theta, start).velocity[:, :, 0])
+        left = np.where(g.mask, g.measured - problem.fly(theta, start).measured[:, :, 0], 0.0)
+        start = fit_starts(problem, theta, start, g, noise.estimate(left, frame, g, 9), (mean, FAST_STD), rounds=3)
+        mean = np.median(start[SPIN], axis=1)
+    std = np.clip(1.4826 * np.median(np.abs(start[SPIN] - mean[:, None]), axis=1), 1.0, FAST_STD)
+    start[SPIN] = mean[:, None]
+    return Situation(theta, start), SpinPrior(mean, std)
+
+
+def _bent(choice: Choice) -> bool:
+    """Whether spin was chosen with a Magnus coefficient that no ball has: a line bent too far."""
+    return choice.magnus is not None and not MAGNUS_KEPT[0] <= choice.magnus <= MAGNUS_KEPT[1]
+
+
+def _misfit(settled: Settled, g: Grid) -> float:
+    """Twice the negative log likelihood of what a choice leaves under the noise that it leaves, and its price.
+
+    Each sample's whitened error is bounded: mis-tracked ones decide nothing.
+    """
+    n, p, choice = settled.noise, settled.projected, settled.choice
+    left = _left(settled.linear, settled.at, p, choice, g)[0]
+    counts = g.mask & (p.weight.T > 0.0)
+    error = np.minimum((noise.whiten(left, n, g) ** 2).sum(axis=0), 3.0 * noise.HUBER**2)
+    spread = 2.0 * np.log(n.scale * np.sqrt(1.0 - n.memory[:, None] ** 2)).sum(axis=0)
+    own = SPIN_COST * g.n if choice.spin else 0.0
+    # As if the samples left out were as usual: to leave out must not pay.
+    share = g.mask.sum() / counts.sum()
+    return float(share * np.where(counts, error + spread, 0.0).sum() + own + choice.threshold * len(choice.effects))
 
 
 def _last(g: Grid) -> np.ndarray:
@@ -246,6 +331,13 @@ def _shifts(linear: Linear, g: Grid) -> tuple[np.ndarray, float]:
     )
 
 
+def shaking(found: BallFindings) -> jitter.Jitter | None:
+    """Deviation of the time stamps in what the chosen causes leave, from the samples that count."""
+    g = found.problem.grid
+    g = replace(g, mask=g.mask & (found.projected.weight.T > 0.0))
+    return jitter.find(left_over(found), found.linear.base.velocity[:, :, 0], g)
+
+
 def left_over(found: BallFindings) -> np.ndarray:
     """(3, T, n) [m] what the chosen causes and each ball's own start leave."""
     return _left(found.linear, found.situation, found.projected, found.choice, found.problem.grid)[0]
@@ -278,173 +370,30 @@ def _left(linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid) 
     return np.where(g.mask, left - np.einsum("kctn,nk->ctn", linear.starts[:6], nu), 0.0), start
 
 
-def _move(problem, start, theta, choice: Choice, noise_now, g: Grid) -> Situation:
-    """The situation at the chosen causes, starts fitted again."""
+def _move(
+    problem: BallProblem, start: np.ndarray, theta: np.ndarray, choice: Choice, noise_now: noise.Noise, g: Grid
+) -> tuple[Situation, np.ndarray | None]:  # fmt: skip
+    """The situation at the chosen causes, starts fitted again; and where balls spin, when each bounces (n,) by its own."""
     if not choice.spin:
-        return Situation(theta, fit_starts(problem, theta, start, g, noise_now, rounds=3))
+        return Situation(theta, fit_starts(problem, theta, start, g, noise_now, rounds=3)), None
     prior = (choice.prior.mean, np.maximum(choice.prior.std, 1.0))
     start = fit_starts(problem, theta, start, g, noise_now, prior, rounds=3)
+    bounces = problem.fly(theta, start).bounce_time[0]
     # About the mean spin, not about each ball's own: that is fitted to its noise, and derivatives taken there would
     # remember it (the first-order method of mixed models against its conditional form).
     start[SPIN] = choice.prior.mean[:, None]
-    return Situation(theta, start)
+    return Situation(theta, start), bounces
 
 
-def unexplained(
-    linear: Linear,
-    at: Situation,
-    p: Projected,
-    choice: Choice,
-    trial: Trial,
-    g: Grid,
-    sessions: np.ndarray,
-    age: np.ndarray,
-    called: Sequence[str],
-) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
-    """Blocks that stay significant beside the chosen causes, the most important first; names that hold beside it."""
-    out, holding = [], []
-    chosen = list(choice.effects)
-    if choice.magnus is not None:
-        chosen.append(p.coefficient)
-    effects = linear.effects[chosen]
-    for block in blocks.build(linear, g, sessions, age, called):
-        columns = np.concatenate([effects, block.columns])
-        both = _with_columns(linear, at, p, columns, g)
-        scores = evidence.with_spin(both, choice.prior.std) if choice.spin else evidence.without_spin(both)
-        extra = list(range(len(chosen), len(columns)))
-        base = [*range(len(chosen)), *scores.always]
-        # The chosen effects' own values are in the situation: what is left is scored at it.
-        own, gram = evidence.unexplained_scores(scores, base, extra)
-        p_value, beta = _joint_test(own, gram)
-        if p_value > BLOCK_LEVEL:
-            continue
-        pattern = np.einsum("kctn,k->ctn", block.columns, beta)
-        worst = np.linalg.norm(np.where(g.mask, pattern, 0.0), axis=0).max(axis=0)
-        size = float(np.percentile(worst, 90))
-        if size < BLOCK_FLOOR or _visible(scores.ball_gram[:, extra][:, :, extra], beta, p, g) < VISIBLE_FLOOR:
-            continue
-        axis = int(
-            np.argmax([np.percentile(np.abs(np.where(g.mask, pattern[a], 0.0)).max(axis=0), 90) for a in range(3)])
-        )
-        importance = np.abs(beta) * np.sqrt(np.maximum(np.diagonal(gram), 0.0))
-        best = int(np.argmax(importance))
-        change = evidence.solve(scores, (*base, *extra))[: len(chosen)]
-        error = np.sqrt(np.diagonal(evidence.sandwich(scores, (*base, *extra))))[: len(chosen)]
-        holding.append(_holding(choice, trial, change, error))
-        out.append(
-            Finding(
-                block.name,
-                block.labels[best],
-                block.directions[best] or "xyz"[axis],
-                size,
-                p_value,
-                _explained(own, gram),
-            )
-        )
-    odd = _odd_balls(linear, at, p, choice, g)
-    if odd is not None:
-        out.append(odd)
-        holding.append({trial.effects[j].name for j in choice.effects})
-    if not out:
-        return (), tuple(e.name for e in trial.effects) + ("magnus", "latency_jitter")
-    order = np.argsort([-f.gain for f in out])
-    return tuple(out[i] for i in order), tuple(holding[order[0]])
+def _weights(linear: Linear, noise_now: noise.Noise, g: Grid, bounces: np.ndarray | None) -> np.ndarray:
+    """Square roots (n, T) of the samples' weights; none between the bounce of the mean spin and that of a ball's own.
 
-
-def _holding(choice: Choice, trial: Trial, change: np.ndarray, error: np.ndarray) -> set[str]:
-    """Chosen effects that keep at least half of their size, and significance, when a block may take over from them."""
-    names = set()
-    for j, before, moved, e in zip(choice.effects, choice.theta, change, error):
-        now = before + moved
-        if abs(now) > select.LEAST_Z * e and 0.5 < now / before < 2.0:
-            names.add(trial.effects[j].name)
-    return names
-
-
-def _with_columns(linear: Linear, at: Situation, p: Projected, columns: np.ndarray, g: Grid) -> Projected:
-    """The projected problem with other columns, its target the residual at the situation (spins kept absolute)."""
-    other = replace(linear, effects=columns)
-    return project(other, Situation(np.zeros(len(columns)), at.start), p.noise, p.weight, g)
-
-
-def _joint_test(own: np.ndarray, gram: np.ndarray) -> tuple[float, np.ndarray]:
-    """Chance that scores (n, E) have mean zero, by Hotelling's T^2 over the balls, and the fitted coefficients."""
-    scale = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
-    useful = np.flatnonzero(scale > 1e-6 * scale.max())
-    beta = np.zeros(len(scale))
-    values, vectors = np.linalg.eigh(gram[np.ix_(useful, useful)] / scale[useful, None] / scale[useful])
-    keep = values > 1e-3 * values.max()
-    u = (own[:, useful] / scale[useful]) @ vectors[:, keep] / np.sqrt(values[keep])
-    n, e = u.shape
-    if n <= e + 5:
-        return 1.0, beta
-    mean = u.mean(axis=0)
-    t2 = n * mean @ np.linalg.lstsq(np.cov(u.T).reshape(e, e), mean, rcond=1e-9)[0]
-    beta[useful] = vectors[:, keep] @ (u.sum(axis=0) / np.sqrt(values[keep])) / scale[useful]
-    return float(f_distribution.sf(t2 * (n - e) / (e * (n - 1)), e, n - e)), beta
-
-
-def _visible(gram: np.ndarray, beta: np.ndarray, p: Projected, g: Grid) -> float:
-    """Size [m], rms over a flight, of a pattern beyond what its ball's start explains: the 95th percentile of the balls."""
-    energy = np.einsum("i,nij,j->n", beta, gram, beta) / (3.0 * g.mask.sum(axis=0))
-    memory = float(p.noise.memory.mean())
-    # Slow patterns lose this factor when noise that remembers itself is whitened.
-    scale = np.median(p.noise.scale) * np.sqrt((1.0 + memory) / (1.0 - memory))
-    return float(np.percentile(np.sqrt(np.maximum(energy, 0.0)), 95) * scale)
-
-
-def _explained(own: np.ndarray, gram: np.ndarray) -> float:
-    total = own.sum(axis=0)
-    return float(total @ np.linalg.lstsq(gram, total, rcond=1e-6)[0])
-
-
-def _odd_balls(linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid) -> Finding | None:
-    """Balls of their own kind: a smooth misfit that the others do not have."""
-    t = g.time / np.maximum(g.time.max(axis=0), 1e-9) * 2.0 - 1.0
-    columns = []
-    for poly in (
-        t**2,
-        t**3,
-        np.where(
-            g.time > linear.base.bounce_time[0],
-            g.time - np.where(np.isfinite(linear.base.bounce_time[0]), linear.base.bounce_time[0], 0.0),
-            0.0,
-        ),
-    ):
-        for a in range(3):
-            column = np.zeros((3, *t.shape))
-            column[a] = poly
-            columns.append(column)
-    both = _with_columns(linear, at, p, np.stack(columns), g)
-    gram, right = both.gram, both.right
-    if choice.spin:
-        inner = both.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
-        left = both.spin_right - both.spin_gram @ choice.prior.mean
-        gram = gram - both.spin_effect.swapaxes(1, 2) @ np.linalg.solve(inner, both.spin_effect)
-        mean = both.spin_effect.swapaxes(1, 2) @ choice.prior.mean
-        right = right - mean - (both.spin_effect.swapaxes(1, 2) @ np.linalg.solve(inner, left[..., None]))[..., 0]
-    scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-300))
-    unit = gram / scale[:, :, None] / scale[:, None, :]
-    values, vectors = np.linalg.eigh(unit)
-    keep = values > 1e-3
-    u = np.einsum("nij,ni->nj", vectors, right / scale) / np.sqrt(np.maximum(values, 1e-12))
-    q, freedom = (np.where(keep, u, 0.0) ** 2).sum(axis=1), np.maximum(keep.sum(axis=1), 1)
-    inflation = max(float(np.median(q / chi2.ppf(0.5, freedom))), 1.0)
-    odd = q / inflation > chi2.isf(ODD_LEVEL, freedom)
-    if odd.sum() < max(3, ODD_SHARE * g.n):
-        return None
-    beta = np.einsum("nij,nj->ni", vectors, np.where(keep, u / np.sqrt(np.maximum(values, 1e-12)), 0.0)) / scale
-    pattern = np.einsum("kctn,nk->ctn", np.stack(columns), beta)
-    per_axis = np.abs(np.where(g.mask, pattern, 0.0)).max(axis=1)[:, odd]
-    size = float(np.median(np.linalg.norm(pattern, axis=0).max(axis=0)[odd]))
-    if size < BLOCK_FLOOR:
-        return None
-    axis = "xyz"[int(np.argmax(np.median(per_axis, axis=1)))]
-    return Finding(
-        "a subset of the balls",
-        f"{int(odd.sum())} of {g.n} balls",
-        axis,
-        size,
-        ODD_LEVEL,
-        float(q[odd].sum() / inflation),
-    )
+    There a straight line in the spin leads astray: the flight has a corner, and it has moved past the sample.
+    """
+    weight = noise.robust_weights(linear.residual, noise_now, g)
+    if bounces is None:
+        return weight
+    ends = np.sort([linear.base.bounce_time[0], bounces], axis=0)
+    with np.errstate(invalid="ignore"):
+        astray = (g.time > ends[0] - CORNER) & (g.time < ends[1] + CORNER)
+    return np.where(astray, 0.0, weight.T).T

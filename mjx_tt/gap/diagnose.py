@@ -14,8 +14,8 @@ import numpy as np
 from scipy.stats import t as student
 
 from mjx_tt import model as models
-from mjx_tt.gap import design, evidence, heldout, jitter, select
-from mjx_tt.gap.balls import BallFindings, diagnose_balls, left_over
+from mjx_tt.gap import design, evidence, heldout, select
+from mjx_tt.gap.balls import BallFindings, diagnose_balls, shaking
 from mjx_tt.gap.catalogue import AT_THE_PADDLE, BY_NAME, EFFECTS, INVISIBLE, SENSING, Effect
 from mjx_tt.gap.dataset import Logs
 from mjx_tt.gap.heldout import Prediction
@@ -228,8 +228,7 @@ def _ball_causes(found: BallFindings, without, seed: int) -> tuple[list[Cause], 
         for axis, mean, std in zip("xyz", choice.prior.mean, choice.prior.std):
             values |= {f"ball_spin.mean_{axis}": float(mean), f"ball_spin.std_{axis}": float(std)}
     if "latency_jitter" not in without:
-        left = left_over(found)
-        shaken = jitter.find(left, found.linear.base.velocity[:, :, 0], found.problem.grid)
+        shaken = shaking(found)
         if shaken is not None and shaken.shift > select.FLOOR / 2:
             path = SENSING + "jitter"
             causes.append(Cause(

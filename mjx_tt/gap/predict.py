@@ -61,6 +61,12 @@ def grid(trajectories: Sequence[Trajectory]) -> Grid:
     return Grid(steps, index, time, measured, mask)
 
 
+def picked(g: Grid, index: np.ndarray) -> Grid:
+    """The grid of the balls with these indices, which may repeat."""
+    paddle = g.paddle and jax.tree.map(lambda x: x[..., index], g.paddle)
+    return Grid(*(x[..., index] for x in (g.steps, g.index, g.time, g.measured, g.mask)), paddle)
+
+
 @dataclass(frozen=True)
 class Flown:
     """Predictions for n balls under v variants."""

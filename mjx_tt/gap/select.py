@@ -85,16 +85,17 @@ def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
             first = max(evidence.all_gains(plain, _candidates(p, trial, False, None), 1).items(), key=lambda x: x[1])[0]
             prior = evidence.fit_spin(p, first)
         sets.append((True, evidence.with_spin(p, prior.std)))
-    found, all_plain = [], {}
-    threshold = LEAST_GAIN
+    found, all_plain, thresholds = [], {}, {}
     for spin, scores in sets:
         candidates = _candidates(p, trial, spin, None if prior is None else prior.std)
         gains = evidence.all_gains(scores, candidates)
         # What chance reaches beside the best set: with a cause left out, its own signal would count as noise.
         best = max(gains, key=lambda s: gains[s] - LEAST_GAIN * len(s))
         rest = [c for c in candidates if c not in best]
+        threshold = LEAST_GAIN
         if rest:
             threshold = max(threshold, evidence.flip_threshold(scores, (*best, *scores.always), rest, rng))
+        thresholds[spin] = threshold
         cost = SPIN_GAIN if spin and trial.spin == "none" else 0.0
         if not spin:
             all_plain = gains
@@ -104,7 +105,7 @@ def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
     top = found[0][3]
     for value, subset, spin, gain in found:
         plain = all_plain.get(tuple(sorted({*subset, p.coefficient} - {None}))[:LARGEST_SUBSET], -np.inf)
-        if _holds(by_spin[spin], subset, gain, trial, threshold, spin, prior, top, plain):
+        if _holds(by_spin[spin], subset, gain, trial, thresholds[spin], spin, prior, top, plain):
             break
     scores = by_spin[spin]
     theta = evidence.solve(scores, (*subset, *scores.always))
@@ -126,7 +127,7 @@ def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
         gain,
         prior if spin else None,
         magnus,
-        threshold,
+        thresholds[spin],
         groups,
         others,
     )
