@@ -54,7 +54,9 @@ class Evaluator:
         def play(theta, mean, inverse_scale, key, pool, thrown):
             drawn = simulator.draw(key, pool, model.model, model.randomise, rows, columns)
             copies = jnp.repeat(theta[:, None], columns // simulator.devices, axis=1)
-            return simulator.rollout(copies, mean, inverse_scale, simulator.local(replace(drawn, ball=thrown)))
+            # Balls of a distribution do not spin: what the drawn ones do is the model's.
+            spinning = replace(thrown, spin=thrown.spin + drawn.ball.spin)
+            return simulator.rollout(copies, mean, inverse_scale, simulator.local(replace(drawn, ball=spinning)))
 
         spread = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
         fixed = simulator.replicate((self.balls, thrown))

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import json
 
+import hand_ball
+import jax
 import numpy as np
 import pytest
 from PIL import Image
 from scipy.stats import binomtest
 
-from experiments import evaluate, plots
+from experiments import build, config, evaluate, plots
 from experiments.evaluate import Played
 from mjx_tt import rewards
-from mjx_tt.rollout import RolloutResult
-from mjx_tt.task import HIT, MISSED, RETURNED
-from robot_io.contract import LIMITS
+from mjx_tt.rollout import RolloutResult, Simulator
+from mjx_tt.task import HIT, MISSED, OUT_OF_REACH, RETURNED
+from robot_io.contract import LIMITS, N_OBSERVATION, n_parameters
 
 N_TERMS = len(rewards.TERMS)
 
@@ -69,6 +71,24 @@ def test_summary_of_nothing_finite_is_still_json():
     report = evaluate.summary(result([MISSED, MISSED], [False, False]))
     assert (report["return_rate"], report["mean_return"], report["non_finite"]) == (0.0, None, 2)
     json.dumps(report, allow_nan=False)
+
+
+def test_an_evaluation_plays_the_spin_of_its_model():
+    """Past a robot that stands still, balls go out of reach when ``hand_ball`` says: a spinning one leaves the table fast."""
+    topspin = 250.0
+    data = {"name": "a", "balls": "narrow", "model": {"ball_spin": {"mean_x": topspin}}, "training": {"pool": 64}}
+    experiment = build.experiment(config.parse(data, "a"), "a")
+    evaluator = evaluate.Evaluator(Simulator(experiment.task), experiment, 32, jax.random.key(0))
+    eleven = np.ones(N_OBSERVATION, np.float32)
+    played = evaluator.play(np.zeros(n_parameters(), np.float32), 0.0 * eleven, eleven, jax.random.key(1))
+    order = np.argsort(np.asarray(evaluator.balls.arrival))
+    missed = played.outcome.ravel() == MISSED
+    assert missed.sum() > 16
+    for i, steps in zip(order[missed], played.steps.ravel()[missed]):
+        ball = jax.tree.map(lambda x: np.asarray(x, float)[:, i], evaluator.balls.state)
+        start = hand_ball.Touch(0.0, ball.position, ball.velocity, np.array([topspin, 0.0, 0.0]))
+        end, _ = hand_ball.fly(hand_ball.on_table(start), lambda p: min(p[1] - OUT_OF_REACH[0], p[2] - OUT_OF_REACH[1]))
+        assert steps == pytest.approx(end * experiment.task.control_rate, abs=1.5)
 
 
 def test_selection_score_is_the_papers_sparse_reward():
