@@ -50,7 +50,15 @@ def load(paths: Sequence[str | os.PathLike]) -> Logs:
         raise ValueError(f"{file}: the joints' {other} is missing beside it: commands and positions are needed")
     joints = tuple(read_robot_csv(*(robot[name] for name in ROBOT_FILES))) if robot else ()
     for file in (f for f in files if f.name not in ROBOT_FILES):
-        data = read(file)
+        try:
+            data = read(file)
+        except ValueError as error:
+            if file.suffix.lower() != ".mcap":
+                raise
+            raise ValueError(
+                f"{error} (a log of balls holds messages on /ball; a session of `mjx-tt run` is read by `mjx-tt diagnose`, "
+                "or by experiments.diagnosis.read_logs)"
+            ) from None
         if not hasattr(data, "trajectories"):
             raise ValueError(
                 f"{file}: holds single ball states, no trajectories: a diagnosis needs positions over time"
