@@ -93,7 +93,10 @@ def apply(theta, history):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PolicyController:
-    """The streaming policy as a ``task.Controller``: parameters of P perturbations and a frozen normaliser (11,)."""
+    """The streaming policy as a ``task.Controller``: parameters of P perturbations and a frozen normaliser.
+
+    mean, inverse_scale: (11,), or (11, P) where every episode has parameters of its own (one repeat).
+    """
 
     parameters: dict
     mean: jax.Array
@@ -106,5 +109,5 @@ class PolicyController:
         return stream(self.parameters, state, self._normalised(observation))
 
     def _normalised(self, x):
-        column = (-1,) + (1,) * (x.ndim - 1)
+        column = self.mean.shape + (1,) * (x.ndim - self.mean.ndim)
         return (x - self.mean.reshape(column)) * self.inverse_scale.reshape(column)

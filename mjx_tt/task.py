@@ -73,7 +73,7 @@ class TaskConfig:
 class Controller(Protocol):
     """What decides about the robot's velocities; batch axes last."""
 
-    mean: jax.Array  # (11,) about which the observations' statistics are summed
+    mean: jax.Array  # (11,) or (11, ...) about which the observations' statistics are summed
 
     def start(self, observation):
         """State before the first control step, from the first observation (11, ...)."""
@@ -91,6 +91,7 @@ class Episodes:
     latency: jax.Array  # (5, ...) [s], order of model.LATENCIES
     seed: jax.Array  # (...) uint32, of the observation noise
     model: SimModel  # leaves scalar or (...)
+    start: jax.Array | None = None  # (8, ...) joint positions at which the robot rests at first; None: at home
 
 
 @jax.tree_util.register_dataclass
@@ -202,14 +203,15 @@ class Task:
         )
 
     def reset(self, episodes: Episodes, controller: Controller) -> EpisodeState:
-        """Robot at home and at rest, ball at its start; before that moment everything is taken to have been so."""
+        """Robot at rest, at home or where the episodes say, ball at its start; before that everything was so."""
         batch, dtype = episodes.ball.position.shape[1:], episodes.ball.position.dtype
 
         def full(value, *leading):
             return jnp.broadcast_to(jnp.asarray(value, dtype), leading + batch)
 
         zeros = full(0.0, N_JOINTS)
-        home = jnp.broadcast_to(jnp.asarray(self.home, dtype).reshape((N_JOINTS,) + (1,) * len(batch)), zeros.shape)
+        home = jnp.asarray(self.home, dtype).reshape((N_JOINTS,) + (1,) * len(batch))
+        home = jnp.broadcast_to(home if episodes.start is None else episodes.start, zeros.shape)
         seen = jnp.concatenate([episodes.ball.position, home])
         zero, false = full(0.0), jnp.broadcast_to(False, batch)
         prepared, tracker = self.prepare(episodes), episodes.model.sensing
@@ -251,9 +253,8 @@ class Task:
             joints = joints + prepared.drives.joint_offset
         return jnp.concatenate([ball, joints])
 
-    def control_step(self, tick, s: EpisodeState, episodes: Episodes, prepared: Prepared, controller: Controller):
-        """One control period: observe, act, advance robot and ball by the substeps."""
-        period = self.config.period
+    def observe(self, tick, s: EpisodeState, episodes: Episodes, prepared: Prepared):
+        """What the policy sees at control step ``tick``: (11, ...)."""
         joints = slice(3, 3 + N_JOINTS)
         captured = [
             latency.ring_read(s.observations[:, :3], tick - prepared.ball.periods),
@@ -261,7 +262,12 @@ class Task:
         ]
         if episodes.model.sensing.jitter is not None:
             captured.append(latency.ring_read(s.observations[:, joints.stop :], tick - prepared.ball.periods))
-        observation = materialise(self._measured(episodes, prepared, jnp.concatenate(captured), tick))
+        return materialise(self._measured(episodes, prepared, jnp.concatenate(captured), tick))
+
+    def control_step(self, tick, s: EpisodeState, episodes: Episodes, prepared: Prepared, controller: Controller):
+        """One control period: observe, act, advance robot and ball by the substeps."""
+        period = self.config.period
+        observation = self.observe(tick, s, episodes, prepared)
         action, controller_state = controller.act(tick, s.controller, observation)
         scale = np.asarray(LIMITS.policy_velocity, action.dtype).reshape((-1,) + (1,) * (action.ndim - 1))
         # After the contact the robot is only braked: what the real one does before it returns home.
@@ -349,7 +355,7 @@ class Task:
         for each in inside[1:]:
             safe = safe & each
         gaps = materialise(self.clearance(materialise(self.kinematics.links(qpos)), qpos[0]))
-        centred = observation - shift.reshape((-1,) + (1,) * (observation.ndim - 1))
+        centred = observation - shift.reshape(shift.shape + (1,) * (observation.ndim - shift.ndim))
         return Sums(
             closest=closest,
             jerk=sums.jerk + alive * relative(jerk, 2.0 * np.asarray(LIMITS.acceleration) / period),
@@ -425,4 +431,3 @@ class Task:
             "style": -sums.bad_style,
         }
         return jnp.stack([terms[name] for name in rewards.TERMS])
-

@@ -1,0 +1,71 @@
+"""Rallies per second: ``python -m benchmarks.rallies [--policy runs/quickstart] [--rallies 1000]``.
+
+All rallies are played to their ends in one compiled call, by five virtual players in turn against one policy; without
+``--policy`` an untrained one, whose rallies are short. Compilation and a first call are not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import policy as policies
+from mjx_tt import platform, players
+from mjx_tt.model import SimModel
+from mjx_tt.policy import initial_theta
+from mjx_tt.rally import End, RallySimulator
+from mjx_tt.task import TaskConfig
+from robot_io.contract import N_OBSERVATION
+
+LANES = 200  # side by side; each plays its share one rally after the other
+RUNS = 3  # of which the fastest counts
+
+
+def main(arguments=None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--policy", help="run or artefact")
+    parser.add_argument("--rallies", type=int, default=1000)
+    parser.add_argument("--lanes", type=int, default=LANES)
+    parser.add_argument("--sim-rate", type=float, default=150.0, help="Hz")
+    chosen = parser.parse_args(arguments)
+    platform.configure(devices=1)
+    if chosen.policy:
+        loaded = policies.load(chosen.policy)
+        theta, mean, inverse_scale = loaded.theta, loaded.mean, loaded.inverse_scale
+    else:
+        theta, mean, inverse_scale = initial_theta(jax.random.key(0)), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION)
+    each = -(-chosen.rallies // chosen.lanes)
+    names = players.names()
+    people = players.stack([players.load(names[lane % len(names)]) for lane in range(chosen.lanes)])
+    columns = jnp.repeat(jnp.asarray(theta, jnp.float32)[:, None], chosen.lanes, axis=1)
+    normaliser = [jnp.asarray(x, jnp.float32) for x in (mean, inverse_scale)]
+    simulator = RallySimulator(TaskConfig(sim_rate=chosen.sim_rate))
+
+    def play(seed):
+        began = time.perf_counter()
+        result = simulator.play(columns, *normaliser, people, SimModel(), jax.random.key(seed), each)
+        length, end = np.asarray(result.length), np.asarray(result.end)
+        return time.perf_counter() - began, length, end, float(result.seconds.sum())
+
+    compiled, *_ = play(0)
+    seconds, length, end, played = min(
+        (play(seed) for seed in range(1, RUNS + 1)), key=lambda run: run[0] / run[1].sum()
+    )
+    print(
+        f"{length.size} rallies, {length.sum()} touches, {played:.0f} s of play in one compiled call of {seconds:.2f} s "
+        f"on {jax.devices()[0].platform}: {length.size / seconds:.0f} rallies/s, {length.sum() / seconds:.0f} touches/s, "
+        f"{played / seconds:.0f} x real time; the first call, with its compilation, took {compiled:.0f} s"
+    )
+    print(f"length {length.mean():.1f} on average, {length.max()} at most; ended by:")
+    for row, count in zip(*np.unique(end, return_counts=True)):
+        print(f"  {count / end.size:6.1%}  {End(row).name.lower().replace('_', ' ')}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
