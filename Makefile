@@ -1,5 +1,6 @@
 # make demo   set up, train the quickstart, evaluate it, export it
 # make rig-demo  the same policy on the emulated robot, over real sockets in real time (trains it first if need be)
+# make study-quick  the whole study in small: five virtual players, all methods, a report (under half an hour; resumable)
 # make test   set up and run the tests
 # make exam   hide causes in logs and let the diagnosis find them: the large examination (hours; resumable)
 # make bench  set up and measure speed against MJX, MuJoCo C and PyBullet
@@ -9,7 +10,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo rig-demo test exam bench setup clean
+.PHONY: demo rig-demo study-quick test exam bench setup clean
 
 demo: $(READY)
 	$(BIN)/mjx-tt train quickstart.yaml --out runs
@@ -17,6 +18,9 @@ demo: $(READY)
 rig-demo: $(READY)
 	test -e runs/quickstart/artefact/manifest.json || $(BIN)/mjx-tt train quickstart.yaml --out runs
 	$(BIN)/mjx-tt run runs/quickstart/artefact --robot rig --balls 30 --log runs/rig-demo
+
+study-quick: $(READY)
+	$(BIN)/mjx-tt is2r study_quick.yaml --out runs
 
 test: $(READY)
 	$(BIN)/python -m pytest

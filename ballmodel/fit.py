@@ -28,6 +28,7 @@ from ballmodel.trajectory import Trajectory
 DT = 1.0 / 300.0  # [s] longest step of the simulated flight
 MIN_SAMPLES = 4  # 12 numbers for 6 unknowns
 PAD = 32  # numbers of samples and of trajectories are rounded up to it, so that similar batches share one compiled fit
+MANY, PAD_MANY = 256, 512  # and more than MANY trajectories to this
 MAX_ITERATIONS = 50
 STEP_TOLERANCE = 1e-9  # [m], [m/s] change below which a fit has converged
 
@@ -191,7 +192,8 @@ def fit_gauss_newton(
     Raises ValueError for too few samples or a spin of the wrong shape.
     """
     _check(trajectories)
-    n, extra = len(trajectories), -len(trajectories) % PAD
+    n = len(trajectories)
+    extra = -n % (PAD if n <= MANY else PAD_MANY)
     spin = np.zeros((3, n)) if spin is None else np.asarray(spin, np.float64)
     if spin.shape != (3, n):
         raise ValueError(f"spin has shape {spin.shape}, (3, {n}) is wanted: one spin for each trajectory")

@@ -17,6 +17,7 @@ from ballmodel.pool import KEPT, OUTCOMES, SECOND_BOUNCE, throw
 from ballmodel.state import BallState
 from ballmodel.trajectory import Dataset, free_flight
 
+LANDED_TOGETHER = 512  # flights are simulated in multiples of it
 ROBOT_SIDE = ((-c.TABLE_WIDTH / 2, -c.TABLE_LENGTH / 2), (c.TABLE_WIDTH / 2, 0.0))  # [m] corners of its half
 
 
@@ -57,7 +58,12 @@ def fit_human(
     state = jax.tree.map(np.asarray, state)
     towards = (state.position[1] > 0.0) & (state.velocity[1] < 0.0)
     state = jax.tree.map(lambda a: a[:, towards], state)
-    thrown = throw(params, jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), state), *ROBOT_SIDE)
+    if not towards.any():
+        raise ValueError(f"{measured.source}: none of {towards.size} balls flies from the human's side to the robot's")
+    # In numbers that similar data sets share, so that one compiled flight serves them.
+    n, extra = int(towards.sum()), -int(towards.sum()) % LANDED_TOGETHER
+    padded = jax.tree.map(lambda a: jnp.asarray(np.pad(a, ((0, 0), (0, extra)), mode="edge"), jnp.float32), state)
+    thrown = jax.tree.map(lambda a: a[..., :n], throw(params, padded, *ROBOT_SIDE))
     outcome = np.asarray(thrown.outcome)
     good = (outcome == KEPT) | (outcome == SECOND_BOUNCE)
     counts = np.bincount(outcome, minlength=len(OUTCOMES))

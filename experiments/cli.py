@@ -164,6 +164,49 @@ def finetune(options: argparse.Namespace) -> int:
     return 0 if report is not None else 130
 
 
+def is2r(options: argparse.Namespace) -> int:
+    from experiments import study_config
+
+    study = study_config.load(_study(options.study), tuple(options.set))
+    devices = study.simulation.devices
+    _start_jax(options.devices or (None if devices == "auto" else devices))
+    from experiments import is2r as loop
+
+    return 0 if loop.run(study, Path(options.out) / study.name, _console()) else 130
+
+
+def study_report(options: argparse.Namespace) -> int:
+    _start_jax(1)
+    from experiments import study_report as report
+
+    _console().print(report.write(Path(options.study)), highlight=False, soft_wrap=True)
+    return 0
+
+
+def blind(options: argparse.Namespace) -> int:
+    _start_jax(1)
+    from experiments import blind_evaluation
+
+    blind_evaluation.run(options, _console())
+    return 0
+
+
+def compare(options: argparse.Namespace) -> int:
+    from experiments import compare_config
+
+    path = Path(options.comparison)
+    if not path.exists() and path.parent == Path():
+        path = compare_config.shipped().get(path.stem, path)
+    comparison, experiment = compare_config.load(path, tuple(options.set))
+    _start_jax(1)
+    from experiments import compare as comparing
+
+    console = _console()
+    folder = comparing.compare(comparison, experiment, str(path), Path(options.out), console)
+    console.print(f"{folder}/comparison.md, with its pictures beside it", highlight=False, soft_wrap=True)
+    return 0
+
+
 def rig(options: argparse.Namespace) -> int:
     _start_jax(1)
     from experiments import play
@@ -339,6 +382,52 @@ Every ball is on disk before the next begins: the same command continues after a
     p.add_argument("--backend", choices=("numpy", "jit"), default="numpy", help="what computes the policy")
     _add_rig(p, None)
 
+    p = _command(commands, "is2r", is2r, "simulate, play, refine: the iterative loop and its study", """\
+  mjx-tt is2r study_quick.yaml                              five virtual players, half an hour, ends in a report
+  mjx-tt is2r study_full.yaml --set players=[player3]       the paper's scale
+  mjx-tt is2r anna.yaml                                     with robot: robot.yaml in it: on a robot, docs/is2r.md
+
+Every finished step is kept: the same command continues after an interruption, a crash, or when people have played.
+A file name without a folder that is not in the current folder is looked up among the shipped studies.
+""")  # fmt: skip
+    p.add_argument("study", metavar="YAML")
+    p.add_argument("--out", default="runs", metavar="FOLDER", help="where the study's folder goes (default: runs)")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one key of the study")
+    _add_devices(p)
+
+    p = _command(commands, "study-report", study_report, "the report of a study, whole or under way: one HTML page", """\
+  mjx-tt study-report runs/study-quick
+
+Writes report/index.html with its pictures and tables: the paper's figures with ours beside them. What a study lacks is named.
+""")  # fmt: skip
+    p.add_argument("study", metavar="FOLDER", help="folder of a study")
+
+    p = _command(commands, "blind", blind, "policies under code names, for people who evaluate them", """\
+  mjx-tt blind make anna-evaluates is2r-ft100=runs/a/artefact s2r-ft100=runs/b/artefact --trainer anna --evaluator anna
+  mjx-tt run anna-evaluates/policies/A --robot robot.yaml          and fill in anna-evaluates/sheet.csv; then B, C, ...
+  mjx-tt blind sheet anna-evaluates                                how many rallies count so far
+  mjx-tt blind open anna-evaluates                                 when all are played: which was which, and the means
+
+The key is sealed in FOLDER/key.sealed; it opens when every code has 50 rallies that count. docs/evaluation.md.
+""")  # fmt: skip
+    p.add_argument("action", choices=("make", "sheet", "open"))
+    p.add_argument("folder", metavar="FOLDER", help="of the blind evaluation")
+    p.add_argument("policies", nargs="*", metavar="MODEL=POLICY", help="of make: a name and its artefact or run")
+    p.add_argument("--trainer", default="", metavar="NAME", help="of make: who trained the policies")
+    p.add_argument("--evaluator", default="", metavar="NAME", help="of make: who plays (default: the trainer)")
+    p.add_argument("--seed", type=int, default=0, metavar="K", help="of make: the study's seed that the policies belong to")
+
+    p = _command(commands, "compare", compare, "several learning algorithms on one task, also where none has trained", """\
+  mjx-tt compare compare_quick.yaml                         BGS, ARS, PPO, SAC, QT-Opt: three minutes each
+  mjx-tt compare mine.yaml --set budget.minutes=60 --set seeds=[0,1,2]
+
+Algorithms and seeds that are finished are kept: the same command continues, and one with more of them adds to it.
+A file name without a folder that is not in the current folder is looked up among the shipped comparisons.
+""")  # fmt: skip
+    p.add_argument("comparison", metavar="YAML", help="docs/algorithms.md explains it")
+    p.add_argument("--out", default="runs", metavar="FOLDER", help="where its folder goes (default: runs)")
+    p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one key")
+
     p = _command(commands, "rig", rig, "the emulated robot alone, on real sockets", """\
   mjx-tt rig --out rig.yaml          and in another terminal:  mjx-tt run ARTEFACT --robot rig.yaml
 """)  # fmt: skip
@@ -450,6 +539,14 @@ def _experiment(name: str) -> Path:
 
     path = Path(name)
     return path if path.exists() or path.parent != Path() else config.shipped().get(path.stem, path)
+
+
+def _study(name: str) -> Path:
+    """The file of that name, or the study of that name that comes with the program."""
+    from experiments import study_config
+
+    path = Path(name)
+    return path if path.exists() or path.parent != Path() else study_config.shipped().get(path.stem, path)
 
 
 def _most_devices(configs) -> int | None:

@@ -232,7 +232,9 @@ def parse(data: dict[str, Any], where: str) -> Config:
 
 def shipped() -> dict[str, Path]:
     """The experiments that come with the program, by name."""
-    return {path.stem: path for path in sorted(Path(__file__).parent.glob("*.yaml"))}
+    others = ("study_", "compare_")  # YAMLs of other commands
+    paths = sorted(Path(__file__).parent.glob("*.yaml"))
+    return {path.stem: path for path in paths if not path.stem.startswith(others)}
 
 
 def json_schema() -> dict[str, Any]:

@@ -166,11 +166,12 @@ def wilson(successes: int, trials: int, z: float = CONFIDENCE_Z) -> tuple[float,
 
 
 def selection_score(result: RolloutResult) -> float:
-    """The paper's sparse reward: +1 hit, +1 landed on the human's side, -2 fault; mean over the episodes.
-
-    A simulated robot faults when it touches itself or the table, or when the episode is not finite.
-    """
+    """``sparse_reward`` in simulation, where a robot faults when it touches itself or the table, or is not finite."""
     collision = result.terms[rewards.TERMS.index("collision")]
-    fault = ~result.finite | (collision < 0)
-    score = (result.outcome != MISSED).astype(float) + (result.outcome == RETURNED)
+    return sparse_reward(result.outcome, ~result.finite | (collision < 0))
+
+
+def sparse_reward(outcome, fault) -> float:
+    """The paper's reward for choosing a seed: +1 hit, +1 landed on the human's side, -2 fault; mean over the episodes."""
+    score = (outcome != MISSED).astype(float) + (outcome == RETURNED)
     return float(np.mean(np.where(fault, -2.0, score)))

@@ -65,6 +65,8 @@ def _walk(mistake: dict[str, Any], model: type[BaseModel]) -> tuple[str, type[Ba
         member = next((s for s in sections if part in _tags(s)), None)
         if isinstance(part, int):
             path += f"[{part}]"
+        elif len(candidates) == 1 and get_origin(candidates[0]) is dict:
+            path, candidates = f"{path}.{part}", _members(get_args(candidates[0])[1])
         elif len(candidates) > 1 and member:
             candidates = [member]
         elif holder:

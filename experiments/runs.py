@@ -69,8 +69,7 @@ class Run:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self.check(config)
-            with replacing(path) as temporary:
-                temporary.write_text(yaml.safe_dump(config.to_dict(), sort_keys=False), encoding="utf-8")
+            write_yaml(path, config.to_dict())
             sessions = self.folder / "run.json"
             before = json.loads(sessions.read_text()) if sessions.exists() else []
             write_json(sessions, [*before, provenance()])
@@ -173,6 +172,12 @@ def write_json(path: Path, data: Any) -> None:
     """Replaces the file by indented JSON, whole or not at all. Raises OSError."""
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_yaml(path: Path, data: dict[str, Any]) -> None:
+    """Replaces the file by YAML in the order given, whole or not at all. Raises OSError."""
+    with replacing(path) as temporary:
+        temporary.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
 
 
 def _git(root: Path, *arguments: str) -> str | None:

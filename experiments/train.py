@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,6 +23,7 @@ from experiments.progress import TrainingProgress
 from experiments.runs import Run
 from experiments.training import Trainer, TrainState
 
+_programs: dict[str, Any] = {}  # compiled updates by what decides them
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
 
 
@@ -68,7 +71,7 @@ class Session:
             with progress, _stop_requests() as stop_wanted:
                 if self.update:
                     progress.note(f"continues after update {self.update}")
-                compiled = self._trainer.lower(self.state).compile()
+                compiled = _compiled(self._config, self._trainer, self.state)
                 while (reason := self._ended()) is None and not stop_wanted():
                     self._advance(compiled, log, progress, stop_wanted)
                 self._save(log)
@@ -133,6 +136,17 @@ class Session:
             log.sync()
             checkpoint.save(self._run.checkpoints, self.update, self.state, self._notes())
         self._saved = (self.update, time.monotonic())
+
+
+def _compiled(config, trainer: Trainer, state: TrainState):
+    """The update's program: one for all runs of this process that differ in balls, seed and first policy only."""
+    sections, training = [config.to_dict()[name] for name in ("task", "model", "optimiser")], config.training
+    length = training.updates if config.optimiser.step.schedule.kind == "cosine" else None
+    rest = [length, build.later_weights(training), training.pool, trainer.simulator.devices]
+    decides = json.dumps([*sections, *rest], sort_keys=True)
+    if decides not in _programs:
+        _programs[decides] = trainer.lower(state).compile()
+    return _programs[decides]
 
 
 def _start(config, run: Run, trainer: Trainer) -> tuple[TrainState, dict]:

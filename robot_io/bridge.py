@@ -29,8 +29,18 @@ from robot_io.faults import Cause
 from robot_io.geometry import RobotGeometry
 from robot_io.history import History
 from robot_io.log.recorder import NullRecorder, SessionRecorder
-from robot_io.log.records import Action, Ball, Command, Event, Joints, Level, Observation, Tick
-from robot_io.log.records import episode_end, episode_start
+from robot_io.log.records import (
+    Action,
+    Ball,
+    Command,
+    Event,
+    Joints,
+    Level,
+    Observation,
+    Tick,
+    episode_end,
+    episode_start,
+)
 from robot_io.observation import Feedback, ObservationDelays, joints, observe
 from robot_io.play import Episode, EpisodeSummary, in_play
 from robot_io.safety import SafetyGate

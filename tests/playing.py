@@ -14,7 +14,6 @@ from mjx_tt.model import LATENCIES, SimModel
 from mjx_tt.task import Episodes, EpisodeState, Return, Task, TaskConfig
 from robot_io.contract import N_JOINTS, N_OBSERVATION
 
-
 P, TICKS = 8, 100  # episodes and control periods of most tests: one size, so that they share one compilation
 
 

@@ -11,8 +11,15 @@ import pytest
 
 from ballmodel.contact import TABLE
 from mjx_tt import robot
-from mjx_tt.clearance import BISECTIONS, BLADE_CAPSULES, SELF_PAIRS, TABLE_CAPSULES, CapsuleClearance
-from mjx_tt.clearance import segment_box_distance, segment_distance
+from mjx_tt.clearance import (
+    BISECTIONS,
+    BLADE_CAPSULES,
+    SELF_PAIRS,
+    TABLE_CAPSULES,
+    CapsuleClearance,
+    segment_box_distance,
+    segment_distance,
+)
 from mjx_tt.kinematics import PaddleKinematics
 from robot_io.contract import LIMITS
 

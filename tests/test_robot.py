@@ -12,6 +12,7 @@ from mjx_tt import robot
 from mjx_tt.chain import chain_from_model, site_frame
 from robot_io.contract import JOINT_NAMES, LIMITS
 
+
 @pytest.fixture(scope="module")
 def model():
     return robot.load_model()

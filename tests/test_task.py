@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 from hand_ball import Touch, fly, on_blade, on_table, path
-from playing import P, TICKS, episodes, model, play, script, task
+from playing import TICKS, P, episodes, model, play, script, task
 from scipy import stats
 
 from mjx_tt import rewards, robot

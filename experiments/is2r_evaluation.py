@@ -1,0 +1,100 @@
+"""A study's rallies: every model with its own player and with others, in one compiled call, under code names."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ballmodel.distribution import BallDistribution
+from ballmodel.files import replacing
+from experiments import blind, build, scoring
+from experiments.study_config import Study
+from experiments.virtual_finetune import VirtualReality
+from mjx_tt import players
+from mjx_tt.rally import Box, RallyResult
+
+EVALUATIONS, LOGS = "evaluations.csv", "evaluations"
+LOGGED_TOUCHES = 30  # human hits that are kept, per rally and lane on average
+EVALUATION = 7  # purpose of a key, beside those of experiments.build
+
+
+def play(
+    study: Study,
+    reality: VirtualReality,
+    seed: int,
+    pairings: list[tuple[str, str, str]],
+    policies: list,
+    boxes: list[BallDistribution],
+) -> RallyResult:
+    """Rallies of each pairing (trainer, evaluator, model) in ``evaluation.lanes`` sessions side by side.
+
+    policies: theta, mean and inverse_scale of each; boxes: what each one was trained for. Arrays are NumPy.
+    """
+    lanes, settings = study.evaluation.lanes, study.evaluation
+
+    def spread(arrays):  # one array (n, ...) per pairing -> (n, pairings x lanes)
+        return jnp.repeat(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1), lanes, axis=-1)
+
+    theta, mean, inverse_scale = (spread(part) for part in zip(*policies))
+    people = players.stack([reality.player(evaluator) for _, evaluator, _ in pairings])
+    person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), people)
+    low, high = (spread(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes))))
+    rallies = settings.rallies // lanes
+    result = reality.simulator.play(
+        theta, mean, inverse_scale, person, reality.known, build.key(seed, EVALUATION), rallies,
+        Box(low, high), settings.max_touches, LOGGED_TOUCHES * rallies,
+    )  # fmt: skip
+    return jax.tree.map(np.asarray, result)
+
+
+def code_names(seed: int, pairings: list[tuple[str, str, str]]) -> list[str]:
+    """A code for each pairing, one to one among the models that a player evaluates."""
+    codes: dict[tuple[str, str, str], str] = {}
+    for evaluator in dict.fromkeys(e for _, e, _ in pairings):
+        mine = [f"{trainer}/{model}" for trainer, e, model in pairings if e == evaluator]
+        drawn = blind.draw(mine, np.random.default_rng([seed, zlib.crc32(evaluator.encode())]))
+        codes |= {(t, e, m): drawn[f"{t}/{m}"] for t, e, m in pairings if e == evaluator}
+    return [codes[pairing] for pairing in pairings]
+
+
+def rallies_of(
+    seed: int, pairings: list[tuple[str, str, str]], codes: list[str], result: RallyResult, lanes: int
+) -> scoring.Rallies:
+    """All rallies as scored lines; the sessions of a pairing count as one, their rallies in turn."""
+    parts = []
+    for i, (pairing, code) in enumerate(zip(pairings, codes)):
+        mine = slice(i * lanes, (i + 1) * lanes)
+        parts.append(scoring.scored(seed, *pairing, code, result.length[:, mine].ravel(), result.end[:, mine].ravel()))
+    return scoring.join(parts)
+
+
+def save_logs(folder: Path, seed: int, pairings: list[tuple[str, str, str]], result: RallyResult, lanes: int) -> None:
+    """Writes each pairing's balls to ``folder``/SEED_TRAINER_EVALUATOR_MODEL.npz, the balls last in every array."""
+    folder.mkdir(parents=True, exist_ok=True)
+    log = result.balls
+    capacity = log.touch.shape[0]
+    taken = np.arange(capacity)[:, None] < np.minimum(log.count, capacity)  # (capacity, L)
+    for i, pairing in enumerate(pairings):
+        mine = slice(i * lanes, (i + 1) * lanes)
+        keep = taken[:, mine]
+        # Rallies are numbered as ``rallies_of`` does: the first of each session, then the second of each, ...
+        number = log.rally[:, mine] * lanes + np.arange(lanes)
+        arrays = {
+            "rally": number[keep],
+            **{name: getattr(log, name)[..., mine][..., keep] for name in (
+                "touch", "first", "position", "velocity", "landing", "hit", "returned", "return_landing",
+            )},
+        }  # fmt: skip
+        path = folder / f"{seed}_{'_'.join(pairing)}.npz"
+        with replacing(path) as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(file, **arrays)
+
+
+def summary(rallies: scoring.Rallies, trainer: str | None = None) -> dict[str, float]:
+    """Mean length of the reported rallies by model, played by their own trainers."""
+    own = rallies.take(rallies.own & rallies.selected & (True if trainer is None else rallies.trainer == trainer))
+    return {model: float(own.length[own.model == model].mean()) for model in dict.fromkeys(own.model.tolist())}

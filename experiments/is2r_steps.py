@@ -1,0 +1,140 @@
+"""A study as a list of named steps: what is done is marked, what was killed begins again, what is left is estimated.
+
+A step is done when the journal says so, what it made is there, and the steps whose files it read were done before it.
+Steps write their files whole (or resume by themselves, as trainings do), and each draws its own keys from its name, so a
+study killed at any moment ends as one that was left alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+
+from rich.console import Console
+
+from experiments.errors import ExperimentError, RunError
+from robot_io.files import sync_folder
+
+JOURNAL = "steps.jsonl"
+
+
+class Waiting(ExperimentError):
+    """A step that people do is not finished: the message says what is to be done before the same command goes on."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One piece of a study.
+
+    name     such as seed0/player1/is2r-sim1
+    kind     steps of a kind take time in proportion to their ``work``
+    inputs   files that it reads, outputs: files that it makes
+    run      does it; the sentence that it returns is shown
+    """
+
+    name: str
+    kind: str
+    work: float
+    inputs: tuple[Path, ...]
+    outputs: tuple[Path, ...]
+    run: Callable[[], str]
+
+
+class Journal:
+    """The steps that were done, in the order of their ends: one JSON line each, on the disk before the next step begins.
+
+    Raises RunError for a line, other than an unfinished last one, that is no entry.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.entries = path, []
+        lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+        whole = 0
+        for i, line in enumerate(lines):
+            try:
+                entry = json.loads(line)
+                entry["step"], entry["kind"], entry["work"], entry["seconds"]
+            except (ValueError, KeyError, TypeError) as error:
+                if i < len(lines) - 1:
+                    raise RunError(f"{path}: line {i + 1} is no step ({error}); restore the file") from None
+                break
+            if not line.endswith(b"\n"):
+                break
+            self.entries.append(entry)
+            whole += len(line)
+        if path.exists():
+            os.truncate(path, whole)
+
+    def append(self, step: Step, seconds: float) -> None:
+        """Marks a step as done. Raises OSError."""
+        entry = {"step": step.name, "kind": step.kind, "work": step.work, "seconds": round(seconds, 2)}
+        with open(self.path, "ab") as file:
+            file.write(json.dumps(entry).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        sync_folder(self.path.parent)
+        self.entries.append(entry)
+
+    def place(self, step: Step) -> int | None:
+        """Where the step's last mark stands; None without one."""
+        return max((i for i, entry in enumerate(self.entries) if entry["step"] == step.name), default=None)
+
+    def seconds_per_work(self) -> dict[str, float]:
+        """What a unit of work of each kind took so far, all sessions together."""
+        work: dict[str, list[float]] = {}
+        for entry in self.entries:
+            sums = work.setdefault(entry["kind"], [0.0, 0.0])
+            sums[0] += entry["seconds"]
+            sums[1] += entry["work"]
+        return {kind: seconds / size for kind, (seconds, size) in work.items() if size}
+
+
+def unfinished(steps: list[Step], journal: Journal) -> list[Step]:
+    """The steps that are still to be done, in their order."""
+    makers = {path: step for step in steps for path in step.outputs}
+    left: list[Step] = []
+    for step in steps:
+        mark = journal.place(step)
+        sources = {makers[path].name: makers[path] for path in step.inputs if path in makers}.values()
+        stale = any(source in left or (journal.place(source) or 0) > (mark or 0) for source in sources)
+        if mark is None or stale or not all(path.exists() for path in step.outputs):
+            left.append(step)
+    return left
+
+
+def run_all(steps: list[Step], journal: Journal, console: Console) -> None:
+    """Does what is not done yet. Raises what a step raises; RunError where a step's input is missing."""
+    left = unfinished(steps, journal)
+    done = len(steps) - len(left)
+    if done:
+        console.print(f"{done} of {len(steps)} steps were done before, {len(left)} are left", highlight=False)
+    for i, step in enumerate(left):
+        missing = [str(path) for path in step.inputs if not path.exists()]
+        if missing:
+            raise RunError(f"{step.name}: {', '.join(missing)} is missing, though the step that makes it is done")
+        began = time.monotonic()
+        text = step.run()
+        for path in step.outputs:
+            if not path.exists():
+                raise RunError(f"{step.name}: did not make {path}")
+        took = time.monotonic() - began
+        journal.append(step, took)
+        console.print(
+            f"[{done + i + 1}/{len(steps)}] {step.name}: {text}  ({took:.1f} s; {remaining(left[i + 1 :], journal)})",
+            highlight=False, soft_wrap=True, markup=False,
+        )  # fmt: skip
+
+
+def remaining(steps: list[Step], journal: Journal) -> str:
+    """An estimate in words of how long these steps take, from what others of their kinds took."""
+    rates = journal.seconds_per_work()
+    known = sum(rates[step.kind] * step.work for step in steps if step.kind in rates)
+    unknown = sorted({step.kind for step in steps} - rates.keys())
+    if unknown:
+        return f"at least {timedelta(seconds=round(known))} left, not yet timed: {', '.join(unknown)}"
+    return f"about {timedelta(seconds=round(known))} left"

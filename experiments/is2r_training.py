@@ -1,0 +1,91 @@
+"""A study's trainings in simulation: ordinary runs, several seeds of a model, the best in reality chosen."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from ballmodel.distribution import load_distribution
+from ballmodel.files import replacing
+from experiments import build, policy, runs
+from experiments.config import Config, Evaluation, Training
+from experiments.is2r_plan import Simulated, updates
+from experiments.policy import Policy
+from experiments.runs import Run
+from experiments.study_config import Study
+from experiments.train import train
+
+POLICY, SELECTION = "policy.npz", "selection.json"
+
+
+def configuration(study: Study, item: Simulated, balls: str | dict, source: Path | None, seed: int) -> Config:
+    """The training YAML of a model: balls by name or content, initial policy from ``source``, the round's recipe."""
+    simulation = study.simulation
+    recipe = simulation.rounds[item.round or 0]
+    optimiser = simulation.optimiser
+    if recipe.step is not None:
+        optimiser = optimiser.model_copy(update={"step": recipe.step})
+    training = Training(
+        updates=updates(study, item),
+        later_rewards=recipe.later_rewards,
+        seed=seed,
+        pool=simulation.pool,
+        checkpoint_seconds=simulation.checkpoint_seconds,
+        evaluate_every=None,
+        devices=simulation.devices,
+    )
+    return Config(
+        name=item.key,
+        balls=balls,
+        model=simulation.model,
+        task=simulation.task,
+        optimiser=optimiser,
+        training=training,
+        evaluation=Evaluation(sim_rate=study.reality.sim_rate, reachable_balls=None),
+        initial_policy=None if source is None else str(source.resolve()),
+    )
+
+
+def simulate(
+    study: Study, item: Simulated, folder: Path, human: Path | None, source: Path | None, name: str, console: Console,
+    score: Callable[[Policy], float] | None,
+) -> str:  # fmt: skip
+    """Trains every seed of a model in ``folder``/training, or goes on with them, and writes the chosen policy.
+
+    human: YAML of the human model; None: the distribution that the item names. source: run to start from. name: of the
+    step, which decides the seeds. score: what a policy is worth in reality, needed to choose among seeds.
+    """
+    balls = item.balls if human is None else load_distribution(human).to_dict()
+    scores = {}
+    for k in range(study.simulation.seeds):
+        seed = zlib.crc32(f"{name}/{k}".encode()) >> 1  # another one for every player, model and study seed
+        config = configuration(study, item, balls, source, seed)
+        experiment, run = build.experiment(config, name), Run(folder / "training" / f"seed{k}")
+        run.check(experiment.config)
+        if not run.trained(experiment.config):
+            train(experiment, run, console)
+        if score is not None:
+            scores[f"seed{k}"] = score(policy.load(run.folder))
+    best = max(scores, key=scores.get) if scores else "seed0"
+    chosen = policy.load(folder / "training" / best)
+    save(folder, chosen)
+    runs.write_json(folder / SELECTION, {"best": f"training/{best}", "scores": scores})
+    worth = f", worth {scores[best]:.2f} of 2 in reality" if scores else ""
+    among = f", best of {len(scores)}" if len(scores) > 1 else ""
+    return f"{updates(study, item)} updates{among}{worth}"
+
+
+def save(folder: Path, chosen: Policy) -> None:
+    """Writes a policy as plain arrays: theta (976,), mean (11,), inverse_scale (11,)."""
+    with replacing(folder / POLICY) as temporary, open(temporary, "wb") as file:
+        np.savez(file, theta=chosen.theta, mean=chosen.mean, inverse_scale=chosen.inverse_scale)
+
+
+def load(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The arrays of ``save``."""
+    with np.load(folder / POLICY) as data:
+        return tuple(np.asarray(data[name], np.float32) for name in ("theta", "mean", "inverse_scale"))

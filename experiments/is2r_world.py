@@ -1,0 +1,77 @@
+"""What the loop asks of a reality, and the virtual one as an answer."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import jax
+
+from ballmodel.files import replacing
+from ballmodel.trajectory import Dataset
+from experiments import build, checkpoint, policy, runs
+from experiments.policy import Policy
+from experiments.runs import CONFIG, Run
+from experiments.study_config import Study
+from experiments.virtual_finetune import VirtualReality
+
+STUDY = 6  # purpose of a key, beside those of experiments.build
+
+
+class World(Protocol):
+    """What the loop asks of a seed's reality. ``name`` is that of the step, from which all chance follows."""
+
+    def first_balls(self, player: str, name: str) -> Dataset:
+        """The player's balls across the table, without a robot."""
+
+    def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
+        """Fine-tunes the policy of the run ``source`` into the run ``folder``; the player's hits and a sentence."""
+
+    def score(self, player: str, name: str) -> Callable[[Policy], float] | None:
+        """What says how good a policy is with the player; None where that is not asked."""
+
+
+class VirtualWorld:
+    """The virtual reality of a seed."""
+
+    def __init__(self, study: Study, seed: int, reality: VirtualReality) -> None:
+        self._study, self._seed, self.reality = study, seed, reality.at(seed)
+
+    def _key(self, name: str):
+        return jax.random.fold_in(build.key(self._seed, STUDY), zlib.crc32(name.encode()) >> 1)
+
+    def first_balls(self, player: str, name: str) -> Dataset:
+        return self.reality.first_balls(
+            self.reality.player(player), self._study.first_balls, self._key(name), Path(name).name
+        )
+
+    def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
+        theta, statistics = policy.load_statistics(source)
+        person = self.reality.player(player)
+        cycle = self.reality.fine_tune(person, theta, statistics, real_updates, self._key(name), folder.name)
+        run = Run(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        config = Run(source).config().model_copy(update={"name": folder.name, "initial_policy": str(source.resolve())})
+        runs.write_yaml(folder / CONFIG, config.to_dict())
+        _write_lines(run.metrics, cycle.rows)
+        checkpoint.save(run.checkpoints, real_updates, cycle.state, {"seconds": 0.0})
+        tenth = max(1, real_updates // 10)
+        first, last = (
+            sum(r["return_rate"] for r in part) / tenth for part in (cycle.rows[:tenth], cycle.rows[-tenth:])
+        )
+        text = f"{real_updates} updates, {len(cycle.balls):,} balls, returned {first:.0%} at first, {last:.0%} at last"
+        return Dataset(cycle.balls, name), text
+
+    def score(self, player: str, name: str) -> Callable[[Policy], float] | None:
+        if self._study.simulation.seeds == 1:
+            return None
+        person, balls, key = self.reality.player(player), self._study.simulation.selection_episodes, self._key(name)
+        return lambda p: self.reality.score(person, (p.theta, p.mean, p.inverse_scale), balls, key)
+
+
+def _write_lines(path: Path, rows: list[dict]) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")

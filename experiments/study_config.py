@@ -1,0 +1,169 @@
+"""The typed YAML of a study: the iterative loop, its baselines and variants, for several players and seeds.
+
+Needs neither JAX nor NumPy, as ``experiments.config``. The defaults are the paper's numbers (Abeyruwan et al. 2022,
+appendices "Iterative-Sim-to-Real Procedure", "Training Hyperparameters" and "Evaluation Methodology").
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from experiments import mistakes
+from experiments.config import Count, LaterRewards, Optimiser, Positive, Section, Step, Task, apply_override, read_yaml
+from experiments.errors import ConfigError
+from experiments.finetune_settings import FineTuning
+from experiments.finetune_settings import parse as parse_fine_tuning
+
+PLAYERS = ("player1", "player2", "player3", "player4", "player5")
+EFFECTS = ("rubber", "table", "magnus", "spin", "noise", "latency", "camera", "drives", "encoders")
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class Round(Section):
+    """A round of the loop: training in simulation, then fine-tuning in reality."""
+
+    simulated: Count
+    """Updates in simulation."""
+    real: Count
+    """Updates in reality."""
+    step: Step | None = None
+    """How the parameters move in this round's simulation; null: as the optimiser says."""
+    later_rewards: LaterRewards | None = None
+    """Other reward weights for the rest of this round's simulation; null: those of the task throughout."""
+
+
+class Simulation(Section):
+    """Training in simulation: what a training YAML says in its sections task, model, optimiser and training."""
+
+    task: Task = Task(sim_rate=150.0)
+    model: dict[str, Any] = {}
+    """SimModel that training believes in, such as {sensing: {ball_noise: 0.02}}; may hold randomise."""
+    optimiser: Optimiser = Optimiser()
+    rounds: Annotated[list[Round], Field(min_length=3, max_length=3)]
+    """The paper's three; fine-tuned 35 %, 65 % and 100 % are named after their 60, 70 and 70 real updates."""
+    pool: Count = 65536
+    """Balls drawn from the human model before a training."""
+    seeds: Count = 3
+    """Trainings per model; the one that does best in reality goes on."""
+    selection_episodes: Count = 50
+    """Balls in reality by which it is chosen."""
+    checkpoint_seconds: Positive = 60.0
+    devices: Count | Literal["auto"] = "auto"
+
+
+class Reality(Section):
+    """The virtual reality: what it has that training does not know, drawn per seed (``experiments.reality``)."""
+
+    without: list[Literal[EFFECTS]] = []
+    """Effects that are left out: there, reality is what training believes."""
+    sim_rate: Positive = 300.0
+    """[Hz] of its physics."""
+    camera_noise: Positive = 0.003
+    """[m] standard deviation of each coordinate of a measured ball, from which the human model is fitted."""
+
+
+class Ablation(Section):
+    """Hand-made ball distributions against the oracle's, zero-shot, for one player."""
+
+    player: Literal[PLAYERS] = "player4"
+    balls: list[str] = ["large", "medium", "narrow"]
+
+
+class Evaluation(Section):
+    """Rallies of every model with its own player and with others."""
+
+    rallies: Annotated[int, Field(ge=50)] = 80
+    """Played by each player with each model; what is left after filtering is cut to the top 60, then to the top 50."""
+    lanes: Count = 8
+    """Sessions side by side into which these rallies are divided."""
+    max_touches: Count = 400
+    """A rally that is longer ends there."""
+    cross: bool = True
+    """Also with the two other players of the paper's table."""
+
+
+class Study(Section):
+    """One study."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    """Folder of the study."""
+    players: Annotated[list[Literal[PLAYERS]], Field(min_length=1)] = list(PLAYERS)
+    seeds: Annotated[list[Seed], Field(min_length=1)] = [0]
+    """Repetitions of the whole study, each with another reality, other initial policies and other chance."""
+    first_balls: Annotated[int, Field(ge=20)] = 200
+    """Balls of D0: across the table, without a robot."""
+    simulation: Simulation
+    fine_tuning: FineTuning = FineTuning()
+    """In reality; the number of updates is the round's."""
+    reality: Reality = Reality()
+    fresh: bool = True
+    """Also the variant whose weights are not carried back from reality to simulation."""
+    ablation: Ablation | None = Ablation()
+    evaluation: Evaluation = Evaluation()
+    robot: str | None = None
+    """A robot.yaml, "rig" or "lockstep": reality is that robot and its operator; null: the virtual reality."""
+    recordings: dict[Literal[PLAYERS], str] = {}
+    """With a robot: each player's first balls as measured, a file that `mjx-tt fit-human` reads."""
+
+    @field_validator("players", "seeds")
+    @classmethod
+    def _different(cls, value: list) -> list:
+        if len(set(value)) < len(value):
+            raise ValueError(f"different entries, got {value}")
+        return value
+
+    @model_validator(mode="after")
+    def _complete(self) -> Study:
+        if self.ablation and self.ablation.player not in self.players:
+            raise ValueError(
+                f"ablation.player {self.ablation.player!r} to be one of the players {self.players}, or ablation: null"
+            )
+        if self.evaluation.rallies % self.evaluation.lanes:
+            raise ValueError(
+                f"evaluation.rallies {self.evaluation.rallies} to be a multiple of its lanes {self.evaluation.lanes}"
+            )
+        missing = [player for player in self.players if player not in self.recordings]
+        if self.robot is not None and missing:
+            raise ValueError(f"with a robot, recordings of the first balls of {', '.join(missing)}")
+        return self
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that ``parse`` reads back, with every default written out."""
+        return self.model_dump(mode="json")
+
+
+def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Study:
+    """Reads a study; ``overrides`` are "dotted.path=value". Relative paths are relative to the file. Raises ConfigError."""
+    path = Path(path)
+    try:
+        data = read_yaml(path.read_text(encoding="utf-8"), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}; shipped are {', '.join(map(str, shipped()))}") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: a study is a mapping with the keys {', '.join(Study.model_fields)}")
+    for override in overrides:
+        apply_override(data, override)
+    if isinstance(data.get("robot"), str) and data["robot"] not in ("rig", "lockstep"):
+        data["robot"] = str((path.parent / data["robot"]).resolve())
+    if isinstance(data.get("recordings"), dict):
+        data["recordings"] = {k: str((path.parent / str(v)).resolve()) for k, v in data["recordings"].items()}
+    return parse(data, str(path))
+
+
+def parse(data: dict[str, Any], where: str) -> Study:
+    """A Study from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
+    try:
+        study = Study.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{where}: {line}" for line in mistakes.lines(error, Study))) from None
+    parse_fine_tuning(study.fine_tuning.model_dump(mode="json"), f"{where}: fine_tuning")
+    return study
+
+
+def shipped() -> dict[str, Path]:
+    """The studies that come with the program, by name."""
+    return {path.stem: path for path in sorted(Path(__file__).parent.glob("study_*.yaml"))}

@@ -1,0 +1,218 @@
+"""A study's folder as data: rallies, ball logs, human models and balls; what is not there is named, not an error."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballmodel import players
+from ballmodel.distribution import AXES, BallDistribution, load_distribution, read_yaml
+from experiments import scoring
+from experiments.errors import ConfigError
+from experiments.study_paper import BY_SKILL, CROSS, FINAL, TEN
+from mjx_tt.players import FOLDER as VIRTUAL_PLAYERS
+
+ROUNDS = ("M0", "M1", "M2")
+DATASETS = ("D0", "D1", "D2")
+LOG = ("rally", "touch", "first", "position", "velocity", "landing", "hit", "returned", "return_landing")
+NUMBERS = tuple(f"{part} {axis} {end}" for part, axes in AXES.items() for axis in axes for end in ("min", "max"))
+"""Names of the 16 numbers of a human model."""
+
+
+@dataclass(frozen=True)
+class BallLog:
+    """The human's balls of one evaluation, arrays with the balls last.
+
+    rally: (n,) its rally; touch: (n,) the touch that hit it; first: (n,) bool, begins a rally;
+    position, velocity: (3, n) [m], [m/s] at the human's contact; landing: (2, n) [m] on the robot's side;
+    hit, returned: (n,) bool; return_landing: (2, n) [m] where the robot's return came down, not finite where there is
+    none
+    """
+
+    rally: np.ndarray
+    touch: np.ndarray
+    first: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    landing: np.ndarray
+    hit: np.ndarray
+    returned: np.ndarray
+    return_landing: np.ndarray
+
+    @property
+    def features(self) -> np.ndarray:
+        """(8, n) position, velocity and landing of the balls that land: what a human model bounds."""
+        points = np.concatenate([self.position, self.velocity, self.landing])
+        return points[:, np.isfinite(points).all(axis=0)]
+
+
+@dataclass
+class Study:
+    """What a study's folder holds.
+
+    missing: what a whole study would have besides, in words
+    """
+
+    folder: Path
+    settings: dict[str, Any]
+    info: dict[str, Any]
+    rallies: scoring.Rallies
+    missing: list[str] = field(default_factory=list)
+
+    @cached_property
+    def seeds(self) -> tuple[int, ...]:
+        """Seeds with evaluations or folders."""
+        found = {int(path.name[4:]) for path in self.folder.glob("seed*") if path.name[4:].isdigit()}
+        return tuple(sorted(found | set(self.rallies.seed.tolist())))
+
+    @cached_property
+    def players(self) -> tuple[str, ...]:
+        """Players with evaluations or folders, from the lowest to the highest skill."""
+        found = {path.name for path in self.folder.glob("seed*/player*")} | set(self.rallies.trainer.tolist())
+        return tuple(p for p in BY_SKILL if p in found)
+
+    def pick(self, models=None, trainers=None, own: bool | None = True, selected: bool = True) -> scoring.Rallies:
+        """Rallies that count. own: by the trainer (True), by others (False), both (None); selected: the top 50 only."""
+        r = self.rallies
+        where = r.selected if selected else ~r.filtered
+        for chosen, column in ((models, r.model), (trainers, r.trainer)):
+            if chosen is not None:
+                where = where & np.isin(column, [chosen] if isinstance(chosen, str) else list(chosen))
+        if own is not None:
+            where = where & (r.own == own)
+        return r.take(where)
+
+    def models_of(self, seed: int, player: str) -> dict[str, BallDistribution]:
+        """The human models that were fitted: of M0, M1, M2 those that are there."""
+        out = {}
+        for name in ROUNDS:
+            path = self.folder / f"seed{seed}" / player / "balls" / f"human_{name}.yaml"
+            if path.exists():
+                out[name] = load_distribution(path)
+        return out
+
+    def log(self, seed: int, trainer: str, evaluator: str, model: str) -> BallLog | None:
+        """The balls of an evaluation. Raises ConfigError for a file without the arrays of a BallLog."""
+        path = self.folder / "evaluations" / f"{seed}_{trainer}_{evaluator}_{model}.npz"
+        if not path.exists():
+            return None
+        with np.load(path) as data:
+            lacking = [name for name in LOG if name not in data]
+            if lacking:
+                raise ConfigError(f"{path}: has no array {', '.join(lacking)}; wanted: {', '.join(LOG)}")
+            return BallLog(*(data[name] for name in LOG))
+
+    def logs(self, trainer: str, model: str) -> list[BallLog]:
+        """The logs of a policy with its own trainer, of all seeds."""
+        found = (self.log(seed, trainer, trainer, model) for seed in self.seeds)
+        return [log for log in found if log is not None]
+
+    def metrics(self, seed: int, player: str, model: str) -> list[dict[str, Any]]:
+        """The rows of a policy's training or fine-tuning, one per update; none where there is no file."""
+        path = self.folder / f"seed{seed}" / player / model / "metrics.jsonl"
+        return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+    def trajectories(self, seed: int, player: str, name: str) -> Path | None:
+        """The measured balls D0, D1 or D2, the last two as additions."""
+        path = self.folder / f"seed{seed}" / player / "balls" / f"{name}.csv"
+        return path if path.exists() else None
+
+    @cached_property
+    def calibration(self) -> Any:
+        """The calibration of the virtual players: the folder's calibration.json or the shipped one; None with people."""
+        own = _json(self.folder / "calibration.json")
+        virtual = self.settings and self.settings.get("robot") is None
+        return own or (_json(VIRTUAL_PLAYERS / "calibration.json") if virtual else None)
+
+    @cached_property
+    def realities(self) -> dict[int, Any]:
+        """The opened realities by seed."""
+        paths = {seed: self.folder / f"seed{seed}" / "reality.yaml" for seed in self.seeds}
+        return {seed: read_yaml(path) for seed, path in paths.items() if path.exists()}
+
+
+def numbers(distribution: BallDistribution) -> np.ndarray:
+    """(16,) the numbers of a human model in the order of NUMBERS."""
+    d = distribution
+    return np.array([
+        value
+        for part, axes in AXES.items()
+        for k in range(len(axes))
+        for value in (getattr(d, f"{part}_min")[k], getattr(d, f"{part}_max")[k])
+    ])  # fmt: skip
+
+
+def paper_models(player: str) -> dict[str, BallDistribution]:
+    """The paper's M0, M1 and M2 of a player."""
+    return {name: players.load(f"{player}/{name}") for name in ROUNDS}
+
+
+def change(a: BallDistribution, b: BallDistribution, scale: np.ndarray) -> float:
+    """Mean over the 16 numbers of |b - a| in units of ``scale`` (16,)."""
+    return float(np.mean(np.abs(numbers(b) - numbers(a)) / scale))
+
+
+def widths(models: dict[str, BallDistribution]) -> np.ndarray:
+    """(16,) the width of each quantity over all given models, the same for its minimum and its maximum."""
+    table = np.array([numbers(m) for m in models.values()]).reshape(len(models), -1, 2)
+    return np.repeat(table[:, :, 1].max(0) - table[:, :, 0].min(0), 2)
+
+
+def load(folder: Path) -> Study:
+    """Reads a study's folder, whole or partial. Raises ConfigError where there is nothing to report on."""
+    folder = Path(folder)
+    path = folder / "evaluations.csv"
+    if not path.exists() and not any(folder.glob("seed*")):
+        raise ConfigError(f"{folder}: is no study: neither evaluations.csv nor a folder seed0 is there")
+    rallies = scoring.read(path) if path.exists() else scoring.join([])
+    settings = read_yaml(folder / "study.yaml") if (folder / "study.yaml").exists() else {}
+    study = Study(folder, settings or {}, _json(folder / "study.json") or {}, rallies)
+    study.missing.extend(_missing(study))
+    return study
+
+
+def _missing(study: Study) -> list[str]:
+    """What a whole study would have besides."""
+    out = []
+    absent = [p for p in BY_SKILL if p not in study.players]
+    if absent:
+        out.append(f"players {', '.join(absent)}")
+    r = study.rallies
+    there = set(zip(r.seed.tolist(), r.trainer.tolist(), r.evaluator.tolist(), r.model.tolist()))
+    for seed in study.seeds:
+        for player in study.players:
+            lacking = [m for m in TEN if (seed, player, player, m) not in there]
+            if lacking:
+                what = "all ten models" if len(lacking) == len(TEN) else ", ".join(lacking)
+                out.append(f"seed {seed}, {player}: evaluation of {what}")
+            others = [e for e in CROSS[player] if any((seed, player, e, m) not in there for m in FINAL)]
+            if others:
+                out.append(f"seed {seed}, {player}: cross-evaluation by {', '.join(others)}")
+            fitted = study.models_of(seed, player)
+            if len(fitted) < len(ROUNDS):
+                out.append(f"seed {seed}, {player}: human model {', '.join(m for m in ROUNDS if m not in fitted)}")
+    short = [
+        f"seed {seed}, {trainer} with {evaluator}, {model}: {count} rallies that count"
+        for (seed, trainer, evaluator, model), count in counted(r).items()
+        if count < scoring.KEEP
+    ]
+    return out + short
+
+
+def counted(rallies: scoring.Rallies) -> dict[tuple[int, str, str, str], int]:
+    """Rallies that are not filtered, by seed, trainer, evaluator and model."""
+    out: dict[tuple[int, str, str, str], int] = {}
+    for s, t, e, m, f in zip(
+        *(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model", "filtered"))
+    ):
+        out[s, t, e, m] = out.get((s, t, e, m), 0) + (not f)
+    return out
+
+
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None

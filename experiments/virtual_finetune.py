@@ -1,0 +1,173 @@
+"""Fine-tuning, seed selection and rallies in a virtual reality, with a virtual player on the other side of the net.
+
+The settings are those of fine-tuning on a robot (``experiments.finetune_settings``): an update's balls are the lanes of
+rallies that go on across updates, as a person keeps playing while the robot tries its perturbations. What comes back is
+what a robot and its cameras would tell: rewards, faults, measured balls.
+"""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ballmodel.optional import without_nominal
+from ballmodel.trajectory import Dataset, Trajectory
+from bgs import normalizer, strategy
+from bgs.strategy import BGSConfig, BGSState
+from experiments import build, evaluate, reality
+from experiments.study_config import Study
+from experiments.training import TrainState
+from mjx_tt import players, rewards
+from mjx_tt.model import SimModel
+from mjx_tt.players import Player
+from mjx_tt.rally import RallySimulator, RallyState, ShotResult
+from mjx_tt.task import MISSED, RETURNED, TaskConfig
+
+FAULT = -2.0  # paper: a fault of the robot
+SELECTION_LANES = 10  # sessions side by side in which policies are compared
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What a cycle of fine-tuning gave.
+
+    state  after the last update; the observation statistics are those it began with
+    rows   per update: mean return, rates of balls hit and returned and of faults, norms of gradient and step
+    balls  the player's hits as the cameras measured them, in the order of play
+    """
+
+    state: TrainState
+    rows: list[dict[str, float]]
+    balls: tuple[Trajectory, ...]
+
+
+class VirtualReality:
+    """One study seed's reality, in which virtual players play with policies. The same key gives the same play.
+
+    model  the reality itself; known: the same without what is nominal. Never for what learns.
+    """
+
+    def __init__(self, study: Study, seed: int) -> None:
+        self._study, self._settings = study, study.fine_tuning
+        self._draw(seed)
+        self._weights = build.reward_weights(self._settings.rewards)
+        self.simulator = RallySimulator(TaskConfig(sim_rate=study.reality.sim_rate, reward_weights=self._weights))
+        # Cycles of different lengths share one compiled call of a length that divides all of them.
+        self._chunk = math.gcd(*(r.real for r in study.simulation.rounds))
+        self._updates = jax.jit(self._updates_of, static_argnames="config")
+        self._lobs = jax.jit(players.first_ball, static_argnums=3)
+        self._compared = jax.jit(self._shots_of, static_argnames="turns")
+
+    def _draw(self, seed: int) -> None:
+        self.model = reality.draw(seed, tuple(self._study.reality.without))
+        self.known = without_nominal(self.model)
+
+    def at(self, seed: int) -> VirtualReality:
+        """The reality of another seed of the same study, with this one's compiled programs."""
+        other = copy(self)
+        other._draw(seed)
+        return other
+
+    def player(self, name: str) -> Player:
+        """The virtual person; in a reality without spin their strokes have none."""
+        person = players.load(name)
+        return players.without_spin(person) if "spin" in self._study.reality.without else person
+
+    def first_balls(self, player: Player, count: int, key, session: str) -> Dataset:
+        """D0: balls across the table without a robot, as the cameras measured them."""
+        ball_key, camera_key = jax.random.split(key)
+        balls = self._lobs(player, players.fresh((count,)), ball_key, (count,))
+        measured = reality.measure(self.model, balls, self._study.reality.camera_noise, camera_key)
+        return Dataset(measured.trajectories(session), session)
+
+    def fine_tune(self, player: Player, theta, statistics, updates: int, key, session: str) -> Cycle:
+        """``updates`` updates from the parameters theta (976,) on, while the player rallies with the robot."""
+        ask_key, rally_key, play_key, camera_key = jax.random.split(key, 4)
+        config = build.bgs_config(self._settings.optimiser(), updates)
+        lanes = self._settings.episodes_per_update
+        rally = self.simulator.start(player, self.known, rally_key, lanes)
+        # Strongly typed as what the updates return, so that the first call and the others are one program.
+        state, rally = jax.tree.map(
+            lambda x: jax.lax.convert_element_type(x, x.dtype), (strategy.init(jnp.asarray(theta), config), rally)
+        )
+        found = []
+        for _ in range(updates // self._chunk):
+            state, rally, part = self._updates(
+                state, rally, statistics, player, self.known, ask_key, play_key, config=config
+            )
+            found.append(jax.tree.map(np.asarray, part))
+        shots, info = jax.tree.map(lambda *x: np.concatenate(x), *found)
+        hits = jax.tree.map(lambda x: np.moveaxis(x, 1, 0).reshape(3, -1), shots.ball)  # (updates, 3, L) -> (3, n)
+        finite = shots.finite.reshape(-1)
+        measured = reality.measure(
+            self.model, jax.tree.map(lambda x: x[:, finite], hits), self._study.reality.camera_noise, camera_key
+        )
+        rows = [
+            {"update": u + 1, **self._row(jax.tree.map(lambda x: x[u], shots))}
+            | {name: float(getattr(info, name)[u]) for name in ("gradient_norm", "update_norm", "elite_std")}
+            for u in range(updates)
+        ]
+        return Cycle(TrainState(state, statistics, ask_key), rows, measured.trajectories(session))
+
+    def score(self, player: Player, policy, balls: int, key) -> float:
+        """The paper's sparse reward by which a seed is chosen, over at least ``balls`` balls of rallies with the player.
+
+        policy: parameters (976,) and normaliser (11,), (11,).
+        """
+        turns = -(-balls // SELECTION_LANES)
+        outcome, fault = self._compared(*map(jnp.asarray, policy), player, self.known, key, turns=turns)
+        return evaluate.sparse_reward(np.asarray(outcome), np.asarray(fault))
+
+    def _updates_of(
+        self, state: BGSState, rally: RallyState, statistics, player: Player, model: SimModel, key, play_key,
+        config: BGSConfig,
+    ):  # fmt: skip
+        """``_chunk`` updates: state and rally after them, and each one's (ShotResult, BGSInfo)."""
+        settings, lanes = self._settings, self._settings.episodes_per_update
+        frozen = [jnp.broadcast_to(x[:, None], (x.shape[0], lanes)) for x in normalizer.normaliser(statistics)]
+
+        def update(carry, _):
+            state, rally = carry
+            directions = strategy.ask(jax.random.fold_in(key, state.updates), state, config)
+            members = strategy.population(state.theta, directions, config.sigma)
+            theta = jnp.repeat(members, settings.repeats, axis=1)  # the lanes of a member side by side
+            shot_key = jax.random.fold_in(play_key, state.updates)
+            rally, shots = self.simulator.shots(theta, *frozen, player, model, rally, shot_key)
+            returns = self._returns(shots).reshape(2 * settings.pairs, settings.repeats).mean(axis=1)
+            state, info = strategy.tell(state, directions, *jnp.split(returns, 2), config)
+            return (state, rally), (shots, info)
+
+        (state, rally), found = jax.lax.scan(update, (state, rally), None, length=self._chunk)
+        return state, rally, found
+
+    def _returns(self, shots: ShotResult):
+        """Weighted returns (L,) of what a robot measures; an episode that is not finite has none."""
+        terms = shots.terms.at[rewards.TERMS.index("fault")].set(jnp.where(shots.fault, FAULT, 0.0))
+        return jnp.where(shots.finite, sum(w * terms[i] for i, w in enumerate(self._weights) if w), jnp.nan)
+
+    def _shots_of(self, theta, mean, inverse_scale, player: Player, model: SimModel, key, turns: int):
+        """Outcomes and faults (turns, SELECTION_LANES) of one policy."""
+        policy = [jnp.broadcast_to(x[:, None], (x.shape[0], SELECTION_LANES)) for x in (theta, mean, inverse_scale)]
+        start_key, play_key = jax.random.split(key)
+
+        def shoot(rally, turn):
+            rally, shots = self.simulator.shots(*policy, player, model, rally, jax.random.fold_in(play_key, turn))
+            return rally, (shots.outcome, shots.fault | ~shots.finite)
+
+        rally = self.simulator.start(player, model, start_key, SELECTION_LANES)
+        return jax.lax.scan(shoot, rally, jnp.arange(turns))[1]
+
+    def _row(self, shots: ShotResult) -> dict[str, float]:
+        """Means over one update's balls."""
+        returns, finite = np.asarray(self._returns(jax.tree.map(jnp.asarray, shots))), shots.finite
+        return {
+            "mean_return": float(returns[finite].mean()) if finite.any() else -math.inf,
+            "return_rate": float((shots.outcome == RETURNED).mean()),
+            "hit_rate": float((shots.outcome != MISSED).mean()),
+            "fault_rate": float(shots.fault.mean()),
+        }

@@ -1,0 +1,158 @@
+"""Blind evaluation: the bijection, the seal, and the protocol from the command line with real artefacts."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import zlib
+
+import numpy as np
+import pytest
+from scipy.stats import chisquare
+
+from experiments import blind, cli, scoring
+from experiments.errors import ConfigError
+from robot_io import artefact, export
+
+MODELS = ("is2r-ft100", "s2r-ft100", "oracle-ft")
+
+
+def test_codes_are_one_to_one_and_the_order_is_random():
+    rng = np.random.default_rng(0)
+    places = np.zeros((4, 4), int)
+    for _ in range(2000):
+        key = blind.draw("abcd", rng)
+        assert list(key.values()) == ["A", "B", "C", "D"] and set(key) == set("abcd")
+        for place, model in enumerate(key):
+            places["abcd".index(model), place] += 1
+    assert chisquare(places.ravel()).pvalue > 1e-3
+    assert blind.codes(28)[-3:] == ("Z", "AA", "AB")
+    with pytest.raises(ValueError, match="each model once"):
+        blind.draw(["a", "a"], rng)
+
+
+def test_a_sealed_file_does_not_show_and_cannot_be_changed(tmp_path):
+    path = tmp_path / "key.sealed"
+    content = {"codes": {"is2r-ft100": "A"}, "number": 0.1}
+    digest = blind.seal(path, content)
+    text = path.read_text()
+    assert "is2r" not in text and "codes" not in text and digest in text
+    assert blind.unseal(path) == content
+    assert blind.seal(tmp_path / "again", content) != digest  # the hash alone does not tell the content by trying
+    sealed = json.loads(text)
+    plain = zlib.decompress(base64.b64decode(sealed["sealed"])).replace(b"ft100", b"ft065")
+    path.write_text(json.dumps(sealed | {"sealed": base64.b64encode(zlib.compress(plain)).decode()}))
+    with pytest.raises(ConfigError, match="changed after sealing"):
+        blind.unseal(path)
+    path.write_text("{}")
+    with pytest.raises(ConfigError, match="no sealed file"):
+        blind.unseal(path)
+
+
+@pytest.fixture(scope="module")
+def artefacts(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("policies")
+    for k, model in enumerate(MODELS):
+        theta = np.random.default_rng(k).normal(0.0, 0.1, 976)
+        export.write(folder / model / "artefact", theta, np.zeros(11), np.ones(11), {"model": model})
+    return folder
+
+
+def fill(sheet, lengths, skip=()):
+    """Writes lengths and ends, robot_missed as row 13, into the lines of a sheet, and leaves out what ``skip`` says."""
+    lines = sheet.read_text().splitlines()
+    comments = [line for line in lines if line.startswith("#")]
+    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    for row in rows[1:]:
+        code, rally = row[0], int(row[1])
+        if (code, rally) not in skip:
+            row[2:] = [str(lengths[code][rally - 1]), "13"]
+    sheet.write_text("\n".join([*comments, *(",".join(row) for row in rows)]) + "\n")
+
+
+def test_people_evaluate_without_knowing_what(tmp_path, artefacts, capsys):
+    folder = tmp_path / "blind"
+    given = [f"{model}={artefacts / model}" for model in MODELS]
+    assert (
+        cli.main(["blind", "make", str(folder), *given, "--trainer", "anna", "--evaluator", "ben", "--seed", "2"]) == 0
+    )
+    assert sorted(p.name for p in (folder / "policies").iterdir()) == ["A", "B", "C"]
+    shown = capsys.readouterr().out + (folder / "sheet.csv").read_text() + (folder / "key.sealed").read_text()
+    assert not any(model in shown for model in MODELS)
+    assert cli.main(["blind", "make", str(folder), *given]) == 1  # never over an evaluation that has begun
+    sheet = (folder / "sheet.csv").read_text()
+    assert (
+        all(f"# {number:>2}  " in sheet for number in range(1, 16)) and "Human hit the first ball to the net." in sheet
+    )
+
+    rng = np.random.default_rng(5)
+    lengths = {code: rng.integers(2, 40, 70) for code in "ABC"}
+    late = {("B", rally) for rally in range(40, 71)}
+    fill(folder / "sheet.csv", lengths, late)
+    assert [(p.code, p.counted, p.complete) for p in blind.progress(folder)] == [
+        ("A", 70, True), ("B", 39, False), ("C", 70, True),
+    ]  # fmt: skip
+    assert cli.main(["blind", "open", str(folder)]) == 1
+    message = capsys.readouterr().err
+    assert "stays sealed" in message and "B has 39" in message and not any(model in message for model in MODELS)
+    assert not (folder / "evaluations.csv").exists()
+
+    fill(folder / "sheet.csv", lengths)
+    assert cli.main(["blind", "sheet", str(folder)]) == 0
+    assert cli.main(["blind", "open", str(folder)]) == 0
+    rallies = scoring.read(folder / "evaluations.csv")
+    assert set(zip(rallies.seed.tolist(), rallies.trainer.tolist(), rallies.evaluator.tolist())) == {(2, "anna", "ben")}
+    for model in MODELS:
+        mine = rallies.take(rallies.model == model)
+        code = str(mine.blind[0])
+        # The code is the folder whose policy is this model's: its provenance says so.
+        assert artefact.load(folder / "policies" / code).manifest["provenance"] == {"model": model}
+        assert mine.length.tolist() == lengths[code].tolist()
+        assert sorted(mine.length[mine.selected]) == sorted(lengths[code][:60])[-50:]
+
+
+def test_a_start_that_was_cut_off_begins_anew(tmp_path, artefacts, monkeypatch):
+    folder, policies = tmp_path / "blind", {model: artefacts / model for model in MODELS[:2]}
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(blind, "seal", killed)  # the policies are copied, the key is not yet there
+        blind.make(folder, policies, "anna", "anna")
+    assert (folder / "policies" / "A").exists() and not (folder / "key.sealed").exists()
+    assert blind.make(folder, policies, "anna", "anna") == ("A", "B")
+    assert sorted(path.name for path in folder.iterdir()) == ["key.sealed", "policies", "sheet.csv"]
+
+
+def test_a_swapped_policy_is_found(tmp_path, artefacts):
+    folder = tmp_path / "blind"
+    folder.mkdir()
+    blind.make(folder, {model: artefacts / model for model in MODELS[:2]}, "anna", "anna")
+    fill(folder / "sheet.csv", {code: np.full(70, 4) for code in "AB"})
+    (folder / "policies" / "A").rename(folder / "policies" / "swap")
+    (folder / "policies" / "B").rename(folder / "policies" / "A")
+    (folder / "policies" / "swap").rename(folder / "policies" / "B")
+    with pytest.raises(ConfigError, match="not the policy that was sealed"):
+        blind.open_key(folder)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("A,1,5,99", "no end of a rally; 1 to"),
+        ("A,1,five,13", "whole numbers"),
+        ("A,1,5,13\nA,1,6,13", "rally 1 of A is there twice"),
+    ],
+)
+def test_a_bad_line_of_a_sheet_is_named(tmp_path, line, says):
+    (tmp_path / "sheet.csv").write_text("code,rally,length,end\n" + line + "\n")
+    with pytest.raises(ConfigError, match=f"sheet.csv: line .*{says}"):
+        blind.read_sheet(tmp_path / "sheet.csv")
+
+
+def test_a_folder_without_a_policy_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="mjx-tt export"):
+        blind.make(tmp_path / "b", {"m": tmp_path, "n": tmp_path}, "a", "a")
+    assert not (tmp_path / "b").exists()
