@@ -82,19 +82,14 @@ def cosine(a: np.ndarray, b: np.ndarray) -> float:
 # The YAML and the plan
 
 
-@pytest.mark.parametrize("name", ["study_quick", "study_full"])
+@pytest.mark.parametrize("name", ["study_quick", "study_night", "study_full"])
 def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for_one(name):
     shipped = study_config.load(study_config.shipped()[name])
     assert [r.real for r in shipped.simulation.rounds] == [60, 70, 70]
     assert len(shipped.players) == 5
     tuning = shipped.fine_tuning
-    assert (tuning.pairs, tuning.repeats, tuning.keep, tuning.sigma, tuning.step.learning_rate) == (
-        5,
-        3,
-        0.6,
-        0.025,
-        0.00375,
-    )
+    settings = (tuning.pairs, tuning.repeats, tuning.keep, tuning.sigma, tuning.step.learning_rate)
+    assert settings == (5, 3, 0.6, 0.025, 0.00375)
     assert name not in config.shipped() and "quickstart" in config.shipped()
 
 
