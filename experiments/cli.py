@@ -165,19 +165,19 @@ def finetune(options: argparse.Namespace) -> int:
 
 
 def is2r(options: argparse.Namespace) -> int:
-    from experiments import study_config
+    from experiments.study import config as study_config
 
     study = study_config.load(_study(options.study), tuple(options.set))
     devices = study.simulation.devices
     _start_jax(options.devices or (None if devices == "auto" else devices))
-    from experiments import is2r as loop
+    from experiments.study import loop
 
     return 0 if loop.run(study, Path(options.out) / study.name, _console()) else 130
 
 
 def study_report(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments import study_report as report
+    from experiments.study import report
 
     _console().print(report.write(Path(options.study)), highlight=False, soft_wrap=True)
     return 0
@@ -185,21 +185,21 @@ def study_report(options: argparse.Namespace) -> int:
 
 def blind(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments import blind_evaluation
+    from experiments.study import blind_evaluation
 
     blind_evaluation.run(options, _console())
     return 0
 
 
 def compare(options: argparse.Namespace) -> int:
-    from experiments import compare_config
+    from experiments.algorithms import config as compare_config
 
     path = Path(options.comparison)
     if not path.exists() and path.parent == Path():
         path = compare_config.shipped().get(path.stem, path)
     comparison, experiment = compare_config.load(path, tuple(options.set))
     _start_jax(1)
-    from experiments import compare as comparing
+    from experiments.algorithms import comparison as comparing
 
     console = _console()
     folder = comparing.compare(comparison, experiment, str(path), Path(options.out), console)
@@ -543,7 +543,7 @@ def _experiment(name: str) -> Path:
 
 def _study(name: str) -> Path:
     """The file of that name, or the study of that name that comes with the program."""
-    from experiments import study_config
+    from experiments.study import config as study_config
 
     path = Path(name)
     return path if path.exists() or path.parent != Path() else study_config.shipped().get(path.stem, path)

@@ -15,8 +15,8 @@ import numpy as np
 from ballmodel import constants as c
 from ballmodel import players
 from ballmodel.distribution import save_distribution
-from experiments import blind, scoring
-from experiments.study_paper import ABLATED, BY_SKILL, CROSS, FINAL, MODELS, VARIANT
+from experiments.study import blind, scoring
+from experiments.study.paper import ABLATED, BY_SKILL, CROSS, FINAL, MODELS, VARIANT
 from mjx_tt.rally import End
 
 MEANS = {

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from scipy.stats import chisquare
 
-from experiments import blind, cli, scoring
+from experiments import cli
 from experiments.errors import ConfigError
+from experiments.study import blind, scoring
 from robot_io import artefact, export
 
 MODELS = ("is2r-ft100", "s2r-ft100", "oracle-ft")

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from ballmodel import players as paper
-from experiments import calibrate_players as calibration
+from experiments.study import calibration
 from mjx_tt import players
 
 

@@ -15,14 +15,14 @@ from brax.envs.base import Env, State
 from brax.training.types import Transition
 from rich.console import Console
 
-from experiments import compare, compare_config
+from experiments.algorithms import comparison as compare
+from experiments.algorithms import config, off_policy
 from experiments.algorithms import learner as learners
-from experiments.algorithms import off_policy
+from experiments.algorithms.config import Ppo, QtOpt, Replay, Sac
 from experiments.algorithms.off_policy import OffPolicyLearner
 from experiments.algorithms.ppo import PpoLearner
 from experiments.algorithms.qt_opt import Critics, QtOptAgent, best_action
 from experiments.algorithms.sac import SacAgent
-from experiments.compare_config import Ppo, QtOpt, Replay, Sac
 from experiments.errors import ConfigError, RunError
 from mjx_tt.brax_env import OBSERVATION_SIZE
 from robot_io.contract import N_JOINTS
@@ -184,7 +184,7 @@ def write(folder, data):
 
 def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
     path, console = write(tmp_path, SMALL), Console()
-    folder = compare.compare(*compare_config.load(path), str(path), tmp_path, console)
+    folder = compare.compare(*config.load(path), str(path), tmp_path, console)
     run = folder / "ES" / "seed0"
     training = json.loads((run / "training.json").read_text())
     assert [point["episodes"] for point in training["curve"]] == [0, 24, 40]  # 8 an update; after a half and the whole
@@ -198,13 +198,13 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
         assert (folder / name).stat().st_size > 0
 
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*.*")}
-    compare.compare(*compare_config.load(path), str(path), tmp_path, console)
+    compare.compare(*config.load(path), str(path), tmp_path, console)
     assert "skipped" in capsys.readouterr().out
     assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*.*")}
 
     def missing(*overrides):
         return compare.unfinished(
-            compare.prepare(*compare_config.load(path, overrides), str(path), tmp_path, console)
+            compare.prepare(*config.load(path, overrides), str(path), tmp_path, console)
         )  # fmt: skip
 
     assert missing() == {"ES": []}
@@ -235,11 +235,11 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
 )
 def test_a_mistake_in_the_yaml_is_named(tmp_path, override, message):
     with pytest.raises(ConfigError, match=message) as error:
-        compare_config.load(write(tmp_path, SMALL), (override,))
+        config.load(write(tmp_path, SMALL), (override,))
     assert "small.yaml" in str(error.value)
 
 
-@pytest.mark.parametrize("name", compare_config.shipped())
+@pytest.mark.parametrize("name", config.shipped())
 def test_a_shipped_comparison_is_valid(name):
-    comparison, experiment = compare_config.load(compare_config.shipped()[name])
+    comparison, experiment = config.load(config.shipped()[name])
     assert comparison.name == name

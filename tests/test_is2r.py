@@ -24,13 +24,15 @@ from scipy.spatial.transform import Rotation
 from ballmodel.aero import drag_factor, magnus_factor
 from ballmodel.state import BallState
 from bgs import normalizer, strategy
-from experiments import blind, build, config, is2r, is2r_evaluation, is2r_plan, policy, reality, scoring, study_config
-from experiments import is2r_training as training
+from experiments import build, config, policy
 from experiments.errors import ConfigError, RunError
-from experiments.is2r_plan import Human, Real, Simulated
-from experiments.is2r_robot import blind_steps
-from experiments.is2r_steps import Journal, Step, Waiting, remaining, run_all, unfinished
-from experiments.virtual_finetune import VirtualReality
+from experiments.study import blind, evaluation, plan, reality, scoring, training
+from experiments.study import config as study_config
+from experiments.study import loop as is2r
+from experiments.study.finetuning import VirtualReality
+from experiments.study.plan import Human, Real, Simulated
+from experiments.study.robot import blind_steps
+from experiments.study.steps import Journal, Step, Waiting, remaining, run_all, unfinished
 from mjx_tt import model as models
 from mjx_tt import rewards
 from mjx_tt.model import SimModel
@@ -115,7 +117,7 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
     whole = study_config.load(study_config.shipped()["study_full"])
     for player in whole.players:
         made: set[str] = {"D0", "large", "medium", "narrow"}
-        for item in is2r_plan.items(whole, player):
+        for item in plan.items(whole, player):
             needs = {Human: lambda i: i.data, Simulated: lambda i: (i.balls, i.source), Real: lambda i: (i.source,)}
             assert {n for n in needs[type(item)](item) if n is not None} <= made, item
             made |= (
@@ -123,34 +125,34 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
                 if isinstance(item, Human)
                 else {item.key} | ({item.data} if isinstance(item, Real) else set())
             )
-        assert set(is2r_plan.MODELS) <= made
+        assert set(plan.MODELS) <= made
     # "the policy was fine-tuned for 70 updates per cycle for the last two cycles and 60 for the first": 200, oracle 35 %.
-    by_key = {item.key: item for item in is2r_plan.LOOP if not isinstance(item, Human)}
+    by_key = {item.key: item for item in plan.LOOP if not isinstance(item, Human)}
     spent = {}
     for key, item in by_key.items():
         before = spent.get(item.source, 0) if item.source else 0
-        spent[key] = before + (is2r_plan.updates(whole, item) if isinstance(item, Real) else 0)
+        spent[key] = before + (plan.updates(whole, item) if isinstance(item, Real) else 0)
     assert spent["is2r-ft100"] == spent["s2r-ft100"] == 200 and spent["oracle-ft"] == 0.35 * 200
-    assert is2r_plan.updates(whole, by_key["oracle-sim"]) == 40000
+    assert plan.updates(whole, by_key["oracle-sim"]) == 40000
 
 
 def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
     whole = study_config.load(study_config.shipped()["study_full"], ("fresh=false", "ablation=null"))
-    pairs = is2r_plan.pairings(whole)
+    pairs = plan.pairings(whole)
     for player in whole.players:
         assert sum(t == e == player for t, e, _ in pairs) == 10
         others = [(t, m) for t, e, m in pairs if e == player != t]
         assert len(others) == len(set(others)) == 6 and len({t for t, _ in others}) == 2
-    codes = is2r_evaluation.code_names(0, pairs)
+    codes = evaluation.code_names(0, pairs)
     for player in whole.players:
         mine = [code for code, (_, e, _) in zip(codes, pairs) if e == player]
         assert len(set(mine)) == 16
-    assert codes != is2r_evaluation.code_names(1, pairs)
+    assert codes != evaluation.code_names(1, pairs)
 
 
 def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
     quick = study_config.load(study_config.shipped()["study_quick"])
-    by_key = {item.key: item for item in is2r_plan.LOOP if isinstance(item, Simulated)}
+    by_key = {item.key: item for item in plan.LOOP if isinstance(item, Simulated)}
     first = training.configuration(quick, by_key["is2r-sim1"], "player3/M0", None, 5)
     later = training.configuration(quick, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
     oracle = training.configuration(quick, by_key["oracle-sim"], "player3/M2", None, 7)
@@ -338,7 +340,7 @@ def loop(what: study_config.Study, folder: Path) -> None:
 
 def test_a_study_leaves_what_it_says(finished):
     player = finished / "seed0" / "player3"
-    for key in is2r_plan.MODELS:
+    for key in plan.MODELS:
         theta, mean, inverse_scale = training.load(player / key)
         assert theta.shape == (976,) and mean.shape == inverse_scale.shape == (N_OBSERVATION,)
         assert np.isfinite(theta).all()
@@ -348,7 +350,7 @@ def test_a_study_leaves_what_it_says(finished):
     started = policy.load(player / "is2r-sim2" / "training" / "seed0").config.initial_policy
     assert started == str((player / "is2r-ft35").resolve())
     rallies = scoring.read(finished / "evaluations.csv")
-    assert set(rallies.model.tolist()) == set(is2r_plan.MODELS) and len(rallies) == 50 * 10
+    assert set(rallies.model.tolist()) == set(plan.MODELS) and len(rallies) == 50 * 10
     with open(finished / "evaluations.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     with np.load(finished / "evaluations" / "0_player3_player3_is2r-ft100.npz") as log:
@@ -381,7 +383,7 @@ def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, *_, **__: compiled.append(event) if event.endswith("backend_compile_duration") else None
     )
-    by_key = {item.key: item for item in is2r_plan.LOOP if isinstance(item, Simulated)}
+    by_key = {item.key: item for item in plan.LOOP if isinstance(item, Simulated)}
     human = finished / "seed0" / "player3" / "balls" / "human_M2.yaml"
     text = training.simulate(study(), by_key["is2r-sim1"], tmp_path / "again", human, None, "again", quiet(), None)
     assert text.startswith("6 updates")

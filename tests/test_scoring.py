@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments import scoring
 from experiments.errors import ConfigError
+from experiments.study import scoring
 from mjx_tt.rally import ROWS, End
 
 # Table end_of_rally_attribution, row by row as printed: did-robot-end-rally ("" where empty or a dash) and "Filter".

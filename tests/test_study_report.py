@@ -16,11 +16,13 @@ from scipy import stats
 
 from ballmodel import constants as c
 from ballmodel import players
-from experiments import cli, scoring, study_claims, study_data, study_heatmaps, study_paper
-from experiments import study_statistics as statistics
+from experiments import cli
 from experiments.errors import ConfigError
-from experiments.study_claims import DIFFERENCE, HITS, RATIO, SHARE, judge
-from experiments.study_statistics import Bootstrap, Interval
+from experiments.study import claims, heatmaps, scoring, statistics
+from experiments.study import data as study_data
+from experiments.study import paper as study_paper
+from experiments.study.claims import DIFFERENCE, HITS, RATIO, SHARE, judge
+from experiments.study.statistics import Bootstrap, Interval
 from mjx_tt.rally import End
 from tests import made_up_study
 
@@ -155,7 +157,7 @@ def test_the_papers_changes_follow_from_its_table():
             ends = [data[m][part][axis] for m in ("M0", "M1", "M2")]
             width = max(e[1] for e in ends) - min(e[0] for e in ends)
             total += (abs(ends[2][0] - ends[1][0]) + abs(ends[2][1] - ends[1][1])) / width
-    assert study_claims.paper_changes("player4")[1] == pytest.approx(total / 16)
+    assert claims.paper_changes("player4")[1] == pytest.approx(total / 16)
 
 
 # Heatmaps
@@ -165,7 +167,7 @@ def test_a_ball_falls_into_the_square_that_the_table_says():
     """Robot's right-hand far corner hit from the human's left near the net, seen from the robot's end."""
     landing = np.array([[0.7, -0.7, 0.0], [-1.3, -0.05, np.nan]])
     place = np.array([[-0.7, 0.0, 0.0], [0.1, 2.2, 0.5]])
-    count, back = study_heatmaps.grid(landing, place, np.array([True, False, True]))
+    count, back = heatmaps.grid(landing, place, np.array([True, False, True]))
     assert count.sum() == 2 and back.sum() == 1
     assert count[2, 0, 0, 0] == 1 and back[2, 0, 0, 0] == 1
     assert count[0, 2, 1, 2] == 1  # behind the human's end line: the square nearest to it
@@ -175,7 +177,7 @@ def test_grids_add_up_to_numpys_histogram():
     rng = np.random.default_rng(0)
     landing = rng.uniform([[-c.TABLE_WIDTH / 2], [-c.TABLE_LENGTH / 2]], [[c.TABLE_WIDTH / 2], [0.0]], (2, 500))
     place = rng.uniform([[-c.TABLE_WIDTH / 2], [0.0]], [[c.TABLE_WIDTH / 2], [c.TABLE_LENGTH / 2]], (2, 500))
-    count, _ = study_heatmaps.grid(landing, place, np.ones(500, bool))
+    count, _ = heatmaps.grid(landing, place, np.ones(500, bool))
     theirs, _ = np.histogramdd(np.concatenate([landing, place]).T, bins=3, range=[
         (-c.TABLE_WIDTH / 2, c.TABLE_WIDTH / 2), (-c.TABLE_LENGTH / 2, 0.0), (-c.TABLE_WIDTH / 2, c.TABLE_WIDTH / 2),
         (0.0, c.TABLE_LENGTH / 2),
@@ -204,7 +206,7 @@ def whole(tmp_path_factory):
 
 
 def test_measured_means_are_the_known_ones(whole):
-    m = study_claims.Measurements(study_data.load(whole))
+    m = claims.Measurements(study_data.load(whole))
     for model in study_paper.TEN:
         for player in ("player3", "player1"):
             known, found = made_up_study.mean_length(player, model), m.unselected.mean(model, [player])
@@ -222,14 +224,14 @@ def test_measured_means_are_the_known_ones(whole):
 
 
 def test_claims_are_judged_as_the_made_up_numbers_demand(whole):
-    found = {f.claim.key: f for f in study_claims.findings(study_claims.Measurements(study_data.load(whole)))}
+    found = {f.claim.key: f for f in claims.findings(claims.Measurements(study_data.load(whole)))}
     assert set(found) == {claim.key for claim in study_paper.CLAIMS}
     for key in ("beginner", "advanced", "fine-tuning", "cross", "keeps-less", "robot-ends"):
         assert found[key].verdict.startswith("agrees"), (key, found[key])
     assert found["first-advanced"].verdict == "differs"  # made up so that later rounds are better
     assert found["intermediate"].verdict == "not comparable"  # no such player in it
     assert found["model-change"].interval.value == pytest.approx(
-        np.sqrt(np.prod([b / a for a, b in map(study_claims.paper_changes, ("player1", "player3"))]))
+        np.sqrt(np.prod([b / a for a, b in map(claims.paper_changes, ("player1", "player3"))]))
     )  # its human models are the paper's
 
 
@@ -255,7 +257,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(whole):
     assert "players player5, player4, player2" in html  # what is missing is named
     assert "<td class=n>11 %</td>" in html and "reached" in html  # of the calibration
     with open(report / "claims.csv", newline="") as file:
-        assert {row["verdict"] for row in csv.DictReader(file)} <= set(study_claims.VERDICTS)
+        assert {row["verdict"] for row in csv.DictReader(file)} <= set(claims.VERDICTS)
     with open(report / "player_skill.csv", newline="") as file:
         paper = [row for row in csv.reader(file) if row[1] == "paper"]
     assert paper[0] == ["player3 (beginner)", "paper", "2", "3", "7", "5.9", "9", "52", "500"]

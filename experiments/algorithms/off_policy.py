@@ -13,8 +13,8 @@ from brax.training.types import Transition
 from flax import struct
 
 from experiments.algorithms import learner
+from experiments.algorithms.config import Replay
 from experiments.algorithms.learner import Learner, NetworkController
-from experiments.compare_config import Replay
 from mjx_tt.brax_env import OBSERVATION_SIZE, TableTennis
 from robot_io.contract import N_JOINTS
 

@@ -17,8 +17,8 @@ from brax.training.agents.ppo import losses, networks
 from flax import struct
 
 from experiments.algorithms import learner
+from experiments.algorithms.config import Ppo
 from experiments.algorithms.learner import Learner, NetworkController
-from experiments.compare_config import Ppo
 from mjx_tt.brax_env import TableTennis
 
 

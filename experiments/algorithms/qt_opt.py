@@ -16,7 +16,7 @@ import optax
 from brax.training.acme import running_statistics
 from flax import linen, struct
 
-from experiments.compare_config import QtOpt
+from experiments.algorithms.config import QtOpt
 from mjx_tt.brax_env import OBSERVATION_SIZE
 from robot_io.contract import N_JOINTS
 

@@ -12,7 +12,7 @@ from brax.training.acme import running_statistics
 from brax.training.agents.sac import losses, networks
 from flax import struct
 
-from experiments.compare_config import Sac
+from experiments.algorithms.config import Sac
 from mjx_tt.brax_env import OBSERVATION_SIZE
 from robot_io.contract import N_JOINTS
 

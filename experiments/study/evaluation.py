@@ -11,9 +11,10 @@ import numpy as np
 
 from ballmodel.distribution import BallDistribution
 from ballmodel.files import replacing
-from experiments import blind, build, scoring
-from experiments.study_config import Study
-from experiments.virtual_finetune import VirtualReality
+from experiments import build
+from experiments.study import blind, scoring
+from experiments.study.config import Study
+from experiments.study.finetuning import VirtualReality
 from mjx_tt import players
 from mjx_tt.rally import Box, RallyResult
 

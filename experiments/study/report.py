@@ -12,17 +12,9 @@ from pathlib import Path
 
 import yaml
 
-from experiments import (
-    study_further_plots,
-    study_heatmaps,
-    study_models,
-    study_plots,
-    study_tables,
-    study_tsne,
-    study_words,
-)
 from experiments.page import Page, details, table
-from experiments.study_claims import (
+from experiments.study import further_plots, heatmaps, models, plots, tables, tsne, words
+from experiments.study.claims import (
     NOT_COMPARABLE,
     VERDICTS,
     Measurements,
@@ -30,10 +22,10 @@ from experiments.study_claims import (
     show,
     span,
 )  # fmt: skip
-from experiments.study_claims import __doc__ as RULES
-from experiments.study_data import Study, load
-from experiments.study_paper import LEVELS, RALLIES, WITHOUT
-from experiments.study_statistics import Estimate
+from experiments.study.claims import __doc__ as RULES
+from experiments.study.data import Study, load
+from experiments.study.paper import LEVELS, RALLIES, WITHOUT
+from experiments.study.statistics import Estimate
 
 REPORT = "report"
 ABSENT = "This study holds nothing of it."
@@ -59,7 +51,7 @@ class _Report:
     def __init__(self, study: Study) -> None:
         self.study, self.measured = study, Measurements(study)
         self.findings = {f.claim.key: f for f in findings(self.measured)}
-        self.tables: dict[str, study_tables.Table] = {}
+        self.tables: dict[str, tables.Table] = {}
         name = study.settings.get("name", study.folder.name)
         seeds = len(study.seeds)
         subtitle = (
@@ -84,11 +76,11 @@ class _Report:
         self.page.section("findings", "What was found")
         self.page.add(
             "<ul>"
-            + "".join(f"<li>{escape(s)}</li>" for s in study_words.sentences(self.measured, self.findings))
+            + "".join(f"<li>{escape(s)}</li>" for s in words.sentences(self.measured, self.findings))
             + "</ul>"
         )
         self._picture(
-            "summary", study_further_plots.summary(list(self.findings.values())),
+            "summary", further_plots.summary(list(self.findings.values())),
             "Ratios of mean rally lengths in this study, with 95 % intervals over seeds and rallies, and the paper's "
             "numbers where "
             "its text states them. On the right the verdict, by the rules at the end of this page.",
@@ -114,26 +106,26 @@ class _Report:
     def _aggregated(self) -> None:
         self.page.section("aggregated", "Over all players")
         self._picture(
-            "aggregated", study_plots.aggregated(self.study, self.measured),
+            "aggregated", plots.aggregated(self.study, self.measured),
             "The paper's figure all_player_results. White circle: mean; line: median; box: quartiles. Normalised: "
             "minus the mean, over "
             "the standard deviation of the player's rallies with all ten models.",
         )  # fmt: skip
         self._picture(
-            "aggregated_means", study_plots.means(self.study, self.measured),
+            "aggregated_means", plots.means(self.study, self.measured),
             "The paper's figure app_summary: means with 95 % intervals over seeds and rallies.",
         )  # fmt: skip
         self._claims("all-ratio", "all-raw", "all-normalised", "all-oracle", "short", "mean")
         self._table(
             "normalised",
-            study_tables.quartiles(self.study, self.measured),
+            tables.quartiles(self.study, self.measured),
             "Normalised rally length: mean, median, quartiles",
         )
 
     def _skill(self) -> None:
         self.page.section("skill", "By skill level")
         self._picture(
-            "by_skill", study_plots.by_skill(self.study, self.measured),
+            "by_skill", plots.by_skill(self.study, self.measured),
             "The paper's figures main_summary_by_skill_level (above) and app_summary_by_skill_level_means (below). "
             "S2R-Oracle+FT has "
             "35 % of the real training of the others.",
@@ -143,14 +135,14 @@ class _Report:
         )
         self._table(
             "player_skill",
-            study_tables.skill(self.study),
+            tables.skill(self.study),
             "Player skill: rally length over the ten models (the paper's table player_skill)",
         )
 
     def _without(self) -> None:
         self.page.section("without", "Without the advanced player")
         self._picture(
-            "without_advanced", study_plots.means(self.study, self.measured, WITHOUT),
+            "without_advanced", plots.means(self.study, self.measured, WITHOUT),
             "The paper's figure app_summary_all_except_outlier, the advanced player left out.",
         )  # fmt: skip
         self._claims("without-raw", "without-normalised")
@@ -158,7 +150,7 @@ class _Report:
     def _checkpoints(self) -> None:
         self.page.section("checkpoints", "On the way: the ten models")
         self._picture(
-            "checkpoints", study_plots.checkpoints(self.study, self.measured),
+            "checkpoints", plots.checkpoints(self.study, self.measured),
             "The paper's figure main_training_curves. Hollow: from simulation; filled: fine-tuned. S2R shares its "
             "first two models "
             "with i-S2R.",
@@ -175,14 +167,14 @@ class _Report:
     def _zero_shot(self) -> None:
         self.page.section("zero-shot", "Zero-shot and fine-tuned")
         self._picture(
-            "zero_shot", study_further_plots.zero_shot(self.study, self.measured),
+            "zero_shot", further_plots.zero_shot(self.study, self.measured),
             "Each policy as it came from simulation, and after its fine-tuning in reality, by skill level. The paper "
             "has it as the "
             "steps of its training curves.",
         )  # fmt: skip
         self._claims("fine-tuning")
         self._picture(
-            "fine_tuning", study_further_plots.fine_tuning(self.study, self.measured),
+            "fine_tuning", further_plots.fine_tuning(self.study, self.measured),
             "Balls that the perturbed policies return while they are fine-tuned in reality (mean over 7 updates; "
             "thick: mean over players "
             "and seeds). The first cycle is the same for both methods; at the gaps i-S2R goes back to simulation, "
@@ -190,25 +182,25 @@ class _Report:
         )  # fmt: skip
         cells = []
         for name in LEVELS:
-            found = [self.measured.ratio(b, a, name) for a, b in study_further_plots.PAIRS]
+            found = [self.measured.ratio(b, a, name) for a, b in further_plots.PAIRS]
             cells.append((name, *(_ratio_text(e) for e in found)))
         head = ("players", "35 % / sim 1", "65 % / sim 2", "100 % / sim 3", "Oracle fine-tuned / sim")
         self._table(
             "zero_shot",
-            study_tables.Table(head, cells, (1, 2, 3, 4)),
+            tables.Table(head, cells, (1, 2, 3, 4)),
             "What fine-tuning brings: ratio of mean rally lengths",
         )
 
     def _human_model(self) -> None:
         self.page.section("human-model", "The human model, round by round")
         self._picture(
-            "evolution", study_models.evolution(self.study, self.measured),
+            "evolution", models.evolution(self.study, self.measured),
             "The paper's figure sim_param_evolution and table ball_dist: the interval of each quantity in M0, M1 and "
             "M2. Bars of several "
             "seeds are means, with the smallest and largest end as whiskers.",
         )  # fmt: skip
         self._picture(
-            "changes", study_models.changes(self.study, self.measured),
+            "changes", models.changes(self.study, self.measured),
             "How far the model moves between rounds: mean over the 16 numbers of the change, each in units of its "
             "quantity's width over "
             "the three models. The paper's follow from its table.",
@@ -216,25 +208,25 @@ class _Report:
         self._claims("model-change", "change-levels")
         self._table(
             "distances",
-            study_tables.change(self.study, self.measured),
+            tables.change(self.study, self.measured),
             "Distance M0 to M1 against M1 to M2",
             opened=True,
         )
         self._table(
             "deviations",
-            study_tables.deviations(self.study),
+            tables.deviations(self.study),
             "Median deviation of the human models from the paper's, in units of each quantity's width",
         )
         self._table(
             "ball_distributions",
-            study_tables.distributions(self.study),
+            tables.distributions(self.study),
             "All numbers of M0, M1 and M2 (the paper's table ball_dist)",
         )
 
     def _cross(self) -> None:
         self.page.section("cross", "With players who did not train the policy")
         self._picture(
-            "cross", study_plots.cross(self.study, self.measured),
+            "cross", plots.cross(self.study, self.measured),
             "The paper's figure main_cross_eval_summary. Normalised: by mean and standard deviation of the trainer's "
             "own evaluation of "
             "that model. Right: mean with others over mean with the trainer.",
@@ -244,18 +236,18 @@ class _Report:
         )
         self._table(
             "cross",
-            study_tables.cross(self.study, self.measured),
+            tables.cross(self.study, self.measured),
             "Trainers and evaluators (the paper's table cross_eval): mean rally length",
         )
         self._picture(
-            "cross_players", study_plots.cross_by_player(self.study, self.measured),
+            "cross_players", plots.cross_by_player(self.study, self.measured),
             "The paper's figure app:cross_eval_details, ordered by the trainer's skill.",
         )  # fmt: skip
 
     def _players(self) -> None:
         self.page.section("players", "Player by player")
         self._picture(
-            "players", study_plots.by_player(self.study, self.measured),
+            "players", plots.by_player(self.study, self.measured),
             "The paper's figure app:trainer_details: mean and distribution of the rally length of the ten models, "
             "players from the lowest "
             "to the highest skill. Dashed: the paper's mean over the ten models of that player.",
@@ -268,22 +260,22 @@ class _Report:
         self.page.section("balls", "The balls on a plane (t-SNE)")
         planes = []
         if self.study.seeds:
-            found = (study_tsne.embed(self.study, player, self.study.seeds[0]) for player in self.study.players)
+            found = (tsne.embed(self.study, player, self.study.seeds[0]) for player in self.study.players)
             planes = [plane for plane in found if plane is not None]
         seed = f"Seed {self.study.seeds[0]}. " if self.study.seeds else ""
         self._picture(
-            "tsne_training", study_tsne.training(planes),
+            "tsne_training", tsne.training(planes),
             f"{seed}The paper's figure app:ball-dist-evo-train: D0, and what the first and second fine-tuning add. "
             "One plane per player "
             "for all three sets of pictures, so a place means the same ball in all; grey: all balls of the player.",
         )  # fmt: skip
         self._picture(
-            "tsne_evaluation", study_tsne.evaluation(planes),
+            "tsne_evaluation", tsne.evaluation(planes),
             "The paper's figure app:ball-dist-evo-train-eval: training balls up to a round, and the balls of the "
             "evaluation after it.",
         )  # fmt: skip
         self._picture(
-            "tsne_methods", study_tsne.methods(planes),
+            "tsne_methods", tsne.methods(planes),
             "The paper's figure app:ball-dist-is2r-s2r: i-S2R left, S2R+FT right. S2R was trained in simulation on "
             "D0 alone; ΔD1 are the "
             "balls of the fine-tuning that it shares with i-S2R.",
@@ -292,7 +284,7 @@ class _Report:
             "The paper draws these without a statement in numbers. Numbers from here: the share of evaluation balls "
             "inside each human model."
         )
-        self._table("inside", study_tables.inside(self.study), "Evaluation balls inside each human model", opened=True)
+        self._table("inside", tables.inside(self.study), "Evaluation balls inside each human model", opened=True)
 
     def _heatmaps(self) -> None:
         self.page.section("heatmaps", "Where balls come from and go to")
@@ -302,11 +294,11 @@ class _Report:
             "rate. Numbers: percent of all balls of the picture; those of a small grid add up to the number above it."
         )
         self._picture(
-            "heatmap_incoming", study_heatmaps.heatmaps(self.study, study_heatmaps.incoming),
+            "heatmap_incoming", heatmaps.heatmaps(self.study, heatmaps.incoming),
             f"The paper's figure app:heatmap-incoming. {how} Small grid: from where on the human's half it was hit.",
         )  # fmt: skip
         self._picture(
-            "heatmap_outgoing", study_heatmaps.heatmaps(self.study, study_heatmaps.outgoing),
+            "heatmap_outgoing", heatmaps.heatmaps(self.study, heatmaps.outgoing),
             f"The paper's figure app:heatmap-outgoing. {how} Small grid: where on the human's half the robot's "
             "return came down (beside it: "
             "the nearest square), of the balls that it touched.",
@@ -316,7 +308,7 @@ class _Report:
     def _ablation(self) -> None:
         self.page.section("ablation", "Which distribution to train on")
         self._picture(
-            "ablation", study_plots.ablation(self.study, self.measured),
+            "ablation", plots.ablation(self.study, self.measured),
             "The paper's figure arbitarary_distributions: zero-shot rallies of policies trained on hand-made "
             "distributions and on the Oracle's.",
         )  # fmt: skip
@@ -325,7 +317,7 @@ class _Report:
     def _variant(self) -> None:
         self.page.section("variant", "Are the weights worth carrying back?")
         self._picture(
-            "variant", study_further_plots.variant(self.study, self.measured),
+            "variant", further_plots.variant(self.study, self.measured),
             "i-S2R, which goes on in simulation from the weights fine-tuned in reality, against the variant that "
             "goes on from its own "
             "weights in simulation and takes only the new human model.",
@@ -335,17 +327,17 @@ class _Report:
     def _ends(self) -> None:
         self.page.section("ends", "Who ends the rallies")
         self._picture(
-            "ends", study_further_plots.ends(self.study, self.measured),
+            "ends", further_plots.ends(self.study, self.measured),
             "Shares of the rallies that count, played with the own trainer, that the robot (coloured) and the human "
             "(grey) ended.",
         )  # fmt: skip
         self._claims("robot-ends")
         self._table(
             "ends",
-            study_tables.ends(self.study),
+            tables.ends(self.study),
             "End-of-rally attribution (the paper's table end_of_rally_attribution)",
         )
-        cut = study_tables.broken_off(self.study)
+        cut = tables.broken_off(self.study)
         if cut:
             self.page.paragraph(
                 f"{cut} reported rallies were broken off at the largest number of touches; their lengths are lower "
@@ -356,12 +348,12 @@ class _Report:
     def _statistics(self) -> None:
         self.page.section("statistics", "Intervals, significance, and what the selection does")
         self._picture(
-            "unselected", study_further_plots.unselected(self.study, self.measured),
+            "unselected", further_plots.unselected(self.study, self.measured),
             f"The paper reports the {RALLIES} longest of 60 rallies. The same comparison on every rally that counts.",
         )  # fmt: skip
         self._table(
             "significance",
-            study_tables.significance(self.measured),
+            tables.significance(self.measured),
             "Differences between the methods, with tests",
             opened=True,
         )
@@ -374,10 +366,10 @@ class _Report:
         )  # fmt: skip
         self._table(
             "models",
-            study_tables.models(self.study, self.measured),
+            tables.models(self.study, self.measured),
             "Every model: mean rally length with intervals of three kinds, quartiles, unselected",
         )
-        self._table("rallies", study_tables.ball_counts(self.study), "Rallies played, counted and reported")
+        self._table("rallies", tables.ball_counts(self.study), "Rallies played, counted and reported")
 
     def _calibration(self) -> None:
         self.page.section("calibration", "How far the virtual players are the paper's")
@@ -388,7 +380,7 @@ class _Report:
             )
             return
         self._picture(
-            "calibration", study_models.calibration(found),
+            "calibration", models.calibration(found),
             "Virtual players without a study: their balls fitted as a human model is, beside the paper's, and their "
             "rallies with policies "
             "of mixed quality. Dotted: 15 % of a range.",
@@ -399,7 +391,7 @@ class _Report:
             for player, by in medians.items()
         ]
         self._table(
-            "calibration_medians", study_tables.Table(("player", "M0", "M1", "M2"), rows, (1, 2, 3)),
+            "calibration_medians", tables.Table(("player", "M0", "M1", "M2"), rows, (1, 2, 3)),
             "Median deviation over the 16 numbers, as a share of each quantity's range", opened=True,
         )  # fmt: skip
         for name, title in (
@@ -411,13 +403,13 @@ class _Report:
                 head = tuple(lines[0])
                 self._table(
                     f"calibration_{name}",
-                    study_tables.Table(head, [tuple(str(r[k]) for k in head) for r in lines]),
+                    tables.Table(head, [tuple(str(r[k]) for k in head) for r in lines]),
                     title,
                 )
 
     def _all_claims(self) -> None:
         self.page.section("claims", "Every claim, and the rules")
-        content = study_tables.claims(list(self.findings.values()))
+        content = tables.claims(list(self.findings.values()))
         self.tables["claims"] = content
         rows = [(*map(escape, row[:6]), _badge(row[6]), escape(row[7])) for row in content.rows]
         self.page.add(details("All claims", table(content.head, rows, content.right)))
@@ -445,7 +437,7 @@ class _Report:
             return
         self.page.picture(name, figure, caption, caption.split(". ")[0])
 
-    def _table(self, name: str, content: study_tables.Table, title: str, opened: bool = False) -> None:
+    def _table(self, name: str, content: tables.Table, title: str, opened: bool = False) -> None:
         self.tables[name] = content
         if not content.rows:
             self._not_drawn(f"{title}: {ABSENT[0].lower() + ABSENT[1:]}")

@@ -11,11 +11,11 @@ import numpy as np
 
 from ballmodel import players
 from ballmodel.files import replacing
-from experiments import scoring
-from experiments.study_claims import Finding, Measurements, paper_changes, show, span
-from experiments.study_data import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
-from experiments.study_paper import ABLATED, BY_KEY, CROSS, FINAL, GROUPS, MODELS, SHORT, TEN, VARIANT, level, of_level
-from experiments.study_statistics import holm, t_mean
+from experiments.study import scoring
+from experiments.study.claims import Finding, Measurements, paper_changes, show, span
+from experiments.study.data import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
+from experiments.study.paper import ABLATED, BY_KEY, CROSS, FINAL, GROUPS, MODELS, SHORT, TEN, VARIANT, level, of_level
+from experiments.study.statistics import holm, t_mean
 from mjx_tt.rally import End
 
 

@@ -1,6 +1,6 @@
 """How near the virtual players come to the paper's people: target against reached, as tables and a picture.
 
-    python -m experiments.calibrate_players --first runs/player3_m0 --later runs/player3_m2 runs/medium --out calibration
+    python -m experiments.study.calibration --first runs/player3_m0 --later runs/player3_m2 runs/medium --out calibration
 
 First balls are compared with M0 and rally balls with M1 and M2, each through the path of real data: seen by cameras at
 125 Hz with noise, fitted, cleaned by DBSCAN, minima and maxima taken. The rallies of D1 are those with the policies
@@ -29,8 +29,9 @@ from ballmodel.files import replacing
 from ballmodel.human import fit_human
 from ballmodel.state import BallState
 from ballmodel.trajectory import Dataset
-from experiments import policy, reality
+from experiments import policy
 from experiments.plots import STYLE
+from experiments.study import reality
 from mjx_tt import model as models
 from mjx_tt import platform, players
 from mjx_tt.rally import ROWS, RallySimulator

@@ -29,9 +29,9 @@ from functools import cached_property
 import numpy as np
 
 from ballmodel import constants as c
-from experiments.study_data import BallLog, Study, change, paper_models, widths
-from experiments.study_paper import CLAIMS, FINAL, GROUPS, TEN, WITHOUT, Claim, of_level
-from experiments.study_statistics import (
+from experiments.study.data import BallLog, Study, change, paper_models, widths
+from experiments.study.paper import CLAIMS, FINAL, GROUPS, TEN, WITHOUT, Claim, of_level
+from experiments.study.statistics import (
     DRAWS,
     Bootstrap,
     Difference,

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import stats
 
 from experiments.finetune_report import t_interval, welch_interval
-from experiments.scoring import Rallies
+from experiments.study.scoring import Rallies
 
 DRAWS = 2000
 PERMUTATIONS = 4000

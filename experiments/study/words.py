@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.study_claims import (
+from experiments.study.claims import (
     AGREES,
     DIFFERS,
     DIRECTION,
@@ -14,7 +14,7 @@ from experiments.study_claims import (
     Finding,
     Measurements,
 )
-from experiments.study_paper import LEVELS, SHORT, of_level
+from experiments.study.paper import LEVELS, SHORT, of_level
 
 
 def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:

@@ -14,9 +14,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.study_data import DATASETS, Study
-from experiments.study_paper import IS2R, S2R
-from experiments.study_style import COLOUR, player_label, styled
+from experiments.study.data import DATASETS, Study
+from experiments.study.paper import IS2R, S2R
+from experiments.study.style import COLOUR, player_label, styled
 from mjx_tt.gap.plots import FAINT
 
 MOST = 500  # balls of a data set, as in the paper

@@ -56,7 +56,7 @@ class Simulation(Section):
 
 
 class Reality(Section):
-    """The virtual reality: what it has that training does not know, drawn per seed (``experiments.reality``)."""
+    """The virtual reality: what it has that training does not know, drawn per seed (``experiments.study.reality``)."""
 
     without: list[Literal[EFFECTS]] = []
     """Effects that are left out: there, reality is what training believes."""
@@ -166,4 +166,4 @@ def parse(data: dict[str, Any], where: str) -> Study:
 
 def shipped() -> dict[str, Path]:
     """The studies that come with the program, by name."""
-    return {path.stem: path for path in sorted(Path(__file__).parent.glob("study_*.yaml"))}
+    return {path.stem: path for path in sorted(Path(__file__).parents[1].glob("study_*.yaml"))}

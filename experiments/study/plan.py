@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from experiments.study_config import Study
+from experiments.study.config import Study
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from experiments import blind, scoring
 from experiments.errors import ConfigError
-from experiments.study_statistics import t_mean
+from experiments.study import blind, scoring
+from experiments.study.statistics import t_mean
 
 
 def run(options: argparse.Namespace, console: Console) -> None:

@@ -198,7 +198,7 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comp
 
 def shipped() -> dict[str, Path]:
     """The comparisons that come with the program, by name."""
-    return {path.stem: path for path in sorted(Path(__file__).parent.glob("compare_*.yaml"))}
+    return {path.stem: path for path in sorted(Path(__file__).parents[1].glob("compare_*.yaml"))}
 
 
 def _experiment(given: str | dict[str, Any], where: str) -> Config:

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from ballmodel.files import replacing
-from experiments import scoring
 from experiments.errors import ConfigError
+from experiments.study import scoring
 
 KEY, SHEET, POLICIES, OPENED, EVALUATIONS = "key.sealed", "sheet.csv", "policies", "key.json", "evaluations.csv"
 BEGUN = ".begun"  # while an evaluation is being made

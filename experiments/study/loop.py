@@ -2,7 +2,7 @@
 
 For every seed and player: balls without a robot, a human model, training in simulation, fine-tuning in reality while the
 player's balls are measured, the next human model, and so on; then rallies of all models, and the report. Reality is a
-virtual one (``experiments.virtual_finetune``) or a robot with its operator (``experiments.is2r_robot``).
+virtual one (``experiments.study.finetuning``) or a robot with its operator (``experiments.study.robot``).
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from ballmodel.distribution import BallDistribution, load_distribution, save_dis
 from ballmodel.flight import ball_params
 from ballmodel.human import fit_human
 from ballmodel.trajectory import Dataset
-from experiments import blind, build, measurements, policy, runs, scoring, study_data
-from experiments import is2r_evaluation as evaluation
-from experiments import is2r_training as training
-from experiments import reality as realities
+from experiments import build, measurements, policy, runs
 from experiments.config import read_yaml
 from experiments.errors import RunError, checked
-from experiments.is2r_plan import ORACLE, Human, Item, Real, Simulated, items, pairings, updates
-from experiments.is2r_steps import JOURNAL, Journal, Step, Waiting, run_all
-from experiments.is2r_training import POLICY, SELECTION
-from experiments.is2r_world import VirtualWorld, World
 from experiments.runs import Run
-from experiments.study_config import Study, parse
-from experiments.virtual_finetune import VirtualReality
+from experiments.study import blind, evaluation, scoring, training
+from experiments.study import data as study_data
+from experiments.study import reality as realities
+from experiments.study.config import Study, parse
+from experiments.study.finetuning import VirtualReality
+from experiments.study.plan import ORACLE, Human, Item, Real, Simulated, items, pairings, updates
+from experiments.study.steps import JOURNAL, Journal, Step, Waiting, run_all
+from experiments.study.training import POLICY, SELECTION
+from experiments.study.world import VirtualWorld, World
 
 SETTINGS, SESSIONS, CONVERGENCE = "study.yaml", "study.json", "convergence.json"
 REPORT = Path("report") / "index.html"
@@ -45,7 +45,7 @@ class Loop:
             shared = VirtualReality(study, study.seeds[0])
             self._world = {seed: VirtualWorld(study, seed, shared) for seed in study.seeds}
         else:
-            from experiments.is2r_robot import RobotWorld
+            from experiments.study.robot import RobotWorld
 
             self._world = dict.fromkeys(study.seeds, RobotWorld(study, console))
 
@@ -83,7 +83,7 @@ class Loop:
         inputs = tuple(p for step in played for p in step.outputs if p.suffix in (".csv", ".yaml", ".json"))
 
         def run() -> str:
-            from experiments import study_report
+            from experiments.study import report as study_report
 
             return str(study_report.write(self.folder))
 
@@ -248,7 +248,7 @@ class Loop:
 
     def _blind(self, seed: int) -> list[Step]:
         """The evaluation by people: for every trainer and evaluator a folder with code names and a scoring sheet."""
-        from experiments.is2r_robot import blind_steps
+        from experiments.study.robot import blind_steps
 
         found = []
         pairs = pairings(self.study)

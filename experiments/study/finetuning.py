@@ -19,8 +19,9 @@ from ballmodel.optional import without_nominal
 from ballmodel.trajectory import Dataset, Trajectory
 from bgs import normalizer, strategy
 from bgs.strategy import BGSConfig, BGSState
-from experiments import build, evaluate, reality
-from experiments.study_config import Study
+from experiments import build, evaluate
+from experiments.study import reality
+from experiments.study.config import Study
 from experiments.training import TrainState
 from mjx_tt import players, rewards
 from mjx_tt.model import SimModel

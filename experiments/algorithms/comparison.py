@@ -24,8 +24,10 @@ import yaml
 from rich.console import Console
 
 from ballmodel.files import replacing
-from experiments import build, checkpoint, compare_report, evaluate, runs
+from experiments import build, checkpoint, evaluate, runs
+from experiments.algorithms import report
 from experiments.algorithms.arena import Arena, draw_balls
+from experiments.algorithms.config import Algorithm, Bgs, Comparison, Ppo, Sac
 from experiments.algorithms.evolution import Evolution
 from experiments.algorithms.learner import MEASURED, Learner
 from experiments.algorithms.off_policy import OffPolicyLearner
@@ -33,7 +35,6 @@ from experiments.algorithms.ppo import PpoLearner
 from experiments.algorithms.qt_opt import QtOptAgent
 from experiments.algorithms.sac import SacAgent
 from experiments.build import Experiment
-from experiments.compare_config import Algorithm, Bgs, Comparison, Ppo, Sac
 from experiments.config import Config
 from experiments.errors import RunError, checked
 from experiments.training import Trainer
@@ -85,7 +86,7 @@ def compare(comparison: Comparison, config: Config, where: str, out: Path, conso
             _run(common, judge, name, seeds)
         else:
             console.print(f"{common.folder / name}: done before, skipped", highlight=False)
-    compare_report.write(common.folder, common.comparison)
+    report.write(common.folder, common.comparison)
     return common.folder
 
 

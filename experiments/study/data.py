@@ -12,9 +12,9 @@ import numpy as np
 
 from ballmodel import players
 from ballmodel.distribution import AXES, BallDistribution, load_distribution, read_yaml
-from experiments import scoring
 from experiments.errors import ConfigError
-from experiments.study_paper import BY_SKILL, CROSS, FINAL, TEN
+from experiments.study import scoring
+from experiments.study.paper import BY_SKILL, CROSS, FINAL, TEN
 from mjx_tt.players import FOLDER as VIRTUAL_PLAYERS
 
 ROUNDS = ("M0", "M1", "M2")

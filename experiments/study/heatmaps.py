@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ballmodel import constants as c
-from experiments.study_data import BallLog, Study
-from experiments.study_paper import SHORT
-from experiments.study_style import colour, player_label, styled
+from experiments.study.data import BallLog, Study
+from experiments.study.paper import SHORT
+from experiments.study.style import colour, player_label, styled
 from mjx_tt.gap.plots import FAINT, INK
 
 CELLS = 3

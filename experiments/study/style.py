@@ -18,8 +18,8 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from experiments.study_paper import ABLATION, BY_KEY, FRESH, IS2R, ORACLE, S2R, SHORT, level, of_level
-from experiments.study_statistics import Bootstrap, Interval
+from experiments.study.paper import ABLATION, BY_KEY, FRESH, IS2R, ORACLE, S2R, SHORT, level, of_level
+from experiments.study.statistics import Bootstrap, Interval
 from mjx_tt.gap.plots import FAINT, INK
 from mjx_tt.gap.plots import STYLE as GAP_STYLE
 

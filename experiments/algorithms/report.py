@@ -19,7 +19,7 @@ from matplotlib.ticker import PercentFormatter
 
 from ballmodel.files import replacing
 from experiments import runs
-from experiments.compare_config import Comparison
+from experiments.algorithms.config import Comparison
 from experiments.evaluate import wilson
 from experiments.plots import INK, STYLE
 

@@ -15,8 +15,8 @@ from ballmodel.trajectory import Dataset
 from experiments import build, checkpoint, policy, runs
 from experiments.policy import Policy
 from experiments.runs import CONFIG, Run
-from experiments.study_config import Study
-from experiments.virtual_finetune import VirtualReality
+from experiments.study.config import Study
+from experiments.study.finetuning import VirtualReality
 
 STUDY = 6  # purpose of a key, beside those of experiments.build
 

@@ -9,10 +9,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ballmodel.distribution import AXES
-from experiments.study_claims import Measurements, paper_changes
-from experiments.study_data import ROUNDS, Study, numbers, paper_models
-from experiments.study_statistics import t_mean
-from experiments.study_style import styled
+from experiments.study.claims import Measurements, paper_changes
+from experiments.study.data import ROUNDS, Study, numbers, paper_models
+from experiments.study.statistics import t_mean
+from experiments.study.style import styled
 from mjx_tt.gap.plots import FAINT, INK
 
 SHADES = {"M0": "#9ecae1", "M1": "#4292c6", "M2": "#08519c"}

@@ -9,9 +9,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ballmodel import players
-from experiments.study_claims import Measurements
-from experiments.study_data import Study
-from experiments.study_paper import (
+from experiments.study.claims import Measurements
+from experiments.study.data import Study
+from experiments.study.paper import (
     ABLATED,
     ABLATION,
     BY_KEY,
@@ -25,7 +25,7 @@ from experiments.study_paper import (
     SHORT,
     TEN,
 )
-from experiments.study_style import (
+from experiments.study.style import (
     COLOUR,
     PAPER_MARK,
     bar,

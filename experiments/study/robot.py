@@ -16,13 +16,14 @@ import numpy as np
 from rich.console import Console
 
 from ballmodel.trajectory import Dataset
-from experiments import blind, build, finetune, finish, measurements, play, policy, scoring
+from experiments import build, finetune, finish, measurements, play, policy
 from experiments.errors import ConfigError
 from experiments.finetune_robot import LockStepRobot
-from experiments.is2r_steps import Step, Waiting
 from experiments.policy import Policy
 from experiments.runs import Run
-from experiments.study_config import Study
+from experiments.study import blind, scoring
+from experiments.study.config import Study
+from experiments.study.steps import Step, Waiting
 
 
 class RobotWorld:

@@ -4,7 +4,7 @@ Each effect moves a few parameters of ``SimModel`` to values drawn from a range 
 effect that is left out keeps what training believes. The draw depends on the seed and on the parameter's name only, so
 leaving out one effect changes no other. Balls spin as the player hits them; training believes that none does.
 
-What was drawn is sealed (``experiments.blind``) when a study begins and opened when it is over. The learner gets measured
+What was drawn is sealed (``experiments.study.blind``) when a study begins and opened when it is over. The learner gets measured
 balls and rewards.
 """
 

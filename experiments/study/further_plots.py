@@ -10,10 +10,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from experiments.finetune_report import smooth
-from experiments.scoring import UNKNOWN
-from experiments.study_claims import RATIO, Finding, Measurements
-from experiments.study_data import Study
-from experiments.study_paper import (
+from experiments.study.claims import RATIO, Finding, Measurements
+from experiments.study.data import Study
+from experiments.study.paper import (
     ABLATION,
     BY_KEY,
     FINAL,
@@ -27,7 +26,8 @@ from experiments.study_paper import (
     WITHOUT,
     of_level,
 )
-from experiments.study_style import (
+from experiments.study.scoring import UNKNOWN
+from experiments.study.style import (
     COLOUR,
     bar,
     colour,

@@ -13,10 +13,10 @@ from ballmodel.distribution import load_distribution
 from ballmodel.files import replacing
 from experiments import build, policy, runs
 from experiments.config import Config, Evaluation, Training
-from experiments.is2r_plan import Simulated, updates
 from experiments.policy import Policy
 from experiments.runs import Run
-from experiments.study_config import Study
+from experiments.study.config import Study
+from experiments.study.plan import Simulated, updates
 from experiments.train import train
 
 POLICY, SELECTION = "policy.npz", "selection.json"
