@@ -64,8 +64,8 @@ from pathlib import Path
 from mjx_tt import platform
 platform.configure(devices=2, cache=Path(".cache/jax"))
 from rich.console import Console
-from experiments import is2r, study_config
-is2r.run(study_config.parse(json.loads(sys.argv[1]), "test"), Path(sys.argv[2]), Console())
+from experiments.study import config, loop
+loop.run(config.parse(json.loads(sys.argv[1]), "test"), Path(sys.argv[2]), Console())
 """
 
 
@@ -401,6 +401,7 @@ def test_a_killed_study_ends_as_one_that_nobody_killed(finished, tmp_path):
     marked = folder / "seed0" / "player3" / "is2r-ft35" / "checkpoints"
     while not marked.exists() and process.poll() is None:
         time.sleep(0.005)
+    assert process.poll() is None, process.stderr.read()
     os.kill(process.pid, signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL, process.stderr.read()
     before = Journal(folder / "steps.jsonl").entries

@@ -5,7 +5,7 @@ Folder of a comparison:
   <algorithm>/seed<K>/training.json   the curve, and under which conditions it came about
   <algorithm>/seed<K>/policy/         the controller's arrays
   <algorithm>/seed<K>/evaluation.json
-  comparison.json, curves.csv, *.png, comparison.md   the report (``compare_report``)
+  comparison.json, curves.csv, *.png, comparison.md   the report (``report``)
 
 An algorithm with a seed is trained in one go: interrupted, that one begins again, and those that are finished stay.
 """
