@@ -302,15 +302,9 @@ def _check(folder: Path, found: dict[str, Any], wanted: dict[str, Any], settings
     changeable = {"source"}  # the policy itself is compared
     if settings.step.schedule.kind == "constant":
         changeable.add("settings.updates")
-    ours, theirs = runs._flat(wanted), runs._flat(found)
-    changed = [
-        f"  {key}: the run has {theirs.get(key)!r}, now {ours.get(key)!r}"
-        for key in sorted(set(ours) | set(theirs))
-        if key not in changeable and ours.get(key) != theirs.get(key)
-    ]
+    changed = runs.differences(found, wanted, changeable.__contains__)
     if changed:
-        lines = "\n".join(changed)
-        raise RunError(f"{folder}: is another fine-tuning:\n{lines}\nRestore these values or choose another --out")
+        raise RunError(f"{folder}: is another fine-tuning:\n{changed}\nRestore these values or choose another --out")
 
 
 def _digest(state: TrainState) -> str:

@@ -7,7 +7,7 @@ import hashlib
 import json
 import platform
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from importlib import metadata
@@ -84,16 +84,10 @@ class Run:
         """Raises RunError naming every key in which a run that is already here differs; nothing for a new folder."""
         if not (self.folder / CONFIG).exists():
             return
-        found, wanted = _flat(self.config().to_dict()), _flat(config.to_dict())
-        changed = [
-            f"  {key}: the run has {found.get(key)!r}, now {wanted.get(key)!r}"
-            for key in sorted(set(found) | set(wanted))
-            if found.get(key) != wanted.get(key) and not _changeable(key)
-        ]
+        changed = differences(self.config().to_dict(), config.to_dict(), _changeable)
         if changed:
-            lines = "\n".join(changed)
             raise RunError(
-                f"{self.folder}: belongs to another configuration:\n{lines}\n"
+                f"{self.folder}: belongs to another configuration:\n{changed}\n"
                 "Restore these values, change the name or --out, or remove the folder"
             )
 
@@ -197,6 +191,18 @@ def _version(package: str) -> str | None:
 
 def _changeable(key: str) -> bool:
     return any(key == allowed or key.startswith(f"{allowed}.") for allowed in CHANGEABLE)
+
+
+def differences(
+    found: dict[str, Any], wanted: dict[str, Any], changeable: Callable[[str], bool], owner: str = "run"
+) -> str:
+    """A line for every key, by dotted path, that may not change and did: what the ``owner`` has and what is wanted now."""
+    theirs, ours = _flat(found), _flat(wanted)
+    return "\n".join(
+        f"  {key}: the {owner} has {theirs.get(key)!r}, now {ours.get(key)!r}"
+        for key in sorted(set(ours) | set(theirs))
+        if ours.get(key) != theirs.get(key) and not changeable(key)
+    )
 
 
 def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -71,10 +71,9 @@ class Replay(Section):
     batch: Count = 256
 
 
-class Sac(Section):
-    """Soft actor-critic with brax's networks and losses."""
+class OffPolicy(Section):
+    """What learners from kept experience have in common."""
 
-    kind: Literal["sac"]
     replay: Replay = Replay()
     layers: Layers = [128, 128]
     learning_rate: Positive = 1e-3
@@ -82,19 +81,19 @@ class Sac(Section):
     reward_scale: Positive = 1.0
     target_rate: Share = 0.005
     """By which the target network moves towards the critic in a gradient step."""
+
+
+class Sac(OffPolicy):
+    """Soft actor-critic with brax's networks and losses."""
+
+    kind: Literal["sac"]
     first_entropy_weight: Positive = 0.1
 
 
-class QtOpt(Section):
+class QtOpt(OffPolicy):
     """QT-Opt in its small form: two critics, the cross-entropy method in place of an actor."""
 
     kind: Literal["qt_opt"]
-    replay: Replay = Replay()
-    layers: Layers = [128, 128]
-    learning_rate: Positive = 1e-3
-    discount: Discount = 0.99
-    reward_scale: Positive = 1.0
-    target_rate: Share = 0.005
     rounds: Count = 2
     """Of the cross-entropy method."""
     candidates: Count = 32

@@ -305,15 +305,9 @@ def _open(study: Study, folder: Path) -> None:
     path = folder / SETTINGS
     if path.exists():
         found = parse(read_yaml(path.read_text(encoding="utf-8"), str(path)), str(path))
-        ours, theirs = (runs._flat(s.to_dict()) for s in (study, found))
-        changed = [
-            f"  {key}: the study has {theirs.get(key)!r}, now {ours.get(key)!r}"
-            for key in sorted(set(ours) | set(theirs))
-            if key not in CHANGEABLE and ours.get(key) != theirs.get(key)
-        ]
+        changed = runs.differences(found.to_dict(), study.to_dict(), CHANGEABLE.__contains__, "study")
         if changed:
-            lines = "\n".join(changed)
-            raise RunError(f"{folder}: is another study:\n{lines}\nRestore these values or choose another --out")
+            raise RunError(f"{folder}: is another study:\n{changed}\nRestore these values or choose another --out")
     runs.write_yaml(path, study.to_dict())
     sessions = folder / SESSIONS
     before = read_yaml(sessions.read_text(encoding="utf-8"), str(sessions)) if sessions.exists() else {"sessions": []}
