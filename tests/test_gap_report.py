@@ -137,7 +137,9 @@ def test_page_is_whole_and_needs_nothing_else(windy_page):
     assert len(sources) == len(files) - 1
     for _, attributes in page.tags:
         for name in set(attributes) & {"src", "href", "srcset", "style"}:
-            assert attributes[name].startswith("data:image/png;base64,")
+            assert attributes[name].startswith(("data:image/png;base64,", "#"))
+    anchors = {a.get("id") for _, a in page.tags}
+    assert {a["href"].removeprefix("#") for tag, a in page.tags if tag == "a"} <= anchors
     text = files[0].read_text(encoding="utf-8")
     assert not {"http:", "https:", "url(", "@import"} & {w for w in ("http:", "https:", "url(", "@import") if w in text}
     pictures = {f.read_bytes() for f in files[1:]}
@@ -394,7 +396,7 @@ def test_a_failed_write_leaves_the_old_report(joints, tmp_path, monkeypatch):
     def broken(figure):
         raise RuntimeError("no picture")
 
-    monkeypatch.setattr(plots, "png", broken)
+    monkeypatch.setattr("mjx_tt.page.png", broken)
     with pytest.raises(RuntimeError, match="no picture"):
         report.write(tmp_path, joints, "title")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"] and (tmp_path / "report.html").read_text() == "old"

@@ -39,7 +39,7 @@ from experiments.study.style import (
     note_empty,
     styled,
 )
-from mjx_tt.gap.plots import FAINT, INK
+from mjx_tt.page import FAINT, INK
 
 CYCLES = {
     S2R: ("is2r-ft35", "s2r-ft65", "s2r-ft100"),

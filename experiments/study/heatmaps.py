@@ -23,7 +23,7 @@ from ballmodel import constants as c
 from experiments.study.data import BallLog, Study
 from experiments.study.paper import SHORT
 from experiments.study.style import colour, player_label, styled
-from mjx_tt.gap.plots import FAINT, INK
+from mjx_tt.page import FAINT, INK
 
 CELLS = 3
 METHODS = ("is2r-ft100", "s2r-ft100")

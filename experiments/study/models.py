@@ -13,7 +13,7 @@ from experiments.study.claims import Measurements, paper_changes
 from experiments.study.data import ROUNDS, Study, numbers, paper_models
 from experiments.study.statistics import t_mean
 from experiments.study.style import styled
-from mjx_tt.gap.plots import FAINT, INK
+from mjx_tt.page import FAINT, INK
 
 SHADES = {"M0": "#9ecae1", "M1": "#4292c6", "M2": "#08519c"}
 UNITS = {"position": "m", "velocity": "m/s", "landing": "m"}

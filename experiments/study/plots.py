@@ -45,7 +45,7 @@ from experiments.study.style import (
     player_label,
     styled,
 )
-from mjx_tt.gap.plots import FAINT, INK
+from mjx_tt.page import FAINT, INK
 
 LONGEST = 60  # touches; last bin of the histogram
 NAMES = {

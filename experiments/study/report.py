@@ -12,7 +12,6 @@ from pathlib import Path
 
 import yaml
 
-from experiments.page import Page, details, table
 from experiments.study import further_plots, heatmaps, models, plots, tables, tsne, words
 from experiments.study.claims import (
     NOT_COMPARABLE,
@@ -26,6 +25,7 @@ from experiments.study.claims import __doc__ as RULES
 from experiments.study.data import Study, load
 from experiments.study.paper import LEVELS, RALLIES, WITHOUT
 from experiments.study.statistics import Estimate
+from mjx_tt.page import Page, details, table
 
 REPORT = "report"
 ABSENT = "This study holds nothing of it."
@@ -41,7 +41,7 @@ def write(folder: Path) -> Path:
     writer = _Report(study)
     writer.compose()
     target = study.folder / REPORT
-    path = writer.page.write(target)
+    path, *_ = writer.page.write(target / "index.html", target)
     for name, content in writer.tables.items():
         content.write(target / f"{name}.csv")
     return path
@@ -59,7 +59,7 @@ class _Report:
             "rallies, of which"
             f" {int(study.rallies.selected.sum()):,} are reported"
         )
-        self.page = Page("Simulate, play, refine: the paper's study repeated", subtitle, STYLE)
+        self.page = Page("Simulate, play, refine: the paper's study repeated", subtitle, css=STYLE)
 
     def compose(self) -> None:
         for part in (
@@ -435,7 +435,7 @@ class _Report:
         if figure is None:
             self._not_drawn(f"{caption.split('.')[0].split(':')[0]}: {ABSENT[0].lower() + ABSENT[1:]}")
             return
-        self.page.picture(name, figure, caption, caption.split(". ")[0])
+        self.page.add(self.page.picture(name, figure, escape(caption), caption.split(". ")[0]))
 
     def _table(self, name: str, content: tables.Table, title: str, opened: bool = False) -> None:
         self.tables[name] = content

@@ -20,11 +20,11 @@ from matplotlib.patches import Patch
 
 from experiments.study.paper import ABLATION, BY_KEY, FRESH, IS2R, ORACLE, S2R, SHORT, level, of_level
 from experiments.study.statistics import Bootstrap, Interval
-from mjx_tt.gap.plots import FAINT, INK
-from mjx_tt.gap.plots import STYLE as GAP_STYLE
+from mjx_tt.page import FAINT, INK
+from mjx_tt.page import STYLE as PAGE_STYLE
 
 COLOUR = {IS2R: "#0072b2", S2R: "#d55e00", ORACLE: "#009e73", FRESH: "#cc79a7", ABLATION: "#e69f00"}
-STYLE = GAP_STYLE | {"figure.constrained_layout.use": True, "axes.titleweight": "bold", "font.size": 9.5}
+STYLE = PAGE_STYLE | {"figure.constrained_layout.use": True, "axes.titleweight": "bold", "font.size": 9.5}
 PAPER_MARK = Line2D([], [], color=INK, marker="D", markerfacecolor="white", linestyle="", label="paper")
 
 

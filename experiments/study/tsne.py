@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from experiments.study.data import DATASETS, Study
 from experiments.study.paper import IS2R, S2R
 from experiments.study.style import COLOUR, player_label, styled
-from mjx_tt.gap.plots import FAINT
+from mjx_tt.page import FAINT
 
 MOST = 500  # balls of a data set, as in the paper
 FEWEST = 10

@@ -6,7 +6,6 @@ Figures are made without pyplot, so that nothing global keeps them. Vermilion is
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,31 +21,15 @@ from mjx_tt.gap.heldout import Prediction
 from mjx_tt.gap.hits import HitFindings
 from mjx_tt.gap.joint import JointResidual, RobotFindings
 from mjx_tt.gap.verdict import Cause
+from mjx_tt.page import FAINT, INK, STYLE
 
-BEFORE, AFTER, INK, FAINT = "#c2410c", "#0b62a4", "#22272e", "#9aa3ad"
+BEFORE, AFTER = "#c2410c", "#0b62a4"
 UNCHANGED = "#5c6670"
 AXES = ("x", "y", "z")
 MEANING = {"x": "across the table", "y": "along the table", "z": "upwards"}
 BINS, FEWEST = 22, 25  # of a curve, and samples in a bin that is drawn
 FEWEST_BALLS = 4  # in a bin of a quantity that a ball has as a whole
 QUANTILES = (5, 25, 50, 75, 95)
-STYLE = {
-    "font.size": 10,
-    "font.family": "sans-serif",
-    "text.color": INK,
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK,
-    "axes.linewidth": 0.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "axes.axisbelow": True,
-    "axes.unicode_minus": True,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "legend.frameon": False,
-}
 
 
 @dataclass(frozen=True)
@@ -83,14 +66,6 @@ def curve(quantity, residual, mask, bins: int = BINS, fewest: int = FEWEST) -> C
         return empty
     quantiles = np.array([np.percentile(groups[k], QUANTILES) for k in full]).T
     return Curve(0.5 * (edges[:-1] + edges[1:])[full], quantiles, np.array([groups[k].size for k in full]))
-
-
-def png(figure: Figure) -> bytes:
-    """The figure as a PNG."""
-    stream = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(stream, format="png", dpi=130, facecolor="white")
-    return stream.getvalue()
 
 
 def flight_time(found: BallFindings) -> tuple[np.ndarray, str]:

@@ -6,21 +6,20 @@ what stays open, how much, what does it bring, what to measure next. Its sentenc
 
 from __future__ import annotations
 
-import base64
 import math
+import re
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from ballmodel.files import replacing
 from mjx_tt.gap import evidence, hits, plots, select, words
 from mjx_tt.gap.balls import BallFindings
 from mjx_tt.gap.catalogue import BY_NAME, INVISIBLE
 from mjx_tt.gap.diagnose import Diagnosis
 from mjx_tt.gap.verdict import Cause, Verdict
+from mjx_tt.page import Page, table
 
 RUNNERS = 5  # of the next best sets that are shown
 FEW = 6  # next steps that are shown at once
@@ -33,72 +32,35 @@ def write(folder: Path, diagnosis: Diagnosis, title: str, play: dict | None = No
     "balls": n}, rates from 0 to 1. Raises OSError when the folder cannot be written; files that were there stay whole.
     """
     folder = Path(folder)
-    pictures = _Pictures()
-    page = _page(diagnosis, title, play, pictures)
-    (folder / "plots").mkdir(parents=True, exist_ok=True)
-    written = []
-    for name, data in pictures.data.items():
-        path = folder / "plots" / f"{name}.png"
-        with replacing(path) as temporary:
-            temporary.write_bytes(data)
-        written.append(path)
-    with replacing(folder / "report.html") as temporary:
-        temporary.write_text(page, encoding="utf-8")
-    return [folder / "report.html", *written]
+    return _page(diagnosis, title, play).write(folder / "report.html", folder / "plots")
 
 
-# The page
-
-
-class _Pictures:
-    """Pictures of the page by name."""
-
-    def __init__(self) -> None:
-        self.data: dict[str, bytes] = {}
-
-    def add(self, name: str, figure: Figure, caption: str, alt: str) -> str:
-        """HTML of a picture; ``caption`` is HTML."""
-        self.data[name] = plots.png(figure)
-        source = base64.b64encode(self.data[name]).decode("ascii")
-        return (
-            f'<figure><div class="wide"><img src="data:image/png;base64,{source}" alt="{escape(alt)}"></div>'
-            f"<figcaption>{caption}</figcaption></figure>"
-        )
-
-
-def _page(d: Diagnosis, title: str, play: dict | None, pictures: _Pictures) -> str:
+def _page(d: Diagnosis, title: str, play: dict | None) -> Page:
     v = d.verdict
-    sections = [
-        ("What the simulation gets wrong", _residuals(d, pictures)),
-        ("Verdict", _verdict(d, pictures)),
-        ("The robot's hits", _hits(d, pictures) if d.hits is not None else ""),
-        ("Other explanations, and why they lost", _runners(d, pictures)),
-        ("What these logs cannot tell", _open_questions(v)),
-        ("Parameters", _parameters(d, pictures)),
-        ("Gain on data that was not used", _held_out(d, pictures)),
-        ("What it costs in play", _play(play, pictures) if play else ""),
-        ("What to measure next", _next(v)),
-        ("Data and noise", _data(d)),
-    ]
-    body = "\n".join(
-        f'<section id="s{k}">\n<h2>{escape(heading)}</h2>\n{content}\n</section>'
-        for k, (heading, content) in enumerate(((h, c) for h, c in sections if c), 1)
-    )
-    names = ", ".join(c.name for c in v.causes)
     state = {
-        "named": names,
+        "named": ", ".join(c.name for c in v.causes),
         "none": "nothing wrong",
         "unexplained": "no entry explains it",
         "undetermined": "not decided",
     }[v.verdict]
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<meta name="viewport"'
-        ' content="width=device-width, initial-scale=1">\n<title>Diagnosis:'
-        f" {escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<header>\n<h1>Measured against"
-        f' simulated</h1>\n<p class="sub">{escape(title)} · {escape(_amount(d))}</p>\n<p><span class="badge'
-        f' {v.verdict}">{escape(v.verdict)}</span>'
-        f" {escape(state)}</p>\n</header>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
-    )
+    badge = f'<span class="badge {v.verdict}">{escape(v.verdict)}</span> {escape(state)}'
+    page = Page("Measured against simulated", f"{title} · {_amount(d)}", badge, CSS)
+    for heading, content in (
+        ("What the simulation gets wrong", _residuals(d, page)),
+        ("Verdict", _verdict(d, page)),
+        ("The robot's hits", _hits(d, page) if d.hits is not None else ""),
+        ("Other explanations, and why they lost", _runners(d, page)),
+        ("What these logs cannot tell", _open_questions(v)),
+        ("Parameters", _parameters(d, page)),
+        ("Gain on data that was not used", _held_out(d, page)),
+        ("What it costs in play", _play(play, page) if play else ""),
+        ("What to measure next", _next(v)),
+        ("Data and noise", _data(d)),
+    ):
+        if content:
+            page.section(re.sub("[^a-z]+", "-", heading.lower()), heading)
+            page.add(content)
+    return page
 
 
 def _amount(d: Diagnosis) -> str:
@@ -111,12 +73,12 @@ def _amount(d: Diagnosis) -> str:
     return ", ".join(parts)
 
 
-def _residuals(d: Diagnosis, pictures: _Pictures) -> str:
+def _residuals(d: Diagnosis, page: Page) -> str:
     out = []
     if d.balls is not None:
         figure, largest = plots.flight_residuals(d.balls)
         out.append(
-            pictures.add(
+            page.picture(
                 "residuals_flight",
                 figure,
                 "<b>How to read it.</b> Each panel shows where the balls were measured relative to where the model"
@@ -128,7 +90,7 @@ def _residuals(d: Diagnosis, pictures: _Pictures) -> str:
             )
         )
         out.append(
-            pictures.add(
+            page.picture(
                 "residuals_quantities",
                 plots.quantity_residuals(d.balls),
                 "The same residuals against other quantities. A pattern in one column says what the error depends on:"
@@ -139,7 +101,7 @@ def _residuals(d: Diagnosis, pictures: _Pictures) -> str:
         )
     if d.robot is not None:
         out.append(
-            pictures.add(
+            page.picture(
                 "residuals_joints",
                 plots.joint_residuals(d.robot),
                 "<b>How to read it.</b> Measured minus predicted position of each joint, left over time, right against"
@@ -152,13 +114,13 @@ def _residuals(d: Diagnosis, pictures: _Pictures) -> str:
     return "\n".join(out)
 
 
-def _verdict(d: Diagnosis, pictures: _Pictures) -> str:
+def _verdict(d: Diagnosis, page: Page) -> str:
     v = d.verdict
     out = [f'<p class="verdict {v.verdict}">{escape(words.sentence(d))}</p>']
     if v.causes:
         head = ("cause", "what it says", "confidence", _effect_head(v.causes))
         out.append(
-            _table(
+            table(
                 head,
                 [(_code(c.name), escape(words.claim(c)), _confidence(c.confidence), _effect(c)) for c in v.causes],
                 right=(2, 3),
@@ -174,7 +136,7 @@ def _verdict(d: Diagnosis, pictures: _Pictures) -> str:
     if d.balls is not None and d.balls.findings:
         out.append("<h3>What no entry of the catalogue explains</h3>")
         out.append(
-            _table(
+            table(
                 ("kind", "where it is largest", "direction", "size [mm]", "evidence"),
                 [
                     (
@@ -191,7 +153,7 @@ def _verdict(d: Diagnosis, pictures: _Pictures) -> str:
         )
         if any(f.block.startswith("bounce") for f in d.balls.findings):
             out.append(
-                pictures.add(
+                page.picture(
                     "bounce_map",
                     plots.bounce_map(d.balls),
                     "Where each ball bounced, coloured by how much higher or lower it flew after the bounce than"
@@ -208,7 +170,7 @@ def _verdict(d: Diagnosis, pictures: _Pictures) -> str:
     if d.robot is not None and d.robot.unexplained_by_joint:
         out.append("<h3>What no entry of the catalogue explains in the joints</h3>")
         out.append(
-            _table(
+            table(
                 ("joint", "kind", "where", "direction", "size [mm], [mrad]"),
                 [
                     tuple(escape(str(u[k])) for k in ("joint", "block", "where", "direction")) + (f"{u['size']:.2f}",)
@@ -242,7 +204,7 @@ def _detectable(d: Diagnosis) -> str:
     opened = " open" if d.verdict.verdict == "none" else ""
     return (
         f"<details{opened}><summary>What was checked, and how small an effect would have been seen</summary>"
-        + _table(("effect that was not named", "meaning", "shows from [mm]", "named from [mm]"), rows, right=(2, 3))
+        + table(("effect that was not named", "meaning", "shows from [mm]", "named from [mm]"), rows, right=(2, 3))
         + '<p class="note">Shift of a flight\'s last sample from which the effect, alone beside what is named, would'
         f" stand out of the noise (evidence of {d.balls.choice.threshold:.0f}, {select.LEAST_Z} standard errors), and"
         f" from which it would be named: nothing below {floor:.0f} mm is of interest. Smooth forces, kicks at the"
@@ -250,7 +212,7 @@ def _detectable(d: Diagnosis) -> str:
     )
 
 
-def _hits(d: Diagnosis, pictures: _Pictures) -> str:
+def _hits(d: Diagnosis, page: Page) -> str:
     """Where the returns lie off, before and after, and what the hits could not show."""
     found = d.hits
     states = (found.before, found.after) if found.causes else (found.before,)
@@ -272,7 +234,7 @@ def _hits(d: Diagnosis, pictures: _Pictures) -> str:
     out = [
         f"<p><b>{found.hits} hits</b> were judged: {_named_hits(d)} the typical return lies"
         f" {'off in ' + ', '.join(off) if off else 'where the model puts it, to within its error'}.</p>",
-        pictures.add(
+        page.picture(
             "hits",
             plots.hits(found),
             "<b>How to read it.</b> The model flies each ball to the racket, moves the blade as the joints were"
@@ -284,7 +246,7 @@ def _hits(d: Diagnosis, pictures: _Pictures) -> str:
             " stand out of. The ball's own causes are settled before and after.",
             "Place and velocity behind the paddle, measured minus predicted, hit by hit",
         ),
-        _table(head, rows, right=range(1, len(head))),
+        table(head, rows, right=range(1, len(head))),
         '<p class="note">Medians with 90 % intervals; hit to hit: the middle 90 %.</p>',
     ]
     named = {c.effect.name for c in found.causes}
@@ -296,7 +258,7 @@ def _hits(d: Diagnosis, pictures: _Pictures) -> str:
             " hits would show it, at other speeds and angles of the blade.</p>"
         )
         lines = [(_code(e.name), escape(words.MEANING[e.name]), escape(e.reading)) for e in quiet]
-        out.append(_table(("effect", "meaning", "reading that would tell"), lines))
+        out.append(table(("effect", "meaning", "reading that would tell"), lines))
     return "\n".join(out)
 
 
@@ -327,7 +289,7 @@ def _effect(c: Cause) -> str:
     return f"{c.effect_mm:.1f}" + (" mrad" if c.name.startswith("joint_") else " mm" if "." in c.name else "")
 
 
-def _runners(d: Diagnosis, pictures: _Pictures) -> str:
+def _runners(d: Diagnosis, page: Page) -> str:
     if d.balls is None:
         return ""
     choice, trial = d.balls.choice, d.balls.trial
@@ -366,7 +328,7 @@ def _runners(d: Diagnosis, pictures: _Pictures) -> str:
         [max(b, 0.0) for b, *_ in rivals],
         " + ".join(chosen) or nothing,
     )
-    return pictures.add(
+    return page.picture(
         "runners_up",
         figure,
         "How far other sets of causes are behind the chosen one: squared error in units of the noise that they fit"
@@ -374,7 +336,7 @@ def _runners(d: Diagnosis, pictures: _Pictures) -> str:
         f" without what looks like it. One more cause must bring at least {choice.threshold:.0f}, which is what chance"
         " reaches in these data.",
         "Bar chart of other sets of causes",
-    ) + _table(("other set", "why it lost (fit: squared error in units of the noise)"), rows)
+    ) + table(("other set", "why it lost (fit: squared error in units of the noise)"), rows)
 
 
 def _rivals(found: BallFindings) -> list[tuple[tuple[int, ...], bool, float]]:
@@ -434,7 +396,7 @@ def _open_questions(v: Verdict) -> str:
             rows.append((_code(c.name), others, "<br>".join(readings) or "-"))
     if rows:
         out.append("<h3>What would settle what is named</h3>")
-        out.append(_table(("named", "would look the same", "reading that would tell"), rows))
+        out.append(table(("named", "would look the same", "reading that would tell"), rows))
     for heading, lines in (
         ("Not identifiable from such logs", v.not_identifiable),
         ("Not excited in these logs", v.not_excited),
@@ -465,11 +427,11 @@ def _lines(lines: Sequence[str]) -> str:
         )
         rows.append((_code(effect), escape(joints), escape(why)))
     if any(r[1] for r in rows):
-        return _table(("effect", "joints", "why"), rows)
-    return _table(("effect", "why" if any(": " in line for line in lines) else "meaning"), [(a, c) for a, _, c in rows])
+        return table(("effect", "joints", "why"), rows)
+    return table(("effect", "why" if any(": " in line for line in lines) else "meaning"), [(a, c) for a, _, c in rows])
 
 
-def _parameters(d: Diagnosis, pictures: _Pictures) -> str:
+def _parameters(d: Diagnosis, page: Page) -> str:
     causes = d.verdict.causes
     if not causes:
         return "<p>No parameter is changed: extended.yaml is the nominal model.</p>"
@@ -483,11 +445,11 @@ def _parameters(d: Diagnosis, pictures: _Pictures) -> str:
             role = "or instead" if path in twins else ""
             nominal = words.nominal(e).removesuffix(unit).strip()
             rows.append((_code(c.name) if not k else role, name, nominal, f"<b>{middle}</b>", f"{low} to {high}", unit))
-    out = [_table(("cause", "parameter", "nominal", "estimate", "90 % interval", "unit"), rows, right=(2, 3, 4))]
+    out = [table(("cause", "parameter", "nominal", "estimate", "90 % interval", "unit"), rows, right=(2, 3, 4))]
     forest = plots.forest_rows(causes, d.balls)
     if forest:
         out.append(
-            pictures.add(
+            page.picture(
                 "parameters",
                 plots.forest(forest),
                 "Estimates (dots) and 90 % intervals (bars), drawn as what they move, so that parameters of different"
@@ -502,7 +464,7 @@ def _parameters(d: Diagnosis, pictures: _Pictures) -> str:
     return "\n".join(out)
 
 
-def _held_out(d: Diagnosis, pictures: _Pictures) -> str:
+def _held_out(d: Diagnosis, page: Page) -> str:
     out = []
     h = d.verdict.held_out
     if h is not None:
@@ -518,7 +480,7 @@ def _held_out(d: Diagnosis, pictures: _Pictures) -> str:
         )
     if d.prediction is not None and d.verdict.causes:
         out.append(
-            pictures.add(
+            page.picture(
                 "held_out",
                 plots.held_out(d.prediction),
                 "Each ball is predicted by a model whose parameters come from other balls: its state from the first 30"
@@ -529,7 +491,7 @@ def _held_out(d: Diagnosis, pictures: _Pictures) -> str:
         )
     if d.robot is not None and d.robot.held_out:
         out.append(
-            pictures.add(
+            page.picture(
                 "held_out_joints",
                 plots.joint_gains(d.robot),
                 "Positions predicted on every other window of the log, with parameters fitted to the rest.",
@@ -538,7 +500,7 @@ def _held_out(d: Diagnosis, pictures: _Pictures) -> str:
         )
         out.append(
             "<details><summary>Joint by joint</summary>"
-            + _table(
+            + table(
                 ("joint", "before", "after", "gain, 90 % interval", "unit"),
                 [
                     (
@@ -557,7 +519,7 @@ def _held_out(d: Diagnosis, pictures: _Pictures) -> str:
     return "\n".join(out)
 
 
-def _play(play: dict, pictures: _Pictures) -> str:
+def _play(play: dict, page: Page) -> str:
     labels = {
         "nominal": "in the nominal simulation",
         "extended": "in the extended simulation, same policy",
@@ -572,15 +534,15 @@ def _play(play: dict, pictures: _Pictures) -> str:
         if len(rates) > 2
         else ""
     )
-    table = _table(
+    rows = table(
         ("where", "returned", "interval"),
         [(escape(n), _percent(r, 1), f"{_percent(a, 1)} to {_percent(b, 1)}") for n, r, a, b in rates],
         right=(1, 2),
     )
-    figure = pictures.add(
+    figure = page.picture(
         "play", plots.play(rates), f"Return rate on {int(play['balls']):,} balls each, with intervals.", "Return rates"
     )
-    return text + ".</p>" + table + figure
+    return text + ".</p>" + rows + figure
 
 
 def _next(v: Verdict) -> str:
@@ -620,7 +582,7 @@ def _data(d: Diagnosis) -> str:
             )
             for a, name in enumerate(("along the flight", "across it, level", "upright to both"))
         ]
-        out.append(_table(("direction", "noise [mm]", "5 to 95 % of the balls [mm]", "memory"), rows, right=(1, 2, 3)))
+        out.append(table(("direction", "noise [mm]", "5 to 95 % of the balls [mm]", "memory"), rows, right=(1, 2, 3)))
         samples = int(found.problem.grid.mask.sum())
         out.append(
             '<p class="note">Noise of the measured positions as the residuals show it; memory: correlation of'
@@ -630,7 +592,7 @@ def _data(d: Diagnosis) -> str:
     logs = d.extended.provenance.get("logs", {})
     if logs:
         rows = [(_code(name), f'<code class="hash">{escape(str(digest))}</code>') for name, digest in logs.items()]
-        out.append(_table(("file", "SHA-256"), rows))
+        out.append(table(("file", "SHA-256"), rows))
     return "\n".join(out)
 
 
@@ -639,55 +601,10 @@ def _code(name: str) -> str:
     return f"<code>{escape(str(name)).replace('_', '_<wbr>').replace('.', '.<wbr>')}</code>"
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """A table; cells are HTML, columns ``right`` hold numbers."""
-
-    def row(tag: str, cells: Sequence[str]) -> str:
-        classes = ["" if k not in right else " class=n" for k in range(len(cells))]
-        return "<tr>" + "".join(f"<{tag}{c}>{cell}</{tag}>" for c, cell in zip(classes, cells)) + "</tr>"
-
-    top, body = row("th", [escape(h) for h in head]), "".join(row("td", r) for r in rows)
-    wide = ' class="many"' if len(head) > 4 else ""
-    return f'<div class="wide"><table{wide}><thead>{top}</thead><tbody>{body}</tbody></table></div>'
-
-
-STYLE = f"""
-:root {{ color-scheme: light; }}
-* {{ box-sizing: border-box; }}
-body {{ margin: 0; background: #f4f5f7; color: {plots.INK};
-  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }}
-header, main {{ max-width: 1000px; margin: 0 auto; padding: 0 20px; }}
-header {{ padding-top: 28px; }}
-h1 {{ font-size: 1.7rem; margin: 0; }}
-h2 {{ font-size: 1.25rem; margin: 0 0 .7rem; }}
-h3 {{ font-size: 1rem; margin: 1.4rem 0 .4rem; }}
-.sub, .note {{ color: #4d5661; }}
-.sub {{ margin: .2rem 0 .8rem; overflow-wrap: anywhere; }}
-.note {{ font-size: .88rem; }}
-section {{ background: #fff; border: 1px solid #dfe3e8; border-radius: 8px; padding: 20px 24px; margin: 18px 0; }}
-.badge {{ display: inline-block; padding: .1rem .6rem; border-radius: 4px; color: #fff; background: #4d5661;
-  font-weight: 600; }}
+CSS = f"""
 .badge.named {{ background: {plots.AFTER}; }}
 .badge.unexplained, .badge.undetermined {{ background: {plots.BEFORE}; }}
 p.verdict {{ font-size: 1.12rem; border-left: 5px solid #4d5661; padding: .2rem 0 .2rem 1rem; margin: 0 0 1rem; }}
 p.verdict.named {{ border-color: {plots.AFTER}; }}
 p.verdict.unexplained, p.verdict.undetermined {{ border-color: {plots.BEFORE}; }}
-figure {{ margin: 0 0 1.2rem; }}
-figcaption {{ font-size: .9rem; color: #4d5661; margin-top: .4rem; }}
-section > :last-child, section > :last-child > :last-child {{ margin-bottom: 0; }}
-li {{ margin-bottom: .45rem; }}
-.wide {{ overflow-x: auto; }}
-img {{ display: block; width: 100%; min-width: 600px; height: auto; }}
-table {{ border-collapse: collapse; width: 100%; font-size: .93rem; margin: .3rem 0 .6rem; }}
-table.many {{ min-width: 560px; }}
-th, td {{ text-align: left; vertical-align: top; padding: .35rem .8rem .35rem 0; border-bottom: 1px solid #e6e9ed; }}
-th {{ font-weight: 600; color: #4d5661; border-bottom-color: {plots.FAINT}; }}
-.n {{ text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }}
-code {{ font: .9em ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }}
-.hash {{ overflow-wrap: anywhere; }}
-summary {{ cursor: pointer; color: {plots.AFTER}; margin: .6rem 0; }}
-@media (max-width: 640px) {{ section {{ padding: 14px 12px; }}
-  header, main {{ padding-left: 10px; padding-right: 10px; }}
-  td, th {{ padding-right: .5rem; }} }}
-@media print {{ body {{ background: #fff; }} section {{ border: 0; }} }}
 """
