@@ -3,7 +3,7 @@
 One update, maximising the mean return F:
 
     directions = ask(key, state, config)                            # delta_i, the columns of (d, N)
-    members = population(state.theta, directions, config.sigma)     # theta +/- sigma delta_i, the columns of (d, 2N)
+    members = population(state, directions, config)                 # theta +/- sigma delta_i, the columns of (d, 2N)
     ... evaluate every member m times with frozen observation statistics, average ...
     state, info = tell(state, directions, plus, minus, config)      # theta += alpha / (k s) sum_elites D_i delta_i
 
@@ -31,7 +31,8 @@ class BGSConfig:
     """Settings of the optimiser; the defaults are the paper's simulation settings (appendix, BGS hyper-parameters).
 
     pairs       N, antithetic pairs per update
-    sigma       perturbation scale: members are theta +/- sigma delta
+    sigma       perturbation scale: members are theta +/- sigma delta; a number or a schedule over updates
+                (``bgs.step``)
     keep        fraction of the pairs that become elites, in (0, 1]
     rank        how elites are chosen: "abs", "signed" or "max" (``shaping.shape``)
     weighting   "returns" or "centered_rank" (``shaping.shape``)
@@ -45,7 +46,7 @@ class BGSConfig:
     """
 
     pairs: int = 200
-    sigma: float = 0.025
+    sigma: float | steps.Schedule = 0.025
     keep: float = 0.3
     rank: str = "abs"
     weighting: str = "returns"
@@ -65,7 +66,8 @@ class BGSConfig:
         for key, allowed in choices.items():
             self._require(key, getattr(self, key) in allowed, f"one of {allowed}")
         self._require("pairs", isinstance(self.pairs, int) and self.pairs >= 1, "a whole number of at least 1")
-        self._require("sigma", 0 < self.sigma < float("inf"), "a positive finite number")
+        number = callable(self.sigma) or 0 < self.sigma < float("inf")
+        self._require("sigma", number, "a positive finite number or a schedule")
         self._require("keep", 0 < self.keep <= 1, "a number in (0, 1]")
         self._require("average", 0 <= self.average < 1, "a number in [0, 1)")
         self._require("step", isinstance(self.step, optax.GradientTransformation), "an optax.GradientTransformation")
@@ -129,10 +131,11 @@ def ask(key: jax.Array, state: BGSState, config: BGSConfig) -> jax.Array:
     )
 
 
-def population(theta: jax.Array, directions: jax.Array, sigma: float) -> jax.Array:
+def population(state: BGSState, directions: jax.Array, config: BGSConfig) -> jax.Array:
     """Members (d, 2N) to evaluate: columns 0..N-1 are theta + sigma delta_i, columns N..2N-1 theta - sigma delta_i."""
-    offsets = sigma * directions
-    return jnp.concatenate([theta[:, None] + offsets, theta[:, None] - offsets], axis=1)
+    sigma = config.sigma(state.updates) if callable(config.sigma) else config.sigma
+    theta, offsets = state.theta[:, None], jnp.asarray(sigma, state.theta.dtype) * directions
+    return jnp.concatenate([theta + offsets, theta - offsets], axis=1)
 
 
 @partial(jax.jit, static_argnames="config")

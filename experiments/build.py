@@ -103,9 +103,12 @@ def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:
         rate = step.cosine(rate, chosen.schedule.final, updates, chosen.schedule.hold)
     elif chosen.schedule.kind == "piecewise":
         rate = step.piecewise(rate, tuple((c.update, c.learning_rate) for c in chosen.schedule.changes))
+    sigma: float | step.Schedule = optimiser.sigma
+    if optimiser.sigma_fall is not None:
+        sigma = step.cosine(sigma, optimiser.sigma_fall.final, updates, optimiser.sigma_fall.hold)
     return BGSConfig(
         pairs=optimiser.pairs,
-        sigma=optimiser.sigma,
+        sigma=sigma,
         keep=optimiser.keep,
         rank=optimiser.rank,
         weighting=optimiser.weighting,

@@ -49,7 +49,8 @@ def train(options: argparse.Namespace) -> int:
     if options.select and not options.seeds:
         raise ConfigError("--select chooses among seeds: give them with --seeds, such as --seeds 0,1,2")
 
-    configs = [(str(path), config.load(path, tuple(options.set))) for path in map(_experiment, options.experiments)]
+    paths = [_file(name, config.shipped()) for name in options.experiments]
+    configs = [(str(path), config.load(path, tuple(options.set))) for path in paths]
     _start_jax(options.devices or _most_devices(configs))
     from experiments import jobs
 
@@ -167,7 +168,7 @@ def finetune(options: argparse.Namespace) -> int:
 def is2r(options: argparse.Namespace) -> int:
     from experiments.study import config as study_config
 
-    study = study_config.load(_study(options.study), tuple(options.set))
+    study = study_config.load(_file(options.study, study_config.shipped()), tuple(options.set))
     devices = study.simulation.devices
     _start_jax(options.devices or (None if devices == "auto" else devices))
     from experiments.study import loop
@@ -194,9 +195,7 @@ def blind(options: argparse.Namespace) -> int:
 def compare(options: argparse.Namespace) -> int:
     from experiments.algorithms import config as compare_config
 
-    path = Path(options.comparison)
-    if not path.exists() and path.parent == Path():
-        path = compare_config.shipped().get(path.stem, path)
+    path = _file(options.comparison, compare_config.shipped())
     comparison, experiment = compare_config.load(path, tuple(options.set))
     _start_jax(1)
     from experiments.algorithms import comparison as comparing
@@ -533,20 +532,10 @@ def _seeds(text: str) -> tuple[int, ...]:
     return tuple(map(int, parts))
 
 
-def _experiment(name: str) -> Path:
-    """The file of that name, or the experiment of that name that comes with the program."""
-    from experiments import config
-
+def _file(name: str, shipped: dict[str, Path]) -> Path:
+    """The file of that name, or the one of that name that comes with the program."""
     path = Path(name)
-    return path if path.exists() or path.parent != Path() else config.shipped().get(path.stem, path)
-
-
-def _study(name: str) -> Path:
-    """The file of that name, or the study of that name that comes with the program."""
-    from experiments.study import config as study_config
-
-    path = Path(name)
-    return path if path.exists() or path.parent != Path() else study_config.shipped().get(path.stem, path)
+    return path if path.exists() or path.parent != Path() else shipped.get(path.stem, path)
 
 
 def _most_devices(configs) -> int | None:

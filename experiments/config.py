@@ -114,6 +114,15 @@ class Step(Section):
     schedule: Annotated[Constant | Cosine | Piecewise, Field(discriminator="kind")] = Cosine(kind="cosine")
 
 
+class SigmaFall(Section):
+    """The scale of the perturbations holds, then falls along half a cosine until the last update."""
+
+    final: Positive
+    """Scale after the last update."""
+    hold: Annotated[float, Field(ge=0, lt=1)] = 0.4
+    """Share of the updates before the fall."""
+
+
 class Optimiser(Section):
     """Blackbox Gradient Sensing. The defaults are the recipe that trains best here; paper.yaml has the paper's."""
 
@@ -123,6 +132,8 @@ class Optimiser(Section):
     """Episodes per perturbation."""
     sigma: Positive = 0.025
     """Scale of the perturbations."""
+    sigma_fall: SigmaFall | None = None
+    """Smaller perturbations later on, for hard balls: the policy that is wanted is not a perturbed one; null: none."""
     keep: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Share of the pairs that become elites."""
     rank: Literal["abs", "signed", "max"] = "abs"
@@ -206,15 +217,7 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
     Relative paths in the file are relative to its folder. Raises ConfigError.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}{_shipped_hint(path)}") from None
-    data = read_yaml(text, str(path))
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: an experiment is a mapping with the keys {', '.join(Config.model_fields)}")
-    for override in overrides:
-        apply_override(data, override)
+    data = read_mapping(path, overrides, "an experiment", Config, shipped())
     for key in ("balls", "model", "initial_policy"):
         value = data.get(key)
         if isinstance(value, str) and (key != "balls" or Path(value).suffix in (".yaml", ".yml")):
@@ -284,7 +287,22 @@ def apply_override(data: dict[str, Any], override: str) -> None:
     data[leaf] = read_yaml(value, f"--set {override}")
 
 
-def _shipped_hint(path: Path) -> str:
-    names = shipped()
-    near = difflib.get_close_matches(path.stem, names, 1)
-    return f"; did you mean {names[near[0]]}?" if near else ""
+def read_mapping(
+    path: Path, overrides: tuple[str, ...], what: str, section: type[Section], shipped: dict[str, Path]
+) -> dict[str, Any]:
+    """The keys of ``section`` that the file and the overrides "dotted.path=value" give; not checked. Raises ConfigError.
+
+    what: "an experiment" or the like and ``shipped``: those that come with the program, for messages.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        near = difflib.get_close_matches(path.stem, shipped, 1)
+        hint = f"did you mean {near[0]}.yaml?" if near else f"shipped are {', '.join(shipped)}"
+        raise ConfigError(f"{path}: cannot be read: {error}; {hint}") from None
+    data = read_yaml(text, str(path))
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: {what} is a mapping with the keys {', '.join(section.model_fields)}")
+    for override in overrides:
+        apply_override(data, override)
+    return data

@@ -179,7 +179,7 @@ class Session:
         """One update; False when the operator stopped it."""
         settings, number = self._settings, self.update + 1
         directions = strategy.ask(jax.random.fold_in(self.state.key, self.update), self.state.bgs, self._bgs)
-        members = np.asarray(strategy.population(self.state.bgs.theta, directions, self._bgs.sigma))
+        members = np.asarray(strategy.population(self.state.bgs, directions, self._bgs))
         entries = []
         # The members take turns, so that a person who tires or warms up is the same to both of a pair.
         for repeat in range(settings.repeats):

@@ -86,7 +86,7 @@ class Trainer:
         config, pairs = self.bgs_config, self.bgs_config.pairs
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
         directions = strategy.ask(direction_key, state.bgs, config)
-        theta = strategy.population(state.bgs.theta, directions, config.sigma)
+        theta = strategy.population(state.bgs, directions, config)
         columns = pairs if self._crn else 2 * pairs
         episodes = self.simulator.draw(
             episode_key, pool, self._model, self._randomise, self._repeats, columns

@@ -121,14 +121,25 @@ def test_gradient_of_a_quadratic_is_exact():
         theta = rng.normal(size=d)
         state = bgs.init(theta, config)
         directions = bgs.ask(jax.random.key(0), state, config)
-        plus, minus = np.split(value(np.asarray(bgs.population(state.theta, directions, config.sigma))), 2)
+        plus, minus = np.split(value(np.asarray(bgs.population(state, directions, config))), 2)
         after, _ = bgs.tell(state, directions, jnp.asarray(plus), jnp.asarray(minus), config)
         np.testing.assert_allclose(after.theta - theta, 2 * config.sigma * (hessian @ theta + slope), rtol=1e-10)
 
 
 def test_population_is_all_plus_then_all_minus():
-    members = bgs.population(jnp.array([1.0, 2.0]), jnp.array([[1.0, 0.0, 2.0], [0.0, 1.0, 4.0]]), 0.5)
+    config = bgs.BGSConfig(sigma=0.5)
+    members = bgs.population(bgs.init(jnp.array([1.0, 2.0]), config), jnp.array([[1.0, 0.0, 2.0], [0.0, 1.0, 4.0]]), config)
     np.testing.assert_array_equal(members, [[1.5, 1.0, 2.0, 0.5, 1.0, 0.0], [2.0, 2.5, 4.0, 2.0, 1.5, 0.0]])
+
+
+def test_perturbations_follow_their_schedule():
+    config = bgs.BGSConfig(pairs=1, sigma=step.cosine(0.4, 0.1, 10, hold=0.5), step=step.make("sgd", 1e-9))
+    state, spread, one = bgs.init(jnp.zeros(2), config), [], jnp.array([[1.0], [0.0]])
+    for _ in range(12):
+        spread.append(float(bgs.population(state, one, config)[0, 0]))
+        state, _ = bgs.tell(state, one, jnp.ones(1), jnp.zeros(1), config)
+    fall = [0.1 + 0.3 * (1 + math.cos(math.pi * k / 5)) / 2 for k in range(6)]
+    np.testing.assert_allclose(spread, [0.4] * 5 + fall + [0.1], rtol=1e-6)
 
 
 _PLAIN = step.make("sgd", step.cosine(0.2, 0.001, 400))
@@ -152,7 +163,7 @@ def test_finds_the_top_of_a_quadratic(config):
 
     def update(state, key):
         directions = bgs.ask(key, state, config)
-        members = bgs.population(state.theta, directions, config.sigma)
+        members = bgs.population(state, directions, config)
         returns = -jnp.sum(stiffness * (members - best[:, None]) ** 2, axis=0)
         return bgs.tell(state, directions, *jnp.split(returns, 2), config)
 

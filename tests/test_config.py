@@ -178,5 +178,9 @@ def test_paper_settings_are_the_papers():
     bgs = build.experiment(config.load(config.shipped()["paper"]), "paper").bgs
     assert (bgs.pairs, bgs.sigma, bgs.keep, bgs.orthogonal, bgs.average) == (200, 0.025, 0.3, True, 0.0)
     assert config.load(config.shipped()["paper"]).optimiser.repeats == 15
+    falling = config.load(config.shipped()["player3_m2"])
+    sigma = build.experiment(falling, "player3_m2").bgs.sigma
+    end = falling.training.updates
+    assert (sigma(0), sigma(end)) == (0.025, pytest.approx(falling.optimiser.sigma_fall.final))
     change, _ = bgs.step.update([1.0], bgs.step.init([0.0]))
     assert change == [pytest.approx(-0.00375)]

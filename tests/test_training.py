@@ -95,7 +95,7 @@ def test_update_is_the_step_that_the_returns_call_for(trainer, run):
     """By hand from the returns: sum of D_i delta_i / (k s), times the learning rate; and statistics merged."""
     before, after = run[0][0], run[0][1]
     directions, episodes = drawn(trainer, before)
-    theta = strategy.population(before.bgs.theta, directions, BGS.sigma)
+    theta = strategy.population(before.bgs, directions, BGS)
     result = jax.jit(trainer.simulator.rollout)(theta, *normalizer.normaliser(before.statistics), episodes)
     returns = np.asarray(result.returns, np.float64).mean(axis=0)
     plus, minus = returns[:PAIRS], returns[PAIRS:]

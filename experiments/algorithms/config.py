@@ -172,14 +172,7 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comp
     shipped ones. Raises ConfigError.
     """
     path = Path(path)
-    try:
-        data = config.read_yaml(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: a comparison is a mapping with the keys {', '.join(Comparison.model_fields)}")
-    for override in overrides:
-        config.apply_override(data, override)
+    data = config.read_mapping(path, overrides, "a comparison", Comparison, shipped())
     for key in ("experiment", "reality"):
         if isinstance(data.get(key), str):
             data[key] = str((path.parent / data[key]).resolve())

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from experiments import mistakes
-from experiments.config import Count, LaterRewards, Optimiser, Positive, Section, Step, Task, apply_override, read_yaml
+from experiments.config import Count, LaterRewards, Optimiser, Positive, Section, Step, Task, read_mapping
 from experiments.errors import ConfigError
 from experiments.finetune_settings import FineTuning
 from experiments.finetune_settings import parse as parse_fine_tuning
@@ -139,14 +139,7 @@ class Study(Section):
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Study:
     """Reads a study; ``overrides`` are "dotted.path=value". Relative paths are relative to the file. Raises ConfigError."""
     path = Path(path)
-    try:
-        data = read_yaml(path.read_text(encoding="utf-8"), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}; shipped are {', '.join(map(str, shipped()))}") from None
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: a study is a mapping with the keys {', '.join(Study.model_fields)}")
-    for override in overrides:
-        apply_override(data, override)
+    data = read_mapping(path, overrides, "a study", Study, shipped())
     if isinstance(data.get("robot"), str) and data["robot"] not in ("rig", "lockstep"):
         data["robot"] = str((path.parent / data["robot"]).resolve())
     if isinstance(data.get("recordings"), dict):

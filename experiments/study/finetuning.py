@@ -135,7 +135,7 @@ class VirtualReality:
         def update(carry, _):
             state, rally = carry
             directions = strategy.ask(jax.random.fold_in(key, state.updates), state, config)
-            members = strategy.population(state.theta, directions, config.sigma)
+            members = strategy.population(state, directions, config)
             theta = jnp.repeat(members, settings.repeats, axis=1)  # the lanes of a member side by side
             shot_key = jax.random.fold_in(play_key, state.updates)
             rally, shots = self.simulator.shots(theta, *frozen, player, model, rally, shot_key)
