@@ -18,7 +18,8 @@ from experiments import policy as policies
 from mjx_tt import platform, players
 from mjx_tt.model import SimModel
 from mjx_tt.policy import initial_theta
-from mjx_tt.rally import End, RallySimulator
+from mjx_tt.rally import RallySimulator
+from mjx_tt.rally_ends import End
 from mjx_tt.task import TaskConfig
 from robot_io.contract import N_OBSERVATION
 

@@ -17,7 +17,7 @@ from ballmodel import players
 from ballmodel.distribution import save_distribution
 from experiments.study import blind, scoring
 from experiments.study.paper import ABLATED, BY_SKILL, CROSS, FINAL, MODELS, VARIANT
-from mjx_tt.rally import End
+from mjx_tt.rally_ends import End
 
 MEANS = {
     "is2r-sim1": 3.0, "is2r-ft35": 5.5, "is2r-sim2": 4.5, "is2r-ft65": 8.5, "is2r-sim3": 6.5, "is2r-ft100": 9.0,

@@ -15,12 +15,13 @@ from ballmodel.flight import ball_params
 from ballmodel.optional import without_nominal
 from ballmodel.pool import sample_pool
 from ballmodel.state import BallState
-from mjx_tt import players, rally
+from mjx_tt import players
 from mjx_tt.between_turns import Sent, homeward, meeting
 from mjx_tt.model import LATENCIES, SimModel, with_values
 from mjx_tt.players import Spread
 from mjx_tt.policy import PolicyController, initial_theta
-from mjx_tt.rally import ROWS, Box, End, RallySimulator, RallyState
+from mjx_tt.rally import Box, RallySimulator, RallyState
+from mjx_tt.rally_ends import ROWS, End, ending
 from mjx_tt.rollout import Simulator
 from mjx_tt.task import MISSED, RETURNED, Episodes, TaskConfig
 from robot_io.contract import LIMITS, N_JOINTS, N_OBSERVATION, n_parameters, unflatten
@@ -291,7 +292,7 @@ def test_corner_and_cord_of_the_robots_return():
     assert side < 0.25 and line < 0.25
     sent = Sent(*(jnp.array([flag] * 2) for flag in (False, False, True)), jnp.array([[0.3] * 2, [-0.9] * 2]))
     false = jnp.zeros(2, bool)
-    end = rally._end(false, sent, jnp.full(2, RETURNED), false, met, false, ~false)
+    end = ending(false, sent, jnp.full(2, RETURNED), false, met, false, ~false)
     assert [End(e) for e in np.asarray(end)] == [End.ROBOT_CORNER, End.ROBOT_GRAZES_NET]
 
 

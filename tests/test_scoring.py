@@ -7,7 +7,7 @@ import pytest
 
 from experiments.errors import ConfigError
 from experiments.study import scoring
-from mjx_tt.rally import ROWS, End
+from mjx_tt.rally_ends import ROWS, End
 
 # Table end_of_rally_attribution, row by row as printed: did-robot-end-rally ("" where empty or a dash) and "Filter".
 PRINTED = [

@@ -23,7 +23,7 @@ from experiments.study import data as study_data
 from experiments.study import paper as study_paper
 from experiments.study.claims import DIFFERENCE, HITS, RATIO, SHARE, judge
 from experiments.study.statistics import Bootstrap, Interval
-from mjx_tt.rally import End
+from mjx_tt.rally_ends import End
 from tests import made_up_study
 
 

@@ -34,7 +34,8 @@ from experiments.plots import STYLE
 from experiments.study import reality
 from mjx_tt import model as models
 from mjx_tt import platform, players
-from mjx_tt.rally import ROWS, RallySimulator
+from mjx_tt.rally import RallySimulator
+from mjx_tt.rally_ends import ROWS
 from mjx_tt.task import TaskConfig
 
 UPDATE_BALLS = 30  # of fine-tuning: 5 pairs, 3 balls each

@@ -43,7 +43,7 @@ from experiments.study.statistics import (
     t_mean,
     welch_interval,
 )
-from mjx_tt.rally import End
+from mjx_tt.rally_ends import End
 
 WIDEST = 4.0  # of an interval of a ratio that still tells "alike": from half to double
 PLAYS = 2.0  # touches; the shortest rally in the paper's table of player skill

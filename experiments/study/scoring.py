@@ -16,7 +16,7 @@ import numpy as np
 
 from ballmodel.files import replacing
 from experiments.errors import ConfigError
-from mjx_tt.rally import ROWS, End
+from mjx_tt.rally_ends import ROWS, End
 
 POOL = 60
 KEEP = 50

@@ -16,7 +16,7 @@ from experiments.study.claims import Finding, Measurements, paper_changes, show,
 from experiments.study.data import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
 from experiments.study.paper import ABLATED, BY_KEY, CROSS, FINAL, GROUPS, MODELS, SHORT, TEN, VARIANT, level, of_level
 from experiments.study.statistics import holm, t_mean
-from mjx_tt.rally import End
+from mjx_tt.rally_ends import End
 
 
 @dataclass(frozen=True)
