@@ -133,7 +133,7 @@ class Optimiser(Section):
     sigma: Positive = 0.025
     """Scale of the perturbations."""
     sigma_fall: SigmaFall | None = None
-    """Smaller perturbations later on, for hard balls: the policy that is wanted is not a perturbed one; null: none."""
+    """Smaller perturbations later on: more returned in this simulation, fewer in another world; null: none."""
     keep: Annotated[float, Field(gt=0, le=1)] = 1.0
     """Share of the pairs that become elites."""
     rank: Literal["abs", "signed", "max"] = "abs"

@@ -15,7 +15,7 @@ import numpy as np
 from ballmodel import constants as c
 from ballmodel import players
 from ballmodel.distribution import save_distribution
-from experiments.study import blind, scoring
+from experiments.study import blind, effects, scoring
 from experiments.study.paper import ABLATED, BY_SKILL, CROSS, FINAL, MODELS, VARIANT
 from mjx_tt.rally_ends import End
 
@@ -28,6 +28,7 @@ MEANS = {
 SKILL = {"player3": 1.0, "player5": 1.4, "player4": 2.0, "player2": 2.4, "player1": 2.8}
 KEPT = {"is2r-ft100": 0.7, "s2r-ft100": 0.35, "oracle-ft": 0.65}
 RALLIES = 80
+WITHOUT = {"magnus": 1.2, "drives": 0.9, "all": 1.5}  # how many times as long the rallies are without an effect
 ROBOT_SHARE = 0.85  # of the counted rallies
 FILTERED_SHARE = 0.08
 ABLATION_PLAYER = "player4"
@@ -64,6 +65,10 @@ def make(folder: Path, seeds=(0,), names=BY_SKILL, balls: int = 60, rallies: int
                 parts.append(one)
                 if model in (*FINAL, "is2r-ft35", "is2r-ft65"):
                     _log(folder / "evaluations" / f"{seed}_{player}_{evaluator}_{model}.npz", one, pools[-1], rng)
+        effects.write(folder / f"seed{seed}" / effects.FILE, [
+            effects.Outcome(seed, player, model, world, 60, mean_length(player, model) * WITHOUT.get(world, 1.0))
+            for player in names for model in effects.MODELS for world in effects.WORLDS
+        ])  # fmt: skip
         (folder / f"seed{seed}" / "reality.yaml").write_text("ball: {flight: {magnus: 0.00037}}\n")
     scoring.write(folder / "evaluations.csv", scoring.join(parts))
     return folder

@@ -22,11 +22,12 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from ballmodel.aero import drag_factor, magnus_factor
+from ballmodel.distribution import load_distribution
 from ballmodel.state import BallState
 from bgs import normalizer, strategy
 from experiments import build, config, policy
 from experiments.errors import ConfigError, RunError
-from experiments.study import blind, evaluation, plan, reality, scoring, training
+from experiments.study import blind, effects, evaluation, plan, reality, scoring, training
 from experiments.study import config as study_config
 from experiments.study import loop as is2r
 from experiments.study.finetuning import VirtualReality
@@ -34,9 +35,10 @@ from experiments.study.plan import Human, Real, Simulated
 from experiments.study.robot import blind_steps
 from experiments.study.steps import Journal, Step, Waiting, remaining, run_all, unfinished
 from mjx_tt import model as models
-from mjx_tt import rewards
+from mjx_tt import players, rewards
 from mjx_tt.model import SimModel
 from mjx_tt.policy import initial_theta
+from mjx_tt.rally import Box
 from robot_io.contract import N_OBSERVATION
 
 ROOT = Path(__file__).parent.parent
@@ -375,6 +377,36 @@ def test_a_study_leaves_what_it_says(finished):
     assert f"ball.paddle.restitution: {drawn.ball.paddle.restitution}" in opened
     assert str(drawn.ball.paddle.restitution) not in (finished / "seed0" / "reality.sealed").read_text()
     assert blind.unseal(finished / "seed0" / "reality.sealed")["seed"] == 0
+
+
+def test_an_effect_is_left_out_for_the_policy_it_says(finished):
+    """One world's rallies played again with every lane in that world."""
+    what, lanes = study(), 10
+    rows = effects.read(finished / "seed0" / effects.FILE)
+    assert [(r.model, r.without) for r in rows] == [(m, w) for m in effects.MODELS for w in effects.WORLDS]
+    player = finished / "seed0" / "player3"
+    policies = [training.load(player / model) for model in effects.MODELS]
+    human = {"is2r-sim1": "M0", "s2r-ft100": "M0"}
+    boxes = [load_distribution(player / "balls" / f"human_{human.get(m, 'M2')}.yaml") for m in effects.MODELS]
+    layout = np.array([(w, m) for w in range(len(effects.WORLDS)) for m in range(6) for _ in range(lanes)]).T
+    theta, mean, inverse_scale = (np.stack(part, axis=-1)[:, layout[1]] for part in zip(*policies))
+    low, high = (np.stack(ends, axis=-1)[:, layout[1]] for ends in zip(*((b.low, b.high) for b in map(Box.of, boxes))))
+    for world in ("latency", "spin"):
+        drawn = reality.draw(0, ("drives", "encoders", world))
+        person = players.load("player3")
+        person = players.without_spin(person) if world == "spin" else person
+        model, person = (jax.tree.map(lambda x: jnp.full(layout.shape[1], x, jnp.float32), t) for t in (drawn, person))
+        result = VirtualReality(what, 0).simulator.play(
+            theta, mean, inverse_scale, person, model, build.key(0, evaluation.EFFECTS), 5, Box(low, high), 8
+        )
+        for m, name in enumerate(effects.MODELS):
+            mine = (layout[0] == effects.WORLDS.index(world)) & (layout[1] == m)
+            length, end = np.asarray(result.length)[:, mine], np.asarray(result.end)[:, mine]
+            kept = ~np.isin(end, list(map(int, scoring.FILTERED)))
+            row = next(r for r in rows if (r.model, r.without) == (name, world))
+            assert row.rallies == kept.sum()
+            assert row.length == pytest.approx(length[kept].mean(), nan_ok=True)
+    assert len({r.length for r in rows}) > 2  # worlds differ
 
 
 def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):

@@ -6,6 +6,7 @@ import base64
 import csv
 import io
 import json
+import math
 import re
 
 import numpy as np
@@ -18,7 +19,7 @@ from ballmodel import constants as c
 from ballmodel import players
 from experiments import cli
 from experiments.errors import ConfigError
-from experiments.study import claims, heatmaps, scoring, statistics
+from experiments.study import claims, effects, heatmaps, scoring, statistics
 from experiments.study import data as study_data
 from experiments.study import paper as study_paper
 from experiments.study.claims import DIFFERENCE, HITS, RATIO, SHARE, judge
@@ -235,6 +236,23 @@ def test_claims_are_judged_as_the_made_up_numbers_demand(whole):
     )  # its human models are the paper's
 
 
+def test_what_an_effect_costs_is_the_geometric_mean_over_players_and_seeds(whole):
+    outcomes = study_data.load(whole).effects
+    for world, ratio in {"magnus": 1.2, "drives": 0.9, "all": 1.5, "camera": 1.0}.items():
+        found = effects.gain(outcomes, "oracle-ft", world)
+        assert (found.value, found.low, found.high) == pytest.approx((ratio, ratio, ratio))
+    lengths = {("a", "nothing"): 2.0, ("a", "spin"): 4.0, ("b", "nothing"): 3.0, ("b", "spin"): 3.0}
+    two = [effects.Outcome(0, player, "is2r-sim1", world, 50, x) for (player, world), x in lengths.items()]
+    found = effects.gain(two, "is2r-sim1", "spin")
+    half = stats.t.ppf(0.975, 1) * math.log(2.0) / 2  # of two logarithms, log 2 and 0
+    assert (found.value, found.high) == pytest.approx((math.sqrt(2.0), math.sqrt(2.0) * math.exp(half)))
+    assert effects.gain(two, "is2r-sim1", "magnus") is None
+    with open(whole / "report" / "effects.csv", newline="") as file:
+        head, *rows = csv.reader(file)
+    column = head.index(study_paper.BY_KEY["oracle-ft"].label)
+    assert {row[0]: row[column] for row in rows}["all"] == "1.50 (1.50 to 1.50)"
+
+
 def test_the_report_is_one_page_that_needs_nothing_else(whole):
     report = whole / "report"
     html = (report / "index.html").read_text()
@@ -246,7 +264,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(whole):
         "zero_shot", "evolution",
         "changes", "cross", "cross_players", "players", "tsne_training", "tsne_evaluation", "tsne_methods",
         "heatmap_incoming",
-        "heatmap_outgoing", "fine_tuning", "calibration", "variant", "ends", "unselected",
+        "heatmap_outgoing", "fine_tuning", "effects", "calibration", "variant", "ends", "unselected",
     )}  # fmt: skip
     for data in pictures:
         image = Image.open(io.BytesIO(base64.b64decode(data))).convert("L")

@@ -84,6 +84,8 @@ class Evaluation(Section):
     """A rally that is longer ends there."""
     cross: bool = True
     """Also with the two other players of the paper's table."""
+    effects: bool = True
+    """Also in the virtual reality with one hidden effect left out at a time."""
 
 
 class Study(Section):

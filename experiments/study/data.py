@@ -13,7 +13,7 @@ import numpy as np
 from ballmodel import players
 from ballmodel.distribution import AXES, BallDistribution, load_distribution, read_yaml
 from experiments.errors import ConfigError
-from experiments.study import scoring
+from experiments.study import effects, scoring
 from experiments.study.paper import BY_SKILL, CROSS, FINAL, TEN
 from mjx_tt.players import FOLDER as VIRTUAL_PLAYERS
 
@@ -128,6 +128,11 @@ class Study:
         own = _json(self.folder / "calibration.json")
         virtual = self.settings and self.settings.get("robot") is None
         return own or (_json(VIRTUAL_PLAYERS / "calibration.json") if virtual else None)
+
+    @cached_property
+    def effects(self) -> list[effects.Outcome]:
+        """Rallies in realities that lack something. Raises ConfigError."""
+        return [o for path in sorted(self.folder.glob(f"seed*/{effects.FILE}")) for o in effects.read(path)]
 
     @cached_property
     def realities(self) -> dict[int, Any]:

@@ -12,7 +12,8 @@ import numpy as np
 from ballmodel.distribution import BallDistribution
 from ballmodel.files import replacing
 from experiments import build
-from experiments.study import blind, scoring
+from experiments.study import blind, effects, scoring
+from experiments.study import reality as realities
 from experiments.study.config import Study
 from experiments.study.finetuning import VirtualReality
 from mjx_tt import players
@@ -20,7 +21,7 @@ from mjx_tt.rally import Box, RallyResult
 
 EVALUATIONS, LOGS = "evaluations.csv", "evaluations"
 LOGGED_TOUCHES = 30  # human hits that are kept, per rally and lane on average
-EVALUATION = 7  # purpose of a key, beside those of experiments.build
+EVALUATION, EFFECTS = 7, 8  # purposes of keys, beside those of experiments.build
 
 
 def play(
@@ -50,6 +51,53 @@ def play(
         Box(low, high), settings.max_touches, LOGGED_TOUCHES * rallies,
     )  # fmt: skip
     return jax.tree.map(np.asarray, result)
+
+
+def play_without(
+    study: Study, reality: VirtualReality, seed: int, models: list[tuple[str, str]], policies: list,
+    boxes: list[BallDistribution],
+) -> list[effects.Outcome]:  # fmt: skip
+    """Rallies of each (player, model) in every world of ``effects.WORLDS``, ``evaluation.rallies`` each, in one call.
+
+    policies: theta, mean and inverse_scale of each; boxes: what each one was trained for. What the study's own reality
+    lacks is left out of all worlds.
+    """
+    lanes, settings = study.evaluation.lanes, study.evaluation
+    absent, everything = tuple(study.reality.without), tuple(realities.RANGES)
+    special = {effects.NOTHING: (), effects.ALL: everything}
+    left_out = [absent + special.get(world, (world,)) for world in effects.WORLDS]
+    worlds = [realities.draw(seed, names) for names in left_out]
+    people = [
+        players.without_spin(person) if "spin" in names else person
+        for names in left_out
+        for person in (players.load(player) for player, _ in models)
+    ]
+
+    # Lanes: worlds x models x sessions.
+    def per_model(arrays):
+        each = jnp.stack([jnp.asarray(a) for a in arrays], axis=-1)
+        return jnp.tile(jnp.repeat(each, lanes, axis=-1), len(worlds))
+
+    theta, mean, inverse_scale = (per_model(part) for part in zip(*policies))
+    low, high = (per_model(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes))))
+    person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), players.stack(people))
+    world = jax.tree.map(lambda *values: jnp.repeat(jnp.array(values, jnp.float32), len(models) * lanes), *worlds)
+    result = reality.simulator.play(
+        theta, mean, inverse_scale, person, world, build.key(seed, EFFECTS), settings.rallies // lanes,
+        Box(low, high), settings.max_touches,
+    )  # fmt: skip
+    shape = (-1, len(worlds), len(models), lanes)
+    length, end = (np.moveaxis(np.asarray(x).reshape(shape), 0, -1) for x in (result.length, result.end))
+    counts = ~np.isin(end, [int(e) for e in scoring.FILTERED])
+    return [
+        effects.Outcome(seed, player, model, without, int(counts[w, m].sum()), _mean(length[w, m][counts[w, m]]))
+        for m, (player, model) in enumerate(models)
+        for w, without in enumerate(effects.WORLDS)
+    ]
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if values.size else float("nan")
 
 
 def code_names(seed: int, pairings: list[tuple[str, str, str]]) -> list[str]:

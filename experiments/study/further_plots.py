@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from experiments.finetune_report import smooth
+from experiments.study import effects
 from experiments.study.claims import RATIO, Finding, Measurements
 from experiments.study.data import Study
 from experiments.study.paper import (
@@ -122,6 +123,40 @@ def _tuned(study: Study, seed: int, player: str, keys: tuple[str, ...]) -> np.nd
             return np.zeros(0)
         parts += [smooth(rate), [np.nan]]
     return np.concatenate(parts)
+
+
+@styled
+def effects_left_out(study: Study) -> Figure | None:
+    """How many times as long the rallies are without an effect, by model."""
+    table = {
+        (model, world): effects.gain(study.effects, model, world)
+        for model in effects.MODELS
+        for world in effects.WORLDS[1:]
+    }
+    if not any(table.values()):
+        return None
+    ratio = np.array([
+        [np.nan if (g := table[model, world]) is None else g.value for model in effects.MODELS]
+        for world in effects.WORLDS[1:]
+    ])  # fmt: skip
+    figure = Figure(figsize=(8.6, 4.6))
+    axes = figure.subplots()
+    limit = max(np.log2(1.5), float(np.nanmax(np.abs(np.log2(ratio)))))
+    image = axes.imshow(np.log2(ratio), cmap="RdBu", vmin=-limit, vmax=limit, aspect="auto")
+    for (row, column), value in np.ndenumerate(ratio):
+        if np.isfinite(value):
+            found = table[effects.MODELS[column], effects.WORLDS[1 + row]]
+            sure = not (np.isnan(found.low) or found.low <= 1.0 <= found.high)
+            dark = abs(np.log2(value)) > 0.6 * limit
+            axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=9, color="white" if dark else INK,
+                      fontweight="bold" if sure else "normal")  # fmt: skip
+    axes.set_xticks(range(len(effects.MODELS)), [BY_KEY[key].label for key in effects.MODELS], fontsize=8)
+    axes.set_yticks(range(len(effects.WORLDS) - 1), effects.WORLDS[1:])
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    axes.set_ylabel("left out of reality")
+    figure.colorbar(image, label="rally length, times", format=lambda v, _: f"{2.0**v:.2g}")
+    return figure
 
 
 @styled

@@ -20,7 +20,7 @@ from experiments import build, measurements, policy, runs
 from experiments.config import read_yaml
 from experiments.errors import RunError, checked
 from experiments.runs import Run
-from experiments.study import blind, evaluation, scoring, training
+from experiments.study import blind, effects, evaluation, scoring, training
 from experiments.study import data as study_data
 from experiments.study import reality as realities
 from experiments.study.config import Study, parse
@@ -101,6 +101,8 @@ class Loop:
                     found.append(self._step(seed, player, item))
                 found.append(self._convergence(seed, player))
             found += [self._evaluate(seed)] if self.study.robot is None else self._blind(seed)
+            if self.study.robot is None and self.study.evaluation.effects:
+                found.append(self._effects(seed))
         found.append(self._collect(found))
         if self.study.robot is None:
             found += map(self._open, self.study.seeds)
@@ -233,6 +235,22 @@ class Loop:
         human = tuple(self.human(seed, player, name) for player in self.study.players for name in ("M0", "M1", "M2"))
         inputs = (*dict.fromkeys(places), *human)
         return Step(f"seed{seed}/evaluation", "evaluation", len(pairs), inputs, (path,), run)
+
+    def _effects(self, seed: int) -> Step:
+        models = [(player, model) for player in self.study.players for model in effects.MODELS]
+        places = [self._policy_of(seed, player, model) for player, model in models]
+        path = self.seed_folder(seed) / effects.FILE
+
+        def run() -> str:
+            policies = [training.load(place.parent) for place in places]
+            boxes = [self._box(seed, player, model) for player, model in models]
+            found = evaluation.play_without(self.study, self._world[seed].reality, seed, models, policies, boxes)
+            effects.write(path, found)
+            return f"{sum(o.rallies for o in found):,} rallies in {len(effects.WORLDS)} worlds"
+
+        human = tuple(self.human(seed, player, name) for player in self.study.players for name in ("M0", "M1", "M2"))
+        work = len(models) * len(effects.WORLDS)
+        return Step(f"seed{seed}/effects", "effects", work, (*places, *human), (path,), run)
 
     def _policy_of(self, seed: int, trainer: str, model: str) -> Path:
         return self.model_folder(seed, trainer, "oracle-sim" if model == ORACLE else model) / POLICY

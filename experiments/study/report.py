@@ -65,7 +65,7 @@ class _Report:
         for part in (
             self._top, self._aggregated, self._skill, self._without, self._checkpoints, self._zero_shot,
             self._human_model,
-            self._cross, self._players, self._balls, self._heatmaps, self._ablation, self._variant, self._ends,
+            self._effects, self._cross, self._players, self._balls, self._heatmaps, self._ablation, self._variant, self._ends,
             self._statistics, self._calibration, self._all_claims, self._about,
         ):  # fmt: skip
             part()
@@ -222,6 +222,16 @@ class _Report:
             tables.distributions(self.study),
             "All numbers of M0, M1 and M2 (the paper's table ball_dist)",
         )
+
+    def _effects(self) -> None:
+        self.page.section("effects", "What each hidden effect costs")
+        self._picture(
+            "effects", further_plots.effects_left_out(self.study),
+            "Not in the paper: the same policies, not trained again, in a reality that lacks one of the effects that "
+            "training does not know, and one that lacks all. Mean rally length over that in the whole reality, geometric "
+            "mean over players and seeds; bold where its 95 % interval excludes 1.",
+        )  # fmt: skip
+        self._table("effects", tables.effects_left_out(self.study), "Rally length without an effect over that with all")
 
     def _cross(self) -> None:
         self.page.section("cross", "With players who did not train the policy")

@@ -11,7 +11,7 @@ import numpy as np
 
 from ballmodel import players
 from ballmodel.files import replacing
-from experiments.study import scoring
+from experiments.study import effects, scoring
 from experiments.study.claims import Finding, Measurements, paper_changes, show, span
 from experiments.study.data import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
 from experiments.study.paper import ABLATED, BY_KEY, CROSS, FINAL, GROUPS, MODELS, SHORT, TEN, VARIANT, level, of_level
@@ -47,6 +47,17 @@ def claims(findings: Sequence[Finding]) -> Table:
         rows,
         (3, 4, 5),
     )
+
+
+def effects_left_out(study: Study) -> Table:
+    """How many times as long the rallies of each model are in a reality without an effect, with 95 % intervals."""
+    rows = []
+    for world in effects.WORLDS[1:]:
+        gains = [effects.gain(study.effects, model, world) for model in effects.MODELS]
+        if any(gains):
+            rows.append((world, *("" if g is None else f"{g.value:.2f} ({g.low:.2f} to {g.high:.2f})" for g in gains)))
+    head = ("left out", *(BY_KEY[model].label for model in effects.MODELS))
+    return Table(head, rows, tuple(range(1, len(head))))
 
 
 def models(study: Study, m: Measurements) -> Table:
