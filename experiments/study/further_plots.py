@@ -150,7 +150,7 @@ def effects_left_out(study: Study) -> Figure | None:
             dark = abs(np.log2(value)) > 0.6 * limit
             axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=9, color="white" if dark else INK,
                       fontweight="bold" if sure else "normal")  # fmt: skip
-    axes.set_xticks(range(len(effects.MODELS)), [BY_KEY[key].label for key in effects.MODELS], fontsize=8)
+    axes.set_xticks(range(len(effects.MODELS)), [BY_KEY[k].label.replace(" fine", "\nfine") for k in effects.MODELS], fontsize=8)
     axes.set_yticks(range(len(effects.WORLDS) - 1), effects.WORLDS[1:])
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
