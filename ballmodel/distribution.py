@@ -17,6 +17,7 @@ import yaml
 
 from ballmodel.files import replacing
 from ballmodel.state import BallState
+from ballmodel.yaml_file import read as read_yaml
 
 AXES = {"position": ("x", "y", "z"), "velocity": ("x", "y", "z"), "landing": ("x", "y")}
 NOTES = ("name", "source", "paper")
@@ -94,14 +95,6 @@ def parse_distribution(data, where: str, name: str = "", source: str = "") -> Ba
         return BallDistribution(**ends, name=str(data.get("name", name)), source=str(data.get("source", source)))
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
-
-
-def read_yaml(path: str | os.PathLike):
-    """The content of a YAML file. Raises ValueError naming the file when it is no valid YAML."""
-    try:
-        return yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not a readable YAML file: {error}") from None
 
 
 def load_distribution(path: str | os.PathLike) -> BallDistribution:

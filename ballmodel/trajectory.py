@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from ballmodel.constants import BALL_RADIUS
 
@@ -126,20 +125,3 @@ def free_flight(trajectory: Trajectory) -> Trajectory:
     """The samples before the first bounce; the lowest sample, which may lie on either side of it, is left out."""
     bounce = first_bounce(trajectory)
     return trajectory if bounce is None else trajectory.part(0, bounce)
-
-
-def resample(trajectory: Trajectory, rate: float) -> Trajectory:
-    """The trajectory at ``rate`` [Hz] from its first sample on, by monotone cubic interpolation: no overshoot.
-
-    Raises ValueError for a rate that is not positive or a trajectory of fewer than two samples.
-    """
-    if not rate > 0.0:
-        raise ValueError(f"rate is {rate}; a positive number of samples per second is wanted")
-    if len(trajectory) < 2:
-        raise ValueError(
-            f"{trajectory.label}: two samples at least are wanted to interpolate, it has {len(trajectory)}"
-        )
-    start, end = trajectory.time[[0, -1]]
-    time = start + np.arange(int(np.floor((end - start) * rate * (1.0 + 1e-12))) + 1) / rate
-    position = PchipInterpolator(trajectory.time, trajectory.position, axis=1)(np.minimum(time, end))
-    return Trajectory(trajectory.session, trajectory.name, time, position)

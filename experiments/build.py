@@ -8,12 +8,12 @@ from typing import Any
 
 import jax
 
-from ballmodel import players
+from ballmodel import players, yaml_file
 from ballmodel.distribution import BallDistribution, parse_distribution
 from ballmodel.pool import BallPool, sample_pool
 from bgs import step
 from bgs.strategy import BGSConfig
-from experiments.config import Config, Optimiser, Rewards, Task, Training, read_yaml
+from experiments.config import Config, Optimiser, Rewards, Task, Training
 from experiments.errors import ConfigError, checked
 from experiments.training import Trainer
 from mjx_tt import model as models
@@ -47,7 +47,10 @@ def experiment(config: Config, where: str) -> Experiment:
     """Looks up what a configuration names; ``where`` is its origin in errors. Raises ConfigError."""
     balls = distribution(config.balls, f"{where}: balls")
     model_data = _mapping(config.model, f"{where}: model")
-    model = checked(f"{where}: model", models.from_dict, model_data, "model")
+    if isinstance(config.model, str):
+        model = checked(f"{where}: model", models.from_dict, model_data, config.model)
+    else:
+        model = checked(where, models.from_dict, model_data, "model")
     if config.initial_policy is not None and not Path(config.initial_policy).is_dir():
         raise ConfigError(
             f"{where}: initial_policy: {config.initial_policy} is no folder; allowed: a run or an artefact"
@@ -159,8 +162,5 @@ def _mapping(model: str | dict[str, Any], where: str) -> dict[str, Any]:
     """The content of a model YAML, plain data as it stands there."""
     if isinstance(model, dict):
         return model
-    try:
-        data = read_yaml(Path(model).read_text(encoding="utf-8"), model)
-    except OSError as error:
-        raise ConfigError(f"{where}: {error}") from None
+    data = checked(where, yaml_file.read, model)
     return {} if data is None else data

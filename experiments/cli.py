@@ -235,14 +235,15 @@ def diagnose(options: argparse.Namespace) -> int:
     console, out = _console(), Path(options.out)
     without = tuple(name for part in options.without for name in part.split(",") if name)
     request = diagnosis.Request(
-        tuple(options.logs), out, options.model, options.spin, without, options.seed, options.randomise
-    )
+        tuple(options.logs), out, options.model, options.spin, without, options.seed, options.randomise,
+        options.policy, options.retrain,
+    )  # fmt: skip
     found = diagnosis.diagnose(request, console)
     extended = diagnosis.save(found, out)
     diagnosis.show(found, console)
     cost = None
     if options.policy:
-        cost = diagnosis.play(extended, request, options.policy, options.retrain, options.episodes, console)
+        cost = diagnosis.play(extended, request, options.episodes, console)
     diagnosis.draw(found, out, ", ".join(Path(p).name for p in options.logs), console, cost)
     return 0
 

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import difflib
 import os
-import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from ballmodel import yaml_file
 from experiments import mistakes
 from experiments.errors import ConfigError
 
@@ -245,39 +244,18 @@ def json_schema() -> dict[str, Any]:
     return Config.model_json_schema() | {"$schema": "https://json-schema.org/draft/2020-12/schema"}
 
 
-class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads 1e-3 as a number, as YAML 1.2 does, and refuses a key given twice."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)
-
-
-def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict:
-    keys = [loader.construct_object(key, deep=True) for key, _ in node.value]
-    for i, key in enumerate(keys):
-        if key in keys[:i]:
-            mark = node.value[i][0].start_mark
-            raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", mark)
-    return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
-
-
 def read_yaml(text: str, where: str) -> Any:
     """Parsed YAML. Raises ConfigError naming ``where`` and the line."""
     try:
-        return yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from None
+        return yaml_file.parse(text, where)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
 
 
 def apply_override(data: dict[str, Any], override: str) -> None:
     """Sets one value of parsed YAML, given as "dotted.path=value" with a YAML value. Raises ConfigError."""
     path, sign, value = override.partition("=")
-    if not sign or not path:
+    if not sign or not all(path.split(".")):
         raise ConfigError(f"--set {override}: needs the form dotted.path=value, such as training.updates=500")
     *parents, leaf = path.split(".")
     for parent in parents:
@@ -297,12 +275,37 @@ def read_mapping(
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        near = difflib.get_close_matches(path.stem, shipped, 1)
-        hint = f"did you mean {near[0]}.yaml?" if near else f"shipped are {', '.join(shipped)}"
-        raise ConfigError(f"{path}: cannot be read: {error}; {hint}") from None
+        raise ConfigError(f"{path}: cannot be read: {error}; {_hint(path, what, shipped)}") from None
     data = read_yaml(text, str(path))
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: {what} is a mapping with the keys {', '.join(section.model_fields)}")
     for override in overrides:
         apply_override(data, override)
+    other = None if _KINDS[what][1] in data else _kind(data)
+    if other is not None:
+        command, key = _KINDS[other]
+        raise ConfigError(f"{path}: is {other}, it has the key {key}: `mjx-tt {command} {path}`; {what} is wanted here")
     return data
+
+
+_KINDS = {  # of YAML: the command that takes it, the key by which it is known
+    "an experiment": ("train", "balls"),
+    "a study": ("is2r", "simulation"),
+    "a comparison": ("compare", "algorithms"),
+}
+
+
+def _kind(data: dict[str, Any]) -> str | None:
+    """What the keys of a YAML say that it is; None where they do not tell."""
+    return next((kind for kind, (_, key) in _KINDS.items() if key in data), None)
+
+
+def _hint(path: Path, what: str, shipped: dict[str, Path]) -> str:
+    """What may have been meant by a file that is not there: one of another command, one nearly of that name."""
+    twin = Path(__file__).parent / f"{path.stem}.yaml"  # shipped files of all commands lie in one folder
+    if path.stem not in shipped and twin.is_file():
+        other = _kind(read_yaml(twin.read_text(encoding="utf-8"), str(twin)))
+        if other not in (None, what):
+            return f"the shipped {twin.name} is {other}: `mjx-tt {_KINDS[other][0]} {twin.name}`; {what} is wanted here"
+    near = difflib.get_close_matches(path.stem, shipped, 1)
+    return f"did you mean {near[0]}.yaml?" if near else f"shipped are {', '.join(shipped)}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,31 +30,49 @@ class Request:
     without: Sequence[str] = ()
     seed: int = 0
     randomise: bool = False
+    policy: str | None = None
+    retrain: int = 0
+
+    def check(self) -> None:
+        """Refuses at once what would fail after the work. Raises ConfigError."""
+        if self.seed < 0:
+            raise ConfigError(f"--seed {self.seed}: a whole number from 0 on is wanted")
+        if self.retrain and self.policy is None:
+            raise ConfigError("--retrain needs --policy: the run or artefact that is to be trained on")
+        if self.retrain < 0:
+            raise ConfigError(f"--retrain {self.retrain}: a number of updates is wanted")
+        if self.policy is not None and policy.load(self.policy).config is None:
+            raise ConfigError(f"{self.policy}: does not say how it was trained; give the run that it came from")
+        existing = next(p for p in (self.out, *self.out.absolute().parents) if p.exists())
+        if not existing.is_dir():
+            raise ConfigError(f"--out {self.out}: {existing} is a file, a folder is wanted")
+        if not os.access(existing, os.W_OK):
+            raise ConfigError(f"--out {self.out}: {existing} cannot be written to")
 
 
 def read_logs(paths: Sequence[str]) -> gap.Logs:
     """Logs of balls and joints, sessions at the robot among them. Raises ValueError or FileNotFoundError naming the file."""
-    files = [f for path in map(Path, paths) for f in (sorted(path.glob("*.mcap")) if path.is_dir() else [path])]
+    files = gap.hashes(paths)
     sessions = [f for f in files if session_logs.is_session(f)]
-    others = [p for p in paths if Path(p) not in sessions and not (Path(p).is_dir() and sessions)]
+    others = [f for f in files if f not in sessions]
     if not sessions:
         return gap.load(paths)
     rest = gap.load(others) if others else gap.Logs((), (), {})
-    balls, joints, sources = list(rest.balls), list(rest.joints), dict(rest.sources)
+    balls, records = list(rest.balls), [("the CSV files", rest.joints)] if rest.joints else []
     for file in sessions:
-        flights, records = session_logs.load(file)
+        flights, joints = session_logs.load(file)
         gap.check(flights, str(file))
         balls += flights
-        # One record a joint: of several sessions the longest tells most.
-        if records and (not joints or records[0].state_time.size > joints[0].state_time.size):
-            joints = list(records)
-        sources[str(file)] = hashlib.sha256(file.read_bytes()).hexdigest()
-    return gap.Logs(tuple(balls), tuple(joints), sources)
+        if joints:
+            records.append((str(file), joints))
+    joints, notes = gap.longest(records)
+    return gap.Logs(tuple(balls), joints, {str(file): digest for file, digest in files.items()}, rest.notes + notes)
 
 
 def diagnose(request: Request, console: Console) -> gap.Diagnosis:
     """Runs the diagnosis and writes its files. Raises ConfigError for bad logs before anything is written."""
-    nominal = checked("", model.load, request.model) if request.model else ModelFile(model.SimModel())
+    request.check()
+    nominal = checked("--model", model.load, request.model) if request.model else ModelFile(model.SimModel())
     logs = checked("", read_logs, request.logs)
     balls, joints = len(logs.balls), len(logs.joints)
     console.print(
@@ -79,17 +98,15 @@ def diagnose(request: Request, console: Console) -> gap.Diagnosis:
 
 
 def play(
-    extended: Path, request: Request, folder: str, retrain: int, episodes: int, console: Console
+    extended: Path, request: Request, episodes: int, console: Console
 ) -> dict[str, dict | int | None]:
     """What the defect costs a policy: return rates with 95 % intervals under the nominal and the extended model.
 
-    extended: the model file that was written. retrain: updates of training under it, from the policy on; 0 for none.
-    The run of that training is kept beside the model file. Raises ConfigError for a policy that does not say how it was
-    trained.
+    extended: the model file that was written, under which the policy is trained on for ``request.retrain`` updates; the
+    run of that training is kept beside the model file.
     """
+    folder, retrain = request.policy, request.retrain
     trained = policy.load(folder)
-    if trained.config is None:
-        raise ConfigError(f"{folder}: does not say how it was trained; give the run that it came from")
     nominal = {"model": request.model} if request.model else {}
 
     def rate(name: str, who: policy.Policy, changes: dict) -> dict[str, float]:
@@ -136,6 +153,8 @@ def show(found: gap.Diagnosis, console: Console) -> None:
     """The answer in a few lines."""
     v = found.verdict
     console.print(f"verdict: {v.verdict}", style="bold")
+    for warning in v.warnings:
+        console.print(f"  note: {warning}", highlight=False)
     for c in v.causes:
         unit = "mm" if c.name.startswith("gantry") else "mrad"
         size = f"{unit} rms" if "." in c.name else "mm at the end of a flight"

@@ -38,6 +38,9 @@ def draw(path: Path, episodes: list[tuple[np.ndarray, np.ndarray]], rate: float,
 
     rate: control rate [Hz]. Raises ValueError for a wrong suffix or camera, RuntimeError without OpenGL.
     """
+    allowed = (".png", *render.VIDEO_SUFFIXES)
+    if path.suffix not in allowed:
+        raise ValueError(f"{path}: suffix {path.suffix!r}; allowed: {', '.join(allowed)}")
     if path.suffix == ".png":
         qpos, ball = episodes[0]
         at = int(np.argmin(ball[:, 1]))  # the ball turns where it meets the paddle

@@ -18,6 +18,7 @@ from ballmodel.importers import MeasuredStates, read, write_mcap
 from ballmodel.importers.csv_file import COLUMNS
 from ballmodel.trajectory import Dataset
 from experiments.errors import ConfigError, checked
+from mjx_tt import gap
 
 
 def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
@@ -37,9 +38,21 @@ def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
 def fit(
     paths: list[str], format: str | None, out: Path, name: str, eps: float | None, min_samples: int, console: Console
 ) -> None:
-    """Fits a distribution, writes its YAML and prints its 16 numbers beside those of the paper's players."""
+    """Fits a distribution, writes its YAML and prints its 16 numbers beside those of the paper's players.
+
+    Raises ConfigError, for balls that cannot be metres and seconds in the table frame with what they look like.
+    """
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"--out {out}: suffix {out.suffix!r}; allowed: .yaml, .yml")
+    if eps is not None and not 0.0 < eps < float("inf"):
+        raise ConfigError(f"--eps {eps:g}: a positive number is wanted")
     measured = read_all(paths, format)
-    distribution, report = checked("", fit_human, measured, ball_params(), eps, min_samples, name or out.stem)
+    try:
+        distribution, report = fit_human(measured, ball_params(), eps, min_samples, name or out.stem)
+    except ValueError as error:
+        if isinstance(measured, Dataset):
+            checked("", gap.check, measured.trajectories, measured.source)
+        raise ConfigError(f"{', '.join(paths)}: {error}") from None
     out.parent.mkdir(parents=True, exist_ok=True)
     save_distribution(out, distribution)
     _print_report(report, console)
@@ -55,6 +68,9 @@ def convert(path: str, format: str | None, out: Path, console: Console) -> None:
     writers = {".csv": write_csv, ".mcap": write_mcap}
     if out.suffix not in writers:
         raise ConfigError(f"{out}: suffix {out.suffix!r}; allowed: {', '.join(writers)}")
+    if out.exists() and out.samefile(path):
+        raise ConfigError(f"--out {out}: is the file to be converted")
+    out.parent.mkdir(parents=True, exist_ok=True)
     writers[out.suffix](out, data)
     samples = sum(len(trajectory) for trajectory in data)
     console.print(f"{out}: {len(data):,} trajectories, {samples:,} samples", highlight=False)

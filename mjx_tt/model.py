@@ -23,9 +23,12 @@ import jax.numpy as jnp
 import yaml
 
 from ballmodel import constants as c
+from ballmodel import yaml_file
 from ballmodel.aero import INTEGRATORS
+from ballmodel.files import replacing
 from ballmodel.flight import BallParams, ball_params
 from ballmodel.optional import optional
+from mjx_tt import bounds
 from mjx_tt.drives import DriveParams
 
 
@@ -215,10 +218,7 @@ def nearest(name: str, known) -> str:
 
 def load(path: str | os.PathLike) -> ModelFile:
     """Reads a model YAML. Raises ValueError naming file, key, what was given and what is allowed."""
-    try:
-        data = yaml.safe_load(Path(path).read_text())
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: not valid YAML: {error}") from None
+    data = yaml_file.read(path)
     return from_dict(data or {}, str(path))
 
 
@@ -235,17 +235,17 @@ def from_dict(data, where: str) -> ModelFile:
             if value not in INTEGRATORS:
                 raise ValueError(f"{where}: {path} = {value!r}, allowed are {INTEGRATORS}")
         else:
-            value = _number(value, f"{where}: {path}")
+            value = _number(value, f"{where}: {path}", path)
         values[path] = value
     parsed = []
-    for path, bounds in ranges.items():
+    for path, ends in ranges.items():
         if path not in known or isinstance(known[path], str):
             raise ValueError(f"{where}: randomise.{path}: unknown parameter{nearest(str(path), known)}")
-        if not isinstance(bounds, list | tuple) or len(bounds) != 2:
-            raise ValueError(f"{where}: randomise.{path} = {bounds!r}, a range is [low, high]")
-        low, high = (_number(b, f"{where}: randomise.{path}") for b in bounds)
+        if not isinstance(ends, list | tuple) or len(ends) != 2:
+            raise ValueError(f"{where}: randomise.{path} = {ends!r}, a range is [low, high]")
+        low, high = (_number(b, f"{where}: randomise.{path}", path) for b in ends)
         if low > high:
-            raise ValueError(f"{where}: randomise.{path} = {bounds!r}, low must not exceed high")
+            raise ValueError(f"{where}: randomise.{path} = {ends!r}, low must not exceed high")
         parsed.append(Range(path, low, high))
     return ModelFile(with_values(SimModel(), values), tuple(parsed), provenance)
 
@@ -266,9 +266,8 @@ def save(path: str | os.PathLike, file: ModelFile) -> None:
         node[leaf] = value if isinstance(value, str) else float(value)
     tree["randomise"] = {r.path: [r.low, r.high] for r in file.randomise}
     tree["provenance"] = file.provenance
-    temporary = Path(f"{path}.tmp")
-    temporary.write_text(yaml.safe_dump(tree, sort_keys=False))
-    os.replace(temporary, path)
+    with replacing(Path(path)) as temporary:
+        temporary.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
 
 
 def _flatten(data: dict, where: str, known, prefix: str = ""):
@@ -281,7 +280,9 @@ def _flatten(data: dict, where: str, known, prefix: str = ""):
         elif any(name.startswith(f"{path}.") for name in known):
             raise ValueError(f"{where}: {path} = {value!r}, a mapping of its parameters is needed")
         else:
-            raise ValueError(f"{where}: unknown parameter {path!r}{nearest(path, known)}")
+            beside = {name for name in known if name.startswith(prefix)} if prefix else {n.split(".")[0] for n in known}
+            hint = nearest(path, known) if difflib.get_close_matches(path, list(known), 1) else nearest(path, beside)
+            raise ValueError(f"{where}: unknown parameter {path!r}{hint}")
 
 
 def _mapping(value, where: str) -> dict:
@@ -290,7 +291,10 @@ def _mapping(value, where: str) -> dict:
     return value or {}
 
 
-def _number(value, where: str) -> float:
+def _number(value, where: str, path: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{where} = {value!r}, a finite number is needed")
+    low, high = bounds.of(path)
+    if not low <= value <= high:
+        raise ValueError(f"{where} = {value!r}, allowed is {low:g} to {high:g} in SI units")
     return float(value)

@@ -23,9 +23,9 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import yaml
 
 from ballmodel import constants as c
+from ballmodel import yaml_file
 from ballmodel.aero import FlightParams
 from ballmodel.state import BallState
 from mjx_tt.strokes import aimed, erring, fall_seconds, stroke_seconds
@@ -338,10 +338,7 @@ def load(name: str) -> Player:
 
 def read(path) -> Player:
     """A player from a YAML file: the tree of field names, a spread as [low, usual, high]. Raises ValueError naming file and key."""
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: not valid YAML: {error}") from None
+    data = yaml_file.read(path)
     if not isinstance(data, dict):
         raise ValueError(f"{path}: a mapping of {', '.join(f.name for f in dataclasses.fields(Player))} is wanted")
     return _parse(Player, {k: v for k, v in data.items() if k not in NOTES}, str(path), "")

@@ -216,7 +216,7 @@ def _no_backend(tried: tuple[str, ...]) -> str:
 def _checked_path(path: str | os.PathLike, suffixes: tuple[str, ...]) -> Path:
     path = Path(path)
     if path.suffix not in suffixes:
-        raise ValueError(f"{path}: the suffix must be one of {suffixes}")
+        raise ValueError(f"{path}: suffix {path.suffix!r}; allowed: {', '.join(suffixes)}")
     if not path.parent.is_dir():
         raise ValueError(f"{path}: the folder {path.parent} does not exist")
     return path

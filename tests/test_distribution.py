@@ -86,7 +86,7 @@ def test_yaml_round_trip(tmp_path):
         ("z: [0.2, 0.5]", "z: [0.2, .nan]", "finite numbers"),
         ("z: [0.2, 0.5]", "q: [0.2, 0.5]", "unknown key 'q'"),
         ("velocity: {x: [-1, 1], y: [-6, -4], z: [0, 1]}", "", "missing key velocity"),
-        ("name: box", "name: [box", "not a readable YAML file"),
+        ("name: box", "name: [box", "not valid YAML"),
     ],
 )
 def test_malformed_yaml_says_file_key_and_what_is_allowed(tmp_path, old, new, message):

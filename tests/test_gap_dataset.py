@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments import cli
+from experiments import cli, diagnosis, session_logs
 from mjx_tt import gap
 
 RATE, SAMPLES = 125.0, 60
@@ -117,6 +117,77 @@ def test_half_a_robot_log_names_the_other_half(tmp_path):
         gap.load([tmp_path])
     with pytest.raises(FileNotFoundError, match="nowhere.csv"):
         gap.load([tmp_path / "nowhere.csv"])
+
+
+def robot(folder, seconds=8.0, commands=1.0, states=1.0, speed=0.1, joint="joint_1"):
+    """A pair of robot logs; ``commands`` and ``states`` multiply the times."""
+    folder.mkdir(exist_ok=True)
+    time = np.arange(round(125 * seconds)) / 125
+    for name, column, scale, values in (
+        ("command", "velocity", commands, speed * np.cos(time)), ("state", "position", states, speed * np.sin(time - 0.05)),
+    ):  # fmt: skip
+        rows = "".join(f"{scale * t:.6f},{joint},{v:.9f}\n" for t, v in zip(time, values))
+        (folder / f"{name}.csv").write_text(f"t,joint,{column}\n{rows}")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "scales, words", [((1.0, 1e3), "joint_1: states are 8 s apart"), ((1e3, 1.0), "0% of the commands fall into")]
+)
+def test_commands_and_states_share_their_seconds(scales, words, tmp_path):
+    folder = robot(tmp_path / "robot", 20.0, *scales)
+    with pytest.raises(ValueError, match=words) as refused:
+        gap.load([folder])
+    assert "milliseconds" in str(refused.value) and "state.csv" in str(refused.value)
+
+
+def test_of_several_robot_logs_the_longest_is_used_and_the_others_are_named(tmp_path):
+    long, short = robot(tmp_path / "long", 12.0), robot(tmp_path / "short", 8.0, joint="joint_2")
+    logs = gap.load([short, long])
+    assert [j.joint for j in logs.joints] == ["joint_1"] and logs.joints[0].state_time.size == 1500
+    assert len(logs.sources) == 4
+    assert any(str(short) in note and str(long) in note for note in logs.notes)
+    with pytest.raises(ValueError, match=r"long.state\.csv: the joints' command\.csv is missing"):
+        gap.load([long / "state.csv", short / "command.csv"])
+
+
+def test_a_log_counts_once(tmp_path):
+    path = write(tmp_path / "log.csv", flights())
+    (tmp_path / "copy.csv").write_bytes(path.read_bytes())
+    for twice_given in ([path, path], [path, tmp_path / "copy.csv"], [tmp_path]):
+        with pytest.raises(ValueError, match="is the same log as"):
+            gap.load(twice_given)
+
+
+def test_sessions_and_other_logs_are_read_together(tmp_path, monkeypatch):
+    """A folder with a session of the robot, balls and joints: nothing of it is dropped."""
+    folder = robot(tmp_path / "all", 12.0)
+    write(folder / "balls.csv", flights())
+    (folder / "session.mcap").write_bytes(b"as if")
+    flown = gap.load([write(tmp_path / "flown.csv", flights(5, seed=1))]).balls
+    monkeypatch.setattr(session_logs, "is_session", lambda path: path.suffix == ".mcap")
+    monkeypatch.setattr(session_logs, "load", lambda path: (flown, ()))
+    logs = diagnosis.read_logs([str(folder)])
+    assert len(logs.balls) == 25 and len(logs.joints) == 1 and len(logs.sources) == 4
+
+
+@pytest.mark.parametrize(
+    "more, words",
+    [
+        (["--seed", "-3"], "--seed -3"),
+        (["--retrain", "5"], "--retrain needs --policy"),
+        (["--policy", "nowhere"], "nowhere"),
+        (["--out", "log.csv"], "log.csv is a file"),
+        (["--model", "log.csv"], "log.csv"),
+    ],
+)
+def test_what_would_fail_later_is_refused_before_the_work(more, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "log.csv", flights())
+    assert cli.main(["diagnose", "log.csv", "--out", "out", *more]) == 1
+    said = capsys.readouterr()
+    assert words in said.err and "trajectories" not in said.out
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["log.csv"]
 
 
 def test_an_unknown_effect_cannot_be_left_out(tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ballmodel.importers import read, read_mcap, write_mcap
-from ballmodel.trajectory import Dataset, Trajectory, first_bounce, free_flight, resample
+from ballmodel.trajectory import Dataset, Trajectory, first_bounce, free_flight
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured data in {DATA}")
@@ -70,16 +70,6 @@ def test_a_slow_ball_low_over_the_table_does_not_bounce_by_noise():
         trajectory, bounce = bouncing(noise=0.003, seed=seed, start=(0, 1.2, 0.06), velocity=(0, -4.0, 0.4))
         found = first_bounce(trajectory)
         assert found is not None and abs(trajectory.time[found] - bounce) < 0.02
-
-
-def test_resampling_reads_between_the_samples():
-    time = np.linspace(0, 1, 101)
-    line = Trajectory("", "line", time, np.stack([time, 2 * time, 3 * time]))
-    new = resample(line, 75.0)
-    np.testing.assert_allclose(new.time, np.arange(76) / 75)
-    np.testing.assert_allclose(new.position, np.arange(76) / 75 * np.array([[1], [2], [3]]), atol=1e-12)
-    with pytest.raises(ValueError, match="rate is 0"):
-        resample(line, 0.0)
 
 
 # --- CSV

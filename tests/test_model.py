@@ -8,14 +8,17 @@ import pytest
 import yaml
 from scipy import stats
 
-from mjx_tt import model
+from mjx_tt import bounds, model
 from mjx_tt.drives import JointDrive
 from mjx_tt.model import LATENCIES, BallSpinParams, LatencyParams, ModelFile, Range, SimModel
 
 
 def test_yaml_keeps_every_parameter(tmp_path):
     """Every leaf gets its own value, so none can be lost or swapped."""
-    values = {path: 0.001 * i + 0.1 for i, path in enumerate(model.paths()) if not path.endswith("integrator")}
+    values = {}
+    for i, path in enumerate(model.paths()):
+        low, high = np.clip(bounds.of(path), -200.0, 200.0)
+        values[path] = float(low + (0.2 + 0.003 * i) * (high - low))
     values["ball.flight.integrator"] = "midpoint"
     ranges = (Range("ball.table.restitution", 0.85, 0.95), Range("latency.abb_action", 0.06, 0.08))
     file = ModelFile(model.with_values(SimModel(), values), ranges, {"source": "diagnosis of session 3", "gain": 0.12})
@@ -25,6 +28,21 @@ def test_yaml_keeps_every_parameter(tmp_path):
     assert read == file
     assert model.paths(read.model) == values
     assert len(values) > 140 and len(set(values.values())) == len(values)
+
+
+def test_every_parameter_has_bounds_and_the_nominal_model_lies_within_them():
+    for path, value in model.paths().items():
+        if not path.endswith("integrator"):
+            low, high = bounds.of(path)
+            assert low <= value <= high and low > -np.inf, path
+
+
+def test_numbers_are_read_as_in_every_other_yaml(tmp_path):
+    (tmp_path / "a.yaml").write_text("sensing: {ball_noise: 1e-3}\n")  # YAML 1.1 would call this text
+    assert model.load(tmp_path / "a.yaml").model.sensing.ball_noise == 0.001
+    (tmp_path / "b.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match=r"b\.yaml: not a text file"):
+        model.load(tmp_path / "b.yaml")
 
 
 def test_what_is_left_out_is_nominal(tmp_path):
@@ -79,10 +97,16 @@ def test_spin_is_gaussian_about_its_mean(mean):
     ("text", "message"),
     [
         ("ball: {table: {restituton: 0.9}}", r"'ball.table.restituton'; did you mean 'ball.table.restitution'\?"),
-        ("zzz: 1", "unknown parameter 'zzz'; known are .*ball.flight.drag_coefficient"),
+        ("zzz: 1", "unknown parameter 'zzz'; known are actuation, ball, ball_spin, drives, latency, sensing"),
         ("ball: {table: {restitution: high}}", "ball.table.restitution = 'high', a finite number is needed"),
         ("ball: {table: {restitution: .nan}}", "ball.table.restitution = nan, a finite number is needed"),
         ("ball: {table: {restitution: true}}", "ball.table.restitution = True, a finite number is needed"),
+        ("ball: {table: {restitution: 93}}", r"ball.table.restitution = 93, allowed is 0 to 1.5 in SI units"),
+        ("sensing: {ball_noise: -1}", r"sensing.ball_noise = -1, allowed is 0 to 0.5"),
+        ("latency: {abb_action: 71}", r"latency.abb_action = 71, allowed is 0 to 1 "),
+        ("drives: {joint_2: {lag: -0.01}}", "drives.joint_2.lag = -0.01, allowed is 0 to 1 "),
+        ("randomise: {ball.flight.mass: [2.6, 2.8]}", "randomise.ball.flight.mass = 2.6, allowed is 0.0001 to 0.1"),
+        ("sensing: {ball_noise: 0.01, ball_noise: 0.02}", "key 'ball_noise' is given twice"),
         ("ball: {flight: {integrator: rk4}}", r"ball.flight.integrator = 'rk4', allowed are \('paper', 'midpoint'\)"),
         ("ball: {flight: {integrator: [paper]}}", "ball.flight.integrator = .*allowed are"),
         ("drives: {joint_7: {lag: 0.02}}", r"'drives.joint_7.lag'; did you mean 'drives.joint_[1-6].lag'"),
@@ -143,8 +167,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.yaml"
     model.save(path, ModelFile(SimModel()))
     before = path.read_text()
-    (tmp_path / "a.yaml.tmp").mkdir()  # where the temporary file would go
-    with pytest.raises(OSError):
-        model.save(path, ModelFile(SimModel(), provenance={"new": True}))
+    with pytest.raises(yaml.representer.RepresenterError):  # half way through the text
+        model.save(path, ModelFile(SimModel(), provenance={"new": object()}))
+    assert [p.name for p in tmp_path.iterdir()] == ["a.yaml"]
     assert path.read_text() == before
     assert yaml.safe_load(before)["provenance"] == {}

@@ -112,7 +112,7 @@ def test_trail_marks_the_path_of_the_ball(home):
 def test_mistakes_are_named(tmp_path, home):
     many = np.tile(home, (3, 1))
     for call, message in (
-        (lambda: render.render_png(tmp_path / "a.jpg", home), r"a\.jpg: the suffix must be one of"),
+        (lambda: render.render_png(tmp_path / "a.jpg", home), r"a\.jpg: suffix '\.jpg'; allowed: \.png"),
         (lambda: render.render_png(tmp_path / "none" / "a.png", home), "folder .* does not exist"),
         (lambda: render.render_png(tmp_path / "a.png", home[:7]), "qpos needs 8 joint positions, got 7"),
         (lambda: render.render_png(tmp_path / "a.png", home, [0, 0]), r"ball_position needs .* \(3\), got \(2,\)"),

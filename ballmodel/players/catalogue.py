@@ -8,7 +8,8 @@ from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 
-from ballmodel.distribution import NOTES, BallDistribution, check_keys, load_distribution, parse_distribution, read_yaml
+from ballmodel.distribution import NOTES, BallDistribution, check_keys, load_distribution, parse_distribution
+from ballmodel.yaml_file import read as read_yaml
 
 FOLDER = Path(__file__).parent
 

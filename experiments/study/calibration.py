@@ -25,6 +25,7 @@ import numpy as np
 import yaml
 
 from ballmodel import players as paper
+from ballmodel import yaml_file
 from ballmodel.files import replacing
 from ballmodel.human import fit_human
 from ballmodel.state import BallState
@@ -206,7 +207,7 @@ def tune(rows: list[dict]) -> None:
     """Moves the ends of the players' spreads by half of what the numbers of these rows lack, and writes their files."""
     for name in players.names():
         path = players.FOLDER / f"{name}.yaml"
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml_file.read(path)
         found = {(r["model"], r["number"]): r for r in rows if r["player"] == name}
         for model, number, group, spread, end in FOLLOWS:
             row, sign = found[model, number], -1.0 if end.startswith("-") else 1.0

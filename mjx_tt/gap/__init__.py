@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from mjx_tt.gap.dataset import Logs, check, load
+from mjx_tt.gap.dataset import Logs, check, hashes, load, longest
 from mjx_tt.gap.diagnose import Diagnosis, diagnose
 from mjx_tt.gap.verdict import Verdict
 
-__all__ = ["Diagnosis", "Logs", "Verdict", "check", "diagnose", "load"]
+__all__ = ["Diagnosis", "Logs", "Verdict", "check", "diagnose", "hashes", "load", "longest"]

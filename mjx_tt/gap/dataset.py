@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,23 +32,35 @@ class Logs:
     balls: tuple[Trajectory, ...]
     joints: tuple[JointRecord, ...]
     sources: dict[str, str]  # file -> SHA-256
+    notes: tuple[str, ...] = ()  # what was not used, and why
+
+
+def hashes(paths: Sequence[str | os.PathLike]) -> dict[Path, str]:
+    """The SHA-256 of every log: of the files given, and of the logs in the folders given.
+
+    Raises ValueError for a folder without logs and for a log that is given twice, FileNotFoundError for what is not there.
+    """
+    found: dict[Path, str] = {}
+    seen: dict[str, Path] = {}
+    for file in (file for path in map(Path, paths) for file in _expand(path)):
+        digest = hashlib.sha256(file.read_bytes()).hexdigest()
+        if digest in seen and file.name != ROBOT_FILES[0]:  # the same commands may be given twice
+            raise ValueError(f"{file}: is the same log as {seen[digest]}, which would count twice")
+        found[file], seen[digest] = digest, file
+    return found
 
 
 def load(paths: Sequence[str | os.PathLike]) -> Logs:
     """Reads logs: ball trajectories (CSV, MCAP, AIMY) and pairs command.csv, state.csv (or a folder that holds them).
 
-    Raises ValueError naming the file and what is wrong with it, FileNotFoundError when there is none.
+    Of several pairs the longest is used. Raises ValueError naming the file and what is wrong with it, FileNotFoundError when
+    there is none.
     """
-    files = [file for path in map(Path, paths) for file in _expand(path)]
+    files = hashes(paths)
     if not files:
         raise ValueError("no log was given")
     balls: list[Trajectory] = []
-    robot = {f.name: f for f in files if f.name in ROBOT_FILES}
-    if len(robot) == 1:
-        name, file = next(iter(robot.items()))
-        other = ROBOT_FILES[1 - ROBOT_FILES.index(name)]
-        raise ValueError(f"{file}: the joints' {other} is missing beside it: commands and positions are needed")
-    joints = tuple(read_robot_csv(*(robot[name] for name in ROBOT_FILES))) if robot else ()
+    joints, notes = longest([(str(folder), read_robot_csv(*pair)) for folder, pair in _pairs(files).items()])
     for file in (f for f in files if f.name not in ROBOT_FILES):
         try:
             data = read(file)
@@ -65,7 +77,31 @@ def load(paths: Sequence[str | os.PathLike]) -> Logs:
             )
         check(data.trajectories, str(file))
         balls += data.trajectories
-    return Logs(tuple(balls), joints, {str(f): hashlib.sha256(f.read_bytes()).hexdigest() for f in files})
+    return Logs(tuple(balls), joints, {str(file): digest for file, digest in files.items()}, notes)
+
+
+def longest(
+    records: Sequence[tuple[str, tuple[JointRecord, ...]]],
+) -> tuple[tuple[JointRecord, ...], tuple[str, ...]]:
+    """Of several logs of joints, each with its name, the one with the most states; and a note on those left out."""
+    if not records:
+        return (), ()
+    name, chosen = max(records, key=lambda r: sum(joint.state_time.size for joint in r[1]))
+    others = ", ".join(other for other, _ in records if other != name)
+    return chosen, (f"the joints are judged by {name} alone, the longest log of them; not by {others}",) if others else ()
+
+
+def _pairs(files: Iterable[Path]) -> dict[Path, tuple[Path, Path]]:
+    """The command.csv and state.csv of each folder. Raises ValueError where one of the two is not among the files."""
+    robot = [f for f in files if f.name in ROBOT_FILES]
+    pairs = {}
+    for folder in dict.fromkeys(f.parent for f in robot):
+        mine = {f.name: f for f in robot if f.parent == folder}
+        for name, other in (ROBOT_FILES, ROBOT_FILES[::-1]):
+            if other not in mine:
+                raise ValueError(f"{mine[name]}: the joints' {other} is missing beside it: commands and positions are needed")
+        pairs[folder] = (mine["command.csv"], mine["state.csv"])
+    return pairs
 
 
 def _expand(path: Path) -> list[Path]:

@@ -8,7 +8,7 @@ found.verdict.causes, found.extended
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import t as student
@@ -84,6 +84,7 @@ def diagnose(
     if logs.joints:
         robot = diagnose_joints(logs.joints, model, seed, [n for n in without if n not in ball_names], say)
     verdict, values, ranges = _verdict(found, prediction, hits, robot, without, seed, say)
+    verdict = replace(verdict, warnings=(*logs.notes, *verdict.warnings))
     if verdict.verdict in ("unexplained", "undetermined") and not (verdict.held_out and verdict.held_out.low > 0.0):
         values, ranges = {}, []  # names that are not to be relied on change the model only if they predict better
     extended = ModelFile(

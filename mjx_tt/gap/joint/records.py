@@ -18,6 +18,8 @@ from robot_io.contract import JOINT_NAMES, LIMITS
 
 FASTEST = 5.0  # times a joint's rated speed beyond which a command is in other units than rad/s or m/s
 WIDEST = 5.0  # times a joint's range beyond which a position is in other units than rad or m
+SPARSEST = 0.5  # [s] from state to state in the median, beyond which time is in other units than seconds
+WITHIN = 0.1  # share of the commands that must fall into the time of the states
 SHORTEST = 1.0  # [s] of common time of commands and states that can tell anything
 
 
@@ -26,8 +28,8 @@ class JointRecord:
     """Commands and states of one joint, on one clock.
 
     Raises ValueError, naming the joint, for a joint that is not in JOINT_NAMES, arrays that do not match, numbers that
-    are not finite, time that does not increase, fewer than SHORTEST seconds of states after the first command, and
-    numbers too large to be SI units.
+    are not finite, time that does not increase, fewer than SHORTEST seconds of states after the first command, times that
+    are not the same seconds, and numbers too large to be SI units.
     """
 
     joint: str
@@ -63,6 +65,18 @@ class JointRecord:
                 f"{self.joint}: {max(common, 0.0):.3g} s of states follow the first command, at least {SHORTEST:g} s "
                 f"are wanted (commands {self.command_time[0]:.3f}..{self.command_time[-1]:.3f}, "
                 f"states {self.state_time[0]:.3f}..{self.state_time[-1]:.3f}: one clock?)"
+            )
+        apart = float(np.median(np.diff(self.state_time)))
+        if apart > SPARSEST:
+            raise ValueError(
+                f"{self.joint}: states are {apart:g} s apart, at most {SPARSEST:g} s are wanted (are these milliseconds?)"
+            )
+        within = np.mean((self.command_time >= self.state_time[0]) & (self.command_time <= self.state_time[-1]))
+        if within < WITHIN and self.command_time[-1] > self.state_time[-1]:
+            raise ValueError(
+                f"{self.joint}: {within:.0%} of the commands fall into the time of the states (commands "
+                f"{self.command_time[0]:.3f}..{self.command_time[-1]:.3f}, states {self.state_time[0]:.3f}.."
+                f"{self.state_time[-1]:.3f}: are the commands' times milliseconds?)"
             )
         i = JOINT_NAMES.index(self.joint)
         _check_size(self.joint, "velocity", self.command_velocity, FASTEST * LIMITS.velocity[i])
