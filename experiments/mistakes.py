@@ -9,16 +9,21 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+LONGEST = 120  # characters of what was given that are shown
+
 
 def lines(error: ValidationError, model: type[BaseModel]) -> list[str]:
-    """One line per mistake: "dotted.path: what was given, what is allowed, the nearest valid name"."""
+    """One line per mistake: "dotted.path: what was given, what is allowed, the nearest valid name".
+
+    A mistake that concerns the whole file has no path; its text names the keys.
+    """
     found: dict[str, tuple[str, list[str]]] = {}  # path -> beginning of the line, what is allowed there
     for mistake in error.errors():
         path, owner = _walk(mistake, model)
         beginning, allowed = _describe(mistake, path, owner)
         found.setdefault(path, (beginning, []))[1].append(allowed)
     return [
-        f"{path}: {beginning}{' or '.join(allowed)}"
+        f"{path and f'{path}: '}{beginning}{' or '.join(allowed)}"
         for path, (beginning, allowed) in found.items()
         # A mapping that fits one member of a union fails as every other one; only the mistake inside it helps.
         if not any(deeper.startswith(f"{path}.") for deeper in found)
@@ -36,7 +41,8 @@ def _describe(mistake: dict[str, Any], path: str, owner: type[BaseModel]) -> tup
     if kind == "extra_forbidden":
         parent, _, name = path.rpartition(".")
         names = list(owner.model_fields)
-        return f"unknown key; {nearest(name, names)}allowed{f' in {parent}' if parent else ''}: ", ", ".join(names)
+        unknown = "unknown key" if path else "unknown key ''"  # which leaves nothing to begin the line with
+        return f"{unknown}; {nearest(name, names)}allowed{f' in {parent}' if parent else ''}: ", ", ".join(names)
     if kind == "missing":
         return "missing, it has no default", ""
     if kind == "union_tag_not_found":
@@ -46,11 +52,19 @@ def _describe(mistake: dict[str, Any], path: str, owner: type[BaseModel]) -> tup
         return f"got {given['kind']!r}; {nearest(given['kind'], re.findall(r'[a-z_]+', tags))}allowed: ", tags
     if kind == "literal_error":
         options = mistake["ctx"]["expected"]
-        return f"got {given!r}; {nearest(str(given), re.findall(r'[a-z_]+', options))}allowed: ", options
+        return f"got {_shown(given)}; {nearest(str(given), re.findall(r'[a-z_]+', options))}allowed: ", options
     if kind in ("model_type", "dict_type"):
-        return f"got {given!r}; allowed: ", "a mapping"
+        return f"got {_shown(given)}; allowed: ", "a mapping"
     message = mistake["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    return f"got {given!r}; allowed: ", message
+    if kind == "value_error" and isinstance(given, dict):
+        return "", message  # about several keys, which it names with what was given
+    return f"got {_shown(given)}; allowed: ", message
+
+
+def _shown(given: Any) -> str:
+    """What was given, cut where it is long."""
+    text = repr(given)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]} ..."
 
 
 def _walk(mistake: dict[str, Any], model: type[BaseModel]) -> tuple[str, type[BaseModel]]:

@@ -20,7 +20,7 @@ from ballmodel.files import replacing
 from experiments.config import Config, parse, read_yaml
 from experiments.errors import RunError
 
-CONFIG = "config.yaml"
+CONFIG, SESSIONS, LOCK = "config.yaml", "run.json", ".lock"
 # What may change between the sessions of a run: none of it touches what an update computes.
 CHANGEABLE = (
     "training.max_minutes",
@@ -63,26 +63,32 @@ class Run:
     def open(self, config: Config) -> None:
         """Makes the folder, or checks that it belongs to the same experiment, and records this session of training.
 
-        Raises RunError naming every differing key, or saying why the folder cannot be written.
+        Raises RunError naming every differing key, or saying that another process trains here or why the folder cannot
+        be written.
         """
         path = self.folder / CONFIG
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self.check(config)
-            write_yaml(path, config.to_dict())
-            sessions = self.folder / "run.json"
-            before = json.loads(sessions.read_text()) if sessions.exists() else []
-            write_json(sessions, [*before, provenance()])
-            for mark in (self.status, self.evaluation):  # of an earlier end, which this session moves
-                mark.unlink(missing_ok=True)
+            with self.locked():  # a run that another process has just begun keeps its records
+                self.check(config)
+                write_yaml(path, config.to_dict())
+                sessions = self.folder / SESSIONS
+                before = json.loads(sessions.read_text()) if sessions.exists() else []
+                write_json(sessions, [*before, provenance()])
+                for mark in (self.status, self.evaluation):  # of an earlier end, which this session moves
+                    mark.unlink(missing_ok=True)
         except OSError as error:
             raise RunError(
                 f"{self.folder}: cannot be written: {error.strerror or error}; choose another --out"
             ) from error
 
     def check(self, config: Config) -> None:
-        """Raises RunError naming every key in which a run that is already here differs; nothing for a new folder."""
-        if not (self.folder / CONFIG).exists():
+        """Raises RunError naming every key in which a run that is already here differs.
+
+        Nothing for a new folder, and for one in which nothing was trained yet: a start that failed must not stand in
+        the way of the corrected one.
+        """
+        if not (self.folder / CONFIG).exists() or self._untouched():
             return
         changed = differences(self.config().to_dict(), config.to_dict(), _changeable)
         if changed:
@@ -91,13 +97,21 @@ class Run:
                 "Restore these values, change the name or --out, or remove the folder"
             )
 
+    def _untouched(self) -> bool:
+        """Whether the folder holds no more than the records of a start: no checkpoint, no measurement, nothing else."""
+        kept = {CONFIG, SESSIONS, LOCK, self.checkpoints.name, self.metrics.name, self.tensorboard.name}
+        if any(path.name not in kept for path in self.folder.iterdir()):
+            return False
+        measured = self.metrics.exists() and self.metrics.stat().st_size > 0
+        return not measured and not (self.checkpoints.exists() and any(self.checkpoints.iterdir()))
+
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Keeps a second process out of the folder; the system frees the lock however this one ends.
 
         Raises RunError when another process holds it.
         """
-        with open(self.folder / ".lock", "w") as file:
+        with open(self.folder / LOCK, "w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

@@ -82,7 +82,9 @@ def test_people_evaluate_without_knowing_what(tmp_path, artefacts, capsys):
     shown = capsys.readouterr().out + (folder / "sheet.csv").read_text() + (folder / "key.sealed").read_text()
     assert not any(model in shown for model in MODELS)
     assert cli.main(["blind", "make", str(folder), *given]) == 1  # never over an evaluation that has begun
-    sheet = (folder / "sheet.csv").read_text()
+    content = (folder / "sheet.csv").read_bytes()
+    assert b"\r" not in content
+    sheet = content.decode()
     assert (
         all(f"# {number:>2}  " in sheet for number in range(1, 16)) and "Human hit the first ball to the net." in sheet
     )
@@ -107,8 +109,11 @@ def test_people_evaluate_without_knowing_what(tmp_path, artefacts, capsys):
     for model in MODELS:
         mine = rallies.take(rallies.model == model)
         code = str(mine.blind[0])
-        # The code is the folder whose policy is this model's: its provenance says so.
-        assert artefact.load(folder / "policies" / code).manifest["provenance"] == {"model": model}
+        # The code is the folder whose policy is this model's: its numbers say so.
+        played, original = (artefact.load(f) for f in (folder / "policies" / code, artefacts / model / "artefact"))
+        for name, array in original.parameters.items():
+            np.testing.assert_array_equal(played.parameters[name], array)
+        assert mine.rally.tolist() == list(range(1, 71))  # as on the sheet
         assert mine.length.tolist() == lengths[code].tolist()
         assert sorted(mine.length[mine.selected]) == sorted(lengths[code][:60])[-50:]
 
@@ -157,3 +162,57 @@ def test_a_folder_without_a_policy_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="mjx-tt export"):
         blind.make(tmp_path / "b", {"m": tmp_path, "n": tmp_path}, "a", "a")
     assert not (tmp_path / "b").exists()
+
+
+def test_a_copy_does_not_say_which_model_it_is(tmp_path, artefacts):
+    folder = tmp_path / "blind"
+    blind.make(folder, {model: artefacts / model for model in MODELS}, "anna", "anna")
+    key = blind.unseal(folder / "key.sealed")
+    for model, code in key["codes"].items():
+        copy = folder / "policies" / code
+        for path in copy.iterdir():
+            assert model.encode() not in path.read_bytes()
+            assert path.stat().st_mtime >= (artefacts / model / "artefact" / path.name).stat().st_mtime
+        loaded = artefact.load(copy)  # whole: what runs it accepts it
+        assert (loaded.manifest["provenance"], loaded.manifest["written_with"]) == ({}, {})
+        assert loaded.digest == key["digests"][model]
+        assert artefact.load(artefacts / model / "artefact").digest == key["originals"][model]
+    times = [(folder / "policies" / code / "params.npz").stat().st_mtime for code in "ABC"]
+    assert times == sorted(times)
+
+
+def test_one_policy_under_two_names_is_refused(tmp_path, artefacts, capsys):
+    first = artefacts / MODELS[0]
+    theta = np.random.default_rng(0).normal(0.0, 0.1, 976)
+    export.write(tmp_path / "again", theta, np.zeros(11), np.ones(11), {"model": "another name"})
+    for other in (first, first / "artefact", tmp_path / "again"):
+        assert cli.main(["blind", "make", str(tmp_path / "b"), f"a={first}", f"b={other}", "--trainer", "player3"]) == 1
+        assert "a and b: are the same policy" in capsys.readouterr().err
+    assert not (tmp_path / "b" / "policies").exists()
+    assert blind.make(tmp_path / "b", {"a": first, "b": first}, "player3", "player3", twice=True) == ("A", "B")
+
+
+def test_a_blind_evaluation_needs_a_trainer(tmp_path, artefacts, capsys):
+    given = [f"{model}={artefacts / model}" for model in MODELS]
+    assert cli.main(["blind", "make", str(tmp_path / "b"), *given]) == 1
+    assert "--trainer" in capsys.readouterr().err and not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("separator, encoding", [(";", "utf-8-sig"), ("\t", "utf-16"), (",", "utf-8"), (";", "cp1252")])
+def test_a_sheet_is_read_as_spreadsheets_save_it(tmp_path, separator, encoding):
+    path = tmp_path / "sheet.csv"
+    blind.blank_sheet(path, ("A", "B"), 3)
+    lines = [line if line.startswith("#") else line.replace(",", separator) for line in path.read_text().splitlines()]
+    lines = [line.replace(f"A{separator}2{separator * 2}", f"A{separator}2{separator}5{separator}13") for line in lines]
+    lines = [f'"{line}"{separator * 3}' if line.startswith("#") else line for line in lines] + [separator * 3]
+    path.write_bytes("\r\n".join(lines).encode(encoding))
+    assert blind.read_sheet(path) == {"A": [blind.Played(2, 5, scoring.End.ROBOT_MISSED)], "B": []}
+
+
+def test_a_rally_that_counts_has_a_touch(tmp_path):
+    path = tmp_path / "sheet.csv"
+    path.write_text("code,rally,length,end\nA,1,0,14\nA,2,0,1\n")  # a dummy ball by hand; not counted
+    assert [p.length for p in blind.read_sheet(path)["A"]] == [0, 0]
+    path.write_text("code,rally,length,end\nA,1,0,13\n")
+    with pytest.raises(ConfigError, match="line 2: length 0: the human's first hit is 1"):
+        blind.read_sheet(path)

@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 from ballmodel.distribution import load_distribution
 from bgs import normalizer
 from experiments import checkpoint, cli, policy
+from experiments.errors import RunError
 from robot_io import artefact, contract
 
 ROOT = Path(__file__).parent.parent
@@ -212,3 +213,71 @@ def test_import_and_fit_human(tmp_path):
     np.testing.assert_allclose(box, [starts.min(axis=0), starts.max(axis=0)], atol=0.01)
     malformed = mjx_tt("import", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
     assert malformed.returncode == 1 and ".csv, .mcap" in malformed.stderr
+
+
+@pytest.mark.parametrize(
+    "command, given, says",
+    [
+        ("train", "study_quick.yaml", "the shipped study_quick.yaml is a study: `mjx-tt is2r study_quick.yaml`"),
+        ("is2r", "quickstart.yaml", "the shipped quickstart.yaml is an experiment: `mjx-tt train quickstart.yaml`"),
+        ("compare", "quickstart.yaml", "is an experiment: `mjx-tt train quickstart.yaml`; a comparison is wanted"),
+        ("train", "{shipped}/study_quick.yaml", "is a study, it has the key simulation: `mjx-tt is2r {shipped}/stu"),
+        ("train", "{shipped}/compare_quick.yaml", "is a comparison, it has the key algorithms: `mjx-tt compare"),
+        ("is2r", "{shipped}/compare_quick.yaml", "is a comparison, it has the key algorithms: `mjx-tt compare"),
+        ("is2r", "{shipped}/narrow.yaml", "is an experiment, it has the key balls: `mjx-tt train"),
+        ("compare", "{shipped}/study_full.yaml", "is a study, it has the key simulation: `mjx-tt is2r"),
+    ],
+)
+def test_a_file_of_another_command_is_told_from_a_wrong_one(command, given, says, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    shipped = ROOT / "experiments"
+    assert cli.main([command, given.format(shipped=shipped)]) == 1
+    said = capsys.readouterr().err
+    assert says.format(shipped=shipped) in said and len(said.splitlines()) == 1
+
+
+def test_a_key_without_a_name_is_refused(tmp_path, capsys):
+    path = tmp_path / "ok.yaml"
+    path.write_text("name: ok\nballs: narrow\n")
+    for override in (".=3", "training.=3", "=3"):
+        assert cli.main(["train", str(path), "--set", override]) == 1
+        assert f"--set {override}: needs the form dotted.path=value" in capsys.readouterr().err
+    path.write_text('name: ok\nballs: narrow\n"": 3\n')
+    assert cli.main(["train", str(path)]) == 1
+    assert f"{path}: unknown key ''; allowed: name, balls" in capsys.readouterr().err
+
+
+def test_a_long_value_is_cut(tmp_path, capsys):
+    path = tmp_path / "ok.yaml"
+    path.write_text(f"name: ok\nballs: narrow\ntraining: {{updates: {list(range(500))}}}\n")
+    assert cli.main(["train", str(path)]) == 1
+    said = capsys.readouterr().err
+    assert "training.updates: got [0, 1, 2" in said and " ...; allowed: a valid integer" in said and len(said) < 400
+
+
+def test_folders_around_runs_say_where_the_runs_are(tmp_path):
+    study = tmp_path / "study"
+    model, tuned = (study / "seed0" / "player3" / key for key in ("is2r-sim1", "is2r-ft35"))
+    chosen = model / "training" / "seed1"
+    for run in (model / "training" / "seed0", chosen, tuned):
+        run.mkdir(parents=True)
+        (run / "config.yaml").write_text("name: a\nballs: narrow\n")
+    (model / "selection.json").write_text('{"best": "training/seed1", "scores": {}}')
+    (tuned / "artefact").mkdir()
+    (tuned / "artefact" / "manifest.json").write_text("{}")
+    (study / "study.yaml").write_text("name: study\n")
+
+    def complaint(folder) -> str:
+        with pytest.raises(RunError, match="neither a run") as raised:
+            policy.load(folder)
+        return str(raised.value)
+
+    assert complaint(model).endswith(f"; of the trainings in it, {chosen} was chosen")
+    for folder in (study, study / "seed0", study / "seed0" / "player3"):
+        assert complaint(folder).endswith(f"; in it are {tuned}, {chosen}"), folder
+    assert complaint(model / "training").endswith(f"; in it are {model / 'training' / 'seed0'}, {chosen}")
+    (model / "selection.json").write_text("{")
+    assert str(model / "training" / "seed0") in complaint(model)
+    assert complaint(tmp_path / "nowhere").endswith("; there is no such folder")
+    (tmp_path / "empty").mkdir()
+    assert complaint(tmp_path / "empty").endswith("(holding manifest.json)")

@@ -115,6 +115,63 @@ def test_mistakes_in_a_study_are_named(changes, message):
         study(**changes)
 
 
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        (
+            {"evaluation": {"rallies": 80, "lanes": 7}},
+            "test: evaluation.rallies 80 is no multiple of its lanes 7 (evaluation.lanes); "
+            "the nearest that is allowed: 77 or 84",
+        ),
+        (
+            {"evaluation": {"rallies": 50, "lanes": 7}},
+            "test: evaluation.rallies 50 is no multiple of its lanes 7 (evaluation.lanes); "
+            "the nearest that is allowed: 56",
+        ),
+        (
+            {"ablation": {"player": "player4"}},
+            "test: ablation.player 'player4' is none of the players of this study; "
+            "allowed: player3, or no ablation at all (ablation: null)",
+        ),
+    ],
+)
+def test_a_mistake_across_keys_names_them_and_no_more(changes, text):
+    with pytest.raises(ConfigError) as raised:
+        study(**changes)
+    assert str(raised.value) == text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"robot": "rig", "recordings": {"player3": "nofile.csv"}}, "recordings.player3: nofile.csv: no such file"),
+        (
+            {"robot": "norobot.yaml", "recordings": {"player3": "nofile.csv"}},
+            "robot: norobot.yaml: cannot be read",
+        ),
+        ({"simulation": TINY["simulation"] | {"model": {"bal": {"x": 1.0}}}}, "simulation: model: .*'bal.x'"),
+        ({"ablation": {"player": "player3", "balls": ["wide"]}}, "ablation.balls: no distribution is called 'wide'"),
+    ],
+)
+def test_what_a_study_names_is_looked_up_before_it_begins(tmp_path, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        is2r.run(study(**changes), tmp_path / "tiny", quiet())
+    assert [path.name for path in (tmp_path / "tiny").iterdir()] == [".lock"]
+
+
+def test_a_start_that_came_to_no_step_does_not_block_another(tmp_path):
+    is2r._open(study(), tmp_path)
+    is2r._open(study(first_balls=61), tmp_path)
+    assert "first_balls: 61" in (tmp_path / is2r.SETTINGS).read_text()
+    Journal(tmp_path / "steps.jsonl").append(Step("seed0/player3/D0", "first balls", 1, (), (), lambda: ""), 1.0)
+    with pytest.raises(RunError, match="first_balls: the study has 61, now 62"):
+        is2r._open(study(first_balls=62), tmp_path)
+    for content in (b"[1]", b"\x80", b"{"):
+        (tmp_path / is2r.SESSIONS).write_bytes(content)
+        with pytest.raises((RunError, ConfigError), match="study.json"):
+            is2r._open(study(first_balls=61), tmp_path)
+
+
 def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_there():
     whole = study_config.load(study_config.shipped()["study_full"])
     for player in whole.players:

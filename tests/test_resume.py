@@ -18,8 +18,10 @@ import numpy as np
 import pytest
 
 from experiments import checkpoint
-from experiments.errors import CheckpointError
+from experiments.config import parse
+from experiments.errors import CheckpointError, RunError
 from experiments.metrics import MetricsLog, read
+from experiments.runs import Run
 
 ROOT = Path(__file__).parent.parent
 UPDATES = 300
@@ -212,3 +214,35 @@ def test_metrics_continue_after_the_checkpoint(tmp_path):
         {"update": 1, "loss": 1.0}, {"update": 2, "loss": 2.0}, {"update": 3, "loss": 30.0},
     ]  # fmt: skip
     assert len(list(board.glob("events.*"))) == 2
+
+
+def test_a_start_without_an_update_does_not_block_the_corrected_one(tmp_path):
+    """Until the first measurement or checkpoint the folder belongs to nobody; from then on it does."""
+    run = Run(tmp_path / "run")
+    wrong, right, third = (parse({"name": "a", "balls": balls}, "a.yaml") for balls in ("large", "narrow", "medium"))
+    run.open(wrong)
+    MetricsLog(run.metrics, run.tensorboard, 0).close()  # made before the first update
+    run.check(right)
+    run.open(right)
+    assert run.config() == right and len(json.loads((run.folder / "run.json").read_text())) == 2
+    run.metrics.write_text('{"update": 1}\n')
+    with pytest.raises(RunError, match="balls: the run has 'narrow', now 'medium'"):
+        run.open(third)
+    run.metrics.write_text("")
+    checkpoint.save(run.checkpoints, 1, state(1.0), {})
+    with pytest.raises(RunError, match="belongs to another configuration"):
+        run.check(third)
+    for path in run.checkpoints.iterdir():
+        path.unlink()
+    (run.folder / "journal.jsonl").write_text("{}\n")  # of a fine-tuning, whose balls a person has played
+    with pytest.raises(RunError, match="belongs to another configuration"):
+        run.check(third)
+
+
+def test_a_run_that_has_just_begun_keeps_its_configuration(tmp_path):
+    run = Run(tmp_path / "run")
+    mine, other = (parse({"name": "a", "balls": balls}, "a.yaml") for balls in ("narrow", "large"))
+    run.open(mine)
+    with run.locked(), pytest.raises(RunError, match="another process is training here"):
+        Run(run.folder).open(other)
+    assert run.config() == mine

@@ -8,6 +8,7 @@ import io
 import json
 import math
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from ballmodel import constants as c
 from ballmodel import players
 from experiments import cli
 from experiments.errors import ConfigError
-from experiments.study import claims, effects, heatmaps, scoring, statistics
+from experiments.study import claims, effects, heatmaps, scoring, statistics, tsne
 from experiments.study import data as study_data
 from experiments.study import paper as study_paper
 from experiments.study.claims import DIFFERENCE, HITS, RATIO, SHARE, judge
@@ -292,6 +293,120 @@ def test_a_study_that_has_just_begun_has_a_report(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match="is no study"):
         study_data.load(tmp_path / "empty")
+
+
+def test_a_folder_of_ordinary_trainings_is_no_study(tmp_path, capsys):
+    (tmp_path / "narrow" / "seed0").mkdir(parents=True)
+    (tmp_path / "narrow" / "seed0" / "config.yaml").write_text("name: narrow\nballs: narrow\n")
+    assert cli.main(["study-report", str(tmp_path / "narrow")]) == 1
+    said = capsys.readouterr().err
+    assert "neither study.yaml nor evaluations.csv" in said
+    assert f"mjx-tt evaluate {tmp_path / 'narrow' / 'seed0'}" in said
+    assert not (tmp_path / "narrow" / "report").exists()
+    with pytest.raises(ConfigError, match="no such folder"):
+        study_data.load(tmp_path / "nowhere")
+    (tmp_path / "study.yaml").write_text("name: begun\n")
+    with pytest.raises(ConfigError, match="nothing to report on yet"):
+        study_data.load(tmp_path)
+
+
+def test_rallies_that_no_figure_shows_are_named(tmp_path):
+    path, strange = tmp_path / "evaluations.csv", {(0, "anna", "player3", "mine"): [4, 5]}
+    scoring.write(path, rallies(strange | {(0, "player3", "player3", "is2r-ft100"): [6]}))
+    study = study_data.load(tmp_path)
+    missing = "; ".join(study.missing)
+    assert "rallies with trainer anna (known are player1, " in missing and "with model mine" in missing
+    assert "with evaluator" not in missing and study.rallies.length.tolist() == [6]
+    scoring.write(path, rallies(strange))  # then there is no figure at all
+    with pytest.raises(ConfigError, match="evaluations.csv: the figures have no place for any .* trainer anna"):
+        study_data.load(tmp_path)
+    path.write_text(path.read_text().replace("anna", ""))
+    with pytest.raises(ConfigError, match="evaluations.csv: line 2: column trainer: a name is wanted"):
+        study_data.load(tmp_path)
+
+
+DAMAGED = {  # file of a study: contents, what reads it
+    "study.yaml": ([b"name: [", b"\x80\x81", b"- a", b"a: 2026-99-99"], study_data.load),
+    "study.json": ([b"{", b"\xff\xfe", b"[1]"], study_data.load),
+    "seed0/player5/balls/human_M1.yaml": ([b"garbage", b"\x80", b"position: 3"], study_data.load),
+    "evaluations.csv": (
+        [b"\x80", b"seed\n", b"seed,trainer,evaluator,model,blind,rally,length,end\n0,a\n"], study_data.load
+    ),
+    "seed0/reality.yaml": ([b"{", b"\x80"], lambda folder: study_data.load(folder).realities),
+    "seed0/effects.csv": ([b"\x80", b"seed\n1\n"], lambda folder: study_data.load(folder).effects),
+    "calibration.json": (
+        [b"{", b"\x80", b"[]", b'{"numbers": 3}', b'{"medians": {"player1": {"M0": "x"}}}',
+         b'{"rallies": [{"player": "a"}]}'],
+        lambda folder: study_data.load(folder).calibration,
+    ),
+    "seed0/player5/is2r-ft35/metrics.jsonl": (
+        [b"\x80\x81\n", b'{"update": 1}\n{"upd\n{"update": 3}\n', b"3\n", b'{"return_rate": "a"}\n'],
+        lambda folder: study_data.load(folder).metrics(0, "player5", "is2r-ft35"),
+    ),
+    "evaluations/0_player5_player5_is2r-ft100.npz": (
+        [b"", b"garbage", b"PK\x03\x04 and no more"],
+        lambda folder: study_data.load(folder).log(0, "player5", "player5", "is2r-ft100"),
+    ),
+    "seed0/player5/balls/D1.csv": (
+        [b"\x80", b"t,x\n1,2\n"], lambda folder: tsne.trained(study_data.load(folder), 0, "player5", "D1")
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    return made_up_study.make(tmp_path_factory.mktemp("small"), names=("player5",), balls=6, cross=False)
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_damaged_file_is_named(small, tmp_path, name):
+    contents, read = DAMAGED[name]
+    folder = tmp_path / "study"
+    shutil.copytree(small, folder)
+    path = folder / name
+    whole = path.read_bytes() if path.exists() else json.dumps(CALIBRATION).encode()
+    for content in contents:
+        path.write_bytes(content)
+        with pytest.raises(ConfigError) as said:
+            read(folder)
+        assert str(said.value).startswith(str(path)), (content, str(said.value))
+        assert str(said.value).count(str(path)) == 1
+    path.write_bytes(whole)
+    assert read(folder) is not None or name.endswith("D1.csv")
+    for cut in (len(whole) // 3, len(whole) // 2) if name.endswith(".npz") else ():
+        path.write_bytes(whole[:cut])
+        with pytest.raises(ConfigError, match="cannot be read"):
+            read(folder)
+
+
+def test_a_damaged_file_ends_the_command_with_one_line(small, tmp_path, capsys):
+    folder = tmp_path / "study"
+    shutil.copytree(small, folder)
+    (folder / "study.yaml").write_bytes(b"\x80\x81")
+    assert cli.main(["study-report", str(folder)]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"mjx-tt: error: {folder / 'study.yaml'}: ") and len(said.splitlines()) == 1
+
+
+def test_a_line_that_is_being_written_is_left_out(small, tmp_path):
+    study = study_data.Study(tmp_path, {}, {}, scoring.join([]))
+    path = tmp_path / "seed0" / "player5" / "is2r-ft35" / "metrics.jsonl"
+    path.parent.mkdir(parents=True)
+    path.write_text('{"update": 1, "return_rate": 0.5}\n{"update": 2, "ret')
+    assert study.metrics(0, "player5", "is2r-ft35") == [{"update": 1, "return_rate": 0.5}]
+
+
+def test_a_log_with_arrays_of_other_shapes_is_named(small, tmp_path):
+    name = "0_player5_player5_is2r-ft100.npz"
+    with np.load(small / "evaluations" / name) as data:
+        arrays = dict(data)
+    (tmp_path / "evaluations").mkdir()
+    study = study_data.Study(tmp_path, {}, {}, scoring.join([]))
+    text = np.full(arrays["hit"].size, "a")
+    for array, wrong in (("touch", arrays["touch"][1:]), ("position", arrays["position"][:2]), ("hit", text)):
+        np.savez(tmp_path / "evaluations" / name, **arrays | {array: wrong})
+        with pytest.raises(ConfigError, match=f"array {array} is .* are wanted"):
+            study.log(0, "player5", "player5", "is2r-ft100")
 
 
 def test_a_log_without_an_array_is_named(whole, tmp_path):

@@ -11,17 +11,19 @@ from __future__ import annotations
 
 import base64
 import binascii
+import codecs
 import csv
 import hashlib
 import itertools
 import json
+import re
 import secrets
 import shutil
 import string
 import zlib
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,10 +31,15 @@ from ballmodel.files import replacing
 from experiments.errors import ConfigError
 from experiments.study import scoring
 
+if TYPE_CHECKING:
+    from robot_io.artefact import Artefact
+
 KEY, SHEET, POLICIES, OPENED, EVALUATIONS = "key.sealed", "sheet.csv", "policies", "key.json", "evaluations.csv"
 BEGUN = ".begun"  # while an evaluation is being made
 SHEET_COLUMNS = ("code", "rally", "length", "end")
+SEPARATORS = ",;\t"
 SPARE = 10  # lines of a sheet beyond the pool, for rallies that will be filtered
+_WHOLE = re.compile("[0-9]{1,9}")
 
 
 # The bijection and its seal
@@ -86,6 +93,15 @@ def unseal(path: Path) -> Any:
 
 
 @dataclass(frozen=True)
+class Played:
+    """A rally on the sheet: its number there, paddle touches, and how it ended."""
+
+    rally: int
+    length: int
+    end: scoring.End
+
+
+@dataclass(frozen=True)
 class Progress:
     """Rallies on the sheet under one code: played, and those that count."""
 
@@ -98,12 +114,15 @@ class Progress:
         return self.counted >= scoring.KEEP
 
 
-def make(folder: Path, policies: dict[str, Path], trainer: str, evaluator: str, seed: int = 0) -> tuple[str, ...]:
+def make(
+    folder: Path, policies: dict[str, Path], trainer: str, evaluator: str, seed: int = 0, twice: bool = False
+) -> tuple[str, ...]:
     """Copies policies to folder/policies/CODE, writes a blank sheet, seals the key; returns the codes in order of
     testing.
 
-    policies: model key to the folder of an artefact or of a run that was exported. Raises ConfigError for a folder that
-    is in use or a policy that is not whole.
+    policies: model key to the folder of an artefact or of a run that was exported; twice: the same policy may stand
+    under two keys. Raises ConfigError for a folder that is in use or policies that are the same, ArtefactError for one
+    that is not whole.
     """
     from robot_io import artefact
 
@@ -119,19 +138,53 @@ def make(folder: Path, policies: dict[str, Path], trainer: str, evaluator: str, 
             raise ConfigError(
                 f"{model}: {path} is no artefact and no run with one; export it with `mjx-tt export {path}`"
             )
-    digests = {model: artefact.load(path).digest for model, path in found.items()}
+    loaded = {model: artefact.load(path) for model, path in found.items()}
+    if not twice:
+        _check_different(loaded)
     key = draw(policies, np.random.default_rng())
     folder.mkdir(parents=True, exist_ok=True)
     if begun.exists():  # killed on the way: nobody has seen its codes
         shutil.rmtree(folder / POLICIES, ignore_errors=True)
     begun.touch()
-    for model, code in key.items():
-        shutil.copytree(found[model], folder / POLICIES / code)
-    content = {"codes": key, "digests": digests, "trainer": trainer, "evaluator": evaluator, "seed": seed}
+    digests = {model: _copy(loaded[model], folder / POLICIES / code) for model, code in key.items()}
+    content = {
+        "codes": key, "digests": digests, "originals": {model: a.digest for model, a in loaded.items()},
+        "trainer": trainer, "evaluator": evaluator, "seed": seed,
+    }  # fmt: skip
     blank_sheet(folder / SHEET, tuple(key.values()))
     seal(folder / KEY, content)
     begun.unlink()
     return tuple(key.values())
+
+
+def _check_different(loaded: dict[str, Artefact]) -> None:
+    """Raises ConfigError where two models are one policy, however often it was exported."""
+    models: dict[str, str] = {}
+    for model, policy in loaded.items():
+        numbers = (*policy.parameters.values(), policy.normaliser_mean, policy.normaliser_inverse_scale)
+        digest = hashlib.sha256(b"".join(a.tobytes() for a in numbers)).hexdigest()
+        if digest in models:
+            raise ConfigError(
+                f"{models[digest]} and {model}: are the same policy, {loaded[models[digest]].folder} and "
+                f"{policy.folder}; each policy once"
+            )
+        models[digest] = model
+
+
+def _copy(policy: Artefact, folder: Path) -> str:
+    """Copies an artefact without what its manifest tells of its origin; returns the copy's own digest.
+
+    Times of the files are those of the copy: the order in which policies were trained would tell them apart.
+    """
+    from robot_io import artefact
+
+    folder.mkdir(parents=True)
+    for name in artefact.HASHED_FILES:
+        shutil.copyfile(policy.folder / name, folder / name)
+    manifest = json.dumps(policy.manifest | {"provenance": {}, "written_with": {}}, indent=2, allow_nan=False).encode()
+    (folder / artefact.MANIFEST).write_bytes(manifest)
+    (folder / artefact.MANIFEST_DIGEST).write_bytes(artefact.digest_line(manifest))
+    return artefact.load(folder).digest
 
 
 def blank_sheet(path: Path, tested: tuple[str, ...], rallies: int = scoring.POOL + SPARE) -> None:
@@ -139,7 +192,7 @@ def blank_sheet(path: Path, tested: tuple[str, ...], rallies: int = scoring.POOL
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         for line in instructions():
             file.write(f"# {line}\n")
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(SHEET_COLUMNS)
         writer.writerows((code, rally, "", "") for code in tested for rally in range(1, rallies + 1))
 
@@ -148,7 +201,8 @@ def instructions() -> list[str]:
     """How to fill in a sheet, with the paper's table (Rally score evaluation and end-of-rally attribution)."""
     lines = [
         "One line a rally, in the order of play. length: paddle touches of human and robot together, the human's first",
-        "hit is 1. end: number of the row that says how the rally ended. Lines without a length are left out.",
+        "hit is 1; 0 only where a rally is not counted. end: number of the row that says how the rally ended.",
+        "Lines with neither length nor end are left out.",
     ]
     for number, (_, description, ended, filtered) in enumerate(scoring.ROWS, 1):
         who = (
@@ -160,38 +214,47 @@ def instructions() -> list[str]:
     return lines
 
 
-def read_sheet(path: Path) -> dict[str, tuple[list[int], list[int]]]:
-    """Lengths and ends of each code's rallies, in the order of their numbers. Raises ConfigError naming the line."""
-    played: dict[str, list[tuple[int, int, int]]] = {}
+def read_sheet(path: Path) -> dict[str, list[Played]]:
+    """Each code's rallies in the order of their numbers. Raises ConfigError naming the line.
+
+    Cells may be separated by commas, semicolons or tabs: what a spreadsheet writes depends on its country.
+    """
+    played: dict[str, list[Played]] = {}
+    content = Path(path).read_bytes()
+    encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+        lines = content.decode(encoding).splitlines()
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not readable as UTF-8: {error}") from None
-    rows = [
-        (number, line)
-        for number, line in enumerate(lines, 1)
-        if line.strip() and not line.lstrip().startswith(("#", '"#'))
-    ]
-    header = next(csv.reader([rows[0][1]])) if rows else []
-    if tuple(name.strip() for name in header[:4]) != SHEET_COLUMNS:
-        raise ConfigError(f"{path}: the first line must be {','.join(SHEET_COLUMNS)}, got {','.join(header)}")
-    for number, line in rows[1:]:
-        code, rally, length, end = ([cell.strip() for cell in next(csv.reader([line]))] + [""] * 4)[:4]
+    lines = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith(("#", '"#'))]
+    head = lines[0][1] if lines else ""
+    separator = next((s for s in SEPARATORS if tuple(_cells(head, s)[:4]) == SHEET_COLUMNS), None)
+    if separator is None:
+        raise ConfigError(f"{path}: the first line must be {','.join(SHEET_COLUMNS)}, got {head.strip()}")
+    for number, line in lines[1:]:
+        cells = _cells(line, separator)
+        code, rally, length, end = (cells + [""] * 4)[:4]
         where = f"{path}: line {number}"
-        played.setdefault(code, [])
+        if not any(cells):
+            continue
+        rallies = played.setdefault(code, [])
         if not length and not end:
             continue
-        if not rally.isdigit() or not length.isdigit():
+        if not _WHOLE.fullmatch(rally) or not _WHOLE.fullmatch(length):
             raise ConfigError(f"{where}: rally and length are whole numbers, got {rally!r} and {length!r}")
+        if any(p.rally == int(rally) for p in rallies):
+            raise ConfigError(f"{where}: rally {rally} of {code} is there twice")
         try:
-            played[code].append((int(rally), int(length), int(scoring.end_of(end))))
+            rallies.append(Played(int(rally), int(length), scoring.end_of(end)))
         except ValueError as error:
             raise ConfigError(f"{where}: end: {error}") from None
-        if played[code].count(played[code][-1]) > 1 or [r for r, *_ in played[code]].count(int(rally)) > 1:
-            raise ConfigError(f"{where}: rally {rally} of {code} is there twice")
-    return {
-        code: ([length for _, length, _ in sorted(p)], [end for *_, end in sorted(p)]) for code, p in played.items()
-    }
+        if not rallies[-1].length and rallies[-1].end not in scoring.FILTERED:
+            raise ConfigError(f"{where}: length 0: the human's first hit is 1, and a rally with end {end} counts")
+    return {code: sorted(rallies, key=lambda p: p.rally) for code, rallies in played.items()}
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
 
 
 def progress(folder: Path) -> list[Progress]:
@@ -206,8 +269,8 @@ def progress(folder: Path) -> list[Progress]:
         raise ConfigError(f"{folder / SHEET}: code {', '.join(unknown)} is unknown; there are {', '.join(tested)}")
     out = []
     for code in tested:
-        _, end = sheet.get(code, ([], []))
-        out.append(Progress(code, len(end), sum(scoring.End(e) not in scoring.FILTERED for e in end)))
+        played = sheet.get(code, [])
+        out.append(Progress(code, len(played), sum(p.end not in scoring.FILTERED for p in played)))
     return out
 
 
@@ -231,7 +294,9 @@ def open_key(folder: Path) -> scoring.Rallies:
     for model, code in key["codes"].items():
         if artefact.load(folder / POLICIES / code).digest != key["digests"][model]:
             raise ConfigError(f"{folder / POLICIES / code}: is not the policy that was sealed under this code")
-        parts.append(scoring.scored(key["seed"], key["trainer"], key["evaluator"], model, code, *sheet[code]))
+        rally, length, end = (np.array(column, int) for column in zip(*map(astuple, sheet[code])))
+        one = scoring.scored(key["seed"], key["trainer"], key["evaluator"], model, code, length, end)
+        parts.append(replace(one, rally=rally))
     rallies = scoring.join(parts)
     scoring.write(folder / EVALUATIONS, rallies)
     with replacing(folder / OPENED) as temporary:

@@ -41,7 +41,11 @@ def make(folder: Path, given: list[str], trainer: str, evaluator: str, seed: int
         policies[model] = Path(path)
     if len(policies) < 2:
         raise ConfigError(f"blind make needs at least two policies, got {len(policies)}")
-    folder.mkdir(parents=True, exist_ok=True)
+    if not trainer:
+        raise ConfigError(
+            "blind make needs --trainer, who trained the policies: for a study's report the player in whose place, "
+            "such as --trainer player3; --evaluator is the trainer where it is left out"
+        )
     codes = blind.make(folder, policies, trainer, evaluator, seed)
     console.print(
         f"{len(codes)} policies under {folder / blind.POLICIES}, to be tested in this order: {' '.join(codes)}",

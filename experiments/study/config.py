@@ -20,6 +20,7 @@ from experiments.finetune_settings import parse as parse_fine_tuning
 
 PLAYERS = ("player1", "player2", "player3", "player4", "player5")
 EFFECTS = ("rubber", "table", "magnus", "spin", "noise", "latency", "camera", "drives", "encoders")
+FEWEST_RALLIES = 50  # of each model that are reported
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
@@ -76,7 +77,7 @@ class Ablation(Section):
 class Evaluation(Section):
     """Rallies of every model with its own player and with others."""
 
-    rallies: Annotated[int, Field(ge=50)] = 80
+    rallies: Annotated[int, Field(ge=FEWEST_RALLIES)] = 80
     """Played by each player with each model; what is left after filtering is cut to the top 60, then to the top 50."""
     lanes: Count = 8
     """Sessions side by side into which these rallies are divided."""
@@ -115,22 +116,31 @@ class Study(Section):
     @classmethod
     def _different(cls, value: list) -> list:
         if len(set(value)) < len(value):
-            raise ValueError(f"different entries, got {value}")
+            raise ValueError("different entries")
         return value
 
     @model_validator(mode="after")
     def _complete(self) -> Study:
         if self.ablation and self.ablation.player not in self.players:
             raise ValueError(
-                f"ablation.player {self.ablation.player!r} to be one of the players {self.players}, or ablation: null"
+                f"ablation.player {self.ablation.player!r} is none of the players of this study; "
+                f"allowed: {', '.join(self.players)}, or no ablation at all (ablation: null)"
             )
-        if self.evaluation.rallies % self.evaluation.lanes:
+        rallies, lanes = self.evaluation.rallies, self.evaluation.lanes
+        if rallies % lanes:
+            more = lanes * (rallies // lanes + 1)
+            near = f"{more - lanes} or {more}" if more - lanes >= FEWEST_RALLIES else more
             raise ValueError(
-                f"evaluation.rallies {self.evaluation.rallies} to be a multiple of its lanes {self.evaluation.lanes}"
+                f"evaluation.rallies {rallies} is no multiple of its lanes {lanes} (evaluation.lanes); "
+                f"the nearest that is allowed: {near}"
             )
         missing = [player for player in self.players if player not in self.recordings]
         if self.robot is not None and missing:
-            raise ValueError(f"with a robot, recordings of the first balls of {', '.join(missing)}")
+            files = ", ".join(f"{player}: FILE" for player in missing)
+            raise ValueError(
+                f"with a robot, recordings of the first balls of {', '.join(missing)} are needed: "
+                f"recordings: {{{files}}}, files that `mjx-tt fit-human` reads"
+            )
         return self
 
     def to_dict(self) -> dict[str, Any]:

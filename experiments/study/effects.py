@@ -64,17 +64,21 @@ def write(path: Path, outcomes: list[Outcome]) -> None:
 
 def read(path: Path) -> list[Outcome]:
     """What ``write`` wrote. Raises ConfigError naming file and line."""
-    with open(path, newline="", encoding="utf-8") as file:
-        out = []
-        for number, row in enumerate(csv.DictReader(file), 2):
-            try:
-                out.append(
-                    Outcome(
-                        int(row["seed"]), row["player"], row["model"], row["without"], int(row["rallies"]),
-                        float(row["length"]),
-                    )  # fmt: skip
-                )
-            except (KeyError, TypeError, ValueError) as error:
-                raise ConfigError(f"{path}: line {number}: {row}: {error!r}; wanted are "
-                                  f"{', '.join(f.name for f in fields(Outcome))}") from None  # fmt: skip
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: not readable as CSV in UTF-8: {error}") from None
+    out = []
+    for number, row in enumerate(rows, 2):
+        try:
+            out.append(
+                Outcome(
+                    int(row["seed"]), row["player"], row["model"], row["without"], int(row["rallies"]),
+                    float(row["length"]),
+                )  # fmt: skip
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigError(f"{path}: line {number}: {row}: {error!r}; wanted are "
+                              f"{', '.join(f.name for f in fields(Outcome))}") from None  # fmt: skip
     return out

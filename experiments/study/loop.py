@@ -294,12 +294,15 @@ class Loop:
 def run(study: Study, folder: Path, console: Console) -> bool:
     """Does, or goes on with, a study in ``folder``, up to its report; False when it waits for people.
 
-    Raises RunError for a folder of another study, naming the differences, and what the steps raise.
+    Raises RunError for a folder of another study, naming the differences, ConfigError for what the study names and is
+    not there, and what the steps raise.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with Run(folder).locked():
-        _open(study, folder)
+        if not Journal(folder / JOURNAL).entries:  # later on, what is no longer read may be gone
+            look_up(study)
         loop = Loop(study, folder, console)
+        _open(study, folder)
         try:
             run_all(loop.steps(), Journal(folder / JOURNAL), console)
         except Waiting as waiting:
@@ -318,15 +321,36 @@ def run(study: Study, folder: Path, console: Console) -> bool:
     return True
 
 
+def look_up(study: Study) -> None:
+    """Raises ConfigError for what a study names and is not there, before hours are spent on its first steps."""
+    for balls in study.ablation.balls if study.ablation else ():
+        build.distribution(balls, "ablation.balls")
+    for item in items(study, study.players[0]):
+        if isinstance(item, Simulated) and item.source is None:
+            build.experiment(training.configuration(study, item, "narrow", None, 0), "simulation")
+    if study.robot is not None:
+        from experiments.study.robot import look_up as look_up_robot
+
+        look_up_robot(study)
+
+
 def _open(study: Study, folder: Path) -> None:
-    """Records what the study is and this session, or checks that it is the one that is asked for."""
+    """Records what the study is and this session, or checks that it is the one that is asked for.
+
+    Where no step is done yet there is nothing that belongs to another study.
+    """
     path = folder / SETTINGS
-    if path.exists():
-        found = parse(read_yaml(path.read_text(encoding="utf-8"), str(path)), str(path))
+    if path.exists() and Journal(folder / JOURNAL).entries:
+        found = parse(read_yaml(checked(str(path), path.read_text, "utf-8"), str(path)), str(path))
         changed = runs.differences(found.to_dict(), study.to_dict(), CHANGEABLE.__contains__, "study")
         if changed:
             raise RunError(f"{folder}: is another study:\n{changed}\nRestore these values or choose another --out")
     runs.write_yaml(path, study.to_dict())
     sessions = folder / SESSIONS
-    before = read_yaml(sessions.read_text(encoding="utf-8"), str(sessions)) if sessions.exists() else {"sessions": []}
-    runs.write_json(sessions, {"sessions": [*before["sessions"], runs.provenance()]})
+    before = []
+    if sessions.exists():
+        found = read_yaml(checked(str(sessions), sessions.read_text, "utf-8"), str(sessions))
+        before = found.get("sessions") if isinstance(found, dict) else None
+        if not isinstance(before, list):
+            raise RunError(f"{sessions}: holds no list of sessions; restore the file or remove it")
+    runs.write_json(sessions, {"sessions": [*before, runs.provenance()]})

@@ -15,15 +15,36 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from ballmodel.importers import read
 from ballmodel.trajectory import Dataset
-from experiments import build, finetune, finish, measurements, play, policy
-from experiments.errors import ConfigError
+from experiments import build, finetune, finish, measurements, play, policy, robots
+from experiments.errors import ConfigError, checked
 from experiments.finetune_robot import LockStepRobot
 from experiments.policy import Policy
 from experiments.runs import Run
 from experiments.study import blind, scoring
 from experiments.study.config import Study
 from experiments.study.steps import Step, Waiting
+
+
+def look_up(study: Study) -> None:
+    """Raises ConfigError where the robot's YAML or a recording is missing or cannot be read."""
+    if study.robot not in (play.RIG, play.LOCK_STEP):
+        try:
+            robots.load_robot(study.robot)
+        except ConfigError as error:
+            raise ConfigError(f"robot: {error}") from None
+    for player in study.players:
+        recording(study, player)
+
+
+def recording(study: Study, player: str) -> Dataset:
+    """What was recorded of a player before the study. Raises ConfigError naming the key and what is wrong."""
+    where, path = f"recordings.{player}", study.recordings[player]
+    measured = checked(where, read, path)
+    if not isinstance(measured, Dataset):
+        raise ConfigError(f"{where}: {path} holds start states; measured trajectories are needed")
+    return measured
 
 
 class RobotWorld:
@@ -33,14 +54,12 @@ class RobotWorld:
         self._study, self._console = study, console
 
     def first_balls(self, player: str, name: str) -> Dataset:
-        """What was recorded of the player before the study. Raises ConfigError for start states instead of tracks."""
-        path = self._study.recordings[player]
-        measured = measurements.read_all([path], None)
-        if not isinstance(measured, Dataset):
-            raise ConfigError(f"recordings.{player}: {path} holds start states; measured trajectories are needed")
+        """What was recorded of the player before the study. Raises ConfigError as ``recording`` does."""
+        measured = recording(self._study, player)
         # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
         label = name.rsplit("/", 1)[-1]
-        return Dataset(tuple(replace(t, session=label, name=str(i)) for i, t in enumerate(measured)), path)
+        tracks = tuple(replace(t, session=label, name=str(i)) for i, t in enumerate(measured))
+        return Dataset(tracks, self._study.recordings[player])
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         """``mjx-tt finetune``; raises Waiting when the operator stopped it."""
@@ -120,15 +139,19 @@ def blind_steps(
             blind.progress(folder)
         elif not (folder / blind.KEY).exists():
             policies = {model: exported(policy.load(run()), console) for model, run in runs_of.items()}
-            codes = blind.make(folder, policies, trainer, evaluator, seed)
+            # The ablation's oracle is a model of the loop under a second name.
+            codes = blind.make(folder, policies, trainer, evaluator, seed, twice=True)
             return f"{len(codes)} policies as {', '.join(codes)}"
         return "policies under code names"
 
     def count() -> str:
         left = [f"{p.code} has {p.counted} of {scoring.KEEP}" for p in blind.progress(folder) if not p.complete]
         if left:
+            # A copy under a code name does not say on which balls it was trained, and the rig throws those.
+            thrown = f" --distribution {evaluator}/M0" if robot == play.RIG else ""
             raise Waiting(
-                f"{name}: {evaluator} plays rallies with `mjx-tt run {folder / blind.POLICIES}/CODE --robot {robot}` and "
+                f"{name}: {evaluator} plays rallies with "
+                f"`mjx-tt run {folder / blind.POLICIES}/CODE --robot {robot}{thrown}` and "
                 f"writes each down in {sheet}; rallies that count: {', '.join(left)}. Then the same command continues"
             )
         return f"{len(blind.open_key(folder)):,} rallies"

@@ -8,6 +8,7 @@ only if the 60 are the first in the order of play, so that is how they are read 
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -145,13 +146,14 @@ def read(path: Path) -> Rallies:
                 where = f"{path}: line {reader.line_num}"
                 group = (
                     _whole(row, "seed", where),
-                    *(row[name] for name in ("trainer", "evaluator", "model", "blind")),
+                    *(_name(row, name, where) for name in ("trainer", "evaluator", "model")),
+                    row["blind"] or "",
                 )
                 try:
-                    end = End[row["end"].strip().upper()]
+                    end = End[(row["end"] or "").strip().upper()]
                 except KeyError:
                     names = ", ".join(e.name.lower() for e in End)
-                    raise ConfigError(f"{where}: column end: {row['end']!r} is none of {names}") from None
+                    raise ConfigError(f"{where}: column end: {row['end'] or ''!r} is none of {names}") from None
                 played = (_whole(row, "rally", where), _whole(row, "length", where), end)
                 evaluations.setdefault(group, []).append(played)
     except (UnicodeDecodeError, csv.Error) as error:
@@ -164,8 +166,14 @@ def read(path: Path) -> Rallies:
     return join(parts)
 
 
-def _whole(row: dict, name: str, where: str) -> int:
-    text = (row[name] or "").strip()
-    if not text.isdigit():
-        raise ConfigError(f"{where}: column {name}: a whole number of at least 0 is wanted, got {text!r}")
+def _name(row: dict, column: str, where: str) -> str:
+    if not row[column]:
+        raise ConfigError(f"{where}: column {column}: a name is wanted, got nothing")
+    return row[column]
+
+
+def _whole(row: dict, column: str, where: str) -> int:
+    text = (row[column] or "").strip()
+    if not re.fullmatch("[0-9]{1,9}", text):
+        raise ConfigError(f"{where}: column {column}: a whole number from 0 to 999999999 is wanted, got {text!r}")
     return int(text)

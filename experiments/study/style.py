@@ -48,11 +48,13 @@ def colour(key: str) -> tuple[float, float, float]:
 
 
 def level_label(name: str) -> str:
+    """A skill level, or all, with its players, for titles."""
     chosen = of_level(name)
     return f"{name.capitalize()}: player{'s' if len(chosen) > 1 else ''} {', '.join(p[-1] for p in chosen)}"
 
 
 def player_label(name: str) -> str:
+    """A player with the skill level, for titles."""
     return f"player {name[-1]} ({level(name)})"
 
 
@@ -64,7 +66,7 @@ def boxes(
     log: bool = False,
     labelled: bool = True,
 ) -> None:
-    """Box plots of models; the paper's form."""
+    """Box plots of models in the paper's form. samples: (n,) rally lengths of each key, empty where there are none."""
     for k, (values, key) in enumerate(zip(samples, keys)):
         if not values.size:
             continue
@@ -94,7 +96,7 @@ def boxes(
 def bars(
     axes: Axes, intervals: Sequence[Interval | None], keys: Sequence[str], ylabel: str, labelled: bool = True
 ) -> None:
-    """Bars of models with their intervals."""
+    """Bars of models with their intervals; None for a model that the study lacks."""
     for k, (interval, key) in enumerate(zip(intervals, keys)):
         bar(axes, k, interval, colour(key), 0.7)
     model_ticks(axes, keys, labelled)
@@ -104,6 +106,7 @@ def bars(
 
 
 def bar(axes: Axes, at: float, interval: Interval | None, shade, width: float, hatch=None) -> None:
+    """One bar with its interval at ``at`` on the x axis, ``width`` in its units; nothing for None."""
     if interval is None:
         return
     axes.bar(at, interval.value, width, color=shade, hatch=hatch, edgecolor="white" if hatch else None, linewidth=0)
@@ -137,6 +140,7 @@ def forest(axes: Axes, intervals: Sequence[Interval | None], labels: Sequence[st
 
 
 def model_ticks(axes: Axes, keys: Sequence[str], labelled: bool) -> None:
+    """A tick for every model at 0, 1, 2 ...; slanted where there are many."""
     names = [SHORT.get(k, k) if len(keys) <= 4 else k for k in keys] if labelled else [""] * len(keys)
     if len(keys) > 4:
         axes.set_xticks(range(len(keys)), names, rotation=45, ha="right", fontsize=8)
@@ -146,31 +150,36 @@ def model_ticks(axes: Axes, keys: Sequence[str], labelled: bool) -> None:
 
 
 def note_empty(axes: Axes, filled: bool | None = None) -> None:
+    """Says that the study has nothing to draw; None: where nothing was drawn."""
     if not (axes.has_data() if filled is None else filled):
         axes.text(0.5, 0.5, "not in this study", transform=axes.transAxes, ha="center", color=FAINT)
 
 
 def patches(keys: Sequence[str]) -> list[Patch]:
+    """Entries of a legend, a model each."""
     return [Patch(facecolor=colour(key), label=SHORT.get(key, BY_KEY[key].label)) for key in keys]
 
 
 def lengths(boot: Bootstrap, key: str, group: str) -> np.ndarray:
-    """What a bootstrap holds of a model with its own trainers of a group."""
+    """(n,) rally lengths of a model with its own trainers of a group: touches, or what the bootstrap made of them."""
     chosen = of_level(group)
     found = [v for cell, v in boot.cells.items() if cell[3] == key and cell[1] in chosen and cell[1] == cell[2]]
     return np.concatenate(found) if found else np.zeros(0)
 
 
 def of_player(boot: Bootstrap, player: str, key: str) -> np.ndarray:
+    """(n,) rally lengths of a model with one trainer, who also evaluates it."""
     found = [v for cell, v in boot.cells.items() if cell[1:] == (player, player, key)]
     return np.concatenate(found) if found else np.zeros(0)
 
 
 def mean_of(boot: Bootstrap, key: str, group: str) -> Interval | None:
+    """Mean rally length of a model over the trainers of a group; None without rallies."""
     return interval_of(boot.mean(key, of_level(group)))
 
 
 def evaluated(boot: Bootstrap, trainer: str, evaluator: str, key: str) -> Interval | None:
+    """Mean rally length of a trainer's model with an evaluator; None without rallies."""
     return interval_of(boot.evaluated(key, trainer, evaluator))
 
 
@@ -180,4 +189,5 @@ def has(boot: Bootstrap, keys: Sequence[str]) -> bool:
 
 
 def interval_of(estimate) -> Interval | None:
+    """The interval of an estimate, if there is one."""
     return None if estimate is None else estimate.interval

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.errors import checked
 from experiments.study.data import DATASETS, Study
 from experiments.study.paper import IS2R, S2R
 from experiments.study.style import COLOUR, player_label, styled
@@ -63,7 +64,10 @@ def embed(study: Study, player: str, seed: int) -> Plane | None:
 
 
 def trained(study: Study, seed: int, player: str, name: str) -> np.ndarray | None:
-    """(8, n) of the measured balls of D0, or of what D1 and D2 add, fitted as the human model is; None without any."""
+    """(8, n) of the measured balls of D0, or of what D1 and D2 add, fitted as the human model is; None without any.
+
+    Raises ConfigError for a file that cannot be read.
+    """
     from ballmodel.flight import ball_params
     from ballmodel.human import fit_human
     from ballmodel.importers.csv_file import read_csv
@@ -71,7 +75,7 @@ def trained(study: Study, seed: int, player: str, name: str) -> np.ndarray | Non
     path = study.trajectories(seed, player, name)
     if path is None:
         return None
-    data = read_csv(path)
+    data = checked("", read_csv, path)
     keep = np.random.default_rng(0).permutation(len(data.trajectories))[:MOST]
     try:
         _, report = fit_human(
