@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -213,15 +214,17 @@ class Config(Section):
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
     """Reads one experiment; ``overrides`` are "dotted.path=value" with the value in YAML.
 
-    Relative paths in the file are relative to its folder. Raises ConfigError.
+    Relative paths in the file are relative to its folder, those of overrides to the current one. Raises ConfigError.
     """
     path = Path(path)
-    data = read_mapping(path, overrides, "an experiment", Config, shipped())
+    return parse(read_mapping(path, overrides, "an experiment", Config, shipped(), _absolute), str(path))
+
+
+def _absolute(data: dict[str, Any], folder: Path) -> None:
     for key in ("balls", "model", "initial_policy"):
         value = data.get(key)
         if isinstance(value, str) and (key != "balls" or Path(value).suffix in (".yaml", ".yml")):
-            data[key] = str((path.parent / value).resolve())
-    return parse(data, str(path))
+            data[key] = str((folder / value).resolve())
 
 
 def parse(data: dict[str, Any], where: str) -> Config:
@@ -266,11 +269,13 @@ def apply_override(data: dict[str, Any], override: str) -> None:
 
 
 def read_mapping(
-    path: Path, overrides: tuple[str, ...], what: str, section: type[Section], shipped: dict[str, Path]
-) -> dict[str, Any]:
+    path: Path, overrides: tuple[str, ...], what: str, section: type[Section], shipped: dict[str, Path],
+    absolute: Callable[[dict[str, Any], Path], None],
+) -> dict[str, Any]:  # fmt: skip
     """The keys of ``section`` that the file and the overrides "dotted.path=value" give; not checked. Raises ConfigError.
 
-    what: "an experiment" or the like and ``shipped``: those that come with the program, for messages.
+    what: "an experiment" or the like and ``shipped``: those that come with the program, for messages. absolute: makes the
+    relative paths in the data absolute, given the folder to which they are relative.
     """
     try:
         text = path.read_text(encoding="utf-8")
@@ -279,8 +284,10 @@ def read_mapping(
     data = read_yaml(text, str(path))
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: {what} is a mapping with the keys {', '.join(section.model_fields)}")
+    absolute(data, path.parent)
     for override in overrides:
         apply_override(data, override)
+    absolute(data, Path.cwd())
     other = None if _KINDS[what][1] in data else _kind(data)
     if other is not None:
         command, key = _KINDS[other]

@@ -47,7 +47,7 @@ def rig_for(artefact: artefacts.Artefact, balls: str | None, params_path: str | 
     from mjx_tt.model import SimModel
 
     chosen = balls or _trained_on(artefact)
-    distribution = build.distribution(chosen, "--balls")
+    distribution = build.distribution(chosen, "--distribution")
     throws = robots.throws_of(distribution, SimModel(), THROWS, seed)
     return Rig(scene(), throws, robots.load_rig(params_path))
 
@@ -55,7 +55,7 @@ def rig_for(artefact: artefacts.Artefact, balls: str | None, params_path: str | 
 def _trained_on(artefact: artefacts.Artefact):
     config = (artefact.manifest.get("provenance") or {}).get("config") or {}
     if "balls" not in config:
-        raise ConfigError(f"{artefact.folder}: does not say on which balls it was trained; name some with --balls")
+        raise ConfigError(f"{artefact.folder}: does not say on which balls it was trained; name some with --distribution")
     return config["balls"]
 
 
@@ -369,7 +369,7 @@ def rig(balls: str, rig_params: str | None, seed: int, ports: tuple[int, ...], o
     from experiments import build
     from mjx_tt.model import SimModel
 
-    throws = robots.throws_of(build.distribution(balls, "--balls"), SimModel(), THROWS, seed)
+    throws = robots.throws_of(build.distribution(balls, "--distribution"), SimModel(), THROWS, seed)
     chosen = Ports(ports[0], ports[1], (ports[2], ports[3]))
     keys = {
         "o": ("switch_on", "switch the arm on"), "b": ("throw", "throw balls, or stop"), "e": ("motors_off", "emergency stop"),

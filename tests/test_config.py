@@ -173,6 +173,18 @@ def test_defaults_are_those_of_the_task_and_weights_follow_the_terms():
     assert dict(zip(rewards.TERMS, changed)) == rewards.REAL_WEIGHTS | {"style": 2.5}
 
 
+def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_current_folder(tmp_path, monkeypatch):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    file = tmp_path / "there" / "a.yaml"
+    file.write_text("name: a\nballs: balls.yaml\nmodel: m.yaml\n")
+    read = config.load(file, ("model=n.yaml", "initial_policy=runs/b"))
+    assert read.balls == str(tmp_path / "there" / "balls.yaml")
+    assert read.model == str(tmp_path / "here" / "n.yaml")
+    assert read.initial_policy == str(tmp_path / "here" / "runs" / "b")
+
+
 def test_paper_settings_are_the_papers():
     """The table of hyper-parameters in the paper's appendix."""
     bgs = build.experiment(config.load(config.shipped()["paper"]), "paper").bgs

@@ -168,14 +168,11 @@ class Comparison(Section):
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comparison, Config]:
     """Reads a comparison and the experiment that it names; ``overrides`` are "dotted.path=value" with the value in YAML.
 
-    Relative paths in the file are relative to its folder; an experiment that is not there is looked up among the
-    shipped ones. Raises ConfigError.
+    Relative paths in the file are relative to its folder, those of overrides to the current one; an experiment that is
+    not there is looked up among the shipped ones. Raises ConfigError.
     """
     path = Path(path)
-    data = config.read_mapping(path, overrides, "a comparison", Comparison, shipped())
-    for key in ("experiment", "reality"):
-        if isinstance(data.get(key), str):
-            data[key] = str((path.parent / data[key]).resolve())
+    data = config.read_mapping(path, overrides, "a comparison", Comparison, shipped(), _absolute)
     try:
         comparison = Comparison.model_validate(data)
     except ValidationError as error:
@@ -186,6 +183,12 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comp
             f"{path}: experiment: training.later_rewards: a comparison has one set of reward weights; null"
         )
     return comparison, experiment
+
+
+def _absolute(data: dict[str, Any], folder: Path) -> None:
+    for key in ("experiment", "reality"):
+        if isinstance(data.get(key), str):
+            data[key] = str((folder / data[key]).resolve())
 
 
 def shipped() -> dict[str, Path]:

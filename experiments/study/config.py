@@ -149,14 +149,19 @@ class Study(Section):
 
 
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Study:
-    """Reads a study; ``overrides`` are "dotted.path=value". Relative paths are relative to the file. Raises ConfigError."""
+    """Reads a study; ``overrides`` are "dotted.path=value".
+
+    Relative paths in the file are relative to its folder, those of overrides to the current one. Raises ConfigError.
+    """
     path = Path(path)
-    data = read_mapping(path, overrides, "a study", Study, shipped())
+    return parse(read_mapping(path, overrides, "a study", Study, shipped(), _absolute), str(path))
+
+
+def _absolute(data: dict[str, Any], folder: Path) -> None:
     if isinstance(data.get("robot"), str) and data["robot"] not in ("rig", "lockstep"):
-        data["robot"] = str((path.parent / data["robot"]).resolve())
+        data["robot"] = str((folder / data["robot"]).resolve())
     if isinstance(data.get("recordings"), dict):
-        data["recordings"] = {k: str((path.parent / str(v)).resolve()) for k, v in data["recordings"].items()}
-    return parse(data, str(path))
+        data["recordings"] = {k: str((folder / str(v)).resolve()) for k, v in data["recordings"].items()}
 
 
 def parse(data: dict[str, Any], where: str) -> Study:
