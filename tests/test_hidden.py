@@ -423,7 +423,13 @@ FIXED = [
     (Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",)),
     (Case("invented", ("air_jet",), 20.0, "iid", 17, count=200), ("flagged",)),
     (Case("deleted", ("table_friction",), 20.0, "iid", 18, without=("table_friction",), count=200), ("flagged",)),
+    # Its exact twins were cleared by an instrument.
+    (
+        Case("single", ("air_density",), 20.0, "iid", 21, ("drag_coefficient", "ball_mass", "ball_radius"), 200),
+        ("right",),
+    ),
     (Case("robot", ("joint_2.lag",), 0.0, "iid", 19), ("right",)),
+    (Case("unexcited", ("joint_3.acceleration_limit",), 0.0, "iid", 22), ("right",)),
     (Case("robot_none", (), 0.0, "iid", 20), ("right",)),
 ]
 
@@ -432,3 +438,4 @@ FIXED = [
 def test_hidden_cases(case, accepted, tmp_path):
     record = exam.examine(case, tmp_path)
     assert record["outcome"] in accepted, record
+    assert record.get("declared", True), "what the log does not show is said"

@@ -135,7 +135,7 @@ def _diagnose(
     if "magnus" in gone and model.ball.flight.magnus_coefficient == 0.0:
         gone |= {"magnus_coefficient", "spin_decay"}  # without the force the nominal model has no use for either
     fitted = tuple(e for e in EFFECTS if e.fit and e.group != AT_THE_PADDLE and not (e.needs_spin and e.name in gone))
-    left_out = tuple(i for i, e in enumerate(fitted) if e.name in gone)
+    left_out = tuple(i for i, e in enumerate(fitted) if e.gone(gone))
     mode = "never" if spin == "none" and "magnus" in gone else spin
     names = list(dict.fromkeys(t.session for t in kept))
     sessions = np.array([names.index(t.session) for t in kept])

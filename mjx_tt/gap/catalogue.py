@@ -50,6 +50,10 @@ class Effect:
     needs_spin: bool = False  # shows only on balls that spin
     fit: bool = True  # False: not a shift of the path, found by other means
 
+    def gone(self, without) -> bool:
+        """Whether nothing is left of the entry when these names are left out: neither its own nor a twin's."""
+        return all(name in without for name in (self.name, *(t.name for t in self.twins)))
+
     def values(self, nominal: Values, change) -> dict:
         """Values of the leaves that express a change (a number or an array)."""
         if self.express is not None:

@@ -114,6 +114,7 @@ def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdic
             causes = [c for c in causes if c.name in found.survivors]
             kept = {path for c in causes for path in c.parameters}
             values, ranges = {k: v for k, v in values.items() if k in kept}, [r for r in ranges if r.path in kept]
+        causes = [_standing_in(cause, without, values, ranges) for cause in causes]
         hidden, excited = _unseen(found, hits, without)
         if hits is not None:
             for cause, change, ends in _hit_causes(found, hits):
@@ -276,6 +277,25 @@ def _twin(effect: Effect, twin, nominal, theta, low, high) -> Estimate:
         return float(twin.of(nominal[twin.path], ratio))
 
     return Estimate(float(nominal[twin.path]), of(theta), *sorted((of(low), of(high))), twin.unit)
+
+
+def _standing_in(cause: Cause, without, values: dict, ranges: list[Range]) -> Cause:
+    """The cause under the name of its first twin, where its own is left out: what was fitted is the same.
+
+    values, ranges: of the extended model; the twin's parameter takes the place of the entry's own.
+    """
+    effect = BY_NAME.get(cause.name)
+    twin = next((t for t in effect.twins if t.name not in without), None) if effect else None
+    if twin is None or cause.name not in without:
+        return cause
+    estimate = cause.parameters[twin.path]
+    values.pop(effect.path)
+    values[twin.path] = estimate.estimate
+    ranges[:] = [r for r in ranges if r.path != effect.path] + [Range(twin.path, estimate.low, estimate.high)]
+    others = [name for name in cause.group if name not in (effect.name, twin.name)]
+    text = cause.separating_measurement.removeprefix(f"{effect.name}: {effect.reading}; ") if others else ""
+    parameters = {path: p for path, p in cause.parameters.items() if path != effect.path}
+    return replace(cause, name=twin.name, group=(twin.name, *others), parameters=parameters, separating_measurement=text)
 
 
 def _spin_cause(found: BallFindings, confidence: float, values: dict, ranges: list, quantile: float) -> Cause:

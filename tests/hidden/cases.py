@@ -309,8 +309,8 @@ class RobotCase:
         return robot.logs(self.joints, rng, gentle=self.case.kind == "unexcited" and self._needs_gentle())
 
     def _needs_gentle(self) -> bool:
-        # A limit above every command is not excited by any stroke; the rest needs strokes that hide it.
-        return not self.case.causes[0].endswith("_limit")
+        # A limit of speed above every command is not excited by any stroke; the rest needs strokes that hide it.
+        return not self.case.causes[0].endswith("velocity_limit")
 
     def truth(self) -> dict:
         values = {c: getattr(self.joints[c.split(".")[0]], c.split(".")[1]) for c in self.amounts}
@@ -343,7 +343,7 @@ def build_robot(case: Case) -> RobotCase:
         if effect == "velocity_gain":
             amount *= float(rng.choice([-1, 1]))
         if case.kind == "unexcited":
-            amount = {"velocity_limit": 3.0 * peak, "acceleration_limit": 4000.0 * peak}.get(effect, amount)
+            amount = 3.0 * peak if effect == "velocity_limit" else amount
         old = getattr(joints[name], effect)
         value = amount if not np.isfinite(old) else old + amount
         joints[name] = replace(joints[name], **{effect: value})
