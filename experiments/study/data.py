@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from ballmodel import players
-from ballmodel.distribution import AXES, BallDistribution, load_distribution, read_yaml
+from ballmodel.distribution import AXES, BallDistribution, load_distribution
+from ballmodel.yaml_file import read as read_yaml
 from experiments.errors import ConfigError
 from experiments.runs import CONFIG
 from experiments.study import effects, scoring
