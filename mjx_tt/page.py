@@ -42,6 +42,9 @@ def png(figure: Figure) -> bytes:
     """The figure as a PNG in STYLE."""
     stream = io.BytesIO()
     with matplotlib.rc_context(STYLE):
+        if figure.get_layout_engine() is not None:  # laid out once; saving would draw all of it another time to do that
+            figure.get_layout_engine().execute(figure)
+            figure.set_layout_engine("none")
         figure.savefig(stream, format="png", dpi=130, facecolor="white")
     return stream.getvalue()
 

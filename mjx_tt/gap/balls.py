@@ -355,19 +355,19 @@ def _theta(p: Projected, choice: Choice, size: int) -> np.ndarray:
 def _left(linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid) -> tuple[np.ndarray, np.ndarray]:
     """Residual (3, T, n) [m] of the linear model with the chosen effects and the best starts, and these, (9, n)."""
     theta = _theta(p, choice, len(at.theta))
-    left = linear.residual - np.einsum("kctn,k->ctn", linear.effects, theta - at.theta)
+    left = linear.residual - np.tensordot(theta - at.theta, linear.effects, 1)
     start = at.start.copy()
     start[SPIN] = 0.0
     if choice.spin:
         full = p.spin_right - p.spin_effect @ theta - p.spin_gram @ choice.prior.mean
         inner = p.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
         start[SPIN] = choice.prior.mean[:, None] + np.linalg.solve(inner, full[..., None])[..., 0].T
-    left = left - np.einsum("kctn,kn->ctn", linear.starts[SPIN], start[SPIN] - at.start[SPIN])
+    left = left - (linear.starts[SPIN] * (start[SPIN] - at.start[SPIN])[:, None, None]).sum(axis=0)
     white = rows(linear.starts[:6], p.noise, p.weight, g)
     target = rows(left[None], p.noise, p.weight, g)
     nu = np.linalg.solve(white.swapaxes(1, 2) @ white + 1e-9 * np.eye(6), white.swapaxes(1, 2) @ target)[..., 0]
     start[:6] += nu.T
-    return np.where(g.mask, left - np.einsum("kctn,nk->ctn", linear.starts[:6], nu), 0.0), start
+    return np.where(g.mask, left - (linear.starts[:6] * nu.T[:, None, None]).sum(axis=0), 0.0), start
 
 
 def _move(

@@ -164,9 +164,9 @@ def _crossing(y: np.ndarray, g: Grid) -> np.ndarray:
 
 def _propagators(linear: Linear, g: Grid):
     """Functions that turn an acceleration profile (T, n) or a kick (n,) along an axis into a column (3, T, n)."""
-    transition = linear.transition  # (n, T, 6, 6)
-    inverse = np.linalg.inv(transition)
-    place = transition[:, :, :3]
+    # Components first, balls last: (6, 6, T, n).
+    inverse = np.ascontiguousarray(np.linalg.inv(linear.transition).transpose(2, 3, 1, 0))
+    place = np.ascontiguousarray(linear.transition[:, :, :3].transpose(2, 3, 1, 0))
     velocity = linear.base.velocity[:, :, 0]
     way = velocity / np.maximum(np.linalg.norm(velocity, axis=0), 1e-9)
     dt = np.zeros_like(g.time)
@@ -174,28 +174,26 @@ def _propagators(linear: Linear, g: Grid):
     bounce = linear.base.bounce_time[0]
     after = (g.time > bounce[None]) & g.mask  # (T, n)
 
-    def propagate(source: np.ndarray) -> np.ndarray:
-        """Sum over earlier samples of Phi^-1 source, carried on: source (T, n, 6) per sample."""
-        reduced = np.cumsum(np.einsum("ntij,tnj->tni", inverse, source), axis=0)
-        return np.einsum("ntci,tni->ctn", place, reduced)
+    # Phi^-1 of a unit impulse along each axis and along the flight, (6, T, n) each. It acts on average half an interval
+    # before the sample.
+    impulse = inverse[:, 3:] + 0.5 * dt * inverse[:, :3]
+    pushed = [impulse[:, 0], impulse[:, 1], impulse[:, 2], (impulse * way).sum(axis=1)]
+
+    def carried(source: np.ndarray) -> np.ndarray:
+        """Sum over earlier samples of what Phi^-1 left of them (6, T, n), carried on."""
+        return (place * np.cumsum(source, axis=1)).sum(axis=1)
 
     def response(phi: np.ndarray, d: int) -> np.ndarray:
         profile = np.where(g.mask, phi, 0.0)
         mean = np.zeros_like(profile)
         mean[1:] = 0.5 * (profile[1:] + profile[:-1]) * dt[1:]
-        source = np.zeros((*profile.shape, 6))
-        for axis in range(3):
-            part = mean * way[axis] if d == 3 else mean * (axis == d)
-            source[..., 3 + axis] = part
-            source[..., axis] = 0.5 * part * dt  # the impulse acts on average half an interval before the sample
-        return propagate(source)
+        return carried(pushed[d] * mean)
 
+    since = g.time - np.where(np.isfinite(bounce), bounce, 0.0)[None]
     first = after & (np.cumsum(after, axis=0) == 1)
+    kicks = [carried(np.where(first, inverse[:, 3 + d] + since * inverse[:, d], 0.0)) for d in range(3)]
 
     def kicked(size: np.ndarray, d: int) -> np.ndarray:
-        source = np.zeros((*first.shape, 6))
-        source[..., 3 + d] = np.where(first, size[None], 0.0)
-        source[..., d] = np.where(first, size[None] * (g.time - np.where(np.isfinite(bounce), bounce, 0.0)[None]), 0.0)
-        return propagate(source)
+        return kicks[d] * size
 
     return response, kicked

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtr, stdtrit
 
 from mjx_tt import model as models
 from mjx_tt.gap import design, evidence, heldout, select
@@ -191,7 +191,7 @@ def _drive_values(cause, robot: RobotFindings) -> dict[str, float]:
 def _ball_causes(found: BallFindings, without, seed: int) -> tuple[list[Cause], dict, list[Range]]:
     choice, effects, nominal = found.choice, found.trial.effects, found.problem.nominal
     confidence = _confidence(found, seed)
-    quantile = float(student.ppf(0.5 + LEVEL / 2, max(found.problem.grid.n - 10, 5)))
+    quantile = float(stdtrit(max(found.problem.grid.n - 10, 5), 0.5 + LEVEL / 2))
     causes, values, ranges = [], {}, []
     matters = select.named(choice, found.trial)
     for i, (j, theta, error) in enumerate(zip(choice.effects, choice.theta, choice.error)):
@@ -245,12 +245,12 @@ def _ball_causes(found: BallFindings, without, seed: int) -> tuple[list[Cause], 
 def _hit_causes(found: BallFindings, hits: HitFindings) -> list[tuple[Cause, dict, list[Range]]]:
     """Causes at the paddle with the leaves and ranges that express them."""
     nominal, out = found.problem.nominal, []
-    quantile = float(student.ppf(0.5 + LEVEL / 2, max(hits.hits - 6, 5)))
+    quantile = float(stdtrit(max(hits.hits - 6, 5), 0.5 + LEVEL / 2))
     for c in hits.causes:
         low, high = c.change - quantile * c.error, c.change + quantile * c.error
         text = "; ".join(f"{e.name}: {e.reading}" for e in (c.effect, *c.rivals)) if c.rivals else ""
         parameters = _parameters(c.effect, nominal, c.change, low, high)
-        sure = float(1.0 - 2.0 * student.sf(abs(c.change) / c.error, max(hits.hits - 6, 5)))
+        sure = float(1.0 - 2.0 * stdtr(max(hits.hits - 6, 5), -abs(c.change) / c.error))
         cause = Cause(
             c.effect.name, (c.effect.name, *(e.name for e in c.rivals)), sure, parameters, 1e3 * c.shift, text
         )

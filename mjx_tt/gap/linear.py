@@ -128,21 +128,34 @@ def rows(x: np.ndarray, noise: Noise, weight: np.ndarray, g: Grid) -> np.ndarray
 def project(
     linear: Linear, at: Situation, noise: Noise, weight: np.ndarray, g: Grid, coefficient: int | None = None
 ) -> Projected:
-    """Whitens, projects the starts out and forms the products."""
-    basis, _ = np.linalg.qr(rows(linear.starts[:6], noise, weight, g))
-    effects = remove(basis, rows(linear.effects, noise, weight, g))
-    spins = remove(basis, rows(linear.starts[SPIN], noise, weight, g))
-    absolute = (
-        linear.residual
-        + np.einsum("kctn,k->ctn", linear.effects, at.theta)
-        + np.einsum("kctn,kn->ctn", linear.starts[SPIN], at.start[SPIN])
-    )
-    target = remove(basis, rows(np.where(g.mask, absolute, 0.0)[None], noise, weight, g))
-    et, st = effects.swapaxes(1, 2), spins.swapaxes(1, 2)
-    return Projected(
-        weight, noise, et @ effects, (et @ target)[..., 0], st @ spins, st @ effects, (st @ target)[..., 0],
-        coefficient,
-    )  # fmt: skip
+    """Whitens, projects the starts out and forms the products; the target is what the effects at zero leave."""
+    target = linear.residual + np.tensordot(at.theta, linear.effects, 1)
+    return StartsOut(linear, target, at.start, noise, weight, g).project(linear.effects, coefficient)
+
+
+class StartsOut:
+    """Flights whitened, starts projected out of spins and target: what any set of columns is judged against.
+
+    target: (3, T, n) [m], to which the spins of the starts (9, n) are added: it is that of balls without spin.
+    """
+
+    def __init__(
+        self, linear: Linear, target: np.ndarray, start: np.ndarray, noise: Noise, weight: np.ndarray, g: Grid
+    ) -> None:
+        self._noise, self._weight, self._grid = noise, weight, g
+        self._basis, _ = np.linalg.qr(rows(linear.starts[:6], noise, weight, g))
+        self._spins = remove(self._basis, rows(linear.starts[SPIN], noise, weight, g))
+        absolute = target + (linear.starts[SPIN] * start[SPIN][:, None, None]).sum(axis=0)
+        self._target = remove(self._basis, rows(np.where(g.mask, absolute, 0.0)[None], noise, weight, g))
+
+    def project(self, columns: np.ndarray, coefficient: int | None = None) -> Projected:
+        """The products of columns (K, 3, T, n) [m per unit]; coefficient: the one that comes along with spin."""
+        effects = remove(self._basis, rows(columns, self._noise, self._weight, self._grid))
+        et, st = effects.swapaxes(1, 2), self._spins.swapaxes(1, 2)
+        return Projected(
+            self._weight, self._noise, et @ effects, (et @ self._target)[..., 0], st @ self._spins, st @ effects,
+            (st @ self._target)[..., 0], coefficient,
+        )  # fmt: skip
 
 
 def remove(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:

@@ -78,13 +78,20 @@ def estimate(residual: np.ndarray, frame: np.ndarray, g: Grid, unknowns: int = 6
 
 def whiten(x: np.ndarray, noise: Noise, g: Grid) -> np.ndarray:
     """Columns (..., 3, T, n) in units of independent noise; zero where there is no sample."""
-    x = np.einsum("actn,...ctn->...atn", noise.frame, np.where(g.mask, x, 0.0)) / noise.scale[:, None]
+    x = np.where(g.mask, x, 0.0)
+    turn = noise.frame / noise.scale[:, None, None]
+    out = np.empty_like(x)
+    for a in range(3):  # written out: several times as fast as einsum, and this is called on every column of every fit
+        np.multiply(turn[a, 0], x[..., 0, :, :], out=out[..., a, :, :])
+        for c in (1, 2):
+            out[..., a, :, :] += turn[a, c] * x[..., c, :, :]
     gap = np.zeros_like(g.time)
     gap[1:] = np.diff(g.time, axis=0) / noise.interval
     decay = np.where(g.mask, noise.memory[:, None, None] ** gap[None], 0.0)
     decay[:, 0] = 0.0
-    before = np.concatenate([np.zeros_like(x[..., :1, :]), x[..., :-1, :]], axis=-2)
-    return np.where(g.mask, (x - decay * before) / np.sqrt(1.0 - decay**2), 0.0)
+    out[..., 1:, :] -= decay[:, 1:] * out[..., :-1, :]
+    out *= np.where(g.mask, 1.0 / np.sqrt(1.0 - decay**2), 0.0)
+    return out
 
 
 def robust_weights(residual: np.ndarray, noise: Noise, g: Grid) -> np.ndarray:

@@ -14,7 +14,7 @@ import matplotlib.ticker
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import binom
+from scipy.special import bdtr
 
 from mjx_tt.gap.balls import BallFindings, left_over
 from mjx_tt.gap.heldout import Prediction
@@ -254,7 +254,7 @@ def _joint(left: Axes, right: Axes, r: JointResidual) -> None:
 def median_interval(values: np.ndarray) -> tuple[float, float, float]:
     """Median of (n,) values with the 90 % interval that their order gives, whatever their distribution (n >= 5)."""
     ordered = np.sort(values)
-    k = int(binom.ppf(0.05, ordered.size, 0.5))
+    k = int(np.searchsorted(bdtr(np.arange(ordered.size), ordered.size, 0.5), 0.05))
     return float(np.median(ordered)), float(ordered[k - 1]), float(ordered[ordered.size - k])
 
 

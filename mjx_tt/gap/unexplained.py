@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
+from scipy.special import chdtri, fdtrc
 
 from mjx_tt.gap import blocks, evidence, select
-from mjx_tt.gap.linear import Linear, Projected, Situation, project
+from mjx_tt.gap.linear import Linear, Projected, Situation, StartsOut
 from mjx_tt.gap.predict import Grid
 from mjx_tt.gap.select import Choice, Trial
 
@@ -49,18 +48,19 @@ def unexplained(
     if choice.magnus is not None:
         chosen.append(p.coefficient)
     effects = linear.effects[chosen]
+    # The chosen effects' own values are in the situation: what is left is scored at it (spins are kept absolute).
+    flights = StartsOut(linear, linear.residual, at.start, p.noise, p.weight, g)
     for block in blocks.build(linear, g, sessions, age, called):
         columns = np.concatenate([effects, block.columns])
-        both = _with_columns(linear, at, p, columns, g)
+        both = flights.project(columns)
         scores = evidence.with_spin(both, choice.prior.std) if choice.spin else evidence.without_spin(both)
         extra = list(range(len(chosen), len(columns)))
         base = [*range(len(chosen)), *scores.always]
-        # The chosen effects' own values are in the situation: what is left is scored at it.
         own, gram = evidence.unexplained_scores(scores, base, extra)
         p_value, beta = _joint_test(own, gram)
         if p_value > BLOCK_LEVEL:
             continue
-        pattern = np.einsum("kctn,k->ctn", block.columns, beta)
+        pattern = np.tensordot(beta, block.columns, 1)
         worst = np.linalg.norm(np.where(g.mask, pattern, 0.0), axis=0).max(axis=0)
         size = float(np.percentile(worst, 90))
         if size < BLOCK_FLOOR or _visible(scores.ball_gram[:, extra][:, :, extra], beta, p, g) < VISIBLE_FLOOR:
@@ -83,7 +83,7 @@ def unexplained(
                 _explained(own, gram),
             )
         )
-    odd = _odd_balls(linear, at, p, choice, g)
+    odd = _odd_balls(linear, flights, choice, g)
     if odd is not None:
         out.append(odd)
         holding.append({trial.effects[j].name for j in choice.effects} | ({"magnus"} if choice.spin else set()))
@@ -116,12 +116,6 @@ def _spin_holding(choice: Choice, trial: Trial, mean: np.ndarray, size: float) -
     return {"magnus"} if same_way and 0.5 < now / before < 2.0 and now * trial.spin_shift > size else set()
 
 
-def _with_columns(linear: Linear, at: Situation, p: Projected, columns: np.ndarray, g: Grid) -> Projected:
-    """The projected problem with other columns, its target the residual at the situation (spins kept absolute)."""
-    other = replace(linear, effects=columns)
-    return project(other, Situation(np.zeros(len(columns)), at.start), p.noise, p.weight, g)
-
-
 def _joint_test(own: np.ndarray, gram: np.ndarray) -> tuple[float, np.ndarray]:
     """Chance that scores (n, E) have mean zero, by Hotelling's T^2 over the balls, and the fitted coefficients."""
     scale = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
@@ -136,7 +130,7 @@ def _joint_test(own: np.ndarray, gram: np.ndarray) -> tuple[float, np.ndarray]:
     mean = u.mean(axis=0)
     t2 = n * mean @ np.linalg.lstsq(np.cov(u.T).reshape(e, e), mean, rcond=1e-9)[0]
     beta[useful] = vectors[:, keep] @ (u.sum(axis=0) / np.sqrt(values[keep])) / scale[useful]
-    return float(f_distribution.sf(t2 * (n - e) / (e * (n - 1)), e, n - e)), beta
+    return float(fdtrc(e, n - e, t2 * (n - e) / (e * (n - 1)))), beta
 
 
 def _visible(gram: np.ndarray, beta: np.ndarray, p: Projected, g: Grid) -> float:
@@ -153,7 +147,7 @@ def _explained(own: np.ndarray, gram: np.ndarray) -> float:
     return float(total @ np.linalg.lstsq(gram, total, rcond=1e-6)[0])
 
 
-def _odd_balls(linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid) -> Finding | None:
+def _odd_balls(linear: Linear, flights: StartsOut, choice: Choice, g: Grid) -> Finding | None:
     """Balls of their own kind: a smooth misfit that the others do not have."""
     t = g.time / np.maximum(g.time.max(axis=0), 1e-9) * 2.0 - 1.0
     columns = []
@@ -170,7 +164,7 @@ def _odd_balls(linear: Linear, at: Situation, p: Projected, choice: Choice, g: G
             column = np.zeros((3, *t.shape))
             column[a] = poly
             columns.append(column)
-    both = _with_columns(linear, at, p, np.stack(columns), g)
+    both = flights.project(np.stack(columns))
     gram, right = both.gram, both.right
     if choice.spin:
         inner = both.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
@@ -184,12 +178,12 @@ def _odd_balls(linear: Linear, at: Situation, p: Projected, choice: Choice, g: G
     keep = values > 1e-3
     u = np.einsum("nij,ni->nj", vectors, right / scale) / np.sqrt(np.maximum(values, 1e-12))
     q, freedom = (np.where(keep, u, 0.0) ** 2).sum(axis=1), np.maximum(keep.sum(axis=1), 1)
-    inflation = max(float(np.median(q / chi2.ppf(0.5, freedom))), 1.0)
-    odd = q / inflation > chi2.isf(ODD_LEVEL, freedom)
+    inflation = max(float(np.median(q / chdtri(freedom, 0.5))), 1.0)
+    odd = q / inflation > chdtri(freedom, ODD_LEVEL)
     if odd.sum() < max(3, ODD_SHARE * g.n):
         return None
     beta = np.einsum("nij,nj->ni", vectors, np.where(keep, u / np.sqrt(np.maximum(values, 1e-12)), 0.0)) / scale
-    pattern = np.einsum("kctn,nk->ctn", np.stack(columns), beta)
+    pattern = (np.stack(columns) * beta.T[:, None, None]).sum(axis=0)
     per_axis = np.abs(np.where(g.mask, pattern, 0.0)).max(axis=1)[:, odd]
     size = float(np.median(np.linalg.norm(pattern, axis=0).max(axis=0)[odd]))
     if size < BLOCK_FLOOR:

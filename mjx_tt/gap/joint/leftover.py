@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from mjx_tt.gap.joint.blocks import Block, blocks
 from mjx_tt.gap.joint.evidence import FLOOR, Judge
@@ -59,6 +58,8 @@ def find(fitter: Fitter, fit: Fit, sigma: float) -> Leftover | None:
 
 def _moments(log: JointLog, r: np.ndarray) -> Leftover | None:
     """Windows in which the joint was somewhere else for a while, which no function of its motion explains."""
+    from scipy.ndimage import median_filter  # half a second to import, which logs without joints need not
+
     smooth = median_filter(r, 9)
     counts = np.diff(np.append(log.starts, r.size))
     slow, quick = (np.add.reduceat(x * x, log.starts) / counts for x in (smooth, r - smooth))
