@@ -109,19 +109,17 @@ def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray
             mine = np.minimum(np.arange(first, first + WIDTH), v * n - 1)
             some = ball[mine]
             paddle = g.paddle and jax.tree.map(lambda x: np.moveaxis(x[..., some], 1, 0), g.paddle)
-            every, *rest = _fly(
-                model, {k: x[mine] for k, x in flat.items()}, columns[:, mine], g.steps[:, some], paddle
+            flown = _fly(
+                model, {k: x[mine] for k, x in flat.items()}, columns[:, mine], g.steps[:, some], g.index[:, some], paddle
             )
-            index = g.index[None, :, some]
-            sampled = [np.take_along_axis(np.asarray(x), index, axis=1) for x in every]
             keep = min(WIDTH, v * n - first)
-            parts.append([x[..., :keep] for x in (*sampled, *map(np.asarray, rest))])
+            parts.append([np.asarray(x)[..., :keep] for x in flown])
     joined = (np.concatenate(x, axis=-1) for x in zip(*parts))
     return Flown(*(x.reshape(*x.shape[:-1], v, n) for x in joined))
 
 
 @jax.jit
-def _fly(model: SimModel, values: dict, start, steps, paddle):
+def _fly(model: SimModel, values: dict, start, steps, index, paddle):
     nominal_latency = model.latency.ball_observation
     model = with_values(without_nominal(model), values)
     # What was measured flew on: a trial start that grazes the net must not be stopped by it.
@@ -179,12 +177,13 @@ def _fly(model: SimModel, values: dict, start, steps, paddle):
     )
     (_, _, _, bounced, at, incoming, struck), (x, v, y) = jax.lax.scan(advance, carry, (steps, *blades))
 
-    def whole(first, later):
-        return jnp.moveaxis(jnp.concatenate([first[None], later]), 0, 1)  # (3, L + 1, ...)
+    def sampled(first, later):
+        at_steps = jnp.moveaxis(jnp.concatenate([first[None], later]), 0, 1)  # (3, L + 1, ...)
+        return jnp.take_along_axis(at_steps, index[None], axis=1)
 
-    position, velocity = whole(state.position, x), whole(state.velocity, v)
-    seen = jnp.where(smoothing > 0.0, whole(filtered, y), position)
-    return (_camera(sensing, seen), position, velocity), bounced, at, incoming, struck
+    position, velocity = sampled(state.position, x), sampled(state.velocity, v)
+    seen = jnp.where(smoothing > 0.0, sampled(filtered, y), position)
+    return _camera(sensing, seen), position, velocity, bounced, at, incoming, struck
 
 
 def _camera(sensing, p):
