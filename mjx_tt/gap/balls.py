@@ -22,6 +22,7 @@ FEWEST_SAMPLES = 15  # of a flight
 FEWEST_BALLS = 12
 WINDOWS = (0.1, 0.2, 0.3, 0.4)  # [s] of a flight that the first fit takes in turn
 ROUNDS = 4  # of choosing and linearising again
+SETTLED = 0.2  # of an estimate's error by which it may still have moved in the last round
 MAGNUS_KEPT = (0.2, 1.5)  # of the coefficient k about which derivatives are taken
 # Coefficient k and mean spin [rad/s] (topspin, gyro, side) to start from where balls may spin fast. In flight only their
 # product shows, at the bounce the spin alone.
@@ -235,14 +236,14 @@ def search(
         if choice.magnus is not None:
             # In flight only k omega shows: a coefficient out of reason is kept within it, the spins take up the rest.
             theta[problem.coefficient] = np.clip(choice.magnus, *MAGNUS_KEPT)
-        settled = chosen_before == (choice.effects, choice.spin) and _close(theta, at.theta, trial)
+        settled = chosen_before == (choice.effects, choice.spin) and _close(theta, at.theta, choice)
         chosen_before, prior = (choice.effects, choice.spin), choice.prior
         (at, bounces), linear = _move(problem, moved, theta, choice, own_noise, g), None
         if settled:
             break
     linear = problem.linearise(at)
     p = project(linear, at, own_noise, _weights(linear, own_noise, g, bounces), g, problem.coefficient)
-    return Settled(at, linear, choice, own_noise, p, trial)
+    return Settled(at, linear, select.refined(choice, p), own_noise, p, trial)
 
 
 def spinning(problem: BallProblem, start: np.ndarray) -> tuple[Situation, SpinPrior]:
@@ -308,8 +309,10 @@ def heading(g: Grid) -> np.ndarray:
     return g.measured[:, k, np.arange(g.n)] - g.measured[:, 0]
 
 
-def _close(a: np.ndarray, b: np.ndarray, trial: Trial) -> bool:
-    return bool(np.all(np.abs(a - b) * trial.shift < 1e-4))
+def _close(theta: np.ndarray, before: np.ndarray, choice: Choice) -> bool:
+    """Whether the chosen effects moved by little of their errors."""
+    chosen = list(choice.effects)
+    return bool(np.all(np.abs(theta - before)[chosen] <= SETTLED * choice.error))
 
 
 def _shifts(linear: Linear, g: Grid) -> tuple[np.ndarray, float]:

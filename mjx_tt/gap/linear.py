@@ -75,6 +75,8 @@ class BallProblem:
         g = self.grid if g is None else g
         k = len(self.effects)
         moves = np.array([e.step if e.step is not None else 1e-3 * e.scale for e in self.effects])
+        # A step of its own is for an effect without a derivative at zero; elsewhere it would only blur.
+        moves = np.where(at.theta != 0.0, np.minimum(moves, np.maximum(0.1 * np.abs(at.theta), 1e-6)), moves)
         # Variants: as it is; start moved (6); effects changed (k); and with a ball that air can bend: as it is, spun (3).
         theta = np.repeat(at.theta[:, None], 11 + k, axis=1)
         theta[np.arange(k), 7 + np.arange(k)] += moves

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -131,6 +131,19 @@ def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
         groups,
         others,
     )
+
+
+def refined(choice: Choice, p: Projected) -> Choice:
+    """The same causes with sizes and errors from derivatives that were taken where they were found."""
+    scores = evidence.with_spin(p, choice.prior.std) if choice.spin else evidence.without_spin(p)
+    columns, count = (*choice.effects, *scores.always), len(choice.effects)
+    theta = evidence.solve(scores, columns) if columns else np.zeros(0)
+    error = np.sqrt(np.diagonal(evidence.sandwich(scores, columns))) if columns else np.zeros(0)
+    prior, magnus = choice.prior, choice.magnus
+    if choice.spin:
+        prior = SpinPrior(theta[count : count + 3], prior.std)
+        magnus = None if p.coefficient is None else float(theta[-1])
+    return replace(choice, theta=theta[:count], error=error[:count], prior=prior, magnus=magnus)
 
 
 def _candidates(p, trial: Trial, spin: bool, std) -> tuple[int, ...]:

@@ -70,13 +70,15 @@ def commands(rng: np.random.Generator, seconds: float, level: float = 1.0, gentl
 def respond(joint: Joint, time: np.ndarray, velocity: np.ndarray, query: np.ndarray) -> np.ndarray:
     """Measured positions, without noise, at times ``query``, from rest at 0."""
     grid = np.arange(0.0, max(time[-1], query[-1]) + STEP, STEP)
-    index = np.searchsorted(time, grid - joint.action_delay + 1e-12, side="right") - 1
+    # The command in the middle of each step: that at its start would be half a step late, which a diagnosis sees.
+    index = np.searchsorted(time, grid + STEP / 2 - joint.action_delay, side="right") - 1
     u = np.where(index >= 0, velocity[np.maximum(index, 0)], 0.0)
     u = np.where(np.abs(u) < joint.deadband, 0.0, u)
     u = np.sign(u) * np.maximum(np.abs(u) - joint.coulomb_friction, 0.0)
     u = np.clip(joint.velocity_gain * u, -joint.velocity_limit, joint.velocity_limit)
     if joint.lag > 0.0 or np.isfinite(joint.acceleration_limit):
-        u = _follow(u, joint.lag, joint.acceleration_limit)
+        after = _follow(u, joint.lag, joint.acceleration_limit)
+        u = (np.concatenate([[0.0], after[:-1]]) + after) / 2
     q = np.concatenate([[0.0], np.cumsum(u[:-1]) * STEP])
     if joint.backlash > 0.0:
         q = _play(q, joint.backlash)
