@@ -276,17 +276,20 @@ def _order(pairs: int) -> list[int]:
 def _open(
     run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, first: TrainState, source: str
 ) -> None:
-    """Records what the run is, or checks that it is the one that is asked for. Raises RunError naming differences."""
-    path = run.folder / SETTINGS
+    """Records what the run is, or checks that it is the one that is asked for. Raises RunError naming differences.
+
+    Before the first ball there is nothing to protect: a start that failed must not stand in the way of the corrected one.
+    """
+    path, journal = run.folder / SETTINGS, run.folder / JOURNAL
     wanted = {
         "source": source,
         "policy": _digest(first),
         "robot": robot.describe(),
         "settings": settings.model_dump(mode="json"),
     }
-    if path.exists():
+    if path.exists() and journal.exists() and journal.stat().st_size > 0:
         _check(run.folder, read_yaml(path.read_text(encoding="utf-8"), str(path)), wanted, settings)
-    elif (run.folder / CONFIG).exists():
+    elif not path.exists() and (run.folder / CONFIG).exists():
         raise RunError(f"{run.folder}: is a run of another kind; choose another --out")
     config = experiment.config.model_copy(
         update={"name": run.folder.name, "initial_policy": str(Path(source).resolve())}

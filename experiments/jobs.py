@@ -87,7 +87,7 @@ def select(folder: Path, jobs: list[Job], console: Console) -> None:
         "scores": scores,
         "best": best,
     }
-    runs.write_json(folder / "selection.json", selection)
+    runs.write_json(folder / policy.SELECTION, selection)
     console.print(
         f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)", highlight=False
     )

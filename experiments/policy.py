@@ -20,7 +20,7 @@ from experiments.runs import CONFIG, Run
 from robot_io import artefact as artefacts
 from robot_io import contract
 
-SELECTION = "selection.json"  # beside several trainings of one model: which was chosen, written by other modules
+SELECTION = "selection.json"  # beside several trainings of one model: which was chosen
 LISTED = 6  # folders that a message names
 # Where runs and artefacts lie in a folder of trainings, a study's folder and those in it.
 _MARKS = (

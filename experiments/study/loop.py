@@ -27,7 +27,7 @@ from experiments.study.config import Study, parse
 from experiments.study.finetuning import VirtualReality
 from experiments.study.plan import ORACLE, Human, Item, Real, Simulated, items, pairings, updates
 from experiments.study.steps import JOURNAL, Journal, Step, Waiting, run_all
-from experiments.study.training import POLICY, SELECTION
+from experiments.study.training import POLICY
 from experiments.study.world import VirtualWorld, World
 
 SETTINGS, SESSIONS, CONVERGENCE = "study.yaml", "study.json", "convergence.json"
@@ -66,7 +66,7 @@ class Loop:
     def run_of(self, seed: int, player: str, model: str) -> Path:
         """The run that holds a model's policy: of several trainings the chosen one."""
         folder = self.model_folder(seed, player, model)
-        chosen = folder / SELECTION
+        chosen = folder / policy.SELECTION
         if not chosen.exists():
             return folder
         return folder / read_yaml(chosen.read_text(encoding="utf-8"), str(chosen))["best"]
@@ -178,7 +178,7 @@ class Loop:
 
         optimiser = self.study.simulation.optimiser
         work = updates(self.study, item) * optimiser.pairs * optimiser.repeats * self.study.simulation.seeds
-        return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run)
+        return Step(name, "training", work, inputs, (folder / POLICY, folder / policy.SELECTION), run)
 
     def _real(self, seed: int, player: str, item: Real) -> Step:
         folder, name = self.model_folder(seed, player, item.key), f"seed{seed}/{player}/{item.key}"

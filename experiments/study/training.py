@@ -13,13 +13,13 @@ from ballmodel.distribution import load_distribution
 from ballmodel.files import replacing
 from experiments import build, policy, runs
 from experiments.config import Config, Evaluation, Training
-from experiments.policy import Policy
+from experiments.policy import SELECTION, Policy
 from experiments.runs import Run
 from experiments.study.config import Study
 from experiments.study.plan import Simulated, updates
 from experiments.train import train
 
-POLICY, SELECTION = "policy.npz", "selection.json"
+POLICY = "policy.npz"
 
 
 def configuration(study: Study, item: Simulated, balls: str | dict, source: Path | None, seed: int) -> Config:

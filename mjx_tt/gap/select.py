@@ -134,16 +134,15 @@ def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
 
 
 def refined(choice: Choice, p: Projected) -> Choice:
-    """The same causes with sizes and errors from derivatives that were taken where they were found."""
-    scores = evidence.with_spin(p, choice.prior.std) if choice.spin else evidence.without_spin(p)
-    columns, count = (*choice.effects, *scores.always), len(choice.effects)
-    theta = evidence.solve(scores, columns) if columns else np.zeros(0)
-    error = np.sqrt(np.diagonal(evidence.sandwich(scores, columns))) if columns else np.zeros(0)
-    prior, magnus = choice.prior, choice.magnus
-    if choice.spin:
-        prior = SpinPrior(theta[count : count + 3], prior.std)
-        magnus = None if p.coefficient is None else float(theta[-1])
-    return replace(choice, theta=theta[:count], error=error[:count], prior=prior, magnus=magnus)
+    """The same causes with sizes and errors from derivatives that were taken where they were found.
+
+    With spin they stay: of coefficient and mean spin the flights show the product, and a step of each is none of that.
+    """
+    if choice.spin or not choice.effects:
+        return choice
+    scores = evidence.without_spin(p)
+    error = np.sqrt(np.diagonal(evidence.sandwich(scores, choice.effects)))
+    return replace(choice, theta=evidence.solve(scores, choice.effects), error=error)
 
 
 def _candidates(p, trial: Trial, spin: bool, std) -> tuple[int, ...]:
