@@ -17,7 +17,7 @@ from mjx_tt.gap.catalogue import AT_THE_PADDLE, EFFECTS
 from mjx_tt.gap.linear import BallProblem, Projected, Situation
 from mjx_tt.gap.predict import grid, heading_axes, leaves, predict
 from mjx_tt.model import SimModel
-from tests.hidden.world import World, camera, fly
+from tests.hidden.world import World, camera, fly, seen
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 FITTED = tuple(e for e in EFFECTS if e.fit and e.group != AT_THE_PADDLE)
@@ -197,6 +197,21 @@ def test_names_a_spin_far_beyond_a_straight_line(spin, k):
     fitted = cause.parameters["ball.flight.magnus_coefficient"].estimate
     np.testing.assert_allclose(fitted * means[[0, 2]], k * np.array(spin)[[0, 2]], atol=0.05 * k * np.linalg.norm(spin))
     assert found.verdict.held_out.low > 0.0
+
+
+def test_the_size_of_a_filter_is_no_more_off_than_its_interval_says():
+    """No derivative exists at no filter, and the first step's is another one than that at its size."""
+    rng = np.random.default_rng(4)
+    start = starts(60, seed=4)
+    start[6:] = 0.0
+    time = np.repeat((np.arange(56) / 125.0)[:, None], 60, axis=1)
+    world = World(smoothing=0.008)
+    measured = seen(world, fly(world, start, time[-1, 0] + 0.01), time)
+    measured = measured + rng.normal(0.0, 0.002, measured.shape)
+    (cause,) = gap.diagnose(gap.Logs(tuple(trajectories(measured)), (), {}), SimModel()).verdict.causes
+    assert cause.name == "tracker_smoothing"
+    found = cause.parameters["sensing.smoothing"]
+    assert abs(found.estimate - 0.008) < 1.5 * (found.high - found.estimate)
 
 
 @pytest.mark.parametrize(("session", "spins"), [("mn5008_topspin", True), ("no_spin_robot_simple", False)])
