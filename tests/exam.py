@@ -191,13 +191,13 @@ def _bar_rows(alone: dict[str, dict]) -> list[str]:
         for name, result in alone["12"].items():
             groups = [{c["name"], *c.get("group", ())} for c in result["causes"] or ()]
             spins = any("magnus" in g for g in groups)
-            held = result["held_out"] or {}
-            gained = "magnus" and held.get("low") is not None and (held["low"] > 0 or held["high"] < 0)
+            held = {k: v for k, v in (result["held_out"] or {}).items() if k != "metric"}
+            gained = bool(held) and (held["low"] > 0 or held["high"] < 0)
             wanted = "spin; gain excludes 0" if "topspin" in name else "not spin"
             met = spins and gained if "topspin" in name else not spins
             answer = "+".join(c["name"] for c in result["causes"] or ()) or result["verdict"]
-            figures = f"{held.get('before')} -> {held.get('after')} {held.get('metric', '')}"
-            interval = f"{held.get('low')} to {held.get('high')}"
+            figures = "held out {before:.1f} -> {after:.1f} mm".format(**held) if held else "-"
+            interval = "{low:.1f} to {high:.1f} mm gained".format(**held) if held else "-"
             ending = f"{interval} | {'met' if met else 'not met'} |"
             lines.append(f"| 12 | launcher, {name} | {wanted} | 1 | {answer}; {figures} | {ending}")
     return lines
@@ -263,7 +263,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--bars", default=",".join(known), help=f"which of {','.join(known)} (default: all)")
     parser.add_argument("--baselines", action="store_true", help="run the four baselines on the same cases as well")
-    parser.add_argument("--part", default="1/1", metavar="K/N", help="only every N-th case, for N processes on one OUT")
+    help_ = "only every N-th case, for N processes on one OUT; the first does bars 11 and 12"
+    parser.add_argument("--part", default="1/1", metavar="K/N", help=help_)
     parser.add_argument("--keep", action="store_true", help="keep logs, truths and reports of every case")
     options = parser.parse_args(arguments)
     bars = options.bars.split(",")
@@ -278,10 +279,10 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--part {options.part}: K of K/N runs from 1 to N")
     options.out.mkdir(parents=True, exist_ok=True)
     alone = {}
-    if "11" in bars:
+    if "11" in bars and part == 1:
         alone["11"] = by_itself(lambda: time_run(options.out / "time", options.seed))
     records = run_all(plan(bars, options.cases, options.seed), options.out, options.keep, (part, parts))
-    if "12" in bars and DATA.is_dir():
+    if "12" in bars and part == 1 and DATA.is_dir():
         alone["12"] = by_itself(lambda: real_data(options.out / "launcher"))
     compared: list[dict] = []
     if options.baselines:

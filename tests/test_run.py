@@ -151,7 +151,10 @@ def playing(policy, tmp_path):
         options = control.ControlOptions(str(policy), log_folder=str(tmp_path), log_name="session")
         with play.Session(rig.robot, options, Console()) as session:
             session.prepare(rig)
-            session.arm()
+            try:
+                session.arm()
+            except RefusedError:  # a busy machine may be late for the axes: a fault, from which an operator recovers
+                session.recover(rig)
             yield rig, session, tmp_path
 
 
