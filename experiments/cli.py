@@ -171,9 +171,10 @@ def is2r(options: argparse.Namespace) -> int:
     study = study_config.load(_file(options.study, study_config.shipped()), tuple(options.set))
     devices = study.simulation.devices
     _start_jax(options.devices or (None if devices == "auto" else devices))
-    from experiments.study import loop
+    from experiments.study import loop, processes
 
-    return 0 if loop.run(study, Path(options.out) / study.name, _console()) else 130
+    side_by_side = processes.choose(study, options.processes, options.devices)
+    return 0 if loop.run(study, Path(options.out) / study.name, _console(), side_by_side) else 130
 
 
 def study_report(options: argparse.Namespace) -> int:
@@ -393,6 +394,10 @@ A file name without a folder that is not in the current folder is looked up amon
     p.add_argument("study", metavar="YAML")
     p.add_argument("--out", default="runs", metavar="FOLDER", help="where the study's folder goes (default: runs)")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one key of the study")
+    p.add_argument(
+        "--processes", type=_count, metavar="N",
+        help="how many do steps side by side, on a device each (default: one per processor core where JAX computes on them)",
+    )  # fmt: skip
     _add_devices(p)
 
     p = _command(commands, "study-report", study_report, "the report of a study, whole or under way: one HTML page", """\

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -67,7 +68,7 @@ from mjx_tt import platform
 platform.configure(devices=2, cache=Path(".cache/jax"))
 from rich.console import Console
 from experiments.study import config, loop
-loop.run(config.parse(json.loads(sys.argv[1]), "test"), Path(sys.argv[2]), Console())
+loop.run(config.parse(json.loads(sys.argv[1]), "test"), Path(sys.argv[2]), Console(), processes=2)
 """
 
 
@@ -481,18 +482,29 @@ def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
     assert np.abs(one - two).max() > 1e-3  # another seed and other balls
 
 
-def test_a_killed_study_ends_as_one_that_nobody_killed(finished, tmp_path):
+def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tmp_path):
+    """Its steps done by two processes, stopped as a batch system does, gone on with, killed, and ended by this one."""
     folder = tmp_path / "tiny"
-    process = subprocess.Popen(
-        [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder)], cwd=ROOT, stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    marked = folder / "seed0" / "player3" / "is2r-ft35" / "checkpoints"
-    while not marked.exists() and process.poll() is None:
-        time.sleep(0.005)
-    assert process.poll() is None, process.stderr.read()
-    os.kill(process.pid, signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL, process.stderr.read()
+    player = folder / "seed0" / "player3"
+
+    def start_and_end(sign: Path, number: int) -> tuple[int, str]:
+        """Exit status and message of a session that gets a signal when ``sign`` is there."""
+        command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder)]
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        while not sign.exists() and process.poll() is None:
+            time.sleep(0.005)
+        time.sleep(0.1)
+        assert process.poll() is None, process.stderr.read()
+        os.kill(process.pid, number)
+        _, message = process.communicate(timeout=120)  # its end means that no worker lives: each holds the pipe
+        return process.returncode, message
+
+    status, message = start_and_end(player / "is2r-sim1" / "training" / "seed0" / "metrics.jsonl", signal.SIGTERM)
+    assert status != 0 and re.search(r"is2r-sim1.*: stopped after update \d", message), message
+    assert f"{folder}: stopped; the same command continues the study" in message
+    assert [e["step"] for e in Journal(folder / "steps.jsonl").entries][-1] == "seed0/player3/M0"
+    status, message = start_and_end(player / "is2r-ft35" / "checkpoints", signal.SIGKILL)
+    assert status == -signal.SIGKILL, message
     before = Journal(folder / "steps.jsonl").entries
     assert before and len(before) < 6
     loop(study(), folder)

@@ -26,6 +26,7 @@ from experiments.study import reality as realities
 from experiments.study.config import Study, parse
 from experiments.study.finetuning import VirtualReality
 from experiments.study.plan import ORACLE, Human, Item, Real, Simulated, items, pairings, updates
+from experiments.study.processes import run_side_by_side
 from experiments.study.steps import JOURNAL, Journal, Step, Waiting, run_all
 from experiments.study.training import POLICY
 from experiments.study.world import VirtualWorld, World
@@ -291,11 +292,12 @@ class Loop:
         return Step("evaluations", "evaluations", len(sources), sources, (path,), run)
 
 
-def run(study: Study, folder: Path, console: Console) -> bool:
+def run(study: Study, folder: Path, console: Console, processes: int = 1) -> bool:
     """Does, or goes on with, a study in ``folder``, up to its report; False when it waits for people.
 
-    Raises RunError for a folder of another study, naming the differences, ConfigError for what the study names and is
-    not there, and what the steps raise.
+    processes: that do steps which need nothing of each other side by side, each on its share of the cores; 1: this one
+    does them all. Raises RunError for a folder of another study, naming the differences, ConfigError for what the study
+    names and is not there, and what the steps raise.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with Run(folder).locked():
@@ -304,7 +306,11 @@ def run(study: Study, folder: Path, console: Console) -> bool:
         loop = Loop(study, folder, console)
         _open(study, folder)
         try:
-            run_all(loop.steps(), Journal(folder / JOURNAL), console)
+            steps, journal = loop.steps(), Journal(folder / JOURNAL)
+            if processes > 1:
+                run_side_by_side(study, folder, steps, journal, console, processes)
+            else:
+                run_all(steps, journal, console)
         except Waiting as waiting:
             console.print(str(waiting), highlight=False, soft_wrap=True, markup=False)
             return False

@@ -107,33 +107,54 @@ def unfinished(steps: list[Step], journal: Journal) -> list[Step]:
     return left
 
 
-def run_all(steps: list[Step], journal: Journal, console: Console) -> None:
-    """Does what is not done yet. Raises what a step raises; RunError where a step's input is missing."""
-    left = unfinished(steps, journal)
-    done = len(steps) - len(left)
-    if done:
-        console.print(f"{done} of {len(steps)} steps were done before, {len(left)} are left", highlight=False)
-    for i, step in enumerate(left):
-        missing = [str(path) for path in step.inputs if not path.exists()]
-        if missing:
-            raise RunError(f"{step.name}: {', '.join(missing)} is missing, though the step that makes it is done")
-        began = time.monotonic()
-        text = step.run()
-        for path in step.outputs:
-            if not path.exists():
-                raise RunError(f"{step.name}: did not make {path}")
-        took = time.monotonic() - began
-        journal.append(step, took)
-        console.print(
-            f"[{done + i + 1}/{len(steps)}] {step.name}: {text}  ({took:.1f} s; {remaining(left[i + 1 :], journal)})",
+def perform(step: Step) -> tuple[str, float]:
+    """Does a step: its sentence, and how long it took [s].
+
+    Raises what the step raises; RunError where an input is missing or an output was not made.
+    """
+    missing = [str(path) for path in step.inputs if not path.exists()]
+    if missing:
+        raise RunError(f"{step.name}: {', '.join(missing)} is missing, though the step that makes it is done")
+    began = time.monotonic()
+    text = step.run()
+    for path in step.outputs:
+        if not path.exists():
+            raise RunError(f"{step.name}: did not make {path}")
+    return text, time.monotonic() - began
+
+
+class Ledger:
+    """Marks the steps of one session as they end, and says so; ``left`` are those still to be done, in their order."""
+
+    def __init__(self, steps: list[Step], journal: Journal, console: Console, processes: int = 1) -> None:
+        self._journal, self._console, self._processes = journal, console, processes
+        self.left, self._total = unfinished(steps, journal), len(steps)
+        done = self._total - len(self.left)
+        if done:
+            console.print(f"{done} of {self._total} steps were done before, {len(self.left)} are left", highlight=False)
+
+    def ended(self, step: Step, text: str, seconds: float) -> None:
+        """After a step that took ``seconds``. Raises OSError."""
+        self._journal.append(step, seconds)
+        self.left.remove(step)
+        place, rest = self._total - len(self.left), remaining(self.left, self._journal, self._processes)
+        self._console.print(
+            f"[{place}/{self._total}] {step.name}: {text}  ({seconds:.1f} s; {rest})",
             highlight=False, soft_wrap=True, markup=False,
         )  # fmt: skip
 
 
-def remaining(steps: list[Step], journal: Journal) -> str:
+def run_all(steps: list[Step], journal: Journal, console: Console) -> None:
+    """Does what is not done yet, one step after the other. Raises what a step raises, and what ``perform`` does."""
+    ledger = Ledger(steps, journal, console)
+    for step in list(ledger.left):
+        ledger.ended(step, *perform(step))
+
+
+def remaining(steps: list[Step], journal: Journal, processes: int = 1) -> str:
     """An estimate in words of how long these steps take, from what others of their kinds took."""
     rates = journal.seconds_per_work()
-    known = sum(rates[step.kind] * step.work for step in steps if step.kind in rates)
+    known = sum(rates[step.kind] * step.work for step in steps if step.kind in rates) / processes
     unknown = sorted({step.kind for step in steps} - rates.keys())
     if unknown:
         return f"at least {timedelta(seconds=round(known))} left, not yet timed: {', '.join(unknown)}"
