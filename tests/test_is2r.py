@@ -437,6 +437,21 @@ def test_a_study_leaves_what_it_says(finished):
     assert blind.unseal(finished / "seed0" / "reality.sealed")["seed"] == 0
 
 
+def test_worlds_side_by_side_are_those_that_were_drawn():
+    """Also drives, which a world without them does not have at all."""
+    drawn = [reality.draw(3, left_out) for left_out in ((), ("drives", "encoders"), ("table",), tuple(reality.RANGES))]
+    together = models.paths(reality.side_by_side(drawn, 2))
+    for path, value in together.items():
+        wanted = [models.paths(world)[path] for world in drawn]
+        if isinstance(value, jax.Array):
+            np.testing.assert_array_equal(value, np.repeat(np.float32(wanted), 2), err_msg=path)
+        else:
+            assert wanted == [value] * 4, path
+    lags = together["drives.gantry_x.lag"]
+    assert lags.shape == (8,) and lags[0] > 0.0 and lags[2] == 0.0 and lags[4] == lags[0] and lags[6] == 0.0
+    assert together["ball.table.restitution"][4] == np.float32(0.93)
+
+
 def test_an_effect_is_left_out_for_the_policy_it_says(finished):
     """One world's rallies played again with every lane in that world."""
     what, lanes = study(), 10

@@ -81,7 +81,7 @@ def play_without(
     theta, mean, inverse_scale = (per_model(part) for part in zip(*policies))
     low, high = (per_model(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes))))
     person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), players.stack(people))
-    world = jax.tree.map(lambda *values: jnp.repeat(jnp.array(values, jnp.float32), len(models) * lanes), *worlds)
+    world = realities.side_by_side(worlds, len(models) * lanes)
     result = reality.simulator.play(
         theta, mean, inverse_scale, person, world, build.key(seed, EFFECTS), settings.rallies // lanes,
         Box(low, high), settings.max_touches,

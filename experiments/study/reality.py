@@ -89,6 +89,15 @@ def _uniform(seed: int, path: str, low: float, high: float) -> float:
     return float(np.random.default_rng([seed, zlib.crc32(path.encode())]).uniform(low, high))
 
 
+def side_by_side(worlds: list[SimModel], lanes: int) -> SimModel:
+    """All worlds in one model, each in as many neighbouring lanes: what differs among them is (worlds * lanes,)."""
+    values = [models.paths(world) for world in worlds]  # also of drives that a world does not have
+    differ = [path for path in values[0] if len({v[path] for v in values}) > 1]
+    return models.with_values(
+        worlds[0], {path: jnp.repeat(jnp.array([v[path] for v in values], jnp.float32), lanes) for path in differ}
+    )
+
+
 def differences(model: SimModel) -> dict[str, float]:
     """What of a reality differs from what training believes, by dotted path."""
     nominal = models.paths()
