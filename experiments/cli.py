@@ -132,6 +132,22 @@ def render(options: argparse.Namespace) -> int:
     return 0
 
 
+def curves(options: argparse.Namespace) -> int:
+    from experiments import metrics, plots
+    from experiments.errors import RunError
+    from experiments.runs import Run
+
+    found = []
+    for folder in options.runs:
+        run = Run(folder)
+        optimiser, rows = run.config().optimiser, metrics.read(run.metrics)
+        if not rows:
+            raise RunError(f"{run.metrics}: holds no update yet")
+        found.append(plots.Curve(str(folder), rows, 2 * optimiser.pairs * optimiser.repeats))
+    _console().print(str(checked("", plots.draw_curves, Path(options.out), found)), highlight=False, soft_wrap=True)
+    return 0
+
+
 def bench(options: argparse.Namespace) -> int:
     _start_jax(options.devices)
     from benchmarks.bench import main as run_benchmarks
@@ -351,6 +367,12 @@ Then write "balls: anna.yaml" in an experiment.
     p.add_argument("--episodes", type=_count, default=2, metavar="N", help="episodes in a video (default: 2)")
     p.add_argument("--camera", default="side", help="side, robot_back, human or top (default: side)")
     p.add_argument("--seed", type=int, metavar="K", help="another seed means other balls")
+
+    p = _command(commands, "curves", curves, "the learning curves of several trainings in one picture", """\
+  mjx-tt curves runs/quickstart runs/paper --out curves.png
+""")  # fmt: skip
+    p.add_argument("runs", nargs="+", metavar="RUN", help="folder of a run, finished or under way")
+    p.add_argument("--out", default="curves.png", metavar="PNG", help="the picture (default: curves.png)")
 
     p = _command(commands, "run", run, "play: an exported policy on a robot, real or emulated", """\
   mjx-tt run runs/quickstart/artefact --robot rig --balls 30

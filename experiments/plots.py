@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,22 @@ def draw_training(path: Path, rows: list[dict[str, Any]], title: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     with plt.rc_context(STYLE):
         return _save(path, _training(rows, title))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A training for ``draw_curves``: rows of its metrics.jsonl, and how many balls an update plays."""
+
+    name: str
+    rows: list[dict[str, Any]]
+    balls: int
+
+
+def draw_curves(path: Path, curves: list[Curve]) -> Path:
+    """Writes the shares of balls that several trainings' policies return, over time and over balls."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with plt.rc_context(STYLE):
+        return _save(path, _curves(curves))
 
 
 def _landing_map(played: Played) -> Figure:
@@ -179,6 +196,32 @@ def _training(rows: list[dict[str, Any]], title: str) -> Figure:
     lower.grid(axis="y", alpha=0.25)
     lower.set_ylabel("mean return")
     lower.set_xlabel("training time [min]")
+    return figure
+
+
+def _curves(curves: list[Curve]) -> Figure:
+    figure, panels = plt.subplots(1, 2, figsize=(9.6, 4.2), sharey=True)
+    for i, curve in enumerate(curves):
+        colour = f"C{i % 10}"
+        minutes = np.array([row["seconds"] for row in curve.rows]) / 60
+        played = curve.balls * np.array([row["update"] for row in curve.rows])
+        rate = _smooth(curve.rows, "return_rate")
+        evaluated = np.array(["evaluation/return_rate" in row for row in curve.rows])
+        at = [row["evaluation/return_rate"] for row, there in zip(curve.rows, evaluated) if there]
+        for axes, x in zip(panels, (minutes, played)):
+            axes.plot(x, rate, color=colour, label=f"{curve.name}, perturbed")
+            if at:
+                axes.plot(x[evaluated], at, "o--", color=colour, markersize=4, linewidth=1, label=f"{curve.name}, evaluated")
+    for axes, label in zip(panels, ("training time [min]", "balls")):
+        axes.set_xscale("log")
+        axes.set_xlim(left=max(line.get_xdata()[-1] for line in axes.lines) / 1000)  # the first updates say nothing
+        axes.xaxis.set_major_formatter(lambda v, _: f"{v:,g}" if v < 1e6 else f"{v / 1e6:g} million")
+        axes.set_xlabel(label)
+        axes.grid(alpha=0.25)
+    panels[0].set_ylim(-0.02, 1.02)
+    panels[0].yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
+    panels[0].set_title("returned balls")
+    panels[0].legend(loc="upper left")
     return figure
 
 

@@ -132,7 +132,8 @@ def test_pictures_show_what_was_counted(tmp_path):
     assert share(missed[1], "#a50026") > 0.05  # and its red end
 
 
-def test_training_curve_survives_missing_values(tmp_path):
+def rising() -> list[dict]:
+    """Rows of metrics of 60 updates, some values missing."""
     rows = [
         {
             "update": i + 1,
@@ -144,5 +145,24 @@ def test_training_curve_survives_missing_values(tmp_path):
         for i in range(60)
     ]
     rows[29] |= {"evaluation/return_rate": 0.4, "evaluation/low": 0.3, "evaluation/high": 0.5}
+    return rows
+
+
+def test_training_curve_survives_missing_values(tmp_path):
+    rows = rising()
     path = plots.draw_training(tmp_path / "training.png", rows, "a title")
     assert share(path, plots.RETURNED_COLOUR) > 0.0005
+
+
+def test_curves_of_several_trainings_are_drawn_over_time_and_balls(tmp_path):
+    """The figure's own lines against the rows: the second training plays ten times the balls in half the time."""
+    rows = rising()
+    faster = [row | {"seconds": row["seconds"] / 2} for row in rows]
+    figure = plots._curves([plots.Curve("one", rows, 100), plots.Curve("two", faster, 1000)])
+    minutes, balls = ({line.get_label(): line.get_xydata() for line in axes.lines} for axes in figure.axes)
+    assert list(minutes) == ["one, perturbed", "one, evaluated", "two, perturbed", "two, evaluated"]
+    assert minutes["one, evaluated"].tolist() == [[pytest.approx(2.9 / 60), 0.4]]
+    assert balls["two, evaluated"].tolist() == [[30_000, 0.4]]
+    np.testing.assert_allclose(minutes["one, perturbed"][:, 0], 2 * minutes["two, perturbed"][:, 0])
+    assert balls["one, perturbed"][-1] == pytest.approx((6000, np.mean(np.arange(35, 60) / 60)))
+    assert share(plots.draw_curves(tmp_path / "a" / "curves.png", [plots.Curve("one", rows, 100)]), "#1f77b4") > 0.0005
