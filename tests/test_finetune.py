@@ -354,6 +354,19 @@ def test_another_fine_tuning_in_the_same_folder_is_refused(source, tmp_path):
         tune(source, tmp_path / "run", Toy(), updates=1)
 
 
+def test_a_start_that_failed_does_not_stand_in_the_way_of_the_corrected_one(source, tmp_path):
+    class Absent(Toy):
+        def play(self, *arguments) -> PlayedBall:
+            raise RunError("no robot answers")
+
+    with pytest.raises(RunError, match="no robot answers"):
+        tune(source, tmp_path / "run", Absent(), sigma=0.05)
+    tune(source, tmp_path / "run", Toy())
+    tune(source, tmp_path / "whole", Toy())
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
+    assert yaml.safe_load((tmp_path / "run" / finetune.SETTINGS).read_text())["settings"]["sigma"] == 0.025
+
+
 def test_a_finished_run_goes_on_when_more_updates_are_asked_for(source, tmp_path):
     tune(source, tmp_path / "whole", Toy())
     tune(source, tmp_path / "run", Toy(), updates=2)
