@@ -11,8 +11,7 @@ alike           the paper says that two things do not differ
 number          agrees: the interval holds the paper's number;  differs: it does not
                 undecided: it holds it, but spans more than a factor of WIDEST
 not comparable  the study lacks what the claim is about; or the paper makes no statement that could be right or wrong;
-or
-                two policies are compared whose rallies are both shorter than PLAYS on average: they hardly return a
+                or two policies are compared whose rallies are both shorter than PLAYS on average: they hardly return a
                 ball
 
 "No difference" is a ratio of one, a difference of zero, and of a share, one half.
