@@ -28,7 +28,7 @@ from ballmodel.state import BallState
 from bgs import normalizer, strategy
 from experiments import build, config, policy
 from experiments.errors import ConfigError, RunError
-from experiments.study import blind, effects, evaluation, plan, reality, scoring, training
+from experiments.study import blind, effects, evaluation, plan, processes, reality, scoring, training
 from experiments.study import config as study_config
 from experiments.study import loop as is2r
 from experiments.study.finetuning import VirtualReality
@@ -379,6 +379,17 @@ def test_the_remaining_time_follows_from_what_the_same_kind_took(tmp_path):
     assert remaining(steps[2:], journal) == "at least 0:00:06 left, not yet timed: slow"
     journal.append(steps[3], 40.0)
     assert remaining([steps[2], steps[4]], Journal(journal.path)) == "about 0:00:56 left"
+
+
+def test_who_does_the_steps(tmp_path):
+    many = study_config.parse(TINY | {"simulation": {**TINY["simulation"], "devices": "auto"}}, "test")
+    assert processes.choose(many, None, None) == len(os.sched_getaffinity(0))
+    assert processes.choose(many, 3, None) == 3
+    assert processes.choose(many, None, 2) == processes.choose(study(), None, None) == 1
+    with_robot = study(robot="lockstep", recordings={"player3": str(tmp_path / "balls.csv")})
+    assert processes.choose(with_robot, None, None) == 1
+    with pytest.raises(ConfigError, match="--processes 2: with a robot .* allowed: 1"):
+        processes.choose(with_robot, 2, None)
 
 
 # The whole loop
