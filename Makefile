@@ -1,6 +1,6 @@
 # make demo   set up, train the quickstart, evaluate it, export it
 # make rig-demo  the same policy on the emulated robot, over real sockets in real time (trains it first if need be)
-# make study-quick  the whole study in small: five virtual players, all methods, a report (under half an hour; resumable)
+# make study-quick  the whole study in small: five virtual players, all methods, a report (twenty minutes on two cores; resumable)
 # make test   set up and run the tests
 # make exam   hide causes in logs and let the diagnosis find them: the large examination (hours; resumable)
 # make bench  set up and measure speed against MJX, MuJoCo C and PyBullet

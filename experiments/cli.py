@@ -406,7 +406,7 @@ Every ball is on disk before the next begins: the same command continues after a
     _add_rig(p, None)
 
     p = _command(commands, "is2r", is2r, "simulate, play, refine: the iterative loop and its study", """\
-  mjx-tt is2r study_quick.yaml                              five virtual players, half an hour, ends in a report
+  mjx-tt is2r study_quick.yaml                              five virtual players, twenty minutes, ends in a report
   mjx-tt is2r study_full.yaml --set players=[player3]       the paper's scale
   mjx-tt is2r anna.yaml                                     with robot: robot.yaml in it: on a robot, docs/is2r.md
 
