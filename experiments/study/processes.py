@@ -1,8 +1,8 @@
 """Steps of a study that need nothing of each other, done side by side: one process per share of the machine's cores.
 
-One training on all cores is slower than as many trainings on a core each, and most of a
-study's steps are independent: players, seeds, methods. This process decides what is next, marks what is done and speaks;
-the workers only do what they are told. What a step makes follows from its name alone, so nothing depends on who does it.
+One training on all cores is slower than as many trainings on a core each, and most of a study's steps are independent:
+players, seeds, methods. The process that was asked decides what is next, marks what is done and says so; the workers
+only do what they are told. What a step makes follows from its name alone, so nothing depends on who does it.
 """
 
 from __future__ import annotations
