@@ -133,17 +133,9 @@ def render(options: argparse.Namespace) -> int:
 
 
 def curves(options: argparse.Namespace) -> int:
-    from experiments import metrics, plots
-    from experiments.errors import RunError
-    from experiments.runs import Run
+    from experiments import plots
 
-    found = []
-    for folder in options.runs:
-        run = Run(folder)
-        optimiser, rows = run.config().optimiser, metrics.read(run.metrics)
-        if not rows:
-            raise RunError(f"{run.metrics}: holds no update yet")
-        found.append(plots.Curve(str(folder), rows, 2 * optimiser.pairs * optimiser.repeats))
+    found = [plots.read_curve(folder) for folder in options.runs]
     _console().print(str(checked("", plots.draw_curves, Path(options.out), found)), highlight=False, soft_wrap=True)
     return 0
 
@@ -418,7 +410,8 @@ A file name without a folder that is not in the current folder is looked up amon
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one key of the study")
     p.add_argument(
         "--processes", type=_count, metavar="N",
-        help="how many do steps side by side, on a device each (default: one per processor core where JAX computes on them)",
+        help="how many do steps side by side, on a device each (default: one per processor core; one in all with --devices, "
+        "on an accelerator or a robot)",
     )  # fmt: skip
     _add_devices(p)
 

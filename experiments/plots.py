@@ -18,7 +18,10 @@ from matplotlib.patches import Rectangle
 
 from ballmodel import constants as c
 from ballmodel.files import replacing
+from experiments import metrics
+from experiments.errors import RunError
 from experiments.evaluate import Played
+from experiments.runs import Run
 from mjx_tt.task import HIT, MISSED, RETURNED
 from robot_io.contract import JOINT_NAMES, JOINT_UNITS, LIMITS
 
@@ -69,6 +72,17 @@ class Curve:
     name: str
     rows: list[dict[str, Any]]
     balls: int
+
+
+def read_curve(folder: str | Path) -> Curve:
+    """The curve of a training in simulation. Raises RunError for a folder that holds none."""
+    run = Run(folder)
+    optimiser, rows = run.config().optimiser, metrics.read(run.metrics)
+    if not rows:
+        raise RunError(f"{run.metrics}: holds no update yet")
+    if "fault_rate" in rows[0]:
+        raise RunError(f"{folder}: is a fine-tuning, with another count of balls and time; wanted is a training in simulation")
+    return Curve(str(folder), rows, 2 * optimiser.pairs * optimiser.repeats)
 
 
 def draw_curves(path: Path, curves: list[Curve]) -> Path:

@@ -11,8 +11,10 @@ import pytest
 from PIL import Image
 from scipy.stats import binomtest
 
-from experiments import build, config, evaluate, plots
+from experiments import build, config, evaluate, plots, runs
+from experiments.errors import RunError
 from experiments.evaluate import Played
+from experiments.runs import Run
 from mjx_tt import rewards
 from mjx_tt.rollout import RolloutResult, Simulator
 from mjx_tt.task import HIT, MISSED, OUT_OF_REACH, RETURNED
@@ -166,3 +168,17 @@ def test_curves_of_several_trainings_are_drawn_over_time_and_balls(tmp_path):
     np.testing.assert_allclose(minutes["one, perturbed"][:, 0], 2 * minutes["two, perturbed"][:, 0])
     assert balls["one, perturbed"][-1] == pytest.approx((6000, np.mean(np.arange(35, 60) / 60)))
     assert share(plots.draw_curves(tmp_path / "a" / "curves.png", [plots.Curve("one", rows, 100)]), "#1f77b4") > 0.0005
+
+
+def test_what_has_no_learning_curve_is_named(tmp_path):
+    run = Run(tmp_path / "run")
+    run.folder.mkdir()
+    runs.write_yaml(run.folder / runs.CONFIG, config.load(config.shipped()["narrow"]).to_dict())
+    with pytest.raises(RunError, match="metrics.jsonl: holds no update yet"):
+        plots.read_curve(run.folder)
+    run.metrics.write_text(json.dumps({"update": 1, "return_rate": 0.5, "fault_rate": 0.0}) + "\n")
+    with pytest.raises(RunError, match="run: is a fine-tuning"):
+        plots.read_curve(run.folder)
+    run.metrics.write_text(json.dumps(rising()[0]) + "\n")
+    optimiser = run.config().optimiser
+    assert plots.read_curve(run.folder).balls == 2 * optimiser.pairs * optimiser.repeats

@@ -383,7 +383,8 @@ def test_the_remaining_time_follows_from_what_the_same_kind_took(tmp_path):
 
 def test_who_does_the_steps(tmp_path):
     many = study_config.parse(TINY | {"simulation": {**TINY["simulation"], "devices": "auto"}}, "test")
-    assert processes.choose(many, None, None) == len(os.sched_getaffinity(0))
+    if jax.default_backend() == "cpu":
+        assert processes.choose(many, None, None) == len(os.sched_getaffinity(0))
     assert processes.choose(many, 3, None) == 3
     assert processes.choose(many, None, 2) == processes.choose(study(), None, None) == 1
     with_robot = study(robot="lockstep", recordings={"player3": str(tmp_path / "balls.csv")})
@@ -532,7 +533,7 @@ def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tm
     status, message = start_and_end(player / "is2r-ft35" / "checkpoints", signal.SIGKILL)
     assert status == -signal.SIGKILL, message
     before = Journal(folder / "steps.jsonl").entries
-    assert before and len(before) < 6
+    assert before and len(before) < 10  # of 20
     loop(study(), folder)
     entries = [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
     assert len(entries) == len(set(entries))  # nothing was done twice
