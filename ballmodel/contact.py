@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from ballmodel import constants as c
-from ballmodel.optional import optional, value_or
+from ballmodel.partial_params import optional, value_or
 from ballmodel.vec import TINY, Vec, components, cross, dot, norm
 
 STICKING = 2.0 / 5.0  # alpha that brings the contact point of a thin shell to rest

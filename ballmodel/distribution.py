@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from ballmodel.files import replacing
+from ballmodel.io.atomic_files import replacing
+from ballmodel.io.yaml import read as read_yaml
 from ballmodel.state import BallState
-from ballmodel.yaml_file import read as read_yaml
 
 AXES = {"position": ("x", "y", "z"), "velocity": ("x", "y", "z"), "landing": ("x", "y")}
 NOTES = ("name", "source", "paper")

@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 
 from ballmodel import contact
-from ballmodel.aero import INTEGRATORS, FlightParams, acceleration
+from ballmodel.aerodynamics import INTEGRATORS, FlightParams, acceleration
 from ballmodel.contact import NET, TABLE, Box, PaddleParams, SurfaceParams, box_gap, surface_frame, surface_gap
-from ballmodel.optional import value_or
+from ballmodel.partial_params import value_or
 from ballmodel.state import BallState
 from ballmodel.vec import TINY, Vec, components, cross, dot, select, stack, stored
 

@@ -22,7 +22,7 @@ from statistics import median
 from rich.console import Console
 from rich.table import Table
 
-from ballmodel.files import replacing
+from ballmodel.io.atomic_files import replacing
 from benchmarks.worker import Worker, summary, take_turns
 
 

@@ -11,15 +11,15 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from ballmodel import flight, players
+from ballmodel import flight, registry
 from ballmodel.flight import ball_params
-from ballmodel.pool import sample_pool
-from mjx_tt import latency, noise
-from mjx_tt.dynamics.fold import materialise
-from mjx_tt.model import SimModel
-from mjx_tt.policy import PolicyController, initial_theta
-from mjx_tt.rollout import Simulator
-from mjx_tt.task import TaskConfig
+from ballmodel.sampling import sample_pool
+from mjx_tt.env.policy import PolicyController, initial_theta
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import TaskConfig
+from mjx_tt.robot.scalar_algebra import materialise
+from mjx_tt.sim import latency, noise
+from mjx_tt.sim.model import SimModel
 from robot_io.contract import LIMITS, N_JOINTS, N_OBSERVATION, unflatten
 from robot_io.limits import limit_velocity
 
@@ -70,7 +70,7 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
     """By name: calls per control step, a step (tick, state) -> state, its first state."""
     simulator, lanes = Simulator(config), rows * columns
     task, timestep = simulator.task, 1.0 / config.sim_rate
-    pool = sample_pool(jax.random.key(0), players.resolve("player3/M0"), ball_params(), 1024)
+    pool = sample_pool(jax.random.key(0), registry.resolve("player3/M0"), ball_params(), 1024)
     episodes = jax.tree.map(
         lambda x: x.reshape(*x.shape[:-2], lanes) if x.ndim >= 2 else x,
         simulator.draw(jax.random.key(1), pool, SimModel(), (), rows, columns),

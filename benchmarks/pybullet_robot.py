@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from mjx_tt import robot
+from mjx_tt.robot import model as robot
 
 
 def urdf(model: mujoco.MjModel) -> str:

@@ -14,13 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import policy as policies
-from mjx_tt import platform, players
-from mjx_tt.model import SimModel
-from mjx_tt.policy import initial_theta
-from mjx_tt.rally import RallySimulator
-from mjx_tt.rally_ends import End
-from mjx_tt.task import TaskConfig
+from experiments.runs import load_policy as policies
+from mjx_tt import platform
+from mjx_tt.env.policy import initial_theta
+from mjx_tt.env.task import TaskConfig
+from mjx_tt.rally import human_player
+from mjx_tt.rally.end_reasons import End
+from mjx_tt.rally.simulator import RallySimulator
+from mjx_tt.sim.model import SimModel
 from robot_io.contract import N_OBSERVATION
 
 LANES = 200  # side by side; each plays its share one rally after the other
@@ -41,8 +42,8 @@ def main(arguments=None) -> int:
     else:
         theta, mean, inverse_scale = initial_theta(jax.random.key(0)), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION)
     each = -(-chosen.rallies // chosen.lanes)
-    names = players.names()
-    people = players.stack([players.load(names[lane % len(names)]) for lane in range(chosen.lanes)])
+    names = human_player.names()
+    people = human_player.stack([human_player.load(names[lane % len(names)]) for lane in range(chosen.lanes)])
     columns = jnp.repeat(jnp.asarray(theta, jnp.float32)[:, None], chosen.lanes, axis=1)
     normaliser = [jnp.asarray(x, jnp.float32) for x in (mean, inverse_scale)]
     simulator = RallySimulator(TaskConfig(sim_rate=chosen.sim_rate))

@@ -37,8 +37,8 @@ def _jax_engine(name: str, lanes: int, chunks: int, steps: int) -> Side:
     import jax.numpy as jnp
     from jax.sharding import Mesh, PartitionSpec
 
-    from mjx_tt.dynamics.fold import materialise
-    from mjx_tt.task import Task, TaskConfig
+    from mjx_tt.env.task import Task, TaskConfig
+    from mjx_tt.robot.scalar_algebra import materialise
 
     task = Task(TaskConfig(engine=name, sim_rate=SIM_RATE))
     devices = jax.devices()
@@ -74,7 +74,7 @@ def mujoco_rollout(robots: int, steps: int, threads: int) -> Side:
     import mujoco
     from mujoco import rollout
 
-    from mjx_tt import robot
+    from mjx_tt.robot import model as robot
 
     model = robot.load_model()
     model.opt.timestep = 1.0 / SIM_RATE
@@ -138,8 +138,8 @@ def rollout(changes: list[str], devices: int | None = None) -> Side:
     import jax
     import jax.numpy as jnp
 
-    from mjx_tt.model import SimModel
-    from mjx_tt.rollout import RESULT_SPECS
+    from mjx_tt.env.rollout import RESULT_SPECS
+    from mjx_tt.sim.model import SimModel
 
     trainer, state = _paper_trainer(changes)
     simulator, columns = trainer.simulator, 2 * trainer.bgs_config.pairs
@@ -164,9 +164,9 @@ def rollout(changes: list[str], devices: int | None = None) -> Side:
 def _paper_trainer(changes: list[str]):
     import jax
 
-    from experiments import build, config
+    from experiments.config import build, experiment
 
-    trainer = build.trainer(build.experiment(config.load(config.shipped()["paper"], tuple(changes)), "paper"))
+    trainer = build.trainer(build.experiment(experiment.load(experiment.shipped()["paper"], tuple(changes)), "paper"))
     return trainer, trainer.init(jax.random.key(0))
 
 

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import optax
 
 from bgs import directions as direction_sampling
+from bgs import optimizers as steps
 from bgs import shaping
-from bgs import step as steps
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,14 @@ class BGSConfig:
 
     pairs       N, antithetic pairs per update
     sigma       perturbation scale: members are theta +/- sigma delta; a number or a schedule over updates
-                (``bgs.step``)
+                (``bgs.optimizers``)
     keep        fraction of the pairs that become elites, in (0, 1]
     rank        how elites are chosen: "abs", "signed" or "max" (``shaping.shape``)
     weighting   "returns" or "centered_rank" (``shaping.shape``)
     normalise   "std" or "none": division by the elites' standard deviation (``shaping.shape``)
     orthogonal  orthogonal or independent Gaussian directions (``directions.sample``)
     scale       "sqrt_d" or "chi": norms of orthogonal directions (``directions.sample``)
-    step        optax transformation, from ``bgs.step.make`` or optax itself
+    step        optax transformation, from ``bgs.optimizers.make`` or optax itself
     average     decay per update of the moving average of theta, in [0, 1); 0 makes the average theta itself
 
     Raises ValueError naming the key, what was given and what is allowed.

@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def train(options: argparse.Namespace) -> int:
-    from experiments import config
+    from experiments.config import experiment as config
 
     if options.select and not options.seeds:
         raise ConfigError("--select chooses among seeds: give them with --seeds, such as --seeds 0,1,2")
@@ -52,22 +52,23 @@ def train(options: argparse.Namespace) -> int:
     paths = [_file(name, config.shipped()) for name in options.experiments]
     configs = [(str(path), config.load(path, tuple(options.set))) for path in paths]
     _start_jax(options.devices or _most_devices(configs))
-    from experiments import jobs
+    from experiments.training import sweep
 
     console = _console()
-    planned = jobs.plan(configs, options.seeds, Path(options.out))
-    ok = jobs.run_all(planned, console)
+    planned = sweep.plan(configs, options.seeds, Path(options.out))
+    ok = sweep.run_all(planned, console)
     if options.select and ok:
         for name in dict.fromkeys(job.config.name for job in planned):
             mine = [job for job in planned if job.config.name == name]
-            jobs.select(Path(options.out) / name, mine, console)
+            sweep.select(Path(options.out) / name, mine, console)
     return 0 if ok else 1
 
 
 def evaluate(options: argparse.Namespace) -> int:
     _start_jax(options.devices)
-    from experiments import evaluate as evaluation
-    from experiments import finish, policy
+    from experiments.evaluation import evaluate as evaluation
+    from experiments.runs import load_policy as policy
+    from experiments.training import finalize
 
     console = _console()
     trained = policy.load(options.policy)
@@ -77,23 +78,24 @@ def evaluate(options: argparse.Namespace) -> int:
     bound = None if options.no_reachable else settings.reachable_balls
     played = evaluation.evaluate(experiment, trained, episodes, seed, bound)
     folder = Path(options.out) if options.out else _evaluation_folder(options)
-    finish.save_evaluation(folder, played, experiment.task.reward_weights)
-    finish.print_report(console, played.report, str(trained.source))
+    finalize.save_evaluation(folder, played, experiment.task.reward_weights)
+    finalize.print_report(console, played.report, str(trained.source))
     console.print(f"  {folder}/evaluation.json, pictures in {folder}/plots", highlight=False, soft_wrap=True)
     return 0
 
 
 def export(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments import finish, policy
-    from experiments.runs import Run
+    from experiments.runs import load_policy as policy
+    from experiments.runs.run_dir import Run
+    from experiments.training import finalize
 
     console, run = _console(), Run(options.run)
     trained = policy.load(options.run)
     experiment = _experiment_of(trained, options)
     report = run.read_evaluation() if run.evaluation.exists() else None
     folder = Path(options.out) if options.out else run.artefact
-    written = finish.export_policy(folder, trained, experiment, report, console)
+    written = finalize.export_policy(folder, trained, experiment, report, console)
     if written:
         console.print(f"artefact: {folder}", highlight=False)
     return 0 if written else 1
@@ -101,7 +103,7 @@ def export(options: argparse.Namespace) -> int:
 
 def fit_human(options: argparse.Namespace) -> int:
     _start_jax(None)
-    from experiments import measurements
+    from experiments.commands import measurements
 
     measurements.fit(
         options.data, options.format, Path(options.out), options.name, options.eps, options.min_samples, _console()
@@ -111,7 +113,7 @@ def fit_human(options: argparse.Namespace) -> int:
 
 def import_(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments import measurements
+    from experiments.commands import measurements
 
     measurements.convert(options.data, options.format, Path(options.out), _console())
     return 0
@@ -119,7 +121,8 @@ def import_(options: argparse.Namespace) -> int:
 
 def render(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments import episodes, policy
+    from experiments.evaluation import video as episodes
+    from experiments.runs import load_policy as policy
 
     console = _console()
     trained = policy.load(options.policy)
@@ -133,10 +136,10 @@ def render(options: argparse.Namespace) -> int:
 
 
 def curves(options: argparse.Namespace) -> int:
-    from experiments import plots
+    from experiments.evaluation import figures
 
-    found = [plots.read_curve(folder) for folder in options.runs]
-    _console().print(str(checked("", plots.draw_curves, Path(options.out), found)), highlight=False, soft_wrap=True)
+    found = [figures.read_curve(folder) for folder in options.runs]
+    _console().print(str(checked("", figures.draw_curves, Path(options.out), found)), highlight=False, soft_wrap=True)
     return 0
 
 
@@ -149,24 +152,24 @@ def bench(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments import play
+    from experiments.deploy import session
 
-    return play.run(
+    return session.run(
         Path(options.artefact), options.robot, options.balls, options.distribution, options.backend, Path(options.log),
         options.rig, options.seed, options.seconds, _console(),
     )  # fmt: skip
 
 
 def finetune(options: argparse.Namespace) -> int:
-    from experiments import finetune_settings
+    from experiments.config import finetuning
 
-    settings = finetune_settings.load(options.settings, tuple(options.set))
+    settings = finetuning.load(options.settings, tuple(options.set))
     _start_jax(1)
-    from experiments import play
-    from experiments.runs import Run
+    from experiments.deploy import session
+    from experiments.runs.run_dir import Run
 
     run = Run(options.out or f"{Path(options.policy).resolve().name}-finetuned")
-    report = play.finetune(
+    report = session.finetune(
         options.policy, settings, run, options.robot, options.distribution, options.rig, options.backend, options.seed,
         _console(),
     )  # fmt: skip
@@ -174,20 +177,20 @@ def finetune(options: argparse.Namespace) -> int:
 
 
 def is2r(options: argparse.Namespace) -> int:
-    from experiments.study import config as study_config
+    from experiments.config import study as study_config
 
     study = study_config.load(_file(options.study, study_config.shipped()), tuple(options.set))
     devices = study.simulation.devices
     _start_jax(options.devices or (None if devices == "auto" else devices))
-    from experiments.study import loop, processes
+    from experiments.study import pipeline, workers
 
-    side_by_side = processes.choose(study, options.processes, options.devices)
-    return 0 if loop.run(study, Path(options.out) / study.name, _console(), side_by_side) else 130
+    side_by_side = workers.choose(study, options.processes, options.devices)
+    return 0 if pipeline.run(study, Path(options.out) / study.name, _console(), side_by_side) else 130
 
 
 def study_report(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments.study import report
+    from experiments.study.report import page as report
 
     _console().print(report.write(Path(options.study)), highlight=False, soft_wrap=True)
     return 0
@@ -195,19 +198,19 @@ def study_report(options: argparse.Namespace) -> int:
 
 def blind(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments.study import blind_evaluation
+    from experiments.study.blind import session
 
-    blind_evaluation.run(options, _console())
+    session.run(options, _console())
     return 0
 
 
 def compare(options: argparse.Namespace) -> int:
-    from experiments.algorithms import config as compare_config
+    from experiments.config import baselines as compare_config
 
     path = _file(options.comparison, compare_config.shipped())
     comparison, experiment = compare_config.load(path, tuple(options.set))
     _start_jax(1)
-    from experiments.algorithms import comparison as comparing
+    from experiments.baselines import compare as comparing
 
     console = _console()
     folder = comparing.compare(comparison, experiment, str(path), Path(options.out), console)
@@ -217,21 +220,21 @@ def compare(options: argparse.Namespace) -> int:
 
 def rig(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments import play
+    from experiments.deploy import session
 
-    return play.rig(options.distribution, options.rig, options.seed, options.ports, Path(options.out), _console())
+    return session.rig(options.distribution, options.rig, options.seed, options.ports, Path(options.out), _console())
 
 
 def log(options: argparse.Namespace) -> int:
-    from experiments import logs
+    from experiments.commands import session_logs
 
     console = _console()
     if options.action == "list":
-        logs.list_logs(Path(options.paths[0]), console)
+        session_logs.list_logs(Path(options.paths[0]), console)
     elif options.action == "check":
-        return 1 if logs.check([Path(p) for p in options.paths], console) else 0
+        return 1 if session_logs.check([Path(p) for p in options.paths], console) else 0
     else:
-        act = logs.salvage if options.action == "salvage" else logs.export
+        act = session_logs.salvage if options.action == "salvage" else session_logs.export
         for path in options.paths:
             act(Path(path), Path(options.out) if options.out else None, console)
     return 0
@@ -239,7 +242,7 @@ def log(options: argparse.Namespace) -> int:
 
 def diagnose(options: argparse.Namespace) -> int:
     _start_jax(1)
-    from experiments import diagnosis
+    from experiments.commands import diagnose as diagnosis
 
     console, out = _console(), Path(options.out)
     without = tuple(name for part in options.without for name in part.split(",") if name)
@@ -260,14 +263,14 @@ def diagnose(options: argparse.Namespace) -> int:
 def schema(options: argparse.Namespace) -> int:
     import json
 
-    from experiments import config
+    from experiments.config import experiment as config
 
     print(json.dumps(config.json_schema(), indent=2))
     return 0
 
 
 def balls(options: argparse.Namespace) -> int:
-    from experiments import measurements
+    from experiments.commands import measurements
 
     measurements.print_catalogue(_console())
     return 0
@@ -576,7 +579,7 @@ def _start_jax(devices: int | None) -> None:
 
 def _experiment_of(trained, options: argparse.Namespace):
     """The experiment that trained a policy, with the balls and model of the command line in place of its own."""
-    from experiments import build
+    from experiments.config import build
 
     config = trained.config
     if config is None:
@@ -589,7 +592,7 @@ def _experiment_of(trained, options: argparse.Namespace):
 
 
 def _evaluation_folder(options: argparse.Namespace) -> Path:
-    from experiments.runs import CONFIG
+    from experiments.runs.run_dir import CONFIG
 
     policy = Path(options.policy)
     changed = [

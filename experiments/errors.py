@@ -22,10 +22,10 @@ class CheckpointError(ExperimentError):
 def explained(error: Exception) -> bool:
     """Whether the error's message is enough."""
     # These need NumPy, which --help should not wait for.
-    from robot_io.artefact import ArtefactError
-    from robot_io.egm_messages import EgmError
+    from robot_io.devices.egm.messages import EgmError
     from robot_io.errors import DeviceError, RefusedError
-    from robot_io.log.records import LogError
+    from robot_io.log.messages import LogError
+    from robot_io.policy.artefact import ArtefactError
 
     return isinstance(error, (ExperimentError, ArtefactError, OSError, RefusedError, DeviceError, EgmError, LogError))
 

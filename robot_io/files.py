@@ -1,4 +1,4 @@
-"""Writing files so that a reader never meets half of one, nor loses one. ``ballmodel.files`` is the same for a package
+"""Writing files so that a reader never meets half of one, nor loses one. ``ballmodel.io.atomic_files`` is the same for a package
 that knows nothing of this one."""
 
 from __future__ import annotations

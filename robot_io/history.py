@@ -1,7 +1,7 @@
 """Timestamped samples of one device, read back at any moment between them.
 
 The simulator's delayed observations interpolate linearly between the states around the wanted moment
-(``mjx_tt.latency``); so does this.
+(``mjx_tt.sim.latency``); so does this.
 """
 
 from __future__ import annotations

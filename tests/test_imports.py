@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.support.paths import ROOT
+
 PACKAGES = ("robot_io", "ballmodel", "bgs", "mjx_tt", "experiments")
 
 # By the longest matching prefix: modules of the project that a module may import besides those of its own package.
@@ -23,9 +24,9 @@ ALLOWED = {
 JAX = ("jax", "jaxlib", "flax", "optax", "brax", "equinox", "mujoco")
 # Of robot_io, whose other modules run on the robot: what some may import besides.
 JAX_ALLOWED = {
-    "robot_io/export.py": JAX,
-    "robot_io/policy_jit.py": ("jax", "jaxlib"),
-    "robot_io/rig/world.py": ("mujoco",),
+    "robot_io/policy/export.py": JAX,
+    "robot_io/policy/jax_policy.py": ("jax", "jaxlib"),
+    "robot_io/emulator/world.py": ("mujoco",),
 }
 
 

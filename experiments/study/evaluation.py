@@ -10,18 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from ballmodel.distribution import BallDistribution
-from ballmodel.files import replacing
-from experiments import build
-from experiments.study import blind, effects, scoring
-from experiments.study import reality as realities
-from experiments.study.config import Study
+from ballmodel.io.atomic_files import replacing
+from experiments.config import build
+from experiments.config.study import Study
+from experiments.study import target_domain as realities
+from experiments.study.analysis import effect_costs, scoring
+from experiments.study.blind import protocol
 from experiments.study.finetuning import VirtualReality
-from mjx_tt import players
-from mjx_tt.rally import Box, RallyResult
+from mjx_tt.rally import human_player
+from mjx_tt.rally.simulator import Box, RallyResult
 
 EVALUATIONS, LOGS = "evaluations.csv", "evaluations"
 LOGGED_TOUCHES = 30  # human hits that are kept, per rally and lane on average
-EVALUATION, EFFECTS = 7, 8  # purposes of keys, beside those of experiments.build
+EVALUATION, EFFECTS = 7, 8  # purposes of keys, beside those of experiments.config.build
 
 
 def play(
@@ -42,7 +43,7 @@ def play(
         return jnp.repeat(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1), lanes, axis=-1)
 
     theta, mean, inverse_scale = (spread(part) for part in zip(*policies))
-    people = players.stack([reality.player(evaluator) for _, evaluator, _ in pairings])
+    people = human_player.stack([reality.player(evaluator) for _, evaluator, _ in pairings])
     person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), people)
     low, high = (spread(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes))))
     rallies = settings.rallies // lanes
@@ -56,7 +57,7 @@ def play(
 def play_without(
     study: Study, reality: VirtualReality, seed: int, models: list[tuple[str, str]], policies: list,
     boxes: list[BallDistribution],
-) -> list[effects.Outcome]:  # fmt: skip
+) -> list[effect_costs.Outcome]:  # fmt: skip
     """Rallies of each (player, model) in every world of ``effects.WORLDS``, ``evaluation.rallies`` each, in one call.
 
     policies: theta, mean and inverse_scale of each; boxes: what each one was trained for. What the study's own reality
@@ -64,13 +65,13 @@ def play_without(
     """
     lanes, settings = study.evaluation.lanes, study.evaluation
     absent, everything = tuple(study.reality.without), tuple(realities.RANGES)
-    special = {effects.NOTHING: (), effects.ALL: everything}
-    left_out = [absent + special.get(world, (world,)) for world in effects.WORLDS]
+    special = {effect_costs.NOTHING: (), effect_costs.ALL: everything}
+    left_out = [absent + special.get(world, (world,)) for world in effect_costs.WORLDS]
     worlds = [realities.draw(seed, names) for names in left_out]
     people = [
-        players.without_spin(person) if "spin" in names else person
+        human_player.without_spin(person) if "spin" in names else person
         for names in left_out
-        for person in (players.load(player) for player, _ in models)
+        for person in (human_player.load(player) for player, _ in models)
     ]
 
     # Lanes: worlds x models x sessions.
@@ -80,7 +81,7 @@ def play_without(
 
     theta, mean, inverse_scale = (per_model(part) for part in zip(*policies))
     low, high = (per_model(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes))))
-    person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), players.stack(people))
+    person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), human_player.stack(people))
     world = realities.side_by_side(worlds, len(models) * lanes)
     result = reality.simulator.play(
         theta, mean, inverse_scale, person, world, build.key(seed, EFFECTS), settings.rallies // lanes,
@@ -90,9 +91,9 @@ def play_without(
     length, end = (np.moveaxis(np.asarray(x).reshape(shape), 0, -1) for x in (result.length, result.end))
     counts = ~np.isin(end, [int(e) for e in scoring.FILTERED])
     return [
-        effects.Outcome(seed, player, model, without, int(counts[w, m].sum()), _mean(length[w, m][counts[w, m]]))
+        effect_costs.Outcome(seed, player, model, without, int(counts[w, m].sum()), _mean(length[w, m][counts[w, m]]))
         for m, (player, model) in enumerate(models)
-        for w, without in enumerate(effects.WORLDS)
+        for w, without in enumerate(effect_costs.WORLDS)
     ]
 
 
@@ -105,7 +106,7 @@ def code_names(seed: int, pairings: list[tuple[str, str, str]]) -> list[str]:
     codes: dict[tuple[str, str, str], str] = {}
     for evaluator in dict.fromkeys(e for _, e, _ in pairings):
         mine = [f"{trainer}/{model}" for trainer, e, model in pairings if e == evaluator]
-        drawn = blind.draw(mine, np.random.default_rng([seed, zlib.crc32(evaluator.encode())]))
+        drawn = protocol.draw(mine, np.random.default_rng([seed, zlib.crc32(evaluator.encode())]))
         codes |= {(t, e, m): drawn[f"{t}/{m}"] for t, e, m in pairings if e == evaluator}
     return [codes[pairing] for pairing in pairings]
 

@@ -1,6 +1,6 @@
 """Fine-tuning, seed selection and rallies in a virtual reality, with a virtual player on the other side of the net.
 
-The settings are those of fine-tuning on a robot (``experiments.finetune_settings``): an update's balls are the lanes of
+The settings are those of fine-tuning on a robot (``experiments.config.finetuning``): an update's balls are the lanes of
 rallies that go on across updates, as a person keeps playing while the robot tries its perturbations. What comes back is
 what a robot and its cameras would tell: rewards, faults, measured balls.
 """
@@ -15,19 +15,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ballmodel.optional import without_nominal
+from ballmodel.partial_params import without_nominal
 from ballmodel.trajectory import Dataset, Trajectory
 from bgs import normalizer, strategy
 from bgs.strategy import BGSConfig, BGSState
-from experiments import build, evaluate
-from experiments.study import reality
-from experiments.study.config import Study
-from experiments.training import TrainState
-from mjx_tt import players, rewards
-from mjx_tt.model import SimModel
-from mjx_tt.players import Player
-from mjx_tt.rally import RallySimulator, RallyState, ShotResult
-from mjx_tt.task import MISSED, RETURNED, TaskConfig
+from experiments.config import build
+from experiments.config.study import Study
+from experiments.evaluation import evaluate
+from experiments.study import target_domain
+from experiments.training.update import TrainState
+from mjx_tt.env import rewards
+from mjx_tt.env.task import MISSED, RETURNED, TaskConfig
+from mjx_tt.rally import human_player
+from mjx_tt.rally.human_player import Player
+from mjx_tt.rally.simulator import RallySimulator, RallyState, ShotResult
+from mjx_tt.sim.model import SimModel
 
 FAULT = -2.0  # paper: a fault of the robot
 SELECTION_LANES = 10  # sessions side by side in which policies are compared
@@ -61,11 +63,11 @@ class VirtualReality:
         # Cycles of different lengths share one compiled call of a length that divides all of them.
         self._chunk = math.gcd(*(r.real for r in study.simulation.rounds))
         self._updates = jax.jit(self._updates_of, static_argnames="config")
-        self._lobs = jax.jit(players.first_ball, static_argnums=3)
+        self._lobs = jax.jit(human_player.first_ball, static_argnums=3)
         self._compared = jax.jit(self._shots_of, static_argnames="turns")
 
     def _draw(self, seed: int) -> None:
-        self.model = reality.draw(seed, tuple(self._study.reality.without))
+        self.model = target_domain.draw(seed, tuple(self._study.reality.without))
         self.known = without_nominal(self.model)
 
     def at(self, seed: int) -> VirtualReality:
@@ -76,14 +78,14 @@ class VirtualReality:
 
     def player(self, name: str) -> Player:
         """The virtual person; in a reality without spin their strokes have none."""
-        person = players.load(name)
-        return players.without_spin(person) if "spin" in self._study.reality.without else person
+        person = human_player.load(name)
+        return human_player.without_spin(person) if "spin" in self._study.reality.without else person
 
     def first_balls(self, player: Player, count: int, key, session: str) -> Dataset:
         """D0: balls across the table without a robot, as the cameras measured them."""
         ball_key, camera_key = jax.random.split(key)
-        balls = self._lobs(player, players.fresh((count,)), ball_key, (count,))
-        measured = reality.measure(self.model, balls, self._study.reality.camera_noise, camera_key)
+        balls = self._lobs(player, human_player.fresh((count,)), ball_key, (count,))
+        measured = target_domain.measure(self.model, balls, self._study.reality.camera_noise, camera_key)
         return Dataset(measured.trajectories(session), session)
 
     def fine_tune(self, player: Player, theta, statistics, updates: int, key, session: str) -> Cycle:
@@ -105,7 +107,7 @@ class VirtualReality:
         shots, info = jax.tree.map(lambda *x: np.concatenate(x), *found)
         hits = jax.tree.map(lambda x: np.moveaxis(x, 1, 0).reshape(3, -1), shots.ball)  # (updates, 3, L) -> (3, n)
         finite = shots.finite.reshape(-1)
-        measured = reality.measure(
+        measured = target_domain.measure(
             self.model, jax.tree.map(lambda x: x[:, finite], hits), self._study.reality.camera_noise, camera_key
         )
         rows = [

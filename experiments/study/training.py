@@ -10,14 +10,15 @@ import numpy as np
 from rich.console import Console
 
 from ballmodel.distribution import load_distribution
-from ballmodel.files import replacing
-from experiments import build, policy, runs
-from experiments.config import Config, Evaluation, Training
-from experiments.policy import SELECTION, Policy
-from experiments.runs import Run
-from experiments.study.config import Study
-from experiments.study.plan import Simulated, updates
-from experiments.train import train
+from ballmodel.io.atomic_files import replacing
+from experiments.config import build
+from experiments.config.experiment import Config, Evaluation, Training
+from experiments.config.study import Study
+from experiments.runs import load_policy, run_dir
+from experiments.runs.load_policy import SELECTION, Policy
+from experiments.runs.run_dir import Run
+from experiments.study.schedule import Simulated, updates
+from experiments.training.loop import train
 
 POLICY = "policy.npz"
 
@@ -69,11 +70,11 @@ def simulate(
         if not run.trained(experiment.config):
             train(experiment, run, console)
         if score is not None:
-            scores[f"seed{k}"] = score(policy.load(run.folder))
+            scores[f"seed{k}"] = score(load_policy.load(run.folder))
     best = max(scores, key=scores.get) if scores else "seed0"
-    chosen = policy.load(folder / "training" / best)
+    chosen = load_policy.load(folder / "training" / best)
     save(folder, chosen)
-    runs.write_json(folder / SELECTION, {"best": f"training/{best}", "scores": scores})
+    run_dir.write_json(folder / SELECTION, {"best": f"training/{best}", "scores": scores})
     worth = f", worth {scores[best]:.2f} of 2 in reality" if scores else ""
     among = f", best of {len(scores)}" if len(scores) > 1 else ""
     return f"{updates(study, item)} updates{among}{worth}"

@@ -10,15 +10,16 @@ from typing import Protocol
 
 import jax
 
-from ballmodel.files import replacing
+from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Dataset
-from experiments import build, checkpoint, policy, runs
-from experiments.policy import Policy
-from experiments.runs import CONFIG, Run
-from experiments.study.config import Study
+from experiments.config import build
+from experiments.config.study import Study
+from experiments.runs import checkpoint, load_policy, run_dir
+from experiments.runs.load_policy import Policy
+from experiments.runs.run_dir import CONFIG, Run
 from experiments.study.finetuning import VirtualReality
 
-STUDY = 6  # purpose of a key, beside those of experiments.build
+STUDY = 6  # purpose of a key, beside those of experiments.config.build
 
 
 class World(Protocol):
@@ -49,13 +50,13 @@ class VirtualWorld:
         )
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
-        theta, statistics = policy.load_statistics(source)
+        theta, statistics = load_policy.load_statistics(source)
         person = self.reality.player(player)
         cycle = self.reality.fine_tune(person, theta, statistics, real_updates, self._key(name), folder.name)
         run = Run(folder)
         folder.mkdir(parents=True, exist_ok=True)
         config = Run(source).config().model_copy(update={"name": folder.name, "initial_policy": str(source.resolve())})
-        runs.write_yaml(folder / CONFIG, config.to_dict())
+        run_dir.write_yaml(folder / CONFIG, config.to_dict())
         _write_lines(run.metrics, cycle.rows)
         checkpoint.save(run.checkpoints, real_updates, cycle.state, {"seconds": 0.0})
         tenth = max(1, real_updates // 10)

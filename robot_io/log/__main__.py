@@ -14,8 +14,8 @@ import sys
 import time
 import traceback
 
+from robot_io.log.messages import Event, Level, LogError
 from robot_io.log.recorder import FRAME, SETUP
-from robot_io.log.records import Event, Level, LogError
 from robot_io.log.writer import Session, SessionWriter
 
 FLUSH_SECONDS = 0.2

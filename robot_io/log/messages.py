@@ -1,182 +1,349 @@
-"""The log's topics: which record becomes which message, and back into numbers.
+"""What a session's log is made of, and how a record travels from the control thread to the recorder process.
 
-Positions, joint states and events use Foxglove's protobuf schemas, so that viewers draw them as they are; the policy's
-vectors and the ticks have two small schemas of their own.
+All times are seconds of the control process's monotonic clock. A record's ``log_time`` says when the control process
+had it: measurements also carry the time at which they were true, and the two are never mixed.
+
+Packed, a record is one kind byte and its fields, little endian without padding; arrays are float64. ``unpack`` is the
+inverse. A packed record has at most LARGEST bytes, so that a pipe takes a frame whole or not at all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import enum
+import json
+import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
-from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
-from foxglove_schemas_protobuf.Log_pb2 import Log
-from foxglove_schemas_protobuf.Point3InFrame_pb2 import Point3InFrame
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+import numpy as np
 
-from robot_io.contract import JOINT_NAMES, JOINT_UNITS, N_JOINTS, N_OBSERVATION, OBSERVATION_NAMES, OBSERVATION_UNITS
-from robot_io.log.records import Action, Ball, Command, Event, Joints, Observation, Tick
+from robot_io.contract import N_JOINTS, N_OBSERVATION
 
-NANO = 1_000_000_000
-FRAME = "table"
-SEQUENCE = 1 << 32
-TICK_FIELDS = ("lateness", "policy_seconds", "ball_age", "gantry_age", "arm_age")
+LARGEST = 4094  # bytes: PIPE_BUF of Linux, less the two of a frame's length
+_CUT = " [cut]"
+_LONGEST_TEXT = 3900  # bytes of UTF-8 of an event's text
 
 
-def _own_messages() -> tuple[type, type]:
-    """robot_log.Values and robot_log.Tick, in a pool of their own so that nothing else's names can clash."""
-    field_type = descriptor_pb2.FieldDescriptorProto
-    file = descriptor_pb2.FileDescriptorProto(
-        name="robot_log.proto", package="robot_log", syntax="proto3", dependency=["google/protobuf/timestamp.proto"]
-    )
-    fields = {
-        "Values": [("values", field_type.LABEL_REPEATED)],
-        "Tick": [(name, field_type.LABEL_OPTIONAL) for name in TICK_FIELDS],
-    }
-    for name, doubles in fields.items():
-        message = file.message_type.add(name=name)
-        message.field.add(
-            name="timestamp", number=1, label=field_type.LABEL_OPTIONAL,
-            type=field_type.TYPE_MESSAGE, type_name=".google.protobuf.Timestamp",
-        )  # fmt: skip
-        message.field.add(name="tick", number=2, label=field_type.LABEL_OPTIONAL, type=field_type.TYPE_UINT64)
-        for number, (double, label) in enumerate(doubles, start=3):
-            message.field.add(name=double, number=number, label=label, type=field_type.TYPE_DOUBLE)
-    pool = descriptor_pool.DescriptorPool()
-    timestamp = descriptor_pb2.FileDescriptorProto()
-    timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
-    pool.Add(timestamp)
-    pool.Add(file)
-    return tuple(message_factory.GetMessageClass(pool.FindMessageTypeByName(f"robot_log.{n}")) for n in fields)
+class LogError(ValueError):
+    """A log cannot be written or read: the message names file or record, what is wrong and what to do."""
 
 
-Values, TickMessage = _own_messages()
+class Level(enum.IntEnum):
+    """Severity of an event; the numbers are those of foxglove.Log."""
+
+    DEBUG = 1
+    INFO = 2
+    WARNING = 3
+    ERROR = 4
+    FATAL = 5
 
 
-@dataclass(frozen=True)
-class Topic:
-    """One channel of the file.
+@dataclass(frozen=True, eq=False, slots=True)
+class Ball:
+    """One sample of the ball's position.
 
-    name      MCAP topic
-    message   protobuf class
-    width     numbers that ``numbers`` gives per message; 0 for events, which hold none
-    numbers   the message's numbers, or raises ValueError
-    metadata  of the MCAP channel
+    capture_time  [s] when the camera saw it
+    received      [s] when it reached the control process
+    position      (3,) [m] ball centre in the table frame
+    id            number of the ball in play, as the tracker counts
     """
 
-    name: str
-    message: Any
-    width: int = 0
-    numbers: Callable[[Any], list[float]] | None = None
-    metadata: dict[str, str] = field(default_factory=dict)
+    KIND: ClassVar[int] = 1
+    capture_time: float
+    received: float
+    position: np.ndarray
+    id: int = 0
 
-    def schema(self) -> bytes:
-        """The message's FileDescriptorSet, dependencies first, as MCAP wants protobuf schemas."""
-        files = descriptor_pb2.FileDescriptorSet()
-        seen: set[str] = set()
+    @property
+    def log_time(self) -> float:
+        return self.received
 
-        def add(file: Any) -> None:
-            if file.name not in seen:
-                seen.add(file.name)
-                for dependency in file.dependencies:
-                    add(dependency)
-                file.CopyToProto(files.file.add())
+    def pack(self) -> bytes:
+        return _BALL.pack(self.KIND, self.capture_time, self.received, self.id) + _array(self, "position", 3)
 
-        add(self.message.DESCRIPTOR.file)
-        return files.SerializeToString(deterministic=True)
+    @classmethod
+    def unpack(cls, data: bytes) -> Ball:
+        _, capture_time, received, id = _BALL.unpack_from(data)
+        return cls(capture_time, received, *_arrays(data, _BALL.size, 3), id)
 
 
-def _point(message: Any) -> list[float]:
-    return [message.point.x, message.point.y, message.point.z]
+@dataclass(frozen=True, eq=False, slots=True)
+class Joints:
+    """Measured joint state in the order of ``contract.JOINT_NAMES``.
+
+    time      [s] when it was true
+    position  (8,) [m], [rad]
+    velocity  (8,) [m/s], [rad/s]
+    received  [s] when it reached the control process; ``time`` if left out
+    """
+
+    KIND: ClassVar[int] = 2
+    time: float
+    position: np.ndarray
+    velocity: np.ndarray
+    received: float | None = None
+
+    @property
+    def log_time(self) -> float:
+        return self.time if self.received is None else self.received
+
+    def pack(self) -> bytes:
+        head = _TWO_TIMES.pack(self.KIND, self.time, self.log_time)
+        return head + _array(self, "position", N_JOINTS) + _array(self, "velocity", N_JOINTS)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Joints:
+        _, time, received = _TWO_TIMES.unpack_from(data)
+        return cls(time, *_arrays(data, _TWO_TIMES.size, N_JOINTS, N_JOINTS), received)
 
 
-def _joints(*names: str) -> Callable[[Any], list[float]]:
-    def numbers(message: Any) -> list[float]:
-        found = tuple(joint.name for joint in message.joints)
-        if found != JOINT_NAMES:
-            raise ValueError(f"joints are {found}, expected {JOINT_NAMES}")
-        return [getattr(joint, name) for name in names for joint in message.joints]
+@dataclass(frozen=True, eq=False, slots=True)
+class Command:
+    """What the policy asked for and what went to the robot in one control tick.
 
-    return numbers
+    requested  (8,) joint velocity asked for [m/s], [rad/s]
+    sent       (8,) joint velocity commanded, after the limiter
+    reference  (8,) commanded joint position at ``time``, from which ``sent`` goes on [m], [rad]
+    """
+
+    KIND: ClassVar[int] = 3
+    tick: int
+    time: float
+    requested: np.ndarray
+    sent: np.ndarray
+    reference: np.ndarray
+
+    @property
+    def log_time(self) -> float:
+        return self.time
+
+    def pack(self) -> bytes:
+        head = _TICKED.pack(self.KIND, self.tick, self.time)
+        arrays = [_array(self, name, N_JOINTS) for name in ("requested", "sent", "reference")]
+        return b"".join([head, *arrays])
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Command:
+        _, tick, time = _TICKED.unpack_from(data)
+        return cls(tick, time, *_arrays(data, _TICKED.size, N_JOINTS, N_JOINTS, N_JOINTS))
 
 
-def _values(count: int) -> Callable[[Any], list[float]]:
-    def numbers(message: Any) -> list[float]:
-        if len(message.values) != count:
-            raise ValueError(f"{len(message.values)} values, expected {count}")
-        return list(message.values)
+@dataclass(frozen=True, eq=False, slots=True)
+class Observation:
+    """The newest observation (11,) that the policy was given in one control tick, SI units, not normalised."""
 
-    return numbers
+    KIND: ClassVar[int] = 4
+    tick: int
+    time: float
+    observation: np.ndarray
+
+    @property
+    def log_time(self) -> float:
+        return self.time
+
+    def pack(self) -> bytes:
+        return _TICKED.pack(self.KIND, self.tick, self.time) + _array(self, "observation", N_OBSERVATION)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Observation:
+        _, tick, time = _TICKED.unpack_from(data)
+        return cls(tick, time, *_arrays(data, _TICKED.size, N_OBSERVATION))
 
 
-def _tick(message: Any) -> list[float]:
-    return [getattr(message, name) for name in TICK_FIELDS]
+@dataclass(frozen=True, eq=False, slots=True)
+class Action:
+    """The policy's answer (8,) in one control tick, in [-1, 1]."""
+
+    KIND: ClassVar[int] = 5
+    tick: int
+    time: float
+    action: np.ndarray
+
+    @property
+    def log_time(self) -> float:
+        return self.time
+
+    def pack(self) -> bytes:
+        return _TICKED.pack(self.KIND, self.tick, self.time) + _array(self, "action", N_JOINTS)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Action:
+        _, tick, time = _TICKED.unpack_from(data)
+        return cls(tick, time, *_arrays(data, _TICKED.size, N_JOINTS))
 
 
-_JOINT_METADATA = {"position": " ".join(JOINT_UNITS), "velocity": " ".join(f"{unit}/s" for unit in JOINT_UNITS)}
+@dataclass(frozen=True, eq=False, slots=True)
+class Tick:
+    """How one control tick went; all in seconds, an age is infinite while nothing has come.
 
-BALL = Topic("/ball", Point3InFrame, 3, _point, {"frame": FRAME, "unit": "m"})
-JOINT_STATES = Topic("/joint_states", JointStates, 2 * N_JOINTS, _joints("position", "velocity"), _JOINT_METADATA)
-REQUESTED = Topic("/commands/requested", JointStates, N_JOINTS, _joints("velocity"), _JOINT_METADATA)
-SENT = Topic("/commands/sent", JointStates, 2 * N_JOINTS, _joints("position", "velocity"), _JOINT_METADATA)
-OBSERVATION = Topic("/observation", Values, N_OBSERVATION, _values(N_OBSERVATION), {
-    "names": " ".join(OBSERVATION_NAMES), "units": " ".join(OBSERVATION_UNITS)
-})  # fmt: skip
-ACTION = Topic("/action", Values, N_JOINTS, _values(N_JOINTS), {"names": " ".join(JOINT_NAMES), "units": "1"})
-TICK = Topic("/tick", TickMessage, len(TICK_FIELDS), _tick, {"unit": "s"})
-EVENT = Topic("/event", Log)
-TOPICS = {
-    topic.name: topic for topic in (BALL, JOINT_STATES, REQUESTED, SENT, OBSERVATION, ACTION, TICK, EVENT)
-}  # fmt: skip
+    time            when the tick began
+    lateness        by which it began after its deadline
+    policy_seconds  spent in the policy
+    ball_age        since the capture of the newest ball sample
+    gantry_age      since the newest state of the linear axes
+    arm_age         since the newest state of the arm
+    """
+
+    KIND: ClassVar[int] = 6
+    tick: int
+    time: float
+    lateness: float
+    policy_seconds: float
+    ball_age: float = float("inf")
+    gantry_age: float = float("inf")
+    arm_age: float = float("inf")
+
+    @property
+    def log_time(self) -> float:
+        return self.time
+
+    def pack(self) -> bytes:
+        return _TICK.pack(
+            self.KIND, self.tick, self.time,
+            self.lateness, self.policy_seconds, self.ball_age, self.gantry_age, self.arm_age,
+        )  # fmt: skip
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Tick:
+        return cls(*_TICK.unpack(data)[1:])
 
 
 @dataclass(frozen=True, slots=True)
-class Encoded:
-    """A message ready for MCAP; times in seconds of the control process's clock."""
+class Event:
+    """Something that happened: a change of state, a fault, what the operator did, an episode's ends.
 
-    topic: Topic
-    log_time: float
-    publish_time: float
-    sequence: int
-    message: Any  # without its timestamp
+    name  short and enumerated, such as "state", "fault", "operator", "episode_start"
+    text  for people, or JSON where the name says so; cut at 3,900 bytes
+    """
 
+    KIND: ClassVar[int] = 7
+    time: float
+    level: Level
+    name: str
+    text: str = ""
 
-def encode(record: Ball | Joints | Command | Observation | Action | Tick | Event) -> list[Encoded]:
-    """The messages of a record; the caller stamps them with ``publish_time``."""
-    match record:
-        case Ball():
-            x, y, z = record.position.tolist()
-            message = Point3InFrame(frame_id=FRAME)
-            message.point.x, message.point.y, message.point.z = x, y, z
-            return [Encoded(BALL, record.received, record.capture_time, record.id, message)]
-        case Joints():
-            message = _joint_states(record.velocity, record.position)
-            return [Encoded(JOINT_STATES, record.log_time, record.time, 0, message)]
-        case Command():
-            requested, sent = _joint_states(record.requested), _joint_states(record.sent, record.reference)
-            return [
-                Encoded(topic, record.time, record.time, record.tick, message)
-                for topic, message in ((REQUESTED, requested), (SENT, sent))
-            ]
-        case Observation():
-            message = Values(tick=record.tick, values=record.observation.tolist())
-            return [Encoded(OBSERVATION, record.time, record.time, record.tick, message)]
-        case Action():
-            message = Values(tick=record.tick, values=record.action.tolist())
-            return [Encoded(ACTION, record.time, record.time, record.tick, message)]
-        case Tick():
-            message = TickMessage(tick=record.tick, **{name: getattr(record, name) for name in TICK_FIELDS})
-            return [Encoded(TICK, record.time, record.time, record.tick, message)]
-        case Event():
-            message = Log(level=int(record.level), name=record.name, message=record.text)
-            return [Encoded(EVENT, record.time, record.time, 0, message)]
-    raise TypeError(f"{type(record).__name__} is no record with messages")
+    @property
+    def log_time(self) -> float:
+        return self.time
+
+    def pack(self) -> bytes:
+        name, text = self.name.encode(), self.text.encode()
+        if not 0 < len(name) <= 100:
+            raise LogError(f"event name {self.name!r}: 1 to 100 bytes are needed, put details into the text")
+        if len(text) > _LONGEST_TEXT:
+            text = text[:_LONGEST_TEXT].decode(errors="ignore").encode() + _CUT.encode()
+        return _EVENT.pack(self.KIND, self.time, Level(self.level), len(name)) + name + text
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Event:
+        _, time, level, length = _EVENT.unpack_from(data)
+        text = _EVENT.size + length
+        return cls(time, Level(level), data[_EVENT.size : text].decode(), data[text:].decode())
 
 
-def _joint_states(velocity: Any, position: Any = None) -> Any:
-    message = JointStates()
-    positions = [None] * N_JOINTS if position is None else position.tolist()
-    for name, p, v in zip(JOINT_NAMES, positions, velocity.tolist()):
-        message.joints.add(name=name, position=p, velocity=v)
-    return message
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """Facts that hold from now on, such as a policy that was exchanged; values that are no strings are kept as JSON."""
+
+    KIND: ClassVar[int] = 8
+    name: str
+    entries: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def log_time(self) -> None:
+        return None
+
+    def pack(self) -> bytes:
+        data = bytes([self.KIND]) + json.dumps([self.name, as_strings(self.entries)]).encode()
+        if len(data) > LARGEST:
+            raise LogError(f"metadata {self.name!r}: {len(data)} bytes, at most {LARGEST} fit; attach it at the start")
+        return data
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Metadata:
+        return cls(*json.loads(data[1:]))
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """The last record of a session that was closed properly: how many records were lost on the way, and why."""
+
+    KIND: ClassVar[int] = 9
+    dropped: int
+    malformed: int
+
+    @property
+    def log_time(self) -> None:
+        return None
+
+    def pack(self) -> bytes:
+        return _END.pack(self.KIND, self.dropped, self.malformed)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> End:
+        return cls(*_END.unpack(data)[1:])
+
+
+Record = Ball | Joints | Command | Observation | Action | Tick | Event | Metadata | End
+
+_BALL = struct.Struct("<BddI")
+_TWO_TIMES = struct.Struct("<Bdd")
+_TICKED = struct.Struct("<BQd")
+_TICK = struct.Struct("<BQd5d")
+_EVENT = struct.Struct("<BdBB")
+_END = struct.Struct("<BQQ")
+_KINDS = {kind.KIND: kind for kind in (Ball, Joints, Command, Observation, Action, Tick, Event, Metadata, End)}
+
+
+def unpack(data: bytes) -> Record:
+    """The record that ``pack`` made. Raises LogError for bytes that are none."""
+    kind = _KINDS.get(data[0] if data else None)
+    if kind is None:
+        raise LogError(f"record of unknown kind {data[:1]!r}, known are {sorted(_KINDS)}")
+    try:
+        return kind.unpack(data)
+    except (struct.error, ValueError, TypeError) as error:
+        raise LogError(f"{kind.__name__} of {len(data)} bytes cannot be unpacked: {error}") from error
+
+
+def episode_start(time: float, episode: int, **details: Any) -> Event:
+    """The event of an episode's start; ``details`` are JSON data."""
+    return Event(time, Level.INFO, "episode_start", _json({"episode": episode, **details}))
+
+
+def episode_end(time: float, episode: int, outcome: str, reward: Mapping[str, float], **details: Any) -> Event:
+    """The event of an episode's end: ``outcome`` is a short enumerated name, ``reward`` its terms by name."""
+    terms = {name: float(value) for name, value in reward.items()}
+    return Event(time, Level.INFO, "episode_end", _json(
+        {"episode": episode, "outcome": outcome, "reward": terms, **details}
+    ))  # fmt: skip
+
+
+def as_strings(entries: Mapping[str, Any]) -> dict[str, str]:
+    """Metadata entries as MCAP keeps them. Raises LogError for a value that is no JSON data."""
+    strings = {}
+    for key, value in entries.items():
+        try:
+            strings[str(key)] = value if isinstance(value, str) else _json(value)
+        except (TypeError, ValueError) as error:
+            raise LogError(f"metadata {key!r}: {value!r} is no string and no JSON data ({error})") from None
+    return strings
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, allow_nan=False)
+
+
+def _array(record: Record, name: str, length: int) -> bytes:
+    values = np.asarray(getattr(record, name), "<f8")
+    if values.shape != (length,):
+        raise LogError(f"{type(record).__name__}.{name} has shape {values.shape}, expected ({length},)")
+    return values.tobytes()
+
+
+def _arrays(data: bytes, offset: int, *lengths: int) -> list[np.ndarray]:
+    if len(data) != offset + 8 * sum(lengths):
+        raise ValueError(f"{offset + 8 * sum(lengths)} bytes are needed")
+    ends = np.cumsum(lengths)[:-1]
+    return np.split(np.frombuffer(data, "<f8", offset=offset), ends)

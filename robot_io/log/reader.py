@@ -15,10 +15,10 @@ from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
 from robot_io.contract import N_JOINTS
-from robot_io.log import messages
-from robot_io.log.messages import NANO, TOPICS, Topic
-from robot_io.log.records import Event, Level, LogError
+from robot_io.log import schema
+from robot_io.log.messages import Event, Level, LogError
 from robot_io.log.scan import Fault, Scan
+from robot_io.log.schema import NANO, TOPICS, Topic
 from robot_io.log.writer import FORMAT, FORMAT_VERSION
 
 
@@ -197,7 +197,7 @@ def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
                 continue
             try:
                 message = topic.message.FromString(record.data)
-                if topic is messages.EVENT:
+                if topic is schema.EVENT:
                     events.append((record.publish_time, _event(message)))
                 else:
                     columns[topic.name].add(record, message)
@@ -223,13 +223,13 @@ def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
 def _assemble(scan, metadata, attachments, columns, events) -> SessionLog:
     offset = int(metadata["session"]["clock_offset_ns"])
     arrays = {name: column.arrays(offset) for name, column in columns.items()}
-    captured, received, ids, positions = arrays[messages.BALL.name]
-    time, joints_received, _, joints = arrays[messages.JOINT_STATES.name]
-    _, _, requested_ticks, requested = arrays[messages.REQUESTED.name]
-    sent_time, _, sent_ticks, sent = arrays[messages.SENT.name]
+    captured, received, ids, positions = arrays[schema.BALL.name]
+    time, joints_received, _, joints = arrays[schema.JOINT_STATES.name]
+    _, _, requested_ticks, requested = arrays[schema.REQUESTED.name]
+    sent_time, _, sent_ticks, sent = arrays[schema.SENT.name]
     # One of the two messages may be lost with a damaged chunk.
     ticks, i, j = np.intersect1d(requested_ticks, sent_ticks, return_indices=True)
-    tick_time, _, tick, tick_numbers = arrays[messages.TICK.name]
+    tick_time, _, tick, tick_numbers = arrays[schema.TICK.name]
     return SessionLog(
         path=scan.path,
         metadata=metadata,
@@ -237,8 +237,8 @@ def _assemble(scan, metadata, attachments, columns, events) -> SessionLog:
         ball=BallSeries(captured, received, positions, ids),
         joints=JointSeries(time, joints_received, joints[:N_JOINTS], joints[N_JOINTS:]),
         commands=CommandSeries(ticks, sent_time[j], requested[:, i], sent[N_JOINTS:, j], sent[:N_JOINTS, j]),
-        observations=_policy(arrays[messages.OBSERVATION.name]),
-        actions=_policy(arrays[messages.ACTION.name]),
+        observations=_policy(arrays[schema.OBSERVATION.name]),
+        actions=_policy(arrays[schema.ACTION.name]),
         ticks=TickSeries(tick, tick_time, *tick_numbers),
         events=tuple(
             Event((stamp - offset) / NANO, event.level, event.name, event.text) for stamp, event in events

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from robot_io.log.records import LARGEST, End, Event, Level, LogError, Record
+from robot_io.log.messages import LARGEST, End, Event, Level, LogError, Record
 from robot_io.log.writer import Session, SessionWriter, sample_clock_offset, session
 
 PIPE_SIZE = 1 << 20  # bytes, what Linux grants without privileges: more than five seconds of a session

@@ -24,7 +24,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 from zstandard import ZstdError, frame_content_size
 
-from robot_io.log.messages import NANO
+from robot_io.log.schema import NANO
 from robot_io.log.writer import checksum
 
 LARGEST_CHUNK = 1 << 28  # bytes, unpacked

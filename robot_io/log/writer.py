@@ -19,8 +19,8 @@ from mcap.writer import CompressionType, Writer
 
 from robot_io import contract
 from robot_io.files import sync_folder
-from robot_io.log import messages
-from robot_io.log.records import End, LogError, Metadata, as_strings, unpack
+from robot_io.log import schema
+from robot_io.log.messages import End, LogError, Metadata, as_strings, unpack
 
 FORMAT = "mjx-tt session log"
 FORMAT_VERSION = 1
@@ -96,7 +96,7 @@ def session(
         "start_time": start_time,
     }
     if host:
-        started = datetime.fromtimestamp(start_time + clock_offset_ns / messages.NANO, timezone.utc)
+        started = datetime.fromtimestamp(start_time + clock_offset_ns / schema.NANO, timezone.utc)
         own |= {
             "started_utc": started.isoformat(timespec="milliseconds"),
             "host": platform.node(),
@@ -152,13 +152,13 @@ class SessionWriter:
         )
         self._writer.start(profile="", library=f"robot_io.log {FORMAT_VERSION}")
         self._add_metadata("session", session.metadata)
-        start = round(float(session.metadata["start_time"]) * messages.NANO) + session.clock_offset_ns
+        start = round(float(session.metadata["start_time"]) * schema.NANO) + session.clock_offset_ns
         for name, content in session.attachments.items():
             media_type = "application/octet-stream" if b"\0" in content else "text/plain"
             self._writer.add_attachment(start, start, name, media_type, content)
         schemas: dict[str, int] = {}
         self._channels = {}
-        for topic in messages.TOPICS.values():
+        for topic in schema.TOPICS.values():
             schema_name = topic.message.DESCRIPTOR.full_name
             if schema_name not in schemas:
                 schemas[schema_name] = self._writer.register_schema(schema_name, "protobuf", topic.schema())
@@ -175,16 +175,16 @@ class SessionWriter:
         elif isinstance(record, End):
             self._end = record
         else:
-            for encoded in messages.encode(record):
+            for encoded in schema.encode(record):
                 published, logged = self._nanoseconds(encoded.publish_time), self._nanoseconds(encoded.log_time)
                 stamp = encoded.message.timestamp
-                stamp.seconds, stamp.nanos = divmod(published, messages.NANO)
+                stamp.seconds, stamp.nanos = divmod(published, schema.NANO)
                 self._writer.add_message(
                     self._channels[encoded.topic.name],
                     log_time=logged,
                     data=encoded.message.SerializeToString(),
                     publish_time=published,
-                    sequence=encoded.sequence % messages.SEQUENCE,
+                    sequence=encoded.sequence % schema.SEQUENCE,
                 )
                 self.messages += 1
         self._unflushed = True
@@ -222,7 +222,7 @@ class SessionWriter:
     def _nanoseconds(self, seconds: float) -> int:
         if not math.isfinite(seconds):
             raise LogError(f"time {seconds}: a finite number of seconds is needed")
-        nanoseconds = round(seconds * messages.NANO) + self._session.clock_offset_ns
+        nanoseconds = round(seconds * schema.NANO) + self._session.clock_offset_ns
         if not 0 <= nanoseconds < 1 << 63:
             raise LogError(f"time {seconds}: is {nanoseconds} ns since 1970, MCAP holds no time before that")
         return nanoseconds

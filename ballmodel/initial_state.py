@@ -1,0 +1,235 @@
+"""Initial state of a ball from its free flight: the paper's Nelder-Mead, and Gauss-Newton for thousands at once.
+
+Both minimise the same thing: the Euclidean distance between the measured positions and a simulated flight, over the
+position and velocity at the first sample (Abeyruwan et al. 2022, "Modeling Human Ball Distributions"). The simulated
+flight takes the steps of ``ballmodel.flight``: the interval between two samples is cut into the fewest equal steps that
+are no longer than DT, so the flight meets every measured time exactly. All in float64.
+
+No force depends on where the ball is, so the flight's shape depends on the velocity alone and the derivative by the
+initial position is the identity: only three directions need differentiating.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import minimize
+
+from ballmodel.aerodynamics import FlightParams
+from ballmodel.flight import free_step
+from ballmodel.state import BallState
+from ballmodel.trajectory import Trajectory
+
+DT = 1.0 / 300.0  # [s] longest step of the simulated flight
+MIN_SAMPLES = 4  # 12 numbers for 6 unknowns
+PAD = 32  # numbers of samples and of trajectories are rounded up to it, so that similar batches share one compiled fit
+MANY, PAD_MANY = 256, 512  # and more than MANY trajectories to this
+MAX_ITERATIONS = 50
+STEP_TOLERANCE = 1e-9  # [m], [m/s] change below which a fit has converged
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """Fitted initial states, as float64 NumPy arrays."""
+
+    state: BallState  # (3, n) at each trajectory's first sample
+    rms: np.ndarray  # (n,) [m] root mean square distance of the samples from the fitted flight
+    covariance: np.ndarray  # (6, 6, n) of position [m] and velocity [m/s], from the residuals' own spread
+    converged: np.ndarray  # (n,) bool
+
+
+@dataclass(frozen=True)
+class _Padded:
+    steps: np.ndarray  # (T - 1, S, n) [s] lengths of the steps between samples; zero where there are fewer
+    time: np.ndarray  # (T, n) [s] since the first sample
+    position: np.ndarray  # (3, T, n) [m]
+    mask: np.ndarray  # (T, n) 1 for a sample, 0 for padding
+
+
+def _check(trajectories: Sequence[Trajectory]) -> None:
+    if not trajectories:
+        raise ValueError("no trajectory to fit")
+    short = [t for t in trajectories if len(t) < MIN_SAMPLES]
+    if short:
+        raise ValueError(
+            f"{len(short)} of {len(trajectories)} trajectories have fewer than {MIN_SAMPLES} samples of free flight, "
+            f"the first is {short[0].label} with {len(short[0])}"
+        )
+
+
+def _pad(trajectories: Sequence[Trajectory]) -> _Padded:
+    n = len(trajectories)
+    length = -(-max(map(len, trajectories)) // PAD) * PAD
+    time, position, mask = np.zeros((n, length)), np.zeros((n, 3, length)), np.zeros((n, length))
+    for i, trajectory in enumerate(trajectories):
+        k = len(trajectory)
+        time[i, :k] = trajectory.time - trajectory.time[0]
+        time[i, k:] = time[i, k - 1]
+        position[i, :, :k] = trajectory.position
+        mask[i, :k] = 1.0
+    gap = np.diff(time, axis=1).T
+    counts = np.maximum(np.ceil(gap / DT * (1.0 - 1e-9)), 1.0)
+    rows = np.arange(int(counts.max()))[None, :, None]
+    steps = np.where(rows < counts[:, None], (gap / counts)[:, None], 0.0)
+    return _Padded(steps, time.T, np.moveaxis(position, 0, -1), mask.T)
+
+
+def _shape(flight: FlightParams, velocity, spin, steps):
+    """Positions (3, T, n) of a flight that starts at the origin."""
+
+    def advance(state, dts):
+        state, _ = jax.lax.scan(lambda s, dt: (free_step(flight, s, dt), None), state, dts)
+        return state, state.position
+
+    start = BallState(jnp.zeros_like(velocity), velocity, spin)
+    _, positions = jax.lax.scan(advance, start, steps)
+    return jnp.moveaxis(jnp.concatenate([start.position[None], positions]), 0, 1)
+
+
+def _initial_guess(padded: _Padded) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity, (3, n), at the first sample of a parabola through each trajectory's samples."""
+    powers = padded.time[None] ** np.arange(3)[:, None, None] * padded.mask
+    moments = np.einsum("itn,jtn->nij", powers, powers)
+    sums = np.einsum("itn,atn->nia", powers, padded.position)
+    coefficients = np.linalg.solve(moments, sums)
+    return coefficients[:, 0].T, coefficients[:, 1].T
+
+
+def _weights(distance, mask, huber):
+    return mask if huber is None else mask * jnp.minimum(1.0, huber / jnp.maximum(distance, 1e-12))
+
+
+def _cost(distance, mask, huber):
+    square = distance * distance
+    if huber is not None:
+        square = jnp.where(distance <= huber, square, 2.0 * huber * distance - huber * huber)
+    return jnp.sum(mask * square, axis=0)
+
+
+def _linearise(flight, x0, v0, spin, steps, measured, mask, huber):
+    """Cost (n,), normal matrix (n, 6, 6) and right-hand side (n, 6) of the weighted least squares at a state."""
+
+    def shape(velocity):
+        return _shape(flight, velocity, spin, steps)
+
+    directions = jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, *v0.shape))
+    relative, slopes = jax.vmap(lambda e: jax.jvp(shape, (v0,), (e,)), out_axes=(None, 0))(directions)
+    residual = measured - relative - x0[:, None]
+    distance = jnp.sqrt(jnp.sum(residual * residual, axis=0))
+    weight = _weights(distance, mask, huber)
+    total = jnp.sum(weight, axis=0)
+    zero = jnp.zeros_like(total)
+    position_velocity = [[jnp.sum(weight * slopes[k, i], axis=0) for k in range(3)] for i in range(3)]
+    velocity_velocity = [[jnp.sum(weight * slopes[k] * slopes[m], axis=(0, 1)) for m in range(3)] for k in range(3)]
+    rows = [[total if i == j else zero for j in range(3)] + position_velocity[i] for i in range(3)]
+    rows += [[position_velocity[i][k] for i in range(3)] + velocity_velocity[k] for k in range(3)]
+    normal = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    right = [jnp.sum(weight * residual[i], axis=0) for i in range(3)]
+    right += [jnp.sum(weight * slopes[k] * residual, axis=(0, 1)) for k in range(3)]
+    return _cost(distance, mask, huber), normal, jnp.stack(right, axis=-1)
+
+
+@partial(jax.jit, static_argnames="huber")
+def _levenberg_marquardt(flight, x0, v0, spin, steps, measured, mask, huber):
+    linearise = partial(_linearise, flight, spin=spin, steps=steps, measured=measured, mask=mask, huber=huber)
+
+    def unfinished(carry):
+        return (carry["iteration"] < MAX_ITERATIONS) & ~jnp.all(carry["converged"])
+
+    def iterate(carry):
+        diagonal = jnp.diagonal(carry["normal"], axis1=1, axis2=2)
+        damped = carry["normal"] + carry["damping"][:, None, None] * diagonal[:, :, None] * jnp.eye(6)
+        change = jnp.linalg.solve(damped, carry["right"][..., None])[..., 0]
+        x_new, v_new = carry["x0"] + change[:, :3].T, carry["v0"] + change[:, 3:].T
+        cost, normal, right = linearise(x_new, v_new)
+        better = (cost <= carry["cost"]) & ~carry["converged"]
+        small = jnp.max(jnp.abs(change), axis=1) < STEP_TOLERANCE
+
+        def pick(new, old):
+            return jnp.where(better.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
+
+        return {
+            "x0": jnp.where(better, x_new, carry["x0"]),
+            "v0": jnp.where(better, v_new, carry["v0"]),
+            "cost": pick(cost, carry["cost"]),
+            "normal": pick(normal, carry["normal"]),
+            "right": pick(right, carry["right"]),
+            "damping": jnp.where(better, carry["damping"] * 0.1, carry["damping"] * 10.0),
+            "converged": carry["converged"] | small,
+            "iteration": carry["iteration"] + 1,
+        }
+
+    cost, normal, right = linearise(x0, v0)
+    carry = {
+        "x0": x0, "v0": v0, "cost": cost, "normal": normal, "right": right,
+        "damping": jnp.full_like(cost, 1e-6), "converged": cost < 0.0, "iteration": jnp.zeros((), jnp.int32),
+    }  # fmt: skip
+    carry = jax.lax.while_loop(unfinished, iterate, carry)
+    x0, v0 = carry["x0"], carry["v0"]
+    residual = measured - _shape(flight, v0, spin, steps) - x0[:, None]
+    square = jnp.sum(residual * residual, axis=0)
+    samples = jnp.sum(mask, axis=0)
+    rms = jnp.sqrt(jnp.sum(mask * square, axis=0) / samples)
+    spread = jnp.sum(_weights(jnp.sqrt(square), mask, huber) * square, axis=0) / (3.0 * samples - 6.0)
+    covariance = jnp.moveaxis(jnp.linalg.inv(carry["normal"]), 0, -1) * spread
+    return x0, v0, rms, covariance, carry["converged"]
+
+
+def fit_gauss_newton(
+    trajectories: Sequence[Trajectory], flight: FlightParams, spin=None, huber: float | None = None
+) -> FitResult:
+    """Fits all free flights at once by damped Gauss-Newton (Levenberg-Marquardt).
+
+    trajectories: free flights (see ``trajectory.free_flight``) of any lengths, each with at least MIN_SAMPLES samples.
+    spin: known spins (3, n) [rad/s] at the first sample; without it the balls do not rotate.
+    huber: distance [m] beyond which a sample counts linearly instead of by its square; None for plain least squares.
+    Compiles once for each padded number of trajectories and samples and each number of steps between samples.
+    Raises ValueError for too few samples or a spin of the wrong shape.
+    """
+    _check(trajectories)
+    n = len(trajectories)
+    extra = -n % (PAD if n <= MANY else PAD_MANY)
+    spin = np.zeros((3, n)) if spin is None else np.asarray(spin, np.float64)
+    if spin.shape != (3, n):
+        raise ValueError(f"spin has shape {spin.shape}, (3, {n}) is wanted: one spin for each trajectory")
+    padded = _pad([*trajectories, *[trajectories[-1]] * extra])
+    spins = np.pad(spin, ((0, 0), (0, extra)), mode="edge")
+    with jax.enable_x64(True):
+        x0, v0 = _initial_guess(padded)
+        result = _levenberg_marquardt(flight, x0, v0, spins, padded.steps, padded.position, padded.mask, huber)
+        x0, v0, rms, covariance, converged = (np.asarray(a)[..., :n] for a in result)
+    return FitResult(BallState(x0, v0, spin), rms, covariance, converged)
+
+
+@jax.jit
+def _rms_distance(unknowns, flight, spin, steps, measured, mask):
+    flown = unknowns[:3, None, None] + _shape(flight, unknowns[3:, None], spin, steps)
+    square = jnp.sum((measured - flown) ** 2, axis=0)
+    return jnp.sqrt(jnp.sum(mask * square) / jnp.sum(mask))
+
+
+def fit_nelder_mead(trajectory: Trajectory, flight: FlightParams, spin=None) -> tuple[BallState, float]:
+    """The paper's fit of one free flight: state, (3,), at the first sample and root mean square distance [m].
+
+    spin: (3,) [rad/s], zero without it. Raises ValueError when there are fewer than MIN_SAMPLES samples.
+    """
+    _check([trajectory])
+    padded = _pad([trajectory])
+    spin = np.zeros(3) if spin is None else np.asarray(spin, np.float64)
+    start = np.concatenate(_initial_guess(padded))[:, 0]
+    # The simplex spans the guess's likely error: a centimetre, a tenth of a metre per second.
+    simplex = start + np.vstack([np.zeros(6), np.diag([0.01] * 3 + [0.1] * 3)])
+    with jax.enable_x64(True):
+        arguments = (flight, *map(jnp.asarray, (spin[:, None], padded.steps, padded.position, padded.mask)))
+        result = minimize(
+            lambda unknowns: float(_rms_distance(unknowns, *arguments)),
+            start,
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "xatol": 1e-7, "fatol": 1e-10, "maxiter": 5000, "maxfev": 10000},
+        )
+    return BallState(result.x[:3], result.x[3:], spin), float(result.fun)

@@ -1,0 +1,78 @@
+"""Finds the paper's distributions by name: ``player1/M0`` to ``player5/M2``, large, medium, narrow, s2r-oracle."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+
+from ballmodel.distribution import NOTES, BallDistribution, check_keys, load_distribution, parse_distribution
+from ballmodel.io.yaml import read as read_yaml
+
+FOLDER = Path(__file__).parent / "data"
+
+
+@dataclass(frozen=True)
+class Skill:
+    """A player's level and rally lengths (number of hits) over all evaluations, paper's table player_skill."""
+
+    level: str  # beginner, intermediate or advanced
+    min: float
+    p25: float
+    mean: float
+    std: float
+    p75: float
+    max: float
+
+
+@cache
+def _catalogue() -> tuple[dict[str, BallDistribution], dict[str, Skill]]:
+    distributions, skills = {}, {}
+    for path in sorted(FOLDER.glob("*.yaml")):
+        data = read_yaml(path)
+        if "models" not in data:
+            distribution = load_distribution(path)
+            distributions[distribution.name] = distribution
+            continue
+        check_keys(data, (*NOTES, "skill", "models"), str(path))
+        check_keys(data["skill"], tuple(f.name for f in fields(Skill)), f"{path}: skill")
+        player = data["name"]
+        skills[player] = Skill(**data["skill"])
+        for model, intervals in data["models"].items():
+            name = f"{player}/{model}"
+            distributions[name] = parse_distribution(intervals, f"{path}: models.{model}", name, data["source"])
+    return distributions, skills
+
+
+def _find(table: dict, name: str, what: str):
+    if name in table:
+        return table[name]
+    near = difflib.get_close_matches(name.lower(), table, n=1, cutoff=0.0)
+    raise ValueError(f"no {what} is called {name!r}; did you mean {near[0]!r}? There are: {', '.join(table)}")
+
+
+def names() -> tuple[str, ...]:
+    """The names that ``load`` knows."""
+    return tuple(_catalogue()[0])
+
+
+def load(name: str) -> BallDistribution:
+    """The distribution of that name, such as "player3/M1" or "narrow". Raises ValueError listing the valid names."""
+    return _find(_catalogue()[0], name, "distribution")
+
+
+def skill(player: str) -> Skill:
+    """The skill of "player1" to "player5". Raises ValueError listing the valid names."""
+    return _find(_catalogue()[1], player, "player")
+
+
+def resolve(name_or_path: str | os.PathLike) -> BallDistribution:
+    """The named distribution, or the one in the YAML file at that path. Raises ValueError or FileNotFoundError."""
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        return load(str(name_or_path))
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; a path to a distribution's YAML or one of {', '.join(names())}")
+    return load_distribution(path)

@@ -1,0 +1,104 @@
+"""Where finished and half-finished policies of every kind are compared: the same balls, frozen, without exploration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ballmodel.sampling import BallPool
+from experiments.config import build
+from experiments.config.build import Experiment
+from mjx_tt.env.rollout import RolloutResult, Simulator
+from mjx_tt.env.task import Controller, Episodes, TaskConfig
+from mjx_tt.sim.model import ModelFile
+
+ROWS, COLUMNS = 2, 256  # episodes of one compiled call
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Remembered:
+    """A controller whose state also keeps its last action (8, ...)."""
+
+    inner: Controller
+    mean: jax.Array
+
+    def start(self, observation):
+        return self.inner.start(observation), observation[3:]  # of the action's shape, before there is one
+
+    def act(self, tick, state, observation):
+        action, inner = self.inner.act(tick, state[0], observation)
+        return action, (inner, action)
+
+
+class Arena:
+    """Plays controllers in one world. A controller of another kind is compiled anew, a retrained one is not.
+
+    task: at the evaluation's rate; world: the simulation's parameters and what is randomised around them.
+    """
+
+    def __init__(self, task: TaskConfig, world: ModelFile) -> None:
+        self._simulator, self._world = Simulator(task, 1), world
+        self._play = jax.jit(self._play_chunk)
+        self._restless = jax.jit(self._action_change)
+
+    def play(self, controller: Controller, balls: BallPool, key) -> RolloutResult:
+        """Every ball of ``balls`` (``draw_balls``) once; NumPy arrays (..., R, P)."""
+        chunks = _chunks(balls)
+        keys = jax.random.split(key, len(chunks))
+        parts = [jax.tree.map(np.asarray, self._play(controller, *given)) for given in zip(chunks, keys)]
+        episodes = [replace(part, observation_sums=0.0, observation_counts=0) for part in parts]
+        return jax.tree.map(lambda *x: np.concatenate(x, axis=-2) if np.ndim(x[0]) else x[0], *episodes)
+
+    def action_change(self, controller: Controller, balls: BallPool, key) -> float:
+        """Mean square of the change of an action, each velocity relative to its limit, from one control step to the next."""
+        return float(self._restless(controller, _chunks(balls)[0], key))
+
+    def _draw(self, balls: BallPool, key) -> Episodes:
+        """The chunk's balls in their order, with the spin that the world gives them."""
+        drawn = self._simulator.draw(key, balls, self._world.model, self._world.randomise, ROWS, COLUMNS)
+        thrown = jax.tree.map(lambda x: x.reshape(-1, ROWS, COLUMNS), balls.state)
+        return replace(drawn, ball=replace(thrown, spin=thrown.spin + drawn.ball.spin))
+
+    def _play_chunk(self, controller, balls: BallPool, key) -> RolloutResult:
+        return self._simulator.play(controller, self._draw(balls, key))
+
+    def _action_change(self, controller, balls: BallPool, key):
+        task, episodes = self._simulator.task, self._draw(balls, key)
+        episodes = jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1) if x.ndim >= 2 else x, episodes)
+        prepared, remembered = task.prepare(episodes), Remembered(controller, controller.mean)
+
+        def advance(carry, tick):
+            state, total, count = carry
+            after = task.control_step(tick, state, episodes, prepared, remembered)
+            counted = (state.live & (tick > 0)).astype(total.dtype)
+            change = jnp.mean((after.controller[1] - state.controller[1]) ** 2, axis=0)
+            return (after, total + jnp.sum(counted * change), count + jnp.sum(counted)), None
+
+        start = (task.reset(episodes, remembered), jnp.zeros(()), jnp.zeros(()))
+        (_, total, count), _ = jax.lax.scan(advance, start, jnp.arange(task.config.max_steps, dtype=jnp.int32))
+        return total / count
+
+
+def draw_balls(experiment: Experiment, key, episodes: int) -> BallPool:
+    """At least ``episodes`` balls, up to whole calls, in the order of their arrival: similar ones play together."""
+    size = ROWS * COLUMNS
+    balls = build.pool(experiment, key, -(-episodes // size) * size)
+    order = np.argsort(np.asarray(balls.arrival))
+    return replace(
+        balls, state=jax.tree.map(lambda x: x[:, order], balls.state),
+        arrival=balls.arrival[order], landing=balls.landing[:, order],
+    )  # fmt: skip
+
+
+def _chunks(balls: BallPool) -> list[BallPool]:
+    n = balls.arrival.shape[0] // (ROWS * COLUMNS)
+    return [_cut(balls, slice(i * ROWS * COLUMNS, (i + 1) * ROWS * COLUMNS)) for i in range(n)]
+
+
+def _cut(balls: BallPool, part: slice) -> BallPool:
+    state = jax.tree.map(lambda x: x[:, part], balls.state)
+    return replace(balls, state=state, arrival=balls.arrival[part], landing=balls.landing[:, part])

@@ -1,0 +1,35 @@
+"""Blackbox Gradient Sensing and ARS: the strategies of ``bgs`` on the compiled update of ``experiments.training.update``."""
+
+from __future__ import annotations
+
+from bgs import normalizer
+from experiments.baselines.learner import Learner
+from experiments.training.update import Trainer, TrainState
+from mjx_tt.env.policy import PolicyController
+from robot_io.contract import unflatten
+
+
+class Evolution(Learner):
+    """One call of the compiled function is one update."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self._trainer = trainer
+
+    def init(self, key) -> TrainState:
+        return self._trainer.init(key)
+
+    def compiled(self, state: TrainState):
+        update, episodes = self._trainer.lower(state).compile(), self._trainer.episodes_per_update
+
+        def advance(state):
+            state, metrics = update(state, self._trainer.pool)
+            finite = episodes - metrics["non_finite"]
+            means = {"hit": "hit_rate", "returned": "return_rate", "episode_return": "mean_return", "steps": "steps"}
+            sums = {name: metrics[mean] * finite for name, mean in means.items()}
+            return state, {"episodes": episodes, **sums}
+
+        return advance
+
+    def controller(self, state: TrainState) -> PolicyController:
+        mean, inverse_scale = normalizer.normaliser(state.statistics)
+        return PolicyController(unflatten(state.bgs.average), mean, inverse_scale)

@@ -1,0 +1,241 @@
+"""Trains several algorithms on one task, evaluates them alike, also in a world that no training saw.
+
+Folder of a comparison:
+  comparison.yaml                     what was asked for, defaults written out
+  <algorithm>/seed<K>/training.json   the curve, and under which conditions it came about
+  <algorithm>/seed<K>/policy/         the controller's arrays
+  <algorithm>/seed<K>/evaluation.json
+  comparison.json, curves.csv, *.png, comparison.md   the report (``report``)
+
+An algorithm with a seed is trained in one go: interrupted, that one begins again, and those that are finished stay.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import yaml
+from rich.console import Console
+
+from ballmodel.io.atomic_files import replacing
+from experiments.baselines import report
+from experiments.baselines.arena import Arena, draw_balls
+from experiments.baselines.bgs import Evolution
+from experiments.baselines.learner import MEASURED, Learner
+from experiments.baselines.off_policy import OffPolicyLearner
+from experiments.baselines.ppo import PpoLearner
+from experiments.baselines.qt_opt import QtOptAgent
+from experiments.baselines.sac import SacAgent
+from experiments.config import build
+from experiments.config.baselines import Algorithm, Bgs, Comparison, Ppo, Sac
+from experiments.config.build import Experiment
+from experiments.config.experiment import Config
+from experiments.errors import RunError, checked
+from experiments.evaluation import evaluate
+from experiments.runs import checkpoint, run_dir
+from experiments.training.update import Trainer
+from mjx_tt.env.brax import TableTennis
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.sim.model import ModelFile
+
+RELATIVE = ("velocity", "acceleration", "jerk")  # reward terms: 1 - mean over joints and steps of |value| / limit
+
+
+@dataclass(frozen=True)
+class Common:
+    """What all algorithms of a comparison share."""
+
+    comparison: Comparison
+    experiment: Experiment
+    reality: ModelFile
+    folder: Path
+    console: Console
+
+    def run_folder(self, name: str, seed: int) -> Path:
+        return self.folder / name / f"seed{seed}"
+
+    def conditions(self, name: str) -> dict[str, Any]:
+        """What decides a training, as plain data."""
+        config = self.experiment.config.to_dict()
+        shared = {key: config[key] for key in ("balls", "model", "task")} | {"pool": config["training"]["pool"]}
+        given = self.comparison.to_dict()
+        return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": given["algorithms"][name]}
+
+    def evaluation_conditions(self) -> dict[str, Any]:
+        """What decides an evaluation besides the policy."""
+        return {
+            "evaluation": self.experiment.config.evaluation.model_dump(mode="json"),
+            "reality": self.comparison.reality,
+        }
+
+
+def compare(comparison: Comparison, config: Config, where: str, out: Path, console: Console) -> Path:
+    """Runs what is not finished yet and writes the report; returns the comparison's folder. Raises ExperimentErrors."""
+    common = prepare(comparison, config, where, out, console)
+    missing = unfinished(common)
+    common.folder.mkdir(parents=True, exist_ok=True)
+    with replacing(common.folder / "comparison.yaml") as temporary:
+        temporary.write_text(yaml.safe_dump(common.comparison.to_dict(), sort_keys=False), encoding="utf-8")
+    judge = Judge(common) if any(missing.values()) else None
+    for name, seeds in missing.items():
+        if seeds:
+            _run(common, judge, name, seeds)
+        else:
+            console.print(f"{common.folder / name}: done before, skipped", highlight=False)
+    report.write(common.folder, common.comparison)
+    return common.folder
+
+
+def prepare(comparison: Comparison, config: Config, where: str, out: Path, console: Console) -> Common:
+    """Looks up what the comparison names; ``where`` is its origin in errors. Raises ConfigError."""
+    experiment = build.experiment(config, where)
+    real = build.experiment(config.model_copy(update={"model": comparison.reality}), f"{where}: reality")
+    alone = {"experiment": experiment.config.to_dict(), "reality": real.config.model}
+    folder = out / comparison.name
+    return Common(comparison.model_copy(update=alone), experiment, real.model, folder, console)
+
+
+def unfinished(common: Common) -> dict[str, list[int]]:
+    """Per algorithm the seeds that lack training or evaluation. Raises RunError for a training under other conditions."""
+    seeds = common.comparison.seeds
+    return {name: [k for k in seeds if not _finished(common, name, k)] for name in common.comparison.algorithms}
+
+
+def learner(settings: Algorithm, experiment: Experiment) -> Learner:
+    """The algorithm on the experiment's task. Raises ConfigError."""
+    config, model = experiment.config, experiment.model
+    pool = build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool)
+    simulator = Simulator(experiment.task, 1)
+    if isinstance(settings, Bgs):
+        optimiser = settings.optimiser
+        bgs = checked("optimiser", build.bgs_config, optimiser, settings.schedule_updates)
+        common_numbers, scale = optimiser.common_random_numbers, optimiser.initial_scale
+        return Evolution(
+            Trainer(simulator, bgs, pool, model.model, model.randomise, optimiser.repeats, common_numbers, scale)
+        )
+    env = TableTennis(simulator, pool, model.model, model.randomise)
+    if isinstance(settings, Ppo):
+        return PpoLearner(settings, env)
+    agent = SacAgent(settings) if isinstance(settings, Sac) else QtOptAgent(settings)
+    return OffPolicyLearner(settings.replay, env, agent)
+
+
+class Judge:
+    """Evaluates controllers: on the way, and in the end in simulation and in reality."""
+
+    def __init__(self, common: Common) -> None:
+        experiment = common.experiment
+        config = experiment.config
+        task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
+        self._arenas = {"simulation": Arena(task, experiment.model), "reality": Arena(task, common.reality)}
+        seed, on_the_way = config.training.seed, common.comparison.curve.episodes
+        self._progress_key = build.key(seed, build.PROGRESS_EPISODES)
+        self._progress_balls = draw_balls(experiment, build.key(seed, build.PROGRESS_BALLS), on_the_way)
+        seed = config.evaluation.seed
+        self._key = build.key(seed, build.EVALUATION_EPISODES)
+        self._balls = draw_balls(experiment, build.key(seed, build.EVALUATION_BALLS), config.evaluation.episodes)
+
+    def progress(self, controller) -> dict[str, Any]:
+        result = self._arenas["simulation"].play(controller, self._progress_balls, self._progress_key)
+        kept = ("return_rate", "low", "high", "hit_rate", "mean_return")
+        summary = evaluate.summary(result)
+        return {name: summary[name] for name in kept}
+
+    def final(self, controller) -> dict[str, Any]:
+        """Per world the summary of ``evaluate``, and how restless the motion is in simulation."""
+        found = {
+            world: evaluate.summary(arena.play(controller, self._balls, self._key))
+            for world, arena in self._arenas.items()
+        }
+        terms = found["simulation"]["terms"]
+        restless = {name: None if terms[name] is None else 1.0 - terms[name] for name in RELATIVE}
+        change = self._arenas["simulation"].action_change(controller, self._balls, self._key)
+        return found | {"restlessness": {"action_change": change if math.isfinite(change) else None} | restless}
+
+
+def _run(common: Common, judge: Judge, name: str, seeds: list[int]) -> None:
+    """What is missing of training and evaluation of one algorithm."""
+    algorithm = learner(common.comparison.algorithms[name], common.experiment)
+    key = build.key(seeds[0], build.INITIAL_STATE)
+    compiled = None
+    for seed in seeds:
+        folder = common.run_folder(name, seed)
+        if not (folder / "training.json").exists():
+            state = algorithm.init(build.key(seed, build.INITIAL_STATE))
+            if compiled is None:
+                common.console.print(f"{folder}: compiling ...", highlight=False)
+                compiled = algorithm.compiled(state)
+            _train(common, judge, name, folder, algorithm, compiled, state)
+        template = jax.eval_shape(lambda key: algorithm.controller(algorithm.init(key)), key)
+        controller, _ = checkpoint.load_latest(folder / "policy", template)
+        found = judge.final(controller)
+        run_dir.write_json(folder / "evaluation.json", {"conditions": common.evaluation_conditions()} | found)
+        rates = (f"{world} {found[world]['return_rate']:.1%}" for world in ("simulation", "reality"))
+        common.console.print(f"{folder}: returned in {', in '.join(rates)}", highlight=False)
+
+
+def _finished(common: Common, name: str, seed: int) -> bool:
+    """Whether training and evaluation are there. Raises RunError for a training under other conditions."""
+    folder = common.run_folder(name, seed)
+    if not (folder / "training.json").exists():
+        return False
+    before, now = json.loads((folder / "training.json").read_text())["conditions"], common.conditions(name)
+    differing = [key for key in now if before.get(key) != now[key]]
+    if differing:
+        raise RunError(
+            f"{folder}: was trained with other settings of {', '.join(differing)}; choose another name or another --out"
+        )
+    path = folder / "evaluation.json"
+    return path.exists() and json.loads(path.read_text())["conditions"] == common.evaluation_conditions()
+
+
+def _train(common: Common, judge: Judge, name: str, folder: Path, algorithm: Learner, advance, state) -> None:
+    """Learns until the budget is spent; the curve has evenly spaced evaluations, the first before any learning."""
+    budget, points = common.comparison.budget, common.comparison.curve.points
+    spent = {"seconds": 0.0, "cpu_seconds": 0.0} | {name: 0 for name in ("episodes", "steps")}
+    curve = [spent | judge.progress(algorithm.controller(state)) | {"training": None}]
+    _say(common.console, folder, curve[-1])
+    since: dict[str, float] = dict.fromkeys(MEASURED, 0.0)
+    while (share := _share(budget, spent)) < 1.0:
+        started = time.monotonic(), time.process_time()
+        state, measured = advance(state)
+        measured = {key: float(value) for key, value in jax.device_get(measured).items()}
+        spent["seconds"] += time.monotonic() - started[0]
+        spent["cpu_seconds"] += time.process_time() - started[1]
+        for key in ("episodes", "steps"):
+            spent[key] += round(measured[key])
+        since = {key: since[key] + measured[key] for key in MEASURED}
+        if int(points * min(_share(budget, spent), 1.0)) > int(points * share):
+            ended = max(since["episodes"], 1.0)
+            training = {key: since[key] / ended for key in ("hit", "returned", "episode_return")}
+            curve.append(dict(spent) | judge.progress(algorithm.controller(state)) | {"training": training})
+            since = dict.fromkeys(MEASURED, 0.0)
+            _say(common.console, folder, curve[-1])
+    notes = {"algorithm": name, **spent}
+    checkpoint.save(folder / "policy", 1, algorithm.controller(state), notes)
+    run_dir.write_json(
+        folder / "training.json",
+        {"conditions": common.conditions(name), "curve": curve, "provenance": run_dir.provenance()},
+    )
+
+
+def _share(budget, spent: dict[str, float]) -> float:
+    """How much of the budget is spent; at 1 it is."""
+    seconds = spent["seconds" if budget.clock == "wall" else "cpu_seconds"]
+    by_time = 0.0 if budget.minutes is None else seconds / (60 * budget.minutes)
+    by_episodes = 0.0 if budget.episodes is None else spent["episodes"] / budget.episodes
+    return max(by_time, by_episodes)
+
+
+def _say(console: Console, folder: Path, point: dict[str, Any]) -> None:
+    console.print(
+        f"{folder}: {point['episodes']:,} episodes, {point['seconds']:.0f} s: returned {point['return_rate']:.1%}, "
+        f"touched {point['hit_rate']:.1%}, mean return {point['mean_return'] or float('nan'):.2f}",
+        highlight=False, soft_wrap=True,
+    )  # fmt: skip

@@ -1,0 +1,128 @@
+"""Learning from a replay buffer: what SAC and QT-Opt share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.training.acme import running_statistics
+from brax.training.types import Transition
+from flax import struct
+
+from experiments.baselines import learner
+from experiments.baselines.learner import Learner, NetworkController
+from experiments.config.baselines import Replay
+from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis
+from robot_io.contract import N_JOINTS
+
+WIDTH = 2 * OBSERVATION_SIZE + N_JOINTS + 2  # numbers in a transition
+CALL = 64  # steps of the environments in one call of ``compiled``
+
+
+@struct.dataclass
+class Buffer:
+    """The last transitions, one a row, as a ring. (Brax's queue moves all of its rows once it is full.)"""
+
+    rows: jax.Array  # (capacity, WIDTH)
+    added: jax.Array  # () int32, all transitions so far
+
+
+def insert(buffer: Buffer, t: Transition) -> Buffer:
+    """Adds a batch whose size divides the capacity."""
+    rows = jnp.concatenate(
+        [t.observation, t.action, t.reward[:, None], t.discount[:, None], t.next_observation], axis=1
+    )
+    capacity = buffer.rows.shape[0]
+    place = jnp.mod(buffer.added, capacity)
+    return Buffer(jax.lax.dynamic_update_slice_in_dim(buffer.rows, rows, place, 0), buffer.added + rows.shape[0])
+
+
+def sample(buffer: Buffer, key, n: int) -> Transition:
+    """n transitions, drawn with replacement from those that the buffer holds."""
+    held = jnp.minimum(buffer.added, buffer.rows.shape[0])
+    rows = buffer.rows[jax.random.randint(key, (n,), 0, held)]
+    ends = np.cumsum([OBSERVATION_SIZE, N_JOINTS, 1, 1])
+    observation, action, reward, discount, following = jnp.split(rows, ends, axis=1)
+    extras = {"policy_extras": {}, "state_extras": {"truncation": jnp.zeros(n)}}
+    return Transition(observation, action, reward[:, 0], discount[:, 0], following, extras)
+
+
+class Agent(Protocol):
+    """What is learned from transitions."""
+
+    def init(self, key) -> Any: ...
+
+    def explore(self, agent, normaliser, observation, key):
+        """Actions (B, 8) to learn from."""
+
+    def update(self, agent, normaliser, batch: Transition, key) -> Any:
+        """The agent after one gradient step."""
+
+    def parameters(self, agent) -> Any:
+        """What ``decide`` needs of the agent."""
+
+    def decide(self, parameters, observation):
+        """Best actions (..., 8); ``parameters``: (normaliser, those of the agent)."""
+
+
+@struct.dataclass
+class OffPolicyState:
+    agent: Any
+    normaliser: Any
+    buffer: Buffer
+    env: Any
+    key: jax.Array
+
+
+@dataclass(frozen=True, eq=False)
+class OffPolicyLearner(Learner):
+    """Random actions first; then ``gradient_steps`` after every step of the environments."""
+
+    replay: Replay
+    env: TableTennis
+    agent: Agent
+
+    def init(self, key) -> OffPolicyState:
+        agent_key, env_key, key = jax.random.split(key, 3)
+        places = self.replay.environments
+        env = jax.jit(self.env.reset)(jax.random.split(env_key, places))
+        capacity = -(-self.replay.capacity // places) * places
+        buffer = Buffer(jnp.zeros((capacity, WIDTH)), jnp.int32(0))
+        return OffPolicyState(self.agent.init(agent_key), learner.empty_normaliser(), buffer, env, key)
+
+    def compiled(self, state: OffPolicyState):
+        return learner.compiled(self._advance, state)
+
+    def controller(self, state: OffPolicyState) -> NetworkController:
+        parameters = (state.normaliser, self.agent.parameters(state.agent))
+        return learner.network_controller(parameters, state.normaliser, self.agent.decide)
+
+    def _advance(self, state: OffPolicyState):
+        state, measured = jax.lax.scan(self._step, state, None, length=CALL)
+        return state, learner.summed(measured)
+
+    def _step(self, state: OffPolicyState, _):
+        play_key, learn_key, key = jax.random.split(state.key, 3)
+        warm = state.buffer.added >= self.replay.random_steps
+
+        def policy(observation, key):
+            action_key, random_key = jax.random.split(key)
+            random = jax.random.uniform(random_key, (observation.shape[0], N_JOINTS), minval=-1.0, maxval=1.0)
+            action = self.agent.explore(state.agent, state.normaliser, observation, action_key)
+            return jnp.where(warm, action, random), {}
+
+        env, transition, measured = learner.play(self.env, state.env, policy, play_key)
+        normaliser = running_statistics.update(state.normaliser, transition.observation)
+        buffer = insert(state.buffer, transition)
+
+        def learn(agent, key):
+            sample_key, update_key = jax.random.split(key)
+            batch = sample(buffer, sample_key, self.replay.batch)
+            return self.agent.update(agent, normaliser, batch, update_key), None
+
+        keys = jax.random.split(learn_key, self.replay.gradient_steps)
+        agent = jax.lax.cond(warm, lambda a: jax.lax.scan(learn, a, keys)[0], lambda a: a, state.agent)
+        return OffPolicyState(agent, normaliser, buffer, env, key), measured

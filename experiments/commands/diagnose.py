@@ -1,0 +1,188 @@
+"""``mjx-tt diagnose``: logs in; verdict.json, extended.yaml, report.html and plots out."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from experiments.config import build
+from experiments.deploy import session_logs
+from experiments.errors import ConfigError, checked
+from experiments.evaluation import evaluate
+from experiments.runs import load_policy as policy
+from experiments.runs.run_dir import Run
+from experiments.training import loop
+from mjx_tt import diagnosis
+from mjx_tt.diagnosis.report import page as report
+from mjx_tt.sim import model
+from mjx_tt.sim.model import ModelFile
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for on the command line."""
+
+    logs: Sequence[str]
+    out: Path
+    model: str | None = None
+    spin: str = "none"
+    without: Sequence[str] = ()
+    seed: int = 0
+    randomise: bool = False
+    policy: str | None = None
+    retrain: int = 0
+
+    def check(self) -> None:
+        """Refuses at once what would fail after the work. Raises ConfigError."""
+        if self.seed < 0:
+            raise ConfigError(f"--seed {self.seed}: a whole number from 0 on is wanted")
+        if self.retrain and self.policy is None:
+            raise ConfigError("--retrain needs --policy: the run or artefact that is to be trained on")
+        if self.retrain < 0:
+            raise ConfigError(f"--retrain {self.retrain}: a number of updates is wanted")
+        if self.policy is not None and policy.load(self.policy).config is None:
+            raise ConfigError(f"{self.policy}: does not say how it was trained; give the run that it came from")
+        existing = next(p for p in (self.out, *self.out.absolute().parents) if p.exists())
+        if not existing.is_dir():
+            raise ConfigError(f"--out {self.out}: {existing} is a file, a folder is wanted")
+        if not os.access(existing, os.W_OK):
+            raise ConfigError(f"--out {self.out}: {existing} cannot be written to")
+
+
+def read_logs(paths: Sequence[str]) -> diagnosis.Logs:
+    """Logs of balls and joints, sessions at the robot among them. Raises ValueError or FileNotFoundError naming the file."""
+    files = diagnosis.hashes(paths)
+    sessions = [f for f in files if session_logs.is_session(f)]
+    others = [f for f in files if f not in sessions]
+    if not sessions:
+        return diagnosis.load(paths)
+    rest = diagnosis.load(others) if others else diagnosis.Logs((), (), {})
+    balls, records = list(rest.balls), [("the CSV files", rest.joints)] if rest.joints else []
+    for file in sessions:
+        flights, joints = session_logs.load(file)
+        diagnosis.check(flights, str(file))
+        balls += flights
+        if joints:
+            records.append((str(file), joints))
+    joints, notes = diagnosis.longest(records)
+    return diagnosis.Logs(tuple(balls), joints, {str(file): digest for file, digest in files.items()}, rest.notes + notes)
+
+
+def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
+    """Runs the diagnosis and writes its files. Raises ConfigError for bad logs before anything is written."""
+    request.check()
+    nominal = checked("--model", model.load, request.model) if request.model else ModelFile(model.SimModel())
+    logs = checked("", read_logs, request.logs)
+    balls, joints = len(logs.balls), len(logs.joints)
+    console.print(
+        f"{balls} trajectories, {joints} joints from {', '.join(str(p) for p in request.logs)}", highlight=False
+    )
+    began = time.perf_counter()
+
+    def say(text: str) -> None:
+        console.print(f"  {time.perf_counter() - began:5.1f} s  {text}", highlight=False)
+
+    provenance = {
+        "made_by": "mjx-tt diagnose",
+        "model": request.model or "nominal",
+        "seed": request.seed,
+        "spin": request.spin,
+    }
+    if request.model:
+        provenance["model_sha256"] = hashlib.sha256(Path(request.model).read_bytes()).hexdigest()
+    return checked(
+        ", ".join(request.logs), diagnosis.diagnose, logs, nominal.model, request.spin, tuple(request.without), request.seed, say,
+        provenance, request.randomise,
+    )  # fmt: skip
+
+
+def play(
+    extended: Path, request: Request, episodes: int, console: Console
+) -> dict[str, dict | int | None]:
+    """What the defect costs a policy: return rates with 95 % intervals under the nominal and the extended model.
+
+    extended: the model file that was written, under which the policy is trained on for ``request.retrain`` updates; the
+    run of that training is kept beside the model file.
+    """
+    folder, retrain = request.policy, request.retrain
+    trained = policy.load(folder)
+    nominal = {"model": request.model} if request.model else {}
+
+    def rate(name: str, who: policy.Policy, changes: dict) -> dict[str, float]:
+        experiment = build.experiment(trained.config.model_copy(update=changes | {"initial_policy": None}), folder)
+        report = evaluate.evaluate(experiment, who, episodes, trained.config.evaluation.seed, None).report
+        console.print(
+            f"  {name}: {report['return_rate']:.1%} of {report['episodes']} balls returned "
+            f"({report['low']:.1%} to {report['high']:.1%})", highlight=False,
+        )  # fmt: skip
+        return {"rate": report["return_rate"], "low": report["low"], "high": report["high"]}
+
+    rates = {
+        "nominal": rate("nominal model", trained, nominal),
+        "extended": rate("extended model", trained, {"model": str(extended)}),
+        "retrained": None,
+    }
+    if retrain:
+        training = trained.config.training.model_copy(update={"updates": retrain, "later_rewards": None})
+        config = trained.config.model_copy(
+            update={"model": str(extended), "initial_policy": folder, "training": training, "name": "retrained"}
+        )
+        run = Run(extended.parent / "retrained")
+        loop.train(build.experiment(config, folder), run, console)
+        rates["retrained"] = rate("retrained", policy.load(run.folder), {"model": str(extended)})
+    return {"balls": episodes, **rates}
+
+
+def save(found: diagnosis.Diagnosis, folder: Path) -> Path:
+    """Writes verdict.json and extended.yaml; returns the path of the latter."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found.verdict.save(folder / "verdict.json")
+    model.save(folder / "extended.yaml", found.extended)
+    return folder / "extended.yaml"
+
+
+def draw(found: diagnosis.Diagnosis, folder: Path, title: str, console: Console, cost: dict | None = None) -> None:
+    """Writes report.html and its pictures, and says where everything is."""
+    report.write(folder, found, title, cost)
+    for name in ("report.html", "verdict.json", "extended.yaml"):
+        console.print(f"  {folder / name}", highlight=False)
+
+
+def show(found: diagnosis.Diagnosis, console: Console) -> None:
+    """The answer in a few lines."""
+    v = found.verdict
+    console.print(f"verdict: {v.verdict}", style="bold")
+    for warning in v.warnings:
+        console.print(f"  note: {warning}", highlight=False)
+    for c in v.causes:
+        unit = "mm" if c.name.startswith("gantry") else "mrad"
+        size = f"{unit} rms" if "." in c.name else "mm at the end of a flight"
+        console.print(f"  {c.name}: {c.effect_mm:.1f} {size}, confidence {c.confidence:.0%}", highlight=False)
+        for path, e in c.parameters.items():
+            console.print(
+                f"    {path} {e.nominal:.6g} -> {e.estimate:.6g} ({e.low:.6g} to {e.high:.6g}) {e.unit}",
+                highlight=False,
+            )
+        if len(c.group) > 1:
+            console.print(
+                f"    cannot be told from {', '.join(c.group[1:])}: {c.separating_measurement}", highlight=False
+            )
+    if v.unexplained:
+        u = v.unexplained
+        console.print(
+            f"  no entry of the catalogue explains: {u.block}, {u.where}, along {u.direction}, {u.size}",
+            highlight=False,
+        )
+    if v.held_out:
+        h = v.held_out
+        console.print(
+            f"  held out: {h.before:.2f} -> {h.after:.2f} mm, gain {h.low:.2f} to {h.high:.2f}", highlight=False
+        )
+    for e in v.next_experiment[:2]:
+        console.print(f"  next: {e.what}{' tells ' + ', '.join(e.separates) if e.separates else ''}", highlight=False)

@@ -1,0 +1,204 @@
+"""The YAML of a comparison of algorithms: the task they share, their settings, and what each may spend.
+
+Needs neither JAX nor NumPy, as ``experiments.config.experiment``, whose sections and errors it uses.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from experiments.config import experiment as config
+from experiments.config import validation
+from experiments.config.experiment import SHIPPED, Config, Count, Optimiser, Positive, Section
+from experiments.errors import ConfigError
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]  # also that of a folder
+Layers = Annotated[list[Count], Field(min_length=1)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Discount = Annotated[float, Field(gt=0, le=1)]
+
+
+class Bgs(Section):
+    """An evolution strategy on the paper's network of 976 parameters: BGS, or with other settings ARS."""
+
+    kind: Literal["bgs"]
+    optimiser: Optimiser = Optimiser()
+    schedule_updates: Count = 2000
+    """Updates over which a cosine schedule of the learning rate falls; it then stays."""
+
+
+class Ppo(Section):
+    """Proximal policy optimisation with brax's networks and loss."""
+
+    kind: Literal["ppo"]
+    environments: Count = 1024
+    unroll: Count = 32
+    """Control steps in every environment between two rounds of learning."""
+    epochs: Count = 4
+    """Passes over the data of a round."""
+    minibatches: Count = 16
+    """Parts, of whole unrolls, that a pass is cut into; they must divide the environments."""
+    learning_rate: Positive = 3e-4
+    discount: Discount = 0.99
+    gae_lambda: Share = 0.95
+    clip: Positive = 0.2
+    entropy_cost: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1e-3
+    reward_scale: Positive = 1.0
+    max_gradient_norm: Positive = 1.0
+    policy_layers: Layers = [64, 64]
+    value_layers: Layers = [64, 64]
+
+    @model_validator(mode="after")
+    def _divides(self) -> Ppo:
+        if self.environments % self.minibatches:
+            raise ValueError(f"minibatches {self.minibatches} do not divide the environments {self.environments}")
+        return self
+
+
+class Replay(Section):
+    """Experience and its use."""
+
+    environments: Count = 64
+    capacity: Count = 300_000
+    """Transitions kept."""
+    random_steps: Count = 20_000
+    """Control steps, of all environments together, with random actions before learning begins."""
+    gradient_steps: Count = 1
+    """After every step of all environments."""
+    batch: Count = 256
+
+
+class OffPolicy(Section):
+    """What learners from kept experience have in common."""
+
+    replay: Replay = Replay()
+    layers: Layers = [128, 128]
+    learning_rate: Positive = 1e-3
+    discount: Discount = 0.99
+    reward_scale: Positive = 1.0
+    target_rate: Share = 0.005
+    """By which the target network moves towards the critic in a gradient step."""
+
+
+class Sac(OffPolicy):
+    """Soft actor-critic with brax's networks and losses."""
+
+    kind: Literal["sac"]
+    first_entropy_weight: Positive = 0.1
+
+
+class QtOpt(OffPolicy):
+    """QT-Opt in its small form: two critics, the cross-entropy method in place of an actor."""
+
+    kind: Literal["qt_opt"]
+    rounds: Count = 2
+    """Of the cross-entropy method."""
+    candidates: Count = 32
+    """Actions tried in a round."""
+    elites: Count = 4
+    """Of them, the best, that decide where the next round looks."""
+    noise: Positive = 0.2
+    """Standard deviation of the exploring noise on every velocity, of which 1 is the limit."""
+    random_share: Share = 0.05
+    """Exploring steps that are wholly random."""
+
+    @model_validator(mode="after")
+    def _fewer(self) -> QtOpt:
+        if self.elites > self.candidates:
+            raise ValueError(f"elites {self.elites} are more than the candidates {self.candidates}")
+        return self
+
+
+Algorithm = Annotated[Bgs | Ppo | Sac | QtOpt, Field(discriminator="kind")]
+
+
+class Budget(Section):
+    """What each algorithm may spend with each seed; whichever is spent first ends its training."""
+
+    minutes: Positive | None = None
+    """Of training, without compilation and evaluations."""
+    episodes: Count | None = None
+    clock: Literal["wall", "cpu"] = "wall"
+    """What the minutes are of: the clock, or processor time of this program, for a machine that is busy otherwise."""
+
+    @model_validator(mode="after")
+    def _limited(self) -> Budget:
+        if self.minutes is None and self.episodes is None:
+            raise ValueError("minutes, episodes or both are needed")
+        return self
+
+
+class Curve(Section):
+    """The evaluations during training."""
+
+    points: Count = 12
+    """Evenly over the budget, besides the one before training."""
+    episodes: Count = 512
+
+
+class Comparison(Section):
+    """One comparison."""
+
+    name: Name
+    experiment: str | dict[str, Any]
+    """An experiment's YAML, its path or content: balls, model, task, pool and evaluation hold for every algorithm."""
+    reality: str | dict[str, Any]
+    """The SimModel that no training sees, its path or content."""
+    algorithms: Annotated[dict[Name, Algorithm], Field(min_length=1)]
+    """By the name that the report gives them."""
+    budget: Budget
+    seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=1)] = [0]
+    curve: Curve = Curve()
+
+    @field_validator("seeds")
+    @classmethod
+    def _different(cls, seeds: list[int]) -> list[int]:
+        if len(set(seeds)) < len(seeds):
+            raise ValueError("different seeds")
+        return seeds
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that ``load`` reads back, with every default written out."""
+        return self.model_dump(mode="json")
+
+
+def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comparison, Config]:
+    """Reads a comparison and the experiment that it names; ``overrides`` are "dotted.path=value" with the value in YAML.
+
+    Relative paths in the file are relative to its folder, those of overrides to the current one; an experiment that is
+    not there is looked up among the shipped ones. Raises ConfigError.
+    """
+    path = Path(path)
+    data = config.read_mapping(path, overrides, "a comparison", Comparison, shipped(), _absolute)
+    try:
+        comparison = Comparison.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{path}: {line}" for line in validation.lines(error, Comparison))) from None
+    experiment = _experiment(comparison.experiment, str(path))
+    if experiment.training.later_rewards is not None:
+        raise ConfigError(
+            f"{path}: experiment: training.later_rewards: a comparison has one set of reward weights; null"
+        )
+    return comparison, experiment
+
+
+def _absolute(data: dict[str, Any], folder: Path) -> None:
+    for key in ("experiment", "reality"):
+        if isinstance(data.get(key), str):
+            data[key] = str((folder / data[key]).resolve())
+
+
+def shipped() -> dict[str, Path]:
+    """The comparisons that come with the program, by name."""
+    return {path.stem: path for path in sorted((SHIPPED / "compare").glob("*.yaml"))}
+
+
+def _experiment(given: str | dict[str, Any], where: str) -> Config:
+    if isinstance(given, dict):
+        return config.parse(given, f"{where}: experiment")
+    path = Path(given)
+    return config.load(path if path.exists() else config.shipped().get(path.stem, path))

@@ -1,0 +1,167 @@
+"""From a configuration to the objects it describes: balls, simulation model, task, optimiser, trainer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from ballmodel import registry
+from ballmodel.distribution import BallDistribution, parse_distribution
+from ballmodel.io import yaml
+from ballmodel.sampling import BallPool, sample_pool
+from bgs import optimizers
+from bgs.strategy import BGSConfig
+from experiments.config.experiment import Config, Optimiser, Rewards, Task, Training
+from experiments.errors import ConfigError, checked
+from experiments.training.update import Trainer
+from mjx_tt.env import rewards
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import TaskConfig
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import ModelFile
+
+# What a seed is used for; each purpose has its own key.
+TRAINING_BALLS, INITIAL_STATE, PROGRESS_BALLS, PROGRESS_EPISODES, EVALUATION_BALLS, EVALUATION_EPISODES = range(6)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A configuration whose names and files have been looked up.
+
+    config        with the content of the files that it named in their place, so that it stands alone
+    distribution  of the balls
+    model         nominal parameters and what is randomised around them
+    task, bgs     settings of simulator and optimiser
+    """
+
+    config: Config
+    distribution: BallDistribution
+    model: ModelFile
+    task: TaskConfig
+    bgs: BGSConfig
+
+
+def experiment(config: Config, where: str) -> Experiment:
+    """Looks up what a configuration names; ``where`` is its origin in errors. Raises ConfigError."""
+    balls = distribution(config.balls, f"{where}: balls")
+    model_data = _mapping(config.model, f"{where}: model")
+    if isinstance(config.model, str):
+        model = checked(f"{where}: model", models.from_dict, model_data, config.model)
+    else:
+        model = checked(where, models.from_dict, model_data, "model")
+    if config.initial_policy is not None and not Path(config.initial_policy).is_dir():
+        raise ConfigError(
+            f"{where}: initial_policy: {config.initial_policy} is no folder; allowed: a run or an artefact"
+        )
+    named = isinstance(config.balls, str) and config.balls in registry.names()
+    alone = config.model_copy(update={"balls": config.balls if named else balls.to_dict(), "model": model_data})
+    return Experiment(
+        config=alone,
+        distribution=balls,
+        model=model,
+        task=checked(f"{where}: task", task_config, config.task),
+        bgs=checked(f"{where}: optimiser", bgs_config, config.optimiser, config.training.updates),
+    )
+
+
+def distribution(balls: str | dict[str, Any], where: str) -> BallDistribution:
+    """The distribution of that name, in the YAML at that path, or with that content. Raises ConfigError."""
+    if isinstance(balls, dict):
+        return checked(where, parse_distribution, balls, "content")
+    return checked(where, registry.resolve, balls)
+
+
+def task_config(task: Task) -> TaskConfig:
+    """Raises ValueError where the numbers do not fit together."""
+    return TaskConfig(
+        engine=task.engine,
+        control_rate=task.control_rate,
+        sim_rate=task.sim_rate,
+        max_steps=task.max_steps,
+        reward_weights=reward_weights(task.rewards),
+    )
+
+
+def reward_weights(chosen: str | Rewards) -> tuple[float, ...]:
+    """Eleven weights in the order of ``rewards.TERMS``."""
+    base = chosen if isinstance(chosen, str) else chosen.base
+    weights = {"sim": rewards.SIM_WEIGHTS, "real": rewards.REAL_WEIGHTS}[base]
+    changed = {} if isinstance(chosen, str) else chosen.model_dump(exclude={"base"}, exclude_none=True)
+    return tuple(float(changed.get(name, weights[name])) for name in rewards.TERMS)
+
+
+def later_weights(training: Training) -> tuple[int, tuple[float, ...]] | None:
+    """The number of updates after which the reward weights change, and those weights."""
+    later = training.later_rewards
+    return later and (round(later.after * training.updates), reward_weights(later.rewards))
+
+
+def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:
+    """``updates`` is the length of the run, which a cosine schedule needs. Raises ValueError."""
+    chosen = optimiser.step
+    rate: float | optimizers.Schedule = chosen.learning_rate
+    if chosen.schedule.kind == "cosine":
+        rate = optimizers.cosine(rate, chosen.schedule.final, updates, chosen.schedule.hold)
+    elif chosen.schedule.kind == "piecewise":
+        rate = optimizers.piecewise(rate, tuple((c.update, c.learning_rate) for c in chosen.schedule.changes))
+    sigma: float | optimizers.Schedule = optimiser.sigma
+    if optimiser.sigma_fall is not None:
+        sigma = optimizers.cosine(sigma, optimiser.sigma_fall.final, updates, optimiser.sigma_fall.hold)
+    return BGSConfig(
+        pairs=optimiser.pairs,
+        sigma=sigma,
+        keep=optimiser.keep,
+        rank=optimiser.rank,
+        weighting=optimiser.weighting,
+        normalise=optimiser.normalise,
+        orthogonal=optimiser.orthogonal,
+        scale=optimiser.scale,
+        step=optimizers.make(chosen.kind, rate, chosen.b1, chosen.b2, chosen.weight_decay),
+        average=optimiser.average,
+    )
+
+
+def device_count(config: Config) -> int:
+    """Devices to train on: the number asked for, or the most of those present that divide the perturbations evenly."""
+    asked, members = config.training.devices, 2 * config.optimiser.pairs
+    if asked != "auto":
+        return asked
+    return max(n for n in range(1, len(jax.devices()) + 1) if members % n == 0)
+
+
+def key(seed: int, purpose: int) -> jax.Array:
+    """A key of its own for each purpose of a seed."""
+    return jax.random.fold_in(jax.random.key(seed), purpose)
+
+
+def pool(experiment: Experiment, key: jax.Array, n: int) -> BallPool:
+    """``n`` balls of the experiment's distribution under its nominal ball model. Raises ConfigError."""
+    return checked("balls", sample_pool, key, experiment.distribution, experiment.model.model.ball, n)
+
+
+def trainer(experiment: Experiment) -> Trainer:
+    """The trainer with its pool of balls drawn. Raises ConfigError."""
+    config = experiment.config
+    simulator = checked("training.devices", Simulator, experiment.task, device_count(config))
+    return Trainer(
+        simulator,
+        experiment.bgs,
+        pool(experiment, key(config.training.seed, TRAINING_BALLS), config.training.pool),
+        experiment.model.model,
+        experiment.model.randomise,
+        config.optimiser.repeats,
+        config.optimiser.common_random_numbers,
+        config.optimiser.initial_scale,
+        later_weights(config.training),
+    )
+
+
+def _mapping(model: str | dict[str, Any], where: str) -> dict[str, Any]:
+    """The content of a model YAML, plain data as it stands there."""
+    if isinstance(model, dict):
+        return model
+    data = checked(where, yaml.read, model)
+    return {} if data is None else data

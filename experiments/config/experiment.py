@@ -1,0 +1,318 @@
+"""The typed experiment YAML: what may stand in it, what is left out means, and errors that say what to change.
+
+Needs neither JAX nor NumPy, so that a mistake in a file is reported at once. Names and files that a configuration
+refers to are looked up by ``experiments.config.build``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from ballmodel.io import yaml
+from experiments.config import validation
+from experiments.errors import ConfigError
+
+SHIPPED = Path(__file__).parents[1] / "shipped"  # train/, study/, compare/: YAMLs that come with the program
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+Decay = Annotated[float, Field(ge=0, lt=1)]
+
+
+class Section(BaseModel):
+    """A mapping of the YAML: unknown keys are errors, nothing is converted silently."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True)
+
+
+class Rewards(Section):
+    """Weights of the eleven reward terms; a term that is left out keeps the weight of ``base``."""
+
+    base: Literal["sim", "real"] = "sim"
+    """The paper's weights for simulation or for the real robot."""
+    state_transition: Finite | None = None
+    net_clearance: Finite | None = None
+    hit_and_land: Finite | None = None
+    fault: Finite | None = None
+    jerk: Finite | None = None
+    acceleration: Finite | None = None
+    velocity: Finite | None = None
+    joint_angle: Finite | None = None
+    collision: Finite | None = None
+    paddle_height: Finite | None = None
+    style: Finite | None = None
+
+
+class Task(Section):
+    """The episode."""
+
+    engine: Literal["fused", "mjx"] = "fused"
+    """Robot dynamics: fused is fast, mjx is the reference."""
+    control_rate: Positive = 75.0
+    """[Hz] of the policy."""
+    sim_rate: Positive = 300.0
+    """[Hz] of the physics, a whole multiple of control_rate."""
+    max_steps: Count = 200
+    """Control steps after which an episode ends."""
+    rewards: Literal["sim", "real"] | Rewards = "sim"
+    """The paper's weights by name, or a mapping that changes single ones."""
+
+
+class Constant(Section):
+    """The learning rate never changes."""
+
+    kind: Literal["constant"]
+
+
+class Cosine(Section):
+    """The learning rate holds, then falls along half a cosine until the last update."""
+
+    kind: Literal["cosine"]
+    final: Positive = 0.0005
+    """Learning rate after the last update."""
+    hold: Annotated[float, Field(ge=0, lt=1)] = 0.3
+    """Share of the updates before the fall."""
+
+
+class Change(Section):
+    """A new learning rate from an update on."""
+
+    update: Count
+    learning_rate: Positive
+
+
+class Piecewise(Section):
+    """The learning rate changes at given updates."""
+
+    kind: Literal["piecewise"]
+    changes: Annotated[list[Change], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _increasing(self) -> Piecewise:
+        starts = [change.update for change in self.changes]
+        if any(later <= earlier for earlier, later in zip(starts, starts[1:])):
+            raise ValueError(f"the updates must increase, got {starts}")
+        return self
+
+
+class Step(Section):
+    """From a gradient estimate to a change of the parameters."""
+
+    kind: Literal["adam", "sgd"] = "adam"
+    learning_rate: Positive = 0.01
+    b1: Decay = 0.9
+    """Adam's decay of the first moment; sgd does not use it."""
+    b2: Decay = 0.99
+    """Adam's decay of the second moment; sgd does not use it."""
+    weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    """Share by which an update shrinks the parameters, over the learning rate."""
+    schedule: Annotated[Constant | Cosine | Piecewise, Field(discriminator="kind")] = Cosine(kind="cosine")
+
+
+class SigmaFall(Section):
+    """The scale of the perturbations holds, then falls along half a cosine until the last update."""
+
+    final: Positive
+    """Scale after the last update."""
+    hold: Annotated[float, Field(ge=0, lt=1)] = 0.4
+    """Share of the updates before the fall."""
+
+
+class Optimiser(Section):
+    """Blackbox Gradient Sensing. The defaults are the recipe that trains best here; paper.yaml has the paper's."""
+
+    pairs: Count = 100
+    """Antithetic pairs of perturbations per update."""
+    repeats: Count = 10
+    """Episodes per perturbation."""
+    sigma: Positive = 0.025
+    """Scale of the perturbations."""
+    sigma_fall: SigmaFall | None = None
+    """Smaller perturbations later on: more returned in this simulation, fewer in another world; null: none."""
+    keep: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of the pairs that become elites."""
+    rank: Literal["abs", "signed", "max"] = "abs"
+    weighting: Literal["returns", "centered_rank"] = "returns"
+    normalise: Literal["std", "none"] = "std"
+    orthogonal: bool = True
+    scale: Literal["sqrt_d", "chi"] = "sqrt_d"
+    step: Step = Step()
+    average: Decay = 0.98
+    """Decay per update of the moving average of the parameters, which is what is evaluated and exported; 0: none."""
+    common_random_numbers: bool = True
+    """Both members of a pair meet the same balls, latencies and noise."""
+    initial_scale: Positive = 0.1
+    """Standard deviation of the random first parameters."""
+
+
+class LaterRewards(Section):
+    """Other reward weights for the rest of a training."""
+
+    after: Annotated[float, Field(ge=0, le=1)]
+    """Share of the updates that are trained with the weights of the task."""
+    rewards: Literal["sim", "real"] | Rewards
+
+
+class Training(Section):
+    """How long to train and what to keep of it."""
+
+    updates: Count = 2000
+    later_rewards: LaterRewards | None = None
+    """First learn to hit with the weights of the task, then with these; null: the same weights throughout."""
+    max_minutes: Positive | None = None
+    """Stop after this much training time, all sessions of the run together; a larger value continues the run."""
+    stop_at_return_rate: Annotated[float, Field(gt=0, le=1)] | None = None
+    """Stop when an evaluation during training reaches this return rate."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    pool: Count = 65536
+    """Balls drawn from the distribution before training; episodes choose among them."""
+    checkpoint_seconds: Positive = 30.0
+    evaluate_every: Count | None = 200
+    """Updates between evaluations on fresh balls; null: none."""
+    evaluate_episodes: Count = 1024
+    devices: Count | Literal["auto"] = "auto"
+    """Devices that share the perturbations; auto: as many as divide them evenly."""
+
+
+class Evaluation(Section):
+    """The evaluation after training."""
+
+    episodes: Count = 2000
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 1000
+    sim_rate: Positive | None = None
+    """[Hz] of the physics; null: that of the task."""
+    reachable_balls: Count | None = 128
+    """Balls for which a motion is optimised, one by one, for a lower bound on the return rate in reach; null: none."""
+
+
+class Config(Section):
+    """One experiment."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    """Folder of the run."""
+    balls: str | dict[str, Any]
+    """A distribution's name such as player3/M1 or narrow, the path of a YAML, or the YAML's content."""
+    model: str | dict[str, Any] = {}
+    """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise."""
+    task: Task = Task()
+    optimiser: Optimiser = Optimiser()
+    training: Training = Training()
+    evaluation: Evaluation = Evaluation()
+    initial_policy: str | None = None
+    """A run folder or an exported artefact whose policy training starts from."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that ``parse`` reads back, with every default written out."""
+        return self.model_dump(mode="json")
+
+
+def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
+    """Reads one experiment; ``overrides`` are "dotted.path=value" with the value in YAML.
+
+    Relative paths in the file are relative to its folder, those of overrides to the current one. Raises ConfigError.
+    """
+    path = Path(path)
+    return parse(read_mapping(path, overrides, "an experiment", Config, shipped(), _absolute), str(path))
+
+
+def _absolute(data: dict[str, Any], folder: Path) -> None:
+    for key in ("balls", "model", "initial_policy"):
+        value = data.get(key)
+        if isinstance(value, str) and (key != "balls" or Path(value).suffix in (".yaml", ".yml")):
+            data[key] = str((folder / value).resolve())
+
+
+def parse(data: dict[str, Any], where: str) -> Config:
+    """A Config from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
+    try:
+        return Config.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{where}: {line}" for line in validation.lines(error, Config))) from None
+
+
+def shipped() -> dict[str, Path]:
+    """The experiments that come with the program, by name."""
+    return {path.stem: path for path in sorted((SHIPPED / "train").glob("*.yaml"))}
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of an experiment YAML, for editors that complete and check while one types."""
+    return Config.model_json_schema() | {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+
+
+def read_yaml(text: str, where: str) -> Any:
+    """Parsed YAML. Raises ConfigError naming ``where`` and the line."""
+    try:
+        return yaml.parse(text, where)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+
+
+def apply_override(data: dict[str, Any], override: str) -> None:
+    """Sets one value of parsed YAML, given as "dotted.path=value" with a YAML value. Raises ConfigError."""
+    path, sign, value = override.partition("=")
+    if not sign or not all(path.split(".")):
+        raise ConfigError(f"--set {override}: needs the form dotted.path=value, such as training.updates=500")
+    *parents, leaf = path.split(".")
+    for parent in parents:
+        data = data.setdefault(parent, {})
+        if not isinstance(data, dict):
+            raise ConfigError(f"--set {override}: {parent} is {data!r}, not a mapping")
+    data[leaf] = read_yaml(value, f"--set {override}")
+
+
+def read_mapping(
+    path: Path, overrides: tuple[str, ...], what: str, section: type[Section], shipped: dict[str, Path],
+    absolute: Callable[[dict[str, Any], Path], None],
+) -> dict[str, Any]:  # fmt: skip
+    """The keys of ``section`` that the file and the overrides "dotted.path=value" give; not checked. Raises ConfigError.
+
+    what: "an experiment" or the like and ``shipped``: those that come with the program, for messages. absolute: makes the
+    relative paths in the data absolute, given the folder to which they are relative.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error}; {_hint(path, what, shipped)}") from None
+    data = read_yaml(text, str(path))
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: {what} is a mapping with the keys {', '.join(section.model_fields)}")
+    absolute(data, path.parent)
+    for override in overrides:
+        apply_override(data, override)
+    absolute(data, Path.cwd())
+    other = None if _KINDS[what][1] in data else _kind(data)
+    if other is not None:
+        command, key = _KINDS[other]
+        raise ConfigError(f"{path}: is {other}, it has the key {key}: `mjx-tt {command} {path}`; {what} is wanted here")
+    return data
+
+
+_KINDS = {  # of YAML: the command that takes it, the key by which it is known
+    "an experiment": ("train", "balls"),
+    "a study": ("is2r", "simulation"),
+    "a comparison": ("compare", "algorithms"),
+}
+
+
+def _kind(data: dict[str, Any]) -> str | None:
+    """What the keys of a YAML say that it is; None where they do not tell."""
+    return next((kind for kind, (_, key) in _KINDS.items() if key in data), None)
+
+
+def _hint(path: Path, what: str, shipped: dict[str, Path]) -> str:
+    """What may have been meant by a file that is not there: one of another command, one nearly of that name."""
+    twin = next(SHIPPED.glob(f"*/{path.stem}.yaml"), None)
+    if path.stem not in shipped and twin:
+        other = _kind(read_yaml(twin.read_text(encoding="utf-8"), str(twin)))
+        if other not in (None, what):
+            return f"the shipped {twin.name} is {other}: `mjx-tt {_KINDS[other][0]} {twin.name}`; {what} is wanted here"
+    near = difflib.get_close_matches(path.stem, shipped, 1)
+    return f"did you mean {near[0]}.yaml?" if near else f"shipped are {', '.join(shipped)}"

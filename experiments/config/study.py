@@ -1,0 +1,189 @@
+"""The typed YAML of a study: the iterative loop, its baselines and variants, for several players and seeds.
+
+Needs neither JAX nor NumPy, as ``experiments.config.experiment``. The defaults are the paper's numbers (Abeyruwan et al. 2022,
+appendices "Iterative-Sim-to-Real Procedure", "Training Hyperparameters" and "Evaluation Methodology").
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from experiments.config import validation
+from experiments.config.experiment import (
+    SHIPPED,
+    Count,
+    LaterRewards,
+    Optimiser,
+    Positive,
+    Section,
+    Step,
+    Task,
+    read_mapping,
+)
+from experiments.config.finetuning import FineTuning
+from experiments.config.finetuning import parse as parse_fine_tuning
+from experiments.errors import ConfigError
+
+PLAYERS = ("player1", "player2", "player3", "player4", "player5")
+EFFECTS = ("rubber", "table", "magnus", "spin", "noise", "latency", "camera", "drives", "encoders")
+FEWEST_RALLIES = 50  # of each model that are reported
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+
+
+class Round(Section):
+    """A round of the loop: training in simulation, then fine-tuning in reality."""
+
+    simulated: Count
+    """Updates in simulation."""
+    real: Count
+    """Updates in reality."""
+    step: Step | None = None
+    """How the parameters move in this round's simulation; null: as the optimiser says."""
+    later_rewards: LaterRewards | None = None
+    """Other reward weights for the rest of this round's simulation; null: those of the task throughout."""
+
+
+class Simulation(Section):
+    """Training in simulation: what a training YAML says in its sections task, model, optimiser and training."""
+
+    task: Task = Task(sim_rate=150.0)
+    model: dict[str, Any] = {}
+    """SimModel that training believes in, such as {sensing: {ball_noise: 0.02}}; may hold randomise."""
+    optimiser: Optimiser = Optimiser()
+    rounds: Annotated[list[Round], Field(min_length=3, max_length=3)]
+    """The paper's three; fine-tuned 35 %, 65 % and 100 % are named after their 60, 70 and 70 real updates."""
+    pool: Count = 65536
+    """Balls drawn from the human model before a training."""
+    seeds: Count = 3
+    """Trainings per model; the one that does best in reality goes on."""
+    selection_episodes: Count = 50
+    """Balls in reality by which it is chosen."""
+    checkpoint_seconds: Positive = 60.0
+    devices: Count | Literal["auto"] = "auto"
+
+
+class Reality(Section):
+    """The virtual reality: what it has that training does not know, drawn per seed (``experiments.study.target_domain``)."""
+
+    without: list[Literal[EFFECTS]] = []
+    """Effects that are left out: there, reality is what training believes."""
+    sim_rate: Positive = 300.0
+    """[Hz] of its physics."""
+    camera_noise: Positive = 0.003
+    """[m] standard deviation of each coordinate of a measured ball, from which the human model is fitted."""
+
+
+class Ablation(Section):
+    """Hand-made ball distributions against the oracle's, zero-shot, for one player."""
+
+    player: Literal[PLAYERS] = "player4"
+    balls: list[str] = ["large", "medium", "narrow"]
+
+
+class Evaluation(Section):
+    """Rallies of every model with its own player and with others."""
+
+    rallies: Annotated[int, Field(ge=FEWEST_RALLIES)] = 80
+    """Played by each player with each model; what is left after filtering is cut to the top 60, then to the top 50."""
+    lanes: Count = 8
+    """Sessions side by side into which these rallies are divided."""
+    max_touches: Count = 400
+    """A rally that is longer ends there."""
+    cross: bool = True
+    """Also with the two other players of the paper's table."""
+    effects: bool = True
+    """Also in the virtual reality with one hidden effect left out at a time."""
+
+
+class Study(Section):
+    """One study."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    """Folder of the study."""
+    players: Annotated[list[Literal[PLAYERS]], Field(min_length=1)] = list(PLAYERS)
+    seeds: Annotated[list[Seed], Field(min_length=1)] = [0]
+    """Repetitions of the whole study, each with another reality, other initial policies and other chance."""
+    first_balls: Annotated[int, Field(ge=20)] = 200
+    """Balls of D0: across the table, without a robot."""
+    simulation: Simulation
+    fine_tuning: FineTuning = FineTuning()
+    """In reality; the number of updates is the round's."""
+    reality: Reality = Reality()
+    fresh: bool = True
+    """Also the variant whose weights are not carried back from reality to simulation."""
+    ablation: Ablation | None = Ablation()
+    evaluation: Evaluation = Evaluation()
+    robot: str | None = None
+    """A robot.yaml, "rig" or "lockstep": reality is that robot and its operator; null: the virtual reality."""
+    recordings: dict[Literal[PLAYERS], str] = {}
+    """With a robot: each player's first balls as measured, a file that `mjx-tt fit-human` reads."""
+
+    @field_validator("players", "seeds")
+    @classmethod
+    def _different(cls, value: list) -> list:
+        if len(set(value)) < len(value):
+            raise ValueError("different entries")
+        return value
+
+    @model_validator(mode="after")
+    def _complete(self) -> Study:
+        if self.ablation and self.ablation.player not in self.players:
+            raise ValueError(
+                f"ablation.player {self.ablation.player!r} is none of the players of this study; "
+                f"allowed: {', '.join(self.players)}, or no ablation at all (ablation: null)"
+            )
+        rallies, lanes = self.evaluation.rallies, self.evaluation.lanes
+        if rallies % lanes:
+            more = lanes * (rallies // lanes + 1)
+            near = f"{more - lanes} or {more}" if more - lanes >= FEWEST_RALLIES else more
+            raise ValueError(
+                f"evaluation.rallies {rallies} is no multiple of its lanes {lanes} (evaluation.lanes); "
+                f"the nearest that is allowed: {near}"
+            )
+        missing = [player for player in self.players if player not in self.recordings]
+        if self.robot is not None and missing:
+            files = ", ".join(f"{player}: FILE" for player in missing)
+            raise ValueError(
+                f"with a robot, recordings of the first balls of {', '.join(missing)} are needed: "
+                f"recordings: {{{files}}}, files that `mjx-tt fit-human` reads"
+            )
+        return self
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that ``parse`` reads back, with every default written out."""
+        return self.model_dump(mode="json")
+
+
+def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Study:
+    """Reads a study; ``overrides`` are "dotted.path=value".
+
+    Relative paths in the file are relative to its folder, those of overrides to the current one. Raises ConfigError.
+    """
+    path = Path(path)
+    return parse(read_mapping(path, overrides, "a study", Study, shipped(), _absolute), str(path))
+
+
+def _absolute(data: dict[str, Any], folder: Path) -> None:
+    if isinstance(data.get("robot"), str) and data["robot"] not in ("rig", "lockstep"):
+        data["robot"] = str((folder / data["robot"]).resolve())
+    if isinstance(data.get("recordings"), dict):
+        data["recordings"] = {k: str((folder / str(v)).resolve()) for k, v in data["recordings"].items()}
+
+
+def parse(data: dict[str, Any], where: str) -> Study:
+    """A Study from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
+    try:
+        study = Study.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{where}: {line}" for line in validation.lines(error, Study))) from None
+    parse_fine_tuning(study.fine_tuning.model_dump(mode="json"), f"{where}: fine_tuning")
+    return study
+
+
+def shipped() -> dict[str, Path]:
+    """The studies that come with the program, by name."""
+    return {path.stem: path for path in sorted((SHIPPED / "study").glob("*.yaml"))}

@@ -1,0 +1,124 @@
+"""The journal of fine-tuning: one JSON line per episode, on the disk before the next ball is played.
+
+Everything but the order of the lines is in the lines: parameters, curves and the human's balls can be made from them again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.errors import RunError
+from robot_io.control.episode import EpisodeSummary
+from robot_io.files import sync_folder
+
+BEFORE, TRAINING, AFTER = "before", "training", "after"
+PHASES = (BEFORE, TRAINING, AFTER)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One episode.
+
+    phase       "training", or the evaluation "before" or "after" it
+    update      whose members are compared, from 1; in an evaluation the updates done before it
+    member      0..2N-1: theta + sigma delta_i for i < N, theta - sigma delta_(i - N) above; 0 in an evaluation
+    repeat      of the member; in an evaluation the number of the ball
+    episode     number given to the robot; it never comes twice in a phase
+    summary     what happened
+    terms       reward terms by name, unweighted
+    returns     weighted sum of the terms
+    discarded   to be played again
+    trajectory  (n, 4) measured ball: t [s], x, y, z [m]
+    """
+
+    phase: str
+    update: int
+    member: int
+    repeat: int
+    episode: int
+    summary: EpisodeSummary
+    terms: dict[str, float]
+    returns: float
+    discarded: bool
+    trajectory: np.ndarray
+
+    @property
+    def place(self) -> tuple[str, int, int, int]:
+        """What the episode was played for."""
+        return self.phase, self.update, self.member, self.repeat
+
+
+class Journal:
+    """Appends entries to a file and reads back what an earlier session left there.
+
+    A last line that was not finished when the power went is dropped. Raises RunError for any other line that is no
+    entry: the file was changed by someone.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.entries: list[Entry] = []
+        whole = self._read() if path.exists() else 0
+        self._file = open(path, "ab", buffering=0)
+        os.ftruncate(self._file.fileno(), whole)
+        os.fsync(self._file.fileno())
+        sync_folder(path.parent)
+
+    def append(self, entry: Entry) -> None:
+        """Adds an entry; it is on the disk when this returns. Raises OSError when the disk refuses."""
+        line = (json.dumps(_to_json(entry), allow_nan=False) + "\n").encode()
+        handle = self._file.fileno()
+        start = os.fstat(handle).st_size
+        try:
+            while line:
+                line = line[os.write(handle, line) :]
+            os.fsync(handle)
+        except OSError:
+            os.ftruncate(handle, start)  # no half a line in the middle, should there be room again
+            raise
+        self.entries.append(entry)
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _read(self) -> int:
+        """Reads the entries; length [bytes] of the whole lines."""
+        content, whole = self.path.read_bytes(), 0
+        lines = content.splitlines(keepends=True)
+        for i, line in enumerate(lines):
+            try:
+                if not line.endswith(b"\n"):
+                    raise ValueError("the line has no end")
+                self.entries.append(_from_json(json.loads(line)))
+            except (ValueError, TypeError, KeyError) as error:
+                if i == len(lines) - 1:
+                    break
+                raise RunError(
+                    f"{self.path}: line {i + 1} is no episode ({error}); restore the file or start a new run"
+                ) from None
+            whole += len(line)
+        return whole
+
+
+def _to_json(entry: Entry) -> dict[str, Any]:
+    shown = {name: getattr(entry, name) for name in ("phase", "update", "member", "repeat", "episode")}
+    return shown | {
+        "summary": asdict(entry.summary),
+        "terms": entry.terms,
+        "return": entry.returns,
+        "discarded": entry.discarded,
+        "trajectory": [[float(v) for v in sample] for sample in entry.trajectory],
+    }
+
+
+def _from_json(data: dict[str, Any]) -> Entry:
+    summary = dict(data.pop("summary"))
+    summary["landing"] = tuple(summary["landing"])
+    trajectory = np.array(data.pop("trajectory"), float).reshape(-1, 4)
+    return Entry(summary=EpisodeSummary(**summary), returns=data.pop("return"), trajectory=trajectory, **data)

@@ -1,0 +1,318 @@
+"""Fine-tuning on a robot: Blackbox Gradient Sensing with one ball at a time, which nothing interrupts for good.
+
+Every episode is on the disk before the next begins (``finetune_journal``), every update ends with a checkpoint. A run that
+was killed continues with the same perturbations and ends, on a robot that repeats itself, in the same parameters bit
+for bit. The run's folder is a run like those of training: it can be evaluated, exported and trained from.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import yaml
+from rich.console import Console
+
+from ballmodel.io.atomic_files import replacing
+from bgs import normalizer, strategy
+from experiments.config import build
+from experiments.config.build import Experiment
+from experiments.config.experiment import read_yaml
+from experiments.config.finetuning import FineTuning
+from experiments.errors import RunError
+from experiments.finetuning import report
+from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journal
+from experiments.finetuning.progress import FineTuningProgress
+from experiments.finetuning.robot import LockStepRobot, NoOperator, Operator, PlayedBall, Robot, thrown
+from experiments.runs import checkpoint, load_policy, run_dir
+from experiments.runs.metrics import MetricsLog
+from experiments.runs.run_dir import CONFIG, Run
+from experiments.training import finalize
+from experiments.training.update import TrainState
+from mjx_tt.env import rewards
+from robot_io.control.episode import HIT, RETURNED, EpisodeSummary
+from robot_io.emulator.config import RigParams
+
+SETTINGS = "finetuning.yaml"
+JOURNAL = "journal.jsonl"
+HUMAN_BALLS = "human_balls.csv"
+CURVE = "finetuning.png"
+FAULT = -2.0  # paper: a fault of the robot
+STOPPED = "stopped"  # the bridge's word for an episode that the operator ended
+EVALUATION_EPISODES = 1_000_000  # number of the first evaluation's first episode: other balls than in fine-tuning
+LOCK_STEP_BALLS = 65536
+PAUSE_POLL = 0.05  # [s]
+
+
+def finetune(
+    source: str | Path,
+    settings: FineTuning,
+    run: Run,
+    robot: Robot,
+    console: Console,
+    operator: Operator | None = None,
+    experiment: Experiment | None = None,
+) -> dict[str, Any] | None:
+    """Fine-tunes the policy of a run or an artefact, or continues to; returns the evaluation's report.
+
+    None: the operator stopped it, and the same call continues. experiment: what ``source`` was trained in, looked up
+    when it is not given. Raises RunError, ConfigError, CheckpointError or ArtefactError with a message for the person
+    at the terminal, and what the robot raises.
+    """
+    experiment = experiment or experiment_of(source)
+    theta, statistics = load_policy.load_statistics(source)
+    first = TrainState(
+        strategy.init(theta.astype(np.float32), build.bgs_config(settings.optimiser(), settings.updates)),
+        statistics,
+        build.key(settings.seed, build.INITIAL_STATE),
+    )
+    run.folder.mkdir(parents=True, exist_ok=True)
+    with run.locked():
+        _open(run, experiment, settings, robot, first, str(source))
+        session = Session(settings, run, robot, operator or NoOperator(), console, first)
+        try:
+            finished = session.run()
+        except OSError as error:
+            raise RunError(
+                f"{error.filename or run.folder}: cannot be written: {error.strerror or error}; every episode before "
+                "is kept. Make room or repair the folder, then run the same command again to continue"
+            ) from error
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"{run.folder}: stopped; the same command continues it") from None
+        finally:
+            session.close()
+        if not finished:
+            console.print(f"{run.folder}: stopped; the same command continues it", highlight=False)
+            return None
+        return conclude(experiment, settings, run, robot, console, session.journal.entries)
+
+
+def experiment_of(source: str | Path, balls: str | None = None) -> Experiment:
+    """The experiment that trained a policy, with other balls if given. Raises RunError where it is not recorded."""
+    trained = load_policy.load(source)
+    if trained.config is None:
+        raise RunError(f"{source}: does not say how it was trained; fine-tune the run that it came from")
+    changed = {"initial_policy": None} | ({"balls": balls} if balls else {})
+    return build.experiment(trained.config.model_copy(update=changed), str(source))
+
+
+def lock_step_robot(experiment: Experiment, params: RigParams = RigParams(), seed: int = 0) -> LockStepRobot:
+    """The emulated robot with balls of the experiment's distribution; ``seed`` draws them."""
+    pool = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), LOCK_STEP_BALLS)
+    return LockStepRobot(thrown(pool.state), params)
+
+
+def reward_terms(summary: EpisodeSummary) -> dict[str, float]:
+    """The terms of an episode on a robot, unweighted, by the formulas of the simulation; others are not measured."""
+    hit, returned = summary.outcome in (HIT, RETURNED), summary.outcome == RETURNED
+    landing = np.array(summary.landing, np.float32)
+    closest = np.float32(summary.closest)
+    nearing = rewards.state_transition(closest, hit, summary.crossed, returned, landing)
+    return {
+        "state_transition": float(nearing),
+        "net_clearance": float(rewards.net_clearance(np.bool_(hit), np.bool_(summary.crossed), summary.net_height)),
+        "hit_and_land": float(returned),
+        "fault": FAULT if summary.fault else 0.0,
+    }
+
+
+class Session:
+    """A fine-tuning between two starts of the program.
+
+    journal  every episode so far
+    state    after ``update`` updates
+    """
+
+    def __init__(
+        self, settings: FineTuning, run: Run, robot: Robot, operator: Operator, console: Console, first: TrainState
+    ) -> None:
+        self._settings, self._run, self._robot, self._operator = settings, run, robot, operator
+        self._bgs = build.bgs_config(settings.optimiser(), settings.updates)
+        self._weights = dict(zip(rewards.TERMS, build.reward_weights(settings.rewards)))
+        found = checkpoint.load_latest(run.checkpoints, first)
+        self.state, notes = found or (first, {"update": 0, "seconds": 0.0})
+        self.update, self._seconds = notes["update"], notes["seconds"]
+        # Frozen: as float32 numbers they are those of the exported policy.
+        self._normaliser = tuple(np.asarray(a) for a in normalizer.normaliser(first.statistics))
+        self.journal = Journal(run.folder / JOURNAL)
+        self._played = {entry.place: entry for entry in self.journal.entries if not entry.discarded}
+        if self.update > settings.updates:
+            raise RunError(f"{run.folder}: has {self.update} updates already, updates = {settings.updates} does not fit")
+        self._log = MetricsLog(run.metrics, run.tensorboard, self.update)
+        planned = 2 * settings.evaluation_balls + settings.updates * settings.episodes_per_update
+        self._progress = FineTuningProgress(console, str(run.folder), planned, settings)
+        self._moment = time.monotonic()
+
+    def close(self) -> None:
+        self.journal.close()
+        self._log.close()
+
+    def run(self) -> bool:
+        """Plays what is still to be played; False when the operator stopped it."""
+        with self._progress as progress:
+            progress.resumed(len(self._played), len(self.journal.entries))
+            if self._evaluate(BEFORE) is None:
+                return False
+            while self.update < self._settings.updates:
+                if not self._advance():
+                    return False
+            return self._evaluate(AFTER) is not None
+
+    def _evaluate(self, phase: str) -> list[Entry] | None:
+        """Episodes of the unperturbed policy."""
+        theta, update = np.asarray(self.state.bgs.average), 0 if phase == BEFORE else self.update
+        if phase == BEFORE and self.update:
+            theta = None  # played before the first update: only read
+        entries = []
+        for ball in range(self._settings.evaluation_balls):
+            entry = self._episode((phase, update, 0, ball), theta)
+            if entry is None:
+                return None
+            entries.append(entry)
+        self._progress.note(f"{phase} fine-tuning: {report.sentence(report.evaluated(entries))}")
+        return entries
+
+    def _advance(self) -> bool:
+        """One update; False when the operator stopped it."""
+        settings, number = self._settings, self.update + 1
+        directions = strategy.ask(jax.random.fold_in(self.state.key, self.update), self.state.bgs, self._bgs)
+        members = np.asarray(strategy.population(self.state.bgs, directions, self._bgs))
+        entries = []
+        # The members take turns, so that a person who tires or warms up is the same to both of a pair.
+        for repeat in range(settings.repeats):
+            for member in _order(settings.pairs):
+                entry = self._episode((TRAINING, number, member, repeat), members[:, member])
+                if entry is None:
+                    return False
+                entries.append(entry)
+        returns = np.zeros(2 * settings.pairs)
+        for entry in entries:
+            returns[entry.member] += entry.returns / settings.repeats
+        plus, minus = np.split(returns.astype(np.float32), 2)
+        bgs, info = strategy.tell(self.state.bgs, directions, plus, minus, self._bgs)
+        self.state, self.update = TrainState(bgs, self.state.statistics, self.state.key), number
+        now = time.monotonic()
+        self._seconds, self._moment = self._seconds + now - self._moment, now
+        row = {"update": number, "seconds": round(self._seconds, 3)} | report.update_row(entries)
+        row |= {name: float(getattr(info, name)) for name in ("gradient_norm", "update_norm", "elite_std")}
+        self._log.write([row])
+        self._log.sync()
+        checkpoint.save(self._run.checkpoints, number, self.state, {"seconds": self._seconds})
+        self._progress.updated(number, row)
+        return True
+
+    def _episode(self, place: tuple[str, int, int, int], theta: np.ndarray | None) -> Entry | None:
+        """The episode of that place: from the journal or played now; None when the operator stopped before it."""
+        while place not in self._played:
+            while self._operator.paused() and not self._operator.stopped():
+                self._progress.paused()
+                time.sleep(PAUSE_POLL)
+            if self._operator.stopped():
+                return None
+            if theta is None:
+                raise RunError(
+                    f"{self.journal.path}: an episode of the evaluation before fine-tuning is missing, though updates "
+                    "are done; restore the file or start a new run"
+                )
+            number = self._next_number(*place[:2])
+            played = self._robot.play(np.ascontiguousarray(theta), *self._normaliser, number)
+            entry = self._entry(place, number, played)
+            self.journal.append(entry)
+            if not entry.discarded:
+                self._played[place] = entry
+            self._progress.played(entry)
+        return self._played[place]
+
+    def _next_number(self, phase: str, update: int) -> int:
+        """A ball that is played again is another one: every attempt counts."""
+        if phase == TRAINING:
+            return sum(entry.phase == TRAINING for entry in self.journal.entries)
+        attempts = sum(entry.phase == phase and entry.update == update for entry in self.journal.entries)
+        return EVALUATION_EPISODES + attempts  # the same balls before and after, where the robot can
+
+    def _entry(self, place: tuple[str, int, int, int], number: int, played: PlayedBall) -> Entry:
+        summary = played.summary
+        terms = reward_terms(summary)
+        returns = sum(self._weights[name] * value for name, value in terms.items())
+        # Asked whatever the bridge says, since the question is about this ball only.
+        discarded = self._operator.discarded() or summary.discarded or summary.fault == STOPPED
+        return Entry(*place, number, summary, terms, returns, discarded, played.trajectory)
+
+
+def conclude(
+    experiment: Experiment, settings: FineTuning, run: Run, robot: Robot, console: Console, entries: list[Entry]
+) -> dict[str, Any]:
+    """Evaluation, picture, the human's balls and the artefact of a fine-tuning that is over; returns the report."""
+    result = report.compare(entries, robot.repeatable)
+    result |= {"settings": settings.model_dump(mode="json"), "robot": robot.describe()}
+    kept = [entry for entry in entries if not entry.discarded]
+    picture = report.draw(run.plots / CURVE, kept, result, f"{run.folder.name}: fine-tuning on a robot")
+    # Balls that a repeatable robot meets before and after are the same.
+    human = [entry for entry in kept if entry.phase != AFTER or not robot.repeatable]
+    balls = report.write_human_balls(run.folder / HUMAN_BALLS, run.folder.name, human)
+    exported = finalize.export_policy(run.artefact, load_policy.load(run.folder), experiment, result, console)
+    run_dir.write_json(run.evaluation, result)
+    report.print_result(console, result, str(run.folder))
+    lines = {
+        "evaluation": run.evaluation,
+        "curve": picture,
+        "balls": f"{run.folder / HUMAN_BALLS} ({balls:,}; mjx-tt fit-human makes a distribution of them)",
+        "artefact": run.artefact if exported else "",
+    }
+    for name, value in lines.items():
+        if value:
+            console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
+    return result
+
+
+def _order(pairs: int) -> list[int]:
+    """Members in the order of play: both of a pair, one after the other."""
+    return [member for pair in range(pairs) for member in (pair, pairs + pair)]
+
+
+def _open(
+    run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, first: TrainState, source: str
+) -> None:
+    """Records what the run is, or checks that it is the one that is asked for. Raises RunError naming differences.
+
+    Before the first ball there is nothing to protect: a start that failed must not stand in the way of the corrected one.
+    """
+    path, journal = run.folder / SETTINGS, run.folder / JOURNAL
+    wanted = {
+        "source": source,
+        "policy": _digest(first),
+        "robot": robot.describe(),
+        "settings": settings.model_dump(mode="json"),
+    }
+    if path.exists() and journal.exists() and journal.stat().st_size > 0:
+        _check(run.folder, read_yaml(path.read_text(encoding="utf-8"), str(path)), wanted, settings)
+    elif not path.exists() and (run.folder / CONFIG).exists():
+        raise RunError(f"{run.folder}: is a run of another kind; choose another --out")
+    config = experiment.config.model_copy(
+        update={"name": run.folder.name, "initial_policy": str(Path(source).resolve())}
+    )
+    for target, data in ((path, wanted), (run.folder / CONFIG, config.to_dict())):
+        with replacing(target) as temporary, open(temporary, "w", encoding="utf-8") as file:
+            yaml.safe_dump(data, file, sort_keys=False)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _check(folder: Path, found: dict[str, Any], wanted: dict[str, Any], settings: FineTuning) -> None:
+    changeable = {"source"}  # the policy itself is compared
+    if settings.step.schedule.kind == "constant":
+        changeable.add("settings.updates")
+    changed = run_dir.differences(found, wanted, changeable.__contains__)
+    if changed:
+        raise RunError(f"{folder}: is another fine-tuning:\n{changed}\nRestore these values or choose another --out")
+
+
+def _digest(state: TrainState) -> str:
+    """SHA-256 of parameters and normaliser."""
+    arrays = (state.bgs.theta, *normalizer.normaliser(state.statistics))
+    return hashlib.sha256(b"".join(np.asarray(a, np.float32).tobytes() for a in arrays)).hexdigest()

@@ -1,0 +1,233 @@
+"""What fine-tuning measures: rows of metrics, the evaluation before and after, the curve, the human's balls."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+from scipy import stats
+
+from ballmodel.io.atomic_files import replacing
+from ballmodel.io.csv import COLUMNS
+from experiments.evaluation.evaluate import wilson
+from experiments.evaluation.figures import HIT_COLOUR, INK, MISSED_COLOUR, RETURNED_COLOUR, STYLE
+from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry
+from robot_io.control.episode import HIT, RETURNED
+
+CURVE_COLOUR = "#4575b4"
+SMOOTHING = 7  # updates
+SHORTEST = 2  # samples of a ball that is worth keeping
+
+
+def t_interval(values, confidence: float = 0.95) -> tuple[float, float, float]:
+    """Mean and Student's t interval of the mean of independent values (at least two)."""
+    values = np.asarray(values, float)
+    mean = float(values.mean())
+    half = float(stats.t.ppf(0.5 + confidence / 2, values.size - 1) * values.std(ddof=1) / math.sqrt(values.size))
+    return mean, mean - half, mean + half
+
+
+def welch_interval(a, b, confidence: float = 0.95) -> tuple[float, float, float]:
+    """Mean of b minus mean of a with Welch's interval (Welch 1947), for independent samples of different spread."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    parts = np.array([a.var(ddof=1) / a.size, b.var(ddof=1) / b.size])
+    difference = float(b.mean() - a.mean())
+    if not parts.sum():
+        return difference, difference, difference
+    freedom = parts.sum() ** 2 / (parts**2 / np.array([a.size - 1, b.size - 1])).sum()
+    half = float(stats.t.ppf(0.5 + confidence / 2, freedom) * math.sqrt(parts.sum()))
+    return difference, difference - half, difference + half
+
+
+def update_row(entries: list[Entry]) -> dict[str, float]:
+    """One update's measurements of its perturbed policies; low, high: 95 % interval of the mean return."""
+    row = _rates(entries)
+    mean, low, high = t_interval([entry.returns for entry in entries])
+    terms = {f"reward/{name}": float(np.mean([e.terms[name] for e in entries])) for name in entries[0].terms}
+    return {"mean_return": mean, "low": low, "high": high} | row | terms
+
+
+def evaluated(entries: list[Entry]) -> dict[str, Any]:
+    """One evaluation: the mean return with its 95 % interval, the rates, the terms."""
+    mean, low, high = t_interval([entry.returns for entry in entries])
+    rates = _rates(entries)
+    returned = wilson(round(rates["return_rate"] * len(entries)), len(entries))
+    return {
+        "balls": len(entries),
+        "mean_return": mean,
+        "low": low,
+        "high": high,
+        **rates,
+        "return_rate_low": returned[0],
+        "return_rate_high": returned[1],
+        "terms": {name: float(np.mean([e.terms[name] for e in entries])) for name in entries[0].terms},
+        "faults": _counts(entry.summary.fault for entry in entries if entry.summary.fault),
+    }
+
+
+def compare(entries: list[Entry], repeatable: bool) -> dict[str, Any]:
+    """What evaluation.json holds. Where both evaluations met the same balls, the difference is taken ball by ball."""
+    kept = [entry for entry in entries if not entry.discarded]
+    updates = max(e.update for e in kept if e.phase == AFTER)  # a run that was continued has several evaluations
+    before = [e for e in kept if e.phase == BEFORE]
+    after = [e for e in kept if e.phase == AFTER and e.update == updates]
+    a, b = {e.episode: e.returns for e in before}, {e.episode: e.returns for e in after}
+    paired = repeatable and set(a) == set(b)
+    if paired:
+        difference, low, high = t_interval([b[episode] - a[episode] for episode in a])
+    else:
+        difference, low, high = welch_interval(list(a.values()), list(b.values()))
+    training = [e for e in entries if e.phase == TRAINING]
+    return {
+        "before": evaluated(before),
+        "after": evaluated(after),
+        "difference": {
+            "mean_return": difference, "low": low, "high": high, "paired": paired,
+            "significant": low > 0.0 or high < 0.0,
+        },
+        "updates": updates,
+        "episodes": sum(not e.discarded for e in training),
+        "discarded": sum(e.discarded for e in entries),
+    }  # fmt: skip
+
+
+def sentence(evaluation: dict[str, Any]) -> str:
+    """One evaluation in words."""
+    e = evaluation
+    faults = ", ".join(f"{count} {cause}" for cause, count in e["faults"].items())
+    return (
+        f"mean return {e['mean_return']:.2f} (95 % interval {e['low']:.2f} to {e['high']:.2f}), "
+        f"{e['return_rate']:.0%} of {e['balls']} balls returned" + (f"; faults: {faults}" if faults else "")
+    )
+
+
+def print_result(console: Console, result: dict[str, Any], title: str) -> None:
+    """The comparison as a table."""
+    table = Table("", "before", "after", title=f"{title}: {result['updates']} updates on the robot", title_justify="left")
+    both = [result["before"], result["after"]]
+    table.add_row("mean return", *(f"{e['mean_return']:.2f}  ({e['low']:.2f} to {e['high']:.2f})" for e in both), style="bold")
+    table.add_row(
+        "return rate",
+        *(f"{e['return_rate']:.0%}  ({e['return_rate_low']:.0%} to {e['return_rate_high']:.0%})" for e in both),
+    )
+    table.add_row("hit rate", *(f"{e['hit_rate']:.0%}" for e in both))
+    table.add_row("faults", *(f"{e['fault_rate']:.0%}" for e in both))
+    for name in both[0]["terms"]:
+        table.add_row(f"  {name}", *(f"{e['terms'][name]:.3f}" for e in both))
+    console.print(table)
+    d = result["difference"]
+    how = "ball by ball" if d["paired"] else "different balls"
+    verdict = "" if d["significant"] else "; no significant change"
+    console.print(
+        f"mean return {d['mean_return']:+.2f} (95 % interval {d['low']:+.2f} to {d['high']:+.2f}, {how}){verdict}",
+        highlight=False, soft_wrap=True,
+    )  # fmt: skip
+
+
+def write_human_balls(path: Path, session: str, entries: list[Entry]) -> int:
+    """Writes the measured balls as ``session,trajectory,t,x,y,z`` (docs/data.md); returns their number."""
+    count = 0
+    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for entry in entries:
+            if len(entry.trajectory) < SHORTEST:
+                continue
+            count += 1
+            name = f"{entry.phase}{entry.episode}"
+            writer.writerows((session, name, *map(repr, sample)) for sample in entry.trajectory.tolist())
+    return count
+
+
+def draw(path: Path, entries: list[Entry], result: dict[str, Any], title: str) -> Path:
+    """Writes the curve of the mean return per update with the evaluations at its ends, as PNG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with plt.rc_context(STYLE), replacing(path) as temporary:
+        figure = _figure(entries, result, title)
+        figure.savefig(temporary, format="png")
+        plt.close(figure)
+    return path
+
+
+def _figure(entries: list[Entry], result: dict[str, Any], title: str) -> Figure:
+    by_update: dict[int, list[Entry]] = {}
+    for entry in entries:
+        if entry.phase == TRAINING:
+            by_update.setdefault(entry.update, []).append(entry)
+    updates = np.array(sorted(by_update))
+    rows = [update_row(by_update[u]) for u in updates]
+    figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.2, 5.8), sharex=True, height_ratios=(2, 1))
+    column = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+    if rows:
+        count = len(by_update[updates[0]])
+        upper.fill_between(updates, column["low"], column["high"], color=CURVE_COLOUR, alpha=0.18, linewidth=0)
+        upper.plot(
+            updates, column["mean_return"], "o", color=CURVE_COLOUR, markersize=3, alpha=0.7,
+            label=f"perturbed policies, {count} balls an update, 95 %",
+        )  # fmt: skip
+        upper.plot(updates, smooth(column["mean_return"]), color=CURVE_COLOUR, linewidth=1.8, label=f"mean over {SMOOTHING} updates")
+        for name, colour, label in (
+            ("hit_rate", HIT_COLOUR, "touched"), ("return_rate", RETURNED_COLOUR, "returned"),
+            ("fault_rate", MISSED_COLOUR, "faults"),
+        ):  # fmt: skip
+            lower.plot(updates, smooth(column[name]), color=colour, label=label, linewidth=1.5)
+    ends = (0, result["updates"] + 1)
+    for at, name in zip(ends, (BEFORE, AFTER)):
+        e = result[name]
+        bars = [[e["mean_return"] - e["low"]], [e["high"] - e["mean_return"]]]
+        label = f"evaluated policy, {e['balls']} balls, 95 %" if name == BEFORE else None
+        upper.errorbar(at, e["mean_return"], bars, fmt="D", color=INK, markersize=5, capsize=3, label=label, zorder=4)
+    upper.axhline(result["before"]["mean_return"], color=INK, linewidth=0.8, linestyle=":", zorder=1)
+    upper.set_ylabel("mean return")
+    upper.set_title(f"{title}\n{_headline(result)}")
+    upper.legend(loc="lower right", fontsize=9)
+    lower.set_ylim(-0.02, 1.02)
+    lower.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
+    lower.set_ylabel(f"balls, mean of {SMOOTHING}")
+    lower.set_xlabel("update")
+    if rows:
+        lower.legend(loc="center right", fontsize=9)
+    for axes in (upper, lower):
+        axes.grid(axis="y", alpha=0.25)
+    return figure
+
+
+def smooth(values: np.ndarray) -> np.ndarray:
+    """Mean over the SMOOTHING updates around each; fewer at the ends."""
+    half = SMOOTHING // 2
+    return np.array([values[max(0, i - half) : i + half + 1].mean() for i in range(len(values))])
+
+
+def _headline(result: dict[str, Any]) -> str:
+    before, after, d = (result[name] for name in ("before", "after", "difference"))
+    return (
+        f"mean return {before['mean_return']:.2f} to {after['mean_return']:.2f}: "
+        f"{d['mean_return']:+.2f} ({d['low']:+.2f} to {d['high']:+.2f})"
+    )
+
+
+def _rates(entries: list[Entry]) -> dict[str, float]:
+    outcomes = [entry.summary.outcome for entry in entries]
+    return {
+        "return_rate": outcomes.count(RETURNED) / len(outcomes),
+        "hit_rate": (outcomes.count(RETURNED) + outcomes.count(HIT)) / len(outcomes),
+        "fault_rate": sum(entry.summary.fault is not None for entry in entries) / len(entries),
+    }
+
+
+def _counts(values) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for value in values:
+        counts[value] = counts.get(value, 0) + 1
+    return counts

@@ -1,0 +1,136 @@
+"""What fine-tuning asks of a robot and of its operator, and the emulated robot in lock-step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+import mjx_tt
+from experiments.errors import RunError
+from robot_io import contract
+from robot_io.control.episode import EpisodeSummary
+from robot_io.emulator.ball_launcher import Throws
+from robot_io.emulator.config import RigParams
+from robot_io.emulator.lockstep import LockStep
+from robot_io.emulator.world import World
+from robot_io.log.messages import Ball
+from robot_io.log.recorder import NullRecorder
+from robot_io.policy.numpy_policy import StreamingPolicy
+
+SCENE = Path(mjx_tt.__file__).parent / "assets" / "scene.xml"
+REPORTING = 1.0  # [s] within which the outcome of an episode that a fault ended is known
+
+
+@dataclass(frozen=True)
+class PlayedBall:
+    """One episode: its summary, and the ball as it was measured, (n, 4): t [s], x, y, z [m], in the order of time."""
+
+    summary: EpisodeSummary
+    trajectory: np.ndarray
+
+
+class Robot(Protocol):
+    """Plays one ball at a time.
+
+    repeatable  an episode's number decides its ball and all else that is random: evaluations before and after can be
+                compared ball by ball
+    """
+
+    repeatable: bool
+
+    def play(
+        self, theta: np.ndarray, mean: np.ndarray, inverse_scale: np.ndarray, episode_number: int
+    ) -> PlayedBall:
+        """Plays the next ball with parameters (976,) and normaliser (11,), (11,), all float32.
+
+        A fault that ends the episode is in its summary, and the robot stands ready again when this returns. Raises
+        RunError, RefusedError or DeviceError when no episode can be played; the fine-tuning can then be continued.
+        """
+
+    def describe(self) -> dict[str, Any]:
+        """What it is, as plain JSON data; a run is continued on a robot that says the same."""
+
+
+class Operator(Protocol):
+    """The person at the robot, asked between episodes."""
+
+    def discarded(self) -> bool:
+        """Whether the ball just played is to be played again; asked once after every ball."""
+
+    def paused(self) -> bool:
+        """Whether to wait; asked again and again while it is so."""
+
+    def stopped(self) -> bool:
+        """Whether to stop here; the same command continues later."""
+
+
+class NoOperator:
+    """Lets everything run."""
+
+    def discarded(self) -> bool:
+        return False
+
+    def paused(self) -> bool:
+        return False
+
+    def stopped(self) -> bool:
+        return False
+
+
+class LockStepRobot:
+    """The emulated robot in this process. Every episode begins with power-on, so that it depends on its number only.
+
+    throws  the balls; episode n meets ball n, and ball n - size after the last
+    """
+
+    repeatable = True
+
+    def __init__(self, throws: Throws, params: RigParams = RigParams(), scene: str | Path = SCENE) -> None:
+        self._throws, self._params, self._scene = throws, params, scene
+        self._world = World(scene, params.world)
+
+    def play(
+        self, theta: np.ndarray, mean: np.ndarray, inverse_scale: np.ndarray, episode_number: int
+    ) -> PlayedBall:
+        policy = StreamingPolicy(contract.unflatten(theta), mean, inverse_scale)
+        balls = BallRecorder()
+        rig = LockStep(
+            self._scene, self._throws, policy, self._params, recorder=balls, first=episode_number, world=self._world
+        )
+        rig.start()
+        found = rig.play(1)
+        if not found and rig.run(REPORTING, lambda: bool(rig.summaries)):  # a fault: the outcome comes a tick later
+            found = [rig.summaries.popleft()]
+        if not found:
+            state = f"{rig.bridge.state.value}, faults: {[str(f) for f in rig.bridge.gate.faults]}"
+            raise RunError(f"episode {episode_number}: the emulated robot saw no ball ({state})")
+        return PlayedBall(found[0], balls.trajectory(found[0].ball))
+
+    def describe(self) -> dict[str, Any]:
+        return {"robot": "lock-step", "params": repr(self._params), "balls": int(self._throws.position.shape[1])}
+
+
+class BallRecorder(NullRecorder):
+    """Keeps the accepted samples of the ball and nothing else."""
+
+    def __init__(self) -> None:
+        self._samples: dict[int, list[tuple[float, ...]]] = {}
+
+    def put(self, *records) -> None:
+        for record in records:
+            if isinstance(record, Ball):
+                sample = (record.capture_time, *map(float, record.position))
+                self._samples.setdefault(record.id, []).append(sample)
+
+    def trajectory(self, ball: int) -> np.ndarray:
+        """Samples (n, 4) of the tracker's ball of that number: t [s], x, y, z [m], in the order of capture."""
+        samples = sorted({sample[0]: sample for sample in self._samples.get(ball, [])}.values())
+        return np.array(samples, float).reshape(-1, 4)
+
+
+def thrown(state) -> Throws:
+    """Balls of a pool, ``BallState`` of arrays (3, n), for the rig's thrower."""
+    return Throws(*(np.asarray(part, float) for part in (state.position, state.velocity, state.spin)))

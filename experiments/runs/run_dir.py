@@ -1,0 +1,227 @@
+"""A run's folder: what lies where, what made it, and whether it may be continued."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import platform
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ballmodel.io.atomic_files import replacing
+from experiments.config.experiment import Config, parse, read_yaml
+from experiments.errors import RunError
+
+CONFIG, SESSIONS, LOCK = "config.yaml", "run.json", ".lock"
+# What may change between the sessions of a run: none of it touches what an update computes.
+CHANGEABLE = (
+    "training.max_minutes",
+    "training.stop_at_return_rate",
+    "training.checkpoint_seconds",
+    "training.evaluate_every",
+    "training.evaluate_episodes",
+    "training.devices",
+    "evaluation",
+)
+_PACKAGES = ("mjx-tt", "jax", "jaxlib", "mujoco", "mujoco-mjx", "optax", "numpy")
+
+
+class Run:
+    """Paths of one run.
+
+    folder           holds config.yaml, run.json, metrics.jsonl, evaluation.json, episode.*
+    checkpoints      states to continue from
+    artefact         the exported policy
+    plots            pictures of the evaluation
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self.checkpoints = self.folder / "checkpoints"
+        self.artefact = self.folder / "artefact"
+        self.plots = self.folder / "plots"
+        self.tensorboard = self.folder / "tensorboard"
+        self.metrics = self.folder / "metrics.jsonl"
+        self.evaluation = self.folder / "evaluation.json"
+        self.status = self.folder / "status.json"
+
+    def config(self) -> Config:
+        """The configuration that the run was started with. Raises RunError when the folder is no run."""
+        path = self.folder / CONFIG
+        if not path.is_file():
+            raise RunError(f"{self.folder}: no run, {CONFIG} is missing")
+        return parse(read_yaml(path.read_text(encoding="utf-8"), str(path)), str(path))
+
+    def open(self, config: Config) -> None:
+        """Makes the folder, or checks that it belongs to the same experiment, and records this session of training.
+
+        Raises RunError naming every differing key, or saying that another process trains here or why the folder cannot
+        be written.
+        """
+        path = self.folder / CONFIG
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with self.locked():  # a run that another process has just begun keeps its records
+                self.check(config)
+                write_yaml(path, config.to_dict())
+                sessions = self.folder / SESSIONS
+                before = json.loads(sessions.read_text()) if sessions.exists() else []
+                write_json(sessions, [*before, provenance()])
+                for mark in (self.status, self.evaluation):  # of an earlier end, which this session moves
+                    mark.unlink(missing_ok=True)
+        except OSError as error:
+            raise RunError(
+                f"{self.folder}: cannot be written: {error.strerror or error}; choose another --out"
+            ) from error
+
+    def check(self, config: Config) -> None:
+        """Raises RunError naming every key in which a run that is already here differs.
+
+        Nothing for a new folder, and for one in which nothing was trained yet: a start that failed must not stand in
+        the way of the corrected one.
+        """
+        if not (self.folder / CONFIG).exists() or self._untouched():
+            return
+        changed = differences(self.config().to_dict(), config.to_dict(), _changeable)
+        if changed:
+            raise RunError(
+                f"{self.folder}: belongs to another configuration:\n{changed}\n"
+                "Restore these values, change the name or --out, or remove the folder"
+            )
+
+    def _untouched(self) -> bool:
+        """Whether the folder holds no more than the records of a start: no checkpoint, no measurement, nothing else."""
+        kept = {CONFIG, SESSIONS, LOCK, self.checkpoints.name, self.metrics.name, self.tensorboard.name}
+        if any(path.name not in kept for path in self.folder.iterdir()):
+            return False
+        measured = self.metrics.exists() and self.metrics.stat().st_size > 0
+        return not measured and not (self.checkpoints.exists() and any(self.checkpoints.iterdir()))
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keeps a second process out of the folder; the system frees the lock however this one ends.
+
+        Raises RunError when another process holds it.
+        """
+        with open(self.folder / LOCK, "w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise RunError(
+                    f"{self.folder}: another process is training here; wait for it or choose another --out"
+                ) from None
+            yield
+
+    def trained(self, config: Config) -> bool:
+        """Whether training has reached its end under this configuration."""
+        if not self.status.exists():
+            return False
+        status = json.loads(self.status.read_text())
+        return training_ended(config, status["update"], status["seconds"], status["return_rate"]) is not None
+
+    def done(self, config: Config) -> bool:
+        """Whether nothing is left to do under this configuration: trained, exported and evaluated."""
+        return self.trained(config) and self.evaluation.exists()
+
+    def read_evaluation(self) -> dict[str, Any]:
+        """What evaluation.json holds."""
+        return json.loads(self.evaluation.read_text())
+
+
+def training_ended(config: Config, update: int, seconds: float, return_rate: float | None) -> str | None:
+    """The setting that ends training at this point, or None.
+
+    seconds: training time so far; return_rate: of the last evaluation during training, None without one.
+    """
+    training = config.training
+    if update >= training.updates:
+        return "updates"
+    if training.max_minutes is not None and seconds >= 60 * training.max_minutes:
+        return "max_minutes"
+    target = training.stop_at_return_rate
+    if target is not None and return_rate is not None and return_rate >= target:
+        return "stop_at_return_rate"
+    return None
+
+
+def digest(config: Config) -> str:
+    """SHA-256 of everything that decides what the updates compute."""
+    kept = {key: value for key, value in _flat(config.to_dict()).items() if not _changeable(key)}
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def provenance() -> dict[str, Any]:
+    """When, with which versions and from which commit: plain data."""
+    return {
+        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "python": platform.python_version(),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "versions": {name: _version(name) for name in _PACKAGES},
+        "git": git_state(),
+    }
+
+
+def git_state() -> dict[str, Any] | None:
+    """Commit of the program's source and whether files differ from it; None outside a repository."""
+    root = Path(__file__).parents[2]
+    commit, changes = _git(root, "rev-parse", "HEAD"), _git(root, "status", "--porcelain", "--untracked-files=no")
+    return None if commit is None else {"commit": commit, "modified": bool(changes)}
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Replaces the file by indented JSON, whole or not at all. Raises OSError."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_yaml(path: Path, data: dict[str, Any]) -> None:
+    """Replaces the file by YAML in the order given, whole or not at all. Raises OSError."""
+    with replacing(path) as temporary:
+        temporary.write_text(yaml.safe_dump(data, sort_keys=False), encoding="utf-8")
+
+
+def _git(root: Path, *arguments: str) -> str | None:
+    try:
+        result = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return result.stdout.strip() if result.returncode == 0 else None
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _changeable(key: str) -> bool:
+    return any(key == allowed or key.startswith(f"{allowed}.") for allowed in CHANGEABLE)
+
+
+def differences(
+    found: dict[str, Any], wanted: dict[str, Any], changeable: Callable[[str], bool], owner: str = "run"
+) -> str:
+    """A line for every key, by dotted path, that may not change and did: what the ``owner`` has and what is wanted now."""
+    theirs, ours = _flat(found), _flat(wanted)
+    return "\n".join(
+        f"  {key}: the {owner} has {theirs.get(key)!r}, now {ours.get(key)!r}"
+        for key in sorted(set(ours) | set(theirs))
+        if ours.get(key) != theirs.get(key) and not changeable(key)
+    )
+
+
+def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Leaves by dotted path."""
+    flat = {}
+    for key, value in data.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) and value else {f"{prefix}{key}": value}
+    return flat

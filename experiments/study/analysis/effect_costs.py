@@ -1,0 +1,84 @@
+"""What each hidden effect costs: a study's policies in its reality with one effect left out at a time.
+
+Nothing is trained again: a policy from simulation meets a reality that is nearer to what it was trained in, and a
+fine-tuned one a reality that lacks something that it may have adapted to.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+
+from ballmodel.io.atomic_files import replacing
+from experiments.config.study import EFFECTS
+from experiments.errors import ConfigError
+from experiments.finetuning.report import t_interval
+from experiments.study.analysis.statistics import Interval
+
+FILE = "effects.csv"
+MODELS = ("is2r-sim1", "is2r-sim3", "oracle-sim", "is2r-ft100", "s2r-ft100", "oracle-ft")
+NOTHING, ALL = "nothing", "all"
+WORLDS = (NOTHING, *EFFECTS, ALL)
+"""What is left out."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Rallies of a policy with its own player in a reality without something, those that the table filters left out."""
+
+    seed: int
+    player: str
+    model: str
+    without: str
+    rallies: int
+    length: float
+    """Mean number of paddle touches; NaN without rallies."""
+
+
+def gain(outcomes: list[Outcome], model: str, without: str) -> Interval | None:
+    """Rally length without an effect over that with all: geometric mean over players and seeds, Student's t on its log.
+
+    None where no player and seed have both; no interval (NaN) for a single one.
+    """
+    found = {(o.seed, o.player, o.without): o.length for o in outcomes if o.model == model and o.length > 0.0}
+    logs = [
+        math.log(length / found[seed, player, NOTHING])
+        for (seed, player, world), length in found.items()
+        if world == without and (seed, player, NOTHING) in found
+    ]
+    if not logs:
+        return None
+    mean, low, high = t_interval(logs) if len(logs) > 1 else (logs[0], math.nan, math.nan)
+    return Interval(math.exp(mean), math.exp(low), math.exp(high), len(logs))
+
+
+def write(path: Path, outcomes: list[Outcome]) -> None:
+    """One line per outcome."""
+    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([f.name for f in fields(Outcome)])
+        writer.writerows(map(astuple, outcomes))
+
+
+def read(path: Path) -> list[Outcome]:
+    """What ``write`` wrote. Raises ConfigError naming file and line."""
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: not readable as CSV in UTF-8: {error}") from None
+    out = []
+    for number, row in enumerate(rows, 2):
+        try:
+            out.append(
+                Outcome(
+                    int(row["seed"]), row["player"], row["model"], row["without"], int(row["rallies"]),
+                    float(row["length"]),
+                )  # fmt: skip
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigError(f"{path}: line {number}: {row}: {error!r}; wanted are "
+                              f"{', '.join(f.name for f in fields(Outcome))}") from None  # fmt: skip
+    return out

@@ -1,0 +1,179 @@
+"""How rallies count: the end-of-rally table, "top 60, then top 50", and the file that keeps every rally.
+
+Abeyruwan et al. 2022, Details on Rally Score Evaluations: rallies whose end the table marks "Filter" are removed; of
+the others the "top 60" are taken and sorted by length, and the 50 longest of these are reported. Both numbers matter
+only if the 60 are the first in the order of play, so that is how they are read here.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from ballmodel.io.atomic_files import replacing
+from experiments.errors import ConfigError
+from mjx_tt.rally.end_reasons import ROWS, End
+
+POOL = 60
+KEEP = 50
+FILTERED = frozenset(end for end, _, _, filtered in ROWS if filtered)
+ROBOT_ENDED = {end: ended for end, _, ended, _ in ROWS}
+NUMBERS = {str(number): end for number, (end, *_) in enumerate(ROWS, 1)}
+"""What a scoring sheet says: the number of the row in the paper's table."""
+UNKNOWN = -1  # whether the robot ended the rally, where the table has no entry
+COLUMNS = (
+    "seed", "trainer", "evaluator", "model", "blind", "rally", "length", "end", "robot_ended", "filtered", "selected",
+)  # fmt: skip
+
+
+def end_of(text: str) -> End:
+    """The end by its row's number (from 1; the first 15 are the paper's) or by its name.
+
+    Raises ValueError listing what is allowed.
+    """
+    text = str(text).strip()
+    if text in NUMBERS:
+        return NUMBERS[text]
+    try:
+        return End[text.upper()]
+    except KeyError:
+        names = ", ".join(end.name.lower() for end, *_ in ROWS)
+        raise ValueError(f"{text!r} is no end of a rally; 1 to {len(ROWS)} are allowed, or {names}") from None
+
+
+def select(length, filtered, pool: int = POOL, keep: int = KEEP) -> np.ndarray:
+    """(n,) bool, the rallies that are reported, of one evaluation's in the order of play.
+
+    length: (n,) touches; filtered: (n,) bool. The first ``pool`` that are not filtered, and of these the ``keep``
+    longest; of equal lengths the earlier. With fewer, all that there are.
+    """
+    length, filtered = np.asarray(length), np.asarray(filtered, bool)
+    first = np.flatnonzero(~filtered)[:pool]
+    chosen = np.zeros(length.size, bool)
+    chosen[first[np.argsort(-length[first], kind="stable")[:keep]]] = True
+    return chosen
+
+
+@dataclass(frozen=True)
+class Rallies:
+    """Rallies of any number of evaluations, one element each, arrays of one length.
+
+    robot_ended is 1, 0 or UNKNOWN; length counts the paddle touches of human and robot.
+    """
+
+    seed: np.ndarray
+    trainer: np.ndarray
+    evaluator: np.ndarray
+    model: np.ndarray
+    blind: np.ndarray
+    rally: np.ndarray
+    length: np.ndarray
+    end: np.ndarray
+    robot_ended: np.ndarray
+    filtered: np.ndarray
+    selected: np.ndarray
+
+    def __len__(self) -> int:
+        return self.length.size
+
+    def take(self, where) -> Rallies:
+        """The rallies at a mask or at indices."""
+        return Rallies(*(getattr(self, f.name)[where] for f in fields(self)))
+
+    @property
+    def own(self) -> np.ndarray:
+        """(n,) bool: played by the policy's own trainer."""
+        return self.trainer == self.evaluator
+
+
+def scored(seed: int, trainer: str, evaluator: str, model: str, blind: str, length, end) -> Rallies:
+    """One evaluation's rallies, in the order of play. length: (n,) touches; end: (n,) End."""
+    length, end = np.asarray(length, int), np.asarray(end, int)
+    count = length.size
+    filtered = np.isin(end, [int(e) for e in FILTERED])
+    ended = [ROBOT_ENDED.get(End(e)) for e in end.tolist()]
+    return Rallies(
+        np.full(count, seed),
+        *(np.full(count, name) for name in (trainer, evaluator, model, blind)),
+        np.arange(count),
+        length,
+        end,
+        np.array([UNKNOWN if e is None else int(e) for e in ended], int),
+        filtered,
+        select(length, filtered),
+    )
+
+
+def join(parts: Iterable[Rallies]) -> Rallies:
+    """Rallies one after the other; without any, an empty one."""
+    parts = list(parts) or [scored(0, "", "", "", "", [], [])]
+    return Rallies(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Rallies)))
+
+
+def write(path: Path, rallies: Rallies) -> None:
+    """Writes evaluations.csv, one line a rally; the end by its name."""
+    names = [End(e).name.lower() for e in rallies.end.tolist()]
+    columns = [getattr(rallies, name).tolist() for name in COLUMNS]
+    columns[COLUMNS.index("end")] = names
+    for name in ("filtered", "selected"):
+        columns[COLUMNS.index(name)] = getattr(rallies, name).astype(int).tolist()
+    ended = rallies.robot_ended.tolist()
+    columns[COLUMNS.index("robot_ended")] = ["" if e == UNKNOWN else e for e in ended]
+    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows(zip(*columns))
+
+
+def read(path: Path) -> Rallies:
+    """Reads evaluations.csv. What counts follows from lengths and ends, so a sheet edited by hand is scored anew.
+
+    Raises ConfigError naming file, line and column.
+    """
+    evaluations: dict[tuple, list[tuple[int, int, End]]] = {}
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            missing = [name for name in COLUMNS[:8] if name not in (reader.fieldnames or ())]
+            if missing:
+                raise ConfigError(f"{path}: column {', '.join(missing)} is missing; wanted: {', '.join(COLUMNS)}")
+            for row in reader:
+                where = f"{path}: line {reader.line_num}"
+                group = (
+                    _whole(row, "seed", where),
+                    *(_name(row, name, where) for name in ("trainer", "evaluator", "model")),
+                    row["blind"] or "",
+                )
+                try:
+                    end = End[(row["end"] or "").strip().upper()]
+                except KeyError:
+                    names = ", ".join(e.name.lower() for e in End)
+                    raise ConfigError(f"{where}: column end: {row['end'] or ''!r} is none of {names}") from None
+                played = (_whole(row, "rally", where), _whole(row, "length", where), end)
+                evaluations.setdefault(group, []).append(played)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path}: not readable as CSV in UTF-8: {error}") from None
+    parts = []
+    for group, played in evaluations.items():
+        played.sort(key=lambda p: p[0])
+        one = scored(*group, [length for _, length, _ in played], [end for *_, end in played])
+        parts.append(replace(one, rally=np.array([rally for rally, *_ in played])))
+    return join(parts)
+
+
+def _name(row: dict, column: str, where: str) -> str:
+    if not row[column]:
+        raise ConfigError(f"{where}: column {column}: a name is wanted, got nothing")
+    return row[column]
+
+
+def _whole(row: dict, column: str, where: str) -> int:
+    text = (row[column] or "").strip()
+    if not re.fullmatch("[0-9]{1,9}", text):
+        raise ConfigError(f"{where}: column {column}: a whole number from 0 to 999999999 is wanted, got {text!r}")
+    return int(text)

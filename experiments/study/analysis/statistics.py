@@ -1,0 +1,268 @@
+"""Means, differences and ratios of rally lengths with 95 % intervals, normalised rally lengths, tests of differences.
+
+Three sources of chance are kept apart. Student's t over the pooled rallies is the paper's way. The bootstrap over
+rallies draws them anew within each policy. The bootstrap over seeds draws the study's repetitions anew as well, so that
+its interval holds for a policy that is trained again; players are always the same ones.
+"""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from experiments.finetuning.report import t_interval, welch_interval
+from experiments.study.analysis.scoring import Rallies
+
+DRAWS = 2000
+PERMUTATIONS = 4000
+EXACT = 14  # units up to which all their sign patterns are tried
+Cell = tuple[int, str, str, str]  # seed, trainer, evaluator, model
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number with its 95 % interval; ``n`` of what it is the mean of."""
+
+    value: float
+    low: float
+    high: float
+    n: int = 0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and what the bootstrap makes of it, (B,); draws of one Bootstrap belong together.
+
+    larger: of a ratio or a difference, the larger of the two numbers that were compared
+    """
+
+    value: float
+    draws: np.ndarray
+    n: int = 0
+    larger: float = np.inf
+
+    @property
+    def interval(self) -> Interval:
+        """Percentiles 2.5 and 97.5 of the draws."""
+        low, high = np.percentile(self.draws, (2.5, 97.5))
+        return Interval(self.value, float(low), float(high), self.n)
+
+    def __sub__(self, other: Estimate) -> Estimate:
+        larger = max(self.value, other.value)
+        return Estimate(self.value - other.value, self.draws - other.draws, self.n, larger)
+
+    def __truediv__(self, other: Estimate) -> Estimate:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            draws = np.nan_to_num(self.draws / other.draws, nan=np.inf)
+        return Estimate(_ratio(self.value, other.value), draws, self.n, max(self.value, other.value))
+
+
+class Bootstrap:
+    """Means over cells (one seed's policy with one evaluator) whose rallies, and the seeds, are drawn anew.
+
+    With S > 1 seeds, S - 1 of them are drawn with replacement: the spread of the draws is then an unbiased estimate of
+    the spread of a mean over S seeds (Rao and Wu 1988), which drawing S makes too small by (S - 1) / S.
+    """
+
+    def __init__(
+        self, rallies: Rallies, values=None, over_seeds: bool = True, draws: int = DRAWS, key: int = 0
+    ) -> None:
+        """values: (n,) of each rally, its length by default."""
+        values = rallies.length if values is None else values
+        rng = np.random.default_rng(key)
+        self.cells = cells(rallies, np.asarray(values, float))
+        self.seeds = tuple(sorted({cell[0] for cell in self.cells}))
+        self.point = {cell: float(v.mean()) for cell, v in self.cells.items()}
+        self._draws = {cell: v[rng.integers(0, v.size, (draws, v.size))].mean(axis=1) for cell, v in self.cells.items()}
+        # Which seeds each draw takes, by how many there are: the same for all means, so that their differences pair.
+        self._chosen = {s: rng.integers(0, s, (s - 1, draws)) for s in range(2, len(self.seeds) + 1) if over_seeds}
+
+    def mean(self, models: str | Iterable[str], trainers: Iterable[str], own: bool | None = True) -> Estimate | None:
+        """Mean over the models' cells of a trainer, then over trainers, then over seeds; None where there is no cell.
+
+        own: evaluated by the trainer (True), by others (False) or by anybody (None).
+        """
+        return self._mean(self._find(models, trainers, own))
+
+    def evaluated(self, model: str, trainer: str, evaluator: str) -> Estimate | None:
+        """Mean of one trainer's policy with one evaluator over the seeds; None where it was not evaluated."""
+        return self._mean([cell for cell in self.cells if cell[1:] == (trainer, evaluator, model)])
+
+    def pair(
+        self, a, b, trainers: Iterable[str], own: bool = True, own_b: bool | None = None
+    ) -> tuple[Estimate, Estimate] | None:
+        """The means of two (sets of) models over the trainers and seeds that have both; own_b: like own by default."""
+        found = self._find(a, trainers, own), self._find(b, trainers, own if own_b is None else own_b)
+        both = {cell[:2] for cell in found[0]} & {cell[:2] for cell in found[1]}
+        if not both:
+            return None
+        return tuple(self._mean([cell for cell in side if cell[:2] in both]) for side in found)
+
+    def _find(self, models, trainers, own: bool | None) -> list[Cell]:
+        models, trainers = (models,) if isinstance(models, str) else tuple(models), tuple(trainers)
+        return [cell for cell in self.cells if cell[3] in models and cell[1] in trainers and _is(own, cell)]
+
+    def _mean(self, found: list[Cell]) -> Estimate | None:
+        groups: dict[int, dict[str, list[Cell]]] = {}
+        for cell in found:
+            groups.setdefault(cell[0], {}).setdefault(cell[1], []).append(cell)
+        if not groups:
+            return None
+        points, draws = (
+            np.array([
+                np.mean([np.mean([table[c] for c in members], axis=0) for members in by_trainer.values()], axis=0)
+                for by_trainer in groups.values()
+            ])
+            for table in (self.point, self._draws)
+        )  # fmt: skip
+        chosen = self._chosen.get(len(groups))
+        drawn = draws.mean(axis=0) if chosen is None else np.take_along_axis(draws, chosen, axis=0).mean(axis=0)
+        return Estimate(float(points.mean()), drawn, sum(self.cells[cell].size for cell in found))
+
+
+def cells(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
+    """The values by seed, trainer, evaluator and model."""
+    groups: dict[Cell, list[int]] = {}
+    columns = (getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model"))
+    for i, cell in enumerate(zip(*columns)):
+        groups.setdefault(cell, []).append(i)
+    return {cell: values[index] for cell, index in groups.items()}
+
+
+def normalised_by_player(rallies: Rallies) -> np.ndarray:
+    """(n,) (length - mean) / std, both over the own evaluations of the trainer in that seed (Normalization,
+    Evaluations).
+
+    ``rallies``: own evaluations of the ten models. NaN where all lengths of a player are equal.
+    """
+    return _standardised(rallies, lambda cell: (cell[0], cell[1]))
+
+
+def normalised_by_model(rallies: Rallies) -> np.ndarray:
+    """(n,) (length - mean) / std, both over the trainer's own evaluation of that model (Normalization,
+    Cross-Evaluations).
+
+    ``rallies``: own and cross-evaluations; NaN where the trainer did not evaluate the model.
+    """
+    return _standardised(rallies, lambda cell: (cell[0], cell[1], cell[3]), own_only=True)
+
+
+def _standardised(rallies: Rallies, group: Callable[[Cell], tuple], own_only: bool = False) -> np.ndarray:
+    length = rallies.length.astype(float)
+    columns = zip(*(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")))
+    names = [group(cell) for cell in columns]
+    out, own = np.full(length.size, np.nan), rallies.own
+    index: dict[tuple, list[int]] = {}
+    for i, name in enumerate(names):
+        index.setdefault(name, []).append(i)
+    for members in index.values():
+        members = np.array(members)
+        base = length[members[own[members]]] if own_only else length[members]
+        if base.size > 1 and base.std(ddof=1) > 0.0:
+            out[members] = (length[members] - base.mean()) / base.std(ddof=1)
+    return out
+
+
+def t_mean(values) -> Interval:
+    """Mean with Student's t interval; without an interval where there are fewer than two values."""
+    values = np.asarray(values, float)
+    if values.size < 2:
+        return Interval(float(values.mean()) if values.size else float("nan"), -np.inf, np.inf, values.size)
+    return Interval(*t_interval(values), values.size)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean of one set of policies minus that of another, with what speaks for it.
+
+    bootstrap: over seeds and rallies; welch: t interval over the pooled rallies, the paper's way
+    p_welch, p_rallies: two-sided, a rally is the unit (Welch's t; permutation within each pair of policies)
+    p_policies: two-sided, a pair of policies (one seed, one player) is the unit; ``pairs`` of them
+    """
+
+    bootstrap: Interval
+    welch: Interval
+    p_welch: float
+    p_rallies: float
+    p_policies: float
+    pairs: int
+
+
+def difference(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bool = True) -> Difference | None:
+    """Of model ``a`` minus model ``b``, over pairs of cells that differ in the model only."""
+    trainers = tuple(trainers)
+    pairs = [
+        (boot.cells[cell], boot.cells[(*cell[:3], b)])
+        for cell in boot.cells
+        if cell[3] == a and cell[1] in trainers and _is(own, cell) and (*cell[:3], b) in boot.cells
+    ]
+    if not pairs or min(min(x.size, y.size) for x, y in pairs) < 2:
+        return None
+    both = boot.pair(a, b, trainers, own)
+    first, second = (np.concatenate(side) for side in zip(*pairs))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of samples without spread, whose p is set here
+        p_welch = stats.ttest_ind(first, second, equal_var=False).pvalue
+    if not np.isfinite(p_welch):
+        p_welch = float(first.mean() == second.mean())
+    return Difference(
+        (both[0] - both[1]).interval,
+        Interval(*welch_interval(second, first), first.size + second.size),
+        float(p_welch),
+        permutation(pairs),
+        sign_flip(np.array([x.mean() - y.mean() for x, y in pairs])),
+        len(pairs),
+    )
+
+
+def permutation(pairs: list[tuple[np.ndarray, np.ndarray]], draws: int = PERMUTATIONS, key: int = 0) -> float:
+    """Two-sided p of the mean difference over pairs of samples, whose members are exchanged within each pair.
+
+    The share of permutations at least as extreme, the observed one among them (Phipson and Smyth 2010).
+    """
+    rng = np.random.default_rng(key)
+    observed, drawn = 0.0, np.zeros(draws)
+    for x, y in pairs:
+        both = np.concatenate([x, y])
+        order = rng.permuted(np.broadcast_to(np.arange(both.size), (draws, both.size)), axis=1)
+        mixed = both[order]
+        observed += x.mean() - y.mean()
+        drawn += mixed[:, : x.size].mean(axis=1) - mixed[:, x.size :].mean(axis=1)
+    extreme = np.abs(drawn) >= abs(observed) * (1.0 - 1e-12)
+    return float((extreme.sum() + 1) / (draws + 1))
+
+
+def sign_flip(differences: np.ndarray, draws: int = PERMUTATIONS, key: int = 0) -> float:
+    """Two-sided p of a mean of zero, from the signs of the differences alone being exchangeable (Fisher's test).
+
+    Exact up to 14 differences. With n of them it cannot be smaller than 2 / 2^n.
+    """
+    d = np.asarray(differences, float)
+    if d.size <= EXACT:
+        signs = np.array(list(itertools.product((1.0, -1.0), repeat=d.size)))
+        return float(np.mean(np.abs(signs @ d) >= abs(d.sum()) * (1.0 - 1e-12)))
+    signs = np.random.default_rng(key).choice((1.0, -1.0), (draws, d.size))
+    return float((np.sum(np.abs(signs @ d) >= abs(d.sum()) * (1.0 - 1e-12)) + 1) / (draws + 1))
+
+
+def holm(p: Iterable[float]) -> list[float]:
+    """p-values adjusted for their number: one family in twenty has a false one below 0.05 (Holm 1979)."""
+    p = np.asarray(list(p), float)
+    order = np.argsort(p)
+    adjusted = np.maximum.accumulate((p.size - np.arange(p.size)) * p[order])
+    out = np.empty(p.size)
+    out[order] = np.minimum(adjusted, 1.0)
+    return out.tolist()
+
+
+def _is(own: bool | None, cell: Cell) -> bool:
+    return own is None or (cell[1] == cell[2]) == own
+
+
+def _ratio(a: float, b: float) -> float:
+    return a / b if b else float("inf")

@@ -1,0 +1,304 @@
+"""Blind evaluation: policies under code names, the key sealed until every rally is on the sheet.
+
+Abeyruwan et al. 2022, Evaluation Methodology: all policies are tested in random order under names of a bijection, which
+is revealed once all evaluations have been completed; a successful evaluation has at least 50 rallies that count.
+
+A sealed file is encoded and carries a hash of its content. It is no secret to somebody who wants to read it: it keeps
+the key from being read by chance, and from being changed after the rallies are known.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import codecs
+import csv
+import hashlib
+import itertools
+import json
+import re
+import secrets
+import shutil
+import string
+import zlib
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ballmodel.io.atomic_files import replacing
+from experiments.errors import ConfigError
+from experiments.study.analysis import scoring
+
+if TYPE_CHECKING:
+    from robot_io.policy.artefact import Artefact
+
+KEY, SHEET, POLICIES, OPENED, EVALUATIONS = "key.sealed", "sheet.csv", "policies", "key.json", "evaluations.csv"
+BEGUN = ".begun"  # while an evaluation is being made
+SHEET_COLUMNS = ("code", "rally", "length", "end")
+SEPARATORS = ",;\t"
+SPARE = 10  # lines of a sheet beyond the pool, for rallies that will be filtered
+_WHOLE = re.compile("[0-9]{1,9}")
+
+
+# The bijection and its seal
+
+
+def codes(count: int) -> tuple[str, ...]:
+    """A, B, ... Z, AA, AB, ... in the order of testing."""
+    lengths = (map("".join, itertools.product(string.ascii_uppercase, repeat=n)) for n in itertools.count(1))
+    return tuple(itertools.islice(itertools.chain.from_iterable(lengths), count))
+
+
+def draw(models, rng: np.random.Generator) -> dict[str, str]:
+    """Code name of every model, one to one, in the order in which they are to be tested.
+
+    The order is random and a code is only a place in it, so neither tells anything. Raises ValueError for a model that
+    is given twice.
+    """
+    models = list(models)
+    if len(set(models)) < len(models):
+        raise ValueError(f"each model once, got {', '.join(models)}")
+    return {models[k]: code for code, k in zip(codes(len(models)), rng.permutation(len(models)).tolist())}
+
+
+def seal(path: Path, content: Any) -> str:
+    """Writes plain JSON data so that it is not read by chance; returns the SHA-256 that commits to it."""
+    plain = json.dumps({"nonce": secrets.token_hex(16), "content": content}).encode()
+    digest = hashlib.sha256(plain).hexdigest()
+    sealed = {
+        "note": "Sealed: to be opened when all evaluations are done.",
+        "sha256": digest,
+        "sealed": base64.b64encode(zlib.compress(plain)).decode("ascii"),
+    }
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(sealed, indent=2) + "\n", encoding="utf-8")
+    return digest
+
+
+def unseal(path: Path) -> Any:
+    """What ``seal`` was given. Raises ConfigError where the content is not what its hash commits to."""
+    try:
+        sealed = json.loads(Path(path).read_text(encoding="utf-8"))
+        plain = zlib.decompress(base64.b64decode(sealed["sealed"], validate=True))
+        if hashlib.sha256(plain).hexdigest() != sealed["sha256"]:
+            raise ConfigError(f"{path}: its content is not what its hash commits to: it was changed after sealing")
+        return json.loads(plain)["content"]
+    except (ValueError, KeyError, TypeError, zlib.error, binascii.Error) as error:
+        raise ConfigError(f"{path}: no sealed file: {error}") from None
+
+
+# The protocol for people
+
+
+@dataclass(frozen=True)
+class Played:
+    """A rally on the sheet: its number there, paddle touches, and how it ended."""
+
+    rally: int
+    length: int
+    end: scoring.End
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Rallies on the sheet under one code: played, and those that count."""
+
+    code: str
+    played: int
+    counted: int
+
+    @property
+    def complete(self) -> bool:
+        return self.counted >= scoring.KEEP
+
+
+def make(
+    folder: Path, policies: dict[str, Path], trainer: str, evaluator: str, seed: int = 0, twice: bool = False
+) -> tuple[str, ...]:
+    """Copies policies to folder/policies/CODE, writes a blank sheet, seals the key; returns the codes in order of
+    testing.
+
+    policies: model key to the folder of an artefact or of a run that was exported; twice: the same policy may stand
+    under two keys. Raises ConfigError for a folder that is in use or policies that are the same, ArtefactError for one
+    that is not whole.
+    """
+    from robot_io.policy import artefact
+
+    folder = Path(folder)
+    begun = folder / BEGUN
+    if (folder / KEY).exists() or ((folder / POLICIES).exists() and not begun.exists()):
+        raise ConfigError(f"{folder}: holds a blind evaluation already; choose another folder")
+    found = {}
+    for model, path in policies.items():
+        path = Path(path)
+        found[model] = path if (path / artefact.MANIFEST).exists() else path / "artefact"
+        if not (found[model] / artefact.MANIFEST).exists():
+            raise ConfigError(
+                f"{model}: {path} is no artefact and no run with one; export it with `mjx-tt export {path}`"
+            )
+    loaded = {model: artefact.load(path) for model, path in found.items()}
+    if not twice:
+        _check_different(loaded)
+    key = draw(policies, np.random.default_rng())
+    folder.mkdir(parents=True, exist_ok=True)
+    if begun.exists():  # killed on the way: nobody has seen its codes
+        shutil.rmtree(folder / POLICIES, ignore_errors=True)
+    begun.touch()
+    digests = {model: _copy(loaded[model], folder / POLICIES / code) for model, code in key.items()}
+    content = {
+        "codes": key, "digests": digests, "originals": {model: a.digest for model, a in loaded.items()},
+        "trainer": trainer, "evaluator": evaluator, "seed": seed,
+    }  # fmt: skip
+    blank_sheet(folder / SHEET, tuple(key.values()))
+    seal(folder / KEY, content)
+    begun.unlink()
+    return tuple(key.values())
+
+
+def _check_different(loaded: dict[str, Artefact]) -> None:
+    """Raises ConfigError where two models are one policy, however often it was exported."""
+    models: dict[str, str] = {}
+    for model, policy in loaded.items():
+        numbers = (*policy.parameters.values(), policy.normaliser_mean, policy.normaliser_inverse_scale)
+        digest = hashlib.sha256(b"".join(a.tobytes() for a in numbers)).hexdigest()
+        if digest in models:
+            raise ConfigError(
+                f"{models[digest]} and {model}: are the same policy, {loaded[models[digest]].folder} and "
+                f"{policy.folder}; each policy once"
+            )
+        models[digest] = model
+
+
+def _copy(policy: Artefact, folder: Path) -> str:
+    """Copies an artefact without what its manifest tells of its origin; returns the copy's own digest.
+
+    Times of the files are those of the copy: the order in which policies were trained would tell them apart.
+    """
+    from robot_io.policy import artefact
+
+    folder.mkdir(parents=True)
+    for name in artefact.HASHED_FILES:
+        shutil.copyfile(policy.folder / name, folder / name)
+    manifest = json.dumps(policy.manifest | {"provenance": {}, "written_with": {}}, indent=2, allow_nan=False).encode()
+    (folder / artefact.MANIFEST).write_bytes(manifest)
+    (folder / artefact.MANIFEST_DIGEST).write_bytes(artefact.digest_line(manifest))
+    return artefact.load(folder).digest
+
+
+def blank_sheet(path: Path, tested: tuple[str, ...], rallies: int = scoring.POOL + SPARE) -> None:
+    """A scoring sheet: the table of ends as comments, then a line for every rally."""
+    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        for line in instructions():
+            file.write(f"# {line}\n")
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(SHEET_COLUMNS)
+        writer.writerows((code, rally, "", "") for code in tested for rally in range(1, rallies + 1))
+
+
+def instructions() -> list[str]:
+    """How to fill in a sheet, with the paper's table (Rally score evaluation and end-of-rally attribution)."""
+    lines = [
+        "One line a rally, in the order of play. length: paddle touches of human and robot together, the human's first",
+        "hit is 1; 0 only where a rally is not counted. end: number of the row that says how the rally ended.",
+        "Lines with neither length nor end are left out.",
+    ]
+    for number, (_, description, ended, filtered) in enumerate(scoring.ROWS, 1):
+        who = (
+            "not counted"
+            if filtered
+            else {True: "the robot ended it", False: "the human ended it", None: "open"}[ended]
+        )
+        lines.append(f"{number:>2}  {description} [{who}]")
+    return lines
+
+
+def read_sheet(path: Path) -> dict[str, list[Played]]:
+    """Each code's rallies in the order of their numbers. Raises ConfigError naming the line.
+
+    Cells may be separated by commas, semicolons or tabs: what a spreadsheet writes depends on its country.
+    """
+    played: dict[str, list[Played]] = {}
+    content = Path(path).read_bytes()
+    encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    try:
+        lines = content.decode(encoding).splitlines()
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not readable as UTF-8: {error}") from None
+    lines = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith(("#", '"#'))]
+    head = lines[0][1] if lines else ""
+    separator = next((s for s in SEPARATORS if tuple(_cells(head, s)[:4]) == SHEET_COLUMNS), None)
+    if separator is None:
+        raise ConfigError(f"{path}: the first line must be {','.join(SHEET_COLUMNS)}, got {head.strip()}")
+    for number, line in lines[1:]:
+        cells = _cells(line, separator)
+        code, rally, length, end = (cells + [""] * 4)[:4]
+        where = f"{path}: line {number}"
+        if not any(cells):
+            continue
+        rallies = played.setdefault(code, [])
+        if not length and not end:
+            continue
+        if not _WHOLE.fullmatch(rally) or not _WHOLE.fullmatch(length):
+            raise ConfigError(f"{where}: rally and length are whole numbers, got {rally!r} and {length!r}")
+        if any(p.rally == int(rally) for p in rallies):
+            raise ConfigError(f"{where}: rally {rally} of {code} is there twice")
+        try:
+            rallies.append(Played(int(rally), int(length), scoring.end_of(end)))
+        except ValueError as error:
+            raise ConfigError(f"{where}: end: {error}") from None
+        if not rallies[-1].length and rallies[-1].end not in scoring.FILTERED:
+            raise ConfigError(f"{where}: length 0: the human's first hit is 1, and a rally with end {end} counts")
+    return {code: sorted(rallies, key=lambda p: p.rally) for code, rallies in played.items()}
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
+
+
+def progress(folder: Path) -> list[Progress]:
+    """How far the sheet is, code by code; writes a blank one where there is none."""
+    folder = Path(folder)
+    tested = tuple(unseal(folder / KEY)["codes"].values())
+    if not (folder / SHEET).exists():
+        blank_sheet(folder / SHEET, tested)
+    sheet = read_sheet(folder / SHEET)
+    unknown = sorted(set(sheet) - set(tested))
+    if unknown:
+        raise ConfigError(f"{folder / SHEET}: code {', '.join(unknown)} is unknown; there are {', '.join(tested)}")
+    out = []
+    for code in tested:
+        played = sheet.get(code, [])
+        out.append(Progress(code, len(played), sum(p.end not in scoring.FILTERED for p in played)))
+    return out
+
+
+def open_key(folder: Path) -> scoring.Rallies:
+    """Reveals which code was which model and writes evaluations.csv and key.json.
+
+    Raises ConfigError while an evaluation lacks rallies that count, or where a policy or the key is not what was
+    sealed.
+    """
+    from robot_io.policy import artefact
+
+    folder = Path(folder)
+    key = unseal(folder / KEY)
+    open_ones = [p for p in progress(folder) if not p.complete]
+    if open_ones:
+        missing = ", ".join(f"{p.code} has {p.counted}" for p in open_ones)
+        raise ConfigError(
+            f"{folder}: the key stays sealed until each code has {scoring.KEEP} rallies that count; {missing}"
+        )
+    sheet, parts = read_sheet(folder / SHEET), []
+    for model, code in key["codes"].items():
+        if artefact.load(folder / POLICIES / code).digest != key["digests"][model]:
+            raise ConfigError(f"{folder / POLICIES / code}: is not the policy that was sealed under this code")
+        rally, length, end = (np.array(column, int) for column in zip(*map(astuple, sheet[code])))
+        one = scoring.scored(key["seed"], key["trainer"], key["evaluator"], model, code, length, end)
+        parts.append(replace(one, rally=rally))
+    rallies = scoring.join(parts)
+    scoring.write(folder / EVALUATIONS, rallies)
+    with replacing(folder / OPENED) as temporary:
+        temporary.write_text(json.dumps(key, indent=2) + "\n", encoding="utf-8")
+    return rallies

@@ -1,0 +1,169 @@
+"""A study on a robot: the loop waits for its operator, who fine-tunes with ``mjx-tt finetune`` and counts rallies blindly.
+
+A step that people do is started here with the same code as the command of its own, and goes on where it was left. What
+they have not finished ends the program with a sentence that says what to do; the same command then continues the study.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from ballmodel.io import read
+from ballmodel.trajectory import Dataset
+from experiments.commands import measurements
+from experiments.config import build
+from experiments.config import robot as robots
+from experiments.config.study import Study
+from experiments.deploy import session
+from experiments.errors import ConfigError, checked
+from experiments.finetuning import loop
+from experiments.finetuning.robot import LockStepRobot
+from experiments.runs import load_policy
+from experiments.runs.load_policy import Policy
+from experiments.runs.run_dir import Run
+from experiments.study.analysis import scoring
+from experiments.study.blind import protocol
+from experiments.study.workflow import Step, Waiting
+from experiments.training import finalize
+
+
+def look_up(study: Study) -> None:
+    """Raises ConfigError where the robot's YAML or a recording is missing or cannot be read."""
+    if study.robot not in (session.RIG, session.LOCK_STEP):
+        try:
+            robots.load_robot(study.robot)
+        except ConfigError as error:
+            raise ConfigError(f"robot: {error}") from None
+    for player in study.players:
+        recording(study, player)
+
+
+def recording(study: Study, player: str) -> Dataset:
+    """What was recorded of a player before the study. Raises ConfigError naming the key and what is wrong."""
+    where, path = f"recordings.{player}", study.recordings[player]
+    measured = checked(where, read, path)
+    if not isinstance(measured, Dataset):
+        raise ConfigError(f"{where}: {path} holds start states; measured trajectories are needed")
+    return measured
+
+
+class RobotWorld:
+    """The robot of ``study.robot`` and the people who play with it."""
+
+    def __init__(self, study: Study, console: Console) -> None:
+        self._study, self._console = study, console
+
+    def first_balls(self, player: str, name: str) -> Dataset:
+        """What was recorded of the player before the study. Raises ConfigError as ``recording`` does."""
+        measured = recording(self._study, player)
+        # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
+        label = name.rsplit("/", 1)[-1]
+        tracks = tuple(replace(t, session=label, name=str(i)) for i, t in enumerate(measured))
+        return Dataset(tracks, self._study.recordings[player])
+
+    def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
+        """``mjx-tt finetune``; raises Waiting when the operator stopped it."""
+        study = self._study
+        settings = study.fine_tuning.model_copy(update={"updates": real_updates, "seed": _seed(name)})
+        balls = settings.updates * settings.episodes_per_update
+        self._console.print(
+            f"{name}: {player} to the table, {balls:,} balls for {settings.updates} updates and twice "
+            f"{settings.evaluation_balls} to compare; the operator's keys are those of mjx-tt finetune",
+            highlight=False, soft_wrap=True,
+        )  # fmt: skip
+        found = session.finetune(
+            str(source), settings, Run(folder), study.robot, None, None, "numpy", _seed(name), self._console
+        )
+        if found is None:
+            raise Waiting(f"{name}: fine-tuning with {player} is not finished; the same command goes on with it")
+        measured = measurements.read_all([str(folder / loop.HUMAN_BALLS)], None)
+        change = found["difference"]["mean_return"]
+        return measured, f"{settings.updates} updates, {len(measured):,} balls, mean return changed by {change:+.2f}"
+
+    def score(self, player: str, name: str) -> Callable[[Policy], float] | None:
+        """Plays ``selection_episodes`` balls with each policy and counts +1 hit, +1 returned, -2 fault."""
+        if self._study.simulation.seeds == 1:
+            return None
+        return lambda trained: self._score(player, name, trained)
+
+    def _score(self, player: str, name: str, trained: Policy) -> float:
+        balls, robot = self._study.simulation.selection_episodes, self._study.robot
+        experiment = loop.experiment_of(trained.source)
+        if robot == session.LOCK_STEP:
+            emulated = loop.lock_step_robot(experiment, seed=_seed(name))
+            return float(np.mean([_lock_step(emulated, trained, n) for n in range(balls)]))
+        artefact = exported(trained, self._console)
+        logs = trained.source / "selection"
+        self._console.print(f"{name}: {player} plays {balls} balls with {trained.source.name}", highlight=False)
+        session.run(artefact, robot, balls, None, "numpy", logs, None, _seed(name), None, self._console)
+        found = json.loads(max(logs.glob("*.json")).read_text(encoding="utf-8"))
+        if found["episodes"] < balls:
+            raise Waiting(
+                f"{name}: {found['episodes']} of {balls} balls were played with {trained.source.name}; once more"
+            )
+        return (found["hit"] + found["returned"] - 2.0 * len(found["faults"])) / found["episodes"]
+
+
+def _lock_step(robot: LockStepRobot, trained: Policy, number: int) -> float:
+    parts = (np.ascontiguousarray(a, np.float32) for a in (trained.theta, trained.mean, trained.inverse_scale))
+    summary = robot.play(*parts, number).summary
+    return -2.0 if summary.fault else float(summary.outcome != "missed") + float(summary.outcome == "returned")
+
+
+def _seed(name: str) -> int:
+    return zlib.crc32(name.encode()) >> 1
+
+
+def exported(trained: Policy, console: Console) -> Path:
+    """The artefact of a run, exported if it has none. Raises ConfigError for a policy that the robot cannot run."""
+    folder = Run(trained.source).artefact
+    if not (folder / "manifest.json").exists():
+        experiment = build.experiment(trained.config.model_copy(update={"initial_policy": None}), str(trained.source))
+        if not finalize.export_policy(folder, trained, experiment, None, console):
+            raise ConfigError(f"{trained.source}: acts at another rate than the robot")
+    return folder
+
+
+def blind_steps(
+    folder: Path, seed: int, trainer: str, evaluator: str, runs_of: dict[str, Callable[[], Path]], inputs: tuple[Path, ...],
+    robot: str, console: Console,
+) -> list[Step]:  # fmt: skip
+    """Two steps: policies under code names with a scoring sheet; then, the sheet filled in, its rallies.
+
+    folder: of this evaluation; runs_of: each model's run. What is played is ``mjx-tt run FOLDER/policies/CODE``.
+    """
+    name, sheet, counted = f"seed{seed}/blind/{trainer}-{evaluator}", folder / protocol.SHEET, folder / protocol.EVALUATIONS
+
+    def make() -> str:
+        if (folder / protocol.KEY).exists() and not sheet.exists():  # killed in between
+            protocol.progress(folder)
+        elif not (folder / protocol.KEY).exists():
+            policies = {model: exported(load_policy.load(run()), console) for model, run in runs_of.items()}
+            # The ablation's oracle is a model of the loop under a second name.
+            codes = protocol.make(folder, policies, trainer, evaluator, seed, twice=True)
+            return f"{len(codes)} policies as {', '.join(codes)}"
+        return "policies under code names"
+
+    def count() -> str:
+        left = [f"{p.code} has {p.counted} of {scoring.KEEP}" for p in protocol.progress(folder) if not p.complete]
+        if left:
+            # A copy under a code name does not say on which balls it was trained, and the rig throws those.
+            thrown = f" --distribution {evaluator}/M0" if robot == session.RIG else ""
+            raise Waiting(
+                f"{name}: {evaluator} plays rallies with "
+                f"`mjx-tt run {folder / protocol.POLICIES}/CODE --robot {robot}{thrown}` and "
+                f"writes each down in {sheet}; rallies that count: {', '.join(left)}. Then the same command continues"
+            )
+        return f"{len(protocol.open_key(folder)):,} rallies"
+
+    return [
+        Step(name, "blind", 1, inputs, (folder / protocol.KEY, sheet), make),
+        Step(f"{name} counted", "blind", 1, (folder / protocol.KEY,), (counted,), count),
+    ]

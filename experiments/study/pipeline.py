@@ -1,0 +1,366 @@
+"""Simulate, play, refine: the iterative loop of the paper with its baselines, as a resumable list of steps.
+
+For every seed and player: balls without a robot, a human model, training in simulation, fine-tuning in reality while the
+player's balls are measured, the next human model, and so on; then rallies of all models, and the report. Reality is a
+virtual one (``experiments.study.finetuning``) or a robot with its operator (``experiments.study.on_robot``).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from ballmodel.distribution import BallDistribution, load_distribution, save_distribution
+from ballmodel.fit_distribution import fit_human
+from ballmodel.flight import ball_params
+from ballmodel.trajectory import Dataset
+from experiments.commands import measurements
+from experiments.config import build
+from experiments.config.experiment import read_yaml
+from experiments.config.study import Study, parse
+from experiments.errors import RunError, checked
+from experiments.runs import load_policy, run_dir
+from experiments.runs.run_dir import Run
+from experiments.study import evaluation, training
+from experiments.study import target_domain as realities
+from experiments.study.analysis import effect_costs, scoring
+from experiments.study.analysis import study_folder as study_data
+from experiments.study.blind import protocol
+from experiments.study.finetuning import VirtualReality
+from experiments.study.schedule import ORACLE, Human, Item, Real, Simulated, items, pairings, updates
+from experiments.study.training import POLICY
+from experiments.study.workers import run_side_by_side
+from experiments.study.workflow import JOURNAL, Journal, Step, Waiting, run_all
+from experiments.study.world import VirtualWorld, World
+
+SETTINGS, SESSIONS, CONVERGENCE = "study.yaml", "study.json", "convergence.json"
+REPORT = Path("report") / "index.html"
+CHANGEABLE = ("players", "seeds", "simulation.checkpoint_seconds", "simulation.devices")
+
+
+class Loop:
+    """All steps of a study in a folder."""
+
+    def __init__(self, study: Study, folder: Path, console: Console) -> None:
+        self.study, self.folder, self.console = study, folder, console
+        self._world: dict[int, World] = {}
+        if study.robot is None:
+            shared = VirtualReality(study, study.seeds[0])
+            self._world = {seed: VirtualWorld(study, seed, shared) for seed in study.seeds}
+        else:
+            from experiments.study.on_robot import RobotWorld
+
+            self._world = dict.fromkeys(study.seeds, RobotWorld(study, console))
+
+    # -- places --------------------------------------------------------------------------------------------------------
+
+    def seed_folder(self, seed: int) -> Path:
+        return self.folder / f"seed{seed}"
+
+    def model_folder(self, seed: int, player: str, model: str) -> Path:
+        return self.seed_folder(seed) / player / model
+
+    def data(self, seed: int, player: str, name: str) -> Path:
+        return self.seed_folder(seed) / player / "balls" / f"{name}.csv"
+
+    def human(self, seed: int, player: str, name: str) -> Path:
+        return self.seed_folder(seed) / player / "balls" / f"human_{name}.yaml"
+
+    def run_of(self, seed: int, player: str, model: str) -> Path:
+        """The run that holds a model's policy: of several trainings the chosen one."""
+        folder = self.model_folder(seed, player, model)
+        chosen = folder / load_policy.SELECTION
+        if not chosen.exists():
+            return folder
+        return folder / read_yaml(chosen.read_text(encoding="utf-8"), str(chosen))["best"]
+
+    # -- steps ---------------------------------------------------------------------------------------------------------
+
+    def steps(self) -> list[Step]:
+        """Everything in the order in which it is done, the report at the end."""
+        played = self.steps_of_play()
+        return [*played, self._report(played)]
+
+    def _report(self, played: list[Step]) -> Step:
+        path = self.folder / REPORT
+        inputs = tuple(p for step in played for p in step.outputs if p.suffix in (".csv", ".yaml", ".json"))
+
+        def run() -> str:
+            from experiments.study.report import page as study_report
+
+            return str(study_report.write(self.folder))
+
+        return Step("report", "report", 1, inputs, (path,), run)
+
+    def steps_of_play(self) -> list[Step]:
+        """All that makes data."""
+        found = []
+        for seed in self.study.seeds:
+            if self.study.robot is None:
+                found.append(self._seal(seed))
+            for player in self.study.players:
+                found.append(self._first_balls(seed, player))
+                for item in items(self.study, player):
+                    found.append(self._step(seed, player, item))
+                found.append(self._convergence(seed, player))
+            found += [self._evaluate(seed)] if self.study.robot is None else self._blind(seed)
+            if self.study.robot is None and self.study.evaluation.effects:
+                found.append(self._effects(seed))
+        found.append(self._collect(found))
+        if self.study.robot is None:
+            found += map(self._open, self.study.seeds)
+        return found
+
+    def _seal(self, seed: int) -> Step:
+        path = self.seed_folder(seed) / "reality.sealed"
+
+        def run() -> str:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return f"sealed with SHA-256 {protocol.seal(path, self._reality(seed))[:16]}..."
+
+        return Step(f"seed{seed}/reality", "seal", 1, (), (path,), run)
+
+    def _reality(self, seed: int) -> dict:
+        without = tuple(self.study.reality.without)
+        return realities.content(realities.draw(seed, without), seed, without)
+
+    def _open(self, seed: int) -> Step:
+        sealed, path = (self.seed_folder(seed) / f"reality.{kind}" for kind in ("sealed", "yaml"))
+
+        def run() -> str:
+            content = protocol.unseal(sealed)
+            if content != self._reality(seed):
+                raise RunError(f"{sealed}: holds another reality than the one of seed {seed} in which was played")
+            run_dir.write_yaml(path, content)
+            return "opened"
+
+        return Step(
+            f"seed{seed}/reality opened", "seal", 1, (sealed, self.folder / evaluation.EVALUATIONS), (path,), run
+        )
+
+    def _first_balls(self, seed: int, player: str) -> Step:
+        path, name = self.data(seed, player, "D0"), f"seed{seed}/{player}/D0"
+
+        def run() -> str:
+            measured = self._world[seed].first_balls(player, name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            measurements.write_csv(path, measured)
+            return f"{len(measured):,} balls without a robot"
+
+        return Step(name, "first balls", 1, (), (path,), run)
+
+    def _step(self, seed: int, player: str, item: Item) -> Step:
+        if isinstance(item, Human):
+            return self._fit(seed, player, item)
+        return self._simulated(seed, player, item) if isinstance(item, Simulated) else self._real(seed, player, item)
+
+    def _fit(self, seed: int, player: str, item: Human) -> Step:
+        path, sources = self.human(seed, player, item.name), tuple(self.data(seed, player, name) for name in item.data)
+
+        def run() -> str:
+            found = measurements.read_all([str(source) for source in sources], None)
+            measured = Dataset(tuple(found), " + ".join(item.data))  # wherever the study's folder lies
+            title = f"{player}/{item.name}, seed {seed}"
+            distribution, report = checked(str(path), fit_human, measured, ball_params(), None, 5, title)
+            save_distribution(path, distribution)
+            return f"fitted to {report.landing.shape[1]:,} of {report.measured:,} balls"
+
+        return Step(f"seed{seed}/{player}/{item.name}", "human model", len(sources), sources, (path,), run)
+
+    def _simulated(self, seed: int, player: str, item: Simulated) -> Step:
+        folder, name = self.model_folder(seed, player, item.key), f"seed{seed}/{player}/{item.key}"
+        human = self.human(seed, player, item.balls) if item.balls.startswith("M") else None
+        inputs = () if human is None else (human,)
+        if item.source is not None:
+            inputs += (self.model_folder(seed, player, item.source) / POLICY,)
+
+        def run() -> str:
+            source = None if item.source is None else self.run_of(seed, player, item.source)
+            score = self._world[seed].score(player, name)
+            return training.simulate(self.study, item, folder, human, source, name, self.console, score)
+
+        optimiser = self.study.simulation.optimiser
+        work = updates(self.study, item) * optimiser.pairs * optimiser.repeats * self.study.simulation.seeds
+        return Step(name, "training", work, inputs, (folder / POLICY, folder / load_policy.SELECTION), run)
+
+    def _real(self, seed: int, player: str, item: Real) -> Step:
+        folder, name = self.model_folder(seed, player, item.key), f"seed{seed}/{player}/{item.key}"
+        data = None if item.data is None else self.data(seed, player, item.data)
+
+        def run() -> str:
+            source = self.run_of(seed, player, item.source)
+            hits, text = self._world[seed].fine_tune(player, source, updates(self.study, item), folder, name)
+            if data is not None:
+                measurements.write_csv(data, hits)
+            training.save(folder, load_policy.load(folder))
+            return text
+
+        outputs = (folder / POLICY, *(() if data is None else (data,)))
+        inputs = (self.model_folder(seed, player, item.source) / POLICY,)
+        return Step(name, "fine-tuning", updates(self.study, item), inputs, outputs, run)
+
+    def _convergence(self, seed: int, player: str) -> Step:
+        sources = {name: self.human(seed, player, name) for name in ("M0", "M1", "M2")}
+        path = self.seed_folder(seed) / player / CONVERGENCE
+
+        def run() -> str:
+            models = {name: load_distribution(source) for name, source in sources.items()}
+            scale = study_data.widths(models)
+            steps = {
+                f"{a}-{b}": study_data.change(models[a], models[b], scale) for a, b in (("M0", "M1"), ("M1", "M2"))
+            }
+            first, second = steps.values()
+            run_dir.write_json(
+                path, {"mean change of the 16 numbers over their ranges": steps, "converging": second < first}
+            )
+            return f"human model changed by {first:.1%}, then by {second:.1%} of its range"
+
+        return Step(f"seed{seed}/{player}/convergence", "convergence", 1, tuple(sources.values()), (path,), run)
+
+    def _evaluate(self, seed: int) -> Step:
+        pairs = pairings(self.study)
+        places = [self._policy_of(seed, trainer, model) for trainer, _, model in pairs]
+        path = self.seed_folder(seed) / evaluation.EVALUATIONS
+        logs = self.folder / evaluation.LOGS
+
+        def run() -> str:
+            lanes, world = self.study.evaluation.lanes, self._world[seed]
+            policies = [training.load(place.parent) for place in places]
+            boxes = [self._box(seed, trainer, model) for trainer, _, model in pairs]
+            result = evaluation.play(self.study, world.reality, seed, pairs, policies, boxes)
+            codes = evaluation.code_names(seed, pairs)
+            evaluation.save_logs(logs, seed, pairs, result, lanes)
+            rallies = evaluation.rallies_of(seed, pairs, codes, result, lanes)
+            scoring.write(path, rallies)
+            lengths = ", ".join(f"{model} {length:.1f}" for model, length in evaluation.summary(rallies).items())
+            return f"{len(rallies):,} rallies; mean length: {lengths}"
+
+        human = tuple(self.human(seed, player, name) for player in self.study.players for name in ("M0", "M1", "M2"))
+        inputs = (*dict.fromkeys(places), *human)
+        return Step(f"seed{seed}/evaluation", "evaluation", len(pairs), inputs, (path,), run)
+
+    def _effects(self, seed: int) -> Step:
+        models = [(player, model) for player in self.study.players for model in effect_costs.MODELS]
+        places = [self._policy_of(seed, player, model) for player, model in models]
+        path = self.seed_folder(seed) / effect_costs.FILE
+
+        def run() -> str:
+            policies = [training.load(place.parent) for place in places]
+            boxes = [self._box(seed, player, model) for player, model in models]
+            found = evaluation.play_without(self.study, self._world[seed].reality, seed, models, policies, boxes)
+            effect_costs.write(path, found)
+            return f"{sum(o.rallies for o in found):,} rallies in {len(effect_costs.WORLDS)} worlds"
+
+        human = tuple(self.human(seed, player, name) for player in self.study.players for name in ("M0", "M1", "M2"))
+        work = len(models) * len(effect_costs.WORLDS)
+        return Step(f"seed{seed}/effects", "effects", work, (*places, *human), (path,), run)
+
+    def _policy_of(self, seed: int, trainer: str, model: str) -> Path:
+        return self.model_folder(seed, trainer, "oracle-sim" if model == ORACLE else model) / POLICY
+
+    def _box(self, seed: int, trainer: str, model: str) -> BallDistribution:
+        """The balls that a policy was last trained on in simulation."""
+        made = {item.key: item for item in items(self.study, trainer) if not isinstance(item, Human)}
+        item = made["oracle-sim" if model == ORACLE else model]
+        while isinstance(item, Real):
+            item = made[item.source]
+        human = self.human(seed, trainer, item.balls)
+        return load_distribution(human) if item.balls.startswith("M") else build.distribution(item.balls, model)
+
+    def _blind(self, seed: int) -> list[Step]:
+        """The evaluation by people: for every trainer and evaluator a folder with code names and a scoring sheet."""
+        from experiments.study.on_robot import blind_steps
+
+        found = []
+        pairs = pairings(self.study)
+        for trainer, evaluator in dict.fromkeys((t, e) for t, e, _ in pairs):
+            models = [m for t, e, m in pairs if (t, e) == (trainer, evaluator)]
+            places = {m: self._policy_of(seed, trainer, m) for m in models}
+            runs_of = {m: partial(self.run_of, seed, trainer, place.parent.name) for m, place in places.items()}
+            folder = self.seed_folder(seed) / "blind" / f"{trainer}-{evaluator}"
+            inputs = tuple(dict.fromkeys(places.values()))
+            found += blind_steps(folder, seed, trainer, evaluator, runs_of, inputs, self.study.robot, self.console)
+        return found
+
+    def _collect(self, before: list[Step]) -> Step:
+        path = self.folder / evaluation.EVALUATIONS
+        sources = tuple(p for step in before for p in step.outputs if p.name == evaluation.EVALUATIONS)
+
+        def run() -> str:
+            rallies = scoring.join(map(scoring.read, sources))
+            scoring.write(path, rallies)
+            return f"{len(rallies):,} rallies"
+
+        return Step("evaluations", "evaluations", len(sources), sources, (path,), run)
+
+
+def run(study: Study, folder: Path, console: Console, processes: int = 1) -> bool:
+    """Does, or goes on with, a study in ``folder``, up to its report; False when it waits for people.
+
+    processes: that do steps which need nothing of each other side by side, each on its share of the cores; 1: this one
+    does them all. Raises RunError for a folder of another study, naming the differences, ConfigError for what the study
+    names and is not there, and what the steps raise.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with Run(folder).locked():
+        if not Journal(folder / JOURNAL).entries:  # later on, what is no longer read may be gone
+            look_up(study)
+        loop = Loop(study, folder, console)
+        _open(study, folder)
+        try:
+            steps, journal = loop.steps(), Journal(folder / JOURNAL)
+            if processes > 1:
+                run_side_by_side(study, folder, steps, journal, console, processes)
+            else:
+                run_all(steps, journal, console)
+        except Waiting as waiting:
+            console.print(str(waiting), highlight=False, soft_wrap=True, markup=False)
+            return False
+        except OSError as error:
+            raise RunError(
+                f"{error.filename or folder}: {error.strerror or error}; every finished step is kept. "
+                "Make room or repair the folder, then run the same command again to continue"
+            ) from error
+        except KeyboardInterrupt as stopped:
+            raise KeyboardInterrupt(
+                f"{stopped}\n{folder}: stopped; the same command continues the study".lstrip()
+            ) from None
+    console.print(f"report: {folder / REPORT}", highlight=False, soft_wrap=True)
+    return True
+
+
+def look_up(study: Study) -> None:
+    """Raises ConfigError for what a study names and is not there, before hours are spent on its first steps."""
+    for balls in study.ablation.balls if study.ablation else ():
+        build.distribution(balls, "ablation.balls")
+    for item in items(study, study.players[0]):
+        if isinstance(item, Simulated) and item.source is None:
+            build.experiment(training.configuration(study, item, "narrow", None, 0), "simulation")
+    if study.robot is not None:
+        from experiments.study.on_robot import look_up as look_up_robot
+
+        look_up_robot(study)
+
+
+def _open(study: Study, folder: Path) -> None:
+    """Records what the study is and this session, or checks that it is the one that is asked for.
+
+    Where no step is done yet there is nothing that belongs to another study.
+    """
+    path = folder / SETTINGS
+    if path.exists() and Journal(folder / JOURNAL).entries:
+        found = parse(read_yaml(checked(str(path), path.read_text, "utf-8"), str(path)), str(path))
+        changed = run_dir.differences(found.to_dict(), study.to_dict(), CHANGEABLE.__contains__, "study")
+        if changed:
+            raise RunError(f"{folder}: is another study:\n{changed}\nRestore these values or choose another --out")
+    run_dir.write_yaml(path, study.to_dict())
+    sessions = folder / SESSIONS
+    before = []
+    if sessions.exists():
+        found = read_yaml(checked(str(sessions), sessions.read_text, "utf-8"), str(sessions))
+        before = found.get("sessions") if isinstance(found, dict) else None
+        if not isinstance(before, list):
+            raise RunError(f"{sessions}: holds no list of sessions; restore the file or remove it")
+    run_dir.write_json(sessions, {"sessions": [*before, run_dir.provenance()]})

@@ -1,0 +1,95 @@
+"""The findings of a study in plain sentences, made from what was measured."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from experiments.study.analysis.claims import (
+    AGREES,
+    DIFFERS,
+    DIRECTION,
+    NOT_COMPARABLE,
+    UNDECIDED,
+    VERDICTS,
+    Finding,
+    Measurements,
+)
+from experiments.study.analysis.paper import LEVELS, SHORT, of_level
+
+
+def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:
+    """The findings in plain words, only of what was measured."""
+    out = []
+
+    def measured(*keys: str) -> list[str]:
+        return [key for key in keys if found[key].interval is not None]
+
+    if measured("all-ratio"):
+        means = ((name, m.raw.mean(key, of_level("all"))) for key, name in SHORT.items())
+        text = ", ".join(f"{name} {mean.value:.1f}" for name, mean in means if mean is not None)
+        out.append(f"Mean rally length in hits: {text}.")
+        out.append(
+            f"Over all players, i-S2R's rallies are {compared(found['all-ratio'])} those of S2R+FT; the paper: 9 % "
+            "longer."
+        )
+    paper = {"beginner": "70 % longer", "intermediate": "175 % longer", "advanced": "far shorter"}
+    for key in measured(*LEVELS):
+        who = {"beginner": "With beginners", "advanced": "With the advanced player"}.get(key, f"With {key} players")
+        out.append(f"{who}, they are {compared(found[key])} those of S2R+FT; the paper: {paper[key]}.")
+    for key in measured("oracle-beginner", "oracle-intermediate"):
+        out.append(
+            f"With {'beginners' if 'beginner' in key else 'intermediate players'}, S2R-Oracle+FT, with 35 % of the "
+            "real training, plays rallies that are "
+            f"{compared(found[key])} i-S2R's; the paper: comparable."
+        )
+    if measured("keeps-is2r", "keeps-s2r"):
+        kept = " and ".join(
+            f"{name} {100 * f.interval.value:.0f} % ({100 * f.interval.low:.0f} to {100 * f.interval.high:.0f} %)"
+            for name, f in (("i-S2R", found["keeps-is2r"]), ("S2R+FT", found["keeps-s2r"]))
+            if f.interval is not None
+        )
+        out.append(
+            f"With players who did not train it, a policy keeps of its rally length: {kept}; the paper: 70 % and 30 %."
+        )
+    steps = {
+        "fine-tuning": "fine-tuning the first policy",
+        "drop-sim2": "the second round in simulation",
+        "drop-sim3": "the third round in simulation",
+    }
+    for key in measured(*steps):
+        text = "longer" if key == "fine-tuning" else "shorter"
+        out.append(f"After {steps[key]}, rallies are {compared(found[key])} before; the paper: {text}.")
+    if m.changes:
+        first, second = np.mean(list(m.changes.values()), axis=0)
+        out.append(
+            f"The human model moves by {100 * first:.1f} % from M0 to M1 and by {100 * second:.1f} % from M1 to M2."
+        )
+    if measured("carried"):
+        out.append(
+            f"With the weights carried back to simulation, rallies are {compared(found['carried'])} without; the paper "
+            "leaves it open."
+        )
+    unselected = m.ratio("is2r-ft100", "s2r-ft100", "all", boot=m.unselected)
+    if unselected is not None:
+        i = unselected.interval
+        out.append(
+            "On every rally that counts, instead of the 50 longest of 60, i-S2R / S2R+FT is "
+            f"{i.value:.2f} ({i.low:.2f} to {i.high:.2f})."
+        )
+    counts = {v: [f for f in found.values() if f.verdict == v] for v in VERDICTS}
+    out.append(
+        f"Of {len(found)} claims of the paper, {len(counts[AGREES])} agree, {len(counts[DIRECTION])} agree in "
+        "direction, "
+        f"{len(counts[DIFFERS])} differ, {len(counts[UNDECIDED])} are undecided and {len(counts[NOT_COMPARABLE])} "
+        "not comparable."
+    )
+    differ = " ".join(f.claim.text for f in counts[DIFFERS])
+    return [*out, f"What differs: {differ}"] if differ else out
+
+
+def compared(f: Finding) -> str:
+    """A ratio of rally lengths as what stands before "than": how much longer or shorter, with its interval."""
+    value, low, high = (100.0 * (x - 1.0) for x in (f.interval.value, f.interval.low, f.interval.high))
+    if low <= 0.0 <= high:
+        return f"not clearly longer or shorter ({value:+.0f} %, {low:+.0f} to {high:+.0f} %) than"
+    return f"{abs(value):.0f} % {'longer' if value > 0 else 'shorter'} ({low:+.0f} to {high:+.0f} %) than"

@@ -1,0 +1,114 @@
+"""What a study makes for each player: human models, policies and the order in which they come about.
+
+The ten models of the paper (appendix "Evaluation Methodology"), the variant whose weights stay in simulation (its
+"Bringing the Fine-Tuned Model from the Real World Back to Simulation"), and the ablation's hand-made distributions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from experiments.config.study import Study
+
+
+@dataclass(frozen=True)
+class Human:
+    """A human model: fitted to data sets together."""
+
+    name: str
+    data: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A policy trained in simulation.
+
+    balls   a human model, or a distribution's name
+    source  model whose weights it starts from; None: from scratch
+    round   whose updates and recipe it has; None: the first round's recipe with the updates of all rounds
+    """
+
+    key: str
+    balls: str
+    source: str | None
+    round: int | None
+
+
+@dataclass(frozen=True)
+class Real:
+    """A policy fine-tuned in reality. data: name of the data set that the player's hits become; None: not used."""
+
+    key: str
+    source: str
+    round: int
+    data: str | None = None
+
+
+Item = Human | Simulated | Real
+
+LOOP: tuple[Item, ...] = (
+    Human("M0", ("D0",)),
+    Simulated("is2r-sim1", "M0", None, 0),
+    Real("is2r-ft35", "is2r-sim1", 0, "D1"),
+    Human("M1", ("D0", "D1")),
+    Simulated("is2r-sim2", "M1", "is2r-ft35", 1),
+    Real("is2r-ft65", "is2r-sim2", 1, "D2"),
+    Human("M2", ("D0", "D1", "D2")),
+    Simulated("is2r-sim3", "M2", "is2r-ft65", 2),
+    Real("is2r-ft100", "is2r-sim3", 2),
+    Real("s2r-ft65", "is2r-ft35", 1),
+    Real("s2r-ft100", "s2r-ft65", 2),
+    Simulated("oracle-sim", "M2", None, None),
+    Real("oracle-ft", "oracle-sim", 2),
+)
+FRESH: tuple[Item, ...] = (
+    Simulated("fresh-sim2", "M1", "is2r-sim1", 1),
+    Real("fresh-ft65", "fresh-sim2", 1, "D2-fresh"),
+    Human("M2-fresh", ("D0", "D1", "D2-fresh")),
+    Simulated("fresh-sim3", "M2-fresh", "fresh-sim2", 2),
+    Real("fresh-ft100", "fresh-sim3", 2),
+)
+MODELS = (
+    "is2r-sim1", "is2r-ft35", "is2r-sim2", "is2r-ft65", "is2r-sim3", "is2r-ft100",
+    "s2r-ft65", "s2r-ft100", "oracle-sim", "oracle-ft",
+)  # fmt: skip
+CROSS_MODELS = ("is2r-ft100", "oracle-ft", "s2r-ft100")
+CROSS = {  # trainer: evaluators, the paper's table of cross-evaluations
+    "player1": ("player4", "player5"),
+    "player2": ("player1", "player3"),
+    "player3": ("player1", "player4"),
+    "player4": ("player2", "player5"),
+    "player5": ("player2", "player3"),
+}
+ORACLE = "oracle"  # the oracle's simulated policy under its name in the ablation
+
+
+def items(study: Study, player: str) -> tuple[Item, ...]:
+    """What is made for a player, in an order in which everything comes after what it needs."""
+    chosen = LOOP + (FRESH if study.fresh else ())
+    if study.ablation and study.ablation.player == player:
+        chosen += tuple(Simulated(balls, balls, None, None) for balls in study.ablation.balls)
+    return chosen
+
+
+def updates(study: Study, item: Simulated | Real) -> int:
+    """Of an item's training or fine-tuning."""
+    rounds = study.simulation.rounds
+    if isinstance(item, Real):
+        return rounds[item.round].real
+    return sum(r.simulated for r in rounds) if item.round is None else rounds[item.round].simulated
+
+
+def pairings(study: Study) -> list[tuple[str, str, str]]:
+    """Trainer, evaluator and model of every evaluation."""
+    found = []
+    for trainer in study.players:
+        own = [item.key for item in items(study, trainer) if not isinstance(item, Human)]
+        if study.ablation and study.ablation.player == trainer:
+            own.append(ORACLE)
+        found += [(trainer, trainer, key) for key in own]
+    if study.evaluation.cross:
+        for trainer in study.players:
+            evaluators = [e for e in CROSS[trainer] if e in study.players]
+            found += [(trainer, evaluator, key) for evaluator in evaluators for key in CROSS_MODELS]
+    return found

@@ -1,0 +1,163 @@
+"""A virtual reality: a simulation that differs from the one in which policies are trained, in ways that training does not know.
+
+Each effect moves a few parameters of ``SimModel`` to values drawn from a range around what a laboratory may have; an
+effect that is left out keeps what training believes. The draw depends on the seed and on the parameter's name only, so
+leaving out one effect changes no other. Balls spin as the player hits them; training believes that none does.
+
+What was drawn is sealed (``experiments.study.blind.protocol``) when a study begins and opened when it is over. The learner gets measured
+balls and rewards.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ballmodel import flight
+from ballmodel.constants import TABLE_LENGTH
+from ballmodel.flight import BallParams
+from ballmodel.state import BallState
+from ballmodel.trajectory import Trajectory
+from mjx_tt.sim import model as models
+from mjx_tt.sim import sensors
+from mjx_tt.sim.model import SimModel
+from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
+
+CAMERA_RATE = 125.0  # [Hz], the paper's cameras
+_SUBSTEPS = 4  # physics per camera frame
+_LONGEST = 1.6  # [s] that a ball is followed
+_AFTER_BOUNCE = 0.12  # [s] that a measured trajectory goes on after the bounce, which ends the free flight
+
+_DRIVES = {
+    f"drives.{name}.{effect}": bounds
+    for i, name in enumerate(JOINT_NAMES)
+    for effect, bounds in (
+        ("lag", (0.01, 0.04) if i in FESTO_JOINTS else (0.005, 0.025)),  # [s]
+        ("velocity_gain", (0.92, 1.02)),
+    )
+}
+_ENCODERS = {
+    f"drives.{name}.joint_offset": (-0.006, 0.006) if i in FESTO_JOINTS else (-0.012, 0.012)  # [m], [rad]
+    for i, name in enumerate(JOINT_NAMES)
+}
+# Training believes: rubber 0.917 and gain 0.68 of one make, table 0.93 and 0.25, no lift, the paper's latencies, no bias.
+# The ranges are estimates: other rubbers and their wear, tables within ITTF's rule (a bounce of 23 cm from 30 cm,
+# restitution 0.876), lift coefficients from 0.3 to 1.5 in the literature, calibration within a centimetre or so.
+RANGES: dict[str, dict[str, tuple[float, float]]] = {
+    "rubber": {"ball.paddle.restitution": (0.78, 0.88), "ball.paddle.tangential_gain": (0.45, 0.75)},
+    "table": {"ball.table.restitution": (0.876, 0.92), "ball.table.friction": (0.15, 0.35)},
+    "magnus": {"ball.flight.magnus_coefficient": (0.4, 1.2), "ball.flight.spin_decay": (0.0, 0.1)},
+    "spin": {},  # of the player's strokes, which is not the model's
+    "noise": {"sensing.ball_noise": (0.003, 0.010)},  # [m]; training's 40 mm is a precaution, no measurement
+    "latency": {
+        "latency.ball_observation": (0.038, 0.058),
+        "latency.abb_observation": (0.025, 0.040),
+        "latency.festo_observation": (0.028, 0.045),
+        "latency.abb_action": (0.066, 0.088),
+        "latency.festo_action": (0.058, 0.085),
+    },
+    "camera": {
+        **{f"sensing.ball_offset_{axis}": (-0.012, 0.012) for axis in "xyz"},
+        **{f"sensing.camera_rotation_{axis}": (-0.008, 0.008) for axis in "xyz"},
+        "sensing.camera_scale": (0.995, 1.005),
+    },
+    "drives": _DRIVES,
+    "encoders": _ENCODERS,
+}
+
+
+def draw(seed: int, without: tuple[str, ...] = ()) -> SimModel:
+    """The reality of that study seed, without the named effects. Raises ValueError for an unknown effect."""
+    for name in without:
+        if name not in RANGES:
+            raise ValueError(f"no effect is called {name!r}; there are {', '.join(RANGES)}")
+    values = {
+        path: _uniform(seed, path, *bounds)
+        for effect, ranges in RANGES.items()
+        if effect not in without
+        for path, bounds in ranges.items()
+    }
+    return models.with_values(SimModel(), values)
+
+
+def _uniform(seed: int, path: str, low: float, high: float) -> float:
+    return float(np.random.default_rng([seed, zlib.crc32(path.encode())]).uniform(low, high))
+
+
+def side_by_side(worlds: list[SimModel], lanes: int) -> SimModel:
+    """All worlds in one model, each in as many neighbouring lanes: what differs among them is (worlds * lanes,)."""
+    values = [models.paths(world) for world in worlds]  # also of drives that a world does not have
+    differ = [path for path in values[0] if len({v[path] for v in values}) > 1]
+    return models.with_values(
+        worlds[0], {path: jnp.repeat(jnp.array([v[path] for v in values], jnp.float32), lanes) for path in differ}
+    )
+
+
+def differences(model: SimModel) -> dict[str, float]:
+    """What of a reality differs from what training believes, by dotted path."""
+    nominal = models.paths()
+    return {path: float(value) for path, value in models.paths(model).items() if value != nominal[path]}
+
+
+def content(model: SimModel, seed: int, without: tuple[str, ...]) -> dict:
+    """What is sealed: plain data."""
+    return {"seed": seed, "without": list(without), "reality": differences(model)}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Tracks of n balls at CAMERA_RATE: what cameras deliver."""
+
+    position: np.ndarray  # (T, 3, n) [m]
+    length: np.ndarray  # (n,) samples of each that were taken
+
+    def trajectories(self, session: str, first: int = 0) -> tuple[Trajectory, ...]:
+        """Named by number from ``first`` on; balls of fewer than two samples are left out."""
+        time = np.arange(self.position.shape[0]) / CAMERA_RATE
+        return tuple(
+            Trajectory(session, str(first + i), time[:k], self.position[:k, :, i].T)
+            for i, k in enumerate(self.length)
+            if k >= 2
+        )
+
+
+@partial(jax.jit, static_argnames="frames")
+def _fly(params: BallParams, state: BallState, frames: int):
+    """Positions (frames, 3, n) at the camera's rate and how many of them (n,) are taken."""
+    dt = 1.0 / (CAMERA_RATE * _SUBSTEPS)
+
+    def substep(_, carry):
+        state, bounced = carry
+        new, events = flight.step(params, state, dt)
+        return new, bounced | events.table
+
+    def frame(carry, _):
+        state, bounced, since, seen, length = carry
+        gone = (state.position[1] < -0.5 * TABLE_LENGTH - 0.3) | (state.position[2] < -0.5) | (since > _AFTER_BOUNCE)
+        seen = seen & ~gone
+        after, bounced = jax.lax.fori_loop(0, _SUBSTEPS, substep, (state, bounced))
+        since = since + jnp.where(bounced, 1.0 / CAMERA_RATE, 0.0)
+        return (after, bounced, since, seen, length + seen), state.position
+
+    none = jnp.zeros(state.position.shape[1:], bool)
+    start = (state, none, jnp.zeros(none.shape), ~none, jnp.zeros(none.shape, jnp.int32))
+    (*_, length), positions = jax.lax.scan(frame, start, None, length=frames)
+    return positions, length
+
+
+def measure(model: SimModel, balls: BallState, noise: float, key) -> Measured:
+    """What the reality's cameras see of balls (3, n) from the player's contact on: its physics, calibration and noise [m]."""
+    n = balls.position.shape[1]
+    padded = jax.tree.map(lambda x: jnp.pad(jnp.asarray(x, jnp.float32), ((0, 0), (0, -n % 256)), mode="edge"), balls)
+    positions, length = _fly(model.ball, padded, round(_LONGEST * CAMERA_RATE))
+    seen, camera = jnp.moveaxis(positions, 1, 0), sensors.camera(model.sensing)
+    if camera is not None:
+        seen = camera.seen(seen)
+    offset = jnp.array([getattr(model.sensing, f"ball_offset_{axis}") for axis in "xyz"])
+    seen = seen + offset[:, None, None] + noise * jax.random.normal(key, seen.shape)
+    return Measured(np.moveaxis(np.asarray(seen, np.float64), 0, 1)[..., :n], np.asarray(length)[:n])

@@ -1,0 +1,109 @@
+"""What follows training: evaluation, pictures, artefact, and the lines that say where they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from experiments.config.build import Experiment
+from experiments.evaluation import evaluate, figures, video
+from experiments.evaluation.evaluate import Played
+from experiments.runs import load_policy, metrics, run_dir
+from experiments.runs.load_policy import Policy
+from experiments.runs.run_dir import Run
+from robot_io import contract
+from robot_io.policy import export
+
+EPISODES_SHOWN = 2
+
+
+def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]:
+    """Evaluates, draws and exports the run's policy; evaluation.json, written last, marks the run as done.
+
+    Returns the report. Raises ArtefactError when the policy's exported forms disagree, OSError when the disk refuses.
+    """
+    trained, evaluation = load_policy.load(run.folder), experiment.config.evaluation
+    console.print(f"{run.folder}: evaluating on {evaluation.episodes:,} fresh balls ...", highlight=False)
+    played = evaluate.evaluate(experiment, trained, evaluation.episodes, evaluation.seed, evaluation.reachable_balls)
+    pictures = figures.draw_evaluation(run.plots, played, experiment.task.reward_weights)
+    title = f"{experiment.config.name}: training on {experiment.distribution.name}"
+    pictures.append(figures.draw_training(run.plots / "training.png", metrics.read(run.metrics), title))
+    shown = show_episodes(experiment, trained, [run.folder / "episode.png", run.folder / "episode.mp4"], console)
+    exported = export_policy(run.artefact, trained, experiment, played.report, console)
+    run_dir.write_json(run.evaluation, played.report)
+    print_report(console, played.report, str(run.folder))
+    lines = {
+        "evaluation": run.evaluation,
+        "pictures": f"{run.plots} ({', '.join(p.name for p in pictures)})",
+        "episodes": ", ".join(str(path) for path in shown),
+        "artefact": run.artefact if exported else "",
+    }
+    for name, value in lines.items():
+        if value:
+            console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
+    return played.report
+
+
+def show_episodes(experiment: Experiment, trained: Policy, paths: list[Path], console: Console) -> list[Path]:
+    """Writes the pictures that this machine can draw; says why where it cannot."""
+    played = video.replay(experiment, trained, EPISODES_SHOWN, experiment.config.evaluation.seed)
+    drawn = []
+    for path in paths:
+        try:
+            drawn.append(video.draw(path, played, experiment.task.control_rate))
+        except RuntimeError as error:
+            console.print(f"{path}: not drawn: {error}", highlight=False)
+    return drawn
+
+
+def export_policy(
+    folder: Path, trained: Policy, experiment: Experiment, report: dict[str, Any] | None, console: Console
+) -> bool:
+    """Writes and verifies the artefact; False, with a line that says so, for a policy that the robot cannot run."""
+    rate = experiment.task.control_rate
+    if rate != contract.CONTROL_RATE:
+        console.print(
+            f"{folder}: not exported: the policy acts at {rate:g} Hz, the robot at {contract.CONTROL_RATE:g} Hz",
+            highlight=False,
+        )
+        return False
+    provenance = {
+        "config": experiment.config.to_dict(),
+        "seed": experiment.config.training.seed,
+        "git": run_dir.git_state(),
+        "update": trained.notes.get("update"),
+        "evaluation": report,
+    }
+    export.write(folder, trained.theta, trained.mean, trained.inverse_scale, provenance, overwrite=True)
+    return True
+
+
+def print_report(console: Console, report: dict[str, Any], title: str) -> None:
+    """The evaluation as a table."""
+    table = Table(title=f"{title} on {report['balls']['name']}", title_justify="left", show_header=False)
+    rate = f"{report['return_rate']:.1%}  (95 % interval {report['low']:.1%} to {report['high']:.1%})"
+    table.add_row("return rate", rate, style="bold")
+    if report["reachable"] is not None:
+        bound = report["reachable"]
+        text = (
+            f"{bound['return_rate']:.1%}  ({bound['balls']} balls, interval {bound['low']:.1%} to {bound['high']:.1%})"
+        )
+        table.add_row("reachable, at least", text)
+    table.add_row("hit rate", f"{report['hit_rate']:.1%}")
+    counts = ", ".join(f"{count:,} {name}" for name, count in report["outcomes"].items())
+    table.add_row("episodes", f"{report['episodes']:,}: {counts}; {report['non_finite']} not finite")
+    if report["mean_return"] is not None:
+        table.add_row("mean return", f"{report['mean_return']:.3f}")
+        for name, value in report["terms"].items():
+            table.add_row(f"  {name}", f"{value:.3f}")
+    console.print(table)
+
+
+def save_evaluation(folder: Path, played: Played, weights: tuple[float, ...]) -> None:
+    """evaluation.json and its pictures, in a folder of their own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figures.draw_evaluation(folder / "plots", played, weights)
+    run_dir.write_json(folder / "evaluation.json", played.report)

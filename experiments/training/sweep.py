@@ -1,0 +1,117 @@
+"""A batch of trainings: several experiments, several seeds, one after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from experiments.config import build
+from experiments.config.build import Experiment
+from experiments.config.experiment import Config
+from experiments.errors import ConfigError, explained
+from experiments.evaluation import evaluate
+from experiments.runs import load_policy, run_dir
+from experiments.runs.run_dir import Run
+from experiments.training.finalize import finish
+from experiments.training.loop import train
+
+SELECTION_EPISODES = 50  # Abeyruwan et al. 2022, appendix "Seed Selection for Rounds of Simulated Training"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: an experiment with its seed, and the file that it comes from."""
+
+    config: Config
+    run: Run
+    where: str
+
+
+def plan(configs: list[tuple[str, Config]], seeds: tuple[int, ...], out: Path) -> list[Job]:
+    """Jobs in ``out``/<name>/, or in ``out``/<name>/seed<k>/ where seeds are given.
+
+    configs: (file, configuration). Raises ConfigError when two files would share a folder.
+    """
+    owners: dict[str, str] = {}
+    for where, config in configs:
+        if config.name in owners:
+            raise ConfigError(
+                f"{where}: name: {config.name!r} is also the name of {owners[config.name]}; give it another"
+            )
+        owners[config.name] = where
+    jobs = []
+    for where, config in configs:
+        folder = out / config.name
+        if not seeds:
+            jobs.append(Job(config, Run(folder), where))
+        for seed in seeds:
+            seeded = config.training.model_copy(update={"seed": seed})
+            jobs.append(Job(config.model_copy(update={"training": seeded}), Run(folder / f"seed{seed}"), where))
+    return jobs
+
+
+def run_all(jobs: list[Job], console: Console) -> bool:
+    """Runs, resumes or skips each job; one that fails does not stop the others. Returns whether all succeeded."""
+    outcomes: list[tuple[Job, str, str]] = []
+    for job in jobs:
+        try:
+            result, failed = _run(job, console), False
+        except Exception as error:  # even a bug in one job must not cost the night's other trainings
+            if explained(error):
+                console.print(f"error: {error}", style="red", highlight=False, soft_wrap=True, markup=False)
+            else:
+                console.print_exception()
+            result, failed = f"{type(error).__name__}: {error}".splitlines()[0], True
+        outcomes.append((job, "failed" if failed else "done", result))
+    if len(jobs) > 1:
+        _print_outcomes(outcomes, console)
+    return all(state == "done" for _, state, _ in outcomes)
+
+
+def select(folder: Path, jobs: list[Job], console: Console) -> None:
+    """The paper's choice among seeds, written to selection.json: the best mean over 50 episodes of a sparse reward.
+
+    All seeds play the same balls. Raises what a missing run or an unwritable folder raises.
+    """
+    scores = {}
+    for job in jobs:
+        experiment = build.experiment(job.config, job.where)
+        trained = load_policy.load(job.run.folder)
+        played = evaluate.evaluate(experiment, trained, SELECTION_EPISODES, job.config.evaluation.seed + 1)
+        scores[job.run.folder.name] = evaluate.selection_score(played.result)
+    best = max(scores, key=scores.get)
+    selection = {
+        "episodes": SELECTION_EPISODES,
+        "reward": {"hit": 1, "landed": 1, "fault": -2},
+        "scores": scores,
+        "best": best,
+    }
+    run_dir.write_json(folder / load_policy.SELECTION, selection)
+    console.print(
+        f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)", highlight=False
+    )
+
+
+def _run(job: Job, console: Console) -> str:
+    experiment: Experiment = build.experiment(job.config, job.where)
+    run, config = job.run, experiment.config
+    run.check(config)
+    if run.done(config):
+        report = run.read_evaluation()
+        console.print(f"{run.folder}: done before, skipped", highlight=False)
+    else:
+        if not run.trained(config):
+            reason = train(experiment, run, console)
+            console.print(f"{run.folder}: trained, ended by {reason}", highlight=False)
+        report = finish(experiment, run, console)
+    return f"{report['return_rate']:.1%} ({report['low']:.1%} to {report['high']:.1%})"
+
+
+def _print_outcomes(outcomes: list[tuple[Job, str, str]], console: Console) -> None:
+    table = Table("run", "", "return rate or error", title="Summary", title_justify="left")
+    for job, state, result in outcomes:
+        table.add_row(str(job.run.folder), f"[{'green' if state == 'done' else 'red'}]{state}[/]", result)
+    console.print(table)

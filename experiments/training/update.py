@@ -1,0 +1,152 @@
+"""One update of Blackbox Gradient Sensing on the simulator, compiled as a whole.
+
+Nothing crosses to the host inside an update: directions, balls, rollouts, the step and the merged observation statistics
+are one compiled call from a ``TrainState`` to the next.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jax.sharding import PartitionSpec
+
+from ballmodel.sampling import BallPool
+from bgs import normalizer, strategy
+from bgs.strategy import BGSConfig, BGSState
+from mjx_tt.env import rewards
+from mjx_tt.env.policy import initial_theta
+from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
+from mjx_tt.env.task import MISSED, RETURNED
+from mjx_tt.sim.model import Range, SimModel
+from robot_io.contract import N_OBSERVATION
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class TrainState:
+    """Everything an update reads: a run resumed from it continues bit for bit."""
+
+    bgs: BGSState
+    statistics: normalizer.ObservationStatistics
+    key: jax.Array  # of the run; update u uses fold_in(key, u)
+
+
+class Trainer:
+    """Updates of one training run.
+
+    repeats                episodes per perturbation
+    common_random_numbers  both members of a pair meet the same balls, latencies and noise
+    initial_scale          standard deviation of the random first weights
+    later_weights          after how many updates the rewards get other weights, and these (11,); None: never
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        bgs_config: BGSConfig,
+        pool: BallPool,
+        model: SimModel,
+        randomise: tuple[Range, ...] = (),
+        repeats: int = 15,
+        common_random_numbers: bool = False,
+        initial_scale: float = 0.1,
+        later_weights: tuple[int, tuple[float, ...]] | None = None,
+    ) -> None:
+        if repeats < 1:
+            raise ValueError(f"repeats is {repeats}, at least 1 is needed")
+        self.simulator, self.bgs_config, self.pool = simulator, bgs_config, simulator.replicate(pool)
+        self._model, self._randomise = model, randomise
+        self._repeats, self._crn, self._initial_scale = repeats, common_random_numbers, initial_scale
+        self._later = later_weights
+        self._update = jax.jit(simulator.on_devices(self._update_local, out_specs=PartitionSpec()))
+
+    @property
+    def episodes_per_update(self) -> int:
+        return 2 * self.bgs_config.pairs * self._repeats
+
+    def init(self, key, theta=None, statistics=None) -> TrainState:
+        """State before the first update, from random weights or from ``theta`` (976,) and its statistics."""
+        theta_key, run_key = jax.random.split(key)
+        theta = initial_theta(theta_key, self._initial_scale) if theta is None else jnp.asarray(theta)
+        statistics = normalizer.empty(N_OBSERVATION) if statistics is None else statistics
+        return self.simulator.replicate(TrainState(strategy.init(theta, self.bgs_config), statistics, run_key))
+
+    def update(self, state: TrainState) -> tuple[TrainState, dict]:
+        """One update and its metrics (scalars on the device; fetch them rarely)."""
+        return self._update(state, self.pool)
+
+    def lower(self, state: TrainState):
+        """The update, lowered for ahead-of-time compilation (``.compile()``)."""
+        return self._update.lower(state, self.pool)
+
+    def _update_local(self, state: TrainState, pool: BallPool):
+        config, pairs = self.bgs_config, self.bgs_config.pairs
+        direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
+        directions = strategy.ask(direction_key, state.bgs, config)
+        theta = strategy.population(state.bgs, directions, config)
+        columns = pairs if self._crn else 2 * pairs
+        episodes = self.simulator.draw(
+            episode_key, pool, self._model, self._randomise, self._repeats, columns
+        )
+        if self._crn:
+            episodes = jax.tree.map(lambda x: jnp.concatenate([x, x], -1) if x.ndim >= 2 else x, episodes)
+        mean, inverse_scale = normalizer.normaliser(state.statistics)
+        simulator = self.simulator
+        result = simulator.rollout(simulator.local(theta), mean, inverse_scale, simulator.local(episodes))
+        result = self._weighed(result, state.bgs.updates)
+        # Everything that the devices have to share, in one sum: each fills in its own members.
+        member = result.returns.mean(axis=0)  # NaN when one of its episodes was not finite
+        failed = ~jnp.isfinite(member)
+        place = jax.lax.axis_index(AXIS) * member.shape[0]
+        members = jnp.zeros((2, 2 * pairs)).at[:, place + jnp.arange(member.shape[0])].set(
+            jnp.stack([jnp.where(failed, 0.0, member), failed])
+        )
+        sums, counts = result.observation_sums.sum(axis=-1), result.observation_counts.sum()
+        shared = (members, sums, counts.astype(jnp.float32), totals(result))
+        flat, unravel = ravel_pytree(shared)
+        members, sums, counts, total = unravel(jax.lax.psum(flat, AXIS))
+        member = jnp.where(members[1] > 0, jnp.nan, members[0])
+        bgs, info = strategy.tell(state.bgs, directions, member[:pairs], member[pairs:], config)
+        seen = normalizer.from_sums(counts.astype(jnp.int32), mean, sums[0], sums[1])
+        metrics = {
+            **{name: getattr(info, name) for name in ("gradient_norm", "update_norm", "failed_pairs", "elite_std")},
+            **means(total),
+        }
+        return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
+
+    def _weighed(self, result: RolloutResult, updates) -> RolloutResult:
+        """The result with the returns that the weights of this update give."""
+        if self._later is None:
+            return result
+        after, weights = self._later
+        returns = jnp.tensordot(jnp.array(weights, jnp.float32), jnp.where(result.finite, result.terms, 0.0), 1)
+        later = jnp.where(result.finite, returns, jnp.nan)
+        return replace(result, returns=jnp.where(updates >= after, later, result.returns))
+
+
+def totals(result: RolloutResult) -> dict:
+    """Sums over the finite episodes of a rollout, from which ``means`` makes metrics; sums of parts add up."""
+
+    def total(x):
+        return jnp.where(result.finite, x, 0.0).sum(axis=(-2, -1)).astype(jnp.float32)
+
+    return {
+        "episodes": total(jnp.ones_like(result.returns)),
+        "non_finite": (~result.finite).sum().astype(jnp.float32),
+        "mean_return": total(result.returns),
+        "return_rate": total(result.outcome == RETURNED),
+        "hit_rate": total(result.outcome != MISSED),
+        "steps": total(result.steps),
+        "terms": total(result.terms),
+    }
+
+
+def means(total: dict) -> dict:
+    """Metrics of finite episodes (scalars) from ``totals``; the reward terms are unweighted."""
+    count = jnp.maximum(total["episodes"], 1.0)
+    over = {k: total[k] / count for k in ("mean_return", "return_rate", "hit_rate", "steps")}
+    terms = {f"reward/{name}": total["terms"][i] / count for i, name in enumerate(rewards.TERMS)}
+    return {**over, "non_finite": total["non_finite"], **terms}

@@ -1,0 +1,199 @@
+"""Anonymous blocks: what no entry of the catalogue explains, as smooth functions that carry no name.
+
+A block is a family of small extra forces, kicks at the bounce or shifts of the measured position. Its effect on a
+measured flight follows from the flight's own transition matrix, bounce included, so nothing is simulated again:
+    dx(t) = Phi_x(t) sum over s < t of Phi(s)^-1 [0; a(s)] ds
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjx_tt.diagnosis.ball.forward_model import Grid
+from mjx_tt.diagnosis.ball.linearization import Linear
+
+DIRECTIONS = ("x", "y", "z", "along the flight")
+FORCES = (0, 3, 2)  # directions of forces: along y and along the flight are nearly one
+KNOTS = 4
+
+
+@dataclass(frozen=True)
+class Block:
+    """A family of unnamed effects: columns (m, 3, T, n) in metres for unit coefficients, and what each stands for."""
+
+    name: str
+    where: str
+    columns: np.ndarray
+    labels: tuple[str, ...]
+    directions: tuple[str, ...]
+
+
+def hats(value: np.ndarray, mask: np.ndarray, knots: int = KNOTS) -> tuple[np.ndarray, np.ndarray]:
+    """Linear B-splines (knots, ...) of a quantity between its 2nd and 98th percentile, and the knots."""
+    low, high = np.percentile(value[mask], [2, 98])
+    if high - low < 1e-9:
+        return np.zeros((0, *value.shape)), np.zeros(0)
+    places = np.linspace(low, high, knots)
+    u = (np.clip(value, low, high) - low) / (high - low) * (knots - 1)
+    return np.clip(1.0 - np.abs(u[None] - np.arange(knots).reshape((-1,) + (1,) * value.ndim)), 0.0, 1.0), places
+
+
+def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called: Sequence[str]) -> list[Block]:
+    """All families.
+
+    sessions: (n,) number of each ball's session; age: (n,) 0 to 1, how far into its session; called: the
+    sessions' names.
+    """
+    position, velocity = linear.base.position[:, :, 0], linear.base.velocity[:, :, 0]  # (3, T, n)
+    speed = np.linalg.norm(velocity, axis=0)
+    later = np.where(g.mask, g.time > linear.base.bounce_time[0], False).astype(float)
+    response, kicked = _propagators(linear, g)
+    out = []
+
+    def family(name, where, basis, labels, respond: Callable, along=(0, 1, 2)):
+        columns, names, directions = [], [], []
+        for phi, label in zip(basis, labels):
+            for d in along:
+                columns.append(respond(phi, d))
+                names.append(label)
+                directions.append(DIRECTIONS[d])
+        if columns:
+            out.append(Block(name, where, np.stack(columns), tuple(names), tuple(directions)))
+
+    def spline(name, quantity, unit, respond, knots=KNOTS, along=(0, 1, 2)):
+        basis, places = hats(quantity, g.mask, knots)
+        family(
+            name,
+            quantity_names[name.split(" over ")[1]],
+            basis,
+            [f"{name.split(' over ')[1]} near {p:.2f} {unit}" for p in places],
+            respond,
+            along,
+        )
+
+    quantity_names = {
+        "x": "across the table", "y": "along the table", "z": "with height", "speed": "with speed",
+        "session": "over the time in a session", "flight": "along the flight",
+    }  # fmt: skip
+    ages = np.broadcast_to(age, g.time.shape)
+    for name, quantity, unit in (
+        ("x", position[0], "m"), ("y", position[1], "m"), ("z", position[2], "m"), ("speed", speed, "m/s"),
+        ("session", ages, "of it"), ("flight", g.time, "s"),
+    ):  # fmt: skip
+        spline(f"force over {name}", quantity, unit, response, along=FORCES)
+    for name, quantity, unit in (("x", position[0], "m"), ("y", position[1], "m"), ("z", position[2], "m")):
+        spline(f"measured position over {name}", quantity, unit, lambda phi, d: _shift(phi, d), 5)
+    for name, coordinate in (("x", 0), ("y", 1), ("z", 2)):
+        steps, labels = _steps(position[coordinate], g.mask)
+        family(f"jump of the measured position at {name}", f"at a plane across {name}", steps, labels, _shift)
+    late = later[:, :] > 0.0
+    if late.any():
+        bx, by = linear.base.bounce[0, 0], linear.base.bounce[1, 0]
+        vin = np.linalg.norm(linear.base.bounce_velocity[:, 0], axis=0)
+        vz = -linear.base.bounce_velocity[2, 0]
+        bounced = np.isfinite(linear.base.bounce_time[0])
+
+        def kick(phi, d):
+            return kicked(phi, d)
+
+        def over(name, value, unit, knots=4):
+            basis, places = hats(np.where(bounced, value, np.nan_to_num(value[bounced].mean())), bounced, knots)
+            family(
+                f"bounce over {name}",
+                f"at the bounce, with {name}",
+                basis,
+                [f"{name} near {p:.2f} {unit}" for p in places],
+                kick,
+            )
+
+        over("x", bx, "m")
+        over("y", np.abs(by), "m from the net")
+        over("speed", vin, "m/s")
+        over("vertical speed", vz, "m/s")
+        over("time in the session", age, "of it")
+        cells, labels = _cells(bx, by, bounced)
+        family("bounce over the table", "at the bounce, by place", cells, labels, kick, (2,))
+    names = np.unique(sessions)
+    if len(names) > 1:
+        basis = np.stack([(sessions == s).astype(float) for s in names])
+        wide = [np.broadcast_to(b, g.time.shape) for b in basis]
+        labels = [f"session {called[s]}" for s in names]
+        family("force by session", "by session", wide, labels, response, FORCES)
+        if late.any():
+            family("bounce by session", "at the bounce, by session", basis, labels, kick)
+    crossing = _crossing(position[1], g)
+    if crossing.any():
+        family("force at the net", "over the net", [crossing], ["|y| < 0.15 m"], response, FORCES)
+    return out
+
+
+def _shift(phi: np.ndarray, d: int) -> np.ndarray:
+    column = np.zeros((3, *phi.shape))
+    column[d] = phi
+    return column
+
+
+def _steps(value: np.ndarray, mask: np.ndarray) -> tuple[list[np.ndarray], list[str]]:
+    places = np.percentile(value[mask], [20, 35, 50, 65, 80])
+    return [(value > p).astype(float) for p in places], [f"beyond {p:.2f} m" for p in places]
+
+
+def _cells(x: np.ndarray, y: np.ndarray, bounced: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Indicator of thirds across and along each half of the table, where enough balls land."""
+    cells, labels = [], []
+    for side in (-1.0, 1.0):
+        on = bounced & (np.sign(y) == side)
+        if on.sum() < 20:
+            continue
+        ex, ey = np.quantile(x[on], [0, 1 / 3, 2 / 3, 1]), np.quantile(y[on], [0, 1 / 3, 2 / 3, 1])
+        for i in range(3):
+            for j in range(3):
+                cell = on & (x >= ex[i]) & (x <= ex[i + 1]) & (y >= ey[j]) & (y <= ey[j + 1])
+                if cell.sum() >= 5:
+                    cells.append(cell.astype(float))
+                    labels.append(f"x {ex[i]:+.2f} to {ex[i + 1]:+.2f}, y {ey[j]:+.2f} to {ey[j + 1]:+.2f} m")
+    return np.array(cells).reshape(-1, len(x)), labels
+
+
+def _crossing(y: np.ndarray, g: Grid) -> np.ndarray:
+    return np.where(g.mask & (np.abs(y) < 0.15), 1.0, 0.0)
+
+
+def _propagators(linear: Linear, g: Grid):
+    """Functions that turn an acceleration profile (T, n) or a kick (n,) along an axis into a column (3, T, n)."""
+    # Components first, balls last: (6, 6, T, n).
+    inverse = np.ascontiguousarray(np.linalg.inv(linear.transition).transpose(2, 3, 1, 0))
+    place = np.ascontiguousarray(linear.transition[:, :, :3].transpose(2, 3, 1, 0))
+    velocity = linear.base.velocity[:, :, 0]
+    way = velocity / np.maximum(np.linalg.norm(velocity, axis=0), 1e-9)
+    dt = np.zeros_like(g.time)
+    dt[1:] = np.diff(g.time, axis=0)
+    bounce = linear.base.bounce_time[0]
+    after = (g.time > bounce[None]) & g.mask  # (T, n)
+
+    # Phi^-1 of a unit impulse along each axis and along the flight, (6, T, n) each. It acts on average half an interval
+    # before the sample.
+    impulse = inverse[:, 3:] + 0.5 * dt * inverse[:, :3]
+    pushed = [impulse[:, 0], impulse[:, 1], impulse[:, 2], (impulse * way).sum(axis=1)]
+
+    def carried(source: np.ndarray) -> np.ndarray:
+        """Sum over earlier samples of what Phi^-1 left of them (6, T, n), carried on."""
+        return (place * np.cumsum(source, axis=1)).sum(axis=1)
+
+    def response(phi: np.ndarray, d: int) -> np.ndarray:
+        profile = np.where(g.mask, phi, 0.0)
+        mean = np.zeros_like(profile)
+        mean[1:] = 0.5 * (profile[1:] + profile[:-1]) * dt[1:]
+        return carried(pushed[d] * mean)
+
+    since = g.time - np.where(np.isfinite(bounce), bounce, 0.0)[None]
+    first = after & (np.cumsum(after, axis=0) == 1)
+    kicks = [carried(np.where(first, inverse[:, 3 + d] + since * inverse[:, d], 0.0)) for d in range(3)]
+
+    def kicked(size: np.ndarray, d: int) -> np.ndarray:
+        return kicks[d] * size
+
+    return response, kicked

@@ -1,0 +1,205 @@
+"""What the model says a tracker would have measured: many balls under many variants of the model, in float64.
+
+The flights are those of ``ballmodel.flight``, bounces inside the step, so the diagnosis fits what the simulation does.
+Steps end at the samples' times; the camera's geometry and the tracker's filter are applied to what was flown. Variants
+(another parameter, another start) are one more batch axis, which is how derivatives are taken: by differences in
+float64, which also serve effects that start at a threshold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ballmodel import flight
+from ballmodel.flight import PaddlePose
+from ballmodel.partial_params import value_or, without_nominal
+from ballmodel.state import BallState
+from ballmodel.trajectory import Trajectory
+from mjx_tt.sim.model import SimModel, paths, with_values
+
+LONGEST_STEP = 0.01  # [s]; second order: 0.05 mm over a flight
+PAD = 16  # numbers of steps are rounded up to it, so that similar logs share one compiled program
+WIDTH = 2048  # columns, balls x variants, of one call: always the same, for the same reason
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Measured samples of n balls on the steps that lead to them; padded to one length."""
+
+    steps: np.ndarray  # (L, n) [s] of measured time, zero where there are fewer
+    index: np.ndarray  # (T, n) step after which sample t is taken; 0 is the start
+    time: np.ndarray  # (T, n) [s] since the first sample
+    measured: np.ndarray  # (3, T, n) [m]
+    mask: np.ndarray  # (T, n) True for a sample
+    paddle: PaddlePose | None = None  # the blade at the steps' ends, each quantity (3, L + 1, n)
+
+    @property
+    def n(self) -> int:
+        return self.mask.shape[1]
+
+
+def grid(trajectories: Sequence[Trajectory]) -> Grid:
+    """Puts trajectories on one padded grid."""
+    counts = [np.maximum(np.ceil(np.diff(t.time) / LONGEST_STEP * (1.0 - 1e-9)), 1.0).astype(int) for t in trajectories]
+    n, samples = len(trajectories), max(map(len, trajectories))
+    length = -(-max(int(c.sum()) for c in counts) // PAD) * PAD
+    steps, index, time = np.zeros((length, n)), np.zeros((samples, n), int), np.zeros((samples, n))
+    measured, mask = np.zeros((3, samples, n)), np.zeros((samples, n), bool)
+    for i, (t, count) in enumerate(zip(trajectories, counts)):
+        k, m = len(t), int(count.sum())
+        steps[:m, i] = np.repeat(np.diff(t.time) / count, count)
+        index[1:k, i] = np.cumsum(count)
+        index[k:, i] = m
+        time[:k, i], time[k:, i] = t.time - t.time[0], t.time[-1] - t.time[0]
+        measured[:, :k, i], measured[:, k:, i] = t.position, t.position[:, -1:]
+        mask[:k, i] = True
+    return Grid(steps, index, time, measured, mask)
+
+
+def picked(g: Grid, index: np.ndarray) -> Grid:
+    """The grid of the balls with these indices, which may repeat."""
+    paddle = g.paddle and jax.tree.map(lambda x: x[..., index], g.paddle)
+    return Grid(*(x[..., index] for x in (g.steps, g.index, g.time, g.measured, g.mask)), paddle)
+
+
+@dataclass(frozen=True)
+class Flown:
+    """Predictions for n balls under v variants."""
+
+    measured: np.ndarray  # (3, T, v, n) [m] what the tracker would report
+    position: np.ndarray  # (3, T, v, n) [m] true
+    velocity: np.ndarray  # (3, T, v, n) [m/s] true
+    bounce_time: np.ndarray  # (v, n) [s] of the first bounce since the first sample; inf without one
+    bounce: np.ndarray  # (3, v, n) [m] where
+    bounce_velocity: np.ndarray  # (3, v, n) [m/s] before it
+    hit_time: np.ndarray  # (v, n) [s] of the paddle's contact since the first sample; inf without one
+
+
+def heading_axes(velocity: np.ndarray) -> np.ndarray:
+    """(3, 3, n) axes in which a ball's spin is told, by its first velocity (3, n): topspin, against its way, sidespin.
+
+    For a ball that flies towards -y they are the table's x, y and z.
+    """
+    across = np.stack([-velocity[1], velocity[0]]) / np.maximum(np.hypot(velocity[0], velocity[1]), 1e-9)
+    x, y = across
+    zero = np.zeros_like(x)
+    return np.stack([np.stack([x, -y, zero]), np.stack([y, x, zero]), np.stack([zero, zero, zero + 1.0])])
+
+
+def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray, g: Grid, axes: np.ndarray) -> Flown:
+    """Flies every ball under every variant.
+
+    values: leaves of ``model`` to replace, each broadcastable to (v, n). start: (9, v, n) position, velocity, spin at
+    the first sample, the spin in ``axes`` (3, 3, n): component, axis, ball.
+    """
+    start = np.concatenate([start[:6], np.einsum("can,avn->cvn", axes, start[6:])])
+    v, n = start.shape[1:]
+    ball = np.tile(np.arange(n), v)  # column -> ball
+    flat = {k: np.broadcast_to(np.asarray(values[k], np.float64), (v, n)).ravel() for k in sorted(values)}
+    columns = start.reshape(9, -1)
+    parts = []
+    with jax.enable_x64(True):
+        for first in range(0, v * n, WIDTH):
+            # The last call is filled up with its last column: one shape, one compiled program.
+            mine = np.minimum(np.arange(first, first + WIDTH), v * n - 1)
+            some = ball[mine]
+            paddle = g.paddle and jax.tree.map(lambda x: np.moveaxis(x[..., some], 1, 0), g.paddle)
+            flown = _fly(
+                model, {k: x[mine] for k, x in flat.items()}, columns[:, mine], g.steps[:, some], g.index[:, some], paddle
+            )
+            keep = min(WIDTH, v * n - first)
+            parts.append([np.asarray(x)[..., :keep] for x in flown])
+    joined = (np.concatenate(x, axis=-1) for x in zip(*parts))
+    return Flown(*(x.reshape(*x.shape[:-1], v, n) for x in joined))
+
+
+@jax.jit
+def _fly(model: SimModel, values: dict, start, steps, index, paddle):
+    nominal_latency = model.latency.ball_observation
+    model = with_values(without_nominal(model), values)
+    # What was measured flew on: a trial start that grazes the net must not be stopped by it.
+    net = replace(model.ball.net, height=-1.0)
+    ball = replace(model.ball, flight=replace(model.ball.flight, integrator="midpoint"), net=net)
+    sensing = model.sensing
+    shape = start.shape[1:]
+    rate = jnp.broadcast_to(jnp.asarray(value_or(sensing.clock_rate, 1.0), start.dtype), shape)
+    smoothing = jnp.broadcast_to(jnp.asarray(value_or(sensing.smoothing, 0.0), start.dtype), shape)
+    tau = jnp.maximum(smoothing, 1e-9)
+
+    def follow(filtered, before, after, dt):
+        """The filter's output after a piece of straight motion: exact."""
+        slope = (after - before) / jnp.maximum(dt, 1e-9)
+        out = after - tau * slope + (filtered - before + tau * slope) * jnp.exp(-dt / tau)
+        return jnp.where(dt > 0.0, out, filtered)
+
+    # A ball that is stamped late meets the paddle of an earlier moment.
+    late = jnp.asarray(model.latency.ball_observation, start.dtype) - nominal_latency
+
+    def moved(pose):
+        turned = jnp.cross(pose.angular_velocity, pose.normal, axis=0)
+        return replace(pose, position=pose.position - late * pose.velocity, normal=pose.normal - late * turned)
+
+    def advance(carry, inputs):
+        state, filtered, elapsed, bounced, at, incoming, struck = carry
+        dt, *blade = inputs
+        dt = dt / rate
+        pair = tuple(jax.tree.map(lambda x: jnp.broadcast_to(x, (3, *shape)), moved(pose)) for pose in blade) or None
+        new, events = flight.step(ball, state, dt, pair)
+        moving = dt > 0.0
+        new = jax.tree.map(lambda a, b: jnp.where(moving, a, b), new, state)
+        landed = events.table & moving
+        hit = landed | (events.paddle & moving)
+        t = jnp.where(hit, events.time, dt)
+        corner = jnp.where(hit, events.position, new.position)
+        filtered = follow(follow(filtered, state.position, corner, t), corner, new.position, dt - t)
+        first = landed & (bounced == jnp.inf)
+        bounced = jnp.where(first, (elapsed + t) * rate, bounced)
+        at = jnp.where(first, events.position, at)
+        incoming = jnp.where(first, state.velocity, incoming)
+        struck = jnp.where(events.paddle & moving & (struck == jnp.inf), (elapsed + events.time) * rate, struck)
+        carry = (new, filtered, elapsed + dt, bounced, at, incoming, struck)
+        return carry, (new.position, new.velocity, filtered)
+
+    state = BallState(start[:3], start[3:6], start[6:])
+    zero = jnp.zeros_like(start[0])
+    # In steady motion the filter trails by tau v: it was running before the first sample.
+    filtered = start[:3] - smoothing * start[3:6]
+    carry = (state, filtered, zero, zero + jnp.inf, start[:3] * 0.0, start[:3] * 0.0, zero + jnp.inf)
+    blades = (
+        ()
+        if paddle is None
+        else tuple(jax.tree.map(lambda x: x[part], paddle) for part in (slice(None, -1), slice(1, None)))
+    )
+    (_, _, _, bounced, at, incoming, struck), (x, v, y) = jax.lax.scan(advance, carry, (steps, *blades))
+
+    def sampled(first, later):
+        at_steps = jnp.moveaxis(jnp.concatenate([first[None], later]), 0, 1)  # (3, L + 1, ...)
+        return jnp.take_along_axis(at_steps, index[None], axis=1)
+
+    position, velocity = sampled(state.position, x), sampled(state.velocity, v)
+    seen = jnp.where(smoothing > 0.0, sampled(filtered, y), position)
+    return _camera(sensing, seen), position, velocity, bounced, at, incoming, struck
+
+
+def _camera(sensing, p):
+    """Positions (3, ...) as the calibrated camera reports them: scale R (1 + k |p|^2) p + offset, R = Rz Ry Rx."""
+    bend, turns = value_or(sensing.camera_distortion, 0.0), ("x", "y", "z")
+    x, y, z = p * (1.0 + bend * jnp.sum(p * p, axis=0)) * value_or(sensing.camera_scale, 1.0)
+    angles = [value_or(getattr(sensing, f"camera_rotation_{axis}"), 0.0) for axis in turns]
+    c, s = jnp.cos(angles[0]), jnp.sin(angles[0])
+    y, z = c * y - s * z, s * y + c * z
+    c, s = jnp.cos(angles[1]), jnp.sin(angles[1])
+    x, z = c * x + s * z, c * z - s * x
+    c, s = jnp.cos(angles[2]), jnp.sin(angles[2])
+    x, y = c * x - s * y, s * x + c * y
+    return jnp.stack([x + sensing.ball_offset_x, y + sensing.ball_offset_y, z + sensing.ball_offset_z])
+
+
+def leaves(model: SimModel) -> dict[str, float]:
+    """Nominal values of the model's numbers by dotted path."""
+    return {k: float(v) for k, v in paths(model).items() if isinstance(v, int | float)}

@@ -1,0 +1,222 @@
+"""The model linearised at a set of causes: whitened residuals and columns, ball by ball, with the nuisances projected out.
+
+Everything is in absolute coordinates: the linear model is  target = E theta + M omega + N nu + noise, with theta the
+effects' changes from the nominal model, omega the spin of each ball, nu its start. So subsets that leave an effect out
+again are compared on the same footing as those that keep it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjx_tt.diagnosis.ball.effects import FLIGHT, Effect
+from mjx_tt.diagnosis.ball.forward_model import Flown, Grid, heading_axes, leaves, predict
+from mjx_tt.diagnosis.ball.noise import Noise, nominal_noise, robust_weights, whiten
+from mjx_tt.sim.model import SimModel
+
+SPIN = slice(6, 9)
+MAGNUS = FLIGHT + "magnus_coefficient"
+START_STEPS = np.array([1e-6] * 3 + [1e-5] * 3 + [0.1] * 3)  # [m], [m/s], [rad/s] of the differences
+REFERENCE_MAGNUS = 0.6  # k used where the nominal model has none: in flight only k omega shows (PHYSICS: 0.3 to 1.5)
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Where the model is linearised."""
+
+    theta: np.ndarray  # (K,) changes of the effects
+    start: np.ndarray  # (9, n)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The linearised model in measured units."""
+
+    residual: np.ndarray  # (3, T, n) [m] measured - predicted
+    starts: np.ndarray  # (9, 3, T, n) derivative by start position, velocity, spin
+    effects: np.ndarray  # (K, 3, T, n) derivative by the effects' changes
+    base: Flown  # with v = 1
+    transition: np.ndarray  # (n, T, 6, 6) derivative of true position and velocity by those at the start
+
+
+class BallProblem:
+    """Measured balls, the nominal model and the effects under trial; velocity: (3, n) tells where each ball heads."""
+
+    def __init__(self, g: Grid, model: SimModel, effects: Sequence[Effect], velocity: np.ndarray) -> None:
+        self.grid, self.model, self.effects = g, model, tuple(effects)
+        self.axes = heading_axes(velocity)
+        self.nominal = leaves(model)
+        names = [e.name for e in self.effects]
+        # The effect that holds k, where the nominal model has none: spin as a cause brings it along.
+        has_none = self.nominal[MAGNUS] == 0.0 and "magnus_coefficient" in names
+        self.coefficient = names.index("magnus_coefficient") if has_none else None
+
+    def values(self, theta: np.ndarray) -> dict:
+        """Leaves for changes theta (K, ...), which add up where effects share a parameter."""
+        base, shape = self.nominal, theta.shape[1:]
+        out: dict[str, np.ndarray] = {}
+        for effect, change in zip(self.effects, theta):
+            for path, value in effect.values(base, change).items():
+                out[path] = out.get(path, np.full(shape, base[path])) + (value - base[path])
+        out.setdefault(MAGNUS, np.full(shape, base[MAGNUS]))
+        return out
+
+    def fly(self, theta: np.ndarray, start: np.ndarray, g: Grid | None = None) -> Flown:
+        """Predictions for changes (K,) or (K, n) and starts (9, n)."""
+        g = self.grid if g is None else g
+        theta = theta[:, None, None] if theta.ndim == 1 else theta[:, None]
+        return predict(self.model, self.values(theta), start[:, None], g, self.axes)
+
+    def linearise(self, at: Situation, g: Grid | None = None) -> Linear:
+        """Residuals and derivatives at a situation."""
+        g = self.grid if g is None else g
+        k = len(self.effects)
+        moves = np.array([e.step if e.step is not None else 1e-3 * e.scale for e in self.effects])
+        # A step of its own is for an effect without a derivative at zero; elsewhere it would only blur.
+        moves = np.where(at.theta != 0.0, np.minimum(moves, np.maximum(0.1 * np.abs(at.theta), 1e-6)), moves)
+        # Variants: as it is; start moved (6); effects changed (k); and with a ball that air can bend: as it is, spun (3).
+        theta = np.repeat(at.theta[:, None], 11 + k, axis=1)
+        theta[np.arange(k), 7 + np.arange(k)] += moves
+        start = np.repeat(at.start[:, None], 11 + k, axis=1)
+        for i in range(6):
+            start[i, 1 + i] += START_STEPS[i]
+        for i in range(6, 9):
+            start[i, 2 + k + i] += START_STEPS[i]
+        values = self.values(theta[:, :, None])
+        values[MAGNUS] = values[MAGNUS].copy()
+        values[MAGNUS][7 + k :] = np.where(np.abs(values[MAGNUS][0]) > 0.05, values[MAGNUS][0], REFERENCE_MAGNUS)
+        flown = predict(self.model, values, start, g, self.axes)
+        base, bent = flown.measured[:, :, 0], flown.measured[:, :, 7 + k]
+
+        def slopes(variants: slice, before: np.ndarray, steps: np.ndarray) -> np.ndarray:
+            return np.moveaxis(flown.measured[:, :, variants] - before[:, :, None], 2, 0) / steps[:, None, None, None]
+
+        starts = slopes(slice(1, 7), base, START_STEPS[:6])
+        starts = np.concatenate([starts, slopes(slice(8 + k, 11 + k), bent, START_STEPS[6:])])
+        effects = slopes(slice(7, 7 + k), base, moves)
+        state = np.concatenate([flown.position, flown.velocity])[:, :, :7]
+        transition = (state[:, :, 1:] - state[:, :, :1]) / START_STEPS[None, None, :6, None]
+        residual = np.where(g.mask, g.measured - base, 0.0)
+        one = Flown(*(x[..., :1, :] for x in (
+            flown.measured, flown.position, flown.velocity, flown.bounce_time, flown.bounce, flown.bounce_velocity,
+            flown.hit_time,
+        )))  # fmt: skip
+        return Linear(residual, starts, effects, one, np.moveaxis(transition, (3, 1), (0, 1)))
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Whitened quantities ball by ball, starts projected out. K effects and their sums with the measured target."""
+
+    weight: np.ndarray  # (n, T) square roots of the robust weights
+    noise: Noise
+    gram: np.ndarray  # (n, K, K)
+    right: np.ndarray  # (n, K) with the absolute target
+    spin_gram: np.ndarray  # (n, 3, 3)
+    spin_effect: np.ndarray  # (n, 3, K)
+    spin_right: np.ndarray  # (n, 3)
+    coefficient: int | None  # the effect that comes along with spin
+
+
+def rows(x: np.ndarray, noise: Noise, weight: np.ndarray, g: Grid) -> np.ndarray:
+    """Whitened and weighted rows (n, 3 T, k) of columns (k, 3, T, n)."""
+    w = whiten(x, noise, g) * weight.T
+    return np.moveaxis(w, -1, 0).reshape(g.n, x.shape[0], -1).swapaxes(1, 2)
+
+
+def project(
+    linear: Linear, at: Situation, noise: Noise, weight: np.ndarray, g: Grid, coefficient: int | None = None
+) -> Projected:
+    """Whitens, projects the starts out and forms the products; the target is what the effects at zero leave."""
+    target = linear.residual + np.tensordot(at.theta, linear.effects, 1)
+    return StartsOut(linear, target, at.start, noise, weight, g).project(linear.effects, coefficient)
+
+
+class StartsOut:
+    """Flights whitened, starts projected out of spins and target: what any set of columns is judged against.
+
+    target: (3, T, n) [m], to which the spins of the starts (9, n) are added: it is that of balls without spin.
+    """
+
+    def __init__(
+        self, linear: Linear, target: np.ndarray, start: np.ndarray, noise: Noise, weight: np.ndarray, g: Grid
+    ) -> None:
+        self._noise, self._weight, self._grid = noise, weight, g
+        self._basis, _ = np.linalg.qr(rows(linear.starts[:6], noise, weight, g))
+        self._spins = remove(self._basis, rows(linear.starts[SPIN], noise, weight, g))
+        absolute = target + (linear.starts[SPIN] * start[SPIN][:, None, None]).sum(axis=0)
+        self._target = remove(self._basis, rows(np.where(g.mask, absolute, 0.0)[None], noise, weight, g))
+
+    def project(self, columns: np.ndarray, coefficient: int | None = None) -> Projected:
+        """The products of columns (K, 3, T, n) [m per unit]; coefficient: the one that comes along with spin."""
+        effects = remove(self._basis, rows(columns, self._noise, self._weight, self._grid))
+        et, st = effects.swapaxes(1, 2), self._spins.swapaxes(1, 2)
+        return Projected(
+            self._weight, self._noise, et @ effects, (et @ self._target)[..., 0], st @ self._spins, st @ effects,
+            (st @ self._target)[..., 0], coefficient,
+        )  # fmt: skip
+
+
+def remove(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Columns (n, m, k) without their part in the orthonormal basis (n, m, q)."""
+    return columns - basis @ (basis.swapaxes(1, 2) @ columns)
+
+
+def fit_starts(
+    problem: BallProblem, theta: np.ndarray, start: np.ndarray, g: Grid, noise: Noise | None = None,
+    prior: tuple[np.ndarray, np.ndarray] | None = None, rounds: int = 4, keep: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
+    """Starts (9, n) of all balls for given changes theta, (K,) or (K, n), by damped Gauss-Newton with robust weights.
+
+    prior: mean and standard deviation (3,) of the spin; without it the balls do not spin (or keep the spin given).
+    keep: (T, n) samples that count, all by default.
+    """
+    noise = nominal_noise(g) if noise is None else noise
+    mask = g.mask if keep is None else g.mask & keep
+    g = replace(g, mask=mask)
+    size = 6 if prior is None else 9
+    damping = np.full(g.n, 1e-9)
+    theta_v = np.repeat(theta[:, None], 1 + size, axis=1) if theta.ndim == 1 else theta[:, None]
+    if theta.ndim == 1:
+        theta_v = theta_v[:, :, None]
+    best_cost, best = np.full(g.n, np.inf), start
+    for _ in range(rounds + 1):
+        variants = np.repeat(start[:, None], 1 + size, axis=1)
+        for i in range(size):
+            variants[i, 1 + i] += START_STEPS[i]
+        flown = predict(
+            problem.model,
+            problem.values(np.broadcast_to(theta_v, (len(theta_v), 1 + size, g.n))),
+            variants,
+            g,
+            problem.axes,
+        )
+        base = flown.measured[:, :, 0]
+        columns = np.moveaxis(flown.measured[:, :, 1:] - base[:, :, None], 2, 0) / START_STEPS[:size, None, None, None]
+        residual = np.where(mask, g.measured - base, 0.0)
+        weight = robust_weights(residual, noise, g)
+        white = rows(residual[None], noise, weight, g)[..., 0]
+        cost = (white**2).sum(axis=1)
+        if prior is not None:
+            pull = (start[SPIN] - prior[0][:, None]) / prior[1][:, None]
+            cost = cost + (pull**2).sum(axis=0)
+        worse = ~(cost <= best_cost * (1.0 + 1e-9))
+        start = np.where(worse, best, start)
+        damping = np.where(worse, damping * 100.0 + 1e-6, damping * 0.1)
+        best_cost, best = np.where(worse, best_cost, cost), start
+        j = rows(columns, noise, weight, g)
+        normal, right = j.swapaxes(1, 2) @ j, (j.swapaxes(1, 2) @ white[..., None])[..., 0]
+        if prior is not None:
+            precision = 1.0 / prior[1] ** 2
+            normal[:, SPIN, SPIN] += np.diag(precision)
+            right[:, SPIN] -= (precision[:, None] * (start[SPIN] - prior[0][:, None])).T
+        scale = np.sqrt(np.diagonal(normal, axis1=1, axis2=2)) + 1e-12
+        damped = normal / scale[:, :, None] / scale[:, None, :] + damping[:, None, None] * np.eye(size)
+        change = np.linalg.solve(damped + 1e-12 * np.eye(size), (right / scale)[..., None])[..., 0] / scale
+        # A ball that was just set back waits: its derivatives belong to the rejected place.
+        start = start.copy()
+        start[:size] += np.where(worse[:, None], 0.0, change).T
+    return best

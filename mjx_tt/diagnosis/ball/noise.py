@@ -1,0 +1,100 @@
+"""The measurement noise as the residuals show it: its scale, its memory, its outliers.
+
+An honest noise model decides whether "something is wrong" means anything: trackers filter, so their noise remembers
+itself; it grows with distance; some samples are plain wrong. Scale and memory are estimated from the residuals, outliers
+are weighted down by Huber's rule, and every test downstream takes its spread from ball to ball.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjx_tt.diagnosis.ball.forward_model import Grid
+
+HUBER = 3.0  # whitened distance beyond which a sample counts linearly; a Gaussian's is beyond it in 3 % of cases
+NOMINAL_SCALE = 0.003  # [m] before anything is known
+LARGEST_MEMORY = 0.97
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of n balls: a first-order autoregression along the flight, across it, and upright to both.
+
+    Time stamps that shake make noise along the flight: in the table's axes it would leak into every one.
+    """
+
+    frame: np.ndarray  # (3, 3, T, n) unit vectors: axis, component
+    scale: np.ndarray  # (3, n) [m] standard deviation of a sample along each axis
+    memory: np.ndarray  # (3,) correlation of neighbouring samples
+    interval: float  # [s] usual time between neighbours
+
+
+def nominal_noise(g: Grid) -> Noise:
+    """Independent noise of NOMINAL_SCALE."""
+    frame = np.broadcast_to(np.eye(3)[:, :, None, None], (3, 3, *g.time.shape))
+    return Noise(frame, np.full((3, g.n), NOMINAL_SCALE), np.zeros(3), _interval(g))
+
+
+def flight_frame(velocity: np.ndarray) -> np.ndarray:
+    """(3, 3, T, n) axes of flights with velocities (3, T, n): along, across (level), upright to both."""
+    along = velocity / np.maximum(np.linalg.norm(velocity, axis=0), 1e-9)
+    across = np.stack([-along[1], along[0], np.zeros_like(along[0])])
+    across = across / np.maximum(np.linalg.norm(across, axis=0), 1e-9)
+    return np.stack([along, across, np.cross(along, across, axis=0)])
+
+
+def _interval(g: Grid) -> float:
+    gaps = np.diff(g.time, axis=0)[g.mask[1:] & (np.diff(g.time, axis=0) > 0.0)]
+    return float(np.median(gaps)) if gaps.size else 1.0
+
+
+def estimate(residual: np.ndarray, frame: np.ndarray, g: Grid, unknowns: int = 6) -> Noise:
+    """Noise of residuals (3, T, n) after a fit of ``unknowns`` numbers to each ball, along the axes of ``frame``."""
+    residual = np.einsum("actn,ctn->atn", frame, residual)
+    interval = _interval(g)
+    samples = g.mask.sum(axis=0)
+    freedom = np.sqrt(3.0 * samples / np.maximum(3.0 * samples - unknowns, 1.0))
+    masked = np.where(g.mask, residual, np.nan)
+    with np.errstate(all="ignore"):
+        own = 1.4826 * np.nanmedian(np.abs(masked), axis=1) * freedom  # (3, n)
+    shared = np.nanmedian(own, axis=1, keepdims=True)
+    # A ball's own scale, shrunk to the others': it carries about as much information as half its samples.
+    share = (samples / (samples + 20.0))[None]
+    scale = np.exp(share * np.log(np.maximum(own, 1e-9)) + (1.0 - share) * np.log(np.maximum(shared, 1e-9)))
+    scale = np.maximum(scale, 0.3 * shared + 1e-7)
+    z = np.clip(np.where(g.mask, residual / scale[:, None], 0.0), -HUBER, HUBER)
+    near = g.mask[1:] & g.mask[:-1] & (np.diff(g.time, axis=0) < 1.5 * interval)
+    memory = np.zeros(3)
+    for a in range(3):
+        pairs, square = (z[a, 1:] * z[a, :-1])[near].sum(), 0.5 * ((z[a, 1:] ** 2 + z[a, :-1] ** 2)[near]).sum()
+        r = pairs / max(square, 1e-12)
+        # The fit takes a share of the slow part: 1 + 3 r over the number of samples is the usual correction.
+        r = r + (1.0 + 4.0 * max(r, 0.0)) * (unknowns / 3.0) / max(float(samples.mean()), 1.0) * 0.5
+        memory[a] = np.clip(r, 0.0, LARGEST_MEMORY)
+    return Noise(frame, scale, memory, interval)
+
+
+def whiten(x: np.ndarray, noise: Noise, g: Grid) -> np.ndarray:
+    """Columns (..., 3, T, n) in units of independent noise; zero where there is no sample."""
+    x = np.where(g.mask, x, 0.0)
+    turn = noise.frame / noise.scale[:, None, None]
+    out = np.empty_like(x)
+    for a in range(3):  # written out: several times as fast as einsum, and this is called on every column of every fit
+        np.multiply(turn[a, 0], x[..., 0, :, :], out=out[..., a, :, :])
+        for c in (1, 2):
+            out[..., a, :, :] += turn[a, c] * x[..., c, :, :]
+    gap = np.zeros_like(g.time)
+    gap[1:] = np.diff(g.time, axis=0) / noise.interval
+    decay = np.where(g.mask, noise.memory[:, None, None] ** gap[None], 0.0)
+    decay[:, 0] = 0.0
+    out[..., 1:, :] -= decay[:, 1:] * out[..., :-1, :]
+    out *= np.where(g.mask, 1.0 / np.sqrt(1.0 - decay**2), 0.0)
+    return out
+
+
+def robust_weights(residual: np.ndarray, noise: Noise, g: Grid) -> np.ndarray:
+    """Square roots (n, T) of Huber's weights of the samples."""
+    distance = np.sqrt((whiten(residual, noise, g) ** 2).sum(axis=0))
+    return np.sqrt(np.minimum(1.0, HUBER / np.maximum(distance, 1e-9))).T

@@ -1,0 +1,199 @@
+"""What no entry of the catalogue explains: anonymous blocks that stay significant beside the chosen causes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri, fdtrc
+
+from mjx_tt.diagnosis.ball import basis_functions, selection
+from mjx_tt.diagnosis.ball import scores as evidence
+from mjx_tt.diagnosis.ball.forward_model import Grid
+from mjx_tt.diagnosis.ball.linearization import Linear, Projected, Situation, StartsOut
+from mjx_tt.diagnosis.ball.selection import Choice, Trial
+
+BLOCK_LEVEL = 2e-5  # chance of one block's false alarm
+BLOCK_FLOOR = 0.0025  # [m] shift that a block must cause on the balls it concerns
+VISIBLE_FLOOR = 2e-4  # [m] rms of what of it no other start of the ball could imitate, on one ball in twenty
+ODD_LEVEL = 1e-5  # chance with which one ball is called odd
+ODD_SHARE = 0.01  # of the balls that may be odd (mis-tracked) before they are a finding
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A block that stays significant."""
+
+    block: str
+    where: str
+    direction: str
+    size: float  # [m]
+    gain: float  # squared error that it explains
+
+
+def unexplained(
+    linear: Linear,
+    at: Situation,
+    p: Projected,
+    choice: Choice,
+    trial: Trial,
+    g: Grid,
+    sessions: np.ndarray,
+    age: np.ndarray,
+    called: Sequence[str],
+) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
+    """Blocks that stay significant beside the chosen causes, the most important first; names that hold beside it."""
+    out, holding = [], []
+    chosen = list(choice.effects)
+    if choice.magnus is not None:
+        chosen.append(p.coefficient)
+    effects = linear.effects[chosen]
+    # The chosen effects' own values are in the situation: what is left is scored at it (spins are kept absolute).
+    flights = StartsOut(linear, linear.residual, at.start, p.noise, p.weight, g)
+    for block in basis_functions.build(linear, g, sessions, age, called):
+        columns = np.concatenate([effects, block.columns])
+        both = flights.project(columns)
+        scores = evidence.with_spin(both, choice.prior.std) if choice.spin else evidence.without_spin(both)
+        extra = list(range(len(chosen), len(columns)))
+        base = [*range(len(chosen)), *scores.always]
+        own, gram = evidence.unexplained_scores(scores, base, extra)
+        p_value, beta = _joint_test(own, gram)
+        if p_value > BLOCK_LEVEL:
+            continue
+        pattern = np.tensordot(beta, block.columns, 1)
+        worst = np.linalg.norm(np.where(g.mask, pattern, 0.0), axis=0).max(axis=0)
+        size = float(np.percentile(worst, 90))
+        if size < BLOCK_FLOOR or _visible(scores.ball_gram[:, extra][:, :, extra], beta, p, g) < VISIBLE_FLOOR:
+            continue
+        axis = int(
+            np.argmax([np.percentile(np.abs(np.where(g.mask, pattern[a], 0.0)).max(axis=0), 90) for a in range(3)])
+        )
+        importance = np.abs(beta) * np.sqrt(np.maximum(np.diagonal(gram), 0.0))
+        best = int(np.argmax(importance))
+        change = evidence.solve(scores, (*base, *extra))
+        error = np.sqrt(np.maximum(np.diagonal(evidence.sandwich(scores, (*base, *extra))), 0.0))[: len(chosen)]
+        mean = change[len(chosen) : len(chosen) + len(scores.always)]
+        holding.append(_holding(choice, trial, change[: len(chosen)], error) | _spin_holding(choice, trial, mean, size))
+        out.append(
+            Finding(
+                block.name,
+                block.labels[best],
+                block.directions[best] or "xyz"[axis],
+                size,
+                _explained(own, gram),
+            )
+        )
+    odd = _odd_balls(linear, flights, choice, g)
+    if odd is not None:
+        out.append(odd)
+        holding.append({trial.effects[j].name for j in choice.effects} | ({"magnus"} if choice.spin else set()))
+    if not out:
+        return (), tuple(e.name for e in trial.effects) + ("magnus", "latency_jitter")
+    order = np.argsort([-f.gain for f in out])
+    return tuple(out[i] for i in order), tuple(holding[order[0]])
+
+
+def _holding(choice: Choice, trial: Trial, change: np.ndarray, error: np.ndarray) -> set[str]:
+    """Chosen effects that keep at least half of their size, and significance, when a block may take over from them."""
+    names = set()
+    for j, before, moved, e in zip(choice.effects, choice.theta, change, error):
+        now = before + moved
+        if abs(now) > selection.LEAST_Z * e and 0.5 < now / before < 2.0:
+            names.add(trial.effects[j].name)
+    return names
+
+
+def _spin_holding(choice: Choice, trial: Trial, mean: np.ndarray, size: float) -> set[str]:
+    """Spin, where the balls keep at least half of theirs, and their way of it, when a block may take over from it.
+
+    A spin that bends the flights less than the block, of size [m], does not stand beside it: it may be part of the block.
+    """
+    if not choice.spin:
+        return set()
+    spread = float((choice.prior.std**2).sum())
+    before, now = (np.sqrt(float((m**2).sum()) + spread) for m in (choice.prior.mean, mean))
+    same_way = float(choice.prior.mean @ mean) + spread > 0.0
+    return {"magnus"} if same_way and 0.5 < now / before < 2.0 and now * trial.spin_shift > size else set()
+
+
+def _joint_test(own: np.ndarray, gram: np.ndarray) -> tuple[float, np.ndarray]:
+    """Chance that scores (n, E) have mean zero, by Hotelling's T^2 over the balls, and the fitted coefficients."""
+    scale = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
+    useful = np.flatnonzero(scale > 1e-6 * scale.max())
+    beta = np.zeros(len(scale))
+    values, vectors = np.linalg.eigh(gram[np.ix_(useful, useful)] / scale[useful, None] / scale[useful])
+    keep = values > 1e-3 * values.max()
+    u = (own[:, useful] / scale[useful]) @ vectors[:, keep] / np.sqrt(values[keep])
+    n, e = u.shape
+    if n <= e + 5:
+        return 1.0, beta
+    mean = u.mean(axis=0)
+    t2 = n * mean @ np.linalg.lstsq(np.cov(u.T).reshape(e, e), mean, rcond=1e-9)[0]
+    beta[useful] = vectors[:, keep] @ (u.sum(axis=0) / np.sqrt(values[keep])) / scale[useful]
+    return float(fdtrc(e, n - e, t2 * (n - e) / (e * (n - 1)))), beta
+
+
+def _visible(gram: np.ndarray, beta: np.ndarray, p: Projected, g: Grid) -> float:
+    """Size [m], rms over a flight, of a pattern beyond what its ball's start explains: the 95th percentile of the balls."""
+    energy = np.einsum("i,nij,j->n", beta, gram, beta) / (3.0 * g.mask.sum(axis=0))
+    memory = float(p.noise.memory.mean())
+    # Slow patterns lose this factor when noise that remembers itself is whitened.
+    scale = np.median(p.noise.scale) * np.sqrt((1.0 + memory) / (1.0 - memory))
+    return float(np.percentile(np.sqrt(np.maximum(energy, 0.0)), 95) * scale)
+
+
+def _explained(own: np.ndarray, gram: np.ndarray) -> float:
+    total = own.sum(axis=0)
+    return float(total @ np.linalg.lstsq(gram, total, rcond=1e-6)[0])
+
+
+def _odd_balls(linear: Linear, flights: StartsOut, choice: Choice, g: Grid) -> Finding | None:
+    """Balls of their own kind: a smooth misfit that the others do not have."""
+    t = g.time / np.maximum(g.time.max(axis=0), 1e-9) * 2.0 - 1.0
+    columns = []
+    for poly in (
+        t**2,
+        t**3,
+        np.where(
+            g.time > linear.base.bounce_time[0],
+            g.time - np.where(np.isfinite(linear.base.bounce_time[0]), linear.base.bounce_time[0], 0.0),
+            0.0,
+        ),
+    ):
+        for a in range(3):
+            column = np.zeros((3, *t.shape))
+            column[a] = poly
+            columns.append(column)
+    both = flights.project(np.stack(columns))
+    gram, right = both.gram, both.right
+    if choice.spin:
+        inner = both.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
+        left = both.spin_right - both.spin_gram @ choice.prior.mean
+        gram = gram - both.spin_effect.swapaxes(1, 2) @ np.linalg.solve(inner, both.spin_effect)
+        mean = both.spin_effect.swapaxes(1, 2) @ choice.prior.mean
+        right = right - mean - (both.spin_effect.swapaxes(1, 2) @ np.linalg.solve(inner, left[..., None]))[..., 0]
+    scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-300))
+    unit = gram / scale[:, :, None] / scale[:, None, :]
+    values, vectors = np.linalg.eigh(unit)
+    keep = values > 1e-3
+    u = np.einsum("nij,ni->nj", vectors, right / scale) / np.sqrt(np.maximum(values, 1e-12))
+    q, freedom = (np.where(keep, u, 0.0) ** 2).sum(axis=1), np.maximum(keep.sum(axis=1), 1)
+    inflation = max(float(np.median(q / chdtri(freedom, 0.5))), 1.0)
+    odd = q / inflation > chdtri(freedom, ODD_LEVEL)
+    if odd.sum() < max(3, ODD_SHARE * g.n):
+        return None
+    beta = np.einsum("nij,nj->ni", vectors, np.where(keep, u / np.sqrt(np.maximum(values, 1e-12)), 0.0)) / scale
+    pattern = (np.stack(columns) * beta.T[:, None, None]).sum(axis=0)
+    per_axis = np.abs(np.where(g.mask, pattern, 0.0)).max(axis=1)[:, odd]
+    size = float(np.median(np.linalg.norm(pattern, axis=0).max(axis=0)[odd]))
+    if size < BLOCK_FLOOR:
+        return None
+    axis = "xyz"[int(np.argmax(np.median(per_axis, axis=1)))]
+    return Finding(
+        "a subset of the balls",
+        f"{int(odd.sum())} of {g.n} balls",
+        axis,
+        size,
+        float(q[odd].sum() / inflation),
+    )

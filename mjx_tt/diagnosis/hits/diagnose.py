@@ -1,0 +1,199 @@
+"""What the robot's hits say: the return as it was measured against the one that the model plays from the same ball.
+
+A hit scatters: where on the rubber, an encoder's tick, a millisecond. So hits are judged in a second step, with the ball's own
+causes settled: each gives one difference of place and one of velocity behind the paddle, and the spread from hit to hit
+is the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ballmodel.trajectory import Trajectory
+from mjx_tt.diagnosis.ball import scores as evidence
+from mjx_tt.diagnosis.ball import selection
+from mjx_tt.diagnosis.ball.diagnose import BallFindings, first_fit, flights, heading
+from mjx_tt.diagnosis.ball.effects import AT_THE_PADDLE, EFFECTS, Effect
+from mjx_tt.diagnosis.ball.forward_model import grid, predict
+from mjx_tt.diagnosis.ball.linearization import BallProblem
+from mjx_tt.diagnosis.ball.scores import Scores
+from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses, watched
+
+FEWEST_HITS = 12
+RETURN = 0.25  # [s] of each return that are used
+FARTHEST = 0.15  # [m] between measured and predicted return at the hit beyond which the model's blade missed the ball
+GAIN = 16.0  # evidence that an effect must bring
+LEAST_Z = 4.0
+LEAST_SHIFT = 0.010  # [m] of the return RETURN after the hit, below which an effect is of no interest
+ROUNDS = 3
+HUBER = 3.5  # deviations of a hit, in six numbers, beyond which it counts less
+
+
+@dataclass(frozen=True)
+class HitCause:
+    """One effect at the paddle."""
+
+    effect: Effect
+    rivals: tuple[Effect, ...]
+    change: float
+    error: float
+    shift: float  # [m] median shift of the return RETURN after the hit
+
+
+@dataclass(frozen=True)
+class HitFindings:
+    """What the hits say."""
+
+    causes: tuple[HitCause, ...]
+    hits: int
+    quiet: tuple[str, ...]  # effects that these hits could not show
+    before: np.ndarray  # (6, n) place [m] and velocity [m/s] behind the paddle, measured - nominal
+    after: np.ndarray  # (6, n) with the causes
+
+
+def diagnose_hits(
+    found: BallFindings, trajectories: Sequence[Trajectory], joints: JointPath | None, without: Sequence[str]
+) -> HitFindings | None:
+    """Judges the hits of the watched balls; None where there are fewer than FEWEST_HITS."""
+    pairs = []
+    for t in trajectories:
+        incoming = flights([t])
+        if not incoming or len(incoming[0]) + 6 > len(t) or not watched(t, joints) or incoming[0].position[1, -1] > 0.0:
+            continue
+        n0 = len(incoming[0])
+        stop = int(np.searchsorted(t.time, t.time[n0] + RETURN))
+        if stop - n0 >= 8:
+            pairs.append((t.part(0, stop), n0))
+    if len(pairs) < FEWEST_HITS:
+        return None
+    effects = tuple(e for e in EFFECTS if e.group == AT_THE_PADDLE and e.name not in without)
+    whole = [t for t, _ in pairs]
+    g = grid(whole)
+    g = replace(g, paddle=poses(whole, g.steps, joints))
+    n0 = np.array([n for _, n in pairs])
+    incoming = np.arange(len(g.time))[:, None] < n0[None]
+    problem = BallProblem(g, found.problem.model, (*found.problem.effects, *effects), heading(g))
+    theta = np.concatenate([found.situation.theta, np.zeros(len(effects))])
+    start = first_fit(problem, theta, found.choice.prior.mean if found.choice.spin else None, incoming)
+    change = np.zeros(len(effects))
+    first = usable = None
+    for _ in range(ROUNDS):
+        now = theta.copy()
+        now[-len(effects) :] = change
+        y, jacobian, hit = _compare(problem, now, start, incoming)
+        if first is None:
+            first = y
+            usable = np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)
+            if usable.sum() < FEWEST_HITS:
+                return None
+        target = y + np.einsum("kcn,k->cn", jacobian, change)
+        chosen, values, errors, scores = _choose(target[:, usable], jacobian[:, :, usable], effects)
+        change = np.zeros(len(effects))
+        change[list(chosen)] = values
+    shift = np.median(np.linalg.norm(jacobian[:, :3] + RETURN * jacobian[:, 3:], axis=1)[:, usable], axis=1)
+    causes = []
+    for i, value, error in zip(chosen, values, errors):
+        if abs(value) * shift[i] >= LEAST_SHIFT:
+            rivals = _rivals(scores, chosen, i, range(len(effects)))
+            causes.append(
+                HitCause(
+                    effects[i],
+                    tuple(effects[r] for r in rivals),
+                    float(value),
+                    float(error),
+                    float(abs(value) * shift[i]),
+                )
+            )
+    could = np.diagonal(scores.gram) * (2.0 * LEAST_SHIFT / np.maximum(shift, 1e-9)) ** 2 > GAIN
+    named = {c.effect.name for c in causes}
+    quiet = tuple(e.name for e, ok in zip(effects, could) if not ok and e.name not in named)
+    now = theta.copy()
+    now[-len(effects) :] = [c if e.name in named else 0.0 for c, e in zip(change, effects)]
+    after, _, _ = _compare(problem, now, start, incoming)
+    return HitFindings(tuple(causes), int(usable.sum()), quiet, first[:, usable], after[:, usable])
+
+
+def _compare(problem: BallProblem, theta: np.ndarray, start: np.ndarray, incoming: np.ndarray):
+    """Differences (6, n) behind the paddle, their derivatives (K, 6, n) by the paddle's effects, and hit times (n,)."""
+    g = problem.grid
+    paddle = [i for i, e in enumerate(problem.effects) if e.group == AT_THE_PADDLE]
+    variants = 1 + len(paddle)
+    thetas = np.repeat(theta[:, None], variants, axis=1)
+    moves = np.array([0.02 * problem.effects[i].scale for i in paddle])
+    thetas[paddle, 1 + np.arange(len(paddle))] += moves
+    flown = predict(
+        problem.model, problem.values(thetas[:, :, None]), np.repeat(start[:, None], variants, axis=1), g, problem.axes
+    )
+    out = g.mask & ~incoming
+    since = np.where(out, g.time - np.where(np.isfinite(flown.hit_time[0]), flown.hit_time[0], 0.0), 0.0)
+    weight = out.astype(float)
+    moments = np.array([[weight.sum(0), since.sum(0)], [since.sum(0), (since**2).sum(0)]])  # (2, 2, n)
+    inverse = np.linalg.inv(np.moveaxis(moments, -1, 0) + 1e-12 * np.eye(2))
+
+    def behind(difference: np.ndarray) -> np.ndarray:
+        """(..., 3, T, n) -> (..., 6, n): a line through the differences of the return."""
+        sums = np.stack([(difference * weight).sum(-2), (difference * since).sum(-2)], axis=-1)  # (..., 3, n, 2)
+        line = np.einsum("nij,...nj->i...n", inverse, sums)
+        return np.concatenate([line[0], line[1]], axis=-2)
+
+    y = behind(np.where(out, g.measured - flown.measured[:, :, 0], 0.0))
+    change = np.moveaxis(flown.measured[:, :, 1:] - flown.measured[:, :, :1], 2, 0)
+    return y, behind(np.where(out, change, 0.0)) / moves[:, None, None], flown.hit_time[0]
+
+
+def _choose(y: np.ndarray, jacobian: np.ndarray, effects: tuple[Effect, ...]):
+    """The best subset by penalised gain; hits are the clusters, their spread the noise."""
+    left, chosen = y - np.median(y, axis=1, keepdims=True), ()
+    for _ in range(ROUNDS):
+        root, weight = _spread(left)
+        j = np.einsum("cd,kdn->kcn", root, jacobian) * np.sqrt(weight)
+        t = root @ y * np.sqrt(weight)
+        gram = np.einsum("kcn,lcn->nkl", j, j)
+        right = np.einsum("kcn,cn->nk", j, t)
+        scores = Scores(gram.sum(axis=0), right.sum(axis=0), gram, right, 0.0, ())
+        gains = evidence.all_gains(scores, tuple(range(len(effects))))
+        chosen, values, errors = (), np.zeros(0), np.zeros(0)
+        for subset in sorted(gains, key=lambda s: GAIN * len(s) - gains[s]):
+            values = evidence.solve(scores, subset) if subset else np.zeros(0)
+            errors = np.sqrt(np.diagonal(evidence.sandwich(scores, subset))) if subset else np.zeros(0)
+            if np.all(np.abs(values) >= LEAST_Z * errors) and all(
+                abs(v) < selection.WIDEST * effects[i].scale for v, i in zip(values, subset)
+            ):
+                chosen = subset
+                break
+        left = (
+            y - np.einsum("kcn,k->cn", jacobian[list(chosen)], values)
+            if chosen
+            else y - np.median(y, axis=1, keepdims=True)
+        )
+    return chosen, values, errors, scores
+
+
+def _spread(left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Root (6, 6) of the inverse covariance of residuals (6, n), robustly, and Huber's weights (n,).
+
+    Place and velocity behind the paddle err together: a hit that is early by a millisecond is both ahead and faster.
+    """
+    scale = 1.4826 * np.median(np.abs(left), axis=1) + 1e-6
+    unit = left / scale[:, None]
+    root = np.eye(len(left))
+    for _ in range(5):
+        distance = np.sqrt(((root @ unit) ** 2).sum(axis=0))
+        weight = np.minimum(1.0, HUBER / np.maximum(distance, 1e-9))
+        covariance = (unit * weight) @ unit.T / weight.sum() + 0.05 * np.eye(len(left))
+        root = np.linalg.inv(np.linalg.cholesky(covariance))
+    return root / scale, weight
+
+
+def _rivals(scores: Scores, chosen: tuple[int, ...], member: int, candidates) -> tuple[int, ...]:
+    """Effects that explain the hits as well in place of a member."""
+    rest = tuple(c for c in chosen if c != member)
+    best = evidence.gain(scores, chosen)
+    return tuple(
+        c
+        for c in candidates
+        if c not in chosen and best - evidence.gain(scores, tuple(sorted((*rest, c)))) < selection.TIE
+    )

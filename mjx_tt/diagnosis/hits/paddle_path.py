@@ -1,0 +1,85 @@
+"""The paddle in a log: its pose over time, from the measured joints, for balls on the same clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ballmodel.flight import PaddlePose
+from ballmodel.trajectory import Trajectory
+from mjx_tt.diagnosis.joint.nominal import nominal_response
+from mjx_tt.diagnosis.joint.records import JointRecord
+from mjx_tt.robot import model as robot
+from mjx_tt.robot.kinematics import PaddleKinematics
+from mjx_tt.sim.model import SimModel
+from robot_io.contract import JOINT_NAMES
+
+HALF_WINDOW = 0.010  # [s] of the central difference that gives joint velocities: a few encoder samples
+FAR = 1e3  # [m] where the blade is parked for a ball that nobody watched the joints of
+
+
+@dataclass(frozen=True)
+class JointPath:
+    """Positions of all joints over time."""
+
+    time: tuple[np.ndarray, ...]  # eight of (m,) [s]
+    position: tuple[np.ndarray, ...]  # eight of (m,)
+
+    def covers(self, start: float, end: float) -> bool:
+        """Whether every joint was measured over this time."""
+        return all(t[0] <= start and t[-1] >= end for t in self.time)
+
+    def at(self, time: np.ndarray) -> np.ndarray:
+        """(8, ...) positions."""
+        return np.stack([np.interp(time, t, q) for t, q in zip(self.time, self.position)])
+
+
+def joint_path(records: Sequence[JointRecord], model: SimModel) -> JointPath | None:
+    """The path of a log that has all eight joints, None otherwise.
+
+    A position is as old as the model says that joint's measurement is when it is reported.
+    """
+    by_name = {r.joint: r for r in records}
+    if set(by_name) != set(JOINT_NAMES):
+        return None
+    mine = [by_name[name] for name in JOINT_NAMES]
+    time = tuple(r.state_time - nominal_response(model, r.joint).observation_delay for r in mine)
+    return JointPath(time, tuple(r.state_position for r in mine))
+
+
+def watched(trajectory: Trajectory, path: JointPath | None) -> bool:
+    """Whether the joints were measured all along a trajectory."""
+    return path is not None and path.covers(trajectory.time[0] - HALF_WINDOW, trajectory.time[-1] + HALF_WINDOW)
+
+
+def poses(trajectories: Sequence[Trajectory], steps: np.ndarray, path: JointPath | None) -> PaddlePose | None:
+    """The blade at the ends of all steps, each quantity (3, L + 1, n); None where no ball's joints were watched.
+
+    steps: (L, n) [s] of measured time from each trajectory's first sample on.
+    """
+    seen = np.array([watched(t, path) for t in trajectories])
+    if not seen.any():
+        return None
+    begin = np.array([t.time[0] for t in trajectories])
+    time = begin + np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
+    q = path.at(time)
+    qd = (path.at(time + HALF_WINDOW) - path.at(time - HALF_WINDOW)) / (2.0 * HALF_WINDOW)
+    with jax.enable_x64(True):
+        pose = jax.tree.map(np.asarray, _pose(q, qd))
+    return PaddlePose(pose.position + np.where(seen, 0.0, FAR), pose.normal, pose.velocity, pose.angular_velocity)
+
+
+@cache
+def _kinematics() -> PaddleKinematics:
+    model = robot.load_model()
+    return PaddleKinematics(robot.chain_from_model(model), robot.paddle_frame(model))
+
+
+@jax.jit
+def _pose(q, qd) -> PaddlePose:
+    return _kinematics().pose(jnp.asarray(q), jnp.asarray(qd))

@@ -1,0 +1,177 @@
+"""The task as a brax environment: one control step per step, for learners that look inside an episode.
+
+Batches are native: the keys given to ``reset`` decide the batch axes (B,), which stand last inside and first in what brax
+sees. A finished episode is followed at once by another one with a fresh ball, so no wrapper of brax is needed; those that
+repeat the first episode would train on one ball per place.
+
+Rewards. R(t) is the task's weighted return of an episode that stopped after control step t, the ball not yet flown out;
+the reward of a step is R(t) - R(t - 1), and at the last step R holds what became of the ball. An episode's rewards
+therefore add up to the return that ``rollout.Simulator`` computes, whatever its terms: counts such as collisions are paid
+when they happen, nearing the ball as it is neared, means over the steps as they move.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import Env, State
+
+from ballmodel.sampling import BallPool
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import Episodes, EpisodeState, Return
+from mjx_tt.sim.model import Range, SimModel
+from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION
+
+OBSERVATION_SIZE = HISTORY * N_OBSERVATION
+FEWEST_FLOWN = 16  # balls flown out together, at least
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Given:
+    """The controller whose action (8, ...) has been decided outside."""
+
+    action: jax.Array
+    mean: jax.Array  # (11,)
+
+    def start(self, observation):
+        return ()
+
+    def act(self, tick, state, observation):
+        return self.action, ()
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Playing:
+    """What an environment remembers between steps; batch axes last."""
+
+    tick: jax.Array  # () int32, common to the batch: where its rings stand
+    key: jax.Array  # of the episodes to come
+    episodes: Episodes
+    state: EpisodeState
+    history: jax.Array  # (8, 11, ...) observations, oldest first
+    earned: jax.Array  # (...) R so far
+
+
+class TableTennis(Env):
+    """Episodes of one simulator on balls of a pool, as ``Simulator.draw`` draws them.
+
+    Observation (..., 88): the last eight observations of the contract, oldest first, not normalised. Action (..., 8) in
+    [-1, 1]. ``done`` is 1 at the step that decided the episode; the state is then already that of the next one.
+    ``metrics`` at such a step, 0 at others: "hit" and "returned", 1 where the ball was, and "episode_return". Nothing is
+    ever truncated: an episode that reaches ``max_steps`` is over, as in the simulator.
+    """
+
+    def __init__(
+        self, simulator: Simulator, pool: BallPool, model: SimModel, randomise: tuple[Range, ...] = ()
+    ) -> None:
+        self._simulator, self._pool, self._model, self._randomise = simulator, pool, model, randomise
+        self._task = simulator.task
+
+    @property
+    def observation_size(self) -> int:
+        return OBSERVATION_SIZE
+
+    @property
+    def action_size(self) -> int:
+        return N_JOINTS
+
+    @property
+    def backend(self) -> str:
+        return self._task.config.engine
+
+    def reset(self, rng: jax.Array) -> State:
+        """``rng``: one key, or keys (B,); raw ones have a last axis of their own."""
+        typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
+        batch = rng.shape if typed else rng.shape[:-1]
+        first = rng.reshape(-1)[0] if typed else rng.reshape(-1, rng.shape[-1])[0]
+        draw_key, key = jax.random.split(first)
+        return self.begin(self.draw(draw_key, batch), key)
+
+    def draw(self, key, batch: tuple[int, ...]) -> Episodes:
+        """Fresh episodes of the batch shape."""
+        drawn = self._simulator.draw(key, self._pool, self._model, self._randomise, 1, int(np.prod(batch)))
+        return jax.tree.map(lambda x: x.reshape(*x.shape[:-2], *batch) if x.ndim >= 2 else x, drawn)
+
+    def begin(self, episodes: Episodes, key) -> State:
+        """The state before the first step of given episodes (...); ``key`` is for those that follow."""
+        state, tick = self._start(episodes), jnp.int32(0)
+        seen = self._task.observe(tick, state, episodes, self._task.prepare(episodes))
+        history = jnp.broadcast_to(seen, (HISTORY, *seen.shape))
+        zero = jnp.zeros(episodes.seed.shape)
+        playing = Playing(tick, key, episodes, state, history, zero)
+        metrics = {"hit": zero, "returned": zero, "episode_return": zero}
+        return State(playing, flatten(history), zero, zero, metrics, {"truncation": zero})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One control period under ``action`` (..., 8)."""
+        task, playing = self._task, state.pipeline_state
+        episodes, before = playing.episodes, playing.state
+        controller = Given(jnp.clip(jnp.moveaxis(action, -1, 0), -1.0, 1.0), jnp.zeros(N_OBSERVATION))
+        after = task.control_step(playing.tick, before, episodes, task.prepare(episodes), controller)
+        done = ~after.live | (after.sums.steps >= task.config.max_steps)
+        back = self._fly_out(after, done & after.hit & after.finite, episodes)
+        terms = task.reward_terms(after, back)
+        earned = sum(w * terms[i] for i, w in enumerate(task.config.reward_weights))
+        finite = after.finite & jnp.isfinite(earned)
+        reward = jnp.where(finite, earned - playing.earned, 0.0)
+        metrics = {
+            "hit": (done & finite & after.hit).astype(reward.dtype),
+            "returned": (finite & back.returned).astype(reward.dtype),
+            "episode_return": jnp.where(done & finite, earned, 0.0),
+        }
+
+        next_key, key = jax.random.split(playing.key)
+        fresh = self.draw(next_key, done.shape)
+        episodes = _where(done, fresh, episodes)
+        started = _where(done, self._start(episodes), after)
+        tick = playing.tick + 1
+        seen = task.observe(tick, started, episodes, task.prepare(episodes))
+        history = jnp.where(done, seen, jnp.concatenate([playing.history[1:], seen[None]]))
+        playing = Playing(tick, key, episodes, started, history, jnp.where(done, 0.0, earned))
+        return state.replace(
+            pipeline_state=playing,
+            obs=flatten(history),
+            reward=reward,
+            done=done.astype(reward.dtype),
+            metrics=state.metrics | metrics,
+        )
+
+    def _start(self, episodes: Episodes) -> EpisodeState:
+        return self._task.reset(episodes, Given(jnp.zeros(N_JOINTS), jnp.zeros(N_OBSERVATION)))
+
+    def _fly_out(self, state: EpisodeState, hit, episodes: Episodes) -> Return:
+        """What becomes of the balls that were hit in this step.
+
+        Few of a batch are at any one step: they are gathered, some at a time, until none is left.
+        """
+        task, ball, batch = self._task, state.ball, hit.shape
+        width = max(FEWEST_FLOWN, batch[0] // 16) if len(batch) == 1 else 0
+        if width == 0 or width >= batch[0]:
+            return task.fly_out(ball, hit, episodes.model)
+
+        def fly_some(carry):
+            left, back = carry
+            index = jnp.nonzero(left, size=width, fill_value=batch[0])[0]
+            some, model = jax.tree.map(lambda x: x[..., index] if x.ndim else x, (ball, episodes.model))
+            part = task.fly_out(some, index < batch[0], model)
+            back = jax.tree.map(lambda x, new: x.at[..., index].set(new, mode="drop"), back, part)
+            return left.at[index].set(False, mode="drop"), back
+
+        zero = jnp.zeros_like(ball.position[0])
+        back = Return(zero > 1.0, zero, zero > 1.0, ball.position[:2])
+        return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), fly_some, (hit, back))[1]
+
+
+def flatten(history):
+    """What a network sees (..., 88) of a history (8, 11, ...)."""
+    return jnp.moveaxis(history.reshape(OBSERVATION_SIZE, *history.shape[2:]), 0, -1)
+
+
+def _where(done, fresh, old):
+    """Of each leaf (..., B) the fresh entry where an episode is done; scalars of a batch are shared by its episodes."""
+    return jax.tree.map(lambda x, y: jnp.where(done, x, y) if x.ndim >= done.ndim else y, fresh, old)

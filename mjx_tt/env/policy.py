@@ -1,0 +1,113 @@
+"""The gated dilated CNN of 976 parameters in JAX, as a full convolution over the history and in streaming form.
+
+Architecture and parameter order: ``robot_io.contract``. Streaming keeps one past input, two past outputs of layer 1 and
+four of layer 2, which is all that the dilations 1, 2, 4 reach back to: 928 multiply-adds a control step instead of 4,576.
+
+Parameters may differ along a last axis of P perturbations: kernels are (2, in, out, P) and the batch of activations
+(channels, B) is R repeats of them, B = R x P with P the faster index. Sums over channels are written out so that each layer is one vector loop over the batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from mjx_tt.robot.scalar_algebra import materialise
+from robot_io.contract import DILATIONS, FILTERS, GATED, N_OBSERVATION, unflatten
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PolicyState:
+    """What streaming remembers, newest last."""
+
+    inputs: jax.Array  # (1, 11, ...) normalised observation of the tick before
+    layer1: jax.Array  # (2, 8, ...)
+    layer2: jax.Array  # (4, 12, ...)
+
+
+def initial_theta(key, scale: float = 0.1):
+    """Random parameters (976,), normal with standard deviation ``scale``; biases are drawn as well."""
+    return scale * jax.random.normal(key, (sum(_sizes()),))
+
+
+def _sizes():
+    inputs = N_OBSERVATION
+    for filters, gated in zip(FILTERS, GATED):
+        outputs = filters * (2 if gated else 1)
+        yield 2 * inputs * outputs + outputs
+        inputs = filters
+
+
+def _layer(kernel, bias, older, newer, gated: bool):
+    """One tap pair of a layer: older, newer (in, B) -> (out, B), with B = R x P for kernels of P perturbations."""
+    columns = kernel.shape[3] if kernel.ndim == 4 else 1
+    shape = (-1, columns) if kernel.ndim == 4 else newer.shape[1:]
+
+    def spread(w):  # (out, P) -> (out, 1, P)
+        return w[:, None] if kernel.ndim == 4 else w.reshape(w.shape + (1,) * (newer.ndim - 1))
+
+    z = spread(bias)
+    for c in range(older.shape[0]):
+        z = z + spread(kernel[0, c]) * older[c].reshape(shape) + spread(kernel[1, c]) * newer[c].reshape(shape)
+    z = materialise(z).reshape(-1, *newer.shape[1:])
+    if not gated:
+        return jnp.tanh(z)
+    half = z.shape[0] // 2
+    return jnp.tanh(z[:half]) * jax.nn.sigmoid(z[half:])
+
+
+def _layers(parameters):
+    return [(parameters[f"conv{i}/kernel"], parameters[f"conv{i}/bias"], gated) for i, gated in enumerate(GATED, 1)]
+
+
+def start(parameters: dict, x) -> PolicyState:
+    """State whose whole history is the first normalised observation ``x`` (11, ...)."""
+    one, two, _ = _layers(parameters)
+    h1 = _layer(*one[:2], x, x, one[2])
+    h2 = _layer(*two[:2], h1, h1, two[2])
+    return PolicyState(x[None], jnp.stack([h1] * DILATIONS[1]), jnp.stack([h2] * DILATIONS[2]))
+
+
+def stream(parameters: dict, state: PolicyState, x):
+    """One control step: normalised observation ``x`` (11, ...) -> action (8, ...) in [-1, 1] and the next state."""
+    one, two, three = _layers(parameters)
+    h1 = materialise(_layer(*one[:2], state.inputs[0], x, one[2]))
+    h2 = materialise(_layer(*two[:2], state.layer1[0], h1, two[2]))
+    action = _layer(*three[:2], state.layer2[0], h2, three[2])
+    return action, PolicyState(
+        x[None], jnp.concatenate([state.layer1[1:], h1[None]]), jnp.concatenate([state.layer2[1:], h2[None]])
+    )
+
+
+def apply(theta, history):
+    """The full convolution: theta (976,), normalised history (8, 11, ...) oldest first -> action (8, ...)."""
+    rows = history
+    for (kernel, bias, gated), dilation in zip(_layers(unflatten(theta)), DILATIONS):
+        rows = jnp.stack([_layer(kernel, bias, rows[t], rows[t + dilation], gated) for t in range(len(rows) - dilation)])
+    return rows[0]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PolicyController:
+    """The streaming policy as a ``task.Controller``: parameters of P perturbations and a frozen normaliser.
+
+    mean, inverse_scale: (11,), or (11, P) where every episode has parameters of its own (one repeat).
+    """
+
+    parameters: dict
+    mean: jax.Array
+    inverse_scale: jax.Array
+
+    def start(self, observation) -> PolicyState:
+        return start(self.parameters, self._normalised(observation))
+
+    def act(self, tick, state: PolicyState, observation):
+        return stream(self.parameters, state, self._normalised(observation))
+
+    def _normalised(self, x):
+        column = self.mean.shape + (1,) * (x.ndim - self.mean.ndim)
+        return (x - self.mean.reshape(column)) * self.inverse_scale.reshape(column)

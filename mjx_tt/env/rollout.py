@@ -1,0 +1,224 @@
+"""Perturbations x episodes in one compiled call, over one or several devices.
+
+Arrays are (component, repeat R, perturbation P). Repeats are sorted by the ball's time of arrival and run in blocks, each
+until its last live episode: blocks keep the working set in the cache and let fast balls end early. The perturbation
+axis can be split over devices (jax.sharding): every device runs its share, with no communication.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from ballmodel.partial_params import without_nominal
+from ballmodel.sampling import BallPool
+from ballmodel.state import BallState, where
+from mjx_tt.env.policy import PolicyController
+from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, Task, TaskConfig
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import Range, SimModel
+from robot_io.contract import unflatten
+
+AXIS = "perturbation"
+CPU_BLOCK = 768  # episodes per block that keep the state inside a core's cache
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class RolloutResult:
+    """What a batch of episodes gave, each (..., R, P)."""
+
+    terms: jax.Array  # (11, R, P) unweighted, order of rewards.TERMS
+    returns: jax.Array  # (R, P) weighted sum; NaN where the episode was not finite
+    outcome: jax.Array  # (R, P) int32: task.MISSED, HIT, RETURNED
+    landing: jax.Array  # (2, R, P) [m] where the outgoing ball came down to the table's height
+    finite: jax.Array  # (R, P) bool
+    steps: jax.Array  # (R, P) int32 control steps under the policy
+    peak_velocity: jax.Array  # (8, R, P) [m/s], [rad/s]
+    observation_sums: jax.Array  # (2, 11, P) sums of (x - mean) and of (x - mean)^2 over the finite episodes
+    observation_counts: jax.Array  # (P,) int32
+
+
+def _by_perturbation(rank: int) -> PartitionSpec:
+    return PartitionSpec(*[None] * (rank - 1), AXIS)
+
+
+# How a result that is left on the devices is laid out: split along P.
+RESULT_SPECS = RolloutResult(
+    terms=_by_perturbation(3), returns=_by_perturbation(2), outcome=_by_perturbation(2), landing=_by_perturbation(3),
+    finite=_by_perturbation(2), steps=_by_perturbation(2), peak_velocity=_by_perturbation(3),
+    observation_sums=_by_perturbation(3), observation_counts=_by_perturbation(1),
+)  # fmt: skip
+
+
+class Simulator:
+    """Draws and runs episodes of one task on ``devices`` devices.
+
+    Raises ValueError when fewer devices exist or a number of perturbations cannot be split evenly.
+    """
+
+    def __init__(self, config: TaskConfig, devices: int = 1) -> None:
+        available = jax.devices()
+        if not 1 <= devices <= len(available):
+            raise ValueError(f"{devices} devices wanted, this process has {len(available)}: {available}")
+        self.config = config
+        self.task = Task(config)
+        self.devices = devices
+        self._mesh = Mesh(np.array(available[:devices]), (AXIS,))
+        self._cpu = available[0].platform == "cpu"
+
+    def draw(
+        self, key, pool: BallPool, model: SimModel, randomise: tuple[Range, ...], repeats: int, columns: int
+    ) -> Episodes:
+        """Balls, latencies, noise seeds and randomised parameters of repeats x columns episodes.
+
+        Within each column the episodes are in the order of the balls' arrival. What the model leaves at its nominal
+        value and a program can do without is None in the episodes' model.
+        """
+        balls_key, latency_key, seed_key, model_key = jax.random.split(key, 4)
+        shape = (repeats, columns)
+        index = jax.random.randint(balls_key, shape, 0, pool.arrival.shape[0])
+        order = jnp.argsort(pool.arrival[index], axis=0)
+        index = jnp.take_along_axis(index, order, axis=0)
+        drawn = models.draw(model_key, model, randomise, shape)
+        ball: BallState = jax.tree.map(lambda x: x[:, index], pool.state)
+        spin = models.draw_spin(jax.random.fold_in(balls_key, 1), drawn.ball_spin, shape)
+        if spin is not None:
+            ball = replace(ball, spin=ball.spin + spin)
+        longest = jnp.array([self.config.max_observation_latency] * 3 + [self.config.max_action_latency] * 2)
+        return Episodes(
+            ball=ball,
+            latency=models.draw_latencies(latency_key, drawn.latency, shape, longest[:, None, None]),
+            seed=jax.random.bits(seed_key, shape, jnp.uint32),
+            model=jax.tree.map(jnp.asarray, without_nominal(drawn)),
+        )
+
+    def on_devices(self, function, **specs):
+        """``function`` run on every device at once, on the same arguments; inside it ``local`` picks a device's share.
+
+        specs: ``out_specs`` of jax.shard_map. What a function combines over devices it should combine in one collective:
+        several at a time starve the few threads that host devices share, and hang.
+        """
+        return jax.shard_map(function, mesh=self._mesh, in_specs=PartitionSpec(), check_vma=False, **specs)
+
+    def replicate(self, tree):
+        """The arrays of ``tree`` on every device: the layout that ``on_devices`` takes and returns."""
+        return jax.device_put(tree, NamedSharding(self._mesh, PartitionSpec()))
+
+    def local(self, tree):
+        """This device's share of arrays (..., P) along the last axis; only inside ``on_devices``. Scalars are shared."""
+        return jax.tree.map(lambda x: self._share(x) if x.ndim else x, tree)
+
+    def _share(self, x):
+        width = x.shape[-1] // self.devices
+        if width * self.devices != x.shape[-1]:
+            raise ValueError(f"{x.shape[-1]} perturbations cannot be split evenly over {self.devices} devices")
+        return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * width, width, axis=-1)
+
+    def rollout(self, theta, mean, inverse_scale, episodes: Episodes) -> RolloutResult:
+        """Runs theta (976, P), one column per perturbation, on episodes (R, P), with the normaliser (11,) frozen.
+
+        Runs on the device it is called for; ``on_devices`` and ``local`` spread it.
+        """
+        columns = theta.shape[-1]
+        if columns != episodes.seed.shape[-1]:
+            raise ValueError(f"theta has {columns} columns, the episodes {episodes.seed.shape[-1]}")
+        controller = PolicyController(unflatten(theta), mean, inverse_scale)
+        return self.play(controller, episodes)
+
+    def play(self, controller: Controller, episodes: Episodes) -> RolloutResult:
+        """Runs any controller on episodes (R, P), in blocks of whole rows."""
+        repeats, columns = episodes.seed.shape
+        rows = self._block_rows(repeats, columns)
+        blocks = repeats // rows
+
+        # Inside a block rows and columns are one axis: one long loop per operation instead of many short ones.
+        def cut(x):  # (..., R, P) -> (blocks, ..., rows x P); scalars are shared
+            if x.ndim < 2:
+                return jnp.broadcast_to(x, (blocks, *x.shape))
+            return jnp.moveaxis(x.reshape(*x.shape[:-2], blocks, rows * columns), -2, 0)
+
+        def join(x):  # (blocks, ..., rows x P) -> (..., R, P)
+            return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], repeats, columns)
+
+        run = partial(self._block, controller=controller)
+        result, sums, counts = jax.lax.map(run, jax.tree.map(cut, episodes))
+        return RolloutResult(
+            **{name: join(value) for name, value in result.items()},
+            observation_sums=sums.reshape(blocks, 2, -1, rows, columns).sum(axis=(0, 3)),
+            observation_counts=counts.reshape(blocks, rows, columns).sum(axis=(0, 1)),
+        )
+
+    def _block_rows(self, repeats: int, columns: int) -> int:
+        """Rows of a block: all of them on an accelerator; on a CPU the largest divisor that stays near CPU_BLOCK."""
+        if not self._cpu:
+            return repeats
+        wanted = max(1, CPU_BLOCK // columns)
+        return max(d for d in range(1, repeats + 1) if repeats % d == 0 and d <= wanted)
+
+    def _block(self, episodes: Episodes, controller: Controller):
+        task, config = self.task, self.config
+        prepared = task.prepare(episodes)
+
+        def running(carry):
+            tick, state = carry
+            return (tick < config.max_steps) & jnp.any(state.live)
+
+        def advance(carry):
+            tick, state = carry
+            return tick + 1, task.control_step(tick, state, episodes, prepared, controller)
+
+        state = task.reset(episodes, controller)
+        _, state = jax.lax.while_loop(running, advance, (jnp.int32(0), state))
+        back = task.fly_out(state.ball, state.hit & state.finite, episodes.model)
+        terms = task.reward_terms(state, back)
+        weights = np.asarray(config.reward_weights, terms.dtype)
+        returns = sum(w * terms[i] for i, w in enumerate(weights))
+        finite = state.finite & jnp.isfinite(returns)
+        returned = state.hit & back.returned & finite
+        outcome = jnp.where(returned, RETURNED, jnp.where(state.hit & finite, HIT, MISSED)).astype(jnp.int32)
+        observed = jnp.where(finite, jnp.stack([state.sums.observation, state.sums.observation_sq]), 0.0)
+        steps = state.sums.steps.astype(jnp.int32)
+        result = dict(
+            terms=terms,
+            returns=jnp.where(finite, returns, jnp.nan),
+            outcome=outcome,
+            landing=back.landing,
+            finite=finite,
+            steps=steps,
+            peak_velocity=state.sums.peak_velocity,
+        )
+        return result, observed, jnp.where(finite, steps, 0)
+
+    def replay(self, theta, mean, inverse_scale, episodes: Episodes):
+        """Plays single episodes for the camera: theta (976,), episodes (R, 1).
+
+        Returns joint positions (max_steps, 8, R), ball positions (max_steps, 3, R) at the control ticks and the number of
+        ticks (R,) until the ball came down.
+        """
+        task = self.task
+        controller = PolicyController(unflatten(theta[:, None]), mean, inverse_scale)
+        prepared = task.prepare(episodes)
+        state = task.reset(episodes, controller)
+        grounded = jnp.zeros_like(state.live)
+        outcome = task.fly_out(state.ball, grounded, episodes.model)
+        flight = replace(episodes.model.ball.flight, integrator="midpoint")
+        params = replace(episodes.model.ball, flight=flight)
+
+        def advance(carry, tick):
+            state, ball, flying, outcome, length = carry
+            shown = (state.qpos[..., 0], ball.position[..., 0])
+            new = task.control_step(tick, state, episodes, prepared, controller)
+            out, outcome, still = task.fly_out_step(params, ball, flying, outcome)
+            ball = where(state.hit, out, new.ball)
+            flying = still | (new.hit & ~state.hit)
+            return (new, ball, flying, outcome, jnp.where(new.live | flying, tick + 2, length)), shown
+
+        start = (state, state.ball, grounded, outcome, jnp.zeros(grounded.shape, jnp.int32))
+        (*_, length), (qpos, ball) = jax.lax.scan(advance, start, jnp.arange(self.config.max_steps))
+        return qpos, ball, jnp.minimum(length[..., 0], self.config.max_steps)

@@ -1,9 +1,0 @@
-"""Measured against simulated: what the model gets wrong, why, how sure that is, and what to measure next."""
-
-from __future__ import annotations
-
-from mjx_tt.gap.dataset import Logs, check, hashes, load, longest
-from mjx_tt.gap.diagnose import Diagnosis, diagnose
-from mjx_tt.gap.verdict import Verdict
-
-__all__ = ["Diagnosis", "Logs", "Verdict", "check", "diagnose", "hashes", "load", "longest"]

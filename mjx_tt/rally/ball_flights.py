@@ -1,0 +1,130 @@
+"""What happens in a rally besides the robot's part of a ball: balls without the robot, and the robot without a ball.
+
+Batch axis last; (L,) unless noted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ballmodel import constants as c
+from ballmodel import flight
+from ballmodel.flight import BallParams
+from ballmodel.state import BallState, where
+from mjx_tt.env.task import FLOOR
+from mjx_tt.rally.human_player import OVER_TABLE, Incoming
+from robot_io.contract import LIMITS
+
+LONGEST = 2.5  # [s] that a ball is followed
+HOME_SPEED, HOME_BRAKING = 0.5, 0.3  # shares of the limits on the way home, the defaults of robot_io.control.bridge
+HOME_DELAY = 0.1  # [s] to brake after the hit (estimate)
+READY = 0.06  # [s] between the bounce and the earliest contact (estimate)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Sent:
+    """What becomes of the players' balls if nobody plays them."""
+
+    net: jax.Array  # bool: touches it
+    own_side: jax.Array  # bool: bounces on the human's half
+    valid: jax.Array  # bool: comes down on the robot's half, from above and without a bounce before
+    landing: jax.Array  # (2, L) [m] there
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Meeting:
+    """How the robot's returns come to the players."""
+
+    incoming: Incoming
+    reached: jax.Array  # bool: could be hit before it bounced again or fell to the floor
+    net: jax.Array  # bool: touched it on the way
+
+
+def _alone(params: BallParams) -> BallParams:
+    """Alone in the air a ball needs no substeps if they are of second order."""
+    return replace(params, flight=replace(params.flight, integrator="midpoint"))
+
+
+def sent(params: BallParams, ball: BallState, period: float) -> Sent:
+    """Flies balls (3, L) until they come down, in steps of ``period`` [s]."""
+    params, false = _alone(params), jnp.zeros(ball.position.shape[1:], bool)
+    start = Sent(false, false, false, jnp.zeros((2, *false.shape)))
+
+    def flying(carry):
+        tick, _, live, _ = carry
+        return (tick < LONGEST / period) & jnp.any(live)
+
+    def advance(carry):
+        tick, ball, live, found = carry
+        new, events = flight.step(params, ball, period)
+        own = live & events.table & (events.position[1] > 0.0)
+        valid = live & events.table & (events.position[1] <= 0.0) & (events.position[2] > 0.0)
+        found = Sent(
+            net=found.net | (live & events.net),
+            own_side=found.own_side | own,
+            valid=found.valid | valid,
+            landing=jnp.where(valid, events.position[:2], found.landing),
+        )
+        live = live & ~valid & ~own & (new.position[2] > FLOOR)
+        return tick + 1, where(live, new, ball), live, found
+
+    return jax.lax.while_loop(flying, advance, (0, ball, ~false, start))[3]
+
+
+def meeting(params: BallParams, ball: BallState, returned, plane, height, period: float) -> Meeting:
+    """Flies the robot's returns (3, L) to the player: to the wished plane y or height z [m], whichever comes first.
+
+    returned: which balls to fly. The contact is looked for once per ``period`` [s].
+    """
+    params, zero = _alone(params), jnp.zeros_like(ball.position[0])
+    start = Meeting(Incoming(ball, jnp.zeros_like(ball.position[:2]), zero), zero > 1.0, zero > 1.0)
+
+    def flying(carry):
+        tick, _, live, _, _ = carry
+        return (tick < LONGEST / period) & jnp.any(live)
+
+    def advance(carry):
+        tick, ball, live, since, met = carry
+        new, events = flight.step(params, ball, period)
+        net = met.net | (live & events.net)
+        bounced = since > 0.0
+        bounce = live & events.table & (events.position[1] > 0.0) & ~bounced
+        again = live & events.table & bounced
+        landing = jnp.where(bounce, events.position[:2], met.incoming.landing)
+        since = jnp.where(bounced, since + period, jnp.where(bounce, period - events.time + 1e-6, 0.0))
+        # A ball over the table is taken before it bounces again.
+        over = (new.position[1] < c.TABLE_LENGTH / 2) & (jnp.abs(new.position[0]) < c.TABLE_WIDTH / 2)
+        lowest = jnp.where(over, jnp.maximum(height, OVER_TABLE), height)
+        fallen = (new.position[2] <= lowest) & (new.velocity[2] < 0.0)
+        contact = live & bounced & (since > READY) & ~again & ((new.position[1] >= plane) | fallen)
+        lost = live & ~contact & (again | (new.position[2] < FLOOR))
+        live = live & ~contact & ~lost
+        seconds = jnp.where(live | contact, (tick + 1) * period, met.incoming.seconds)
+        incoming = Incoming(where(contact, new, met.incoming.ball), landing, seconds)
+        return tick + 1, where(live, new, ball), live, since, Meeting(incoming, met.reached | contact, net)
+
+    return jax.lax.while_loop(flying, advance, (0, ball, returned, zero, start))[4]
+
+
+def homeward(home, qpos, seconds):
+    """Joint positions (8, L) ``seconds`` (L,) after the hit, on the way home (8,) as the bridge drives it."""
+    speed, braking = HOME_SPEED * column(LIMITS.policy_velocity), HOME_BRAKING * column(LIMITS.acceleration)
+    error, driven = column(home) - qpos, jnp.maximum(seconds - HOME_DELAY, 0.0)
+    distance = jnp.abs(error)
+    # At full speed until the braking distance, then along the parabola b / 2 (T - t)^2 that is left.
+    stop = jnp.minimum(speed**2 / (2.0 * braking), distance)
+    cruise = (distance - stop) / speed
+    braked = jnp.maximum(jnp.sqrt(2.0 * stop / braking) - (driven - cruise), 0.0)
+    moved = jnp.where(driven < cruise, speed * driven, distance - 0.5 * braking * braked**2)
+    return qpos + jnp.sign(error) * jnp.clip(moved, 0.0, distance)
+
+
+def column(values):
+    """Numbers of the joints as (8, 1)."""
+    return jnp.asarray(np.asarray(values, np.float32))[:, None]

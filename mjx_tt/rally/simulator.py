@@ -1,0 +1,315 @@
+"""Rallies of virtual players with a policy, many at once, to their ends, with the paper's attribution of those ends.
+
+Every lane holds one player, one policy and one world. Its turns are the task's episodes: the player's ball, the robot's
+part of it as ``task`` plays it, the outgoing ball to the player's next contact. A turn is a pure function of all lanes;
+rallies that ended begin anew in the next turn, until every lane has played its number, in one compiled call.
+
+After a hit the robot goes home as the bridge drives it, and starts the next episode as far on its way as the time
+allowed. A fault of the robot (it touches itself or the table, or an episode is not finite) stops it in the arm's own
+home pose: the rally is over, and the next ball is a dummy that only brings it back to the start pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from ballmodel.distribution import BallDistribution
+from ballmodel.partial_params import without_nominal
+from ballmodel.state import BallState, where
+from mjx_tt.env import rewards
+from mjx_tt.env.policy import PolicyController
+from mjx_tt.env.task import HIT, MISSED, RETURNED, Episodes, Task, TaskConfig
+from mjx_tt.rally import ball_flights, human_player
+from mjx_tt.rally.ball_flights import column, homeward
+from mjx_tt.rally.end_reasons import End, ending
+from mjx_tt.rally.human_player import Player, PlayerState
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import SimModel
+from robot_io.contract import LIMITS, N_JOINTS, unflatten
+
+ENDLESS = 1_000_000  # touches
+FAULT = -2.0  # reward of a robot's fault, the paper's table of rewards
+IDLE = 0.05  # share of the policy's velocity limits that a robot which "did not react" stays under
+BLIND = 0.003  # probability that the tracker loses a first ball and the robot does not react (estimate)
+BY_HAND = 0.5  # share of the dummy balls that are thrown by hand
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Box:
+    """Bounds of a ball distribution: position (3), velocity (3), landing (2); (8,) or (8, L)."""
+
+    low: jax.Array
+    high: jax.Array
+
+    @staticmethod
+    def of(distribution: BallDistribution) -> Box:
+        d = distribution
+        return Box(
+            jnp.array([*d.position_min, *d.velocity_min, *d.landing_min]),
+            jnp.array([*d.position_max, *d.velocity_max, *d.landing_max]),
+        )
+
+    def holds(self, ball: BallState, landing):
+        """Whether balls (3, ...) with landing (2, ...) lie inside, (...)."""
+        values = jnp.concatenate([ball.position, ball.velocity, landing])
+        low, high = (x.reshape(x.shape + (1,) * (values.ndim - x.ndim)) for x in (self.low, self.high))
+        return jnp.all((values >= low) & (values <= high), axis=0)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class RallyState:
+    """Lanes between two turns; the next ball is about to leave the player's paddle. All (L,) unless noted."""
+
+    player: PlayerState
+    ball: BallState  # (3, L)
+    touches: jax.Array  # int32 paddle touches of this rally so far, the coming ball's included
+    start: jax.Array  # (8, L) joint positions of the robot
+    dummy: jax.Array  # bool: the robot stands in the arm's own home pose
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ShotResult:
+    """One turn of every lane; (L,) unless noted."""
+
+    ball: BallState  # (3, L) the player's ball as it left the paddle
+    first: jax.Array  # bool: it started a rally
+    touch: jax.Array  # int32 its number in the rally, 1 for the first
+    landing: jax.Array  # (2, L) [m] where it bounced on the robot's side, NaN where it did not
+    terms: jax.Array  # (11, L) unweighted reward terms, the fault among them
+    finite: jax.Array  # bool
+    outcome: jax.Array  # int32: task.MISSED, HIT, RETURNED
+    fault: jax.Array  # bool: the robot stopped itself
+    end: jax.Array  # int8 End; NONE where the rally goes on
+    return_landing: jax.Array  # (2, L) [m] where the robot's ball came down, NaN where it hit none
+    robot_peak: jax.Array  # (8, L) [m/s], [rad/s]
+    seconds: jax.Array  # [s] until the player's next contact, or until the ball was over
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class BallLog:
+    """Human hits, up to a capacity per lane: (capacity, L), components first; slots past ``count`` are zero."""
+
+    rally: jax.Array  # int32 index of the rally in its lane
+    touch: jax.Array  # int32
+    position: jax.Array  # (3, capacity, L) [m] at the human's contact
+    velocity: jax.Array  # (3, capacity, L) [m/s]
+    spin: jax.Array  # (3, capacity, L) [rad/s]
+    landing: jax.Array  # (2, capacity, L) [m] on the robot's side, NaN where there was none
+    hit: jax.Array  # bool: by the robot
+    returned: jax.Array  # bool
+    return_landing: jax.Array  # (2, capacity, L) [m], NaN where the robot hit none
+    count: jax.Array  # (L,) int32 hits, those that found no room included
+
+    @property
+    def first(self):
+        """(capacity, L) bool: balls that started a rally."""
+        return self.touch == 1
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class RallyResult:
+    """Rallies of all lanes, (rallies, L) each."""
+
+    length: jax.Array  # int32 paddle touches of human and robot
+    end: jax.Array  # int8 End
+    seconds: jax.Array  # [s] of play
+    balls: BallLog
+    player: PlayerState  # (L,) as the session left them
+
+
+class RallySimulator:
+    """Plays rallies under one task configuration, all lanes on the default device."""
+
+    def __init__(self, config: TaskConfig) -> None:
+        self.config = config
+        self.task = Task(config)
+        self._play = jax.jit(self._play_all, static_argnames=("rallies", "max_touches", "capacity"))
+        self._shots = jax.jit(self._turn)
+        self._start = jax.jit(self._start_lanes, static_argnames="lanes")
+
+    def start(self, player: Player, model: SimModel, key, lanes: int) -> RallyState:
+        """Fresh players about to hit a first ball, the robot at home."""
+        return self._start(player, without_nominal(model), key, lanes=lanes)
+
+    def shots(self, theta, mean, inverse_scale, player: Player, model: SimModel, state: RallyState, key, box=None):
+        """Every lane plays one ball: the player's answer where the rally goes on, else a new first ball.
+
+        theta (976, L), mean and inverse_scale (11, L) or (11,); player and model with leaves scalar or (L,); box: None, or
+        the ``Box`` beyond which balls are out of distribution. Returns the next state and the ShotResult. A lane whose
+        robot stands still after a fault gets its dummy ball unseen, between two turns.
+        """
+        state, result, _ = self._shots(theta, mean, inverse_scale, player, without_nominal(model), state, key, box)
+        return replace(state, dummy=jnp.zeros_like(state.dummy)), result
+
+    def play(
+        self, theta, mean, inverse_scale, player: Player, model: SimModel, key, rallies: int,
+        box: Box | BallDistribution | None = None, max_touches: int = 400, capacity: int = 0,
+    ) -> RallyResult:  # fmt: skip
+        """``rallies`` rallies of every lane, one after the other, in one compiled call.
+
+        theta (976, L), mean and inverse_scale (11, L) or (11,); player and model: leaves scalar or (L,). box: what is out
+        of distribution, None: nothing is. A rally is broken off (End.NONE) at max_touches. capacity: human hits per lane
+        that the log keeps.
+        """
+        box = Box.of(box) if isinstance(box, BallDistribution) else box
+        return self._play(
+            jnp.asarray(theta), mean, inverse_scale, player, without_nominal(model), key, box,
+            rallies=rallies, max_touches=max_touches, capacity=max(capacity, 1),
+        )  # fmt: skip
+
+    # -- turns ---------------------------------------------------------------------------------------------------------
+
+    def _start_lanes(self, player, model, key, lanes: int) -> RallyState:
+        fresh = human_player.fresh((lanes,))
+        ball = human_player.first_ball(player, fresh, key, (lanes,))
+        home = jnp.broadcast_to(jnp.asarray(self.task.home, jnp.float32)[:, None], (N_JOINTS, lanes))
+        return RallyState(fresh, ball, jnp.ones(lanes, jnp.int32), home, jnp.zeros(lanes, bool))
+
+    def _turn(
+        self, theta, mean, inverse_scale, player: Player, model: SimModel, state: RallyState, key, box,
+        max_touches: int = ENDLESS,
+    ):  # fmt: skip
+        """One ball of every lane. Returns the next state, the result and the paddle touches of each rally so far."""
+        lanes = state.touches.shape[0]
+        keys = iter(jax.random.split(key, 8))
+        ball, first = state.ball, state.touches == 1
+        sent = ball_flights.sent(model.ball, ball, self.config.period)
+        robot = self._robot(next(keys), theta, mean, inverse_scale, model, ball, state.start)
+        blind = first & (jax.random.uniform(next(keys), (lanes,)) < BLIND)
+        finite = robot.finite
+        fault = ((robot.sums.collision > 0.0) | ~finite) & ~blind
+        hit = robot.hit & finite & ~fault & ~blind
+        played = replace(robot, hit=hit)
+        back = self.task.fly_out(robot.ball, hit, model)
+        returned = hit & back.returned
+        terms = self.task.reward_terms(played, back)
+        terms = terms.at[rewards.TERMS.index("fault")].set(jnp.where(fault, FAULT, 0.0))
+        outcome = jnp.where(returned, RETURNED, jnp.where(hit, HIT, MISSED)).astype(jnp.int32)
+
+        plane, height = human_player.wish(player, next(keys), (lanes,))
+        met = ball_flights.meeting(model.ball, robot.ball, returned, plane, height, self.config.period)
+        answer = human_player.answer(player, state.player, next(keys), met.incoming, model.ball.flight)
+        answered = returned & met.reached & answer.hit
+        goes_on = answered & (state.touches + 2 <= max_touches)
+        idle = jnp.all(robot.sums.peak_velocity < IDLE * column(LIMITS.policy_velocity), axis=0)
+        inside = jnp.ones(lanes, bool) if box is None else box.holds(ball, jnp.where(sent.valid, sent.landing, 0.0))
+        end = ending(first, sent, outcome, answered, met, blind | idle, inside)
+
+        learnt = jax.tree.map(partial(jnp.where, returned & met.reached), answer.state, state.player)
+        rested = human_player.rested(player, learnt)
+        fresh_ball = human_player.first_ball(player, rested, next(keys), (lanes,))
+        pose = homeward(self.task.home, robot.qpos, met.incoming.seconds)
+        after = RallyState(
+            player=jax.tree.map(partial(jnp.where, goes_on), learnt, rested),
+            ball=where(goes_on, answer.ball, fresh_ball),
+            touches=jnp.where(goes_on, state.touches + 2, 1),
+            start=jnp.where(goes_on, pose, column(self.task.home)),
+            dummy=fault,
+        )
+        steps = robot.sums.steps * self.config.period
+        nowhere = jnp.full((2, lanes), jnp.nan)
+        result = ShotResult(
+            ball=ball, first=first, touch=state.touches, landing=jnp.where(sent.valid, sent.landing, nowhere),
+            terms=terms, finite=finite, outcome=outcome, fault=fault, end=end.astype(jnp.int8),
+            return_landing=jnp.where(hit, back.landing, nowhere), robot_peak=robot.sums.peak_velocity,
+            seconds=steps + jnp.where(returned, met.incoming.seconds, 0.0),
+        )  # fmt: skip
+        return after, result, state.touches + hit
+
+    def _robot(self, key, theta, mean, inverse_scale, model: SimModel, ball: BallState, start):
+        """The robot's part of one episode: its last state."""
+        latency_key, seed_key = jax.random.split(key)
+        lanes = ball.position.shape[1:]
+        longest = jnp.array([self.config.max_observation_latency] * 3 + [self.config.max_action_latency] * 2)[:, None]
+        episodes = Episodes(
+            ball=ball,
+            latency=models.draw_latencies(latency_key, model.latency, lanes, longest),
+            seed=jax.random.bits(seed_key, lanes, jnp.uint32),
+            model=model,
+            start=start,
+        )
+        task, controller = self.task, PolicyController(unflatten(theta), mean, inverse_scale)
+        prepared = task.prepare(episodes)
+
+        def running(carry):
+            tick, state = carry
+            return (tick < self.config.max_steps) & jnp.any(state.live)
+
+        def advance(carry):
+            tick, state = carry
+            return tick + 1, task.control_step(tick, state, episodes, prepared, controller)
+
+        return jax.lax.while_loop(running, advance, (jnp.int32(0), task.reset(episodes, controller)))[1]
+
+    # -- sessions ------------------------------------------------------------------------------------------------------
+
+    def _play_all(self, theta, mean, inverse_scale, player, model, key, box, *, rallies, max_touches, capacity):
+        lanes = theta.shape[-1]
+        start_key, key = jax.random.split(key)
+        lane = jnp.arange(lanes)
+        state = self._start_lanes(player, model, start_key, lanes)
+        table = (
+            jnp.zeros((rallies, lanes), jnp.int32), jnp.full((rallies, lanes), End.NONE, jnp.int8), jnp.zeros((rallies, lanes)),
+        )  # fmt: skip
+        whole, some = jnp.zeros((capacity, lanes), jnp.int32), jnp.zeros((capacity, lanes), bool)
+        three, two = (jnp.zeros((n, capacity, lanes)) for n in (3, 2))
+        log = BallLog(whole, whole, three, three, three, two, some, some, two, jnp.zeros(lanes, jnp.int32))
+
+        def unfinished(carry):
+            turn, _, done, *_ = carry
+            return jnp.any(done < rallies) & (turn < rallies * (max_touches + 2))
+
+        def advance(carry):
+            turn, state, done, seconds, (length, end, spent), log = carry
+            key_turn, key_dummy = jax.random.split(jax.random.fold_in(key, turn))
+            after, shot, touches = self._turn(
+                theta, mean, inverse_scale, player, model, state, key_turn, box, max_touches
+            )
+            # A dummy ball is a turn of its own in which nobody plays: the ball that waits is thrown afterwards.
+            dummy, playing = state.dummy, done < rallies
+            by_hand = jax.random.uniform(key_dummy, dummy.shape) < BY_HAND
+            over = playing & (dummy | (after.touches == 1))
+            why = jnp.where(dummy, jnp.where(by_hand, End.DUMMY_BY_HAND, End.DUMMY_WITH_PADDLE), shot.end)
+            touches = jnp.where(dummy, jnp.where(by_hand, 0, 1), touches)
+            seconds = seconds + jnp.where(dummy, 0.0, shot.seconds)
+            row = jnp.where(over, done, rallies)  # a row past the end: nothing is written
+            length = length.at[row, lane].set(touches, mode="drop")
+            end = end.at[row, lane].set(why.astype(jnp.int8), mode="drop")
+            spent = spent.at[row, lane].set(seconds, mode="drop")
+            log = _logged(log, done, shot, playing & ~dummy, lane)
+            state = replace(jax.tree.map(partial(jnp.where, dummy), state, after), dummy=after.dummy & ~dummy)
+            return turn + 1, state, done + over, jnp.where(over, 0.0, seconds), (length, end, spent), log
+
+        carry = (jnp.int32(0), state, jnp.zeros(lanes, jnp.int32), jnp.zeros(lanes), table, log)
+        _, state, _, _, (length, end, spent), log = jax.lax.while_loop(unfinished, advance, carry)
+        return RallyResult(length, end, spent, log, state.player)
+
+
+def _logged(log: BallLog, rally, shot: ShotResult, keep, lane) -> BallLog:
+    capacity = log.touch.shape[0]
+    slot = jnp.where(keep, log.count, capacity)
+
+    def put(buffer, value):
+        return buffer.at[..., slot, lane].set(value, mode="drop")
+
+    return BallLog(
+        rally=put(log.rally, rally),
+        touch=put(log.touch, shot.touch),
+        position=put(log.position, shot.ball.position),
+        velocity=put(log.velocity, shot.ball.velocity),
+        spin=put(log.spin, shot.ball.spin),
+        landing=put(log.landing, shot.landing),
+        hit=put(log.hit, shot.outcome != MISSED),
+        returned=put(log.returned, shot.outcome == RETURNED),
+        return_landing=put(log.return_landing, shot.return_landing),
+        count=log.count + keep,
+    )

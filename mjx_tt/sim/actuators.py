@@ -1,0 +1,171 @@
+"""What a joint's drive makes of its velocity command u before the simulated servo follows it, and of its position then.
+
+    1. u is held for a control period and arrives ``action_delay`` later than the joint's drawn latency says
+    2. dead band: 0 where |u| < deadband
+    3. Coulomb friction, as the velocity it costs: u - c sign(u) where |u| > c, else 0
+    4. times velocity_gain
+    5. clipped to +-velocity_limit
+    6. first-order lag: dv/dt = (u - v) / lag
+    7. |dv/dt| <= acceleration_limit
+    8. the servo of the MJCF follows v: dq/dt = v but for the arm's dynamics
+    9. backlash b: what the joint carries follows q with play, and moves only when |q - output| reaches b / 2
+   10. measured is output(t - observation delay) + joint_offset
+
+Steps 2 to 5 have no memory and act on the commands, 6 and 7 are solved exactly over a substep in which u is constant.
+A model without drives (``SimModel.drives`` None), or an effect that no joint departs from, costs nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+
+from ballmodel.partial_params import optional, value_or
+from robot_io.contract import JOINT_NAMES, LIMITS
+
+# "No limit" as numbers that no drive reaches: ten times the fastest joint's speed, and up to it within 10 microseconds.
+NO_VELOCITY_LIMIT = 10.0 * max(LIMITS.velocity)  # [m/s], [rad/s]
+NO_ACCELERATION_LIMIT = 1e5 * NO_VELOCITY_LIMIT  # [m/s^2], [rad/s^2]
+SHORTEST = 1e-9  # [s], keeps exponents finite
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class JointDrive:
+    """One joint's drive; nominal it does nothing. Every field is a scalar or has the episodes' batch shape.
+
+    Units are those of the joint: [m] for the gantry's axes, [rad] for the arm's joints.
+    """
+
+    action_delay: jax.Array | float | None = optional(0.0)  # [s] more than latency.abb_action or festo_action draws
+    observation_delay: jax.Array | float | None = optional(0.0)  # [s] more than latency.*_observation draws
+    lag: jax.Array | float | None = optional(0.0)  # [s]
+    velocity_gain: jax.Array | float | None = optional(1.0)  # reached over commanded, beside actuation.velocity_gain
+    joint_offset: jax.Array | float | None = optional(0.0)  # [m], [rad] measured less true position
+    velocity_limit: jax.Array | float | None = optional(NO_VELOCITY_LIMIT)  # [m/s], [rad/s]
+    acceleration_limit: jax.Array | float | None = optional(NO_ACCELERATION_LIMIT)  # [m/s^2], [rad/s^2]
+    backlash: jax.Array | float | None = optional(0.0)  # [m], [rad] width of the play
+    coulomb_friction: jax.Array | float | None = optional(0.0)  # [m/s], [rad/s] that friction costs
+    deadband: jax.Array | float | None = optional(0.0)  # [m/s], [rad/s]
+
+
+EFFECTS = tuple(f.name for f in dataclasses.fields(JointDrive))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class DriveParams:
+    """The eight joints' drives, by ``robot_io.contract.JOINT_NAMES``."""
+
+    gantry_x: JointDrive = field(default_factory=JointDrive)
+    gantry_y: JointDrive = field(default_factory=JointDrive)
+    joint_1: JointDrive = field(default_factory=JointDrive)
+    joint_2: JointDrive = field(default_factory=JointDrive)
+    joint_3: JointDrive = field(default_factory=JointDrive)
+    joint_4: JointDrive = field(default_factory=JointDrive)
+    joint_5: JointDrive = field(default_factory=JointDrive)
+    joint_6: JointDrive = field(default_factory=JointDrive)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Drives:
+    """The same by effect, each (8, ...), None where no joint has it: ready for the loop."""
+
+    action_delay: jax.Array | None
+    observation_delay: jax.Array | None
+    lag: jax.Array | None
+    velocity_gain: jax.Array | None
+    joint_offset: jax.Array | None
+    velocity_limit: jax.Array | None
+    acceleration_limit: jax.Array | None
+    backlash: jax.Array | None
+    coulomb_friction: jax.Array | None
+    deadband: jax.Array | None
+
+    @property
+    def follows(self) -> bool:
+        """Whether the velocity needs time to follow its command."""
+        return self.lag is not None or self.acceleration_limit is not None
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class DriveState:
+    """What the drives remember; None where nothing has to be."""
+
+    velocity: jax.Array | None  # (8, ...) [m/s], [rad/s] v of steps 6 and 7
+    output: jax.Array | None  # (8, ...) [m], [rad] position behind the play
+
+
+def by_effect(params: DriveParams | None, shape: tuple[int, ...], dtype) -> Drives:
+    """The drives' numbers as arrays (8, *shape)."""
+    nominal = {f.name: f.default for f in dataclasses.fields(JointDrive)}
+
+    def column(effect: str):
+        values = [getattr(getattr(params, joint), effect) for joint in JOINT_NAMES] if params is not None else [None]
+        if all(value is None for value in values):
+            return None
+        return jnp.stack([jnp.broadcast_to(jnp.asarray(value_or(v, nominal[effect]), dtype), shape) for v in values])
+
+    return Drives(**{effect: column(effect) for effect in EFFECTS})
+
+
+def at_rest(drives: Drives, qpos) -> DriveState:
+    """The drives of a robot that stands at qpos (8, ...), in the middle of every play."""
+    return DriveState(
+        jnp.zeros_like(qpos) if drives.follows else None, qpos if drives.backlash is not None else None
+    )
+
+
+def reachable(drives: Drives, command):
+    """Steps 2 to 5: the velocity (8, ...) that a delayed command (8, ...) asks of the drive in the end."""
+    u = command
+    if drives.deadband is not None:
+        u = jnp.where(jnp.abs(u) < drives.deadband, 0.0, u)
+    if drives.coulomb_friction is not None:
+        u = jnp.sign(u) * jnp.maximum(jnp.abs(u) - drives.coulomb_friction, 0.0)
+    if drives.velocity_gain is not None:
+        u = u * drives.velocity_gain
+    if drives.velocity_limit is not None:
+        u = jnp.clip(u, -drives.velocity_limit, drives.velocity_limit)
+    return u
+
+
+def follow(drives: Drives, state: DriveState, u, timestep: float) -> tuple[jax.Array, DriveState]:
+    """Steps 6 and 7 over one substep [s] of constant u (8, ...): the mean velocity in it, and the state at its end.
+
+    As long as the lag asks for more than the acceleration limit a, v moves at a; that ends at |u - v| = a lag, and from
+    there on the difference decays exponentially. The servo gets the mean, with which its way is exact.
+    """
+    if not drives.follows:
+        return u, state
+    v = state.velocity
+    lag = jnp.zeros_like(v) if drives.lag is None else jnp.maximum(drives.lag, 0.0)
+    gap = u - v
+    if drives.acceleration_limit is None:
+        limited, speed_up = jnp.zeros_like(v), jnp.zeros_like(v)
+    else:
+        a = drives.acceleration_limit
+        limited = jnp.clip((jnp.abs(gap) - a * lag) / a, 0.0, timestep)  # [s] spent at the limit
+        speed_up = jnp.sign(gap) * a * limited
+    rest = timestep - limited
+    left = gap - speed_up  # u - v when the limit is left
+    decay = jnp.exp(-rest / jnp.maximum(lag, SHORTEST))
+    way = (v + 0.5 * speed_up) * limited + u * rest - left * lag * (1.0 - decay)
+    return way / timestep, DriveState(u - left * decay, state.output)
+
+
+def carry(drives: Drives, state: DriveState, qpos, qvel, timestep: float):
+    """Step 9 over one substep: position and velocity (8, ...) of what the joints carry, and the state.
+
+    qpos, qvel: of the joints at the substep's end.
+    """
+    if drives.backlash is None:
+        return qpos, qvel, state
+    half = 0.5 * drives.backlash
+    output = jnp.clip(state.output, qpos - half, qpos + half)
+    return output, (output - state.output) / timestep, DriveState(state.velocity, output)

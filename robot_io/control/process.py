@@ -1,0 +1,312 @@
+"""The control process: one thread around select() for the arm, the tracker, the operator and the 75 Hz tick.
+
+Started by ``start``; it talks with its owner over a pipe:
+    to it    ("prepare",) ("arm",) ("stop",) ("reset",) ("discard",) ("pause", bool)
+             ("policy", theta, mean, inverse_scale) ("quit",)
+    from it  ("ready", report) ("status", dict) ("episode", EpisodeSummary, ball (n, 4)) ("refused", sentence)
+             ("failed", sentence) ("ended", statistics)
+When the owner goes away, the robot is stopped and the process ends.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import select
+import signal
+import time
+from collections import deque
+from dataclasses import asdict, dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robot_io import log
+from robot_io.contract import unflatten
+from robot_io.control import realtime
+from robot_io.control.bridge import Bridge, BridgeConfig, State
+from robot_io.control.config import RobotConfig, linear_axes
+from robot_io.control.timings import Timings
+from robot_io.devices.egm.session import EgmConfig, EgmSession, EgmSocket
+from robot_io.devices.festo import AxesThread
+from robot_io.devices.tracker import Tracker, TrackerSocket
+from robot_io.errors import RefusedError
+from robot_io.policy import artefact as artefacts
+from robot_io.policy.numpy_policy import StreamingPolicy
+from robot_io.safety.gate import SafetyGate
+
+STATUS_PERIOD = 0.2  # [s]
+STOP_TIME = 2.0  # [s] for coming to rest before the process ends
+
+
+@dataclass(frozen=True)
+class ControlOptions:
+    """artefact: folder; backend: "numpy" or "jit"; log_folder and log_name of the MCAP, None: no log."""
+
+    artefact: str
+    backend: str = "numpy"
+    log_folder: str | None = None
+    log_name: str = "session"
+    metadata: tuple[tuple[str, str], ...] = ()
+    attachments: tuple[tuple[str, str], ...] = ()
+
+
+def make_policy(backend: str, parameters, mean, inverse_scale):
+    """A policy for the loop. Raises ValueError for an unknown backend."""
+    if backend == "numpy":
+        return StreamingPolicy(parameters, mean, inverse_scale)
+    if backend == "jit":
+        from robot_io.policy.jax_policy import JitPolicy  # imports JAX
+
+        return JitPolicy(parameters, mean, inverse_scale)
+    raise ValueError(f"policy backend {backend!r}, allowed: numpy, jit")
+
+
+def start(config: RobotConfig, options: ControlOptions) -> tuple[multiprocessing.Process, Connection]:
+    """Starts the process; the first message on the pipe is "ready" or "failed"."""
+    context = multiprocessing.get_context("spawn")
+    mine, theirs = context.Pipe()
+    process = context.Process(target=_main, args=(config, options, theirs), name="control")
+    process.start()
+    theirs.close()
+    return process, mine
+
+
+def _main(config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the owner, who asks for an orderly stop
+    try:
+        control = Control(config, options, pipe)
+    except Exception as error:
+        pipe.send(("failed", f"{error}" or type(error).__name__))
+        return
+    with control:
+        control.run()
+
+
+class Control:
+    """Sockets, thread and recorder around a ``Bridge``; use as a context manager."""
+
+    def __init__(self, config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
+        self._config, self._options, self._pipe = config, options, pipe
+        loaded = artefacts.load(options.artefact)
+        policy = make_policy(options.backend, loaded.parameters, loaded.normaliser_mean, loaded.normaliser_inverse_scale)
+        self.timings = Timings()
+        self._opened: list = []
+        try:
+            self._arm_socket = self._open(EgmSocket(config.arm.host, config.arm.port))
+            self._tracker_socket = self._open(TrackerSocket(config.tracker))
+            recorder = log.NullRecorder()
+            if options.log_folder is not None:
+                metadata = {"artefact": options.artefact, "artefact_sha256": loaded.digest, "robot": config.name}
+                recorder = log.Recorder.start(
+                    options.log_folder, options.log_name, metadata | dict(options.metadata), dict(options.attachments)
+                )
+            self._recorder = self._open(recorder)
+            self._axes = self._open(AxesThread(linear_axes(config)))
+            self._session = EgmSession(EgmConfig(config.arm.controller, timeout=config.arm.timeout))
+            self._tracker = Tracker(config.tracker)
+            gate = SafetyGate(config=config.safety)
+            bridge_config = BridgeConfig(delays=config.delays)
+            self.bridge = Bridge(
+                self._session, self._axes, self._tracker, gate, policy, bridge_config, recorder, self._episode
+            )
+            self._warm_up(policy, gate)
+        except BaseException:
+            self._close()
+            raise
+        self._done = False
+        self._unsent: deque = deque()
+        self._status_at = 0.0
+        self._period = 1.0 / config.rate
+
+    def _open(self, thing):
+        self._opened.append(thing)
+        return thing
+
+    def __enter__(self) -> Control:
+        return self
+
+    def __exit__(self, *exc_info) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        """In the opposite order: the axes stop before the log ends."""
+        for thing in reversed(self._opened):
+            thing.close()
+        self._opened.clear()
+
+    @staticmethod
+    def _warm_up(policy, gate: SafetyGate) -> None:
+        """First calls import and allocate: not in the loop."""
+        for _ in range(20):
+            policy.step(np.zeros(11))
+            gate.geometry.gaps(np.zeros((8, 8)))
+        policy.reset()
+
+    def run(self) -> None:
+        """Until told to quit."""
+        report = realtime.prepare(self._config.realtime.priority, self._config.realtime.lock_memory)
+        self._axes.start()  # afterwards: a thread inherits the scheduling of the one that starts it
+        self._pipe.send(("ready", report))
+        try:
+            self._loop()
+        finally:
+            self._send(("ended", self.timings.summary()))
+            while self._unsent and self._flush():
+                pass
+
+    def _loop(self) -> None:
+        spin, bridge = self._config.realtime.spin, self.bridge
+        arm, tracker, pipe = self._arm_socket.fileno(), self._tracker_socket.fileno(), self._pipe.fileno()
+        deadline = time.monotonic() + self._period
+        end = float("inf")
+        while True:
+            now = time.monotonic()
+            ready, _, _ = select.select([arm, tracker, pipe], [], [], max(deadline - now - spin, 0.0))
+            if arm in ready:
+                self._answer_arm()
+            if tracker in ready:
+                now = time.monotonic()
+                for datagram, source in self._tracker_socket.drain():
+                    bridge.tracker_received(datagram, source, now)
+            if pipe in ready:
+                self._listen()
+            now = time.monotonic()
+            if now < deadline - spin:
+                continue
+            while now < deadline:
+                now = time.monotonic()
+            self._tick(deadline, now)
+            deadline += self._period
+            missed = int((time.monotonic() - deadline) / self._period)
+            if missed > 0:
+                self.timings.missed += missed
+                deadline += missed * self._period
+                self._recorder.put(log.Event(now, log.Level.WARNING, "ticks_missed", json.dumps({"missed": missed})))
+            if self._done:
+                end = min(end, now + STOP_TIME)
+                if now >= end or bridge.gate.at_rest:
+                    return
+
+    def _answer_arm(self) -> None:
+        began = time.monotonic()
+        if self._arm_socket.drain(self._session, began):
+            reply = self.bridge.arm_received(began)
+            if reply is not None:
+                self._arm_socket.send(reply, self._session.endpoint)
+                self.timings.reply.add(time.monotonic() - began)
+
+    def _tick(self, deadline: float, now: float) -> None:
+        state = self._axes.state
+        if state is not None:
+            self.bridge.axes_received(state.position, state.received)
+        self.bridge.tick(deadline, now)
+        self.timings.lateness.add(now - deadline)
+        if self.bridge.policy_seconds:
+            self.timings.policy.add(self.bridge.policy_seconds)
+        self.timings.tick.add(time.monotonic() - now)
+        if now >= self._status_at:
+            self._status_at = now + STATUS_PERIOD
+            if not self._unsent:
+                self._unsent.append(("status", self.status(now)))
+        if self._unsent:
+            self._flush()
+
+    # The owner
+
+    def _listen(self) -> None:
+        """Takes the owner's messages; a pipe that ends means stop."""
+        try:
+            while self._pipe.poll():
+                self._obey(self._pipe.recv())
+        except (EOFError, OSError):
+            self._obey(("quit",))
+
+    def _obey(self, message: tuple) -> None:
+        now = time.monotonic()
+        kind, *arguments = message
+        try:
+            if kind == "arm":
+                self.bridge.arm(now)
+            elif kind == "prepare":  # the linear axes
+                self._axes.acknowledge() if self._axes.axes.fault else None
+                self._axes.enable()
+                self._axes.home()
+            elif kind == "stop":
+                self.bridge.stop(now)
+            elif kind == "reset":
+                self.bridge.reset(now)
+            elif kind == "discard":
+                self.bridge.discard(now)
+            elif kind == "pause":
+                self.bridge.paused = bool(arguments[0])
+            elif kind == "policy":
+                theta, mean, inverse_scale = arguments
+                self.bridge.set_policy(make_policy(self._options.backend, unflatten(theta), mean, inverse_scale))
+            elif kind == "quit":
+                self.bridge.stop(now)
+                self._done = True
+            else:
+                raise RefusedError(f"unknown request {kind!r}")
+        except RefusedError as error:
+            self._send(("refused", str(error)))
+
+    def _episode(self, summary) -> None:
+        self._send(("episode", summary, self.bridge.ball_track(summary)))
+
+    def _send(self, message: tuple) -> None:
+        self._unsent.append(message)
+
+    def _flush(self) -> bool:
+        """Sends what fits without waiting; False when the pipe is full or gone."""
+        try:
+            while self._unsent and select.select([], [self._pipe], [], 0.0)[1]:
+                self._pipe.send(self._unsent.popleft())
+            return not self._unsent
+        except (OSError, ValueError):
+            self._unsent.clear()
+            return False
+
+    def status(self, now: float) -> dict[str, Any]:
+        """For the operator's view."""
+        bridge, counts = self.bridge, self.bridge.counts
+        return {
+            "time": now,
+            "state": bridge.state.value,
+            "paused": bridge.paused,
+            "at_home": bridge.state in (State.READY, State.ACTIVE) and bridge.at_home,
+            "faults": [{"cause": f.cause.value, "text": f.sentence} for f in bridge.gate.faults],
+            "present": {cause.value: text for cause, text in bridge.gate.present.items()},
+            "arm": self._session.problem(now),
+            "axes": self._axes.problem(now),
+            "tracker": None if self._tracker.received and now - self._tracker.received < 0.5 else "silent",
+            "joints": bridge.joint_table(),
+            "balls": counts.balls,
+            "outcomes": dict(counts.outcomes),
+            "rally": counts.rally,
+            "longest_rally": counts.longest_rally,
+            "egm": asdict(self._session.statistics),
+            "tracker_counts": dict(self._tracker.counts),
+            "axes_cycles": self._axes.cycles,
+            "axes_late": self._axes.late,
+            "log_dropped": self._recorder.dropped,
+            "timings": self.timings.summary(),
+        }
+
+
+def wait_for(pipe: Connection, kind: str, seconds: float) -> tuple:
+    """The next message of that kind; others are dropped. Raises RefusedError for "failed", TimeoutError."""
+    end = time.monotonic() + seconds
+    while pipe.poll(max(end - time.monotonic(), 0.0)):
+        message = pipe.recv()
+        if message[0] == kind:
+            return message
+        if message[0] == "failed":
+            raise RefusedError(message[1])
+    raise TimeoutError(f"the control process did not say {kind!r} within {seconds:g} s")
+
+
+def log_path(options: ControlOptions) -> Path | None:
+    return None if options.log_folder is None else Path(options.log_folder) / f"{options.log_name}.mcap"

@@ -1,0 +1,306 @@
+"""The computer's end of ABB EGM: ``EgmSession`` is the protocol, without socket or clock; ``EgmSocket`` a UDP socket.
+
+The controller sends its state every 4 ms and afterwards takes ONE queued message; with none queued it goes on with the
+last one, speed included, until its own communication timeout. Hence: read everything that is queued, answer only the
+newest packet, and answer it once. Nothing here can stop an arm whose computer has died; only the controller's
+``\\CommTimeout`` does (RAPID, EGMSetupUC): commissioning sets it to 0.05..0.1 s in place of the default of about 1 s.
+"""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import socket
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from robot_io.devices.egm.messages import MAX_DATAGRAM, UINT32, decode_robot, encode_sensor
+from robot_io.devices.egm.messages import EgmError as EgmError
+
+DEFAULT_PORT = 6510
+RECENT = 1.0  # [s] of controller time: a packet that much older or newer than the last is no neighbour of it
+MAX_DRAIN = 1000  # datagrams per call: a flood must not keep the caller from its control tick
+
+
+@dataclass(frozen=True)
+class EgmConfig:
+    """Settings of an EGM session.
+
+    controller_address  IPv4 address that packets are taken from; None takes that of the first valid packet. The port is
+                        learned from the first valid packet, and again after a silence of ``timeout``
+    period              the controller's cycle [s]
+    timeout             age [s] at which feedback is stale: ``problem`` says so, and the next packet opens a new session
+    """
+
+    controller_address: str | None = None
+    period: float = 0.004
+    timeout: float = 0.05
+
+    def __post_init__(self) -> None:
+        if self.controller_address is not None:
+            try:
+                ipaddress.IPv4Address(self.controller_address)
+            except ValueError:
+                raise ValueError(
+                    f"controller_address {self.controller_address!r} is no IPv4 address such as 192.168.125.1; "
+                    "give the controller's address as a number"
+                ) from None
+        if not 0 < self.period < self.timeout < RECENT:
+            raise ValueError(
+                f"period {self.period} s and timeout {self.timeout} s must satisfy 0 < period < timeout < {RECENT} s"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class ArmFeedback:
+    """The newest accepted packet of the controller.
+
+    sequence         of the packet, modulo 2**32
+    time             controller's clock [s]; starts again at 0 every 49.7 days
+    position         (6,) measured joint positions [rad], read-only
+    motors_on, egm_running, rapid_running
+    received         ``now`` at its reception [s]
+    """
+
+    sequence: int
+    time: float
+    position: np.ndarray
+    motors_on: bool
+    egm_running: bool
+    rapid_running: bool
+    received: float
+
+
+@dataclass
+class EgmStatistics:
+    """Counters since the session object was made.
+
+    received  datagrams given to ``receive``: accepted plus rejected
+    rejected  by reason: stranger, duplicate, out_of_order or an ``EgmError.reason``
+    lost      packets that had not arrived when a later one of the same session did
+    replies   EgmSensor messages built
+    """
+
+    received: int = 0
+    accepted: int = 0
+    rejected: Counter = field(default_factory=Counter)
+    lost: int = 0
+    replies: int = 0
+
+
+class EgmSession:
+    """One controller's EGM stream: what to believe of it and what to answer.
+
+    feedback    ``ArmFeedback`` or None before the first packet
+    session_id  0 before the first packet; grows when the controller starts anew, changes state or was silent for
+                ``timeout``: the owner then takes the measured position as its new reference
+    endpoint    (address, port) that replies go to, None before the first packet
+    """
+
+    def __init__(self, config: EgmConfig = EgmConfig()):
+        self.config = config
+        self.feedback: ArmFeedback | None = None
+        self.session_id = 0
+        self.endpoint: tuple[str, int] | None = None
+        self.statistics = EgmStatistics()
+        self._time_ms = 0
+        self._pending = False
+        self._reply_sequence = 0
+        self._last_refusal = ""
+
+    def receive(self, datagram: bytes, source: tuple[str, int], now: float) -> bool:
+        """Takes one datagram; True when it is the trusted controller's newest packet. No content makes it raise."""
+        self.statistics.received += 1
+        if not self._trusts(source, now):
+            trusted = self.config.controller_address or f"{self.endpoint[0]} port {self.endpoint[1]}"
+            return self._refuse("stranger", f"from {source[0]} port {source[1]}, only {trusted} is trusted")
+        try:
+            message = decode_robot(datagram)
+        except EgmError as error:
+            return self._refuse(error.reason, str(error))
+        last, new_session = self.feedback, True
+        if last is not None:
+            steps, elapsed_ms = message.sequence - last.sequence, message.time_ms - self._time_ms
+            order = _order(steps, elapsed_ms, now - last.received, self.config)
+            if order in ("duplicate", "out_of_order"):
+                return self._refuse(order, f"sequence {message.sequence} after {last.sequence}")
+            states = ("motors_on", "egm_running", "rapid_running")
+            new_session = order == "new" or any(getattr(message, s) != getattr(last, s) for s in states)
+            if order == "next":
+                self.statistics.lost += steps % UINT32 - 1
+        self.session_id += new_session
+        self.endpoint = (source[0], source[1])
+        self._time_ms = message.time_ms
+        self.feedback = ArmFeedback(
+            sequence=message.sequence,
+            time=message.time_ms / 1000.0,
+            position=message.position,
+            motors_on=message.motors_on,
+            egm_running=message.egm_running,
+            rapid_running=message.rapid_running,
+            received=now,
+        )
+        self._pending = True
+        self.statistics.accepted += 1
+        return True
+
+    def reply(self, position, velocity, now: float) -> bytes | None:
+        """The answer to the newest packet: position (6,) [rad] and velocity (6,) [rad/s] to move at.
+
+        To hold, pass the held position and zeros. Returns None when no packet waits for an answer, or when one has
+        waited for ``timeout``. Raises ValueError on another shape or a non-finite number; the packet then still waits.
+        """
+        if not self._pending:
+            return None
+        datagram = encode_sensor(self._reply_sequence, int(now * 1000.0), position, velocity)
+        self._pending = False
+        if self._is_stale(now):
+            return None
+        self._reply_sequence = (self._reply_sequence + 1) % UINT32
+        self.statistics.replies += 1
+        return datagram
+
+    def problem(self, now: float) -> str | None:
+        """Why the arm cannot be moved, as a sentence that says what to do; None when it can."""
+        feedback = self.feedback
+        if feedback is None:
+            return (
+                "No EGM packet has arrived from the arm's controller: start its RAPID program, and check that its "
+                f"UCdevice has this computer's address and port{self._refusals()}."
+            )
+        if self._is_stale(now):
+            return (
+                f"No EGM packet from the arm's controller for {now - feedback.received:.3f} s (limit "
+                f"{self.config.timeout:.3f} s): check the cable and whether the EGM session has ended there"
+                f"{self._refusals()}."
+            )
+        if not feedback.motors_on:
+            return "The arm's motors are off: release the emergency stop and switch the motors on at the controller."
+        if not feedback.rapid_running:
+            return "The arm's RAPID program is stopped: start it at the controller."
+        if not feedback.egm_running:
+            return "EGM is not running on the arm's controller: let its RAPID program reach EGMRunJoint."
+        return None
+
+    def _trusts(self, source: tuple[str, int], now: float) -> bool:
+        address = self.config.controller_address or (self.endpoint and self.endpoint[0])
+        if address and source[0] != address:
+            return False
+        return self.endpoint is None or source[1] == self.endpoint[1] or self._is_stale(now)
+
+    def _is_stale(self, now: float) -> bool:
+        return now - self.feedback.received > self.config.timeout
+
+    def _refuse(self, reason: str, sentence: str) -> bool:
+        self.statistics.rejected[reason] += 1
+        self._last_refusal = f"{reason}: {sentence}"
+        return False
+
+    def _refusals(self) -> str:
+        count = self.statistics.rejected.total()
+        return f"; {count} datagrams were refused, the last as {self._last_refusal}" if count else ""
+
+
+def _order(sequence_change: int, time_change: int, silence: float, config: EgmConfig) -> str:
+    """How a packet follows the last accepted one: "next", "new" (session), "duplicate" or "out_of_order".
+
+    sequence_change  difference of the sequence numbers, taken modulo 2**32
+    time_change      difference of the controller's clock [ms], taken modulo 2**32
+    silence          seconds since the last accepted packet
+
+    The controller's clock goes on when EGM starts again and the numbers begin at 0. So a packet with an earlier time
+    was overtaken, whatever its number, and a lower number with a later time is a new session. Only a clock that stands
+    still (some simulators) leaves the decision to the numbers alone.
+    """
+    steps, elapsed = _signed(sequence_change), _signed(time_change) / 1000.0
+    if steps == 0 and elapsed == 0:
+        return "duplicate"
+    near = elapsed > -RECENT if elapsed else steps * config.period > -RECENT
+    if (elapsed, steps) < (0, 0) and near and silence < RECENT:
+        return "out_of_order"
+    neighbour = 0 < steps < RECENT / config.period and 0 <= elapsed < RECENT
+    return "next" if neighbour and silence <= config.timeout else "new"
+
+
+def _signed(difference: int) -> int:
+    return (difference + UINT32 // 2) % UINT32 - UINT32 // 2
+
+
+class EgmSocket:
+    """A non-blocking UDP socket on one of this computer's addresses.
+
+    address  IPv4 address of the network that the controller is on; "0.0.0.0" (every interface) is refused unless
+             ``all_interfaces``
+    port     as in the controller's UCdevice; 0 takes a free one
+
+    Raises EgmError (reasons: interface, in_use, no_address, socket) when it cannot be opened.
+    """
+
+    def __init__(self, address: str, port: int = DEFAULT_PORT, all_interfaces: bool = False):
+        if address in ("", "0.0.0.0") and not all_interfaces:
+            raise EgmError(
+                "interface",
+                f"address {address!r} listens on every interface: give this computer's address on the arm's network",
+            )
+        self.network_errors = 0
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind((address, port))
+        except (OSError, OverflowError) as error:
+            self._socket.close()
+            raise _bind_error(address, port, error) from error
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """(address, port) that it listens on."""
+        return self._socket.getsockname()
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def drain(self, session: EgmSession, now: float) -> bool:
+        """Feeds everything that is queued to the session; True when a packet was accepted, so that a reply is due."""
+        accepted = False
+        for _ in range(MAX_DRAIN):
+            try:
+                datagram, source = self._socket.recvfrom(MAX_DATAGRAM + 1)  # one more, so that longer ones are noticed
+            except BlockingIOError:
+                break
+            except OSError:  # a reply met a closed port, the interface is down; what is queued behind is still good
+                self.network_errors += 1
+                continue
+            accepted |= session.receive(datagram, source, now)
+        return accepted
+
+    def send(self, datagram: bytes, endpoint: tuple[str, int]) -> bool:
+        """Sends to ``EgmSession.endpoint``; False (and ``network_errors`` grows) when the network refuses it."""
+        try:
+            return self._socket.sendto(datagram, endpoint) == len(datagram)
+        except OSError:
+            self.network_errors += 1
+            return False
+
+    def close(self) -> None:
+        self._socket.close()
+
+    def __enter__(self) -> EgmSocket:
+        return self
+
+    def __exit__(self, *exc_info) -> None:
+        self.close()
+
+
+def _bind_error(address: str, port: int, error: Exception) -> EgmError:
+    where, code = f"UDP {address} port {port}", getattr(error, "errno", None)
+    if code == errno.EADDRINUSE:
+        return EgmError(
+            "in_use",
+            f"{where} is in use by another program, perhaps an earlier run of this one or RobotStudio: end it "
+            "(ss -ulpn lists it), or choose another port here and in the controller's UCdevice",
+        )
+    if code == errno.EADDRNOTAVAIL:
+        return EgmError("no_address", f"{where}: this computer has no such address; ip address lists those that it has")
+    return EgmError("socket", f"{where} cannot be opened ({error}); give an IPv4 address and a port from 1024 to 65535")

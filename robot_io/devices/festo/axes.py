@@ -1,0 +1,344 @@
+"""Two linear axes that follow a stream of positions and velocities. No socket, no clock, no thread.
+
+The drives position: each cycle they get a target and a highest speed (``robot_io.devices.festo.following``). When the computer
+dies in mid-motion they stop by themselves: at the last target, at most ``lead`` seconds and a braking distance away, or
+when their node guards fire.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from robot_io.devices.festo.config import N_AXES, AxesConfig, AxesFault, AxesState, Axis
+from robot_io.devices.festo.following import Move, Reference, Target, move
+from robot_io.devices.festo.modbus_link import AxisLost
+from robot_io.devices.festo.profile import AxisCommand, AxisStatus
+
+
+class _Channel:
+    """What is known of one axis and wanted of it."""
+
+    def __init__(self, axis: Axis) -> None:
+        self.axis = axis
+        self.configured = False
+        self.status: AxisStatus | None = None
+        self.received = -math.inf
+        self.on = False  # shall be enabled
+        self.was_enabled = False
+        self.homing = False  # shall be homed
+
+    @property
+    def position(self) -> float:
+        return self.axis.zero + self.axis.direction * self.status.position
+
+
+class FestoAxes:
+    """The axes' two exchanges a cycle and everything decided around them. Call ``cycle`` at 125 Hz.
+
+    ``command`` and the requests (``enable``, ``home``, ``acknowledge``, ``stop``, ``disable``) note what is wanted.
+    They and the properties may be used from another thread than ``cycle``.
+
+    fault      ``AxesFault`` that stopped the axes, latched until ``acknowledge``; None
+    commanded  (2,) velocity set-points [m/s] of the last cycle, zero while holding
+    stale_commands  how often a stream of commands broke off
+    """
+
+    def __init__(self, axes: Sequence[Axis], config: AxesConfig = AxesConfig()):
+        if len(axes) != N_AXES:
+            raise ValueError(f"{len(axes)} axes given, the robot has {N_AXES}")
+        self.config = config
+        self.fault: AxesFault | None = None
+        self.commanded = np.zeros(N_AXES)
+        self.stale_commands = 0
+        self._channels = [_Channel(axis) for axis in axes]
+        self._state: AxesState | None = None
+        self._target: Target | None = None
+        self._ignore_before = -math.inf  # commands up to here are void
+        self._requests: deque[str] = deque()
+        self._moving = False
+        self._reference = Reference(self.config.latency)
+        self._deadlines = dict.fromkeys(("acknowledge", "enable", "home"), math.inf)
+        self._acknowledging = False
+        self._sequence = 0
+
+    @property
+    def state(self) -> AxesState | None:
+        """The newest state, None before both axes have answered."""
+        return self._state
+
+    def command(self, position, velocity, now: float) -> None:
+        """The newest target: position (2,) [m] at ``now``, velocity (2,) [m/s] to go on with. ValueError: no number."""
+        numbers = []
+        for name, values in (("position", position), ("velocity", velocity)):
+            array = np.asarray(values, np.float64)
+            if array.shape != (N_AXES,) or not np.isfinite(array).all():
+                raise ValueError(f"{name} {values!r} must be {N_AXES} finite numbers")
+            numbers.append(tuple(array.tolist()))
+        self._target = Target(numbers[0], numbers[1], now)
+
+    def acknowledge(self) -> None:
+        """Clears the latched fault and those of the drives. They stay off until ``enable``."""
+        self._requests.append("acknowledge")
+
+    def enable(self) -> None:
+        """Switches both drives on; ignored while a fault is latched."""
+        self._requests.append("enable")
+
+    def home(self) -> None:
+        """Homes the axes that are not homed yet; ignored while a fault is latched."""
+        self._requests.append("home")
+
+    def stop(self) -> None:
+        """Brakes and holds; commands given before count no more."""
+        self._requests.append("stop")
+
+    def disable(self) -> None:
+        """Brakes and switches both drives off."""
+        self._requests.append("disable")
+
+    def cycle(self, now: float) -> None:
+        """One exchange with each axis. Raises nothing of the links: a lost axis is a latched fault."""
+        self._sequence += 1
+        self._take_requests(now)
+        self._supervise(now)
+        self._moving = self._may_move(now)
+        commands = self._commands(now)
+        healthy = self.fault is None
+        for i, channel in enumerate(self._channels):
+            self._exchange(channel, commands[i], now)
+            if healthy and self.fault is not None and self._moving:
+                # The other axes must not wait for the next cycle to stop.
+                healthy, self._moving, self._sequence = False, False, self._sequence + 1
+                commands = self._commands(now)
+                for earlier in self._channels[:i]:
+                    self._exchange(earlier, commands[self._channels.index(earlier)], now)
+        self._publish()
+
+    def standing(self) -> bool:
+        """Nothing moves, as far as is known."""
+        return all(c.status is None or not c.status.enabled or abs(c.status.velocity) < 0.005 for c in self._channels)
+
+    def problem(self, now: float) -> str | None:
+        """Why the axes cannot follow commands, as a sentence that says what to do; None when they can."""
+        fault, state = self.fault, self._state
+        if fault is not None:
+            return fault.sentence
+        if state is None:
+            return "The linear axes have not answered yet: start the exchange with them, then enable and home them."
+        age = now - state.received
+        if age > self.config.state_timeout:
+            limit = self.config.state_timeout
+            return f"The linear axes' state is {age:.3f} s old, allowed are {limit:.3f} s: is the exchange running?"
+        if any(channel.homing for channel in self._channels):
+            return "The linear axes are being homed: wait."
+        if not state.enabled:
+            return f"{self._names(lambda s: not s.enabled)} switched off: enable the axes."
+        if not state.homed:
+            return f"{self._names(lambda s: not s.homed)} not homed: home the axes."
+        return None
+
+    def switch_off(self) -> None:
+        """Last words: tells each drive to brake and switch off, whatever fails with another."""
+        for channel in self._channels:
+            profile = channel.axis.profile
+            try:
+                channel.axis.link.exchange(
+                    profile.write_address, profile.encode(AxisCommand()), profile.read_address, profile.read_count
+                )
+            except Exception:  # nothing is left to do but the same for the others; the drive has its node guard
+                continue
+
+    def close(self) -> None:
+        for channel in self._channels:
+            channel.axis.link.close()
+
+    # What is wanted and what is allowed
+
+    def _take_requests(self, now: float) -> None:
+        while self._requests:
+            request = self._requests.popleft()
+            if request == "acknowledge":
+                self.fault = None
+                self._acknowledging = True
+                self._deadlines["acknowledge"] = now + self.config.acknowledge_timeout
+            elif request in ("stop", "disable"):
+                self._ignore_before = now
+            elif self.fault is not None:
+                continue
+            for channel in self._channels:
+                if request in ("acknowledge", "disable"):
+                    channel.on = channel.was_enabled = channel.homing = False
+                elif request == "stop":
+                    channel.homing = False
+                elif request == "enable":
+                    channel.on = True
+                elif request == "home":
+                    channel.homing = channel.status is None or not channel.status.homed
+            if request in ("enable", "home"):
+                self._deadlines[request] = now + getattr(
+                    self.config, "enable_timeout" if request == "enable" else "homing_timeout"
+                )
+
+    def _supervise(self, now: float) -> None:
+        """Latches a fault when the drives took too long for a request or are not where they should be."""
+        if self._acknowledging and all(c.status is not None and not c.status.fault for c in self._channels):
+            self._acknowledging = False
+        elif self._acknowledging and now > self._deadlines["acknowledge"]:
+            self._acknowledging = False
+            faulty = [c for c in self._channels if c.status is None or c.status.fault]
+            words = "; ".join(f"{c.axis.name}: {self._fault_words(c)}" for c in faulty)
+            self._latch(
+                "acknowledge_timeout", f"A fault does not go away ({words}): remove its cause, then acknowledge again."
+            )
+        for channel in self._channels:
+            name, status = channel.axis.name, channel.status
+            if status is None:
+                continue
+            if channel.on and not status.enabled and now > self._deadlines["enable"]:
+                self._latch(
+                    "enable_timeout",
+                    f"{name} does not switch on: is its load voltage on, and does nothing else control it?",
+                )
+                channel.on = False
+            if channel.homing and status.homed and not status.homing:
+                channel.homing = False
+            if channel.homing and now > self._deadlines["home"]:
+                channel.homing = False
+                self._latch(
+                    "homing_timeout",
+                    f"{name} is not homed after {self.config.homing_timeout} s: look at its reference switch.",
+                )
+
+    def _may_move(self, now: float) -> bool:
+        target = self._target
+        if target is None or target.time <= self._ignore_before or self.fault is not None:
+            return False
+        if not all(c.on and c.status and c.status.enabled and c.status.homed and not c.homing for c in self._channels):
+            return False
+        if now - target.time > self.config.command_timeout:
+            self.stale_commands += self._moving
+            return False
+        if not self._moving:
+            self._reference.restart()
+        return True
+
+    def _commands(self, now: float) -> list[AxisCommand]:
+        moves = self._moves(now) if self._moving else []
+        if not moves:
+            moves = [Move(c.position if c.status else 0.0, 0.0, 0.0) for c in self._channels]
+        self.commanded = np.array([m.velocity for m in moves])
+        commands = []
+        for channel, wanted in zip(self._channels, moves):
+            status, axis = channel.status, channel.axis
+            commands.append(
+                AxisCommand(
+                    enable=bool(channel.on and status and not status.fault and (status.enabled or status.ready)),
+                    # Pulsed: a drive that is still braking takes no notice of the edge.
+                    acknowledge=bool(self._acknowledging and status and status.fault and self._sequence // 8 % 2),
+                    home=bool(channel.homing and status and status.enabled),
+                    move=self._moving,
+                    position=(wanted.position - axis.zero) * axis.direction,
+                    speed=wanted.speed,
+                    acceleration=self.config.acceleration,
+                    sequence=self._sequence,
+                )
+            )
+        return commands
+
+    def _moves(self, now: float) -> list[Move]:
+        """Each axis's move; none, and a fault, when one is too far off its reference."""
+        cfg, target, reference = self.config, self._target, self._target.at(now)
+        self._reference.add(now, reference)
+        moves = []
+        for i, channel in enumerate(self._channels):
+            axis = channel.axis
+            error = self._reference.at(channel.received)[i] - channel.position
+            if abs(error) > cfg.max_error:
+                self._moving = False
+                self._latch(
+                    "following_error",
+                    f"{axis.name} is {abs(error):.3f} m from where it was commanded, allowed are {cfg.max_error} m: "
+                    "is it blocked, or did the commands not start from its position?",
+                )
+                return []
+            moves.append(move(reference[i], target.velocity[i], error, (axis.lower, axis.upper), cfg))
+        return moves
+
+    # The exchange
+
+    def _exchange(self, channel: _Channel, command: AxisCommand, now: float) -> None:
+        axis, profile = channel.axis, channel.axis.profile
+        try:
+            if not channel.configured:
+                self._configure(channel)
+            registers = axis.link.exchange(
+                profile.write_address, profile.encode(command), profile.read_address, profile.read_count
+            )
+            status = profile.decode(registers)
+        except AxisLost as error:
+            channel.configured = channel.on = channel.was_enabled = channel.homing = False
+            channel.status = None
+            self._latch(
+                "axis_lost", f"{axis.name} is lost ({error.reason}): both axes stop; then acknowledge and enable them."
+            )
+            return
+        except ValueError as error:
+            self._latch("bad_answer", f"{axis.name}: {error}.")
+            return
+        channel.status, channel.received = status, now
+        if status.fault and not self._acknowledging:
+            self._latch(
+                "drive_fault",
+                f"{axis.name} has a fault, {self._fault_words(channel)}. Remove the cause, then acknowledge it.",
+            )
+            channel.on = False
+        elif channel.on and channel.was_enabled and not status.enabled:
+            channel.on = False
+            self._latch("switched_off", f"{axis.name} has switched off by itself: acknowledge, then enable the axes.")
+        channel.was_enabled = status.enabled and channel.on
+
+    def _configure(self, channel: _Channel) -> None:
+        guard = channel.axis.profile.node_guard(self.config.node_guard)
+        if guard is not None:
+            address, values = guard
+            answer = channel.axis.link.exchange(address, values, address, len(values))
+            if answer != values:
+                self._latch(
+                    "node_guard",
+                    f"{channel.axis.name} took the time-out {values} as {answer}: without it, it would not stop when "
+                    "the computer dies.",
+                )
+                return
+        channel.configured = True
+
+    def _latch(self, cause: str, sentence: str) -> None:
+        """The first fault counts: the others mostly follow from it."""
+        if self.fault is None:
+            self.fault = AxesFault(cause, sentence)
+
+    def _publish(self) -> None:
+        channels = self._channels
+        if any(c.status is None for c in channels):
+            return
+        position = np.array([c.position for c in channels])
+        velocity = np.array([c.axis.direction * c.status.velocity for c in channels])
+        for array in (position, velocity):
+            array.flags.writeable = False
+        self._state = AxesState(
+            position=position,
+            velocity=velocity,
+            received=min(c.received for c in channels),
+            enabled=all(c.status.enabled for c in channels),
+            homed=all(c.status.homed for c in channels),
+        )
+
+    def _fault_words(self, channel: _Channel) -> str:
+        return "no answer" if channel.status is None else channel.axis.profile.fault_text(channel.status.fault_code)
+
+    def _names(self, wrong) -> str:
+        names = [c.axis.name for c in self._channels if c.status is None or wrong(c.status)]
+        return f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'}"

@@ -1,0 +1,167 @@
+"""PROFIdrive telegram 111 (MDI positioning) of Festo's CMMT drives in Modbus registers.
+
+Each word is one register; double words come low word first. Order and bits are those of festo-edcon 1.0.3
+(``profidrive/telegram111.py``, ``words.py``), which agrees with telegram 111 of the PROFIdrive basic positioner:
+    out  STW1, POS_STW1, POS_STW2, STW2, OVERRIDE, MDI_TARPOS (2), MDI_VELOCITY (2), MDI_ACC, MDI_DEC
+    in   ZSW1, POS_ZSW1, POS_ZSW2, ZSW2, MELDW, XIST_A (2), NIST_B (2), FAULT_CODE, WARN_CODE
+Positions and speeds are in user units of the drive's set-up; OVERRIDE, MDI_ACC and MDI_DEC are N2 (0x4000 is 100 % of a
+base value), NIST_B is N4 (0x40000000 is 100 %). festo-edcon moves the whole 28-register block each time; so does this.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntFlag
+
+from robot_io.devices.festo.faults import CMMT_FAULTS, fault_text
+from robot_io.devices.festo.profile import INT32, AxisCommand, AxisStatus, count_of, expect_count, signed
+
+OUTPUT_ADDRESS, INPUT_ADDRESS, BLOCK = 0, 100, 28
+TIMEOUT_ADDRESS = 400  # 32 bits, low word first [ms]
+WORDS = 11  # of the 28 that telegram 111 uses, each way
+N2, N4 = 0x4000, 0x40000000  # 100 %
+ALL_N2 = (0, 0x7FFF)
+
+
+class STW1(IntFlag):
+    """Control word 1, position mode."""
+
+    ON = 1 << 0
+    NO_COAST_STOP = 1 << 1
+    NO_QUICK_STOP = 1 << 2
+    ENABLE_OPERATION = 1 << 3
+    NO_REJECT_TASK = 1 << 4  # 0: brake and drop the traversing task
+    NO_INTERMEDIATE_STOP = 1 << 5
+    ACTIVATE_TASK = 1 << 6
+    FAULT_ACKNOWLEDGE = 1 << 7
+    CONTROL_BY_PLC = 1 << 10
+    START_HOMING = 1 << 11
+
+
+class PosSTW1(IntFlag):
+    """Positioning control word 1."""
+
+    ABSOLUTE = 1 << 8
+    CONTINUOUS_UPDATE = 1 << 12  # new MDI values count at once, without a new edge of ACTIVATE_TASK
+    MDI = 1 << 15
+
+
+class PosSTW2(IntFlag):
+    """Positioning control word 2."""
+
+    SOFTWARE_LIMITS = 1 << 14
+    HARDWARE_LIMITS = 1 << 15
+
+
+class ZSW1(IntFlag):
+    """Status word 1, position mode."""
+
+    READY_TO_SWITCH_ON = 1 << 0
+    READY_TO_OPERATE = 1 << 1
+    OPERATION_ENABLED = 1 << 2
+    FAULT = 1 << 3
+    NO_COAST_STOP = 1 << 4
+    NO_QUICK_STOP = 1 << 5
+    INHIBITED = 1 << 6
+    WARNING = 1 << 7
+    FOLLOWING = 1 << 8  # following error within its tolerance
+    CONTROL_REQUESTED = 1 << 9
+    TARGET_REACHED = 1 << 10
+    HOME_SET = 1 << 11
+    TASK_ACKNOWLEDGED = 1 << 12
+    STOPPED = 1 << 13
+    ACCELERATES = 1 << 14
+    DECELERATES = 1 << 15
+
+
+class PosZSW1(IntFlag):
+    """Positioning status word 1."""
+
+    HOMING = 1 << 11
+    MDI = 1 << 15
+
+
+POWERED = (
+    STW1.NO_COAST_STOP | STW1.NO_QUICK_STOP | STW1.ENABLE_OPERATION | STW1.CONTROL_BY_PLC | STW1.NO_INTERMEDIATE_STOP
+)
+
+
+@dataclass(frozen=True)
+class CmmtProfile:
+    """Telegram 111 with the units of the drive's set-up.
+
+    position_unit      [m] a count of MDI_TARPOS and XIST_A
+    velocity_unit      [m/s] a count of MDI_VELOCITY
+    base_velocity      [m/s] that NIST_B's 100 % stand for ("base value velocity")
+    base_acceleration  [m/s^2] that 100 % of MDI_ACC and MDI_DEC stand for
+    software_limits, hardware_limits  limit switches that the drive shall heed
+    """
+
+    position_unit: float = 1e-6
+    velocity_unit: float = 1e-3
+    base_velocity: float = 2.0
+    base_acceleration: float = 15.0
+    software_limits: bool = True
+    hardware_limits: bool = False
+
+    write_address = OUTPUT_ADDRESS
+    read_address = INPUT_ADDRESS
+    read_count = BLOCK
+
+    def __post_init__(self) -> None:
+        for name in ("position_unit", "velocity_unit", "base_velocity", "base_acceleration"):
+            if not 0 < getattr(self, name) < 1e6:
+                raise ValueError(
+                    f"CmmtProfile.{name} is {getattr(self, name)}, it must be positive, as in the drive's set-up"
+                )
+
+    def encode(self, command: AxisCommand) -> list[int]:
+        stw1 = POWERED
+        if command.enable:
+            stw1 |= STW1.ON
+        if command.acknowledge:
+            stw1 |= STW1.FAULT_ACKNOWLEDGE
+        if command.home:
+            stw1 |= STW1.START_HOMING | STW1.NO_REJECT_TASK
+        if command.move:
+            stw1 |= STW1.ACTIVATE_TASK | STW1.NO_REJECT_TASK
+        pos_stw2 = PosSTW2.SOFTWARE_LIMITS * self.software_limits | PosSTW2.HARDWARE_LIMITS * self.hardware_limits
+        position = count_of(command.position, self.position_unit, INT32, "target position [m]")
+        velocity = count_of(command.speed, self.velocity_unit, (0, INT32[1]), "speed [m/s]")
+        acceleration = count_of(command.acceleration, self.base_acceleration / N2, ALL_N2, "acceleration [m/s^2]")
+        words = struct.pack(
+            "<HHHHHiiHH",
+            stw1,
+            PosSTW1.MDI | PosSTW1.ABSOLUTE | PosSTW1.CONTINUOUS_UPDATE,
+            pos_stw2,
+            0,
+            N2,
+            position,
+            velocity,
+            acceleration,
+            acceleration,
+        )
+        return [*struct.unpack(f"<{WORDS}H", words), *[0] * (BLOCK - WORDS)]
+
+    def decode(self, registers: list[int]) -> AxisStatus:
+        expect_count(registers, BLOCK)
+        zsw1, pos_zsw1 = registers[0], registers[1]
+        return AxisStatus(
+            ready=bool(zsw1 & ZSW1.READY_TO_SWITCH_ON and zsw1 & ZSW1.CONTROL_REQUESTED),
+            enabled=bool(zsw1 & ZSW1.OPERATION_ENABLED),
+            fault=bool(zsw1 & ZSW1.FAULT),
+            fault_code=registers[9],
+            warning_code=registers[10],
+            homing=bool(pos_zsw1 & PosZSW1.HOMING),
+            homed=bool(zsw1 & ZSW1.HOME_SET),
+            position=signed(registers[5] | registers[6] << 16, 32) * self.position_unit,
+            velocity=signed(registers[7] | registers[8] << 16, 32) * self.base_velocity / N4,
+        )
+
+    def node_guard(self, seconds: float) -> tuple[int, list[int]]:
+        milliseconds = count_of(seconds, 1e-3, (1, INT32[1]), "node guard [s]")
+        return TIMEOUT_ADDRESS, [milliseconds & 0xFFFF, milliseconds >> 16]
+
+    def fault_text(self, code: int) -> str:
+        return fault_text(code, CMMT_FAULTS)

@@ -1,0 +1,107 @@
+"""Settings of the two linear axes, and what they report. SI units."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from robot_io.devices.festo.modbus_link import RegisterLink
+from robot_io.devices.festo.profile import AxisProfile
+
+N_AXES = 2
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of the robot.
+
+    lower, upper  range that is ever commanded [m], robot's coordinate
+    zero          [m] where the drive's coordinate reads 0; direction (1 or -1) of the drive's coordinate in the robot's
+    """
+
+    name: str
+    link: RegisterLink
+    profile: AxisProfile
+    lower: float
+    upper: float
+    zero: float = 0.0
+    direction: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.lower < self.upper:
+            raise ValueError(f"axis {self.name}: lower {self.lower} must be below upper {self.upper}")
+        if self.direction not in (1, -1):
+            raise ValueError(f"axis {self.name}: direction {self.direction} must be 1 or -1")
+
+
+@dataclass(frozen=True)
+class AxesConfig:
+    """Settings of the motion and of the supervision; SI units.
+
+    speed, acceleration  highest that are commanded
+    latency              L: from a commanded velocity to its effect in the position that is read back [s]
+    gain, max_correction k [1/s] and the bound of the correction [m/s]
+    lead                 how far ahead of the braking distance the target lies, in time at the speed [s]; longer than
+                         the longest gap between two cycles plus the timing error of the position
+    hold_speed           for reaching a target whose velocity is 0
+    max_error            deviation from the commanded position that is a fault [m]
+    node_guard           silence after which a drive stops by itself [s]; set at start-up where the profile can
+    command_timeout      age of a command at which the axes stop and hold [s]
+    state_timeout        age of the state at which it counts as unknown [s]
+    acknowledge_timeout, enable_timeout, homing_timeout [s]
+    """
+
+    speed: float = 2.0
+    acceleration: float = 15.0
+    latency: float = 0.0645 + 0.033
+    gain: float = 3.0
+    max_correction: float = 0.3
+    lead: float = 0.05
+    hold_speed: float = 0.1
+    max_error: float = 0.1
+    node_guard: float = 0.1
+    command_timeout: float = 0.05
+    state_timeout: float = 0.05
+    acknowledge_timeout: float = 1.0
+    enable_timeout: float = 5.0
+    homing_timeout: float = 30.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"AxesConfig.{name} is {value}, it must be positive and finite")
+        if self.gain * self.latency > 1 / math.e:
+            raise ValueError(
+                f"gain {self.gain} / s overshoots with a latency of {self.latency} s: "
+                f"at most {1 / math.e / self.latency:.2f}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class AxesState:
+    """What the drives said.
+
+    position  (2,) [m], velocity (2,) [m/s], read-only
+    received  ``now`` of the older of the two answers [s]
+    enabled, homed  both are
+    """
+
+    position: np.ndarray
+    velocity: np.ndarray
+    received: float
+    enabled: bool
+    homed: bool
+
+
+@dataclass(frozen=True)
+class AxesFault:
+    """Why the axes were stopped: a short name and a sentence.
+
+    Names: axis_lost, drive_fault, switched_off, acknowledge_timeout, enable_timeout, homing_timeout, node_guard,
+    bad_answer, following_error.
+    """
+
+    cause: str
+    sentence: str

@@ -1,0 +1,331 @@
+"""An emulator of ABB's side of EGM in joint mode, without socket or clock: give it to anything that moves six joints.
+
+One call of ``step`` is one controller cycle: feedback goes out first, then ONE queued message is taken. With none
+queued the last reference stays in force, its speed included, until ``comm_timeout``. The references pass a dead time
+and the speed a first-order low-pass; the velocity for the drives is
+    velocity = low-passed speed + pos_corr_gain * (position reference - measured position).
+A stop for whatever reason is the controller's own decision: it acts at once, behind the dead time, and brings the
+velocity to zero at ``stop_deceleration``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from robot_io.contract import ABB_JOINTS, LIMITS
+from robot_io.devices.egm.messages import N_ARM_JOINTS, EgmError, decode_sensor, encode_robot
+
+EVENTS_KEPT = 1000
+
+
+def _arm(values) -> tuple[float, ...]:
+    return tuple(values[i] for i in ABB_JOINTS)
+
+
+@dataclass(frozen=True)
+class ArmParams:
+    """Parameters of the emulated controller; times in seconds, joint tuples in rad, rad/s, rad/s^2.
+
+    cycle              nominal period of ``step``
+    feedback_delay     age of the positions that feedback reports
+    dead_time          from taking a message to its effect on the drives (reported: about 50 ms)
+    low_pass           bandwidth of the speed reference's filter [Hz] (EGM's default 20 Hz: time constant 8 ms)
+    pos_corr_gain      [1/s], RAPID's PosCorrGain
+    comm_timeout       silence after which EGM stops, RAPID's CommTimeout. The default is ABB's, and until it has passed
+                       the arm runs on at its last speed when the computer dies: commissioning sets 0.05..0.1 s
+    stop_deceleration  of each joint in any stop; estimates, what the arm is taken to accelerate at (joint 5 as joint 6)
+    lower, upper       position range; a position outside it by more than ``position_tolerance`` switches the motors off
+    max_speed          joint speeds of the drives (120T); above ``overspeed`` times that the motors are switched off
+    queue_length       messages that wait at most; later ones are dropped
+    stream_always      feedback also while EGM is not running (RAPID's EGMStreamStart)
+    """
+
+    cycle: float = 0.004
+    feedback_delay: float = 0.029
+    dead_time: float = 0.055
+    low_pass: float = 20.0
+    pos_corr_gain: float = 1.0
+    comm_timeout: float = 1.0
+    stop_deceleration: tuple[float, ...] = (60.0, 60.0, 60.0, 100.0, 120.0, 120.0)
+    lower: tuple[float, ...] = _arm(LIMITS.lower)
+    upper: tuple[float, ...] = _arm(LIMITS.upper)
+    max_speed: tuple[float, ...] = _arm(LIMITS.velocity)
+    position_tolerance: float = math.radians(0.5)
+    overspeed: float = 1.1
+    queue_length: int = 64
+    stream_always: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("stop_deceleration", "lower", "upper", "max_speed"):
+            values = getattr(self, name)
+            if len(values) != N_ARM_JOINTS or not np.isfinite(values).all():
+                raise ValueError(f"ArmParams.{name} needs {N_ARM_JOINTS} finite numbers, got {values}")
+        for name in ("cycle", "low_pass", "comm_timeout", "queue_length"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"ArmParams.{name} {getattr(self, name)} must be positive")
+        for name in ("feedback_delay", "dead_time", "pos_corr_gain", "position_tolerance"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"ArmParams.{name} {getattr(self, name)} must be 0 or positive, and finite")
+        if min(self.stop_deceleration) <= 0 or min(self.max_speed) <= 0 or not self.overspeed >= 1:
+            raise ValueError("ArmParams: stop_deceleration and max_speed must be positive, overspeed at least 1")
+        if not all(low < high for low, high in zip(self.lower, self.upper)):
+            raise ValueError(f"ArmParams: lower {self.lower} must be below upper {self.upper} in every joint")
+
+
+@dataclass(frozen=True)
+class ArmEvent:
+    """Something that the controller's log would show: ``now`` of the last step, a short name, a sentence."""
+
+    time: float
+    name: str
+    sentence: str
+
+
+@dataclass
+class ArmStatistics:
+    """Counters since power-on.
+
+    cycles    calls of ``step``
+    received  datagrams given to ``receive``
+    rejected  of those, by reason: stranger, not_running, queue_full, out_of_range or an ``EgmError.reason``
+    consumed  messages that became the reference
+    starved   cycles with EGM running and no message queued
+    """
+
+    cycles: int = 0
+    received: int = 0
+    rejected: Counter = field(default_factory=Counter)
+    consumed: int = 0
+    starved: int = 0
+
+
+class ArmStateError(RuntimeError):
+    """An operator's action that the controller's state does not allow."""
+
+
+class ArmController:
+    """The controller of one arm. It sends to ``client`` = (address, port) and takes messages from there only.
+
+    Starts with motors off. An operator calls ``motors_on``, ``start_rapid``, ``start_egm``; ``motors_off`` is the
+    emergency stop. ``motors_on()`` and the like return nothing and raise ArmStateError where they are not allowed.
+    """
+
+    def __init__(self, client: tuple[str, int], params: ArmParams = ArmParams()):
+        self.client = (client[0], client[1])
+        self.params = params
+        self.statistics = ArmStatistics()
+        self.events: deque[ArmEvent] = deque(maxlen=EVENTS_KEPT)
+        self.motors_are_on = self.rapid_is_running = self.egm_is_running = False
+        self._queue: deque = deque()
+        self._history: deque[tuple[float, np.ndarray]] = deque()  # measured positions, back to feedback_delay ago
+        self._sequence = 0
+        self._now: float | None = None
+        self._velocity = np.zeros(N_ARM_JOINTS)
+        self._reference: _Reference | None = None  # made by the first step after start_egm
+        self._last_message = 0.0
+        self._deceleration = np.array(params.stop_deceleration)
+        self._max_speed = np.array(params.max_speed)
+        self._lower = np.array(params.lower) - params.position_tolerance
+        self._upper = np.array(params.upper) + params.position_tolerance
+
+    @property
+    def cause(self) -> str | None:
+        """Why it stopped last, None while EGM runs or before anything happened."""
+        stops = [event.sentence for event in self.events if event.name not in ("motors_on", "rapid_start", "egm_start")]
+        return None if self.egm_is_running or not stops else stops[-1]
+
+    def motors_on(self) -> None:
+        self.motors_are_on = True
+        self._log("motors_on", "motors switched on")
+
+    def motors_off(self, name: str = "motors_off", sentence: str = "motors switched off: emergency stop") -> None:
+        """Stops the arm, RAPID and EGM; allowed in every state."""
+        self._log(name, sentence)
+        self.motors_are_on = self.rapid_is_running = False
+        self._end_egm()
+
+    def start_rapid(self) -> None:
+        if not self.motors_are_on:
+            raise ArmStateError("RAPID cannot start with the motors off: call motors_on() first")
+        self.rapid_is_running = True
+        self._log("rapid_start", "RAPID started")
+
+    def stop_rapid(self) -> None:
+        self._log("rapid_stop", "RAPID stopped by the operator")
+        self.rapid_is_running = False
+        self._end_egm()
+
+    def start_egm(self) -> None:
+        """A new EGM session: sequence numbers begin at 0, the reference is where the arm stands."""
+        if not self.rapid_is_running:
+            raise ArmStateError("EGM cannot start while RAPID is stopped: call start_rapid() first")
+        if self._velocity.any():
+            raise ArmStateError("EGM cannot start while the arm still brakes: step until the velocity is zero")
+        self._end_egm()
+        self.egm_is_running = True
+        self._sequence = 0
+        self._log("egm_start", "EGM started")
+
+    def stop_egm(self, name: str = "egm_stop", sentence: str = "EGM stopped by the operator") -> None:
+        """Stops the arm and EGM; RAPID goes on."""
+        self._log(name, sentence)
+        self._end_egm()
+
+    def receive(self, datagram: bytes, source: tuple[str, int], now: float) -> bool:
+        """Queues one EgmSensor; True when it was taken. No content makes it raise.
+
+        Position and speed are both required: half a message never moves the arm. A reference outside the joint range or
+        beyond the overspeed limit ends EGM, as on the real controller.
+        """
+        self.statistics.received += 1
+        if (source[0], source[1]) != self.client:
+            return self._refuse("stranger")
+        if not self.egm_is_running:
+            return self._refuse("not_running")
+        try:
+            message = decode_sensor(datagram)
+        except EgmError as error:
+            return self._refuse(error.reason)
+        outside = (message.position < self._lower) | (message.position > self._upper)
+        outside |= np.abs(message.velocity) > self.params.overspeed * self._max_speed
+        if outside.any():
+            joint = int(np.argmax(outside))
+            self.stop_egm(
+                "reference_out_of_range",
+                f"EGM stopped: reference of arm joint {joint + 1} out of range, position {message.position[joint]:.4g} "
+                f"rad, speed {message.velocity[joint]:.4g} rad/s",
+            )
+            return self._refuse("out_of_range")
+        if len(self._queue) >= self.params.queue_length:
+            return self._refuse("queue_full")
+        self._queue.append(message)
+        return True
+
+    def step(self, now: float, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, bytes | None]:
+        """One cycle at time ``now`` with the joints' true position (6,) [rad] and velocity (6,) [rad/s].
+
+        Returns the velocity (6,) [rad/s] for the drives until the next cycle, and the EgmRobot datagram for ``client``.
+        """
+        position, velocity = (np.array(x, np.float64) for x in (position, velocity))
+        if position.shape != (N_ARM_JOINTS,) or velocity.shape != position.shape:
+            raise ValueError(f"position and velocity must be ({N_ARM_JOINTS},), got {position.shape}, {velocity.shape}")
+        if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
+            raise ValueError(f"the arm's state has a non-finite number: position {position}, velocity {velocity}")
+        if self._now is not None and not now > self._now:
+            raise ValueError(f"time must advance: step at {now} s after {self._now} s")
+        elapsed = self.params.cycle if self._now is None else now - self._now
+        self._now = now
+        self.statistics.cycles += 1
+        self._supervise(position, velocity)
+        if self.egm_is_running and self._reference is None:
+            self._reference = _Reference(now, position, self.params)
+            self._last_message = now
+        datagram = self._feedback(now, position)
+        if self.egm_is_running:
+            self._take_message(now)
+        if self.egm_is_running:
+            speed, target = self._reference.at(now)
+            wanted = speed + self.params.pos_corr_gain * (target - position)
+            self._velocity = np.minimum(np.maximum(wanted, -self._max_speed), self._max_speed)
+        else:
+            step = self._deceleration * elapsed
+            self._velocity = self._velocity - np.minimum(np.maximum(self._velocity, -step), step)
+        return self._velocity.copy(), datagram
+
+    def _supervise(self, position: np.ndarray, velocity: np.ndarray) -> None:
+        if not self.motors_are_on:
+            return
+        outside = (position < self._lower) | (position > self._upper)
+        too_fast = np.abs(velocity) > self.params.overspeed * self._max_speed
+        if outside.any():
+            joint = int(np.argmax(outside))
+            self.motors_off(
+                "position_out_of_range",
+                f"motors switched off: arm joint {joint + 1} is at {position[joint]:.4f} rad, outside "
+                f"[{self.params.lower[joint]:.4f}, {self.params.upper[joint]:.4f}] rad",
+            )
+        elif too_fast.any():
+            joint = int(np.argmax(too_fast))
+            limit = self.params.overspeed * self._max_speed[joint]
+            self.motors_off(
+                "overspeed",
+                f"motors switched off: arm joint {joint + 1} moves at {velocity[joint]:.3f} rad/s, "
+                f"limit {limit:.3f} rad/s",
+            )
+
+    def _feedback(self, now: float, position: np.ndarray) -> bytes | None:
+        history, wanted = self._history, now - self.params.feedback_delay
+        history.append((now, position))
+        while len(history) > 1 and history[1][0] <= wanted:
+            history.popleft()
+        reported = history[0][1]
+        if len(history) > 1 and wanted > history[0][0]:
+            (before, start), (after, end) = history[0], history[1]
+            reported = start + (wanted - before) / (after - before) * (end - start)
+        if not (self.egm_is_running or self.params.stream_always):
+            return None
+        planned = self._reference.target if self.egm_is_running else position
+        states = self.motors_are_on, self.egm_is_running, self.rapid_is_running
+        datagram = encode_robot(self._sequence, round(now * 1000.0), reported, planned, *states)
+        self._sequence += 1
+        return datagram
+
+    def _take_message(self, now: float) -> None:
+        if self._queue:
+            message = self._queue.popleft()
+            self._reference.push(now + self.params.dead_time, message.velocity, message.position)
+            self._last_message = now
+            self.statistics.consumed += 1
+            return
+        self.statistics.starved += 1
+        silence = now - self._last_message
+        if silence >= self.params.comm_timeout - 1e-9:  # sums of cycle times are not exact
+            self.stop_egm("comm_timeout", f"EGM stopped: no message for {silence:.3f} s")
+
+    def _end_egm(self) -> None:
+        self.egm_is_running = False
+        self._reference = None
+        self._queue.clear()
+
+    def _refuse(self, reason: str) -> bool:
+        self.statistics.rejected[reason] += 1
+        return False
+
+    def _log(self, name: str, sentence: str) -> None:
+        self.events.append(ArmEvent(self._now or 0.0, name, sentence))
+
+
+class _Reference:
+    """Speed and position references behind the dead time, and the speed's low-pass.
+
+    The filter's input is constant between references, so each piece is integrated exactly, also where a reference takes
+    effect between two cycles.
+    """
+
+    def __init__(self, now: float, position: np.ndarray, params: ArmParams):
+        self.target = position  # (6,) [rad]
+        self._decay = 2.0 * math.pi * params.low_pass
+        self._time = now
+        self._input = np.zeros(N_ARM_JOINTS)
+        self._filtered = np.zeros(N_ARM_JOINTS)
+        self._coming: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
+
+    def push(self, due: float, speed: np.ndarray, target: np.ndarray) -> None:
+        self._coming.append((due, speed, target))
+
+    def at(self, now: float) -> tuple[np.ndarray, np.ndarray]:
+        """Filtered speed (6,) [rad/s] and position reference (6,) [rad] in force at ``now``."""
+        while self._coming and self._coming[0][0] <= now:
+            due, speed, target = self._coming.popleft()
+            self._advance(due)
+            self._input, self.target = speed, target
+        self._advance(now)
+        return self._filtered, self.target
+
+    def _advance(self, time: float) -> None:
+        self._filtered = self._input + (self._filtered - self._input) * math.exp(-self._decay * (time - self._time))
+        self._time = time

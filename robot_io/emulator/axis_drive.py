@@ -1,0 +1,175 @@
+"""The emulated drive behind an axis's registers: power, faults, homing, positioning. SI units, no registers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from robot_io.emulator.axis_motion import Past, advance, brake
+
+FOLLOWING_ERROR = 126  # CMMT's number
+
+
+class Power(Enum):
+    INHIBITED = "inhibited"  # an ON command that is already there does not count
+    READY = "ready"
+    SWITCHING_ON = "switching on"
+    OPERATING = "operating"
+    SWITCHING_OFF = "switching off"  # still powered, braking
+
+
+@dataclass(frozen=True)
+class DriveParams:
+    """Properties of a drive and its axis.
+
+    speed, acceleration   highest [m/s], [m/s^2]
+    smoothing             window of the jerk-limiting mean over the generated velocity [s]; 0 for none
+    position_gain         of the position controller [1/s]
+    following_error       deviation from the generated position that is a fault [m]
+    switch_on_time        from ON to operating [s]
+    homing_time           [s]; the search itself is not modelled, the axis stands
+    """
+
+    speed: float = 2.0
+    acceleration: float = 15.0
+    smoothing: float = 0.008
+    position_gain: float = 20.0
+    following_error: float = 0.1
+    switch_on_time: float = 0.05
+    homing_time: float = 1.0
+
+
+class Drive:
+    """Commands take effect at once; ``step`` moves on in time and gives the velocity set-point."""
+
+    def __init__(self, params: DriveParams) -> None:
+        self.params = params
+        self.power = Power.INHIBITED
+        self.fault_code = 0
+        self.homed = False
+        self.homing = False
+        self.task = False  # a positioning task is active
+        self.paused = False
+        self.target = 0.0
+        self.origin: float | None = None  # the plant's position that is reported as 0
+        self.x = self.v = 0.0  # generated
+        self.acceleration = params.acceleration
+        self._speed = params.speed
+        self._allowed = False
+        self._until = 0.0  # end of switching on or homing
+        self._now: float | None = None
+        self._area = 0.0  # time integral of x
+        self._past = Past(2.0 * params.smoothing + 0.01)
+        self._position = 0.0
+
+    @property
+    def operating(self) -> bool:
+        return self.power is Power.OPERATING
+
+    @property
+    def reached(self) -> bool:
+        """At rest with nothing left to do."""
+        return self.v == 0.0 and (not self.task or self.x == self.target)
+
+    def request_power(self, on: bool, allowed: bool) -> None:
+        """``allowed``: no coast stop and no quick stop asked for."""
+        self._allowed = allowed
+        if not allowed:
+            self._switch_off()
+        elif self.power is Power.INHIBITED and not on and not self.fault_code:
+            self.power = Power.READY
+        elif self.power is Power.READY and on:
+            self.power, self._until = Power.SWITCHING_ON, (self._now or 0.0) + self.params.switch_on_time
+        elif not on:
+            self._switch_off()
+
+    def acknowledge(self) -> None:
+        if self.power is Power.INHIBITED:
+            self.fault_code = 0
+
+    def fault(self, code: int) -> None:
+        """The first fault counts until it is acknowledged."""
+        self.fault_code = self.fault_code or code
+        self._switch_off()
+        if self.power is not Power.SWITCHING_OFF:
+            self.power = Power.INHIBITED
+
+    def home(self) -> bool:
+        """Starts homing; False when the drive cannot now."""
+        if not self.operating or self.v != 0.0:
+            return False
+        self.homing, self.homed, self.task = True, False, False
+        self._until = (self._now or 0.0) + self.params.homing_time
+        return True
+
+    def abort_homing(self) -> None:
+        self.homing = False
+
+    def position(self, target: float, speed: float, acceleration: float, relative: bool = False) -> bool:
+        """A positioning task (reported coordinate); False if refused: not operating, homing, absolute and not homed."""
+        if not self.operating or self.homing or not (self.homed or relative) or acceleration <= 0.0:
+            return False
+        self.target = self.x + target if relative else target + (self.origin or 0.0)
+        self._speed = min(max(speed, 0.0), self.params.speed)
+        self.acceleration = min(acceleration, self.params.acceleration)
+        self.task, self.paused = True, False
+        return True
+
+    def halt(self) -> None:
+        """Brakes and drops the task."""
+        self.task = False
+
+    def pause(self) -> None:
+        """Brakes and keeps the task until ``resume``."""
+        self.paused = True
+
+    def resume(self) -> None:
+        self.paused = False
+
+    def measure(self, position: float) -> None:
+        """The plant's position, of which the generator starts when the drive gets power."""
+        self._position = position
+        if self.origin is None:
+            self.origin = position
+        if self.power not in (Power.OPERATING, Power.SWITCHING_OFF):
+            self.x, self.v = position, 0.0
+
+    def step(self, now: float) -> None:
+        """Moves the generator on to ``now``."""
+        if self._now is None:
+            self._now = now
+        dt, self._now = now - self._now, now
+        before = self.x
+        if self.power is Power.SWITCHING_ON and now >= self._until:
+            self.power = Power.OPERATING
+        if self.power is Power.OPERATING and self.task and not self.paused:
+            self.x, self.v = advance(self.x, self.v, self.target, self._speed, self.acceleration, dt)
+        elif self.power in (Power.OPERATING, Power.SWITCHING_OFF):
+            self.x, self.v = brake(self.x, self.v, self.params.acceleration, dt)
+        if self.power is Power.SWITCHING_OFF and self.v == 0.0:
+            self.power = Power.READY if self._allowed and not self.fault_code else Power.INHIBITED
+        if self.homing and now >= self._until:
+            self.homing, self.homed, self.origin = False, True, 0.0
+        self._area += 0.5 * (before + self.x) * dt
+        self._past.add(now, self.x, self._area)
+
+    def set_point(self) -> float:
+        """Velocity [m/s] for the plant: the smoothed generated one and the position controller's."""
+        window, x, v = self.params.smoothing, self.x, self.v
+        if window > 0.0:
+            earlier, area = self._past.at(self._now - window)
+            x, v = (self._area - area) / window, (self.x - earlier) / window
+        if self.power not in (Power.OPERATING, Power.SWITCHING_OFF):
+            return 0.0
+        error = x - self._position
+        if abs(error) > self.params.following_error:
+            self.fault(FOLLOWING_ERROR)
+        highest = 1.1 * self.params.speed
+        return min(max(v + self.params.position_gain * error, -highest), highest)
+
+    def _switch_off(self) -> None:
+        self.task = self.homing = False
+        if self.power in (Power.OPERATING, Power.SWITCHING_OFF) and self.v != 0.0:
+            self.power = Power.SWITCHING_OFF
+        elif self.power is not Power.INHIBITED:
+            self.power = Power.READY if self._allowed and not self.fault_code else Power.INHIBITED

@@ -1,0 +1,175 @@
+"""Rig and bridge in one process on a clock of its own: the same code as in real time, as fast as the machine allows.
+
+Bytes on the wire are those of the sockets; only UDP and TCP themselves are left out. Deterministic: equal parameters give
+equal episodes, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_JOINTS
+from robot_io.control.bridge import Bridge, BridgeConfig, Policy, State
+from robot_io.control.config import PROFILES, axis_range
+from robot_io.control.episode import EpisodeSummary
+from robot_io.devices.egm.session import EgmConfig, EgmSession
+from robot_io.devices.festo import Axis, DirectLink, FestoAxes
+from robot_io.devices.tracker import Tracker, TrackerConfig
+from robot_io.emulator.arm import ArmController
+from robot_io.emulator.axes import AxisEmulator
+from robot_io.emulator.ball_launcher import Thrower, Throws
+from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, RigParams
+from robot_io.emulator.network import Network
+from robot_io.emulator.tracker import TrackerEmulator
+from robot_io.emulator.world import World
+from robot_io.errors import RefusedError
+from robot_io.log.recorder import SessionRecorder
+from robot_io.safety.gate import SafetyConfig, SafetyGate
+
+GRID = 3000  # ticks a second of the clock, so that 75, 125 and 250 Hz are whole numbers of them
+ARM, AXES, TRACK, CONTROL = GRID // 250, GRID // 125, GRID // 125, GRID // 75
+BRIDGE, CONTROLLER = ("127.0.0.1", 6510), ("127.0.0.1", 6511)
+
+
+class LockStep:
+    """A robot with its bridge, from power-on.
+
+    scene   the MJCF; throws: what is thrown, from ball number ``first`` on
+    world   one to use again, which is reset: making it takes a while
+    """
+
+    def __init__(
+        self,
+        scene: str | Path,
+        throws: Throws,
+        policy: Policy,
+        params: RigParams = RigParams(),
+        config: BridgeConfig = BridgeConfig(),
+        safety: SafetyConfig | None = None,
+        recorder: SessionRecorder | None = None,
+        first: int = 0,
+        world: World | None = None,
+    ) -> None:
+        self.params = params
+        self.world = world or World(scene, params.world)
+        self.world.reset()
+        arm_params = replace(params.arm, dead_time=params.arm.dead_time + params.action_delay)
+        self.arm = ArmController(BRIDGE, arm_params)
+        dead_time = params.axis_dead_time + params.action_delay
+        self.emulators = [
+            AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)
+            for _ in FESTO_JOINTS
+        ]
+        self.axes = FestoAxes([
+            Axis(name, DirectLink(emulator), PROFILES[params.axis_profile](), *axis_range(i))
+            for i, (name, emulator) in enumerate(zip(("gantry_x", "gantry_y"), self.emulators))
+        ], AXES_CONFIG)  # fmt: skip
+        seed = np.random.SeedSequence([params.seed, first]).generate_state(4)
+        self.cameras = TrackerEmulator(params.tracker, int(seed[0]))
+        self._to_bridge = Network(params.arm_network, int(seed[1]))
+        self._to_arm = Network(params.arm_network, int(seed[2]))
+        self._frames = Network(params.tracker_network, int(seed[3]))
+        self.thrower = Thrower(throws, params.pause, first)
+        self.summaries: deque[EpisodeSummary] = deque()
+        session = EgmSession(EgmConfig(controller_address=CONTROLLER[0]))
+        self.bridge = Bridge(
+            session, self.axes, Tracker(TrackerConfig()), SafetyGate(config=safety), policy, config, recorder,
+            self.summaries.append,
+        )  # fmt: skip
+        self._clock = 0
+        self._setpoint = np.zeros(N_JOINTS)
+        self.throwing = False
+        self.bridge_alive = True
+
+    @property
+    def now(self) -> float:
+        return self._clock / GRID
+
+    def step(self) -> None:
+        """To the next moment at which anything happens."""
+        following = min(n - self._clock % n for n in (ARM, CONTROL))
+        self.world.advance(self._setpoint, following / GRID)
+        self._clock += following
+        now, clock = self.now, self._clock
+        if clock % ARM == 0:
+            self._devices(now)
+        if clock % TRACK == 0:
+            world = self.world
+            self.cameras.step(now, world.number, world.ball if world.in_play else None)
+        for datagram in self.cameras.due(now):
+            self._frames.send(datagram, now)
+        if self.bridge_alive:
+            self._bridge(now, clock)
+        for reply in self._to_arm.due(now):
+            self.arm.receive(reply, BRIDGE, now)
+        if self.throwing:
+            self.thrower.update(self.world, now)
+
+    def _devices(self, now: float) -> None:
+        qpos, qvel = self.world.qpos, self.world.qvel
+        abb = list(ABB_JOINTS)
+        speed, datagram = self.arm.step(now, qpos[abb], qvel[abb])
+        self._setpoint[abb] = speed
+        for i, emulator in zip(FESTO_JOINTS, self.emulators):
+            self._setpoint[i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
+        if datagram is not None:
+            self._to_bridge.send(datagram, now)
+
+    def _bridge(self, now: float, clock: int) -> None:
+        bridge, fresh = self.bridge, False
+        for datagram in self._to_bridge.due(now):
+            fresh |= bridge.arm_session.receive(datagram, CONTROLLER, now)
+        if fresh:
+            reply = bridge.arm_received(now)
+            if reply is not None:
+                self._to_arm.send(reply, now)
+        for datagram in self._frames.due(now):
+            bridge.tracker_received(datagram, "127.0.0.1", now)
+        if clock % AXES == 0:
+            self.axes.cycle(now)
+            state = self.axes.state
+            if state is not None:
+                bridge.axes_received(state.position, state.received)
+        if clock % CONTROL == 0:
+            bridge.tick(now, now)
+
+    def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
+        """Runs for at most ``seconds`` or until the condition holds; whether it did."""
+        end = self._clock + round(seconds * GRID)
+        while self._clock < end:
+            if until():
+                return True
+            self.step()
+        return until()
+
+    def start(self) -> None:
+        """Switches everything on, homes the axes and arms the bridge. Raises RefusedError when it does not get ready."""
+        self.arm.motors_on()
+        self.arm.start_rapid()
+        self.arm.start_egm()
+        self.run(0.1)
+        self.axes.enable()
+        self.run(1.0, lambda: self.axes.state is not None and self.axes.state.enabled)
+        self.axes.home()
+        self.run(5.0, lambda: self.axes.problem(self.now) is None)
+        self.run(0.1)
+        self.bridge.arm(self.now)
+        if not self.run(5.0, lambda: self.bridge.at_home):
+            raise RefusedError(f"the rig does not reach its home pose: {self.bridge.gate.faults}")
+
+    def play(self, balls: int, longest: float = 20.0) -> list[EpisodeSummary]:
+        """Plays until the outcomes of ``balls`` more balls are known; fewer when the bridge stops or time runs out."""
+        found: list[EpisodeSummary] = []
+        self.throwing = True
+        for _ in range(balls):
+            self.run(longest, lambda: bool(self.summaries) or self.bridge.state in (State.FAULT, State.DISARMED))
+            if not self.summaries:
+                break
+            found.append(self.summaries.popleft())
+        self.throwing = False
+        return found

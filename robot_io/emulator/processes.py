@@ -1,0 +1,314 @@
+"""The rig in real time: world, arm's controller, linear axes and tracker as processes of their own on real sockets."""
+
+from __future__ import annotations
+
+import multiprocessing
+import random
+import signal
+import socket
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from robot_io.contract import ABB_JOINTS, FESTO_JOINTS
+from robot_io.control import realtime
+from robot_io.control.config import ArmConfig, AxisConfig, RobotConfig
+from robot_io.devices.tracker import TrackerConfig
+from robot_io.emulator.arm import ArmController, ArmStateError
+from robot_io.emulator.axes import AxisEmulator
+from robot_io.emulator.axis_server import serve
+from robot_io.emulator.ball_launcher import Thrower, Throws
+from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, RigParams
+from robot_io.emulator.network import Network
+from robot_io.emulator.shared_state import Shared
+from robot_io.emulator.tracker import TrackerEmulator
+from robot_io.emulator.world import World
+from robot_io.errors import DeviceError
+
+HOST = "127.0.0.1"
+WORLD_STEP = 0.002  # [s]
+START_TIME = 20.0  # [s]
+PORT_RANGE = 20000, 32000
+PRIORITY = 40  # of SCHED_FIFO, where it is allowed
+
+
+@dataclass(frozen=True)
+class Ports:
+    """Of the bridge's two sockets and the two drives."""
+
+    arm: int
+    tracker: int
+    axes: tuple[int, int]
+
+
+def free_ports() -> Ports:
+    """Ports that nobody uses now, below those that the system gives to sockets without one of their own: between this
+    look and their use it would give them away. Raises DeviceError when there are too few."""
+    found: list[int] = []
+    for port in random.SystemRandom().sample(range(*PORT_RANGE), 200):
+        kind = socket.SOCK_DGRAM if len(found) < 2 else socket.SOCK_STREAM
+        with socket.socket(socket.AF_INET, kind) as probe:
+            try:
+                probe.bind((HOST, port))
+            except OSError:
+                continue
+        found.append(port)
+        if len(found) == 4:
+            return Ports(found[0], found[1], (found[2], found[3]))
+    raise DeviceError(f"no free ports for the rig between {PORT_RANGE[0]} and {PORT_RANGE[1]}")
+
+
+class Rig:
+    """The four processes; use as a context manager. ``robot`` is what a bridge needs to connect to them.
+
+    Raises DeviceError when one of them does not start.
+    """
+
+    def __init__(self, scene: str, throws: Throws, params: RigParams = RigParams(), ports: Ports | None = None) -> None:
+        self.params, self.ports = params, ports or free_ports()
+        self._shared = Shared()
+        self._shared["silent_until"][0] = -1.0
+        context = multiprocessing.get_context("spawn")
+        jobs: dict[str, tuple[Callable, tuple]] = {
+            "world": (_world, (scene, throws)), "arm": (_arm, ()), "axes": (_axes, ()), "tracker": (_tracker, ()),
+        }  # fmt: skip
+        self._processes, self._pipes = {}, {}
+        for name, (job, arguments) in jobs.items():
+            mine, theirs = context.Pipe()
+            process = context.Process(
+                target=_run, args=(job, self._shared.name, params, self.ports, theirs, arguments), name=f"rig-{name}"
+            )
+            process.start()
+            theirs.close()
+            self._processes[name], self._pipes[name] = process, mine
+        try:
+            for name, pipe in self._pipes.items():
+                answer = pipe.recv() if pipe.poll(START_TIME) else "does not start"
+                if answer != "ready":
+                    raise DeviceError(f"rig: {name}: {answer}")
+        except (EOFError, DeviceError) as error:
+            self.close()
+            raise DeviceError(str(error) or "rig: a process ended at once") from None
+
+    @property
+    def robot(self) -> RobotConfig:
+        axes = tuple(AxisConfig(HOST, port) for port in self.ports.axes)
+        return RobotConfig(
+            name="rig",
+            arm=ArmConfig(HOST, self.ports.arm, HOST),
+            axis_profile=self.params.axis_profile,
+            axes=axes,
+            axes_motion=AXES_CONFIG,
+            tracker=TrackerConfig(HOST, self.ports.tracker, HOST),
+        )
+
+    def switch_on(self) -> None:
+        """What a person does at the arm's controller: motors on, RAPID, EGM."""
+        self._pipes["arm"].send(("switch_on",))
+
+    def motors_off(self) -> None:
+        """The emergency stop of the arm."""
+        self._pipes["arm"].send(("motors_off",))
+
+    def drive_fault(self, axis: int, code: int) -> None:
+        """A fault of one linear axis's drive."""
+        self._pipes["axes"].send(("fault", axis, code))
+
+    def connect_axis(self, axis: int, connected: bool) -> None:
+        """Pulls a linear axis's network cable or plugs it in again."""
+        self._pipes["axes"].send(("reconnect" if connected else "disconnect", axis))
+
+    def drop_out(self, seconds: float) -> None:
+        """The tracker sends nothing for a while."""
+        self._pipes["tracker"].send(("drop_out", seconds))
+
+    def throw(self, on: bool) -> None:
+        """Starts or ends the throwing of balls."""
+        self._shared["throwing"][0] = on
+
+    @property
+    def thrown(self) -> int:
+        return int(self._shared.value("thrown"))
+
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """True joint positions and velocities (8,)."""
+        qpos, qvel = self._shared.read("qpos", "qvel")
+        return qpos, qvel
+
+    def check(self) -> None:
+        """Raises DeviceError when a process has ended."""
+        for name, process in self._processes.items():
+            if not process.is_alive():
+                raise DeviceError(f"rig: the process of the {name} has ended with status {process.exitcode}")
+
+    def close(self) -> None:
+        self._shared["finish"][0] = 1.0
+        for process in self._processes.values():
+            process.join(2.0)
+            if process.is_alive():
+                process.kill()
+                process.join()
+        for pipe in self._pipes.values():
+            pipe.close()
+        self._shared.close()
+
+    def __enter__(self) -> Rig:
+        return self
+
+    def __exit__(self, *exc_info) -> None:
+        self.close()
+
+
+def _run(job: Callable, name: str, params: RigParams, ports: Ports, pipe, arguments: tuple) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    shared = Shared(name)
+    # These stand for hardware, which nothing else on this machine can delay; below the bridge's priority.
+    realtime.prepare(PRIORITY)
+    try:
+        job(shared, params, ports, pipe, *arguments)
+    except (KeyboardInterrupt, BrokenPipeError, EOFError):
+        pass
+    except OSError as error:
+        pipe.send(str(error))
+    except Exception:
+        pipe.send(traceback.format_exc())
+        raise
+    finally:
+        shared.close()
+
+
+def _paced(shared: Shared, pipe, period: float):
+    """Absolute deadlines [s] until the rig ends; what has been missed is made up for one by one, as a real clock would."""
+    parent = multiprocessing.parent_process()
+    deadline, count = time.monotonic(), 0
+    while not shared.value("finish"):
+        deadline += period
+        count += 1
+        wait = deadline - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        elif wait < -0.5:
+            deadline = time.monotonic()  # the machine was asleep
+        if count % 256 == 0 and not parent.is_alive():
+            return
+        yield deadline
+
+
+def _world(shared: Shared, params: RigParams, ports: Ports, pipe, scene: str, throws: Throws) -> None:
+    world = World(scene, params.world)
+    thrower = Thrower(throws, params.pause)
+
+    def publish(now: float) -> None:
+        shared.publish(
+            now, world.qpos, world.qvel, world.ball, world.number, world.in_play, world.collisions, thrower.thrown
+        )
+
+    publish(time.monotonic())
+    pipe.send("ready")
+    last = time.monotonic()
+    for _ in _paced(shared, pipe, WORLD_STEP):
+        now = time.monotonic()
+        world.advance(shared["setpoint"].copy(), min(now - last, 0.05))
+        last = now
+        if shared.value("throwing"):
+            thrower.update(world, now)
+        publish(now)
+
+
+def _arm(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
+    client = (HOST, ports.arm)
+    controller = ArmController(client, replace(params.arm, dead_time=params.arm.dead_time + params.action_delay))
+    out, back = Network(params.arm_network, params.seed), Network(params.arm_network, params.seed + 1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+        wire.bind((HOST, 0))
+        wire.setblocking(False)
+        pipe.send("ready")
+        rows = list(ABB_JOINTS)
+        for _ in _paced(shared, pipe, params.arm.cycle):
+            while pipe.poll():
+                _operate(controller, pipe.recv()[0])
+            now = time.monotonic()
+            qpos, qvel = shared.read("qpos", "qvel")
+            setpoint, datagram = controller.step(now, qpos[rows], qvel[rows])
+            shared["setpoint"][rows] = setpoint
+            if datagram is not None:
+                out.send(datagram, now)
+            for ready in out.due(now):
+                try:
+                    wire.sendto(ready, client)
+                except OSError:
+                    pass  # nobody listens
+            while True:
+                try:
+                    back.send((received := wire.recvfrom(2048))[0], now)
+                except OSError:
+                    break
+                if received[1] != client:
+                    controller.receive(received[0], received[1], now)  # counted as a stranger's
+            for reply in back.due(now):
+                controller.receive(reply, client, now)
+
+
+def _operate(controller: ArmController, request: str) -> None:
+    if request == "motors_off":
+        controller.motors_off()
+        return
+    for action in (controller.motors_on, controller.start_rapid, controller.start_egm):
+        try:
+            action()
+        except ArmStateError:
+            pass  # it is so already
+
+
+def _axes(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
+    dead_time = params.axis_dead_time + params.action_delay
+    emulators = [
+        AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)
+        for _ in FESTO_JOINTS
+    ]
+    servers = [serve(emulator, HOST, port) for emulator, port in zip(emulators, ports.axes)]
+    try:
+        pipe.send("ready")
+        for _ in _paced(shared, pipe, 0.004):
+            while pipe.poll():
+                kind, axis, *rest = pipe.recv()
+                {
+                    "disconnect": emulators[axis].disconnect,
+                    "reconnect": emulators[axis].reconnect,
+                    "fault": emulators[axis].inject_fault,
+                }[kind](*rest)
+            now = time.monotonic()
+            qpos, qvel = shared.read("qpos", "qvel")
+            for i, emulator in zip(FESTO_JOINTS, emulators):
+                shared["setpoint"][i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
+    finally:
+        for server in servers:
+            server.close()
+
+
+def _tracker(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
+    cameras, network = TrackerEmulator(params.tracker, params.seed + 2), Network(params.tracker_network, params.seed + 3)
+    period = 1.0 / params.tracker.rate
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+        wire.bind((HOST, 0))
+        pipe.send("ready")
+        # Several times a frame, so that frames leave close to the end of their latency.
+        for count, _ in enumerate(_paced(shared, pipe, period / 4)):
+            now = time.monotonic()
+            while pipe.poll():
+                cameras.drop_out(now + pipe.recv()[1])
+            if count % 4 == 0:
+                ball, in_play, number, taken = shared.read("ball", "ball_in_play", "ball_number", "time")
+                cameras.step(float(taken[0]), int(number[0]), ball if in_play[0] else None)
+            for datagram in cameras.due(now):
+                network.send(datagram, now)
+            for datagram in network.due(now):
+                try:
+                    wire.sendto(datagram, (HOST, ports.tracker))
+                except OSError:
+                    pass
+
+

@@ -1,0 +1,56 @@
+"""The ball tracker of the rig: what two cameras and a triangulation make of the world's ball."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from robot_io.devices.tracker import BallSample, encode
+
+
+@dataclass(frozen=True)
+class TrackerParams:
+    """Of the emulated tracker.
+
+    rate     [Hz] of the cameras (paper: 125)
+    latency  [s] from capture to the datagram (paper: about 15 ms)
+    noise    [m] standard deviation on each coordinate
+    offset   [m] of the calibration, added to every position
+    """
+
+    rate: float = 125.0
+    latency: float = 0.015
+    noise: float = 0.003
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class TrackerEmulator:
+    """Frames of the ball; ``step`` once per 1 / rate seconds."""
+
+    def __init__(self, params: TrackerParams, seed: int) -> None:
+        self._params, self._random = params, np.random.default_rng(seed)
+        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._sequence = 0
+        self._silent_until = -np.inf
+
+    def drop_out(self, until: float) -> None:
+        """Sends nothing until then."""
+        self._silent_until = until
+
+    def step(self, now: float, ball: int, position: np.ndarray | None) -> None:
+        """Captures a frame: the ball's number and true position (3,) [m], None when there is none."""
+        params = self._params
+        if position is not None:
+            position = position + params.noise * self._random.normal(size=3) + np.array(params.offset)
+        if now >= self._silent_until:
+            self._waiting.append((now + params.latency, encode(BallSample(self._sequence, ball, now, position))))
+        self._sequence += 1
+
+    def due(self, now: float) -> list[bytes]:
+        """Datagrams that are ready to be sent."""
+        ready = []
+        while self._waiting and self._waiting[0][0] <= now + 1e-9:
+            ready.append(self._waiting.popleft()[1])
+        return ready

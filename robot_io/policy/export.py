@@ -1,0 +1,283 @@
+"""Makes an artefact from trained parameters and proves that its four forms of the policy agree.
+
+The only module of this package that imports JAX, ONNX and ONNX Runtime; the robot needs none of them.
+All forms take a batch-last history (8, 11, B), oldest observation first, and give actions (8, B).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import secrets
+import shutil
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import onnx
+import onnxruntime
+from onnx import TensorProto, helper, numpy_helper
+
+from robot_io import contract
+from robot_io.policy import artefact as artefacts
+from robot_io.policy import numpy_policy
+from robot_io.policy.artefact import ArtefactError
+
+AGREEMENT = 1e-5  # largest difference allowed between any two forms of the policy, of an action in [-1, 1]
+GOLDEN_COUNT = 64
+ONNX_OPSET = 17
+ONNX_IR_VERSION = 8  # the IR that came with opset 17, so older runtimes load it too
+
+def write(
+    folder: str | Path,
+    theta: np.ndarray,
+    normaliser_mean: np.ndarray,
+    normaliser_inverse_scale: np.ndarray,
+    provenance: dict[str, Any],
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Writes the policy theta (976,) with its normaliser (11,), (11,) as an artefact and returns ``verify``'s report.
+
+    ``provenance`` is plain JSON data kept in the manifest: training configuration, git state, seed, return rate.
+    The artefact is built and verified in a hidden folder beside ``folder`` and renamed into place, so ``folder`` never
+    holds half of one. An existing artefact is replaced only with ``overwrite``; a folder that holds anything else never
+    is. Numbers are stored as float32.
+
+    Raises ArtefactError for arrays of a wrong shape, non-finite numbers, provenance that is not JSON, or an existing
+    folder; OSError when the disk refuses.
+    """
+    folder = Path(folder).resolve()
+    _check_target(folder, overwrite)
+    theta = _finite(theta, "theta", (contract.n_parameters(),))
+    mean = _finite(normaliser_mean, "normaliser_mean", (contract.N_OBSERVATION,))
+    inverse_scale = _finite(normaliser_inverse_scale, "normaliser_inverse_scale", (contract.N_OBSERVATION,))
+    contents = _contents(contract.unflatten(theta), mean, inverse_scale, provenance)
+
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    staging = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}")
+    staging.mkdir()
+    try:
+        for name, content in contents.items():
+            with open(staging / name, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        report = verify(staging)
+        _move_into_place(staging, folder, overwrite)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+    return report
+
+
+def verify(folder: str | Path, histories: int = 1000, seed: int = 0) -> dict[str, Any]:
+    """Loads an artefact and compares its four forms on random observation histories.
+
+    Returns {"digest", "histories", "tolerance", "largest_difference" (between any two forms), "from_reference" (per
+    form against the NumPy reference)}. Raises ArtefactError when the artefact does not load or its forms disagree.
+    """
+    artefact = artefacts.load(folder)
+    history = random_histories(artefact.normaliser_mean, artefact.normaliser_inverse_scale, histories, seed)
+    session = onnxruntime.InferenceSession(
+        (artefact.folder / artefacts.ONNX).read_bytes(), providers=["CPUExecutionProvider"]
+    )
+    exported = jax.export.deserialize(bytearray((artefact.folder / artefacts.JAX_EXPORT).read_bytes()))
+    with jax.default_device(jax.devices("cpu")[0]):
+        actions = {
+            "numpy": artefact.forward(history),
+            "jit": np.asarray(_jitted_forward(
+                artefact.parameters,
+                artefact.normaliser_mean.astype(np.float32),
+                artefact.normaliser_inverse_scale.astype(np.float32),
+                history,
+            )),
+            "onnxruntime": session.run(["action"], {"history": history})[0],
+            "jax_export": np.asarray(exported.call(history)),
+        }
+    stacked = np.stack(list(actions.values()))
+    reference = actions.pop("numpy")
+    from_reference = {name: float(np.max(np.abs(action - reference))) for name, action in actions.items()}
+    report = {
+        "digest": artefact.digest,
+        "histories": histories,
+        "tolerance": AGREEMENT,
+        "largest_difference": float(np.max(stacked.max(axis=0) - stacked.min(axis=0))),
+        "from_reference": from_reference,
+    }
+    if not report["largest_difference"] <= AGREEMENT:
+        raise ArtefactError(
+            f"{folder}: its forms of the policy differ by {report['largest_difference']:.3g} (from the NumPy "
+            f"reference: {from_reference}), allowed is {AGREEMENT:g}; do not run it, export the policy again"
+        )
+    return report
+
+
+def forward_jax(
+    parameters: dict[str, jax.Array],
+    normaliser_mean: jax.Array,
+    normaliser_inverse_scale: jax.Array,
+    history: jax.Array,
+) -> jax.Array:
+    """``policy_numpy.forward`` for a batch in JAX: history (8, 11, B) to actions (8, B), in the inputs' precision."""
+    x = (history - normaliser_mean[:, None]) * normaliser_inverse_scale[:, None]
+    for i, (dilation, gated) in enumerate(zip(contract.DILATIONS, contract.GATED), start=1):
+        taps = jnp.stack([x[:-dilation], x[dilation:]])
+        x = jnp.einsum("kio,ktib->tob", parameters[f"conv{i}/kernel"], taps, precision=jax.lax.Precision.HIGHEST)
+        x = x + parameters[f"conv{i}/bias"][:, None]
+        if gated:
+            signal, gate = jnp.split(x, 2, axis=1)
+            x = jnp.tanh(signal) * jax.nn.sigmoid(gate)
+        else:
+            x = jnp.tanh(x)
+    return x[0]
+
+
+_jitted_forward = jax.jit(forward_jax)
+
+
+def random_histories(mean: np.ndarray, inverse_scale: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Observation histories (8, 11, count), float32, spread twice as wide as what the normaliser saw in training."""
+    scale = np.divide(1.0, inverse_scale, out=np.ones_like(inverse_scale), where=inverse_scale > 0)
+    standard = np.random.default_rng(seed).standard_normal((contract.HISTORY, contract.N_OBSERVATION, count))
+    return (mean[:, None] + 2.0 * scale[:, None] * standard).astype(np.float32)
+
+
+def onnx_model(parameters: dict[str, np.ndarray], mean: np.ndarray, inverse_scale: np.ndarray) -> onnx.ModelProto:
+    """The policy with its normaliser as a graph of standard operators: "history" (8, 11, B) to "action" (8, B)."""
+    constants = {"mean": mean[:, None], "inverse_scale": inverse_scale[:, None]}
+    nodes = [
+        helper.make_node("Sub", ["history", "mean"], ["centred"]),
+        helper.make_node("Mul", ["centred", "inverse_scale"], ["normalised"]),
+        helper.make_node("Transpose", ["normalised"], ["layer0"], perm=[2, 1, 0]),  # Conv wants (B, channels, time)
+    ]
+    for i, (dilation, gated) in enumerate(zip(contract.DILATIONS, contract.GATED), start=1):
+        constants[f"kernel{i}"] = np.ascontiguousarray(parameters[f"conv{i}/kernel"].transpose(2, 1, 0))
+        constants[f"bias{i}"] = parameters[f"conv{i}/bias"]
+        nodes.append(helper.make_node(
+            "Conv", [f"layer{i - 1}", f"kernel{i}", f"bias{i}"], [f"conv{i}"],
+            kernel_shape=[contract.KERNEL], dilations=[dilation],
+        ))
+        if gated:
+            nodes += [
+                helper.make_node("Split", [f"conv{i}"], [f"signal{i}", f"gate{i}"], axis=1),
+                helper.make_node("Tanh", [f"signal{i}"], [f"tanh{i}"]),
+                helper.make_node("Sigmoid", [f"gate{i}"], [f"sigmoid{i}"]),
+                helper.make_node("Mul", [f"tanh{i}", f"sigmoid{i}"], [f"layer{i}"]),
+            ]
+        else:
+            nodes.append(helper.make_node("Tanh", [f"conv{i}"], [f"layer{i}"]))
+    constants["time_axis"] = np.array([2], np.int64)
+    nodes += [
+        helper.make_node("Squeeze", [f"layer{len(contract.FILTERS)}", "time_axis"], ["batch_first"]),
+        helper.make_node("Transpose", ["batch_first"], ["action"], perm=[1, 0]),
+    ]
+    value = helper.make_tensor_value_info
+    graph = helper.make_graph(
+        nodes,
+        "table_tennis_policy",
+        [value("history", TensorProto.FLOAT, [contract.HISTORY, contract.N_OBSERVATION, "batch"])],
+        [value("action", TensorProto.FLOAT, [contract.N_JOINTS, "batch"])],
+        [numpy_helper.from_array(array, name) for name, array in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", ONNX_OPSET)], ir_version=ONNX_IR_VERSION)
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def jax_export(parameters: dict[str, np.ndarray], mean: np.ndarray, inverse_scale: np.ndarray) -> bytes:
+    """The policy with its numbers inside, serialised by ``jax.export`` for the CPU, any batch size."""
+    policy = jax.jit(lambda history: forward_jax(parameters, mean, inverse_scale, history))
+    shape = jax.export.symbolic_shape(f"{contract.HISTORY}, {contract.N_OBSERVATION}, batch")
+    exported = jax.export.export(policy, platforms=["cpu"])(jax.ShapeDtypeStruct(shape, jnp.float32))
+    return bytes(exported.serialize())
+
+
+def _contents(
+    parameters: dict[str, np.ndarray], mean: np.ndarray, inverse_scale: np.ndarray, provenance: dict[str, Any]
+) -> dict[str, bytes]:
+    history = random_histories(mean, inverse_scale, GOLDEN_COUNT, seed=1)
+    action = numpy_policy.forward(parameters, mean, inverse_scale, history)
+    contents = {
+        artefacts.PARAMETERS: _npz(parameters),
+        artefacts.GOLDEN: _npz({"history": history, "action": action}),
+        artefacts.ONNX: onnx_model(parameters, mean, inverse_scale).SerializeToString(),
+        artefacts.JAX_EXPORT: jax_export(parameters, mean, inverse_scale),
+    }
+    manifest = {
+        "schema_version": artefacts.SCHEMA_VERSION,
+        "contract": contract.describe(),
+        "architecture": artefacts.architecture(),
+        "normaliser": {
+            "formula": artefacts.NORMALISER_FORMULA,
+            "mean": [float(v) for v in mean],
+            "inverse_scale": [float(v) for v in inverse_scale],
+        },
+        "golden": {"file": artefacts.GOLDEN, "count": GOLDEN_COUNT, "tolerance": artefacts.GOLDEN_TOLERANCE},
+        "files": {name: artefacts.sha256(content) for name, content in contents.items()},
+        "provenance": provenance,
+        "written_with": {
+            "utc": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "jax": jax.__version__,
+            "numpy": np.__version__,
+            "onnx": onnx.__version__,
+            "onnx_opset": ONNX_OPSET,
+        },
+    }
+    try:
+        raw = json.dumps(manifest, indent=2, allow_nan=False).encode()
+    except (TypeError, ValueError) as error:
+        message = f"{artefacts.MANIFEST}: provenance is not plain JSON ({error}); convert it first"
+        raise ArtefactError(message) from error
+    return contents | {artefacts.MANIFEST: raw, artefacts.MANIFEST_DIGEST: artefacts.digest_line(raw)}
+
+
+def _npz(arrays: dict[str, np.ndarray]) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def _finite(array: np.ndarray, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(array, np.float32)
+    if array.shape != shape:
+        raise ArtefactError(f"{name} has shape {array.shape}, expected {shape}")
+    bad = np.flatnonzero(~np.isfinite(array))
+    if bad.size:
+        raise ArtefactError(
+            f"{name}[{bad[0]}] is {array[bad[0]]} ({bad.size} non-finite in all); export an earlier checkpoint"
+        )
+    return array
+
+
+def _check_target(folder: Path, overwrite: bool) -> None:
+    if not folder.exists():
+        return
+    if not overwrite:
+        raise ArtefactError(f"{folder}: already exists; choose another name or overwrite it explicitly")
+    if not folder.is_dir():
+        raise ArtefactError(f"{folder}: is a file, an artefact is a folder; choose another name")
+    foreign = sorted({entry.name for entry in folder.iterdir()} - set(artefacts.FILES))
+    if foreign:
+        raise ArtefactError(
+            f"{folder}: holds {', '.join(foreign)}, which no artefact does; not overwritten, choose another name"
+        )
+
+
+def _move_into_place(staging: Path, folder: Path, overwrite: bool) -> None:
+    _check_target(folder, overwrite)  # again: the target may have appeared meanwhile
+    if not folder.exists():
+        os.rename(staging, folder)
+        return
+    # A folder cannot be renamed over a full one. A crash between the two renames leaves the old artefact whole, here:
+    replaced = folder.with_name(f".{folder.name}.replaced-{secrets.token_hex(4)}")
+    os.rename(folder, replaced)
+    try:
+        os.rename(staging, folder)
+    except OSError:
+        os.rename(replaced, folder)
+        raise
+    shutil.rmtree(replaced)

@@ -1,0 +1,307 @@
+"""Where the robot's capsules are and how far they stay from the table, the floor and each other. NumPy, float64.
+
+``robot_geometry.json`` (format 1) is written from the MJCF by ``python -m mjx_tt.robot.geometry_export``:
+    joints          in contract order: name, type (slide or hinge), unit axis, pos and rot of the joint's frame in the
+                    one before it at q = 0 [m]; every frame sits on its joint's anchor, hinges come after slides
+    capsules        name, the joint that carries it, axis end points p0 and p1 in that joint's frame, radius [m]
+    table           centre and half sizes of the table top's box [m];   floor: its height [m]
+    table_capsules, blade_capsules, self_pairs: names of what is watched;   home: joint positions (8,)
+
+Gaps are signed: negative by how deep a capsule overlaps, at most by its radius (an axis inside the box counts as 0).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robot_io.contract import JOINT_NAMES, N_JOINTS
+
+FORMAT = 1
+SHIPPED = "robot_geometry.json"
+LEVELS = 5  # halvings of a stretch before it counts as too close
+
+_KEYS = ("format", "joints", "capsules", "table", "floor", "table_capsules", "blade_capsules", "self_pairs", "home")
+_TINY = 1e-12  # as in the simulation: segments more parallel than this are taken as parallel
+_NO_WAY = 1e-30  # stands for a direction component of 0 in quotients
+
+
+class GeometryError(ValueError):
+    """The geometry file cannot be used: the message names the file, what was found and what to do."""
+
+
+class Clearances(NamedTuple):
+    """Smallest gaps [m], each (B,), as the simulation's reward knows them."""
+
+    table: np.ndarray  # any watched capsule to the table top
+    own: np.ndarray  # any watched pair of capsules
+    blade: np.ndarray  # the blade to the table top
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box: low and high corners (3, 1, 1) [m]."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+    def distance(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Distance [m], (n, B), of segments p-q, ends (3, n, B); 0 where they meet. Exact.
+
+        Along a segment the squared distance is convex and its derivative linear between the points where a coordinate
+        enters or leaves its slab: interpolating between the two such points around the zero finds the minimum.
+        """
+        d = q - p
+        inverse = 1.0 / np.where(np.abs(d) < _NO_WAY, _NO_WAY, d)
+        kinks = np.concatenate([(self.low - p) * inverse, (self.high - p) * inverse])
+        t = np.empty((8, *p.shape[1:]))
+        t[0], t[1] = 0.0, 1.0
+        np.clip(kinks, 0.0, 1.0, out=t[2:])
+        slope = np.einsum("xknb,xnb->knb", self._gap(p[:, None] + t * d[:, None]), d)
+        falling = slope <= 0.0
+        t_low, t_high = np.where(falling, t, 0.0).max(0), np.where(falling, 1.0, t).min(0)
+        s_low, s_high = np.where(falling, slope, -np.inf).max(0), np.where(falling, np.inf, slope).min(0)
+        inside = np.isfinite(s_low) & np.isfinite(s_high)
+        share = -np.where(inside, s_low, 0.0) / np.where(inside, s_high - s_low, 1.0)
+        best = np.where(np.isfinite(s_low), np.where(inside, t_low + share * (t_high - t_low), 1.0), 0.0)
+        gap = self._gap(p + best * d)
+        return np.sqrt(np.einsum("xnb,xnb->nb", gap, gap))
+
+    def _gap(self, point):
+        """From the nearest point of the box to ``point`` (3, ..., n, B)."""
+        extra = (1,) * (point.ndim - 3)
+        low, high = (corner.reshape(3, *extra, 1, 1) for corner in (self.low, self.high))
+        return point - np.minimum(np.maximum(point, low), high)
+
+
+def segment_distance(p1, q1, p2, q2) -> np.ndarray:
+    """Distance [m], (n, B), of segments p1-q1 and p2-q2, each end (3, n, B).
+
+    Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
+    """
+    d1, d2, r = q1 - p1, q2 - p2, p1 - p2
+    a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
+    f, c = _dot(d2, r), _dot(d1, r)
+    denominator = a * e - b * b
+    s = np.where(denominator > _TINY, (b * f - c * e) / np.maximum(denominator, _TINY), 0.0)
+    t = np.clip((b * np.clip(s, 0.0, 1.0) + f) / np.maximum(e, _TINY), 0.0, 1.0)
+    s = np.clip((b * t - c) / np.maximum(a, _TINY), 0.0, 1.0)
+    gap = r + s * d1 - t * d2
+    return np.sqrt(_dot(gap, gap))
+
+
+def _dot(a, b):
+    return np.einsum("xnb,xnb->nb", a, b)
+
+
+class RobotGeometry:
+    """The robot's capsules and what is watched about them.
+
+    rows    what each watched gap is between, for messages: "col_wrist to the table", ...
+    kinds   (R,) what kind of gap a row is: "table", "self" or "floor"
+    home    (8,) joint positions of the home pose
+    """
+
+    def __init__(self, data: dict[str, Any], where: str = "geometry") -> None:
+        """From parsed JSON; ``where`` names its origin in errors. Raises GeometryError."""
+        _check(data, where)
+        self.home = np.array(data["home"], float)
+        self._basis = _transform_basis(data["joints"])
+        self._hinge = np.array([[joint["type"] == "hinge"] for joint in data["joints"]], float)
+        capsules = {c["name"]: c for c in data["capsules"]}
+        watched, pairs = data["table_capsules"], data["self_pairs"]
+        unknown = sorted({*watched, *data["blade_capsules"], *(n for pair in pairs for n in pair)} - capsules.keys())
+        if unknown:
+            raise GeometryError(f"{where}: no capsules named {unknown}; it has {sorted(capsules)}")
+        order = self._names = list(capsules)
+        self._joint = np.array([JOINT_NAMES.index(capsules[n]["joint"]) for n in order])
+        local = np.array([[[*capsules[n][end], 1.0] for end in ("p0", "p1")] for n in order])
+        self._local = local.swapaxes(1, 2)[:, None]  # (capsules, 1, 4, 2)
+        self._radius = np.array([capsules[n]["radius"] for n in order], float)[:, None]
+        self._table_rows = np.array([order.index(n) for n in watched])
+        self._blade_rows = np.array([watched.index(n) for n in data["blade_capsules"]])
+        self._first = np.array([order.index(a) for a, _ in pairs])
+        self._second = np.array([order.index(b) for _, b in pairs])
+        centre, half = (np.array(data["table"][key], float).reshape(3, 1, 1) for key in ("centre", "half"))
+        self._floor = float(data["floor"])
+        self._top = Box(centre - half, centre + half)
+        # Frame and legs are not modelled one by one: nothing of the arm belongs under the table.
+        self._block = Box(np.concatenate([self._top.low[:2], [[[self._floor]]]]), self._top.high)
+        self.rows = (
+            *(f"{n} to the table" for n in watched),
+            *(f"{a} to {b}" for a, b in pairs),
+            *(f"{n} to the floor" for n in watched),
+        )
+        self.kinds = np.array(["table"] * len(watched) + ["self"] * len(pairs) + ["floor"] * len(watched))
+        self._levers = _levers(data["joints"], [(int(j), capsules[n]) for j, n in zip(self._joint, order)])
+
+    @classmethod
+    def load(cls, path: str | Path | None = None) -> RobotGeometry:
+        """The shipped geometry, or another file. Raises GeometryError."""
+        source = resources.files("robot_io.safety") / SHIPPED if path is None else Path(path)
+        try:
+            data = json.loads(source.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            remedy = "write it with python -m mjx_tt.robot.geometry_export"
+            raise GeometryError(f"{source}: cannot be read ({error}); {remedy}") from error
+        return cls(data, str(source))
+
+    def ends(self, q: np.ndarray) -> np.ndarray:
+        """World end points (2, 3, capsules, B) of every capsule's axis at joint positions q (8, B)."""
+        n = q.shape[1]
+        values = np.stack([np.ones_like(q), np.sin(q), 1.0 - np.cos(q), q], axis=-1)  # (8, B, 4)
+        local = np.matmul(values, self._basis).reshape(N_JOINTS, n, 4, 4)
+        world = np.empty_like(local)
+        world[0] = local[0]
+        for i in range(1, N_JOINTS):
+            np.matmul(world[i - 1], local[i], out=world[i])
+        points = np.matmul(world[self._joint, :, :3], self._local)  # (capsules, B, 3, 2)
+        return np.ascontiguousarray(points.transpose(3, 2, 0, 1))
+
+    def middle(self, capsule: str, q: np.ndarray) -> np.ndarray:
+        """World position (3,) [m] of the middle of a capsule's axis at joint positions q (8,)."""
+        return self.ends(q[:, None])[:, :, self._names.index(capsule), 0].mean(axis=0)
+
+    def clearances(self, q: np.ndarray) -> Clearances:
+        """The simulation's clearances at joint positions q (8, B)."""
+        ends = self.ends(np.asarray(q, float))
+        table = self._to_box(self._top, ends)
+        return Clearances(table.min(0), self._own(ends).min(0), table[self._blade_rows].min(0))
+
+    def gaps(self, q: np.ndarray) -> np.ndarray:
+        """Every watched gap (R, B) [m] in the order of ``rows`` at q (8, B).
+
+        Here the table reaches down to the floor, so a gap to it is never larger than ``clearances`` says.
+        """
+        return self._gaps(self.ends(q))
+
+    def first_too_close(self, q: np.ndarray, margin: np.ndarray, slack: float) -> int | None:
+        """Row of a gap that may come too close on the way q (8, N), straight between its points; None: proven clear.
+
+        margin  (R,) [m] wanted gaps; where a row starts with less, it must not lose anything
+        slack   [m] by which gaps may be smaller between the points than at them
+
+        Between two points a capsule leaves the straight chord by at most its curvature / 8, and along the chords a gap
+        stays above (g_0 + g_1 - chord) / 2. Stretches that this does not clear are halved up to ``LEVELS`` times; what
+        is unclear then counts as too close.
+        """
+        ends = self.ends(q)
+        gaps = self._gaps(ends)
+        least = np.minimum(margin, gaps[:, 0])[:, None]
+        low = ~(gaps >= least).all(1)  # so that NaN is too close
+        if low.any():
+            return int(low.argmax())
+        least = least - slack
+        a, b = slice(None, -1), slice(1, None)
+        q0, q1, e0, e1, g0, g1 = q[:, a], q[:, b], ends[..., a], ends[..., b], gaps[:, a], gaps[:, b]
+        for level in range(LEVELS + 1):
+            unclear = ~(0.5 * (g0 + g1 - self._chord(e1 - e0)) - self._bulge(q1 - q0) >= least)
+            some = unclear.any(0)
+            if not some.any():
+                return None
+            if level == LEVELS:
+                break
+            q0, q1, e0, e1, g0, g1 = (x[..., some] for x in (q0, q1, e0, e1, g0, g1))
+            middle = 0.5 * (q0 + q1)
+            ends = self.ends(middle)
+            gaps = self._gaps(ends)
+            low = ~(gaps >= least).all(1)
+            if low.any():
+                return int(low.argmax())
+            q0, q1 = np.concatenate([q0, middle], -1), np.concatenate([middle, q1], -1)
+            e0, e1 = np.concatenate([e0, ends], -1), np.concatenate([ends, e1], -1)
+            g0, g1 = np.concatenate([g0, gaps], -1), np.concatenate([gaps, g1], -1)
+        return int(unclear.any(1).argmax())
+
+    def _to_box(self, box: Box, ends: np.ndarray) -> np.ndarray:
+        some = ends[:, :, self._table_rows]
+        return box.distance(some[0], some[1]) - self._radius[self._table_rows]
+
+    def _own(self, ends: np.ndarray) -> np.ndarray:
+        first, second = ends[:, :, self._first], ends[:, :, self._second]
+        distance = segment_distance(first[0], first[1], second[0], second[1])
+        return distance - self._radius[self._first] - self._radius[self._second]
+
+    def _gaps(self, ends: np.ndarray) -> np.ndarray:
+        floor = ends[:, 2, self._table_rows].min(0) - self._radius[self._table_rows] - self._floor
+        return np.concatenate([self._to_box(self._block, ends), self._own(ends), floor])
+
+    def _chord(self, moved: np.ndarray) -> np.ndarray:
+        """Longest chord (R, B) of any point of what a row is between, from the ends' ways (2, 3, n, B)."""
+        alone = np.sqrt(np.einsum("exnb,exnb->enb", moved, moved).max(0))[self._table_rows]
+        relative = moved[:, None, :, self._first] - moved[None, :, :, self._second]
+        pairs = np.sqrt(np.einsum("efxnb,efxnb->efnb", relative, relative).max((0, 1)))
+        return np.concatenate([alone, pairs, alone])
+
+    def _bulge(self, dq: np.ndarray) -> np.ndarray:
+        """How far (R, B) a row's gap can differ from that along the chords, for joints moving straight by dq (8, B)."""
+        size = np.abs(dq) * self._hinge
+        inner = np.cumsum(size, axis=0) - size
+        bulge = self._levers @ (size * (size + 2.0 * inner)) / 8.0  # (capsules, B)
+        alone = bulge[self._table_rows]
+        return np.concatenate([alone, bulge[self._first] + bulge[self._second], alone])
+
+
+def _transform_basis(joints: list[dict]) -> np.ndarray:
+    """(8, 4, 16): every joint's 4 x 4 transform is the sum of these times 1, sin q, 1 - cos q and q (Rodrigues)."""
+    basis = np.zeros((N_JOINTS, 4, 4, 4))
+    for i, joint in enumerate(joints):
+        rot, axis = np.array(joint["rot"], float), np.array(joint["axis"], float)
+        basis[i, 0, :3, :3], basis[i, 0, :3, 3], basis[i, 0, 3, 3] = rot, joint["pos"], 1.0
+        if joint["type"] == "slide":
+            basis[i, 3, :3, 3] = rot @ axis
+        else:
+            x, y, z = axis
+            skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            basis[i, 1, :3, :3], basis[i, 2, :3, :3] = rot @ skew, rot @ skew @ skew
+    return basis.reshape(N_JOINTS, 4, 16)
+
+
+def _levers(joints: list[dict], capsules: list[tuple[int, dict]]) -> np.ndarray:
+    """(capsules, 8) [m]: bound on the distance of a capsule's axis from each hinge that moves it, in any pose."""
+    levers = np.zeros((len(capsules), N_JOINTS))
+    for row, (last, capsule) in enumerate(capsules):
+        length = max(math.hypot(*capsule["p0"]), math.hypot(*capsule["p1"]))
+        for i in range(last, -1, -1):
+            if joints[i]["type"] == "hinge":
+                levers[row, i] = length
+                length += math.hypot(*joints[i]["pos"])
+    return levers
+
+
+def _check(data: Any, where: str) -> None:
+    rewrite = "write it again with python -m mjx_tt.robot.geometry_export"
+    if not isinstance(data, dict) or set(data) != set(_KEYS):
+        found = sorted(data) if isinstance(data, dict) else type(data).__name__
+        raise GeometryError(f"{where}: keys are {found}, expected {sorted(_KEYS)}; {rewrite}")
+    if data["format"] != FORMAT:
+        raise GeometryError(f"{where}: format is {data['format']!r}, this program reads {FORMAT}; {rewrite}")
+    try:
+        names = tuple(joint["name"] for joint in data["joints"])
+        if names != JOINT_NAMES:
+            raise GeometryError(f"{where}: joints are {names}, the contract's are {JOINT_NAMES}; {rewrite}")
+        types = [joint["type"] for joint in data["joints"]]
+        if types != sorted(types, key=("slide", "hinge").index):
+            raise GeometryError(f"{where}: joint types are {types}; slides must come before hinges")
+        numbers = [
+            *(np.array(joint[key], float).reshape(shape) for joint in data["joints"]
+              for key, shape in (("axis", 3), ("pos", 3), ("rot", (3, 3)))),
+            *(np.array(c[key], float).reshape(shape) for c in data["capsules"]
+              for key, shape in (("p0", 3), ("p1", 3), ("radius", ()))),
+            *(np.array(data["table"][key], float).reshape(3) for key in ("centre", "half")),
+            np.array(data["home"], float).reshape(N_JOINTS), np.array(data["floor"], float).reshape(()),
+        ]  # fmt: skip
+        if any(c["joint"] not in JOINT_NAMES for c in data["capsules"]):
+            raise GeometryError(f"{where}: a capsule is on a joint that is none of {JOINT_NAMES}; {rewrite}")
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, GeometryError):
+            raise
+        raise GeometryError(f"{where}: malformed ({error!r}); {rewrite}") from error
+    if not all(np.isfinite(n).all() for n in numbers):
+        raise GeometryError(f"{where}: holds a non-finite number; {rewrite}")

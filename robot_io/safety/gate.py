@@ -1,0 +1,383 @@
+"""The last gate that every velocity command passes on its way to the robot, once per control period: docs/safety.md.
+
+The gate keeps a reference: the joint positions that its commands add up to. What it has accepted so far can always be
+braked: from the reference and the last velocity every joint, slowing down at its acceleration limit, comes to rest
+inside its range, and the robot on its way keeps its margins to table, floor and itself. A request is accepted only when
+the same holds after it; otherwise the gate brakes, along the way that was proven before. Any doubt means the same:
+brake, hold, and remember why.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from robot_io.contract import CONTROL_RATE, JOINT_NAMES, JOINT_UNITS, LIMITS, N_JOINTS, JointLimits
+from robot_io.errors import RefusedError
+from robot_io.limits import limit_velocity
+from robot_io.safety.clearance import RobotGeometry
+from robot_io.safety.config import SLACK
+from robot_io.safety.config import SafetyConfig as SafetyConfig
+from robot_io.safety.faults import Cause, Fault, FaultLatch
+from robot_io.safety.monitor import FeedbackMonitor, eight, worst
+
+SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
+INSIDE = 1e-6  # [m] by which a gap must miss its margin to count as inside: more than rounding
+ROUNDING = 1e-9  # of each limit, allowed in the check of our own results
+LONGEST_LEAD = 3.0  # control periods that commands may come ahead of the clock
+
+
+class State(Enum):
+    DISARMED = "disarmed"  # nothing moves; the reference is the measured position
+    ARMED = "armed"  # requests pass as far as they are safe
+    STOPPING = "stopping"  # slowing down to rest, then holding
+    FAULT = "fault"  # as stopping, until the operator resets the faults
+
+
+@dataclass(frozen=True)
+class Sent:
+    """What the gate lets pass; the only thing that may be sent to the robot.
+
+    velocity  (8,) for the coming control period [m/s], [rad/s]
+    position  (8,) reference at that period's end [m], [rad]; NaN while no finite position was ever measured
+    changed   names of the rules that changed the request, in order: speed_scale, escape, velocity, acceleration,
+              position, clearance, or the state's name when it is not armed; empty: sent as requested
+    state     after this command
+    """
+
+    velocity: np.ndarray
+    position: np.ndarray
+    changed: tuple[str, ...]
+    state: State
+
+
+class SafetyGate:
+    """One robot's gate. Times are seconds of one monotonic clock, passed in by the caller.
+
+    limits    kinematic limits; the simulation's
+    period    control period [s]
+    geometry  the robot's, None: the shipped one
+    """
+
+    def __init__(
+        self,
+        limits: JointLimits = LIMITS,
+        period: float = 1.0 / CONTROL_RATE,
+        geometry: RobotGeometry | None = None,
+        config: SafetyConfig | None = None,
+    ) -> None:
+        if not 0.0 < period < math.inf:
+            raise ValueError(f"period is {period} s, it must be positive")
+        self.config = config = config or SafetyConfig()
+        self.geometry = geometry or RobotGeometry.load()
+        self.period = period
+        scale = config.speed_scale
+        self.limits = limits if scale == 1.0 else replace(
+            limits,
+            velocity=tuple(scale * v for v in limits.velocity),
+            policy_velocity=tuple(scale * v for v in limits.policy_velocity),
+        )  # fmt: skip
+        self._v_max, self._a = np.array(self.limits.velocity), np.array(limits.acceleration)
+        self._step = self._a * period
+        # Beyond the limiter's own margin by this the limiter still leads back within a period or two.
+        outside = np.array(limits.margin) - 0.25 * self._step * period
+        self._low, self._high = np.array(limits.lower) + outside, np.array(limits.upper) - outside
+        margins = {"table": config.table_margin, "self": config.self_margin, "floor": config.floor_margin}
+        self._margin = np.array([margins[kind] for kind in self.geometry.kinds])
+        self._inside = np.zeros(self._margin.shape, bool)  # gaps that have been below their margin since arming
+        self._still = np.array(config.still)
+        self._monitor = FeedbackMonitor(limits, self.geometry, config)
+        self._latch = FaultLatch()
+        self._mode = State.DISARMED  # apart from faults
+        self._engaged = False  # whether the reference is ours, not the measured position
+        self._velocity, self._acceleration = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
+        self._reference = np.full(N_JOINTS, np.nan)
+        self._measured_velocity: np.ndarray | None = None
+        self._last: float | None = None  # time of the command before
+        self._lead = 0.0  # [s] that commands are ahead of the clock
+        self._armed_at = 0.0
+
+    @property
+    def state(self) -> State:
+        return State.FAULT if self._latch else self._mode
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the command in force is zero velocity."""
+        return not self._velocity.any()
+
+    @property
+    def engaged(self) -> bool:
+        """Whether the reference is the gate's: from arming to disarming or reset. Otherwise nothing may be sent."""
+        return self._engaged
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocity (8,) that was sent last."""
+        return self._velocity.copy()
+
+    @property
+    def reference(self) -> np.ndarray:
+        """Reference (8,) that was sent last."""
+        return self._reference.copy()
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Latched faults: the one that stopped the robot, then what came later."""
+        return self._latch.all
+
+    @property
+    def present(self) -> dict[Cause, str]:
+        """Conditions that keep the gate from being armed or reset at the moment."""
+        return self._latch.present
+
+    def arm(self, measured, now: float, measured_velocity=None) -> None:
+        """Takes the measured position (8,) as reference and lets requests pass from now on.
+
+        measured_velocity (8,): None takes what the last ``command`` was told. Raises RefusedError, and changes nothing,
+        when a fault is latched or present, the position is outside its range or in contact, or the robot moves.
+        """
+        if self._latch:
+            raise RefusedError(f"not armed: {self._latch.first}; reset it first")
+        if self._latch.present:
+            listed = "; ".join(f"{cause.name}: {sentence}" for cause, sentence in self._latch.present.items())
+            raise RefusedError(f"not armed: {listed}")
+        if self._mode is State.ARMED or not self.at_rest:
+            raise RefusedError("not armed: it is armed or still stopping")
+        if not math.isfinite(now):
+            raise RefusedError(f"not armed: the time is {now}")
+        position, problem = eight(measured, "measured position")
+        if problem:
+            raise RefusedError(f"not armed: {problem}")
+        outside = (position < self._low) | (position > self._high)
+        if outside.any():
+            i = int(outside.argmax())
+            allowed = f"[{self._low[i]:.4f}, {self._high[i]:.4f}] {JOINT_UNITS[i]}"
+            found = f"{JOINT_NAMES[i]} is at {position[i]:.4f}"
+            raise RefusedError(f"not armed: {found}, allowed is {allowed}; jog it back")
+        touching = self._monitor.contact(position)
+        if touching:
+            raise RefusedError(f"not armed: {touching}; jog it away")
+        velocity = self._measured_velocity if measured_velocity is None else measured_velocity
+        if velocity is None:
+            raise RefusedError("not armed: no measured velocity yet")
+        velocity, problem = eight(velocity, "measured velocity")
+        if problem:
+            raise RefusedError(f"not armed: {problem}")
+        if (np.abs(velocity) > self._still).any():
+            raise RefusedError(f"not armed: {worst(velocity, self._still, '/s')}, it must be at rest")
+        self._mode, self._engaged, self._armed_at = State.ARMED, True, now
+        self._velocity, self._acceleration = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
+        self._reference = position
+        self._inside = np.ones(self._margin.shape, bool)
+        self._lead, self._last = 0.0, None
+        self._monitor.restart(position, now)
+
+    def brake(self, now: float) -> None:
+        """Slows down to rest from the next command on and holds; no fault. Armed again by ``arm``."""
+        if self._mode is State.ARMED:
+            self._mode = State.STOPPING
+
+    def disarm(self, now: float) -> None:
+        """Gives the reference up. Raises RefusedError while the robot is commanded to move: brake first."""
+        if not self.at_rest:
+            raise RefusedError("not disarmed: it still moves; brake first")
+        self._mode, self._engaged = State.DISARMED, False
+
+    def fault(self, cause: Cause, sentence: str, now: float) -> None:
+        """Latches something that has happened, and brakes."""
+        self._latch.event(cause, sentence, now)
+        if self._mode is State.ARMED:
+            self._mode = State.STOPPING
+
+    def condition(self, cause: Cause, present: bool, sentence: str, now: float) -> None:
+        """Says whether something lasts that must not be: brakes and latches it, and neither ``reset`` nor ``arm`` works
+        until it is said to be over. While disarmed it is only noted, but for the emergency stop."""
+        self._latch.condition(cause, present, sentence, now, latch=self._engaged or cause is Cause.ESTOP)
+        if present and self._mode is State.ARMED:
+            self._mode = State.STOPPING
+
+    def estop(self, pressed: bool, now: float) -> None:
+        """Tells the state of the emergency stop."""
+        self.condition(Cause.ESTOP, pressed, "the emergency stop is pressed", now)
+
+    def reset(self, now: float) -> None:
+        """The operator's: forgets the faults; the gate is disarmed then. Without a fault it does nothing.
+
+        Raises RefusedError, and forgets nothing, while the robot is commanded to move or a cause is present.
+        """
+        if not self._latch:
+            return
+        if not self.at_rest:
+            raise RefusedError("cannot reset: it still moves")
+        self._latch.reset()
+        self._mode, self._engaged = State.DISARMED, False
+
+    def check(
+        self, now: float, arm_age: float, axes_age: float, tracker_age: float, ball_in_play: bool, policy_age: float
+    ) -> None:
+        """Watchdogs: ages [s] of what was last heard of each device, infinite for never; NaN counts as too old.
+
+        The policy's age matters only while armed and is counted from arming at the earliest.
+        """
+        c = self.config
+        if self._mode is State.ARMED and not self._latch:
+            policy_age = min(policy_age, now - self._armed_at) if policy_age == policy_age else math.nan
+        else:
+            policy_age = 0.0
+        for cause, what, age, allowed in (
+            (Cause.STALE_ARM, "the arm's controller", arm_age, c.stale_arm),
+            (Cause.STALE_AXES, "the linear axes", axes_age, c.stale_axes),
+            (Cause.STALE_TRACKER, "the tracker", tracker_age if ball_in_play else 0.0, c.stale_tracker),
+            (Cause.STALE_POLICY, "the policy", policy_age, c.stale_policy),
+        ):
+            sentence = f"nothing heard from {what} for {age:.3f} s, allowed is {allowed} s"
+            self.condition(cause, not age <= allowed, sentence, now)
+
+    def command(self, request, measured, measured_velocity, now: float) -> Sent:
+        """One control tick: requested, measured velocity and measured position, each (8,), to what has to be sent.
+
+        Never raises: whatever is wrong with the inputs is a fault, and what comes back then is the braked motion.
+        """
+        now = self._timing(now)
+        self._watch(measured, measured_velocity, now)
+        wanted = self._request(request, now)
+        if not self._engaged:
+            return Sent(np.zeros(N_JOINTS), self._reference.copy(), (self.state.value,), self.state)
+        left = np.abs(self._velocity) - self._step
+        braked = np.where(left > ROUNDING * self._step, np.copysign(left, self._velocity), 0.0)
+        velocity, changed = braked, (self.state.value,)
+        if self.state is State.ARMED:
+            try:
+                velocity, changed = self._allowed(wanted, braked)
+                broken = self._broken(velocity)
+            except Exception as error:  # a mistake of ours must still brake the robot
+                broken = f"{type(error).__name__}: {error}"
+            if broken:
+                self.fault(Cause.INTERNAL, broken, now)
+                velocity, changed = braked, (self.state.value,)
+        self._acceleration = (velocity - self._velocity) / self.period
+        self._velocity = velocity
+        self._reference = self._reference + velocity * self.period
+        self._monitor.sent(self._reference, now + self.period)
+        return Sent(velocity.copy(), self._reference.copy(), changed, self.state)
+
+    def _allowed(self, wanted: np.ndarray, braked: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        """The first velocity (8,) on the way from the limited request to braking that is clear, and the rules."""
+        rules = []
+        scaled = wanted * self.config.speed_scale
+        if (scaled != wanted).any():
+            rules.append("speed_scale")
+        if self._inside.any():  # what has reached its margin keeps it
+            self._inside &= self.geometry.gaps(self._reference[:, None])[:, 0] < self._margin - INSIDE
+        if self._inside.any():  # slow enough to stop within a period: the way ends where this command leads
+            slow = np.minimum(self.config.escape_speed * self._v_max, 0.9 * self._step)
+            slowed = np.clip(scaled, -slow, slow)
+            if (slowed != scaled).any():
+                rules.append("escape")
+            scaled = slowed
+        velocity = limit_velocity(scaled, self._velocity, self._reference, self.period, self.limits)
+        clipped = np.clip(scaled, -self._v_max, self._v_max)
+        rated = np.clip(clipped, self._velocity - self._step, self._velocity + self._step)
+        for name, before, after in (
+            ("velocity", scaled, clipped), ("acceleration", clipped, rated), ("position", rated, velocity),
+        ):  # fmt: skip
+            if (before != after).any():
+                rules.append(name)
+        if (velocity == braked).all():  # cleared before, or at rest
+            return velocity, tuple(rules)
+        for share in SHARES:
+            # Between two velocities that keep the kinematic limits every one does: they bound each joint by itself.
+            tried = velocity if share == 1.0 else braked + share * (velocity - braked)
+            if self._clear(tried):
+                return tried, tuple(rules if share == 1.0 else [*rules, "clearance"])
+        return braked, (*rules, "clearance")
+
+    def _clear(self, velocity: np.ndarray) -> bool:
+        """Whether this period and braking after it keep the margins, or leave a margin that is missed already."""
+        way = self.braking_way(velocity)
+        if self.geometry.first_too_close(way, self._margin, SLACK) is not None:
+            return False
+        if self._inside.any():
+            gaps = self.geometry.gaps(way)[self._inside]
+            return bool((gaps[:, -1] > gaps[:, 0]).all())
+        return True
+
+    def braking_way(self, velocity: np.ndarray) -> np.ndarray:
+        """References (8, N) now and after each period until rest: one period at ``velocity``, then braking."""
+        periods = max(1, math.ceil(float((np.abs(velocity) / self._step).max())))
+        left = np.maximum(np.abs(velocity)[:, None] - self._step[:, None] * np.arange(periods), 0.0)
+        moved = np.cumsum(np.sign(velocity)[:, None] * left * self.period, axis=1)
+        return np.concatenate([self._reference[:, None], self._reference[:, None] + moved], axis=1)
+
+    def _broken(self, velocity: np.ndarray) -> str:
+        """The limit that an accepted velocity breaks, as a sentence; empty: none. Checks what was computed above."""
+        acceleration = (velocity - self._velocity) / self.period
+        jerk = (acceleration - self._acceleration) / self.period
+        position = self._reference + velocity * self.period
+        for name, values, bound in (
+            ("velocity", velocity, self._v_max),
+            ("acceleration", acceleration, self._a),
+            ("jerk", jerk, 2.0 * self._a / self.period),
+        ):
+            if not (np.abs(values) <= bound * (1.0 + ROUNDING)).all():
+                return f"accepted {name}: {worst(values, bound)}"
+        if not ((position >= self._low - ROUNDING) & (position <= self._high + ROUNDING)).all():
+            return f"accepted position {position} is outside {self._low} to {self._high}"
+        return ""
+
+    def _timing(self, now: float) -> float:
+        """Watches the rhythm of the commands; returns the time to go on with."""
+        last, self._last = self._last, now
+        if not math.isfinite(now):
+            self._last = last
+            self.fault(Cause.TIMING, f"the time is {now}", last or 0.0)
+            return last or 0.0
+        if last is None or not self._engaged:
+            return now
+        gap = now - last
+        self._lead = max(0.0, self._lead + self.period - gap)
+        if gap < 0.0:
+            self.fault(Cause.TIMING, f"time went back by {-gap:.4f} s", now)
+        elif gap > self.config.late:
+            self.fault(Cause.TIMING, f"{gap:.3f} s between two commands, allowed is {self.config.late} s", now)
+        elif self._lead > LONGEST_LEAD * self.period:
+            self.fault(Cause.TIMING, f"commands come faster than every {self.period:.5f} s", now)
+        return now
+
+    def _request(self, request, now: float) -> np.ndarray:
+        """The requested velocity (8,), zero when it cannot be used."""
+        values, problem = eight(request, "requested velocity")
+        finite = values is None or bool(np.isfinite(values).all())
+        if not problem:
+            kind = np.asarray(request).dtype
+            tiny = np.finfo(kind if kind.kind == "f" else np.float64).tiny
+            # No motion is that slow: bytes that were taken for numbers often look like this.
+            subnormal = (values != 0.0) & (np.abs(values) < tiny)
+            if subnormal.any():
+                i = int(subnormal.argmax())
+                problem = f"requested velocity: {JOINT_NAMES[i]} is {values[i]}, a subnormal number"
+        self.condition(Cause.NON_FINITE_COMMAND, not finite, problem, now)
+        self.condition(Cause.MALFORMED_COMMAND, bool(problem) and finite, problem, now)
+        return np.zeros(N_JOINTS) if problem else values
+
+    def _watch(self, measured, measured_velocity, now: float) -> None:
+        """Looks at what was measured."""
+        position, problem = eight(measured, "measured position")
+        velocity, second = eight(measured_velocity, "measured velocity")
+        problem = problem or second
+        self.condition(Cause.NON_FINITE_FEEDBACK, bool(problem), problem, now)
+        self._measured_velocity = None if problem else velocity
+        if problem:
+            return
+        if not self._engaged:
+            self._reference = position
+        for cause, sentence in self._monitor.conditions(position, velocity).items():
+            self.condition(cause, bool(sentence), sentence, now)
+        if self._engaged and not self._latch:
+            sentence = self._monitor.following_error(position, now)
+            if sentence:
+                self.fault(Cause.FOLLOWING_ERROR, sentence, now)

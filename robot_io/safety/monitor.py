@@ -1,0 +1,93 @@
+"""What measured positions and velocities say: are they numbers, within limits, clear, and where the robot was sent."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from robot_io.contract import JOINT_NAMES, JOINT_UNITS, N_JOINTS, JointLimits
+from robot_io.safety.clearance import RobotGeometry
+from robot_io.safety.config import SafetyConfig
+from robot_io.safety.faults import Cause
+
+EARLY = 0.1  # [s] by which a measurement may be looked at before the end of the newest period
+
+
+class FeedbackMonitor:
+    """Compares measurements with limits, geometry and the references that were sent."""
+
+    def __init__(self, limits: JointLimits, geometry: RobotGeometry, config: SafetyConfig) -> None:
+        self._lower, self._upper = np.array(limits.lower), np.array(limits.upper)
+        self._fastest = config.overspeed * np.array(limits.velocity)
+        self._geometry, self._config = geometry, config
+        self._tolerance = np.array(config.following_error)
+        self._past: deque[tuple[float, np.ndarray]] = deque()  # times and references at the ends of periods
+        self._off = 0  # measurements in a row with a following error
+
+    def restart(self, position: np.ndarray, now: float) -> None:
+        """The reference (8,) has been here until now."""
+        self._past, self._off = deque([(now, position)]), 0
+
+    def sent(self, reference: np.ndarray, time: float) -> None:
+        """The reference (8,) will be here at ``time``, on a straight way from the one before."""
+        self._past.append((time, reference))
+        self._forget(time - self._config.delay[1] - EARLY)
+
+    def conditions(self, position: np.ndarray, velocity: np.ndarray) -> dict[Cause, str]:
+        """What is wrong with a measurement of finite numbers, each (8,); an empty sentence: nothing."""
+        return {Cause.LIMIT: self._limit(position, velocity), Cause.CLEARANCE: self.contact(position)}
+
+    def contact(self, position: np.ndarray) -> str:
+        """What touches at a position (8,), as a sentence; empty: nothing."""
+        with np.errstate(all="ignore"):  # of numbers that no robot can measure
+            gaps = self._geometry.gaps(position[:, None])[:, 0]
+        row = int(gaps.argmin())
+        return "" if gaps[row] > 0.0 else f"{self._geometry.rows[row]}: {gaps[row]:.4f} m"
+
+    def following_error(self, position: np.ndarray, now: float) -> str:
+        """How the measured position (8,) misses every place where the reference was while its effect was under way."""
+        shortest, longest = self._config.delay
+        self._forget(now - longest)
+        if not self._past:
+            return ""
+        seen = [r for i, (_, r) in enumerate(self._past) if i == 0 or self._past[i - 1][0] < now - shortest]
+        error = np.maximum(np.min(seen, axis=0) - position, position - np.max(seen, axis=0))
+        self._off = self._off + 1 if (error > self._tolerance).any() else 0
+        if self._off < self._config.following_ticks:
+            return ""
+        return f"away from the reference: {worst(np.maximum(error, 0.0), self._tolerance)}"
+
+    def _forget(self, time: float) -> None:
+        while len(self._past) > 1 and self._past[1][0] <= time:
+            self._past.popleft()
+
+    def _limit(self, position: np.ndarray, velocity: np.ndarray) -> str:
+        outside = np.maximum(self._lower - position, position - self._upper)
+        if (outside > 0.0).any():
+            i = int(outside.argmax())
+            allowed = f"[{self._lower[i]:.4f}, {self._upper[i]:.4f}]"
+            return f"{JOINT_NAMES[i]} is at {position[i]:.4f} {JOINT_UNITS[i]}, its range is {allowed}"
+        if (np.abs(velocity) > self._fastest).any():
+            return f"measured speed: {worst(velocity, self._fastest, '/s')}"
+        return ""
+
+
+def eight(values, what: str) -> tuple[np.ndarray | None, str]:
+    """Eight finite float64 numbers, and what is wrong with them instead; None where they are not eight numbers."""
+    try:
+        given = np.asarray(values)
+    except Exception as error:  # whatever an array-like object does when it is converted
+        return None, f"{what} is not an array: {error}"
+    if given.shape != (N_JOINTS,) or given.dtype.kind not in "fiu":
+        return None, f"{what} is {given.dtype} {given.shape}, needed are {N_JOINTS} real numbers"
+    numbers = given.astype(np.float64)
+    for i in np.flatnonzero(~np.isfinite(numbers)):
+        return numbers, f"{what}: {JOINT_NAMES[i]} is {numbers[i]}"
+    return numbers, ""
+
+
+def worst(values: np.ndarray, bound: np.ndarray, per: str = "") -> str:
+    """Names the joint that exceeds its bound the most; all (8,)."""
+    i = int(np.argmax(np.abs(values) / bound))
+    return f"{JOINT_NAMES[i]} {values[i]:.4g}, allowed is {bound[i]:.4g} {JOINT_UNITS[i]}{per}"

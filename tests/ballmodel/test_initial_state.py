@@ -1,0 +1,202 @@
+"""Initial-state fits against known truth, an independent optimiser and measured launcher balls."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from ballmodel import initial_state, registry
+from ballmodel.aerodynamics import FlightParams
+from ballmodel.fit_distribution import fit_human
+from ballmodel.flight import ball_params
+from ballmodel.initial_state import fit_gauss_newton, fit_nelder_mead
+from ballmodel.io import read
+from ballmodel.sampling import sample_pool
+from ballmodel.trajectory import Dataset, Trajectory, free_flight
+from tests.support.paths import DATA
+
+K_D = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027)
+
+
+def flight(start, time, magnus=0.0, spin=(0.0, 0.0, 0.0)):
+    """The paper's step in NumPy, cut as the fits document it: equal steps of at most 1/300 s between samples."""
+    k_m = magnus * 1.29 * 1.256e-3 * 0.02 / (2 * 0.0027)
+    x, v = np.array(start[:3], float), np.array(start[3:], float)
+    positions = [x]
+    for gap in np.diff(time):
+        n = int(np.ceil(gap * 300 - 1e-6))
+        for _ in range(n):
+            a = np.array([0, 0, -9.81]) - K_D * np.linalg.norm(v) * v + k_m * np.cross(spin, v)
+            x, v = x + gap / n * (v + gap / n * a / 2), v + gap / n * a
+        positions.append(x)
+    return np.array(positions).T
+
+
+def balls(n, samples, noise, seed=0, **kinds):
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform([-0.7, 0.8, 0.1, -1.5, -8, -1], [0.7, 1.9, 0.8, 1.5, -3, 3], (n, 6))
+    trajectories = []
+    for i, start in enumerate(truth):
+        count = samples if np.isscalar(samples) else samples[i]
+        time = 100.0 + np.arange(count) / 125 + rng.uniform(0, 0.003, count)
+        clean = flight(start, time, **kinds)
+        trajectories.append(Trajectory("s", str(i), time, clean + rng.normal(0, noise, clean.shape)))
+    return trajectories, truth.T
+
+
+def unknowns(state):
+    return np.concatenate([state.position, state.velocity])
+
+
+def test_recovers_a_noiseless_flight_exactly():
+    trajectories, truth = balls(20, [4 + 3 * i for i in range(20)], 0.0)
+    result = fit_gauss_newton(trajectories, FlightParams())
+    np.testing.assert_allclose(unknowns(result.state), truth, atol=1e-7)
+    assert result.converged.all() and result.rms.max() < 1e-9
+    assert result.state.position.dtype == np.float64
+
+
+def test_gauss_newton_is_no_worse_than_nelder_mead():
+    trajectories, truth = balls(25, 60, 0.002)
+    result = fit_gauss_newton(trajectories, FlightParams())
+    for i, trajectory in enumerate(trajectories):
+        state, rms = fit_nelder_mead(trajectory, FlightParams())
+        assert result.rms[i] <= rms + 1e-12
+        np.testing.assert_allclose(unknowns(result.state)[:, i], unknowns(state), atol=1e-4)
+        np.testing.assert_allclose(unknowns(state), truth[:, i], atol=0.02)
+
+
+def test_both_fits_measure_the_same_distance():
+    trajectories, _ = balls(3, 30, 0.003, seed=4)
+    result = fit_gauss_newton(trajectories, FlightParams())
+    for i, trajectory in enumerate(trajectories):
+        model = flight(unknowns(result.state)[:, i], trajectory.time)
+        rms = np.sqrt(np.mean(np.sum((model - trajectory.position) ** 2, axis=0)))
+        assert result.rms[i] == pytest.approx(rms, rel=1e-9)
+
+
+def test_covariance_predicts_the_error():
+    trajectories, truth = balls(400, 40, 0.002, seed=1)
+    result = fit_gauss_newton(trajectories, FlightParams())
+    error = unknowns(result.state) - truth
+    squared = np.einsum("in,nij,jn->n", error, np.linalg.inv(np.moveaxis(result.covariance, -1, 0)), error)
+    # Six degrees of freedom: mean 6, and a standard error of sqrt(12 / 400) = 0.17 of that mean.
+    assert np.mean(squared) == pytest.approx(6.0, abs=4 * 0.18)
+
+
+def test_a_batch_of_different_lengths_equals_single_fits():
+    trajectories, _ = balls(6, [8, 30, 15, 32, 5, 21], 0.002, seed=2)
+    together = fit_gauss_newton(trajectories, FlightParams())
+    for i, trajectory in enumerate(trajectories):
+        alone = fit_gauss_newton([trajectory], FlightParams())
+        np.testing.assert_allclose(unknowns(together.state)[:, i], unknowns(alone.state)[:, 0], atol=1e-9)
+        np.testing.assert_allclose(together.covariance[..., i], alone.covariance[..., 0], rtol=1e-6)
+
+
+def test_a_gap_in_the_samples_does_not_change_the_flight():
+    trajectories, truth = balls(5, 50, 0.0, seed=3)
+    keep = np.r_[0:10, 30:50]
+    thinned = []
+    for t in trajectories:
+        fine = flight(truth[:, len(thinned)], t.time[keep])
+        thinned.append(Trajectory("", t.name, t.time[keep], fine))
+    result = fit_gauss_newton(thinned, FlightParams())
+    np.testing.assert_allclose(unknowns(result.state), truth, atol=1e-7)
+
+
+def test_known_spin_is_used():
+    spin = np.array([70.0, -20.0, 30.0])
+    trajectories, truth = balls(5, 40, 0.0, magnus=0.6, spin=spin)
+    params = FlightParams(magnus_coefficient=0.6)
+    spins = np.tile(spin[:, None], (1, 5))
+    with_spin, without = fit_gauss_newton(trajectories, params, spins), fit_gauss_newton(trajectories, params)
+    np.testing.assert_allclose(unknowns(with_spin.state), truth, atol=1e-7)
+    assert without.rms.min() > 1e-3
+    state, _ = fit_nelder_mead(trajectories[0], params, spin)
+    np.testing.assert_allclose(unknowns(state), truth[:, 0], atol=1e-4)
+
+
+def test_huber_loss_shrugs_off_stray_samples():
+    trajectories, truth = balls(10, 40, 0.001, seed=5)
+    for t in trajectories:
+        t.position[:, 7] += 0.4
+        t.position[:, 30] -= 0.3
+    plain = fit_gauss_newton(trajectories, FlightParams())
+    robust = fit_gauss_newton(trajectories, FlightParams(), huber=0.005)
+    errors = [np.abs(unknowns(r.state) - truth).max(axis=0) for r in (plain, robust)]
+    assert np.all(errors[1] < 0.1 * errors[0])
+    assert robust.converged.all()
+
+
+def test_same_shapes_compile_once():
+    for seed in (0, 1):
+        trajectories, _ = balls(7, 20, 0.001, seed=seed)
+        fit_gauss_newton(trajectories, FlightParams(drag_coefficient=0.4 + 0.1 * seed))
+        if seed == 0:
+            compiled = initial_state._levenberg_marquardt._cache_size()
+    assert initial_state._levenberg_marquardt._cache_size() == compiled
+    assert not jax.config.jax_enable_x64
+
+
+def test_refuses_what_cannot_be_fitted():
+    trajectories, _ = balls(3, 10, 0.0)
+    short = trajectories[1].part(0, 3)
+    with pytest.raises(ValueError, match="1 of 2 .* fewer than 4 samples .* trajectory s/1 with 3"):
+        fit_gauss_newton([trajectories[0], short], FlightParams())
+    with pytest.raises(ValueError, match=r"spin has shape \(3, 2\), \(3, 3\) is wanted"):
+        fit_gauss_newton(trajectories, FlightParams(), np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="no trajectory"):
+        fit_gauss_newton([], FlightParams())
+
+
+def test_trajectories_of_a_distribution_give_its_numbers_back():
+    """Balls drawn from a box, measured with noise up to their bounce, fitted: the box returns from inside."""
+    target = registry.load("medium")
+    pool = sample_pool(jax.random.key(0), target, ball_params(), 300)
+    rng = np.random.default_rng(0)
+    trajectories = []
+    for i in range(300):
+        start = np.concatenate([pool.state.position[:, i], pool.state.velocity[:, i]])
+        time = np.arange(200) / 125
+        clean = flight(start, time)
+        airborne = clean[:, : int(np.argmax(clean[2] < 0.02))]
+        noisy = airborne + rng.normal(0, 0.002, airborne.shape)
+        trajectories.append(Trajectory("home", str(i), time[: airborne.shape[1]], noisy))
+    distribution, report = fit_human(Dataset(tuple(trajectories), "synthetic"), ball_params(), name="me")
+    assert report.measured == 300 and report.landing.shape[1] > 290
+    assert np.median(report.fit_rms) == pytest.approx(0.002 * np.sqrt(3), rel=0.1)
+    kept = ~report.outliers.outlier
+    drawn = np.concatenate([pool.state.position, pool.state.velocity, pool.landing])
+    for name, low, high in (("position", 0, 3), ("velocity", 3, 6), ("landing", 6, 8)):
+        np.testing.assert_allclose(getattr(distribution, f"{name}_min"), drawn[low:high].min(1), atol=0.1)
+        np.testing.assert_allclose(getattr(distribution, f"{name}_max"), drawn[low:high].max(1), atol=0.1)
+    assert kept.mean() > 0.9
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured data in {DATA}")
+def test_launcher_balls_and_what_their_residuals_say():
+    """A drag-only flight misses a topspin ball by more than a spinless one, and Magnus lift explains the difference."""
+    rms = {}
+    for session in ("no_spin_robot_simple", "mn5008_topspin"):
+        flights = [free_flight(t) for t in read(DATA / "aimy_launcher" / f"{session}.hdf5")]
+        result = fit_gauss_newton(flights, FlightParams())
+        assert result.converged.all()
+        rms[session] = np.median(result.rms)
+        assert np.all((result.state.velocity[1] > -7.5) & (result.state.velocity[1] < -3.5))
+        if session == "mn5008_topspin":
+            spin = np.zeros((3, len(flights)))
+            spin[0] = 100.0  # [rad/s] topspin of a ball towards -y; the wheels give no number
+            with_lift = fit_gauss_newton(flights, FlightParams(magnus_coefficient=0.6), spin)
+            assert np.median(with_lift.rms) < 0.5 * rms[session]
+    assert rms["no_spin_robot_simple"] < rms["mn5008_topspin"] < 0.03
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured data in {DATA}")
+def test_measured_states_give_a_distribution_of_human_size():
+    distribution, report = fit_human(read(DATA / "deepmind_ball_states" / "rallies.json"), ball_params())
+    assert report.measured == 13088
+    assert sum(report.outcomes.values()) + report.elsewhere == 13088
+    # The paper's players never exceed 9 m/s; the outlier share must be small for minima and maxima to mean something.
+    assert -12.0 < distribution.velocity_min[1] < -6.0 and distribution.velocity_max[1] < 0.0
+    assert 0.0 < report.outliers.outlier.mean() < 0.05

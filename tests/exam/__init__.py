@@ -1,0 +1,1 @@
+"""Hidden effects in data, and whether the diagnosis finds them."""

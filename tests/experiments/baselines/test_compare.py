@@ -1,0 +1,245 @@
+"""The algorithms on problems whose answer is known, and a comparison from its YAML to its report."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import deque
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+from brax.envs.base import Env, State
+from brax.training.types import Transition
+from rich.console import Console
+
+from experiments.baselines import compare, off_policy
+from experiments.baselines import learner as learners
+from experiments.baselines.off_policy import OffPolicyLearner
+from experiments.baselines.ppo import PpoLearner
+from experiments.baselines.qt_opt import Critics, QtOptAgent, best_action
+from experiments.baselines.sac import SacAgent
+from experiments.config import baselines
+from experiments.config.baselines import Ppo, QtOpt, Replay, Sac
+from experiments.errors import ConfigError, RunError
+from mjx_tt.env.brax import OBSERVATION_SIZE
+from robot_io.contract import N_JOINTS
+
+# Of what is observed, the best action is a fixed linear function, cut to the allowed range.
+WEIGHTS = np.random.default_rng(0).normal(size=(OBSERVATION_SIZE, N_JOINTS)).astype(np.float32) / 12.0
+
+
+class Aim(Env):
+    """Episodes of one step: the reward is minus the squared distance of the action from the best one, which earns 0."""
+
+    observation_size, action_size, backend = OBSERVATION_SIZE, N_JOINTS, "none"
+
+    def reset(self, rng):
+        observation = jax.random.normal(rng[0], (rng.shape[0], OBSERVATION_SIZE))
+        zero = jnp.zeros(rng.shape[0])
+        metrics = {"hit": zero, "returned": zero, "episode_return": zero}
+        return State(rng[0], observation, zero, zero, metrics, {"truncation": zero})
+
+    def step(self, state, action):
+        reward = -jnp.mean((action - best(state.obs)) ** 2, axis=-1)
+        key, draw = jax.random.split(state.pipeline_state)
+        metrics = state.metrics | {"episode_return": reward}
+        observation = jax.random.normal(draw, state.obs.shape)
+        return state.replace(
+            pipeline_state=key, obs=observation, reward=reward, done=jnp.ones_like(reward), metrics=metrics
+        )
+
+
+def best(observation):
+    return jnp.clip(observation @ WEIGHTS, -0.8, 0.8)
+
+
+REPLAY = Replay(environments=16, capacity=20_000, random_steps=2_000, gradient_steps=2, batch=128)
+
+
+@pytest.mark.parametrize(
+    "learner, calls, left",
+    [
+        (
+            PpoLearner(Ppo(kind="ppo", environments=256, unroll=4, minibatches=4, learning_rate=1e-3, gae_lambda=1.0), Aim()),
+            120, 0.4,
+        ),
+        (OffPolicyLearner(REPLAY, Aim(), SacAgent(Sac(kind="sac", learning_rate=1e-3, layers=[64, 64]))), 40, 0.4),
+        (OffPolicyLearner(REPLAY, Aim(), QtOptAgent(QtOpt(kind="qt_opt", learning_rate=1e-3, layers=[64, 64]))), 40, 0.6),
+    ],
+    ids=["PPO", "SAC", "QT-Opt"],
+)  # fmt: skip
+def test_a_learner_comes_near_the_best_action(learner, calls, left):
+    """``left``: share of the squared distance that standing still leaves."""
+    state = learner.init(jax.random.key(0))
+    advance = learner.compiled(state)
+    for _ in range(calls):
+        state, measured = advance(state)
+    assert measured["episodes"] == measured["steps"] > 0
+    controller = learner.controller(state)
+    observation = jax.random.normal(jax.random.key(9), (500, OBSERVATION_SIZE))
+    action = controller.decide(controller.parameters, observation)
+    assert np.abs(action).max() <= 1.0
+    distance = np.mean((action - best(observation)) ** 2) / np.mean(best(observation) ** 2)
+    assert distance < left
+
+
+def test_the_search_finds_the_best_action():
+    target = jnp.asarray(np.random.default_rng(1).uniform(-0.9, 0.9, (20, N_JOINTS)), jnp.float32).at[0].set(1.5)
+    normals = jax.random.normal(jax.random.key(0), (12, 200, N_JOINTS))
+    found = best_action(lambda a: -jnp.sum((a - target[:, None]) ** 2, axis=-1), normals, 15)
+    assert found.shape == target.shape
+    # The first lies outside of what is allowed: there the nearest corner is the best.
+    np.testing.assert_allclose(found, np.clip(target, -1, 1), atol=0.05)
+
+
+def test_the_critics_are_networks_of_observation_and_action_together():
+    """Splitting the first layer changes nothing: the same numbers from one matrix on both inputs."""
+    critics = Critics((16, 16))
+    rng = np.random.default_rng(2)
+    observation, action = rng.normal(size=(5, OBSERVATION_SIZE)), rng.normal(size=(5, N_JOINTS))
+    parameters = critics.init(jax.random.key(0), jnp.zeros(OBSERVATION_SIZE), jnp.zeros(N_JOINTS))
+    layers = parameters["params"]
+    for critic in range(2):
+        seen, chosen, hidden, last = (layers[f"Dense_{4 * critic + i}"] for i in range(4))
+        first = np.concatenate([seen["kernel"], chosen["kernel"]])
+        h = np.maximum(np.concatenate([observation, action], axis=1) @ first + seen["bias"], 0.0)
+        h = np.maximum(h @ hidden["kernel"] + hidden["bias"], 0.0)
+        value = (h @ last["kernel"] + last["bias"])[:, 0]
+        np.testing.assert_allclose(
+            critics.apply(parameters, observation, action)[:, critic], value, rtol=1e-4, atol=1e-5
+        )
+    many = critics.apply(parameters, observation[:, None], np.stack([action, -action], axis=1))
+    np.testing.assert_allclose(many[:, 1], critics.apply(parameters, observation, -action), rtol=1e-4, atol=1e-5)
+
+
+def test_qt_opt_fits_the_clipped_double_target():
+    """One gradient step against the formula written out: r + gamma (1 - end) min Q'(s', best action of Q'_1)."""
+    agent = QtOptAgent(
+        QtOpt(kind="qt_opt", layers=[8], discount=0.9, reward_scale=0.5, target_rate=0.25, learning_rate=3e-4)
+    )
+    state = agent.init(jax.random.key(0))
+    normaliser = learners.empty_normaliser()  # mean 0, deviation 1
+    rng = np.random.default_rng(3)
+    seen, following = rng.normal(size=(2, 6, OBSERVATION_SIZE)).astype(np.float32)
+    action = rng.uniform(-1, 1, (6, N_JOINTS)).astype(np.float32)
+    reward, discount = rng.normal(size=6).astype(np.float32), np.array([1, 1, 0, 1, 0, 1], np.float32)
+    batch = Transition(seen, action, reward, discount, following, {})
+    after = agent.update(state, normaliser, batch, jax.random.key(4))
+    chosen = best_action(
+        lambda a: agent._critics.apply(state.target, following[:, None], a)[..., 0], agent._draw(jax.random.key(4)), 4
+    )
+    value = np.min(agent._critics.apply(state.target, following, chosen), axis=-1)
+    wanted = 0.5 * reward + 0.9 * discount * value
+
+    def loss(critic):
+        return jnp.mean((agent._critics.apply(critic, seen, action) - wanted[:, None]) ** 2)
+
+    gradient = jax.grad(loss)(state.critic)
+    # Adam's first step is the learning rate against the gradient's sign, wherever it is not tiny.
+    for before, now, target, g in zip(*map(jax.tree.leaves, (state.critic, after.critic, after.target, gradient))):
+        clear = np.abs(g) > 1e-5
+        np.testing.assert_allclose((now - before)[clear], (-3e-4 * np.sign(g))[clear], rtol=2e-3)
+        np.testing.assert_allclose(target, 0.75 * before + 0.25 * now, rtol=1e-5, atol=1e-7)
+
+
+def test_the_buffer_holds_the_last_transitions():
+    capacity, batch = 12, 4
+    buffer = off_policy.Buffer(jnp.zeros((capacity, off_policy.WIDTH)), jnp.int32(0))
+    kept = deque(maxlen=capacity)
+    for i in range(5):
+        number = np.arange(i * batch, (i + 1) * batch, dtype=np.float32)
+        observation = np.repeat(number[:, None], OBSERVATION_SIZE, axis=1)
+        added = Transition(observation, observation[:, :N_JOINTS] + 0.25, number, number % 2, observation + 0.5, {})
+        buffer = off_policy.insert(buffer, added)
+        kept.extend(number)
+        drawn = off_policy.sample(buffer, jax.random.key(i), 400)
+        assert set(np.asarray(drawn.reward)) == set(kept)
+        np.testing.assert_array_equal(drawn.observation[:, 0], drawn.reward)
+        np.testing.assert_array_equal(drawn.action[:, -1], drawn.reward + 0.25)
+        np.testing.assert_array_equal(drawn.discount, drawn.reward % 2)
+        np.testing.assert_array_equal(drawn.next_observation[:, -1], drawn.reward + 0.5)
+
+
+SMALL = {
+    "name": "small",
+    "experiment": {
+        "name": "small", "balls": "player3/M0", "task": {"sim_rate": 150}, "training": {"pool": 64},
+        "evaluation": {"episodes": 512, "sim_rate": 150},
+    },
+    "reality": {"ball_spin": {"mean_x": 300.0}},
+    "algorithms": {"ES": {"kind": "bgs", "optimiser": {"pairs": 2, "repeats": 2}}},
+    "budget": {"episodes": 40},
+    "curve": {"points": 2, "episodes": 512},
+}  # fmt: skip
+
+
+def write(folder, data):
+    path = folder / "small.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
+    path, console = write(tmp_path, SMALL), Console()
+    folder = compare.compare(*baselines.load(path), str(path), tmp_path, console)
+    run = folder / "ES" / "seed0"
+    training = json.loads((run / "training.json").read_text())
+    assert [point["episodes"] for point in training["curve"]] == [0, 24, 40]  # 8 an update; after a half and the whole
+    rows = list(csv.DictReader((folder / "curves.csv").open()))
+    assert [float(row["return_rate"]) for row in rows] == [point["return_rate"] for point in training["curve"]]
+    report = json.loads((folder / "comparison.json").read_text())["algorithms"]["ES"]
+    assert report["simulation"]["by_seed"]["0"] == report["simulation"]["return_rate"]
+    assert report["simulation"]["mean_return"] != report["reality"]["mean_return"]  # only spin differs between the two
+    assert 0 < report["restlessness"]["action_change"] < 4
+    for name in ("curves.png", "transfer.png", "restlessness.png", "comparison.md"):
+        assert (folder / name).stat().st_size > 0
+
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*.*")}
+    compare.compare(*baselines.load(path), str(path), tmp_path, console)
+    assert "skipped" in capsys.readouterr().out
+    assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*.*")}
+
+    def missing(*overrides):
+        return compare.unfinished(
+            compare.prepare(*baselines.load(path, overrides), str(path), tmp_path, console)
+        )  # fmt: skip
+
+    assert missing() == {"ES": []}
+    assert missing("seeds=[0, 3]") == {"ES": [3]}
+    assert missing("algorithms.P={kind: ppo}") == {"ES": [], "P": [0]}
+    assert missing("reality.ball_spin.mean_x=100.0") == {"ES": [0]}  # to be evaluated again
+    for override in ("budget.episodes=80", "algorithms.ES.optimiser.pairs=3", "experiment.balls=narrow"):
+        with pytest.raises(RunError, match="ES/seed0.*other settings of (budget|algorithm|balls);"):
+            missing(override)
+
+
+@pytest.mark.parametrize(
+    "override, message",
+    [
+        ("algorithms.X={kind: pp}", r"algorithms\.X\.kind.*pp"),
+        ("algorithms.X={kind: ppo, minibatches: 7}", r"algorithms\.X: .*minibatches 7 .*1024"),
+        ("algorithms.X={kind: qt_opt, elites: 40}", r"algorithms\.X: .*elites 40 .*32"),
+        (
+            "algorithms.X={kind: ppo, minibatch: 7}",
+            r"algorithms\.X\.minibatch: unknown key; did you mean 'minibatches'",
+        ),
+        ("algorithms.a/b={kind: ppo}", r"algorithms\.a/b"),
+        ("budget={clock: cpu}", r"minutes, episodes or both"),
+        ("seeds=[1, 1]", r"seeds.*different"),
+        ("experiment.training.later_rewards={after: 0.5, rewards: real}", r"later_rewards"),
+        ("experiment.ball=narrow", r"experiment.*unknown key.*ball"),
+    ],
+)
+def test_a_mistake_in_the_yaml_is_named(tmp_path, override, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        baselines.load(write(tmp_path, SMALL), (override,))
+    assert "small.yaml" in str(error.value)
+
+
+@pytest.mark.parametrize("name", baselines.shipped())
+def test_a_shipped_comparison_is_valid(name):
+    comparison, experiment = baselines.load(baselines.shipped()[name])
+    assert comparison.name == name

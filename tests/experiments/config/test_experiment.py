@@ -1,0 +1,199 @@
+"""Experiment YAMLs: what is shipped loads, and a mistake is named with its place and the way out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jsonschema
+import pytest
+import yaml
+
+from ballmodel import registry
+from experiments.config import build
+from experiments.config import experiment as config
+from experiments.errors import ConfigError
+from mjx_tt.env import rewards
+from mjx_tt.env.task import TaskConfig
+
+SMALLEST = {"name": "a", "balls": "narrow"}
+
+
+def with_value(path: str, value) -> dict:
+    """The smallest experiment with one more value at a dotted path."""
+    data = json.loads(json.dumps(SMALLEST))
+    *parents, leaf = path.split(".")
+    node = data
+    for parent in parents:
+        node = node.setdefault(parent, {})
+    node[leaf] = value
+    return data
+
+
+def complaint(data: dict) -> str:
+    with pytest.raises(ConfigError) as raised:
+        build.experiment(config.parse(data, "my.yaml"), "my.yaml")
+    return str(raised.value)
+
+
+@pytest.mark.parametrize("path", config.shipped().values(), ids=config.shipped().keys())
+def test_shipped_experiments_load_and_fit_the_schema(path):
+    jsonschema.validate(config.read_yaml(path.read_text(), str(path)), config.json_schema())
+    loaded = config.load(path)
+    assert loaded.name == path.stem
+    build.experiment(loaded, str(path))
+
+
+def test_schema_refuses_what_the_program_refuses():
+    for data in (with_value("trainin", {}), with_value("task.engine", "fast"), with_value("optimiser.keep", 0)):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(data, config.json_schema())
+
+
+@pytest.mark.parametrize(
+    "path, value, place, hint",
+    [
+        ("trainin", {}, "trainin: unknown key", "did you mean 'training'?"),
+        ("training.update", 3, "training.update: unknown key", "did you mean 'updates'?"),
+        ("training.updates", 0, "training.updates: got 0", "greater than or equal to 1"),
+        ("training.updates", "10", "training.updates: got '10'", "integer"),
+        ("training.devices", "all", "training.devices: got 'all'", "integer or 'auto'"),
+        ("optimiser.pairs", True, "optimiser.pairs: got True", "integer"),
+        ("optimiser.sigma", float("nan"), "optimiser.sigma: got nan", "finite"),
+        ("optimiser.rank", "singed", "optimiser.rank: got 'singed'", "did you mean 'signed'?"),
+        (
+            "optimiser.step.schedule",
+            {"kind": "cosin"},
+            "optimiser.step.schedule.kind: got 'cosin'",
+            "did you mean 'cosine'?",
+        ),
+        (
+            "optimiser.step.schedule",
+            {"kind": "cosine", "fin": 1.0},
+            "optimiser.step.schedule.fin: unknown",
+            "did you mean 'final'?",
+        ),
+        ("optimiser.step.schedule", {"hold": 0.5}, "optimiser.step.schedule.kind: missing", ""),
+        (
+            "optimiser.step.schedule",
+            {"kind": "piecewise", "changes": [{"update": 5, "rate": 0.1}]},
+            "optimiser.step.schedule.changes[0].rate: unknown key",
+            "learning_rate",
+        ),
+        ("task.rewards", {"styl": 1.0}, "task.rewards.styl: unknown key", "did you mean 'style'?"),
+        (
+            "task.rewards",
+            "simm",
+            "task.rewards: got 'simm'",
+            "did you mean 'sim'? allowed: 'sim' or 'real' or a mapping",
+        ),
+        ("task", 4, "task: got 4", "a mapping"),
+        ("name", "two words", "name: got 'two words'", "pattern"),
+        ("task.sim_rate", 310.0, "task: sim_rate 310.0 Hz", "whole multiple"),
+        ("balls", "player6/M0", "balls: no distribution is called 'player6/M0'", "did you mean 'player"),
+        ("balls", {"position": {}}, "balls: content", "velocity"),
+        (
+            "model",
+            {"ball": {"table": {"restitutio": 0.9}}},
+            "model: unknown parameter 'ball.table.restitutio'",
+            "'ball.table.restitution'",
+        ),
+        (
+            "model",
+            {"randomise": {"ball.table.restitution": [1, 0]}},
+            "randomise.ball.table.restitution",
+            "low must not exceed high",
+        ),
+        ("initial_policy", "nowhere", "initial_policy: nowhere", "a run or an artefact"),
+    ],
+)
+def test_a_mistake_is_named_with_file_path_and_hint(path, value, place, hint):
+    text = complaint(with_value(path, value))
+    assert text.startswith("my.yaml: ")
+    assert place in text
+    assert hint in text
+
+
+def test_every_mistake_of_a_file_is_listed():
+    text = complaint(with_value("training", {"updates": 0, "sed": 1}))
+    assert len(text.splitlines()) == 2
+
+
+def test_missing_key():
+    with pytest.raises(ConfigError, match="my.yaml: balls: missing"):
+        config.parse({"name": "a"}, "my.yaml")
+
+
+def test_yaml_traps(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text("name: a\nballs: narrow\noptimiser: {sigma: 25e-3}\n")
+    assert config.load(file).optimiser.sigma == 0.025  # YAML 1.1 would call this text
+    file.write_text("name: a\nballs: narrow\nname: b\n")
+    with pytest.raises(ConfigError, match=r"key 'name' is given twice.*line 3"):
+        config.load(file)
+    file.write_text("name: [a\n")
+    with pytest.raises(ConfigError, match="not valid YAML"):
+        config.load(file)
+    with pytest.raises(ConfigError, match="quickstart.yaml"):
+        config.load(tmp_path / "quickstrt.yaml")
+
+
+def test_overrides(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text("name: a\nballs: narrow\n")
+    changed = config.load(file, ("training.updates=7", "balls=player1/M0", "optimiser.step.kind=sgd"))
+    assert (changed.training.updates, changed.balls, changed.optimiser.step.kind) == (7, "player1/M0", "sgd")
+    with pytest.raises(ConfigError, match="--set training.updates"):
+        config.load(file, ("training.updates",))
+
+
+def test_a_looked_up_experiment_stands_alone(tmp_path):
+    """Files that it names are taken in, relative to its own folder, so that a run can be read anywhere."""
+    balls = registry.load("player2/M1").to_dict() | {"name": "anna"}
+    (tmp_path / "anna.yaml").write_text(yaml.safe_dump(balls))
+    (tmp_path / "model.yaml").write_text(
+        "sensing: {ball_noise: 0.02}\nrandomise: {ball.table.restitution: [0.9, 0.95]}\n"
+    )
+    file = tmp_path / "a.yaml"
+    file.write_text("name: a\nballs: anna.yaml\nmodel: model.yaml\n")
+    first = build.experiment(config.load(file), str(file))
+    for path in tmp_path.iterdir():
+        path.unlink()
+    again = build.experiment(config.parse(yaml.safe_load(yaml.safe_dump(first.config.to_dict())), "copy"), "copy")
+    assert again.distribution == first.distribution == replace(registry.load("player2/M1"), name="anna")
+    assert again.model == first.model
+    assert again.model.model.sensing.ball_noise == 0.02
+    assert again.config == first.config
+
+
+def test_defaults_are_those_of_the_task_and_weights_follow_the_terms():
+    experiment = build.experiment(config.parse(SMALLEST, "a"), "a")
+    assert experiment.task == TaskConfig()
+    assert tuple(config.Rewards.model_fields)[1:] == rewards.TERMS
+    changed = build.reward_weights(config.Rewards(base="real", style=2.5))
+    assert dict(zip(rewards.TERMS, changed)) == rewards.REAL_WEIGHTS | {"style": 2.5}
+
+
+def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_current_folder(tmp_path, monkeypatch):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    file = tmp_path / "there" / "a.yaml"
+    file.write_text("name: a\nballs: balls.yaml\nmodel: m.yaml\n")
+    read = config.load(file, ("model=n.yaml", "initial_policy=runs/b"))
+    assert read.balls == str(tmp_path / "there" / "balls.yaml")
+    assert read.model == str(tmp_path / "here" / "n.yaml")
+    assert read.initial_policy == str(tmp_path / "here" / "runs" / "b")
+
+
+def test_paper_settings_are_the_papers():
+    """The table of hyper-parameters in the paper's appendix."""
+    bgs = build.experiment(config.load(config.shipped()["paper"]), "paper").bgs
+    assert (bgs.pairs, bgs.sigma, bgs.keep, bgs.orthogonal, bgs.average) == (200, 0.025, 0.3, True, 0.0)
+    assert config.load(config.shipped()["paper"]).optimiser.repeats == 15
+    falling = config.load(config.shipped()["player3_m2"])
+    sigma = build.experiment(falling, "player3_m2").bgs.sigma
+    end = falling.training.updates
+    assert (sigma(0), sigma(end)) == (0.025, pytest.approx(falling.optimiser.sigma_fall.final))
+    change, _ = bgs.step.update([1.0], bgs.step.init([0.0]))
+    assert change == [pytest.approx(-0.00375)]

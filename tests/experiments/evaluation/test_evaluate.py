@@ -1,0 +1,187 @@
+"""Counting: rates, intervals, the paper's selection score, and pictures that show what was counted."""
+
+from __future__ import annotations
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.stats import binomtest
+
+from experiments.config import build
+from experiments.config import experiment as config
+from experiments.errors import RunError
+from experiments.evaluation import evaluate, figures
+from experiments.evaluation.evaluate import Played
+from experiments.runs import run_dir
+from experiments.runs.run_dir import Run
+from mjx_tt.env import rewards
+from mjx_tt.env.rollout import RolloutResult, Simulator
+from mjx_tt.env.task import HIT, MISSED, OUT_OF_REACH, RETURNED
+from robot_io.contract import LIMITS, N_OBSERVATION, n_parameters
+from tests.oracles import ball_flight
+
+N_TERMS = len(rewards.TERMS)
+
+
+def result(outcome: list[int], finite: list[bool] | None = None, collision: list[float] | None = None) -> RolloutResult:
+    """Episodes (N, 1) with these outcomes."""
+    shape = (len(outcome), 1)
+    finite = np.ones(shape, bool) if finite is None else np.array(finite).reshape(shape)
+    terms = np.zeros((N_TERMS, *shape))
+    terms[rewards.TERMS.index("collision")] = 0 if collision is None else np.array(collision).reshape(shape)
+    terms[0] = np.where(finite, 2.0, np.nan)
+    rng = np.random.default_rng(0)
+    return RolloutResult(
+        terms=terms,
+        returns=np.where(finite, 3.0, np.nan),
+        outcome=np.array(outcome).reshape(shape),
+        landing=rng.uniform([[[-0.7]], [[0.1]]], [[[0.7]], [[1.3]]], (2, *shape)),
+        finite=finite,
+        steps=np.full(shape, 80),
+        peak_velocity=np.array(LIMITS.velocity)[:, None, None] * rng.uniform(0.2, 1, (8, *shape)),
+        observation_sums=np.zeros((2, 11, 1)),
+        observation_counts=np.zeros(1, int),
+    )
+
+
+@pytest.mark.parametrize("successes, trials", [(0, 10), (10, 10), (1, 3), (1871, 2000), (1, 100_000)])
+def test_wilson_interval_is_scipys(successes, trials):
+    expected = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
+    assert evaluate.wilson(successes, trials) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+@pytest.mark.parametrize("successes, trials", [(1, 0), (3, 2), (-1, 2)])
+def test_wilson_refuses_impossible_counts(successes, trials):
+    with pytest.raises(ValueError, match=f"{successes} successes in {trials} trials"):
+        evaluate.wilson(successes, trials)
+
+
+def test_summary_counts_a_non_finite_episode_as_missed_and_leaves_it_out_of_means():
+    report = evaluate.summary(result([RETURNED, RETURNED, HIT, MISSED, MISSED], [True, True, True, True, False]))
+    assert report["return_rate"] == pytest.approx(2 / 5)
+    assert report["hit_rate"] == pytest.approx(3 / 5)
+    assert report["episodes"] == 5
+    assert report["outcomes"] == {"missed": 2, "hit": 1, "returned": 2}
+    assert report["non_finite"] == 1
+    assert report["mean_return"] == 3.0
+    assert report["terms"]["state_transition"] == 2.0
+    assert list(report["terms"]) == list(rewards.TERMS)
+    json.dumps(report, allow_nan=False)
+
+
+def test_summary_of_nothing_finite_is_still_json():
+    report = evaluate.summary(result([MISSED, MISSED], [False, False]))
+    assert (report["return_rate"], report["mean_return"], report["non_finite"]) == (0.0, None, 2)
+    json.dumps(report, allow_nan=False)
+
+
+def test_an_evaluation_plays_the_spin_of_its_model():
+    """Past a robot that stands still, balls go out of reach when ``hand_ball`` says: a spinning one leaves the table fast."""
+    topspin = 250.0
+    data = {"name": "a", "balls": "narrow", "model": {"ball_spin": {"mean_x": topspin}}, "training": {"pool": 64}}
+    experiment = build.experiment(config.parse(data, "a"), "a")
+    evaluator = evaluate.Evaluator(Simulator(experiment.task), experiment, 32, jax.random.key(0))
+    eleven = np.ones(N_OBSERVATION, np.float32)
+    played = evaluator.play(np.zeros(n_parameters(), np.float32), 0.0 * eleven, eleven, jax.random.key(1))
+    order = np.argsort(np.asarray(evaluator.balls.arrival))
+    missed = played.outcome.ravel() == MISSED
+    assert missed.sum() > 16
+    for i, steps in zip(order[missed], played.steps.ravel()[missed]):
+        ball = jax.tree.map(lambda x: np.asarray(x, float)[:, i], evaluator.balls.state)
+        start = ball_flight.Touch(0.0, ball.position, ball.velocity, np.array([topspin, 0.0, 0.0]))
+        end, _ = ball_flight.fly(ball_flight.on_table(start), lambda p: min(p[1] - OUT_OF_REACH[0], p[2] - OUT_OF_REACH[1]))
+        assert steps == pytest.approx(end * experiment.task.control_rate, abs=1.5)
+
+
+def test_selection_score_is_the_papers_sparse_reward():
+    """Missed 0, hit +1, landed +1 more; a touch of robot or table, or a failed episode, -2 whatever the ball did."""
+    played = result(
+        [MISSED, HIT, RETURNED, RETURNED, MISSED],
+        finite=[True, True, True, True, False],
+        collision=[0.0, 0.0, 0.0, -1.0, 0.0],
+    )
+    assert evaluate.selection_score(played) == pytest.approx((0 + 1 + 2 - 2 - 2) / 5)
+
+
+def share(path, colour) -> float:
+    """Share of a picture's pixels within 12 levels of a colour "#rrggbb"."""
+    wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
+    pixels = np.asarray(Image.open(path).convert("RGB")).astype(int)
+    return float((np.abs(pixels - wanted).max(axis=-1) <= 12).mean())
+
+
+def test_pictures_show_what_was_counted(tmp_path):
+    def draw(folder, outcome):
+        played = result([outcome] * 400)
+        rng = np.random.default_rng(1)
+        incoming = rng.uniform([[[-0.7]], [[-1.3]]], [[[0.7]], [[-0.1]]], (2, 400, 1))
+        return figures.draw_evaluation(
+            tmp_path / folder, Played(evaluate.summary(played), played, incoming), (1.0,) * N_TERMS
+        )
+
+    returned, missed = draw("returned", RETURNED), draw("missed", MISSED)
+    assert [path.name for path in returned] == [
+        "landing_map.png",
+        "return_rate_map.png",
+        "rewards.png",
+        "joint_speeds.png",
+    ]
+    assert share(returned[0], "#000000") < 0.5  # a picture, not a black frame
+    dots = [np.asarray(Image.open(paths[0]).convert("RGB")).astype(int) for paths in (returned, missed)]
+    green = [((d[..., 1] > d[..., 0] + 25) & (d[..., 1] > d[..., 2] + 25)).mean() for d in dots]
+    assert green[0] > 10 * green[1]
+    assert share(returned[1], "#006837") > 0.05  # the colour map's green end fills the robot's half
+    assert share(missed[1], "#a50026") > 0.05  # and its red end
+
+
+def rising() -> list[dict]:
+    """Rows of metrics of 60 updates, some values missing."""
+    rows = [
+        {
+            "update": i + 1,
+            "seconds": 0.1 * i,
+            "return_rate": i / 60,
+            "hit_rate": None if i < 3 else 0.5,
+            "mean_return": None,
+        }
+        for i in range(60)
+    ]
+    rows[29] |= {"evaluation/return_rate": 0.4, "evaluation/low": 0.3, "evaluation/high": 0.5}
+    return rows
+
+
+def test_training_curve_survives_missing_values(tmp_path):
+    rows = rising()
+    path = figures.draw_training(tmp_path / "training.png", rows, "a title")
+    assert share(path, figures.RETURNED_COLOUR) > 0.0005
+
+
+def test_curves_of_several_trainings_are_drawn_over_time_and_balls(tmp_path):
+    """The figure's own lines against the rows: the second training plays ten times the balls in half the time."""
+    rows = rising()
+    faster = [row | {"seconds": row["seconds"] / 2} for row in rows]
+    figure = figures._curves([figures.Curve("one", rows, 100), figures.Curve("two", faster, 1000)])
+    minutes, balls = ({line.get_label(): line.get_xydata() for line in axes.lines} for axes in figure.axes)
+    assert list(minutes) == ["one, perturbed", "one, evaluated", "two, perturbed", "two, evaluated"]
+    assert minutes["one, evaluated"].tolist() == [[pytest.approx(2.9 / 60), 0.4]]
+    assert balls["two, evaluated"].tolist() == [[30_000, 0.4]]
+    np.testing.assert_allclose(minutes["one, perturbed"][:, 0], 2 * minutes["two, perturbed"][:, 0])
+    assert balls["one, perturbed"][-1] == pytest.approx((6000, np.mean(np.arange(35, 60) / 60)))
+    assert share(figures.draw_curves(tmp_path / "a" / "curves.png", [figures.Curve("one", rows, 100)]), "#1f77b4") > 0.0005
+
+
+def test_what_has_no_learning_curve_is_named(tmp_path):
+    run = Run(tmp_path / "run")
+    run.folder.mkdir()
+    run_dir.write_yaml(run.folder / run_dir.CONFIG, config.load(config.shipped()["narrow"]).to_dict())
+    with pytest.raises(RunError, match="metrics.jsonl: holds no update yet"):
+        figures.read_curve(run.folder)
+    run.metrics.write_text(json.dumps({"update": 1, "return_rate": 0.5, "fault_rate": 0.0}) + "\n")
+    with pytest.raises(RunError, match="run: is a fine-tuning"):
+        figures.read_curve(run.folder)
+    run.metrics.write_text(json.dumps(rising()[0]) + "\n")
+    optimiser = run.config().optimiser
+    assert figures.read_curve(run.folder).balls == 2 * optimiser.pairs * optimiser.repeats

@@ -1,0 +1,485 @@
+"""Fine-tuning: what an update does, what a kill leaves, what the operator may do, what comes out at the end."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from io import StringIO
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+from scipy import stats
+
+from ballmodel.distribution import load_distribution
+from bgs import strategy
+from experiments import cli
+from experiments.config import build, finetuning
+from experiments.config import experiment as config
+from experiments.config.finetuning import FineTuning
+from experiments.errors import ConfigError, RunError
+from experiments.finetuning import loop
+from experiments.finetuning import report as finetune_report
+from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journal
+from experiments.finetuning.robot import LockStepRobot, NoOperator, PlayedBall
+from experiments.runs import checkpoint, load_policy, metrics
+from experiments.runs.run_dir import Run
+from mjx_tt.env.policy import initial_theta
+from robot_io import contract
+from robot_io.control.episode import EpisodeSummary
+from robot_io.emulator.ball_launcher import Throws
+from robot_io.policy import artefact as artefacts
+from robot_io.policy import export
+from tests.support.paths import ROOT
+
+MEAN = np.linspace(-0.3, 0.4, contract.N_OBSERVATION, dtype=np.float32)
+INVERSE_SCALE = np.linspace(1.0, 3.0, contract.N_OBSERVATION, dtype=np.float32)
+BALLS = 12
+LOCK_STEP_DRIVER = """
+import sys
+from pathlib import Path
+from mjx_tt import platform
+platform.configure(1, cache=Path(".cache/jax"))
+from tests.experiments.finetuning import test_loop
+test_loop.lock_step_run(sys.argv[1], sys.argv[2])
+"""
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Path:
+    """An artefact of a policy that knows nothing yet."""
+    folder = tmp_path_factory.mktemp("policy") / "artefact"
+    experiment = config.parse({"name": "source", "balls": "player3/M0"}, "test")
+    theta = np.asarray(initial_theta(jax.random.key(3), 0.1))
+    export.write(folder, theta, MEAN, INVERSE_SCALE, {"config": experiment.to_dict()})
+    return folder
+
+
+class Toy:
+    """A "robot" that nears the ball the better, the nearer three parameters are to their optimum; remembers what it plays."""
+
+    repeatable = True
+
+    def __init__(self, fault_at: int | None = None) -> None:
+        self.played: list[tuple[np.ndarray, np.ndarray, np.ndarray, int]] = []
+        self.fault_at = fault_at
+
+    def play(self, theta, mean, inverse_scale, episode_number) -> PlayedBall:
+        self.played.append((theta.copy(), mean.copy(), inverse_scale.copy(), episode_number))
+        noise = np.random.default_rng(episode_number).normal()
+        closest = 0.2 + float(np.linalg.norm(theta[:3] - 0.3)) + 0.002 * noise
+        fault = "limit" if episode_number == self.fault_at else None
+        return PlayedBall(summary(closest=closest, number=episode_number, fault=fault), flight(episode_number))
+
+    def describe(self) -> dict:
+        return {"robot": "toy"}
+
+
+def summary(outcome: str = "missed", closest: float = 0.2, number: int = 1, **changes) -> EpisodeSummary:
+    made = EpisodeSummary(number, number, 1.0, 2.0, 40, outcome, closest, False, 0.0, (0.0, -1.37))
+    return replace(made, **changes)
+
+
+def flight(seed: int = 0, n: int = 5) -> np.ndarray:
+    return np.column_stack([np.arange(n) * 0.008, np.random.default_rng(seed).normal(size=(n, 3))])
+
+
+def quiet() -> Console:
+    return Console(file=StringIO(), width=120)
+
+
+def tune(source: Path, folder: Path, robot, operator=None, **settings):
+    wanted = {"updates": 3, "pairs": 3, "repeats": 2, "evaluation_balls": 4} | settings
+    return loop.finetune(source, FineTuning(**wanted), Run(folder), robot, quiet(), operator)
+
+
+def entries(folder: Path) -> list[Entry]:
+    journal = Journal(folder / loop.JOURNAL)
+    journal.close()
+    return journal.entries
+
+
+def last_theta(folder: Path) -> np.ndarray:
+    return checkpoint.read_latest(folder / "checkpoints")[0]["bgs.theta"]
+
+
+# Settings and rewards
+
+
+def test_the_defaults_are_the_papers_real_settings():
+    chosen = finetuning.load()
+    assert (chosen.step.learning_rate, chosen.sigma, chosen.pairs, chosen.repeats, chosen.keep) == (
+        0.00375, 0.025, 5, 3, 0.6,
+    )  # fmt: skip
+    assert chosen.step.kind == "sgd" and chosen.step.schedule.kind == "constant" and chosen.orthogonal
+    assert chosen.updates in (60, 70) and chosen.episodes_per_update == 30
+    weights = dict(zip(loop.rewards.TERMS, build.reward_weights(chosen.rewards)))
+    assert {name: weight for name, weight in weights.items() if weight} == {
+        "state_transition": 1.0, "net_clearance": 1.0, "hit_and_land": 0.1, "fault": 1.0,
+    }  # fmt: skip
+
+
+def test_settings_come_from_file_then_command_line(tmp_path):
+    path = tmp_path / "tuning.yaml"
+    path.write_text("updates: 12\npairs: 7\n")
+    chosen = finetuning.load(path, ("pairs=9", "step.learning_rate=0.001"))
+    assert (chosen.updates, chosen.pairs, chosen.repeats, chosen.step.learning_rate) == (12, 9, 3, 0.001)
+
+
+@pytest.mark.parametrize(
+    "data, named",
+    [
+        ({"pair": 5}, "pairs"),
+        ({"keep": 0.0}, "keep"),
+        ({"rewards": "sim"}, "real"),
+        ({"rewards": {"base": "real", "jerk": 0.3}}, "jerk"),
+    ],
+)
+def test_a_mistake_in_the_settings_is_named(data, named):
+    with pytest.raises(ConfigError, match=named):
+        finetuning.parse(data, "tuning.yaml")
+
+
+def test_reward_terms_of_a_real_episode():
+    at_target = summary("returned", crossed=True, net_height=0.35, landing=(0.0, 0.685))
+    assert loop.reward_terms(at_target) == pytest.approx(
+        {"state_transition": 5.0, "net_clearance": 1.0, "hit_and_land": 1.0, "fault": 0.0}, abs=1e-6
+    )
+    beside = loop.reward_terms(summary("hit", crossed=True, net_height=0.60, landing=(0.7, 0.685)))
+    assert beside["state_transition"] == pytest.approx(3.0 + 0.5 + 0.5 * math.exp(-1.0), abs=1e-6)
+    assert beside["net_clearance"] == pytest.approx(math.exp(-1.0), abs=1e-6)
+    missed = loop.reward_terms(summary("missed", closest=0.25, fault="clearance"))
+    assert missed["state_transition"] == pytest.approx(3.0 * math.exp(-1.0), abs=1e-6)
+    assert (missed["net_clearance"], missed["hit_and_land"], missed["fault"]) == (0.0, 0.0, -2.0)
+
+
+# Updates
+
+
+def test_an_update_follows_the_journal_by_the_papers_rule(source, tmp_path):
+    """theta and every member are computed again in NumPy from the returns in the journal."""
+    toy, settings = Toy(fault_at=9), FineTuning(updates=2, pairs=3, repeats=2, evaluation_balls=2)
+    tune(source, tmp_path / "run", toy, updates=2, evaluation_balls=2)
+    theta = load_policy.load(source).theta.astype(np.float32)
+    bgs = build.bgs_config(settings.optimiser(), 2)
+    trained = [entry for entry in entries(tmp_path / "run") if entry.phase == TRAINING]
+    assert [entry.episode for entry in trained] == list(range(24))
+    assert trained[9].terms["fault"] == -2.0
+    thetas = {number: played for played, _, _, number in toy.played}
+    for update in (1, 2):
+        key = jax.random.fold_in(build.key(0, build.INITIAL_STATE), update - 1)
+        directions = np.asarray(strategy.ask(key, strategy.init(theta, bgs), bgs))
+        assert directions.T @ directions == pytest.approx(976 * np.eye(3), abs=0.01)
+        returns = np.zeros((6, 2))
+        for entry in (entry for entry in trained if entry.update == update):
+            sign = 1 if entry.member < 3 else -1
+            member = theta + sign * np.float32(0.025) * directions[:, entry.member % 3]
+            np.testing.assert_allclose(thetas[entry.episode], member, atol=1e-6)
+            assert entry.returns == pytest.approx(
+                entry.terms["state_transition"] + entry.terms["net_clearance"]
+                + 0.1 * entry.terms["hit_and_land"] + entry.terms["fault"]
+            )  # fmt: skip
+            returns[entry.member, entry.repeat] = entry.returns
+        plus, minus = np.split(returns.mean(axis=1), 2)
+        elite = np.argsort(-np.abs(plus - minus))[: int(0.6 * 3)]
+        std = np.concatenate([plus[elite], minus[elite]]).std()
+        theta = theta + 0.00375 / (len(elite) * std) * directions[:, elite] @ (plus - minus)[elite]
+        theta = theta.astype(np.float32)
+    np.testing.assert_allclose(last_theta(tmp_path / "run"), theta, atol=1e-5)
+
+
+def test_it_climbs_and_the_report_says_so(source, tmp_path):
+    easy = {"updates": 150, "pairs": 8, "repeats": 1, "keep": 1.0, "evaluation_balls": 10}
+    report = tune(source, tmp_path / "run", Toy(), **easy)
+    assert report["difference"]["paired"] and report["difference"]["significant"]
+    assert report["difference"]["low"] > 0
+    assert json.loads((tmp_path / "run" / "evaluation.json").read_text()) == report
+    rows = metrics.read(tmp_path / "run" / "metrics.jsonl")
+    assert [row["update"] for row in rows] == list(range(1, 151))
+    assert all(row["low"] <= row["mean_return"] <= row["high"] for row in rows)
+    assert list((tmp_path / "run" / "tensorboard").iterdir())
+    assert (tmp_path / "run" / "plots" / loop.CURVE).stat().st_size > 10_000
+
+
+def test_the_artefact_is_what_the_robot_played_last(source, tmp_path):
+    toy = Toy()
+    tune(source, tmp_path / "run", toy, average=0.5)
+    exported = artefacts.load(tmp_path / "run" / "artefact")
+    theta, mean, inverse_scale, _ = toy.played[-1]
+    np.testing.assert_array_equal(exported.normaliser_mean, mean)
+    np.testing.assert_array_equal(exported.normaliser_inverse_scale, inverse_scale)
+    for name, wanted in contract.unflatten(theta).items():
+        np.testing.assert_array_equal(exported.parameters[name], wanted)
+    np.testing.assert_array_equal(toy.played[0][0], load_policy.load(source).theta)  # before: the policy as it came
+    np.testing.assert_allclose(mean, MEAN, rtol=1e-6)
+    np.testing.assert_allclose(inverse_scale, INVERSE_SCALE, rtol=1e-6)
+
+
+def test_the_run_can_be_trained_from_and_tuned_again(source, tmp_path):
+    tune(source, tmp_path / "first", Toy())
+    loaded = load_policy.load(tmp_path / "first")
+    theta, _ = load_policy.load_statistics(tmp_path / "first")
+    np.testing.assert_array_equal(theta, last_theta(tmp_path / "first"))
+    assert loaded.config.name == "first" and loaded.config.balls == "player3/M0"
+    again = Toy()
+    tune(tmp_path / "first", tmp_path / "second", again, updates=1)
+    np.testing.assert_array_equal(again.played[0][0], theta)
+
+
+# Interruptions
+
+
+def test_killed_at_random_moments_it_ends_in_the_same_parameters(source, tmp_path):
+    """The emulated robot, SIGKILL three times; against a run that nothing disturbs."""
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    command = [sys.executable, "-c", LOCK_STEP_DRIVER, str(source)]
+    chance = random.Random(5)
+    for mark in (2, 5, 8):
+        process = subprocess.Popen([*command, str(killed)], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        while process.poll() is None and _lines(killed / loop.JOURNAL) < mark:
+            time.sleep(0.02)
+        assert process.poll() is None, process.stdout.read().decode()
+        time.sleep(0.3 * chance.random())
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        assert _lines(killed / loop.JOURNAL) >= mark
+    done = subprocess.run([*command, str(killed)], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    lock_step_run(str(source), str(whole))
+    np.testing.assert_array_equal(last_theta(killed), last_theta(whole))
+    assert (killed / "human_balls.csv").read_text().replace("killed", "whole") == (
+        whole / "human_balls.csv"
+    ).read_text()
+    assert [_plain(entry) for entry in entries(killed)] == [_plain(entry) for entry in entries(whole)]
+
+
+def lock_step_run(source: str, folder: str) -> None:
+    """In a process of its own: a few balls on the emulated robot."""
+    settings = FineTuning(updates=2, pairs=2, repeats=1, evaluation_balls=2)
+    loop.finetune(source, settings, Run(folder), LockStepRobot(throws()), Console())
+
+
+def throws(n: int = BALLS) -> Throws:
+    """Balls of a person without much imagination."""
+    chance = np.random.default_rng(2)
+    low, high = np.array([[-0.2, 0.9, 0.2, -0.2, -4.8, 1.2], [0.2, 1.1, 0.3, 0.2, -4.4, 1.5]])
+    balls = chance.uniform(low, high, (n, 6)).T
+    return Throws(balls[:3], balls[3:], np.zeros((3, n)))
+
+
+def _lines(path: Path) -> int:
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def _plain(entry: Entry) -> dict:
+    return asdict(entry) | {"trajectory": entry.trajectory.tolist()}
+
+
+class Interrupted(Exception):
+    """Stands for a power cut."""
+
+
+class Failing(Toy):
+    """Loses power in an episode."""
+
+    def __init__(self, after: int) -> None:
+        super().__init__()
+        self.left = after
+
+    def play(self, *arguments) -> PlayedBall:
+        if not self.left:
+            raise Interrupted
+        self.left -= 1
+        return super().play(*arguments)
+
+
+@pytest.mark.parametrize("after", [0, 3, 4, 9, 10, 15, 16, 25])
+def test_no_more_than_the_episode_in_play_is_lost(source, tmp_path, after):
+    tune(source, tmp_path / "whole", Toy())
+    with pytest.raises(Interrupted):
+        tune(source, tmp_path / "cut", Failing(after))
+    assert len(entries(tmp_path / "cut")) == after
+    rest = Toy()
+    tune(source, tmp_path / "cut", rest)
+    assert len(rest.played) == 3 * 12 + 2 * 4 - after
+    np.testing.assert_array_equal(last_theta(tmp_path / "cut"), last_theta(tmp_path / "whole"))
+    assert len(metrics.read(tmp_path / "cut" / "metrics.jsonl")) == 3
+
+
+def test_it_continues_from_the_journal_when_checkpoints_are_gone(source, tmp_path):
+    tune(source, tmp_path / "run", Toy())
+    theta = last_theta(tmp_path / "run")
+    for path in (tmp_path / "run" / "checkpoints").iterdir():
+        path.unlink()
+    rest = Toy()
+    tune(source, tmp_path / "run", rest)
+    assert not rest.played
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), theta)
+
+
+def test_half_a_line_is_dropped_and_its_episode_played_again(source, tmp_path):
+    with pytest.raises(Interrupted):
+        tune(source, tmp_path / "run", Failing(8))
+    path = tmp_path / "run" / loop.JOURNAL
+    content = path.read_bytes()
+    for cut in (1, 50, len(content.splitlines()[-1])):
+        path.write_bytes(content[:-cut])
+        assert len(entries(tmp_path / "run")) == 7
+    tune(source, tmp_path / "run", Toy())
+    tune(source, tmp_path / "whole", Toy())
+    assert path.read_bytes() == (tmp_path / "whole" / loop.JOURNAL).read_bytes()
+
+
+def test_a_journal_that_was_changed_is_refused(source, tmp_path):
+    with pytest.raises(Interrupted):
+        tune(source, tmp_path / "run", Failing(8))
+    path = tmp_path / "run" / loop.JOURNAL
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines[:2], b"nonsense\n", *lines[3:]]))
+    with pytest.raises(RunError, match="line 3"):
+        tune(source, tmp_path / "run", Toy())
+
+
+def test_another_fine_tuning_in_the_same_folder_is_refused(source, tmp_path):
+    tune(source, tmp_path / "run", Toy(), updates=2)
+    with pytest.raises(RunError, match=r"settings\.sigma: the run has 0\.025, now 0\.05"):
+        tune(source, tmp_path / "run", Toy(), updates=2, sigma=0.05)
+    with pytest.raises(RunError, match="updates = 1"):
+        tune(source, tmp_path / "run", Toy(), updates=1)
+
+
+def test_a_start_that_failed_does_not_stand_in_the_way_of_the_corrected_one(source, tmp_path):
+    class Absent(Toy):
+        def play(self, *arguments) -> PlayedBall:
+            raise RunError("no robot answers")
+
+    with pytest.raises(RunError, match="no robot answers"):
+        tune(source, tmp_path / "run", Absent(), sigma=0.05)
+    tune(source, tmp_path / "run", Toy())
+    tune(source, tmp_path / "whole", Toy())
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
+    assert yaml.safe_load((tmp_path / "run" / loop.SETTINGS).read_text())["settings"]["sigma"] == 0.025
+
+
+def test_a_finished_run_goes_on_when_more_updates_are_asked_for(source, tmp_path):
+    tune(source, tmp_path / "whole", Toy())
+    tune(source, tmp_path / "run", Toy(), updates=2)
+    report = tune(source, tmp_path / "run", Toy())
+    assert report["updates"] == 3 and report["after"]["balls"] == 4 and report["difference"]["paired"]
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
+
+
+# The operator
+
+
+class Person(NoOperator):
+    """Discards the balls of these numbers, stops after so many balls, pauses for some looks once."""
+
+    def __init__(self, discards=(), stop_after: int | None = None, looks: int = 0) -> None:
+        self.asked, self._discards, self._stop_after, self.looks = 0, set(discards), stop_after, looks
+
+    def discarded(self) -> bool:
+        self.asked += 1
+        return self.asked - 1 in self._discards
+
+    def paused(self) -> bool:
+        self.looks -= 1
+        return self.looks >= 0
+
+    def stopped(self) -> bool:
+        return self.asked == self._stop_after
+
+
+def test_discarded_balls_are_played_again_with_other_balls(source, tmp_path):
+    person = Person(discards={1, 6, 7})
+    report = tune(source, tmp_path / "run", Toy(), person)
+    found = entries(tmp_path / "run")
+    assert report["discarded"] == 3 and [entry.discarded for entry in found[:9]] == [i in (1, 6, 7) for i in range(9)]
+    kept = [entry for entry in found if not entry.discarded]
+    assert len(kept) == len({entry.place for entry in kept}) == 3 * 12 + 2 * 4
+    assert len({(entry.phase, entry.episode) for entry in found}) == len(found)
+    assert not report["difference"]["paired"]  # other balls before than after
+    rows = list(csv.DictReader(open(tmp_path / "run" / "human_balls.csv")))
+    assert len({row["trajectory"] for row in rows}) == 3 * 12 + 4
+
+
+def test_what_the_bridge_discards_or_the_operators_stop_ends_does_not_count(source, tmp_path):
+    class Stopped(Toy):
+        def play(self, *arguments) -> PlayedBall:
+            played = super().play(*arguments)
+            bad = {2: {"fault": "stopped"}, 3: {"discarded": True}}.get(len(self.played), {})
+            return PlayedBall(replace(played.summary, **bad), played.trajectory)
+
+    report = tune(source, tmp_path / "run", Stopped())
+    assert report["discarded"] == 2 and report["before"]["balls"] == 4 and not report["before"]["faults"]
+
+
+def test_stop_and_continue_and_pause(source, tmp_path):
+    tune(source, tmp_path / "whole", Toy())
+    assert tune(source, tmp_path / "run", Toy(), Person(stop_after=11)) is None
+    assert len(entries(tmp_path / "run")) == 11
+    person = Person(looks=3)
+    assert tune(source, tmp_path / "run", Toy(), person) is not None
+    assert person.looks < 0
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "whole"))
+
+
+def test_fewer_updates_than_planned_are_an_end_too(source, tmp_path):
+    assert tune(source, tmp_path / "run", Toy(), Person(stop_after=4 + 12)) is None
+    report = tune(source, tmp_path / "run", Toy(), updates=1)
+    assert report["updates"] == 1 and report["after"]["balls"] == 4
+    assert yaml.safe_load((tmp_path / "run" / loop.SETTINGS).read_text())["settings"]["updates"] == 1
+
+
+# Measurements
+
+
+def test_intervals_are_those_of_scipy():
+    chance = np.random.default_rng(0)
+    a, b = chance.normal(1, 1, 30), chance.normal(2, 3, 20)
+    mean, low, high = finetune_report.t_interval(a)
+    wanted = stats.ttest_1samp(a, 0).confidence_interval(0.95)
+    assert (mean, low, high) == pytest.approx((a.mean(), wanted.low, wanted.high))
+    difference, low, high = finetune_report.welch_interval(a, b)
+    wanted = stats.ttest_ind(b, a, equal_var=False).confidence_interval(0.95)
+    assert (difference, low, high) == pytest.approx((b.mean() - a.mean(), wanted.low, wanted.high))
+
+
+def test_the_emulated_robots_balls_make_a_human_distribution(tmp_path):
+    """fit-human finds what was thrown, from the noisy samples of the emulated tracker."""
+    robot, thrown, played = LockStepRobot(throws()), throws(), []
+    theta = np.zeros(contract.n_parameters(), np.float32)
+    for number in range(BALLS):
+        ball = robot.play(theta, MEAN, INVERSE_SCALE, number)
+        assert np.all(np.diff(ball.trajectory[:, 0]) > 0)
+        np.testing.assert_allclose(ball.trajectory[0, 1:], thrown.position[:, number], atol=0.1)
+        played.append(Entry(BEFORE, 0, 0, number, number, ball.summary, {}, 0.0, False, ball.trajectory))
+    again = robot.play(theta, MEAN, INVERSE_SCALE, 4)
+    np.testing.assert_array_equal(again.trajectory, played[4].trajectory)
+    assert again.summary == played[4].summary
+    other = robot.play(theta, MEAN, INVERSE_SCALE, 4 + BALLS)  # the same ball, seen with other noise
+    assert not np.array_equal(other.trajectory[:5], again.trajectory[:5])
+
+    path = tmp_path / "balls.csv"
+    assert finetune_report.write_human_balls(path, "monday", played) == BALLS
+    assert cli.main(["fit-human", str(path), "--out", str(tmp_path / "anna.yaml"), "--eps", "100"]) == 0
+    found = load_distribution(tmp_path / "anna.yaml")
+    np.testing.assert_allclose(found.velocity_max[1], thrown.velocity[1].max(), atol=0.25)
+    np.testing.assert_allclose(found.velocity_min[1], thrown.velocity[1].min(), atol=0.25)
+
+
+def test_phases_are_told_apart(source, tmp_path):
+    tune(source, tmp_path / "run", Toy())
+    phases = [entry.phase for entry in entries(tmp_path / "run")]
+    assert phases == [BEFORE] * 4 + [TRAINING] * 36 + [AFTER] * 4

@@ -1,0 +1,219 @@
+"""Blind evaluation: the bijection, the seal, and the protocol from the command line with real artefacts."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import zlib
+
+import numpy as np
+import pytest
+from scipy.stats import chisquare
+
+from experiments import cli
+from experiments.errors import ConfigError
+from experiments.study.analysis import scoring
+from experiments.study.blind import protocol
+from robot_io.policy import artefact, export
+
+MODELS = ("is2r-ft100", "s2r-ft100", "oracle-ft")
+
+
+def test_codes_are_one_to_one_and_the_order_is_random():
+    rng = np.random.default_rng(0)
+    places = np.zeros((4, 4), int)
+    for _ in range(2000):
+        key = protocol.draw("abcd", rng)
+        assert list(key.values()) == ["A", "B", "C", "D"] and set(key) == set("abcd")
+        for place, model in enumerate(key):
+            places["abcd".index(model), place] += 1
+    assert chisquare(places.ravel()).pvalue > 1e-3
+    assert protocol.codes(28)[-3:] == ("Z", "AA", "AB")
+    with pytest.raises(ValueError, match="each model once"):
+        protocol.draw(["a", "a"], rng)
+
+
+def test_a_sealed_file_does_not_show_and_cannot_be_changed(tmp_path):
+    path = tmp_path / "key.sealed"
+    content = {"codes": {"is2r-ft100": "A"}, "number": 0.1}
+    digest = protocol.seal(path, content)
+    text = path.read_text()
+    assert "is2r" not in text and "codes" not in text and digest in text
+    assert protocol.unseal(path) == content
+    assert protocol.seal(tmp_path / "again", content) != digest  # the hash alone does not tell the content by trying
+    sealed = json.loads(text)
+    plain = zlib.decompress(base64.b64decode(sealed["sealed"])).replace(b"ft100", b"ft065")
+    path.write_text(json.dumps(sealed | {"sealed": base64.b64encode(zlib.compress(plain)).decode()}))
+    with pytest.raises(ConfigError, match="changed after sealing"):
+        protocol.unseal(path)
+    path.write_text("{}")
+    with pytest.raises(ConfigError, match="no sealed file"):
+        protocol.unseal(path)
+
+
+@pytest.fixture(scope="module")
+def artefacts(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("policies")
+    for k, model in enumerate(MODELS):
+        theta = np.random.default_rng(k).normal(0.0, 0.1, 976)
+        export.write(folder / model / "artefact", theta, np.zeros(11), np.ones(11), {"model": model})
+    return folder
+
+
+def fill(sheet, lengths, skip=()):
+    """Writes lengths and ends, robot_missed as row 13, into the lines of a sheet, and leaves out what ``skip`` says."""
+    lines = sheet.read_text().splitlines()
+    comments = [line for line in lines if line.startswith("#")]
+    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    for row in rows[1:]:
+        code, rally = row[0], int(row[1])
+        if (code, rally) not in skip:
+            row[2:] = [str(lengths[code][rally - 1]), "13"]
+    sheet.write_text("\n".join([*comments, *(",".join(row) for row in rows)]) + "\n")
+
+
+def test_people_evaluate_without_knowing_what(tmp_path, artefacts, capsys):
+    folder = tmp_path / "blind"
+    given = [f"{model}={artefacts / model}" for model in MODELS]
+    assert (
+        cli.main(["blind", "make", str(folder), *given, "--trainer", "anna", "--evaluator", "ben", "--seed", "2"]) == 0
+    )
+    assert sorted(p.name for p in (folder / "policies").iterdir()) == ["A", "B", "C"]
+    shown = capsys.readouterr().out + (folder / "sheet.csv").read_text() + (folder / "key.sealed").read_text()
+    assert not any(model in shown for model in MODELS)
+    assert cli.main(["blind", "make", str(folder), *given]) == 1  # never over an evaluation that has begun
+    content = (folder / "sheet.csv").read_bytes()
+    assert b"\r" not in content
+    sheet = content.decode()
+    assert (
+        all(f"# {number:>2}  " in sheet for number in range(1, 16)) and "Human hit the first ball to the net." in sheet
+    )
+
+    rng = np.random.default_rng(5)
+    lengths = {code: rng.integers(2, 40, 70) for code in "ABC"}
+    late = {("B", rally) for rally in range(40, 71)}
+    fill(folder / "sheet.csv", lengths, late)
+    assert [(p.code, p.counted, p.complete) for p in protocol.progress(folder)] == [
+        ("A", 70, True), ("B", 39, False), ("C", 70, True),
+    ]  # fmt: skip
+    assert cli.main(["blind", "open", str(folder)]) == 1
+    message = capsys.readouterr().err
+    assert "stays sealed" in message and "B has 39" in message and not any(model in message for model in MODELS)
+    assert not (folder / "evaluations.csv").exists()
+
+    fill(folder / "sheet.csv", lengths)
+    assert cli.main(["blind", "sheet", str(folder)]) == 0
+    assert cli.main(["blind", "open", str(folder)]) == 0
+    rallies = scoring.read(folder / "evaluations.csv")
+    assert set(zip(rallies.seed.tolist(), rallies.trainer.tolist(), rallies.evaluator.tolist())) == {(2, "anna", "ben")}
+    for model in MODELS:
+        mine = rallies.take(rallies.model == model)
+        code = str(mine.blind[0])
+        # The code is the folder whose policy is this model's: its numbers say so.
+        played, original = (artefact.load(f) for f in (folder / "policies" / code, artefacts / model / "artefact"))
+        for name, array in original.parameters.items():
+            np.testing.assert_array_equal(played.parameters[name], array)
+        assert mine.rally.tolist() == list(range(1, 71))  # as on the sheet
+        assert mine.length.tolist() == lengths[code].tolist()
+        assert sorted(mine.length[mine.selected]) == sorted(lengths[code][:60])[-50:]
+
+
+def test_a_start_that_was_cut_off_begins_anew(tmp_path, artefacts, monkeypatch):
+    folder, policies = tmp_path / "blind", {model: artefacts / model for model in MODELS[:2]}
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(protocol, "seal", killed)  # the policies are copied, the key is not yet there
+        protocol.make(folder, policies, "anna", "anna")
+    assert (folder / "policies" / "A").exists() and not (folder / "key.sealed").exists()
+    assert protocol.make(folder, policies, "anna", "anna") == ("A", "B")
+    assert sorted(path.name for path in folder.iterdir()) == ["key.sealed", "policies", "sheet.csv"]
+
+
+def test_a_swapped_policy_is_found(tmp_path, artefacts):
+    folder = tmp_path / "blind"
+    folder.mkdir()
+    protocol.make(folder, {model: artefacts / model for model in MODELS[:2]}, "anna", "anna")
+    fill(folder / "sheet.csv", {code: np.full(70, 4) for code in "AB"})
+    (folder / "policies" / "A").rename(folder / "policies" / "swap")
+    (folder / "policies" / "B").rename(folder / "policies" / "A")
+    (folder / "policies" / "swap").rename(folder / "policies" / "B")
+    with pytest.raises(ConfigError, match="not the policy that was sealed"):
+        protocol.open_key(folder)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("A,1,5,99", "no end of a rally; 1 to"),
+        ("A,1,five,13", "whole numbers"),
+        ("A,1,5,13\nA,1,6,13", "rally 1 of A is there twice"),
+    ],
+)
+def test_a_bad_line_of_a_sheet_is_named(tmp_path, line, says):
+    (tmp_path / "sheet.csv").write_text("code,rally,length,end\n" + line + "\n")
+    with pytest.raises(ConfigError, match=f"sheet.csv: line .*{says}"):
+        protocol.read_sheet(tmp_path / "sheet.csv")
+
+
+def test_a_folder_without_a_policy_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="mjx-tt export"):
+        protocol.make(tmp_path / "b", {"m": tmp_path, "n": tmp_path}, "a", "a")
+    assert not (tmp_path / "b").exists()
+
+
+def test_a_copy_does_not_say_which_model_it_is(tmp_path, artefacts):
+    folder = tmp_path / "blind"
+    protocol.make(folder, {model: artefacts / model for model in MODELS}, "anna", "anna")
+    key = protocol.unseal(folder / "key.sealed")
+    for model, code in key["codes"].items():
+        copy = folder / "policies" / code
+        for path in copy.iterdir():
+            assert model.encode() not in path.read_bytes()
+            assert path.stat().st_mtime >= (artefacts / model / "artefact" / path.name).stat().st_mtime
+        loaded = artefact.load(copy)  # whole: what runs it accepts it
+        assert (loaded.manifest["provenance"], loaded.manifest["written_with"]) == ({}, {})
+        assert loaded.digest == key["digests"][model]
+        assert artefact.load(artefacts / model / "artefact").digest == key["originals"][model]
+    times = [(folder / "policies" / code / "params.npz").stat().st_mtime for code in "ABC"]
+    assert times == sorted(times)
+
+
+def test_one_policy_under_two_names_is_refused(tmp_path, artefacts, capsys):
+    first = artefacts / MODELS[0]
+    theta = np.random.default_rng(0).normal(0.0, 0.1, 976)
+    export.write(tmp_path / "again", theta, np.zeros(11), np.ones(11), {"model": "another name"})
+    for other in (first, first / "artefact", tmp_path / "again"):
+        assert cli.main(["blind", "make", str(tmp_path / "b"), f"a={first}", f"b={other}", "--trainer", "player3"]) == 1
+        assert "a and b: are the same policy" in capsys.readouterr().err
+    assert not (tmp_path / "b" / "policies").exists()
+    assert protocol.make(tmp_path / "b", {"a": first, "b": first}, "player3", "player3", twice=True) == ("A", "B")
+
+
+def test_a_blind_evaluation_needs_a_trainer(tmp_path, artefacts, capsys):
+    given = [f"{model}={artefacts / model}" for model in MODELS]
+    assert cli.main(["blind", "make", str(tmp_path / "b"), *given]) == 1
+    assert "--trainer" in capsys.readouterr().err and not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("separator, encoding", [(";", "utf-8-sig"), ("\t", "utf-16"), (",", "utf-8"), (";", "cp1252")])
+def test_a_sheet_is_read_as_spreadsheets_save_it(tmp_path, separator, encoding):
+    path = tmp_path / "sheet.csv"
+    protocol.blank_sheet(path, ("A", "B"), 3)
+    lines = [line if line.startswith("#") else line.replace(",", separator) for line in path.read_text().splitlines()]
+    lines = [line.replace(f"A{separator}2{separator * 2}", f"A{separator}2{separator}5{separator}13") for line in lines]
+    lines = [f'"{line}"{separator * 3}' if line.startswith("#") else line for line in lines] + [separator * 3]
+    path.write_bytes("\r\n".join(lines).encode(encoding))
+    assert protocol.read_sheet(path) == {"A": [protocol.Played(2, 5, scoring.End.ROBOT_MISSED)], "B": []}
+
+
+def test_a_rally_that_counts_has_a_touch(tmp_path):
+    path = tmp_path / "sheet.csv"
+    path.write_text("code,rally,length,end\nA,1,0,14\nA,2,0,1\n")  # a dummy ball by hand; not counted
+    assert [p.length for p in protocol.read_sheet(path)["A"]] == [0, 0]
+    path.write_text("code,rally,length,end\nA,1,0,13\n")
+    with pytest.raises(ConfigError, match="line 2: length 0: the human's first hit is 1"):
+        protocol.read_sheet(path)

@@ -1,0 +1,607 @@
+"""The iterative loop: its plan, its hidden reality, its fine-tuning, and what a kill leaves of it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from io import StringIO
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from ballmodel.aerodynamics import drag_factor, magnus_factor
+from ballmodel.distribution import load_distribution
+from ballmodel.state import BallState
+from bgs import normalizer, strategy
+from experiments.config import build, experiment
+from experiments.config import study as study_config
+from experiments.errors import ConfigError, RunError
+from experiments.runs import load_policy
+from experiments.study import evaluation, schedule, target_domain, training, workers
+from experiments.study import pipeline as is2r
+from experiments.study.analysis import effect_costs, scoring
+from experiments.study.blind import protocol
+from experiments.study.finetuning import VirtualReality
+from experiments.study.on_robot import blind_steps
+from experiments.study.schedule import Human, Real, Simulated
+from experiments.study.workflow import Journal, Step, Waiting, remaining, run_all, unfinished
+from mjx_tt.env import rewards
+from mjx_tt.env.policy import initial_theta
+from mjx_tt.rally import human_player
+from mjx_tt.rally.simulator import Box
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import SimModel
+from robot_io.contract import N_OBSERVATION
+from tests.support.paths import ROOT
+
+TINY = {
+    "name": "tiny",
+    "players": ["player3"],
+    "first_balls": 60,
+    "simulation": {
+        "task": {"max_steps": 60, "sim_rate": 150.0},
+        "optimiser": {"pairs": 2, "repeats": 2, "step": {"schedule": {"kind": "constant"}}},
+        "pool": 64,
+        "seeds": 1,
+        "devices": 1,
+        "rounds": [{"simulated": 6, "real": 2}, {"simulated": 3, "real": 4}, {"simulated": 3, "real": 4}],
+    },
+    "fine_tuning": {"pairs": 5, "repeats": 1},
+    "reality": {"sim_rate": 75.0, "without": ["drives", "encoders"]},  # compiles in half the time
+    "fresh": False,
+    "ablation": None,
+    "evaluation": {"rallies": 50, "lanes": 10, "max_touches": 8},
+}
+DRIVER = """
+import json, sys
+from pathlib import Path
+from mjx_tt import platform
+platform.configure(devices=2, cache=Path(".cache/jax"))
+from rich.console import Console
+from experiments.config import study as config
+from experiments.study import pipeline
+pipeline.run(config.parse(json.loads(sys.argv[1]), "test"), Path(sys.argv[2]), Console(), processes=2)
+"""
+
+
+def study(**changes) -> study_config.Study:
+    return study_config.parse(TINY | changes, "test")
+
+
+def quiet() -> Console:
+    return Console(file=StringIO(), width=200)
+
+
+def cosine(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+
+
+# The YAML and the plan
+
+
+@pytest.mark.parametrize("name", ["study_quick", "study_night", "study_full"])
+def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for_one(name):
+    shipped = study_config.load(study_config.shipped()[name])
+    assert [r.real for r in shipped.simulation.rounds] == [60, 70, 70]
+    assert len(shipped.players) == 5
+    tuning = shipped.fine_tuning
+    settings = (tuning.pairs, tuning.repeats, tuning.keep, tuning.sigma, tuning.step.learning_rate)
+    assert settings == (5, 3, 0.6, 0.025, 0.00375)
+    assert name not in experiment.shipped() and "quickstart" in experiment.shipped()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"player": ["player3"]}, "player: unknown key; did you mean 'players'"),
+        ({"players": ["player3", "player3"]}, "different entries"),
+        ({"players": ["anna"]}, "got 'anna'"),
+        ({"reality": {"without": ["magic"]}}, "got 'magic'"),
+        ({"ablation": {"player": "player4"}}, "ablation.player 'player4'"),
+        ({"evaluation": {"rallies": 50, "lanes": 7}}, "multiple of its lanes 7"),
+        ({"robot": "lockstep"}, "recordings of the first balls of player3"),
+        ({"fine_tuning": {"rewards": "sim"}}, "not measure"),
+    ],
+)
+def test_mistakes_in_a_study_are_named(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        study(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        (
+            {"evaluation": {"rallies": 80, "lanes": 7}},
+            "test: evaluation.rallies 80 is no multiple of its lanes 7 (evaluation.lanes); "
+            "the nearest that is allowed: 77 or 84",
+        ),
+        (
+            {"evaluation": {"rallies": 50, "lanes": 7}},
+            "test: evaluation.rallies 50 is no multiple of its lanes 7 (evaluation.lanes); "
+            "the nearest that is allowed: 56",
+        ),
+        (
+            {"ablation": {"player": "player4"}},
+            "test: ablation.player 'player4' is none of the players of this study; "
+            "allowed: player3, or no ablation at all (ablation: null)",
+        ),
+    ],
+)
+def test_a_mistake_across_keys_names_them_and_no_more(changes, text):
+    with pytest.raises(ConfigError) as raised:
+        study(**changes)
+    assert str(raised.value) == text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"robot": "rig", "recordings": {"player3": "nofile.csv"}}, "recordings.player3: nofile.csv: no such file"),
+        (
+            {"robot": "norobot.yaml", "recordings": {"player3": "nofile.csv"}},
+            "robot: norobot.yaml: cannot be read",
+        ),
+        ({"simulation": TINY["simulation"] | {"model": {"bal": {"x": 1.0}}}}, "simulation: model: .*'bal.x'"),
+        ({"ablation": {"player": "player3", "balls": ["wide"]}}, "ablation.balls: no distribution is called 'wide'"),
+    ],
+)
+def test_what_a_study_names_is_looked_up_before_it_begins(tmp_path, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        is2r.run(study(**changes), tmp_path / "tiny", quiet())
+    assert [path.name for path in (tmp_path / "tiny").iterdir()] == [".lock"]
+
+
+def test_a_start_that_came_to_no_step_does_not_block_another(tmp_path):
+    is2r._open(study(), tmp_path)
+    is2r._open(study(first_balls=61), tmp_path)
+    assert "first_balls: 61" in (tmp_path / is2r.SETTINGS).read_text()
+    Journal(tmp_path / "steps.jsonl").append(Step("seed0/player3/D0", "first balls", 1, (), (), lambda: ""), 1.0)
+    with pytest.raises(RunError, match="first_balls: the study has 61, now 62"):
+        is2r._open(study(first_balls=62), tmp_path)
+    for content in (b"[1]", b"\x80", b"{"):
+        (tmp_path / is2r.SESSIONS).write_bytes(content)
+        with pytest.raises((RunError, ConfigError), match="study.json"):
+            is2r._open(study(first_balls=61), tmp_path)
+
+
+def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_there():
+    whole = study_config.load(study_config.shipped()["study_full"])
+    for player in whole.players:
+        made: set[str] = {"D0", "large", "medium", "narrow"}
+        for item in schedule.items(whole, player):
+            needs = {Human: lambda i: i.data, Simulated: lambda i: (i.balls, i.source), Real: lambda i: (i.source,)}
+            assert {n for n in needs[type(item)](item) if n is not None} <= made, item
+            made |= (
+                {item.name}
+                if isinstance(item, Human)
+                else {item.key} | ({item.data} if isinstance(item, Real) else set())
+            )
+        assert set(schedule.MODELS) <= made
+    # "the policy was fine-tuned for 70 updates per cycle for the last two cycles and 60 for the first": 200, oracle 35 %.
+    by_key = {item.key: item for item in schedule.LOOP if not isinstance(item, Human)}
+    spent = {}
+    for key, item in by_key.items():
+        before = spent.get(item.source, 0) if item.source else 0
+        spent[key] = before + (schedule.updates(whole, item) if isinstance(item, Real) else 0)
+    assert spent["is2r-ft100"] == spent["s2r-ft100"] == 200 and spent["oracle-ft"] == 0.35 * 200
+    assert schedule.updates(whole, by_key["oracle-sim"]) == 40000
+
+
+def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
+    whole = study_config.load(study_config.shipped()["study_full"], ("fresh=false", "ablation=null"))
+    pairs = schedule.pairings(whole)
+    for player in whole.players:
+        assert sum(t == e == player for t, e, _ in pairs) == 10
+        others = [(t, m) for t, e, m in pairs if e == player != t]
+        assert len(others) == len(set(others)) == 6 and len({t for t, _ in others}) == 2
+    codes = evaluation.code_names(0, pairs)
+    for player in whole.players:
+        mine = [code for code, (_, e, _) in zip(codes, pairs) if e == player]
+        assert len(set(mine)) == 16
+    assert codes != evaluation.code_names(1, pairs)
+
+
+def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
+    quick = study_config.load(study_config.shipped()["study_quick"])
+    by_key = {item.key: item for item in schedule.LOOP if isinstance(item, Simulated)}
+    first = training.configuration(quick, by_key["is2r-sim1"], "player3/M0", None, 5)
+    later = training.configuration(quick, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
+    oracle = training.configuration(quick, by_key["oracle-sim"], "player3/M2", None, 7)
+    assert first.training.updates + 2 * later.training.updates == oracle.training.updates
+    assert (first.initial_policy, later.initial_policy, oracle.initial_policy) == (None, str(tmp_path), None)
+    assert (
+        later.optimiser.step.learning_rate < first.optimiser.step.learning_rate == oracle.optimiser.step.learning_rate
+    )
+    assert build.later_weights(later.training)[0] == 0
+
+
+# The hidden reality
+
+
+def test_leaving_out_an_effect_changes_no_other_and_seeds_differ():
+    everything = target_domain.differences(target_domain.draw(3))
+    ranges = {path: bounds for group in target_domain.RANGES.values() for path, bounds in group.items()}
+    assert everything.keys() == ranges.keys()
+    assert all(low <= everything[path] <= high for path, (low, high) in ranges.items())
+    for effect in target_domain.RANGES:
+        left = target_domain.differences(target_domain.draw(3, (effect,)))
+        assert left == {path: value for path, value in everything.items() if path not in target_domain.RANGES[effect]}
+    assert tuple(target_domain.RANGES) == study_config.EFFECTS
+    assert target_domain.draw(3, study_config.EFFECTS) == models.with_values(SimModel(), {})
+    other = target_domain.differences(target_domain.draw(4))
+    assert all(other[path] != value for path, value in everything.items())
+    with pytest.raises(ValueError, match="no effect is called 'magic'; there are rubber"):
+        target_domain.draw(3, ("magic",))
+
+
+def test_measured_balls_are_the_flight_as_the_camera_sees_it():
+    """Against the equations of motion integrated by SciPy and a rotation by SciPy."""
+    world = target_domain.draw(1)
+    rng = np.random.default_rng(0)
+    n, noise = 40, 0.002
+    position = np.array([[0.3], [1.3], [0.3]]) + 0.05 * rng.normal(size=(3, n))
+    velocity = np.array([[-0.2], [-5.0], [1.6]]) + 0.2 * rng.normal(size=(3, n))
+    spin = 60.0 * rng.normal(size=(3, n))
+    measured = target_domain.measure(world, BallState(position, velocity, spin), noise, jax.random.key(0))
+    flight, sensor = world.ball.flight, world.sensing
+    drag, lift = float(drag_factor(flight)), float(magnus_factor(flight))
+    angles = [sensor.camera_rotation_x, sensor.camera_rotation_y, sensor.camera_rotation_z]
+    camera = sensor.camera_scale * Rotation.from_euler("xyz", angles).as_matrix()
+    offset = np.array([sensor.ball_offset_x, sensor.ball_offset_y, sensor.ball_offset_z])
+    residuals = []
+    for i in range(n):
+
+        def motion(t, y, omega=spin[:, i]):
+            turning = omega * np.exp(-flight.spin_decay * t)
+            v = y[3:]
+            return [*v, *(-drag * np.linalg.norm(v) * v + lift * np.cross(turning, v) + [0, 0, flight.gravity_z])]
+
+        frames = 30  # before any of them bounces
+        times = np.arange(frames) / target_domain.CAMERA_RATE
+        path = solve_ivp(motion, (0, 1), [*position[:, i], *velocity[:, i]], t_eval=times, rtol=1e-9, atol=1e-9).y[:3]
+        assert path[2].min() > 0.03
+        residuals.append(measured.position[:frames, :, i].T - (camera @ path + offset[:, None]))
+    residuals = np.array(residuals)
+    assert abs(residuals.mean()) < 5 * noise / np.sqrt(residuals.size) + 1e-4
+    assert residuals.std() == pytest.approx(noise, rel=0.05)
+    tracks = measured.trajectories("session")
+    assert len(tracks) == n and all(t.time[1] - t.time[0] == pytest.approx(1 / 125) for t in tracks)
+    assert all(0.3 < t.time[-1] < 1.2 for t in tracks)
+
+
+# Fine-tuning
+
+
+@pytest.fixture(scope="module")
+def virtual() -> VirtualReality:
+    return VirtualReality(study(), 0)
+
+
+def test_an_update_is_the_papers_formula_of_what_the_robot_measures(virtual):
+    """The parameters after the first chunk of updates, computed anew in NumPy from the same balls."""
+    person, theta = virtual.player("player3"), np.asarray(initial_theta(jax.random.key(0), 0.3))
+    statistics = normalizer.ObservationStatistics(
+        jnp.array([0, 100], jnp.int32), jnp.zeros(N_OBSERVATION), jnp.full(N_OBSERVATION, 25.0)
+    )
+    key = jax.random.key(5)
+    cycle = virtual.fine_tune(person, theta, statistics, 2, key, "test")
+    ask_key, rally_key, play_key, _ = jax.random.split(key, 4)
+    tuning = study().fine_tuning
+    pairs, lanes = tuning.pairs, tuning.episodes_per_update
+    settings = build.bgs_config(tuning.optimiser(), 2)
+    frozen = [np.repeat(np.asarray(x)[:, None], lanes, axis=1) for x in normalizer.normaliser(statistics)]
+    rally = virtual.simulator.start(person, virtual.known, rally_key, lanes)
+    weights = np.array(list(rewards.REAL_WEIGHTS.values()))
+    now = theta.astype(np.float64)
+    for number in range(2):
+        state = strategy.init(jnp.asarray(now, jnp.float32), settings)
+        delta = np.asarray(strategy.ask(jax.random.fold_in(ask_key, number), state, settings), np.float64)
+        members = np.concatenate([now[:, None] + 0.025 * delta, now[:, None] - 0.025 * delta], axis=1)
+        shot_key = jax.random.fold_in(play_key, number)
+        rally, shots = virtual.simulator.shots(
+            np.repeat(members, tuning.repeats, axis=1).astype(np.float32),
+            *frozen,
+            person,
+            virtual.known,
+            rally,
+            shot_key,
+        )
+        assert np.asarray(shots.finite).all()
+        terms = np.array(shots.terms, np.float64)
+        terms[rewards.TERMS.index("fault")] = np.where(shots.fault, -2.0, 0.0)
+        returns = (weights @ terms).reshape(2 * pairs, tuning.repeats).mean(axis=1)
+        difference = returns[:pairs] - returns[pairs:]
+        elites = np.argsort(-np.abs(difference))[: int(0.6 * pairs)]
+        spread = np.std(np.concatenate([returns[:pairs][elites], returns[pairs:][elites]]))
+        now = now + 0.00375 * delta[:, elites] @ difference[elites] / (len(elites) * spread)
+        assert cycle.rows[number]["mean_return"] == pytest.approx((weights @ terms).mean(), abs=1e-3)
+        assert cycle.rows[number]["fault_rate"] == pytest.approx(float(np.mean(np.asarray(shots.fault))), abs=1e-6)
+    np.testing.assert_allclose(cycle.state.bgs.theta, now, atol=2e-5)
+    assert np.abs(now - theta).max() > 1e-3
+    assert len(cycle.balls) == 2 * lanes
+    np.testing.assert_array_equal(cycle.state.statistics.mean, statistics.mean)
+
+
+# Steps
+
+
+def toy_steps(folder: Path, done: list[str], fail: str | None = None) -> list[Step]:
+    """a -> b -> d, a -> c -> d, each writing what it read and its name."""
+
+    def step(name: str, *sources: str) -> Step:
+        def run() -> str:
+            if name == fail:
+                raise KeyboardInterrupt
+            done.append(name)
+            (folder / name).write_text("".join((folder / s).read_text() for s in sources) + name)
+            return "made"
+
+        return Step(name, "toy", 1, tuple(folder / s for s in sources), (folder / name,), run)
+
+    return [step("a"), step("b", "a"), step("c", "a"), step("d", "b", "c")]
+
+
+def test_steps_go_on_where_they_were_stopped_and_follow_what_is_made_anew(tmp_path):
+    done: list[str] = []
+    path = tmp_path / "steps.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        run_all(toy_steps(tmp_path, done, fail="c"), Journal(path), quiet())
+    with open(path, "ab") as file:
+        file.write(b'{"step": "c", "kin')  # killed while it wrote
+    run_all(toy_steps(tmp_path, done), Journal(path), quiet())
+    assert done == ["a", "b", "c", "d"] and (tmp_path / "d").read_text() == "abacd"
+    run_all(toy_steps(tmp_path, done), Journal(path), quiet())
+    assert len(done) == 4
+    (tmp_path / "b").unlink()
+    assert [s.name for s in unfinished(toy_steps(tmp_path, done), Journal(path))] == ["b", "d"]
+    with pytest.raises(KeyboardInterrupt):  # b is made anew, and then it is killed: d is older than b
+        run_all(toy_steps(tmp_path, done, fail="d"), Journal(path), quiet())
+    assert [s.name for s in unfinished(toy_steps(tmp_path, done), Journal(path))] == ["d"]
+    path.write_text("nonsense\n" + path.read_text())
+    with pytest.raises(RunError, match="line 1 is no step"):
+        Journal(path)
+
+
+def test_the_remaining_time_follows_from_what_the_same_kind_took(tmp_path):
+    journal = Journal(tmp_path / "steps.jsonl")
+    steps = [Step(str(i), "fast" if i < 3 else "slow", i + 1.0, (), (), lambda: "") for i in range(5)]
+    journal.append(steps[0], 2.0)
+    journal.append(steps[1], 4.0)
+    assert remaining(steps[2:], journal) == "at least 0:00:06 left, not yet timed: slow"
+    journal.append(steps[3], 40.0)
+    assert remaining([steps[2], steps[4]], Journal(journal.path)) == "about 0:00:56 left"
+
+
+def test_who_does_the_steps(tmp_path):
+    many = study_config.parse(TINY | {"simulation": {**TINY["simulation"], "devices": "auto"}}, "test")
+    if jax.default_backend() == "cpu":
+        assert workers.choose(many, None, None) == len(os.sched_getaffinity(0))
+    assert workers.choose(many, 3, None) == 3
+    assert workers.choose(many, None, 2) == workers.choose(study(), None, None) == 1
+    with_robot = study(robot="lockstep", recordings={"player3": str(tmp_path / "balls.csv")})
+    assert workers.choose(with_robot, None, None) == 1
+    with pytest.raises(ConfigError, match="--processes 2: with a robot .* allowed: 1"):
+        workers.choose(with_robot, 2, None)
+
+
+# The whole loop
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("study") / "tiny"
+    loop(study(), folder)
+    return folder
+
+
+def loop(what: study_config.Study, folder: Path) -> None:
+    """The study without its report, which has tests of its own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    is2r._open(what, folder)
+    run_all(is2r.Loop(what, folder, quiet()).steps_of_play(), Journal(folder / "steps.jsonl"), quiet())
+
+
+def test_a_study_leaves_what_it_says(finished):
+    player = finished / "seed0" / "player3"
+    for key in schedule.MODELS:
+        theta, mean, inverse_scale = training.load(player / key)
+        assert theta.shape == (976,) and mean.shape == inverse_scale.shape == (N_OBSERVATION,)
+        assert np.isfinite(theta).all()
+    # Weights are carried on: from simulation to reality and back.
+    tuned, trained, other = (training.load(player / key)[0] for key in ("is2r-ft35", "is2r-sim1", "oracle-sim"))
+    assert cosine(tuned, trained) > 0.9 and abs(cosine(other, trained)) < 0.3
+    started = load_policy.load(player / "is2r-sim2" / "training" / "seed0").config.initial_policy
+    assert started == str((player / "is2r-ft35").resolve())
+    rallies = scoring.read(finished / "evaluations.csv")
+    assert set(rallies.model.tolist()) == set(schedule.MODELS) and len(rallies) == 50 * 10
+    with open(finished / "evaluations.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    with np.load(finished / "evaluations" / "0_player3_player3_is2r-ft100.npz") as log:
+        mine = [row for row in rows if row["model"] == "is2r-ft100"]
+        # Each rally's paddle touches: the human's hits, and the robot's.
+        for row in mine:
+            of = log["rally"] == int(row["rally"])
+            assert int(row["length"]) == of.sum() + log["hit"][of].sum()
+            assert log["first"][of].sum() == 1
+    intervals = {}  # eight quantities, each with its two ends
+    for name in ("M0", "M1", "M2"):
+        model = yaml.safe_load((player / "balls" / f"human_{name}.yaml").read_text())
+        intervals[name] = np.array([v for part in ("position", "velocity", "landing") for v in model[part].values()])
+    width = np.max([i[:, 1] for i in intervals.values()], axis=0) - np.min(
+        [i[:, 0] for i in intervals.values()], axis=0
+    )
+    found = json.loads((player / "convergence.json").read_text())["mean change of the 16 numbers over their ranges"]
+    for a, b in (("M0", "M1"), ("M1", "M2")):
+        assert found[f"{a}-{b}"] == pytest.approx(np.mean(np.abs(intervals[b] - intervals[a]) / width[:, None]))
+    opened = (finished / "seed0" / "reality.yaml").read_text()
+    drawn = target_domain.draw(0, ("drives", "encoders"))
+    assert f"ball.paddle.restitution: {drawn.ball.paddle.restitution}" in opened
+    assert str(drawn.ball.paddle.restitution) not in (finished / "seed0" / "reality.sealed").read_text()
+    assert protocol.unseal(finished / "seed0" / "reality.sealed")["seed"] == 0
+
+
+def test_worlds_side_by_side_are_those_that_were_drawn():
+    """Also drives, which a world without them does not have at all."""
+    drawn = [target_domain.draw(3, left_out) for left_out in ((), ("drives", "encoders"), ("table",), tuple(target_domain.RANGES))]
+    together = models.paths(target_domain.side_by_side(drawn, 2))
+    for path, value in together.items():
+        wanted = [models.paths(world)[path] for world in drawn]
+        if isinstance(value, jax.Array):
+            np.testing.assert_array_equal(value, np.repeat(np.float32(wanted), 2), err_msg=path)
+        else:
+            assert wanted == [value] * 4, path
+    lags = together["drives.gantry_x.lag"]
+    assert lags.shape == (8,) and lags[0] > 0.0 and lags[2] == 0.0 and lags[4] == lags[0] and lags[6] == 0.0
+    assert together["ball.table.restitution"][4] == np.float32(0.93)
+
+
+def test_an_effect_is_left_out_for_the_policy_it_says(finished):
+    """One world's rallies played again with every lane in that world."""
+    what, lanes = study(), 10
+    rows = effect_costs.read(finished / "seed0" / effect_costs.FILE)
+    assert [(r.model, r.without) for r in rows] == [(m, w) for m in effect_costs.MODELS for w in effect_costs.WORLDS]
+    player = finished / "seed0" / "player3"
+    policies = [training.load(player / model) for model in effect_costs.MODELS]
+    human = {"is2r-sim1": "M0", "s2r-ft100": "M0"}
+    boxes = [load_distribution(player / "balls" / f"human_{human.get(m, 'M2')}.yaml") for m in effect_costs.MODELS]
+    layout = np.array([(w, m) for w in range(len(effect_costs.WORLDS)) for m in range(6) for _ in range(lanes)]).T
+    theta, mean, inverse_scale = (np.stack(part, axis=-1)[:, layout[1]] for part in zip(*policies))
+    low, high = (np.stack(ends, axis=-1)[:, layout[1]] for ends in zip(*((b.low, b.high) for b in map(Box.of, boxes))))
+    for world in ("latency", "spin"):
+        drawn = target_domain.draw(0, ("drives", "encoders", world))
+        person = human_player.load("player3")
+        person = human_player.without_spin(person) if world == "spin" else person
+        model, person = (jax.tree.map(lambda x: jnp.full(layout.shape[1], x, jnp.float32), t) for t in (drawn, person))
+        result = VirtualReality(what, 0).simulator.play(
+            theta, mean, inverse_scale, person, model, build.key(0, evaluation.EFFECTS), 5, Box(low, high), 8
+        )
+        for m, name in enumerate(effect_costs.MODELS):
+            mine = (layout[0] == effect_costs.WORLDS.index(world)) & (layout[1] == m)
+            length, end = np.asarray(result.length)[:, mine], np.asarray(result.end)[:, mine]
+            kept = ~np.isin(end, list(map(int, scoring.FILTERED)))
+            row = next(r for r in rows if (r.model, r.without) == (name, world))
+            assert row.rallies == kept.sum()
+            assert row.length == pytest.approx(length[kept].mean(), nan_ok=True)
+    assert len({r.length for r in rows}) > 2  # worlds differ
+
+
+def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
+    """Compilations counted by JAX itself."""
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: compiled.append(event) if event.endswith("backend_compile_duration") else None
+    )
+    by_key = {item.key: item for item in schedule.LOOP if isinstance(item, Simulated)}
+    human = finished / "seed0" / "player3" / "balls" / "human_M2.yaml"
+    text = training.simulate(study(), by_key["is2r-sim1"], tmp_path / "again", human, None, "again", quiet(), None)
+    assert text.startswith("6 updates")
+    assert not compiled
+    one, two = training.load(tmp_path / "again")[0], training.load(finished / "seed0" / "player3" / "is2r-sim1")[0]
+    assert np.abs(one - two).max() > 1e-3  # another seed and other balls
+
+
+def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tmp_path):
+    """Its steps done by two processes, stopped as a batch system does, gone on with, killed, and ended by this one."""
+    folder = tmp_path / "tiny"
+    player = folder / "seed0" / "player3"
+
+    def start_and_end(sign: Path, number: int) -> tuple[int, str]:
+        """Exit status and message of a session that gets a signal when ``sign`` is there."""
+        command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder)]
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        while not sign.exists() and process.poll() is None:
+            time.sleep(0.005)
+        time.sleep(0.1)
+        assert process.poll() is None, process.stderr.read()
+        os.kill(process.pid, number)
+        _, message = process.communicate(timeout=120)  # its end means that no worker lives: each holds the pipe
+        return process.returncode, message
+
+    status, message = start_and_end(player / "is2r-sim1" / "training" / "seed0" / "metrics.jsonl", signal.SIGTERM)
+    assert status != 0 and re.search(r"is2r-sim1.*: stopped after update \d", message), message
+    assert f"{folder}: stopped; the same command continues the study" in message
+    assert [e["step"] for e in Journal(folder / "steps.jsonl").entries][-1] == "seed0/player3/M0"
+    status, message = start_and_end(player / "is2r-ft35" / "checkpoints", signal.SIGKILL)
+    assert status == -signal.SIGKILL, message
+    before = Journal(folder / "steps.jsonl").entries
+    assert before and len(before) < 10  # of 20
+    loop(study(), folder)
+    entries = [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
+    assert len(entries) == len(set(entries))  # nothing was done twice
+    for path in sorted(finished.rglob("*")):
+        if path.suffix in (".csv", ".npz", ".yaml") and path.name != "config.yaml":
+            mine = folder / path.relative_to(finished)
+            if path.suffix == ".npz":
+                with np.load(path) as a, np.load(mine) as b:
+                    names = [n for n in a.files if n != "notes"]
+                    assert names == [n for n in b.files if n != "notes"]
+                    for name in names:
+                        np.testing.assert_array_equal(a[name], b[name], err_msg=f"{path}: {name}")
+            else:
+                assert path.read_bytes() == mine.read_bytes(), path
+
+
+def test_a_folder_belongs_to_one_study(finished):
+    with pytest.raises(RunError, match="first_balls: the study has 60, now 61"):
+        is2r._open(study(first_balls=61), finished)
+
+
+# On a robot
+
+
+def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
+    """The emulated robot in lock-step; then the scoring sheet, by hand."""
+    tuning = {"pairs": 1, "repeats": 1, "evaluation_balls": 2}
+    small = [{"simulated": 2, "real": 1}] * 3
+    what = study(
+        robot="lockstep", fine_tuning=tuning, simulation=TINY["simulation"] | {"rounds": small},
+        recordings={"player3": str(finished / "seed0" / "player3" / "balls" / "D0.csv")},
+    )  # fmt: skip
+    console, folder = quiet(), tmp_path / "robot"
+    steps = is2r.Loop(what, folder, console).steps_of_play()
+    names = [step.name for step in steps]
+    assert "seed0/reality" not in names and names[-1] == "evaluations"
+    first = names.index("seed0/player3/is2r-ft35") + 1
+    folder.mkdir()
+    run_all(steps[:first], Journal(folder / "steps.jsonl"), console)
+    measured = (folder / "seed0" / "player3" / "balls" / "D1.csv").read_text().splitlines()
+    assert measured[0] == "session,trajectory,t,x,y,z" and len(measured) > 20
+    assert (folder / "seed0" / "player3" / "is2r-ft35" / "journal.jsonl").read_text().count("\n") == 2 + 2 + 2
+    theta, _, _ = training.load(folder / "seed0" / "player3" / "is2r-ft35")
+    assert np.isfinite(theta).all()
+
+
+def test_people_play_under_code_names_and_the_key_opens_when_the_sheet_is_full(finished, tmp_path):
+    folder, player = tmp_path / "blind", finished / "seed0" / "player3"
+    runs_of = {key: (lambda key=key: player / key) for key in ("is2r-ft35", "is2r-ft65")}
+    make, count = blind_steps(folder, 0, "player3", "player4", runs_of, (), "robot.yaml", quiet())
+    journal = Journal(tmp_path / "steps.jsonl")
+    with pytest.raises(Waiting, match=r"player4 plays rallies with .*policies/CODE --robot robot.yaml.*A has 0 of 50"):
+        run_all([make, count], journal, quiet())
+    sheet = folder / protocol.SHEET
+    lines = sheet.read_text().splitlines()
+    length = {"A": 3, "B": 8}
+    filled = [f"{line[:-2]},{length[line[0]]},13" if line.endswith(",,") else line for line in lines]
+    sheet.write_text("\n".join(filled) + "\n")
+    assert [step.name for step in unfinished([make, count], journal)] == [count.name]
+    run_all([make, count], journal, quiet())
+    rallies = scoring.read(folder / protocol.EVALUATIONS)
+    codes = protocol.unseal(folder / protocol.KEY)["codes"]
+    for model, code in codes.items():
+        assert set(rallies.length[rallies.model == model].tolist()) == {length[code]}
+    played = load_policy.load(folder / protocol.POLICIES / codes["is2r-ft65"])
+    np.testing.assert_array_equal(played.theta, training.load(player / "is2r-ft65")[0])

@@ -1,0 +1,422 @@
+"""The study's statistics against other libraries and hand-computed numbers; its report on made-up studies."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import json
+import math
+import re
+import shutil
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+from scipy import stats
+
+from ballmodel import constants as c
+from ballmodel import registry
+from experiments import cli
+from experiments.errors import ConfigError
+from experiments.study.analysis import claims, effect_costs, scoring, statistics
+from experiments.study.analysis import paper as study_paper
+from experiments.study.analysis import study_folder as study_data
+from experiments.study.analysis.claims import DIFFERENCE, HITS, RATIO, SHARE, judge
+from experiments.study.analysis.statistics import Bootstrap, Interval
+from experiments.study.report import heatmaps, tsne
+from mjx_tt.rally.end_reasons import End
+from tests.support import made_up_study
+
+
+def rallies(lengths: dict, end=End.ROBOT_MISSED):
+    """Rallies from {(seed, trainer, evaluator, model): lengths}."""
+    return scoring.join(
+        scoring.scored(s, t, e, m, "A", values, [end] * len(values)) for (s, t, e, m), values in lengths.items()
+    )
+
+
+# Statistics
+
+
+def test_bootstrap_of_one_policy_is_scipys():
+    length = np.random.default_rng(0).geometric(0.1, 50)
+    found = Bootstrap(rallies({(0, "player1", "player1", "is2r-ft100"): length}), draws=20000)
+    interval = found.mean("is2r-ft100", ["player1"]).interval
+    theirs = stats.bootstrap((length,), np.mean, n_resamples=20000, method="percentile", rng=1).confidence_interval
+    assert interval.value == pytest.approx(length.mean())
+    assert (interval.low, interval.high) == pytest.approx(theirs, abs=0.15)
+
+
+@pytest.mark.parametrize("count", [2, 3, 6])
+def test_bootstrap_over_seeds_has_the_spread_of_a_mean_over_seeds(count):
+    levels = np.random.default_rng(count).integers(2, 40, count)  # rallies of a seed do not differ: only seeds do
+    data = rallies({(s, "player1", "player1", "m"): np.full(5, level) for s, level in enumerate(levels)})
+    draws = Bootstrap(data, draws=40000).mean("m", ["player1"]).draws
+    assert draws.mean() == pytest.approx(levels.mean(), rel=0.02)
+    assert draws.var() == pytest.approx(levels.var(ddof=1) / count, rel=0.05)
+    fixed = Bootstrap(data, over_seeds=False).mean("m", ["player1"]).draws
+    assert np.ptp(fixed) == 0.0
+
+
+def test_the_interval_covers_as_often_as_it_says():
+    rng, truth, hits = np.random.default_rng(3), 12.0, 0
+    for k in range(300):
+        length = 1 + rng.geometric(1.0 / (truth - 1.0), (2, 60))
+        data = rallies({(0, f"player{i}", f"player{i}", "m"): x for i, x in enumerate(length)})
+        data = data.take(~data.filtered)
+        i = Bootstrap(data, draws=300, key=k).mean("m", ["player0", "player1"]).interval
+        hits += i.low <= truth <= i.high
+    assert 0.90 <= hits / 300 <= 0.98
+
+
+def test_trainers_weigh_the_same_and_only_pairs_are_compared():
+    data = rallies({
+        (0, "player1", "player1", "a"): [10, 10], (0, "player1", "player1", "b"): [5] * 4,
+        (0, "player2", "player2", "a"): [4] * 6, (0, "player3", "player3", "b"): [99],
+    })  # fmt: skip
+    boot = Bootstrap(data)
+    names = ["player1", "player2", "player3"]
+    assert boot.mean("a", names).value == 7.0
+    first, second = boot.pair("a", "b", names)
+    assert (first / second).value == 2.0 and (first - second).value == 5.0  # player 1 alone has both
+    assert boot.pair("a", "b", ["player2"]) is None and boot.mean("c", names) is None
+
+
+def test_tests_of_differences_are_scipys():
+    rng = np.random.default_rng(1)
+    x, y = rng.geometric(0.1, 40), rng.geometric(0.14, 40)
+    data = rallies({(0, "player1", "player1", "a"): x, (0, "player1", "player1", "b"): y})
+    found = statistics.difference(Bootstrap(data), "a", "b", ["player1"])
+    welch = stats.ttest_ind(x, y, equal_var=False)
+    assert found.p_welch == pytest.approx(welch.pvalue)
+    assert (found.welch.low, found.welch.high) == pytest.approx(tuple(welch.confidence_interval()))
+    theirs = stats.permutation_test(
+        (x, y), lambda a, b: a.mean() - b.mean(), n_resamples=20000, permutation_type="independent", rng=2
+    )
+    assert found.p_rallies == pytest.approx(theirs.pvalue, abs=0.02)
+    signs = rng.normal(0.6, 1.0, 9)
+    exact = stats.permutation_test((signs,), np.sum, n_resamples=np.inf, permutation_type="samples")
+    assert statistics.sign_flip(signs) == pytest.approx(exact.pvalue)
+    assert statistics.sign_flip(np.ones(5)) == 2 / 2**5
+    assert statistics.holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+
+
+def test_normalisation_both_ways_by_hand():
+    data = rallies({
+        (0, "player1", "player1", "a"): [2, 4], (0, "player1", "player1", "b"): [6, 8],
+        (0, "player1", "player4", "a"): [1, 3], (1, "player1", "player1", "a"): [10, 30],
+    })  # fmt: skip
+    own = data.take(data.own)
+    by_player = statistics.normalised_by_player(own)
+    spread = np.sqrt(20 / 3)  # of 2, 4, 6, 8 around 5
+    assert by_player == pytest.approx([*(np.array([-3, -1, 1, 3]) / spread), -np.sqrt(0.5), np.sqrt(0.5)])
+    by_model = statistics.normalised_by_model(data)
+    unit = np.sqrt(2.0)  # of 2, 4
+    expected = {
+        (0, "a", True): [-1 / unit, 1 / unit],
+        (0, "a", False): [-2 / unit, 0.0],
+        (0, "b", True): [-1 / unit, 1 / unit],
+    }
+    for (seed, model, is_own), values in expected.items():
+        where = (data.seed == seed) & (data.model == model) & (data.own == is_own)
+        assert by_model[where] == pytest.approx(values)
+
+
+# Verdicts
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit", "interval", "paper", "verdict"),
+    [
+        ("more", RATIO, (1.6, 1.2, 2.1), 1.7, "agrees"),
+        ("more", RATIO, (1.6, 1.2, 2.1), None, "agrees"),
+        ("more", RATIO, (1.6, 1.2, 2.1), 2.75, "agrees in direction"),
+        ("more", RATIO, (1.1, 0.9, 1.3), 1.09, "undecided"),
+        ("more", RATIO, (1.1, 0.9, 1.3), 2.75, "differs"),
+        ("more", RATIO, (0.7, 0.5, 0.9), None, "differs"),
+        ("less", RATIO, (0.7, 0.5, 0.9), None, "agrees"),
+        ("less", RATIO, (1.7, 1.5, 1.9), None, "differs"),
+        ("alike", RATIO, (1.1, 0.8, 1.4), None, "agrees"),
+        ("alike", RATIO, (1.1, 0.3, 4.0), None, "undecided"),
+        ("alike", RATIO, (1.3, 1.1, 1.6), None, "differs"),
+        ("more", DIFFERENCE, (0.3, 0.1, 0.5), None, "agrees"),
+        ("more", SHARE, (0.45, 0.40, 0.49), None, "differs"),
+        ("number", HITS, (20.0, 18.0, 23.0), 22.0, "agrees"),
+        ("number", HITS, (9.0, 8.0, 11.0), 22.0, "differs"),
+    ],
+)
+def test_verdicts_follow_the_rules(kind, unit, interval, paper, verdict):
+    assert judge(kind, unit, Interval(*interval), paper)[0] == verdict
+
+
+def test_the_papers_changes_follow_from_its_table():
+    """Player 4's M1 to M2 by hand from the YAML of the paper's table."""
+    data = yaml.safe_load((registry.catalogue.FOLDER / "player4.yaml").read_text())["models"]
+    total = 0.0
+    for part in ("position", "velocity", "landing"):
+        for axis in data["M0"][part]:
+            ends = [data[m][part][axis] for m in ("M0", "M1", "M2")]
+            width = max(e[1] for e in ends) - min(e[0] for e in ends)
+            total += (abs(ends[2][0] - ends[1][0]) + abs(ends[2][1] - ends[1][1])) / width
+    assert claims.paper_changes("player4")[1] == pytest.approx(total / 16)
+
+
+# Heatmaps
+
+
+def test_a_ball_falls_into_the_square_that_the_table_says():
+    """Robot's right-hand far corner hit from the human's left near the net, seen from the robot's end."""
+    landing = np.array([[0.7, -0.7, 0.0], [-1.3, -0.05, np.nan]])
+    place = np.array([[-0.7, 0.0, 0.0], [0.1, 2.2, 0.5]])
+    count, back = heatmaps.grid(landing, place, np.array([True, False, True]))
+    assert count.sum() == 2 and back.sum() == 1
+    assert count[2, 0, 0, 0] == 1 and back[2, 0, 0, 0] == 1
+    assert count[0, 2, 1, 2] == 1  # behind the human's end line: the square nearest to it
+
+
+def test_grids_add_up_to_numpys_histogram():
+    rng = np.random.default_rng(0)
+    landing = rng.uniform([[-c.TABLE_WIDTH / 2], [-c.TABLE_LENGTH / 2]], [[c.TABLE_WIDTH / 2], [0.0]], (2, 500))
+    place = rng.uniform([[-c.TABLE_WIDTH / 2], [0.0]], [[c.TABLE_WIDTH / 2], [c.TABLE_LENGTH / 2]], (2, 500))
+    count, _ = heatmaps.grid(landing, place, np.ones(500, bool))
+    theirs, _ = np.histogramdd(np.concatenate([landing, place]).T, bins=3, range=[
+        (-c.TABLE_WIDTH / 2, c.TABLE_WIDTH / 2), (-c.TABLE_LENGTH / 2, 0.0), (-c.TABLE_WIDTH / 2, c.TABLE_WIDTH / 2),
+        (0.0, c.TABLE_LENGTH / 2),
+    ])  # fmt: skip
+    assert np.array_equal(count, theirs)
+
+
+# The report
+
+
+CALIBRATION = {
+    "medians": {"player3": {"M0": 0.04, "M1": 0.11, "M2": 0.12}},
+    "numbers": [
+        {"player": "player3", "model": "M0", "number": "vz min", "target": 0.64, "reached": 0.61, "deviation": 0.016}
+    ],
+    "rallies": [{"player": "player3", "statistic": "mean", "target": 7.0, "reached": 6.4, "rallies": 500}],
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = made_up_study.make(tmp_path_factory.mktemp("study"), seeds=(0, 1), names=("player3", "player1"), balls=25)
+    (folder / "calibration.json").write_text(json.dumps(CALIBRATION))
+    assert cli.main(["study-report", str(folder)]) == 0
+    return folder
+
+
+def test_measured_means_are_the_known_ones(whole):
+    m = claims.Measurements(study_data.load(whole))
+    for model in study_paper.TEN:
+        for player in ("player3", "player1"):
+            known, found = made_up_study.mean_length(player, model), m.unselected.mean(model, [player])
+            # Of some 145 rallies of a geometric distribution, under policies that scatter by 5 %.
+            assert found.value == pytest.approx(known, abs=4 * (known / np.sqrt(145) + 0.05 * known / np.sqrt(2)))
+    kept = m.ratio("is2r-ft100", "is2r-ft100", "all", False, True, boot=m.unselected).interval
+    assert kept.low - 0.1 <= 0.7 <= kept.high + 0.1
+    robot = made_up_study.ROBOT_SHARE  # and of the human's, a third are returns to the corner
+    assert m.robot_ends().value == pytest.approx(robot + (1.0 - robot) / 3, abs=0.03)
+    made = [study_data.load(whole).log(seed, "player1", "player1", "is2r-ft100") for seed in (0, 1)]
+    far = sum(
+        int(h and y > 1.37) for log in made for h, r, y in zip(log.hit, log.returned, log.return_landing[1]) if not r
+    )
+    assert m.over().value == pytest.approx(far / sum(int(np.sum(~log.returned)) for log in made))
+
+
+def test_claims_are_judged_as_the_made_up_numbers_demand(whole):
+    found = {f.claim.key: f for f in claims.findings(claims.Measurements(study_data.load(whole)))}
+    assert set(found) == {claim.key for claim in study_paper.CLAIMS}
+    for key in ("beginner", "advanced", "fine-tuning", "cross", "keeps-less", "robot-ends"):
+        assert found[key].verdict.startswith("agrees"), (key, found[key])
+    assert found["first-advanced"].verdict == "differs"  # made up so that later rounds are better
+    assert found["intermediate"].verdict == "not comparable"  # no such player in it
+    assert found["model-change"].interval.value == pytest.approx(
+        np.sqrt(np.prod([b / a for a, b in map(claims.paper_changes, ("player1", "player3"))]))
+    )  # its human models are the paper's
+
+
+def test_what_an_effect_costs_is_the_geometric_mean_over_players_and_seeds(whole):
+    outcomes = study_data.load(whole).effects
+    for world, ratio in {"magnus": 1.2, "drives": 0.9, "all": 1.5, "camera": 1.0}.items():
+        found = effect_costs.gain(outcomes, "oracle-ft", world)
+        assert (found.value, found.low, found.high) == pytest.approx((ratio, ratio, ratio))
+    lengths = {("a", "nothing"): 2.0, ("a", "spin"): 4.0, ("b", "nothing"): 3.0, ("b", "spin"): 3.0}
+    two = [effect_costs.Outcome(0, player, "is2r-sim1", world, 50, x) for (player, world), x in lengths.items()]
+    found = effect_costs.gain(two, "is2r-sim1", "spin")
+    half = stats.t.ppf(0.975, 1) * math.log(2.0) / 2  # of two logarithms, log 2 and 0
+    assert (found.value, found.high) == pytest.approx((math.sqrt(2.0), math.sqrt(2.0) * math.exp(half)))
+    assert effect_costs.gain(two, "is2r-sim1", "magnus") is None
+    with open(whole / "report" / "effects.csv", newline="") as file:
+        head, *rows = csv.reader(file)
+    column = head.index(study_paper.BY_KEY["oracle-ft"].label)
+    assert {row[0]: row[column] for row in rows}["all"] == "1.50 (1.50 to 1.50)"
+
+
+def test_the_report_is_one_page_that_needs_nothing_else(whole):
+    report = whole / "report"
+    html = (report / "index.html").read_text()
+    assert not re.findall(r"(?:src|href)=[\"'](?!data:|#)", html) and "http" not in html
+    pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', html)
+    files = {path.name for path in report.glob("*.png")}
+    assert len(pictures) == len(files) and files >= {f"{name}.png" for name in (
+        "summary", "aggregated", "aggregated_means", "by_skill", "without_advanced", "checkpoints",
+        "zero_shot", "evolution",
+        "changes", "cross", "cross_players", "players", "tsne_training", "tsne_evaluation", "tsne_methods",
+        "heatmap_incoming",
+        "heatmap_outgoing", "fine_tuning", "effects", "calibration", "variant", "ends", "unselected",
+    )}  # fmt: skip
+    for data in pictures:
+        image = Image.open(io.BytesIO(base64.b64decode(data))).convert("L")
+        assert image.width > 600 and np.asarray(image).std() > 5.0  # something is drawn
+    for claim in study_paper.CLAIMS:
+        assert claim.text.replace("'", "&#x27;") in html, claim.key
+    assert html.index("What was found") < html.index("Over all players")
+    assert "players player5, player4, player2" in html  # what is missing is named
+    assert "<td class=n>11 %</td>" in html and "reached" in html  # of the calibration
+    with open(report / "claims.csv", newline="") as file:
+        assert {row["verdict"] for row in csv.DictReader(file)} <= set(claims.VERDICTS)
+    with open(report / "player_skill.csv", newline="") as file:
+        paper = [row for row in csv.reader(file) if row[1] == "paper"]
+    assert paper[0] == ["player3 (beginner)", "paper", "2", "3", "7", "5.9", "9", "52", "500"]
+
+
+def test_a_study_that_has_just_begun_has_a_report(tmp_path):
+    folder = made_up_study.make(tmp_path, names=("player5",), balls=6, cross=False)
+    for path in (folder / "evaluations").iterdir():
+        path.unlink()
+    (folder / "evaluations.csv").unlink()
+    assert cli.main(["study-report", str(folder)]) == 0
+    html = (folder / "report" / "index.html").read_text()
+    assert "seed 0, player5: evaluation of all ten models" in html and "evolution" in html
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="is no study"):
+        study_data.load(tmp_path / "empty")
+
+
+def test_a_folder_of_ordinary_trainings_is_no_study(tmp_path, capsys):
+    (tmp_path / "narrow" / "seed0").mkdir(parents=True)
+    (tmp_path / "narrow" / "seed0" / "config.yaml").write_text("name: narrow\nballs: narrow\n")
+    assert cli.main(["study-report", str(tmp_path / "narrow")]) == 1
+    said = capsys.readouterr().err
+    assert "neither study.yaml nor evaluations.csv" in said
+    assert f"mjx-tt evaluate {tmp_path / 'narrow' / 'seed0'}" in said
+    assert not (tmp_path / "narrow" / "report").exists()
+    with pytest.raises(ConfigError, match="no such folder"):
+        study_data.load(tmp_path / "nowhere")
+    (tmp_path / "study.yaml").write_text("name: begun\n")
+    with pytest.raises(ConfigError, match="nothing to report on yet"):
+        study_data.load(tmp_path)
+
+
+def test_rallies_that_no_figure_shows_are_named(tmp_path):
+    path, strange = tmp_path / "evaluations.csv", {(0, "anna", "player3", "mine"): [4, 5]}
+    scoring.write(path, rallies(strange | {(0, "player3", "player3", "is2r-ft100"): [6]}))
+    study = study_data.load(tmp_path)
+    missing = "; ".join(study.missing)
+    assert "rallies with trainer anna (known are player1, " in missing and "with model mine" in missing
+    assert "with evaluator" not in missing and study.rallies.length.tolist() == [6]
+    scoring.write(path, rallies(strange))  # then there is no figure at all
+    with pytest.raises(ConfigError, match="evaluations.csv: the figures have no place for any .* trainer anna"):
+        study_data.load(tmp_path)
+    path.write_text(path.read_text().replace("anna", ""))
+    with pytest.raises(ConfigError, match="evaluations.csv: line 2: column trainer: a name is wanted"):
+        study_data.load(tmp_path)
+
+
+DAMAGED = {  # file of a study: contents, what reads it
+    "study.yaml": ([b"name: [", b"\x80\x81", b"- a", b"a: 2026-99-99"], study_data.load),
+    "study.json": ([b"{", b"\xff\xfe", b"[1]"], study_data.load),
+    "seed0/player5/balls/human_M1.yaml": ([b"garbage", b"\x80", b"position: 3"], study_data.load),
+    "evaluations.csv": (
+        [b"\x80", b"seed\n", b"seed,trainer,evaluator,model,blind,rally,length,end\n0,a\n"], study_data.load
+    ),
+    "seed0/reality.yaml": ([b"{", b"\x80"], lambda folder: study_data.load(folder).realities),
+    "seed0/effects.csv": ([b"\x80", b"seed\n1\n"], lambda folder: study_data.load(folder).effects),
+    "calibration.json": (
+        [b"{", b"\x80", b"[]", b'{"numbers": 3}', b'{"medians": {"player1": {"M0": "x"}}}',
+         b'{"rallies": [{"player": "a"}]}'],
+        lambda folder: study_data.load(folder).calibration,
+    ),
+    "seed0/player5/is2r-ft35/metrics.jsonl": (
+        [b"\x80\x81\n", b'{"update": 1}\n{"upd\n{"update": 3}\n', b"3\n", b'{"return_rate": "a"}\n'],
+        lambda folder: study_data.load(folder).metrics(0, "player5", "is2r-ft35"),
+    ),
+    "evaluations/0_player5_player5_is2r-ft100.npz": (
+        [b"", b"garbage", b"PK\x03\x04 and no more"],
+        lambda folder: study_data.load(folder).log(0, "player5", "player5", "is2r-ft100"),
+    ),
+    "seed0/player5/balls/D1.csv": (
+        [b"\x80", b"t,x\n1,2\n"], lambda folder: tsne.trained(study_data.load(folder), 0, "player5", "D1")
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    return made_up_study.make(tmp_path_factory.mktemp("small"), names=("player5",), balls=6, cross=False)
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_damaged_file_is_named(small, tmp_path, name):
+    contents, read = DAMAGED[name]
+    folder = tmp_path / "study"
+    shutil.copytree(small, folder)
+    path = folder / name
+    whole = path.read_bytes() if path.exists() else json.dumps(CALIBRATION).encode()
+    for content in contents:
+        path.write_bytes(content)
+        with pytest.raises(ConfigError) as said:
+            read(folder)
+        assert str(said.value).startswith(str(path)), (content, str(said.value))
+        assert str(said.value).count(str(path)) == 1
+    path.write_bytes(whole)
+    assert read(folder) is not None or name.endswith("D1.csv")
+    for cut in (len(whole) // 3, len(whole) // 2) if name.endswith(".npz") else ():
+        path.write_bytes(whole[:cut])
+        with pytest.raises(ConfigError, match="cannot be read"):
+            read(folder)
+
+
+def test_a_damaged_file_ends_the_command_with_one_line(small, tmp_path, capsys):
+    folder = tmp_path / "study"
+    shutil.copytree(small, folder)
+    (folder / "study.yaml").write_bytes(b"\x80\x81")
+    assert cli.main(["study-report", str(folder)]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"mjx-tt: error: {folder / 'study.yaml'}: ") and len(said.splitlines()) == 1
+
+
+def test_a_line_that_is_being_written_is_left_out(small, tmp_path):
+    study = study_data.Study(tmp_path, {}, {}, scoring.join([]))
+    path = tmp_path / "seed0" / "player5" / "is2r-ft35" / "metrics.jsonl"
+    path.parent.mkdir(parents=True)
+    path.write_text('{"update": 1, "return_rate": 0.5}\n{"update": 2, "ret')
+    assert study.metrics(0, "player5", "is2r-ft35") == [{"update": 1, "return_rate": 0.5}]
+
+
+def test_a_log_with_arrays_of_other_shapes_is_named(small, tmp_path):
+    name = "0_player5_player5_is2r-ft100.npz"
+    with np.load(small / "evaluations" / name) as data:
+        arrays = dict(data)
+    (tmp_path / "evaluations").mkdir()
+    study = study_data.Study(tmp_path, {}, {}, scoring.join([]))
+    text = np.full(arrays["hit"].size, "a")
+    for array, wrong in (("touch", arrays["touch"][1:]), ("position", arrays["position"][:2]), ("hit", text)):
+        np.savez(tmp_path / "evaluations" / name, **arrays | {array: wrong})
+        with pytest.raises(ConfigError, match=f"array {array} is .* are wanted"):
+            study.log(0, "player5", "player5", "is2r-ft100")
+
+
+def test_a_log_without_an_array_is_named(whole, tmp_path):
+    source = whole / "evaluations" / "0_player3_player3_is2r-ft100.npz"
+    with np.load(source) as data:
+        kept = {name: data[name] for name in data if name != "returned"}
+    folder = tmp_path / "evaluations"
+    folder.mkdir()
+    np.savez(folder / source.name, **kept)
+    study = study_data.Study(tmp_path, {}, {}, scoring.join([]))
+    with pytest.raises(ConfigError, match="has no array returned"):
+        study.log(0, "player3", "player3", "is2r-ft100")

@@ -1,0 +1,89 @@
+"""Which rallies count: against the paper's table copied by hand, and against selection by another algorithm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments.errors import ConfigError
+from experiments.study.analysis import scoring
+from mjx_tt.rally.end_reasons import ROWS, End
+
+# Table end_of_rally_attribution, row by row as printed: did-robot-end-rally ("" where empty or a dash) and "Filter".
+PRINTED = [
+    ("", "Filter"), ("", "Filter"), ("Yes", ""), ("", "Filter"), ("Yes", ""), ("No", ""), ("No", ""), ("Yes", ""),
+    ("", "Filter"), ("", "Filter"), ("No", ""), ("No", ""), ("Yes", ""), ("", "Filter"), ("", "Filter"),
+]  # fmt: skip
+
+
+def test_ends_are_attributed_as_in_the_papers_table():
+    one = scoring.scored(0, "p", "p", "m", "A", np.ones(15, int), [row[0] for row in ROWS[:15]])
+    printed = {"Yes": 1, "No": 0, "": scoring.UNKNOWN}
+    assert one.robot_ended.tolist() == [printed[who] for who, _ in PRINTED]
+    assert one.filtered.tolist() == [what == "Filter" for _, what in PRINTED]
+
+
+def test_a_return_beside_the_table_is_the_robots():
+    one = scoring.scored(0, "p", "p", "m", "A", [4], [End.ROBOT_OUT])
+    assert one.robot_ended.tolist() == [1] and not one.filtered[0] and one.selected[0]
+
+
+def test_selection_is_the_fifty_longest_of_the_first_sixty():
+    rng = np.random.default_rng(1)
+    for count in (10, 55, 64, 90):
+        length, filtered = rng.integers(1, 30, count), rng.random(count) < 0.15
+        chosen = scoring.select(length, filtered)
+        pool = [i for i in range(count) if not filtered[i]][:60]
+        while len(pool) > 50:  # take away the shortest, one by one; of equal ones the last played
+            pool.remove(min(pool, key=lambda i: (length[i], -i)))
+        assert np.flatnonzero(chosen).tolist() == pool
+
+
+def test_a_rally_after_the_sixtieth_is_not_reported_however_long():
+    length = np.full(61, 3)
+    length[60] = 300
+    assert not scoring.select(length, np.zeros(61, bool))[60]
+    filtered = np.zeros(61, bool)
+    filtered[7] = True  # now it is the sixtieth that counts
+    assert scoring.select(length, filtered)[60]
+
+
+def test_the_file_keeps_every_rally(tmp_path):
+    rng = np.random.default_rng(2)
+    ends = rng.integers(0, len(End), 70)
+    evaluations = ((0, "player1", "player1"), (0, "player1", "player4"), (3, "player2", "player2"))
+    written = scoring.join(
+        scoring.scored(seed, trainer, evaluator, "is2r-ft100", "Q", rng.integers(1, 40, 70), ends)
+        for seed, trainer, evaluator in evaluations
+    )
+    scoring.write(tmp_path / "evaluations.csv", written)
+    read = scoring.read(tmp_path / "evaluations.csv")
+    for name in scoring.COLUMNS:
+        assert getattr(read, name).tolist() == getattr(written, name).tolist(), name
+    assert read.own.sum() == 140
+    lines = (tmp_path / "evaluations.csv").read_text().splitlines()
+    assert lines[0] == "seed,trainer,evaluator,model,blind,rally,length,end,robot_ended,filtered,selected"
+    assert len(lines) == 211
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("0,a,a,m,A,0,5,fell_asleep,,,", "line 2: column end: 'fell_asleep' is none of first_net"),
+        ("0,a,a,m,A,0,5,3,,,", "column end: '3'"),  # a number could be counted from 0 or from 1
+        ("0,a,a,m,A,0,long,robot_missed,,,", "column length"),
+        ("x,a,a,m,A,0,5,robot_missed,,,", "column seed"),
+    ],
+)
+def test_a_bad_line_is_named(tmp_path, line, says):
+    path = tmp_path / "evaluations.csv"
+    path.write_text(",".join(scoring.COLUMNS) + "\n" + line + "\n")
+    with pytest.raises(ConfigError, match=says):
+        scoring.read(path)
+
+
+def test_a_missing_column_is_named(tmp_path):
+    path = tmp_path / "evaluations.csv"
+    path.write_text("seed,trainer,evaluator,model,blind,rally,end\n")
+    with pytest.raises(ConfigError, match="column length is missing"):
+        scoring.read(path)

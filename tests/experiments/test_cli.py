@@ -1,0 +1,284 @@
+"""The command line as a person meets it: in a process of its own, on a tiny experiment."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ballmodel.distribution import load_distribution
+from bgs import normalizer
+from experiments import cli
+from experiments.errors import RunError
+from experiments.runs import checkpoint, load_policy
+from robot_io import contract
+from robot_io.policy import artefact
+from tests.support.paths import ROOT
+
+COMMANDS = ("train", "evaluate", "export", "fit-human", "import", "render", "bench", "schema", "balls",
+            "run", "rig", "finetune", "log")  # fmt: skip
+EXPERIMENT = """
+name: tiny
+balls: player5/M0
+task: {max_steps: 60}
+optimiser: {pairs: 2, repeats: 2}
+training: {updates: 3, pool: 64, evaluate_every: 2, evaluate_episodes: 8, devices: 1}
+evaluation: {episodes: 8, reachable_balls: null}
+"""
+
+
+def mjx_tt(*arguments) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "experiments.cli", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """(experiment YAML, folder of runs, output) of one whole ``mjx-tt train``."""
+    folder = tmp_path_factory.mktemp("cli")
+    yaml = folder / "tiny.yaml"
+    yaml.write_text(EXPERIMENT)
+    done = mjx_tt("train", yaml, "--out", folder / "runs", "--devices", 1)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return yaml, folder / "runs", done.stdout
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_teaches_by_examples(command, capsys):
+    with pytest.raises(SystemExit) as left:
+        cli.main([command, "--help"])
+    assert left.value.code == 0
+    text = capsys.readouterr().out
+    assert "examples:" in text and f"mjx-tt {command}" in text
+
+
+def test_help_does_not_wait_for_jax():
+    check = "import sys; from experiments import cli; cli._parser(); sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", check], cwd=ROOT).returncode == 0
+
+
+@pytest.mark.parametrize("seeds", ["0,0", "a", "1,", "-1"])
+def test_seeds_that_are_none(seeds, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["train", "x.yaml", f"--seeds={seeds}"])
+    assert "different whole numbers separated by commas" in capsys.readouterr().err
+
+
+def test_train_leaves_evaluation_artefact_pictures_and_measurements(trained):
+    _, runs, output = trained
+    run = runs / "tiny"
+    report = json.loads((run / "evaluation.json").read_text())
+    assert {"return_rate", "low", "high", "hit_rate", "episodes", "reachable"} <= report.keys()
+    assert 0 <= report["low"] <= report["return_rate"] <= report["high"] <= 1
+    assert sum(report["outcomes"].values()) == report["episodes"] == 8
+    arrays, notes = checkpoint.read_latest(run / "checkpoints")
+    exported = artefact.load(run / "artefact")
+    flat = np.concatenate([exported.parameters[name].ravel() for name in contract.parameter_shapes()])
+    np.testing.assert_array_equal(flat, arrays["bgs.average"])
+    assert exported.manifest["provenance"]["config"]["name"] == "tiny"
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert [row["update"] for row in rows] == [1, 2, 3] and notes["update"] == 3
+    assert ["evaluation/return_rate" in row for row in rows] == [False, True, False]
+    assert {path.stem for path in (run / "plots").glob("*.png")} == {
+        "landing_map", "return_rate_map", "rewards", "joint_speeds", "training",
+    }  # fmt: skip
+    for path in (run / "evaluation.json", run / "plots", run / "artefact"):
+        assert str(path) in output.replace("\n", "")
+
+
+def test_train_skips_what_is_done_and_one_failing_job_does_not_stop_the_others(trained, tmp_path):
+    yaml, runs, _ = trained
+    before = (runs / "tiny" / "evaluation.json").stat().st_mtime_ns
+    (tmp_path / "broken.yaml").write_text("name: broken\nballs: player9/M0\n")
+    again = mjx_tt("train", tmp_path / "broken.yaml", yaml, "--out", runs)
+    assert again.returncode == 1
+    assert "no distribution is called 'player9/M0'" in again.stdout
+    assert "done before, skipped" in again.stdout
+    assert (runs / "tiny" / "evaluation.json").stat().st_mtime_ns == before
+    summary = again.stdout[again.stdout.index("Summary") :]
+    assert "failed" in summary and "done" in summary
+
+
+def test_train_refuses_another_configuration_in_the_same_folder(trained):
+    yaml, runs, _ = trained
+    refused = mjx_tt("train", yaml, "--out", runs, "--set", "optimiser.sigma=0.05", "--set", "training.max_minutes=9")
+    assert refused.returncode == 1
+    assert "optimiser.sigma: the run has 0.025, now 0.05" in refused.stdout
+    assert "max_minutes" not in refused.stdout  # which may change
+
+
+def test_train_into_a_folder_that_cannot_be_written(trained, tmp_path):
+    yaml, _, _ = trained
+    (tmp_path / "file").write_text("")
+    refused = mjx_tt("train", yaml, "--out", tmp_path / "file")
+    assert refused.returncode == 1
+    assert "cannot be written: Not a directory; choose another --out" in refused.stdout
+    assert "Traceback" not in refused.stdout + refused.stderr
+
+
+def test_mistake_in_a_yaml_ends_with_one_line(tmp_path):
+    (tmp_path / "a.yaml").write_text("name: a\nballs: narrow\ntrainin: {}\n")
+    refused = mjx_tt("train", tmp_path / "a.yaml")
+    assert refused.returncode == 1
+    assert refused.stderr.startswith(
+        f"mjx-tt: error: {tmp_path / 'a.yaml'}: trainin: unknown key; did you mean 'training'?"
+    )
+    assert len(refused.stderr.splitlines()) == 1
+
+
+def test_evaluate_artefact_on_other_balls_leaves_the_artefact_alone(trained):
+    """The policy plays on as exported; the pictures go beside it, since no other file belongs into an artefact."""
+    _, runs, _ = trained
+    folder = runs / "tiny" / "artefact"
+    done = mjx_tt("evaluate", folder, "--balls", "narrow", "--episodes", 8, "--no-reachable", "--devices", 1)
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads((runs / "tiny" / "artefact-evaluation-narrow" / "evaluation.json").read_text())
+    assert report["balls"]["name"] == "narrow"
+    artefact.load(folder)
+
+
+def test_seeds_get_folders_of_their_own_and_the_best_is_selected(trained, tmp_path):
+    yaml, _, _ = trained
+    done = mjx_tt("train", yaml, "--out", tmp_path, "--seeds", "7", "--select", "--devices", 1)
+    assert done.returncode == 0, done.stdout + done.stderr
+    selection = json.loads((tmp_path / "tiny" / "selection.json").read_text())
+    assert selection["best"] == "seed7" and -2 <= selection["scores"]["seed7"] <= 2
+    assert "seed: 7" in (tmp_path / "tiny" / "seed7" / "config.yaml").read_text()
+
+
+def test_selection_needs_seeds(tmp_path, capsys):
+    assert cli.main(["train", "quickstart.yaml", "--select", "--out", str(tmp_path)]) == 1
+    assert "--seeds 0,1,2" in capsys.readouterr().err
+
+
+def test_policy_is_the_same_from_run_and_from_artefact(trained):
+    """An artefact keeps the normaliser, not the statistics: what training continues from gives the same normaliser."""
+    _, runs, _ = trained
+    run = load_policy.load(runs / "tiny")
+    for folder in (runs / "tiny", runs / "tiny" / "artefact"):
+        loaded = load_policy.load(folder)
+        theta, statistics = load_policy.load_statistics(folder)
+        np.testing.assert_array_equal(loaded.theta, run.theta)
+        np.testing.assert_array_equal(theta, run.theta)
+        for mean, inverse_scale in ((loaded.mean, loaded.inverse_scale), normalizer.normaliser(statistics)):
+            np.testing.assert_allclose(mean, run.mean, rtol=1e-6)
+            np.testing.assert_allclose(inverse_scale, run.inverse_scale, rtol=1e-5)
+
+
+def test_render(trained, tmp_path):
+    """What training drew is a video that plays; a picture can be asked for; a camera that is not there is named."""
+    _, runs, _ = trained
+    done = mjx_tt("render", runs / "tiny", "--out", tmp_path / "a.png", "--camera", "human")
+    if "no OpenGL back end" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert imageio.imread(tmp_path / "a.png").std() > 10
+    with imageio.get_reader(runs / "tiny" / "episode.mp4") as video:
+        assert sum(1 for _ in video) > 60
+    refused = mjx_tt("render", runs / "tiny", "--out", tmp_path / "a.png", "--camera", "nowhere")
+    assert refused.returncode == 1 and "robot_back" in refused.stderr
+
+
+def drag_only(_, state):
+    """Abeyruwan et al. 2022: C_d 0.47, rho 1.29, A 1.256e-3, m 0.0027."""
+    velocity = state[3:]
+    drag = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027) * np.linalg.norm(velocity)
+    return np.concatenate([velocity, [0, 0, -9.81] - drag * velocity])
+
+
+def test_import_and_fit_human(tmp_path):
+    """Balls flown by SciPy with the paper's drag come back as the box they were thrown from, by way of CSV and MCAP."""
+    rng = np.random.default_rng(0)
+    lines, n, times = ["trajectory,t,x,y,z"], 12, np.arange(0, 0.3, 1 / 125)
+    starts = np.array([0.3, 1.3, 0.3, 0.0, -5.5, 1.2]) + rng.uniform(-0.05, 0.05, (n, 6))
+    for i, start in enumerate(starts):
+        flight = solve_ivp(drag_only, (0, 0.3), start, t_eval=times, rtol=1e-9, atol=1e-9)
+        lines += [f"{i},{t},{x},{y},{z}" for t, (x, y, z) in zip(times, flight.y[:3].T)]
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    converted = mjx_tt("import", tmp_path / "a.csv", "--out", tmp_path / "a.mcap")
+    assert converted.returncode == 0, converted.stderr
+    back = mjx_tt("import", tmp_path / "a.mcap", "--out", tmp_path / "b.csv")
+    assert f"{n} trajectories" in back.stdout, back.stderr
+    fitted = mjx_tt("fit-human", tmp_path / "b.csv", "--out", tmp_path / "anna.yaml")
+    assert fitted.returncode == 0, fitted.stdout + fitted.stderr
+    assert "player3/M2" in fitted.stdout and "anna" in fitted.stdout
+    distribution = load_distribution(tmp_path / "anna.yaml")
+    box = np.array(
+        [distribution.position_min + distribution.velocity_min, distribution.position_max + distribution.velocity_max]
+    )
+    np.testing.assert_allclose(box, [starts.min(axis=0), starts.max(axis=0)], atol=0.01)
+    malformed = mjx_tt("import", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
+    assert malformed.returncode == 1 and ".csv, .mcap" in malformed.stderr
+
+
+@pytest.mark.parametrize(
+    "command, given, says",
+    [
+        ("train", "study_quick.yaml", "the shipped study_quick.yaml is a study: `mjx-tt is2r study_quick.yaml`"),
+        ("is2r", "quickstart.yaml", "the shipped quickstart.yaml is an experiment: `mjx-tt train quickstart.yaml`"),
+        ("compare", "quickstart.yaml", "is an experiment: `mjx-tt train quickstart.yaml`; a comparison is wanted"),
+        ("train", "{shipped}/study_quick.yaml", "is a study, it has the key simulation: `mjx-tt is2r {shipped}/stu"),
+        ("train", "{shipped}/compare_quick.yaml", "is a comparison, it has the key algorithms: `mjx-tt compare"),
+        ("is2r", "{shipped}/compare_quick.yaml", "is a comparison, it has the key algorithms: `mjx-tt compare"),
+        ("is2r", "{shipped}/narrow.yaml", "is an experiment, it has the key balls: `mjx-tt train"),
+        ("compare", "{shipped}/study_full.yaml", "is a study, it has the key simulation: `mjx-tt is2r"),
+    ],
+)
+def test_a_file_of_another_command_is_told_from_a_wrong_one(command, given, says, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    shipped = ROOT / "experiments"
+    assert cli.main([command, given.format(shipped=shipped)]) == 1
+    said = capsys.readouterr().err
+    assert says.format(shipped=shipped) in said and len(said.splitlines()) == 1
+
+
+def test_a_key_without_a_name_is_refused(tmp_path, capsys):
+    path = tmp_path / "ok.yaml"
+    path.write_text("name: ok\nballs: narrow\n")
+    for override in (".=3", "training.=3", "=3"):
+        assert cli.main(["train", str(path), "--set", override]) == 1
+        assert f"--set {override}: needs the form dotted.path=value" in capsys.readouterr().err
+    path.write_text('name: ok\nballs: narrow\n"": 3\n')
+    assert cli.main(["train", str(path)]) == 1
+    assert f"{path}: unknown key ''; allowed: name, balls" in capsys.readouterr().err
+
+
+def test_a_long_value_is_cut(tmp_path, capsys):
+    path = tmp_path / "ok.yaml"
+    path.write_text(f"name: ok\nballs: narrow\ntraining: {{updates: {list(range(500))}}}\n")
+    assert cli.main(["train", str(path)]) == 1
+    said = capsys.readouterr().err
+    assert "training.updates: got [0, 1, 2" in said and " ...; allowed: a valid integer" in said and len(said) < 400
+
+
+def test_folders_around_runs_say_where_the_runs_are(tmp_path):
+    study = tmp_path / "study"
+    model, tuned = (study / "seed0" / "player3" / key for key in ("is2r-sim1", "is2r-ft35"))
+    chosen = model / "training" / "seed1"
+    for run in (model / "training" / "seed0", chosen, tuned):
+        run.mkdir(parents=True)
+        (run / "config.yaml").write_text("name: a\nballs: narrow\n")
+    (model / "selection.json").write_text('{"best": "training/seed1", "scores": {}}')
+    (tuned / "artefact").mkdir()
+    (tuned / "artefact" / "manifest.json").write_text("{}")
+    (study / "study.yaml").write_text("name: study\n")
+
+    def complaint(folder) -> str:
+        with pytest.raises(RunError, match="neither a run") as raised:
+            load_policy.load(folder)
+        return str(raised.value)
+
+    assert complaint(model).endswith(f"; of the trainings in it, {chosen} was chosen")
+    for folder in (study, study / "seed0", study / "seed0" / "player3"):
+        assert complaint(folder).endswith(f"; in it are {tuned}, {chosen}"), folder
+    assert complaint(model / "training").endswith(f"; in it are {model / 'training' / 'seed0'}, {chosen}")
+    (model / "selection.json").write_text("{")
+    assert str(model / "training" / "seed0") in complaint(model)
+    assert complaint(tmp_path / "nowhere").endswith("; there is no such folder")
+    (tmp_path / "empty").mkdir()
+    assert complaint(tmp_path / "empty").endswith("(holding manifest.json)")

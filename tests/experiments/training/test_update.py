@@ -1,0 +1,182 @@
+"""The compiled update: devices, failed episodes, common random numbers, one compilation, both engines."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ballmodel import registry
+from ballmodel.sampling import sample_pool
+from bgs import normalizer, optimizers, strategy
+from bgs.strategy import BGSConfig
+from experiments.config import build, experiment
+from experiments.training.update import Trainer
+from mjx_tt.env import rewards
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import TaskConfig
+from mjx_tt.sim.model import SimModel
+
+PAIRS, REPEATS = 4, 2
+BGS = BGSConfig(pairs=PAIRS, sigma=0.05, keep=1.0, step=optimizers.make("sgd", 0.01))
+
+
+@pytest.fixture(scope="module")
+def pool():
+    return sample_pool(jax.random.key(0), registry.load("narrow"), SimModel().ball, 64)
+
+
+@pytest.fixture(scope="module")
+def trainer(pool):
+    return Trainer(Simulator(TaskConfig()), BGS, pool, SimModel(), repeats=REPEATS)
+
+
+@pytest.fixture(scope="module")
+def run(trainer):
+    """The state before and after each of three updates, and their metrics."""
+    return updates(trainer)
+
+
+def updates(trainer):
+    states, metrics = [trainer.init(jax.random.key(1))], []
+    for _ in range(3):
+        state, measured = trainer.update(states[-1])
+        states.append(state)
+        metrics.append(jax.tree.map(float, measured))
+    return states, metrics
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_several_updates_compile_once(trainer, trainer_on_two, run, run_on_two, devices, caplog):
+    trainer, states = {1: (trainer, run[0]), 2: (trainer_on_two, run_on_two[0])}[devices]
+    with jax.log_compiles(True), caplog.at_level(logging.WARNING):
+        for state in states:
+            trainer.update(state)
+        assert not [r for r in caplog.records if "compil" in r.getMessage().lower()]
+        jax.jit(lambda x: x + devices)(1.0)
+    assert [r for r in caplog.records if "compil" in r.getMessage().lower()], "compilations are not logged any more"
+
+
+@pytest.fixture(scope="module")
+def trainer_on_two(pool):
+    return Trainer(Simulator(TaskConfig(), devices=2), BGS, pool, SimModel(), repeats=REPEATS)
+
+
+@pytest.fixture(scope="module")
+def run_on_two(trainer_on_two):
+    return updates(trainer_on_two)
+
+
+def test_two_devices_give_the_update_of_one(run, run_on_two):
+    """To the order of float32 sums, over several updates, so that statistics and normaliser take part."""
+    for before, one, two in zip(run[0], run[0][1:], run_on_two[0][1:]):
+        change = np.asarray(one.bgs.theta) - np.asarray(before.bgs.theta)
+        np.testing.assert_allclose(two.bgs.theta, one.bgs.theta, rtol=0, atol=1e-3 * np.abs(change).max())
+        np.testing.assert_array_equal(two.statistics.count, one.statistics.count)
+        np.testing.assert_allclose(two.statistics.mean, one.statistics.mean, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(two.statistics.m2, one.statistics.m2, rtol=1e-4)
+    for one, two in zip(run[1], run_on_two[1]):
+        assert two == pytest.approx(one, rel=1e-3, abs=1e-5)
+    assert {shard.device for shard in run_on_two[0][1].bgs.theta.addressable_shards} == set(jax.devices()[:2])
+
+
+def drawn(trainer, state):
+    """Directions (976, pairs) and episodes (R, 2 x pairs) of the update of ``state``."""
+    direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
+    directions = strategy.ask(direction_key, state.bgs, BGS)
+    return directions, trainer.simulator.draw(episode_key, trainer.pool, SimModel(), (), REPEATS, 2 * PAIRS)
+
+
+def test_update_is_the_step_that_the_returns_call_for(trainer, run):
+    """By hand from the returns: sum of D_i delta_i / (k s), times the learning rate; and statistics merged."""
+    before, after = run[0][0], run[0][1]
+    directions, episodes = drawn(trainer, before)
+    theta = strategy.population(before.bgs, directions, BGS)
+    result = jax.jit(trainer.simulator.rollout)(theta, *normalizer.normaliser(before.statistics), episodes)
+    returns = np.asarray(result.returns, np.float64).mean(axis=0)
+    plus, minus = returns[:PAIRS], returns[PAIRS:]
+    gradient = np.asarray(directions) @ (plus - minus) / (PAIRS * returns.std())
+    change = np.asarray(after.bgs.theta) - np.asarray(before.bgs.theta)
+    np.testing.assert_allclose(change, 0.01 * gradient, rtol=0, atol=1e-3 * np.abs(change).max())
+    assert np.abs(change).max() > 1e-5
+    counts, sums = np.asarray(result.observation_counts), np.asarray(result.observation_sums).sum(axis=-1)
+    assert float(normalizer.total(after.statistics)) == counts.sum()
+    np.testing.assert_allclose(after.statistics.mean, sums[0] / counts.sum(), rtol=1e-4, atol=1e-5)
+    deviations = sums[1] - sums[0] ** 2 / counts.sum()
+    np.testing.assert_allclose(after.statistics.m2, deviations, rtol=1e-3, atol=1e-2)
+    metrics = run[1][0]
+    assert metrics["mean_return"] == pytest.approx(returns.mean(), rel=1e-4)
+    assert metrics["steps"] == pytest.approx(np.asarray(result.steps).mean(), rel=1e-5)
+    assert metrics["non_finite"] == metrics["failed_pairs"] == 0
+
+
+def test_failed_episodes_are_counted_and_their_pairs_dropped(trainer, run, pool):
+    """A ball of the pool that is not finite fails every member that draws it, and with it the member's pair."""
+    start = run[0][0]
+    directions, episodes = drawn(trainer, start)
+    x = np.asarray(pool.state.position[0])
+    thrown = np.asarray(episodes.ball.position[0])
+    poisoned = next(i for i in range(len(x)) if (thrown == x[i]).any())
+    meets = (thrown == x[poisoned]).any(axis=0)
+    pairs = meets[:PAIRS] | meets[PAIRS:]
+    assert 0 < pairs.sum() < PAIRS
+    position = pool.state.position.at[0, poisoned].set(jnp.nan)
+    bad_pool = trainer.simulator.replicate(replace(pool, state=replace(pool.state, position=position)))
+    state, metrics = trainer._update(start, bad_pool)
+    assert metrics["failed_pairs"] == pairs.sum()
+    assert metrics["non_finite"] == (thrown == x[poisoned]).sum()
+    assert np.isfinite(state.bgs.theta).all() and np.isfinite(state.statistics.mean).all()
+    # The change lies in the span of the directions that are left.
+    directions = np.asarray(directions, np.float64)[:, ~pairs]
+    change = np.asarray(state.bgs.theta, np.float64) - np.asarray(start.bgs.theta, np.float64)
+    left = change - directions @ np.linalg.lstsq(directions, change, rcond=None)[0]
+    assert np.linalg.norm(change) > 1e-4 and np.linalg.norm(left) < 1e-3 * np.linalg.norm(change)
+
+
+TINY = """
+name: tiny
+balls: narrow
+task: {{engine: {engine}}}
+optimiser: {{pairs: 1, repeats: 1, sigma: 1.0e-12, common_random_numbers: true}}
+training: {{pool: 16, devices: 1}}
+"""
+
+
+def test_the_same_yaml_trains_under_both_engines():
+    """The smallest experiment: one pair, one episode each. Common random numbers give both members of a pair the same
+    ball, latencies and noise, so without a difference in their parameters there is none in their returns."""
+    returns = {}
+    for engine in ("fused", "mjx"):
+        settings = experiment.parse(experiment.read_yaml(TINY.format(engine=engine), "tiny.yaml"), "tiny.yaml")
+        trainer = build.trainer(build.experiment(settings, "tiny.yaml"))
+        state, metrics = trainer.update(trainer.init(build.key(0, build.INITIAL_STATE)))
+        assert trainer.simulator.task.engine.name == engine
+        assert int(state.bgs.updates) == 1 and np.isfinite(state.bgs.theta).all()
+        assert metrics["non_finite"] == 0 and metrics["gradient_norm"] == 0
+        returns[engine] = float(metrics["mean_return"])
+    assert returns["fused"] == pytest.approx(returns["mjx"], rel=1e-3)
+
+
+def test_mistakes_are_named(pool):
+    with pytest.raises(ValueError, match="repeats is 0, at least 1 is needed"):
+        Trainer(Simulator(TaskConfig()), BGS, pool, SimModel(), repeats=0)
+
+
+def test_later_weights_take_over_after_their_update(trainer, run, pool):
+    """Before it nothing changes; from then on the step is that of a task with these weights."""
+    weights = tuple(0.0 if name == "state_transition" else weight for name, weight in rewards.SIM_WEIGHTS.items())
+    changing = Trainer(Simulator(TaskConfig()), BGS, pool, SimModel(), repeats=REPEATS, later_weights=(2, weights))
+    other = Trainer(Simulator(TaskConfig(reward_weights=weights)), BGS, pool, SimModel(), repeats=REPEATS)
+    states, metrics = updates(changing)
+    for i in (1, 2):
+        np.testing.assert_allclose(states[i].bgs.theta, run[0][i].bgs.theta, rtol=0, atol=1e-6)
+    expected, _ = other.update(states[2])
+    np.testing.assert_allclose(states[3].bgs.theta, expected.bgs.theta, rtol=0, atol=1e-6)
+    assert np.abs(np.asarray(states[3].bgs.theta - trainer.update(states[2])[0].bgs.theta)).max() > 1e-4
+    for measured, used in zip(metrics, (tuple(rewards.SIM_WEIGHTS.values()),) * 2 + (weights,)):
+        terms = [measured[f"reward/{name}"] for name in rewards.TERMS]
+        assert measured["mean_return"] == pytest.approx(np.dot(used, terms), rel=1e-5)

@@ -1,0 +1,225 @@
+"""The parts of the ball's diagnosis against other code: flights, unnamed forces, noise, gains, mixed spins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from ballmodel.trajectory import Trajectory
+from mjx_tt import diagnosis
+from mjx_tt.diagnosis.ball import basis_functions, noise, time_jitter
+from mjx_tt.diagnosis.ball import scores as evidence
+from mjx_tt.diagnosis.ball.diagnose import first_fit
+from mjx_tt.diagnosis.ball.effects import AT_THE_PADDLE, EFFECTS
+from mjx_tt.diagnosis.ball.forward_model import grid, heading_axes, leaves, predict
+from mjx_tt.diagnosis.ball.linearization import BallProblem, Projected, Situation
+from mjx_tt.sim import model
+from mjx_tt.sim.model import SimModel
+from tests.exam.generator.world import World, camera, fly, seen
+from tests.support.paths import DATA
+
+FITTED = tuple(e for e in EFFECTS if e.fit and e.group != AT_THE_PADDLE)
+CHANGED = {
+    "ball.flight.drag_coefficient": ("drag_coefficient", 0.55), "ball.flight.magnus_coefficient": ("magnus_coefficient", 0.6),
+    "ball.flight.spin_decay": ("spin_decay", 0.4), "ball.flight.wind_x": ("wind_x", 0.5), "ball.flight.wind_y": ("wind_y", -0.4),
+    "ball.flight.gravity_x": ("gravity_x", 0.2), "ball.table.restitution": ("restitution", 0.85),
+    "ball.table.restitution_slope": ("restitution_slope", 0.01), "ball.table.friction": ("friction", 0.15),
+    "ball.table.height": ("height", 0.01), "ball.table.tilt_x": ("tilt_x", 0.02), "ball.table.tilt_y": ("tilt_y", -0.015),
+    "sensing.camera_scale": ("camera_scale", 1.02), "sensing.camera_rotation_x": ("camera_rotation_x", 0.01),
+    "sensing.camera_rotation_y": ("camera_rotation_y", -0.02), "sensing.camera_rotation_z": ("camera_rotation_z", 0.03),
+    "sensing.camera_distortion": ("camera_distortion", 0.004),
+}  # fmt: skip
+
+
+def starts(n: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    position = rng.uniform([[-0.4], [1.0], [0.2]], [[0.4], [1.6], [0.4]], (3, n))
+    velocity = rng.uniform([[-0.6], [-6.0], [0.5]], [[0.6], [-4.5], [1.5]], (3, n))
+    return np.concatenate([position, velocity, rng.normal(0.0, 30.0, (3, n))])
+
+
+def flown(world: World, start: np.ndarray, samples: int = 56) -> np.ndarray:
+    """(3, samples, n) measured positions at 125 Hz by the tests' own physics."""
+    time = np.repeat((np.arange(samples) / 125.0)[:, None], start.shape[1], axis=1)
+    return camera(world, fly(world, start, time[-1, 0] + 0.01).at(time))
+
+
+def trajectories(measured: np.ndarray) -> list[Trajectory]:
+    time = np.arange(measured.shape[1]) / 125.0
+    return [Trajectory(f"day{i % 4}", str(i), time, measured[:, :, i]) for i in range(measured.shape[2])]
+
+
+def problem_of(measured: np.ndarray) -> BallProblem:
+    return BallProblem(grid(trajectories(measured)), SimModel(), FITTED, measured[:, 8] - measured[:, 0])
+
+
+@pytest.mark.parametrize(
+    "paths", [(), *((p,) for p in CHANGED), tuple(CHANGED)], ids=lambda p: "+".join(p)[-40:] or "nominal"
+)
+def test_predicts_what_other_code_flies(paths):
+    start = starts(40)
+    if "ball.flight.spin_decay" in paths:
+        paths = (*paths, "ball.flight.magnus_coefficient")
+    truth = flown(replace(World(), **{CHANGED[p][0]: CHANGED[p][1] for p in paths}), start)
+    g = grid(trajectories(np.nan_to_num(truth)))
+    axes = heading_axes(start[3:6])
+    local = np.concatenate([start[:6], np.einsum("can,cn->an", axes, start[6:])])
+    nominal = leaves(SimModel())
+    values = {p: np.array([[CHANGED[p][1] if p in paths else nominal[p]]]) for p in CHANGED}
+    ours = predict(SimModel(), values, local[:, None], g, axes)
+    error = np.linalg.norm(ours.measured[:, :, 0] - truth, axis=0)
+    assert np.nanmax(error) < 3e-4 and np.nanmedian(error) < 5e-5
+
+
+def test_an_unnamed_force_moves_a_flight_as_it_would():
+    """The transition matrix carries a force through the bounce: against the difference of two simulated flights."""
+    start = starts(12)
+    start[6:] = 0.0
+
+    def field(position, velocity):
+        push = 1e-3 * np.exp(-(((position[1] - 0.3) / 0.3) ** 2))
+        return np.stack([push, 0.0 * push, 2.0 * push])
+
+    moved = flown(World(field=field), start) - flown(World(), start)
+    problem = problem_of(flown(World(), start))
+    linear = problem.linearise(Situation(np.zeros(len(FITTED)), start))
+    response, _ = basis_functions._propagators(linear, problem.grid)
+    y = linear.base.position[1, :, 0]
+    push = 1e-3 * np.exp(-(((y - 0.3) / 0.3) ** 2))
+    ours = response(push, 0) + 2.0 * response(push, 2)
+    assert np.abs(ours - moved).max() < 0.03 * np.abs(moved).max()
+
+
+def test_first_fit_finds_the_bounce_of_every_ball():
+    start = starts(80, seed=1)
+    start[6:] = 0.0
+    measured = flown(World(), start) + np.random.default_rng(2).normal(0.0, 0.003, (3, 56, 80))
+    fitted = first_fit(problem_of(measured))
+    assert np.abs(fitted[:3] - start[:3]).max() < 0.01
+    assert np.abs(fitted[3:6] - start[3:6]).max() < 0.08
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.7])
+def test_noise_is_found_with_its_memory(memory):
+    rng = np.random.default_rng(3)
+    g = grid(trajectories(np.zeros((3, 400, 60))))
+    e = rng.normal(size=(3, 400, 60))
+    for t in range(1, 400):
+        e[:, t] = memory * e[:, t - 1] + np.sqrt(1 - memory**2) * e[:, t]
+    found = noise.estimate(0.004 * e, noise.nominal_noise(g).frame, g)
+    assert np.median(found.scale) == pytest.approx(0.004, rel=0.05)
+    assert found.memory == pytest.approx(np.full(3, memory), abs=0.04)
+    white = noise.whiten(0.004 * e, found, g)
+    assert np.abs(np.mean(white[:, 2:] * white[:, 1:-1])) < 0.05 and white.std() == pytest.approx(1.0, rel=0.06)
+
+
+def test_gains_of_all_subsets_are_those_of_least_squares():
+    rng = np.random.default_rng(4)
+    columns, target = rng.normal(size=(500, 6)), rng.normal(size=500)
+    columns[:, 3] = columns[:, 1] + 0.1 * rng.normal(size=500)
+    gram, right = columns.T @ columns, columns.T @ target
+    scores = evidence.Scores(gram, right, gram[None], right[None], 0.0, ())
+    gains = evidence.all_gains(scores, tuple(range(6)))
+    assert len(gains) == 1 + 6 + 15 + 20
+    for size in (1, 2, 3):
+        for subset in combinations(range(6), size):
+            left = target - columns[:, subset] @ np.linalg.lstsq(columns[:, subset], target, rcond=None)[0]
+            assert gains[subset] == pytest.approx(target @ target - left @ left, rel=1e-6)
+
+
+def test_spins_are_estimated_as_a_distribution():
+    """Mean and spread of a random effect, from balls that each see it in noise."""
+    rng = np.random.default_rng(5)
+    n, mean, std = 2000, np.array([10.0, 0.0, -5.0]), np.array([8.0, 3.0, 4.0])
+    design = rng.normal(0.0, 0.1, (n, 40, 3))
+    spins = mean + std * rng.normal(size=(n, 3))
+    target = np.einsum("nij,nj->ni", design, spins) + rng.normal(size=(n, 40))
+    zero = np.zeros((n, 0, 0))
+    p = Projected(
+        np.ones((n, 40)), None, zero, np.zeros((n, 0)),
+        design.swapaxes(1, 2) @ design, np.zeros((n, 3, 0)), np.einsum("nij,ni->nj", design, target), None,
+    )  # fmt: skip
+    prior = evidence.fit_spin(p, ())
+    assert prior.mean == pytest.approx(mean, abs=0.4)
+    assert prior.std == pytest.approx(std, rel=0.08)
+
+
+@pytest.mark.parametrize("grows", [True, False])
+def test_time_stamps_shake_only_if_their_noise_grows_with_speed(grows):
+    rng = np.random.default_rng(6)
+    g = grid(trajectories(np.zeros((3, 60, 200))))
+    velocity = np.stack([np.zeros((60, 200)), np.linspace(-7.0, -3.0, 60)[:, None] * np.ones(200), np.zeros((60, 200))])
+    along = velocity[1] * 0.002 if grows else 0.010
+    left = rng.normal(0.0, 0.003, (3, 60, 200))
+    left[1] += along * rng.normal(size=(60, 200))
+    found = time_jitter.find(left, velocity, g)
+    assert (found is not None) == grows
+    if grows:
+        assert found.seconds == pytest.approx(0.002, rel=0.1)
+
+
+def test_the_extended_model_is_one_that_training_loads(tmp_path):
+    """A slippery table comes back within its interval, in a file that the simulator reads, and predicts unseen balls."""
+    start = starts(120, seed=7)
+    start[6:] = 0.0
+    measured = flown(World(friction=0.19), start) + np.random.default_rng(8).normal(0.0, 0.003, (3, 56, 120))
+    logs = diagnosis.Logs(tuple(trajectories(measured)), (), {"log": "0" * 64})
+    found = diagnosis.diagnose(logs, randomise=True)
+    assert found.verdict.verdict == "named" and [c.name for c in found.verdict.causes] == ["table_friction"]
+    estimate = found.verdict.causes[0].parameters["ball.table.friction"]
+    assert abs(estimate.estimate - 0.19) < 1.2 * (estimate.high - estimate.low) < 0.01  # four standard errors
+    assert found.verdict.held_out.low > 0.0
+    model.save(tmp_path / "extended.yaml", found.extended)
+    loaded = model.load(tmp_path / "extended.yaml")
+    assert loaded.model.ball.table.friction == pytest.approx(estimate.estimate)
+    assert [r.path for r in loaded.randomise] == ["ball.table.friction"]
+    assert loaded.provenance["logs"] == {"log": "0" * 64}
+
+
+@pytest.mark.parametrize(("spin", "k"), [((200.0, 0.0, 0.0), 0.3), ((-120.0, 0.0, 40.0), 0.6)])
+def test_names_a_spin_far_beyond_a_straight_line(spin, k):
+    """Balls of a launcher that spin fast, by the tests' own physics: out of reach of derivatives about resting balls."""
+    rng = np.random.default_rng(3)
+    n = 30
+    start = starts(n)
+    start[3] *= 0.3
+    start[4] = rng.normal(-5.0, 0.3, n)
+    start[6:] = np.array(spin)[:, None] + rng.normal(0.0, 5.0, (3, n))
+    measured = flown(World(magnus_coefficient=k), start, 64)
+    kept = np.isfinite(measured).all(axis=(0, 1))
+    measured = measured[:, :, kept] + rng.normal(0.0, 0.002, measured[:, :, kept].shape)
+    found = diagnosis.diagnose(diagnosis.Logs(tuple(trajectories(measured)), (), {}), SimModel())
+    (cause,) = found.verdict.causes
+    assert found.verdict.verdict == "named" and cause.name == "magnus"
+    means = np.array([cause.parameters[f"ball_spin.mean_{axis}"].estimate for axis in "xyz"])
+    fitted = cause.parameters["ball.flight.magnus_coefficient"].estimate
+    np.testing.assert_allclose(fitted * means[[0, 2]], k * np.array(spin)[[0, 2]], atol=0.05 * k * np.linalg.norm(spin))
+    assert found.verdict.held_out.low > 0.0
+
+
+def test_the_size_of_a_filter_is_no_more_off_than_its_interval_says():
+    """No derivative exists at no filter, and the first step's is another one than that at its size."""
+    rng = np.random.default_rng(4)
+    start = starts(60, seed=4)
+    start[6:] = 0.0
+    time = np.repeat((np.arange(56) / 125.0)[:, None], 60, axis=1)
+    world = World(smoothing=0.008)
+    measured = seen(world, fly(world, start, time[-1, 0] + 0.01), time)
+    measured = measured + rng.normal(0.0, 0.002, measured.shape)
+    (cause,) = diagnosis.diagnose(diagnosis.Logs(tuple(trajectories(measured)), (), {}), SimModel()).verdict.causes
+    assert cause.name == "tracker_smoothing"
+    found = cause.parameters["sensing.smoothing"]
+    assert abs(found.estimate - 0.008) < 1.5 * (found.high - found.estimate)
+
+
+@pytest.mark.parametrize(("session", "spins"), [("mn5008_topspin", True), ("no_spin_robot_simple", False)])
+def test_a_launchers_topspin_is_named_and_its_straight_balls_are_not(session, spins):
+    path = DATA / "aimy_launcher" / f"{session}.hdf5"
+    if not path.exists():
+        pytest.skip(f"{path} is not there: measured balls of a launcher")
+    verdict = diagnosis.diagnose(diagnosis.load([path])).verdict
+    assert ("magnus" in [c.name for c in verdict.causes]) == spins
+    assert verdict.held_out.low > 0.0

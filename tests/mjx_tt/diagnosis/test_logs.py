@@ -1,0 +1,198 @@
+"""Logs that cannot be what they claim are refused by name, and nothing is written."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments import cli
+from experiments.commands import diagnose
+from experiments.deploy import session_logs
+from mjx_tt import diagnosis as gap
+
+RATE, SAMPLES = 125.0, 60
+
+
+def flights(n: int = 20, seed: int = 0) -> np.ndarray:
+    """(n, SAMPLES, 4) t, x, y, z of balls that fall freely, bounce once on the table, and go on."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for _ in range(n):
+        x, y, z = rng.uniform([-0.4, 1.0, 0.2], [0.4, 1.6, 0.4])
+        vx, vy, vz = rng.uniform([-0.8, -6.0, 0.5], [0.8, -5.0, 1.5])
+        t = np.arange(SAMPLES) / RATE
+        hit = (vz + np.sqrt(vz**2 + 2 * 9.81 * (z - 0.02))) / 9.81
+        after = np.maximum(t - hit, 0.0)
+        up = 0.93 * (9.81 * hit - vz)
+        height = np.where(t < hit, z + vz * t - 4.905 * t**2, 0.02 + up * after - 4.905 * after**2)
+        out.append(np.stack([t, x + vx * t, y + vy * t, height], axis=1))
+    return np.array(out)
+
+
+def write(path, balls, header="session,trajectory,t,x,y,z"):
+    lines = [header]
+    for i, ball in enumerate(balls):
+        lines += [f"day,{i},{t:.6f},{x:.6f},{y:.6f},{z:.6f}" for t, x, y, z in ball]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def metres_as_millimetres(b):
+    b[..., 1:] *= 1000.0
+
+
+def swapped_lengths(b):
+    b[..., [1, 2]] = b[..., [2, 1]]
+
+
+def swapped_heights(b):
+    b[..., [2, 3]] = b[..., [3, 2]]
+
+
+def upside_down(b):
+    b[..., 3] *= -1.0
+
+
+def above_the_floor(b):
+    b[..., 3] += 0.76
+
+
+def milliseconds(b):
+    b[..., 0] *= 1000.0
+
+
+def nobody_knows(b):
+    b[3, 10, 2] = np.nan
+
+
+def twice(b):
+    b[2, 7, 0] = b[2, 6, 0]
+
+
+def backwards(b):
+    b[2, 7, 0] = b[2, 5, 0] - 0.001
+
+
+WRONG = [
+    (metres_as_millimetres, "millimetres"),
+    (swapped_lengths, "swapped axes"),
+    (swapped_heights, "balls fall along y"),
+    (upside_down, "z must point up"),
+    (above_the_floor, "from the floor"),
+    (milliseconds, "unit of length or time|milliseconds"),
+    (nobody_knows, "row|finite|nan"),
+    (twice, "row 129, column .t.: 0.048 does not come after 0.048"),
+    (backwards, "row 129, column .t.: 0.039 does not come after 0.048"),
+]
+
+
+def test_a_right_log_is_taken(tmp_path):
+    logs = gap.load([write(tmp_path / "log.csv", flights())])
+    assert len(logs.balls) == 20 and logs.joints == ()
+    assert list(logs.sources) == [str(tmp_path / "log.csv")]
+
+
+@pytest.mark.parametrize("change, words", WRONG, ids=[c.__name__ for c, _ in WRONG])
+def test_what_cannot_be_is_refused_by_name(change, words, tmp_path):
+    balls = flights()
+    change(balls)
+    path = write(tmp_path / "log.csv", balls)
+    with pytest.raises(ValueError, match=f"(?i){words}") as refused:
+        gap.load([path])
+    assert "log.csv" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "balls, words", [(flights(0), "no traject|empty|no row"), (flights(1), "1 usable flights of 1")]
+)
+def test_too_little_is_said_and_nothing_written(balls, words, tmp_path, capsys):
+    path = write(tmp_path / "log.csv", balls)
+    assert cli.main(["diagnose", str(path), "--out", str(tmp_path / "out")]) == 1
+    assert not (tmp_path / "out").exists()
+    error = capsys.readouterr().err
+    assert any(word in error for word in words.split("|")), error
+
+
+def test_half_a_robot_log_names_the_other_half(tmp_path):
+    (tmp_path / "command.csv").write_text("t,joint,velocity\n0,joint_1,0.1\n")
+    with pytest.raises(ValueError, match="state.csv is missing"):
+        gap.load([tmp_path])
+    with pytest.raises(FileNotFoundError, match="nowhere.csv"):
+        gap.load([tmp_path / "nowhere.csv"])
+
+
+def robot(folder, seconds=8.0, commands=1.0, states=1.0, speed=0.1, joint="joint_1"):
+    """A pair of robot logs; ``commands`` and ``states`` multiply the times."""
+    folder.mkdir(exist_ok=True)
+    time = np.arange(round(125 * seconds)) / 125
+    for name, column, scale, values in (
+        ("command", "velocity", commands, speed * np.cos(time)), ("state", "position", states, speed * np.sin(time - 0.05)),
+    ):  # fmt: skip
+        rows = "".join(f"{scale * t:.6f},{joint},{v:.9f}\n" for t, v in zip(time, values))
+        (folder / f"{name}.csv").write_text(f"t,joint,{column}\n{rows}")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "scales, words", [((1.0, 1e3), "joint_1: states are 8 s apart"), ((1e3, 1.0), "0% of the commands fall into")]
+)
+def test_commands_and_states_share_their_seconds(scales, words, tmp_path):
+    folder = robot(tmp_path / "robot", 20.0, *scales)
+    with pytest.raises(ValueError, match=words) as refused:
+        gap.load([folder])
+    assert "milliseconds" in str(refused.value) and "state.csv" in str(refused.value)
+
+
+def test_of_several_robot_logs_the_longest_is_used_and_the_others_are_named(tmp_path):
+    long, short = robot(tmp_path / "long", 12.0), robot(tmp_path / "short", 8.0, joint="joint_2")
+    logs = gap.load([short, long])
+    assert [j.joint for j in logs.joints] == ["joint_1"] and logs.joints[0].state_time.size == 1500
+    assert len(logs.sources) == 4
+    assert any(str(short) in note and str(long) in note for note in logs.notes)
+    with pytest.raises(ValueError, match=r"long.state\.csv: the joints' command\.csv is missing"):
+        gap.load([long / "state.csv", short / "command.csv"])
+
+
+def test_a_log_counts_once(tmp_path):
+    path = write(tmp_path / "log.csv", flights())
+    (tmp_path / "copy.csv").write_bytes(path.read_bytes())
+    for twice_given in ([path, path], [path, tmp_path / "copy.csv"], [tmp_path]):
+        with pytest.raises(ValueError, match="is the same log as"):
+            gap.load(twice_given)
+
+
+def test_sessions_and_other_logs_are_read_together(tmp_path, monkeypatch):
+    """A folder with a session of the robot, balls and joints: nothing of it is dropped."""
+    folder = robot(tmp_path / "all", 12.0)
+    write(folder / "balls.csv", flights())
+    (folder / "session.mcap").write_bytes(b"as if")
+    flown = gap.load([write(tmp_path / "flown.csv", flights(5, seed=1))]).balls
+    monkeypatch.setattr(session_logs, "is_session", lambda path: path.suffix == ".mcap")
+    monkeypatch.setattr(session_logs, "load", lambda path: (flown, ()))
+    logs = diagnose.read_logs([str(folder)])
+    assert len(logs.balls) == 25 and len(logs.joints) == 1 and len(logs.sources) == 4
+
+
+@pytest.mark.parametrize(
+    "more, words",
+    [
+        (["--seed", "-3"], "--seed -3"),
+        (["--retrain", "5"], "--retrain needs --policy"),
+        (["--policy", "nowhere"], "nowhere"),
+        (["--out", "log.csv"], "log.csv is a file"),
+        (["--model", "log.csv"], "log.csv"),
+    ],
+)
+def test_what_would_fail_later_is_refused_before_the_work(more, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "log.csv", flights())
+    assert cli.main(["diagnose", "log.csv", "--out", "out", *more]) == 1
+    said = capsys.readouterr()
+    assert words in said.err and "trajectories" not in said.out
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["log.csv"]
+
+
+def test_an_unknown_effect_cannot_be_left_out(tmp_path):
+    logs = gap.load([write(tmp_path / "log.csv", flights())])
+    with pytest.raises(ValueError, match="did you mean 'table_friction'"):
+        gap.diagnose(logs, without=["table_fricton"])

@@ -1,0 +1,417 @@
+"""The report and the JSON of a diagnosis: of balls flown by other code in a side wind, and of joints."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from io import BytesIO
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from PIL import Image
+
+from ballmodel.trajectory import Trajectory
+from mjx_tt import diagnosis as gap
+from mjx_tt.diagnosis.ball import effects as catalogue
+from mjx_tt.diagnosis.hits.diagnose import HitCause, HitFindings
+from mjx_tt.diagnosis.joint import JointRecord
+from mjx_tt.diagnosis.joint.effects import NAMES
+from mjx_tt.diagnosis.logs import Logs
+from mjx_tt.diagnosis.report import figures
+from mjx_tt.diagnosis.report import page as report
+from mjx_tt.diagnosis.report import text as words
+from mjx_tt.diagnosis.verdict import Cause, Estimate, Unexplained
+from mjx_tt.sim import model
+from tests.support.paths import ROOT
+
+PLAY = {
+    "nominal": {"rate": 0.93, "low": 0.91, "high": 0.95},
+    "extended": {"rate": 0.71, "low": 0.68, "high": 0.74},
+    "retrained": {"rate": 0.9, "low": 0.88, "high": 0.92},
+    "balls": 1000,
+}
+SCHEMA = json.loads((ROOT / "docs" / "verdict.schema.json").read_text(encoding="utf-8"))
+WIND = 0.35  # [m/s] towards -x
+VOID = {"meta", "link", "br", "img", "hr", "wbr", "input"}
+
+
+def flights(wind: float, balls: int = 60, noise: float = 0.002, seed: int = 1) -> tuple[Trajectory, ...]:
+    """Balls of the paper's model (no spin) in moving air, by plain Euler steps of 0.25 ms; one bounce each."""
+    rng = np.random.default_rng(seed)
+    drag, dt = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027), 2.5e-4
+    x = rng.uniform([-0.5, 1.2, 0.25], [0.5, 1.5, 0.45], (balls, 3))
+    v = rng.uniform([-0.6, -5.6, 0.6], [0.6, -4.2, 1.6], (balls, 3))
+    path = []
+    for step in range(int(0.6 / dt)):
+        if step % 32 == 0:
+            path.append(x.copy())
+        u = v - [wind, 0.0, 0.0]
+        a = [0.0, 0.0, -9.81] - drag * np.linalg.norm(u, axis=1, keepdims=True) * u
+        x, v = x + dt * (v + 0.5 * dt * a), v + dt * a
+        low = (x[:, 2] < 0.02) & (v[:, 2] < 0.0) & (np.abs(x[:, 0]) < 0.7625) & (np.abs(x[:, 1]) < 1.37)
+        for i in np.flatnonzero(low):
+            # Back to the surface, Coulomb friction against the contact point's slip, then up again.
+            back = (x[i, 2] - 0.02) / v[i, 2]
+            x[i] -= back * v[i]
+            slip = v[i, :2].copy()
+            most = 0.25 * 1.93 * -v[i, 2]
+            v[i, :2] -= slip * min(most / np.linalg.norm(slip), 0.4)
+            v[i, 2] *= -0.93
+            x[i] += back * v[i]
+    places = np.array(path).transpose(1, 2, 0) + rng.normal(0.0, noise, (balls, 3, len(path)))
+    time = 0.008 * np.arange(len(path))
+    return tuple(Trajectory(f"day{i % 3}", str(i), time, p) for i, p in enumerate(places))
+
+
+@pytest.fixture(scope="module")
+def windy() -> gap.Diagnosis:
+    return gap.diagnose(Logs(flights(-WIND), (), {"windy.csv": "ab" * 32}))
+
+
+@pytest.fixture(scope="module")
+def joints() -> gap.Diagnosis:
+    """Two joints, one of which answers 60 ms late on top of what is known."""
+    rng = np.random.default_rng(4)
+    records = []
+    for name, delay, lag in (("gantry_x", 0.0645, 0.033), ("joint_2", 0.071 + 0.06, 0.029)):
+        time = np.arange(0.0, 20.0, 0.1)
+        velocity = rng.uniform(-0.6, 0.6, time.size) * (rng.random(time.size) < 0.6)
+        state = np.arange(0.0, 20.0, 0.01)
+        # A delayed, held command integrated on a fine grid.
+        fine = np.arange(-0.3, 20.0, 1e-3)
+        held = np.where(
+            fine - delay - lag >= 0.0,
+            velocity[np.clip(((fine - delay - lag) / 0.1).astype(int), 0, time.size - 1)],
+            0.0,
+        )
+        position = np.interp(state, fine + 1e-3, np.cumsum(held) * 1e-3) + rng.normal(0.0, 1e-4, state.size)
+        records.append(JointRecord(name, time, velocity, state, position))
+    return gap.diagnose(Logs((), tuple(records), {"command.csv": "12" * 32, "state.csv": "34" * 32}))
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, text, and whether every tag is closed in its turn."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.tags, self.text, self.open, self.section, self.sections = [], "", [], "", {}
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open and self.open.pop() == tag, f"</{tag}> at {self.getpos()}"
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] == "h2":
+            self.section = data
+        if "style" not in self.open:
+            self.text += data
+            self.sections[self.section] = self.sections.get(self.section, "") + data
+
+
+@pytest.fixture(scope="module")
+def windy_page(windy, tmp_path_factory) -> tuple[Page, list[Path]]:
+    return written(tmp_path_factory.mktemp("report"), windy, play=PLAY)
+
+
+def written(folder: Path, diagnosis: gap.Diagnosis, **more) -> tuple[Page, list[Path]]:
+    files = report.write(folder, diagnosis, "one <log> & another.csv", **more)
+    page = Page(files[0].read_text(encoding="utf-8"))
+    assert not page.open
+    return page, files
+
+
+def test_page_is_whole_and_needs_nothing_else(windy_page):
+    page, files = windy_page
+    assert files[0].name == "report.html" and all(f.is_file() for f in files)
+    assert sorted(p for p in files[0].parent.rglob("*") if p.is_file()) == sorted(files)
+    assert not {"script", "link", "iframe", "object", "base"} & {tag for tag, _ in page.tags}
+    assert "one <log> & another.csv" in page.text, "the title is text, not markup"
+    sources = [a["src"] for tag, a in page.tags if tag == "img"]
+    assert len(sources) == len(files) - 1
+    for _, attributes in page.tags:
+        for name in set(attributes) & {"src", "href", "srcset", "style"}:
+            assert attributes[name].startswith(("data:image/png;base64,", "#"))
+    anchors = {a.get("id") for _, a in page.tags}
+    assert {a["href"].removeprefix("#") for tag, a in page.tags if tag == "a"} <= anchors
+    text = files[0].read_text(encoding="utf-8")
+    assert not {"http:", "https:", "url(", "@import"} & {w for w in ("http:", "https:", "url(", "@import") if w in text}
+    pictures = {f.read_bytes() for f in files[1:]}
+    for source in sources:
+        data = base64.b64decode(source.removeprefix("data:image/png;base64,"), validate=True)
+        assert data in pictures, "the page and plots/ show the same pictures"
+        image = Image.open(BytesIO(data))
+        image.load()
+        assert image.width > 1000 and np.asarray(image.convert("L")).std() > 5.0
+    assert all(a["alt"] for tag, a in page.tags if tag == "img")
+
+
+def test_sections_follow_the_readers_questions(windy_page):
+    page, _ = windy_page
+    headings = [h for h in page.sections if h]
+    assert headings == [
+        "What the simulation gets wrong",
+        "Verdict",
+        "Other explanations, and why they lost",
+        "What these logs cannot tell",
+        "Parameters",
+        "Gain on data that was not used",
+        "What it costs in play",
+        "What to measure next",
+        "Data and noise",
+    ]
+    assert "ab" * 32 in page.sections["Data and noise"] and "60 flights" in page.sections["Data and noise"]
+
+
+def test_sentence_names_the_cause_with_its_direction_and_size(windy, windy_page):
+    text = words.sentence(windy)
+    assert windy.verdict.verdict == "named" and [c.name for c in windy.verdict.causes] == ["wind_x"]
+    assert text.startswith("The air moves sideways, towards -x, at 0.3") and "named wind_x" in text
+    low, high = (float(x) for x in text.split("(")[1].split(")")[0].split(" to "))
+    assert low < WIND < high
+    assert "gravity_tilt_x" in windy.verdict.causes[0].group and "alike with" in text and "gravity_tilt_x" in text
+    page, _ = windy_page
+    assert text in page.sections["Verdict"]
+    assert "gravity_tilt_x" in page.sections["What these logs cannot tell"] and "spirit level" in page.text
+    assert "ball.flight.wind_x" in page.sections["Parameters"]
+
+
+def test_residual_picture_shows_the_wind_before_and_nothing_after(windy):
+    """A ball that side wind blows runs ahead of its fitted parabola at both ends."""
+    found = windy.balls
+    before, after = figures.residuals(found)
+    time, origin = figures.flight_time(found)
+    assert origin == "bounce"
+    x = figures.curve(found.problem.grid.time, before[0], found.problem.grid.mask)
+    assert x.quantiles[2, 0] < -1.0 and x.quantiles[2, -1] < -1.0 and x.quantiles[2].max() > 0.5
+    assert np.abs(figures.curve(time, after[0], found.problem.grid.mask).quantiles[2]).max() < 0.8
+    assert np.all(np.diff(x.quantiles, axis=0) >= 0.0)
+
+
+def test_curve_is_the_plain_quantile_of_each_bin():
+    rng = np.random.default_rng(0)
+    quantity, residual = rng.uniform(0.0, 1.0, 4000), rng.normal(size=4000)
+    c = figures.curve(quantity, residual + 10.0 * quantity, np.ones(4000, bool), 5)
+    low, high = np.percentile(quantity, (1, 99))
+    inside = (quantity >= low) & (quantity < low + (high - low) / 5)
+    expected = np.percentile((residual + 10.0 * quantity)[inside], (5, 25, 50, 75, 95))
+    np.testing.assert_allclose(c.quantiles[:, 0], expected, rtol=1e-12)
+    np.testing.assert_allclose(c.place[0], low + 0.1 * (high - low), rtol=1e-12)
+    assert figures.curve(quantity[:10], residual[:10], np.ones(10, bool)).place.size == 0
+    assert figures.curve(np.ones(100), residual[:100], np.ones(100, bool)).place.size == 0
+
+
+def test_smallest_visible_effect_falls_with_more_balls(windy):
+    """Half the balls hold half the information: what shows grows by the square root of two, up to its own scatter."""
+    all_of_them = words.detectable(windy.balls)
+    assert set(all_of_them) >= {"table_restitution", "wind_y", "camera_scale"} and "wind_x" not in all_of_them
+    p = windy.balls.projected
+    half = replace(
+        p, **{name: getattr(p, name)[::2] for name in ("gram", "right", "spin_gram", "spin_effect", "spin_right")}
+    )
+    fewer = words.detectable(replace(windy.balls, projected=half))
+    ratio = [fewer[n] / all_of_them[n] for n in all_of_them if math.isfinite(all_of_them[n] + fewer[n])]
+    assert 1.2 < np.median(ratio) < 1.7
+
+
+def test_verdicts_validate_against_the_schema(windy, joints, tmp_path):
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    check = jsonschema.Draft202012Validator(SCHEMA)
+    for diagnosis in (windy, joints):
+        diagnosis.verdict.save(tmp_path / "verdict.json")
+        check.validate(json.loads((tmp_path / "verdict.json").read_text(encoding="utf-8")))
+    wrong = windy.verdict.to_dict() | {"verdict": "sure"}
+    assert [e.path[0] for e in check.iter_errors(json.loads(json.dumps(wrong)))] == ["verdict"]
+
+
+def test_joints_are_named_and_drawn(joints, tmp_path):
+    assert "joint_2.action_delay" in [c.name for c in joints.verdict.causes]
+    assert "joint_2 acts later on a command than the model says, delay 131" in words.sentence(joints)
+    page, files = written(tmp_path, joints)
+    assert [f.name for f in files[1:]] == ["residuals_joints.png", "parameters.png", "held_out_joints.png"]
+    assert "joint_2.action_delay" in page.sections["Parameters"] and "ball" not in page.sections["Data and noise"]
+    assert "joint_offset" in page.sections["What these logs cannot tell"]
+
+
+def test_nothing_wrong_says_what_would_have_been_seen(windy, tmp_path):
+    """The windy balls against a model that knows the wind: nothing is left to name."""
+    path = "ball.flight.wind_x"
+    right = gap.diagnose(Logs(flights(-WIND), (), {}), model.with_values(model.SimModel(), {path: -WIND}))
+    assert right.verdict.verdict == "none"
+    text = words.sentence(right)
+    assert "agrees with 60 balls" in text and "mm" in text
+    page, files = written(tmp_path, right)
+    assert "not the nominal" not in page.text and "held_out.png" not in [f.name for f in files]
+    assert "table_restitution" in page.sections["Verdict"] and ("details", {"open": None}) in page.tags
+
+
+def test_unexplained_says_where_and_how_much(windy, joints, tmp_path):
+    odd = Unexplained("bounce over x", "x near -0.18 m", "z", "12.8 mm")
+    v = replace(windy.verdict, verdict="unexplained", unexplained=odd)
+    text = words.sentence(replace(windy, verdict=v))
+    for part in (
+        "no entry of the catalogue",
+        "bounce that changes with x",
+        "x near -0.18 m",
+        "in z",
+        "12.8 mm",
+        "caution",
+        "wind_x",
+    ):
+        assert part in text
+    subset = replace(v, unexplained=Unexplained("a subset of the balls", "5 of 60 balls", "z", "40.0 mm"))
+    assert "5 of 60 balls fly unlike the others" in words.sentence(replace(windy, verdict=subset))
+    page, _ = written(tmp_path, replace(joints, verdict=v))
+    assert ("span", {"class": "badge unexplained"}) in page.tags
+
+
+def hit_findings(names=("paddle_offset",)) -> HitFindings:
+    """Forty hits whose returns are 20 mm ahead along the table and 0.3 m/s too slow upwards, and right afterwards."""
+    scatter = np.random.default_rng(2).normal(size=(6, 40)) * np.array([[2e-3] * 3 + [0.04] * 3]).T
+    scatter -= np.median(scatter, axis=1, keepdims=True)
+    off = np.array([0.0, 0.020, 0.0, 0.0, 0.0, -0.3])[:, None]
+    causes = tuple(HitCause(catalogue.BY_NAME[n], (), 0.012, 0.001, 0.04) for n in names)
+    quiet = ("paddle_friction", "paddle_offset")
+    return HitFindings(causes, 40, quiet, scatter + off, scatter if names else scatter + off)
+
+
+def test_hits_show_where_the_returns_lie_off(windy, windy_page, tmp_path):
+    page, files = written(tmp_path, replace(windy, hits=hit_findings()))
+    headings = [h for h in page.sections if h]
+    assert headings[1:4] == ["Verdict", "The robot's hits", "Other explanations, and why they lost"]
+    assert {f.name for f in files} == {f.name for f in windy_page[1]} - {"play.png"} | {"hits.png"}
+    text = page.sections["The robot's hits"]
+    assert "40 hits were judged: they name paddle_offset (not in the verdict). With it, the typical return" in text
+    assert "lies where the model puts it" in text
+    number = r"([+-][0-9.]+)"
+    cells = rf"<td>place y \[mm\]</td><td class=n><b>{number}</b> \({number} to {number}\)</td>.*?<b>{number}</b>"
+    middle, low, high, after = map(float, re.search(cells, files[0].read_text(encoding="utf-8")).groups())
+    assert (middle, after) == (20.0, 0.0) and 18.5 < low < 20.0 < high < 21.5
+    assert "velocity z [m/s]-0.30 (" in text and "-0.0 " not in text
+    cannot = text.split("What these hits could not show")[1]
+    assert "grip of the paddle" in cannot and "paddle_offset" not in cannot, "what is named was shown"
+
+
+def test_hits_that_name_nothing_have_one_state(windy, tmp_path):
+    quiet = replace(windy, hits=hit_findings(()))
+    page, _ = written(tmp_path, quiet)
+    text = page.sections["The robot's hits"]
+    assert "name nothing at the paddle, and the typical return" in text
+    assert "lies off in place y +20.0 mm, velocity z -0.30 m/s." in text
+    assert "after: median" not in text and "place of the paddle" in text
+    nothing = words.sentence(replace(quiet, verdict=replace(windy.verdict, verdict="none", causes=())))
+    assert "40 hits name nothing at the paddle either; paddle_friction, paddle_offset they could not show" in nothing
+
+
+def test_interval_of_a_median_covers_it():
+    """By the binomial law: of twelve numbers the third to the tenth, of twenty the sixth to the fifteenth."""
+    assert figures.median_interval(np.arange(12.0, 0.0, -1.0)) == (6.5, 3.0, 10.0)
+    assert figures.median_interval(np.arange(1.0, 21.0)) == (10.5, 6.0, 15.0)
+    draws = np.random.default_rng(5).exponential(size=(2000, 31))
+    inside = [low <= math.log(2.0) <= high for _, low, high in map(figures.median_interval, draws)]
+    assert 0.90 <= np.mean(inside) < 0.96
+
+
+def test_cost_in_play(windy_page, joints, tmp_path):
+    page, files = windy_page
+    text = page.sections["What it costs in play"]
+    assert "costs 22.0 percentage points" in text and "brings 19.0 back" in text and "1,000 balls" in text
+    assert "play.png" in [f.name for f in files]
+    page, _ = written(tmp_path, joints, play=PLAY | {"retrained": None})
+    assert "costs 22.0" in page.text and "brings" not in page.sections["What it costs in play"]
+
+
+def test_spin_in_plain_words():
+    spin = {f"ball_spin.mean_{a}": Estimate(0.0, m, m - 2, m + 2, "rad/s") for a, m in zip("xyz", (60.0, 1.0, -3.0))}
+    spin |= {f"ball_spin.std_{a}": Estimate(0.0, s, s - 1, s + 1, "rad/s") for a, s in zip("xyz", (12.0, 5.0, 5.0))}
+    text = words.claim(
+        Cause(
+            "magnus",
+            ("magnus",),
+            1.0,
+            {"ball.flight.magnus_coefficient": Estimate(0.0, 0.6, 0.5, 0.7, "1")} | spin,
+            20.0,
+            "",
+        )
+    )
+    assert "balls spin" in text and "about x: mean 60 rad/s (58 to 62), ball to ball 12 rad/s (11 to 13)" in text
+
+
+@pytest.mark.parametrize(
+    "name, estimate, text",
+    [
+        (
+            "table_restitution",
+            Estimate(0.93, 0.8997, 0.8967, 0.9023, "1"),
+            "returns less speed than the model says, restitution 0.900 (0.897 to 0.902) instead of 0.93",
+        ),
+        ("table_height", Estimate(0.0, -0.0041, -0.0044, -0.0038, "m"), "lies 4.1 mm (3.8 to 4.4) lower"),
+        (
+            "gravity_scale",
+            Estimate(-9.81, -9.93, -9.95, -9.91, "m/s^2"),
+            "Balls fall faster than the model says, acceleration -9.93 m/s² (-9.95 to -9.91) instead of -9.81 m/s²",
+        ),
+        (
+            "tracker_smoothing",
+            Estimate(0.0, 0.0081, 0.0077, 0.0085, "s"),
+            "time constant 8.1 ms (7.7 to 8.5) instead of 0 ms",
+        ),
+        (
+            "gantry_x.velocity_limit",
+            Estimate(math.inf, 1.31, 1.30, 1.32, "m/s"),
+            "gantry_x gets no faster than 1.31 m/s (1.30 to 1.32) instead of no limit",
+        ),
+        (
+            "joint_3.joint_offset",
+            Estimate(0.0, -0.004, -0.0041, -0.0039, "rad"),
+            "joint_3 reads 4.0 mrad (3.9 to 4.1) too low",
+        ),
+    ],
+)
+def test_claims_in_plain_words(name, estimate, text):
+    assert text in words.claim(Cause(name, (name,), 1.0, {"a.parameter": estimate}, 10.0, ""))
+
+
+def test_every_name_of_the_catalogue_has_words():
+    effects = {e.name for e in catalogue.EFFECTS}
+    names = (
+        effects
+        | {t.name for e in catalogue.EFFECTS for t in e.twins}
+        | {"latency_jitter"}
+    )
+    assert names | set(NAMES) == set(words.MEANING)
+    assert set(NAMES) == set(words.ROBOT_CLAIMS)
+    assert effects - {"magnus"} <= set(words.CLAIMS)
+
+
+def test_a_failed_write_leaves_the_old_report(joints, tmp_path, monkeypatch):
+    (tmp_path / "report.html").write_text("old")
+
+    def broken(figure):
+        raise RuntimeError("no picture")
+
+    monkeypatch.setattr("mjx_tt.viz.html.png", broken)
+    with pytest.raises(RuntimeError, match="no picture"):
+        report.write(tmp_path, joints, "title")
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"] and (tmp_path / "report.html").read_text() == "old"
+
+
+def test_an_effect_below_the_floor_is_mentioned_but_not_named(windy):
+    choice = windy.balls.choice
+    (j,) = choice.effects
+    tiny = replace(choice, theta=np.array([0.0012 / windy.balls.trial.shift[j]]))
+    found = replace(
+        windy, balls=replace(windy.balls, choice=tiny), verdict=replace(windy.verdict, verdict="none", causes=())
+    )
+    assert "too small to matter, wind_x (1.2 mm)" in words.sentence(found)

@@ -1,0 +1,121 @@
+"""The policy's two JAX forms against each other and against the NumPy reference."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_tt.env import policy
+from mjx_tt.env.policy import PolicyController
+from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION, n_parameters, unflatten
+from robot_io.policy import numpy_policy
+from robot_io.policy.jax_policy import JitPolicy
+
+TICKS, P, R = 12, 5, 3
+PRECISION = pytest.mark.parametrize(("x64", "atol"), [(True, 1e-12), (False, 1e-6)], ids=["float64", "float32"])
+
+
+def draw(x64, seed=0):
+    """theta (976, P), mean and inverse scale (11,), observations (ticks, 11, R x P)."""
+    rng = np.random.default_rng(seed)
+    dtype = np.float64 if x64 else np.float32
+    shapes = (n_parameters(), P), (N_OBSERVATION,), (TICKS, N_OBSERVATION, R * P)
+    theta, mean, observations = (rng.normal(0, scale, shape) for scale, shape in zip((0.3, 0.5, 1.0), shapes))
+    return [x.astype(dtype) for x in (theta, mean, rng.uniform(0.5, 2, N_OBSERVATION), observations)]
+
+
+@jax.jit
+def streamed(theta, mean, inverse_scale, observations):
+    """Actions (ticks, 8, B) of the controller that the rollout uses."""
+    controller = PolicyController(unflatten(theta), mean, inverse_scale)
+
+    def tick(state, n):
+        action, state = controller.act(n, state, observations[n])
+        return state, action
+
+    return jax.lax.scan(tick, controller.start(observations[0]), jnp.arange(TICKS))[1]
+
+
+def histories(observations):
+    """(ticks, 8, 11, B): the first observation fills what came before it."""
+    padded = np.concatenate([np.repeat(observations[:1], HISTORY - 1, 0), observations])
+    return np.stack([padded[t : t + HISTORY] for t in range(len(observations))])
+
+
+def test_has_976_parameters():
+    theta = policy.initial_theta(jax.random.key(0))
+    assert theta.shape == (976,) and n_parameters() == 976
+    assert float(theta.std()) == pytest.approx(0.1, rel=0.1)
+    assert float(policy.initial_theta(jax.random.key(0), 0.5).std()) == pytest.approx(0.5, rel=0.1)
+
+
+@PRECISION
+def test_full_equals_streaming(x64, atol):
+    with jax.enable_x64(x64):
+        theta, mean, inverse_scale, observations = draw(x64)
+        theta = theta[:, 0]
+        x = (observations - mean[:, None]) * inverse_scale[:, None]
+        full = np.asarray(jax.jit(jax.vmap(policy.apply, (None, 0)))(theta, histories(x)))
+        stream = streamed(theta, mean, inverse_scale, observations)
+    assert full.shape == (TICKS, N_JOINTS, R * P) and full.dtype == theta.dtype
+    np.testing.assert_allclose(stream, full, rtol=0, atol=atol)
+    assert np.abs(full).max() < 1 and np.std(full) > 0.1
+
+
+@PRECISION
+def test_both_forms_equal_numpy_for_every_perturbation(x64, atol):
+    """Column b of the batch is played with the parameters of perturbation b mod P."""
+    with jax.enable_x64(x64):
+        theta, mean, inverse_scale, observations = draw(x64, seed=1)
+        actions = np.asarray(streamed(theta, mean, inverse_scale, observations))
+        x = (observations - mean[:, None]) * inverse_scale[:, None]
+        full = np.asarray(jax.jit(jax.vmap(policy.apply, (None, 0)))(theta, histories(x)))
+    for b in range(R * P):
+        parameters = unflatten(theta[:, b % P])
+        exact = [numpy_policy.forward(parameters, mean, inverse_scale, h) for h in histories(observations[..., b])]
+        np.testing.assert_allclose(actions[..., b], exact, rtol=0, atol=atol)
+        np.testing.assert_allclose(full[..., b], exact, rtol=0, atol=atol)
+        robot = numpy_policy.StreamingPolicy(parameters, mean, inverse_scale)
+        np.testing.assert_allclose([robot.step(o) for o in observations[..., b]], exact, rtol=0, atol=1e-12)
+
+
+def test_columns_equal_single_evaluations():
+    theta, mean, inverse_scale, observations = draw(x64=False, seed=2)
+    together = streamed(theta, mean, inverse_scale, observations)
+    for p in range(P):
+        alone = streamed(theta[:, p], mean, inverse_scale, observations[..., p::P])
+        np.testing.assert_allclose(together[..., p::P], alone, rtol=0, atol=1e-6)
+
+
+def test_sees_exactly_the_last_eight_observations():
+    theta, mean, inverse_scale, observations = draw(x64=False, seed=3)
+    changed = observations.copy()
+    changed[2] += 1.0
+    before, after = (streamed(theta, mean, inverse_scale, o) for o in (observations, changed))
+    differs = (np.abs(before - after) > 1e-6).any(axis=(1, 2))
+    assert differs.tolist() == [2 <= t < 2 + HISTORY for t in range(TICKS)]
+
+
+@pytest.fixture
+def control_process():
+    """Undoes what the compiled policy sets for the process that it runs in."""
+    yield
+    jax.config.update("jax_cpu_enable_async_dispatch", True)  # JAX's default
+
+
+def test_the_compiled_policy_of_the_control_loop_equals_the_streaming_one(control_process):
+    random = np.random.default_rng(3)
+    parameters = unflatten(0.3 * random.standard_normal(n_parameters()))
+    mean, inverse_scale = random.standard_normal((2, N_OBSERVATION))
+    kinds = JitPolicy, numpy_policy.StreamingPolicy
+    compiled, streaming = (kind(parameters, mean, inverse_scale) for kind in kinds)
+    for _ in range(3):
+        compiled.reset()
+        streaming.reset()
+        for observation in random.standard_normal((20, N_OBSERVATION)):
+            np.testing.assert_allclose(compiled.step(observation), streaming.step(observation), rtol=0, atol=1e-5)
+    for wrong in (np.zeros(10), np.full(N_OBSERVATION, np.nan)):
+        with pytest.raises(ValueError, match="11 finite numbers"):
+            compiled.step(wrong)

@@ -1,0 +1,224 @@
+"""The rollout: drawing, blocks, failed episodes and statistics, against episodes that are played tick by tick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ballmodel import registry
+from ballmodel.sampling import sample_pool
+from mjx_tt.env import rewards, rollout
+from mjx_tt.env.policy import PolicyController, initial_theta
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import HIT, MISSED, RETURNED, TaskConfig
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import Range, SimModel
+from robot_io.contract import N_OBSERVATION, unflatten
+from tests.support import scripted_episodes
+
+R, P = 6, 4
+MEAN = np.array([0.0, 0.5, 0.3, *[0.1] * 8], np.float32)
+INVERSE_SCALE = np.array([3.0, 1.5, 4.0, *[1.0] * 8], np.float32)
+RANDOMISE = (Range("ball.table.restitution", 0.88, 0.97),)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    return sample_pool(jax.random.key(0), registry.load("narrow"), SimModel().ball, 64)
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return Simulator(TaskConfig())
+
+
+@pytest.fixture(scope="module")
+def episodes(simulator, pool):
+    draw = jax.jit(lambda key: simulator.draw(key, pool, SimModel(), RANDOMISE, R, P))
+    return draw(jax.random.key(1))
+
+
+@pytest.fixture(scope="module")
+def theta():
+    return np.stack([initial_theta(jax.random.key(i), 0.2) for i in range(P)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def run(simulator, theta, episodes):
+    """The rollout in three blocks of two rows each, compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rollout, "CPU_BLOCK", 2 * P)
+        assert simulator._block_rows(R, P) == 2
+        roll = jax.jit(lambda theta, episodes: simulator.rollout(theta, MEAN, INVERSE_SCALE, episodes))
+        return roll.lower(theta, episodes).compile()
+
+
+@pytest.fixture(scope="module")
+def result(run, theta, episodes):
+    return jax.tree.map(np.asarray, run(theta, episodes))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Watched:
+    """A controller whose state also keeps what it was shown."""
+
+    inner: PolicyController
+    mean: jax.Array
+
+    def start(self, observation):
+        return self.inner.start(observation), observation
+
+    def act(self, tick, state, observation):
+        action, inner = self.inner.act(tick, state[0], observation)
+        return action, (inner, observation)
+
+
+def flat(x):
+    """(..., R, P) -> (..., R x P), the batch of a rollout's block."""
+    return x.reshape(*x.shape[:-2], -1) if x.ndim >= 2 else x
+
+
+@pytest.fixture(scope="module")
+def played(simulator, episodes, theta):
+    """The same episodes tick by tick, all in one block."""
+    controller = Watched(PolicyController(unflatten(theta), MEAN, INVERSE_SCALE), MEAN)
+    return scripted_episodes.play(simulator.task, jax.tree.map(flat, episodes), controller, ticks=120)
+
+
+def test_equals_the_same_episodes_played_tick_by_tick(result, played):
+    """So neither the loop nor the size of its blocks changes an episode."""
+    assert not played.live[-1].any()  # so that 120 ticks are all of it
+    np.testing.assert_allclose(flat(result.terms), played.terms, atol=2e-4)
+    weights = np.array(list(rewards.SIM_WEIGHTS.values()))
+    np.testing.assert_allclose(result.returns, np.tensordot(weights, result.terms, 1), atol=1e-5)
+    np.testing.assert_array_equal(flat(result.steps), played.live.sum(axis=0) + 1)
+    hit, returned = played.last.hit, played.back.returned & played.last.hit
+    np.testing.assert_array_equal(flat(result.outcome), np.where(returned, RETURNED, np.where(hit, HIT, MISSED)))
+    np.testing.assert_allclose(flat(result.peak_velocity), played.last.sums.peak_velocity, rtol=1e-5)
+    assert result.finite.all()
+
+
+def test_statistics_equal_numpys_over_everything_that_was_observed(result, played):
+    seen = np.asarray(played.controller[1], np.float64)  # (ticks, 11, R x P)
+    alive = np.concatenate([np.ones((1, R * P), bool), played.live[:-1]])
+    for column in range(P):
+        x = np.concatenate([seen[alive[:, b], :, b] for b in range(column, R * P, P)])
+        assert result.observation_counts[column] == len(x)
+        np.testing.assert_allclose(result.observation_sums[0, :, column], (x - MEAN).sum(axis=0), rtol=1e-4, atol=1e-2)
+        np.testing.assert_allclose(
+            result.observation_sums[1, :, column], ((x - MEAN) ** 2).sum(axis=0), rtol=1e-4, atol=1e-2
+        )
+
+
+@pytest.mark.parametrize(
+    ("repeats", "columns", "rows"), [(15, 400, 1), (15, 40, 15), (10, 200, 2), (7, 200, 1), (7, 100, 7)]
+)
+def test_blocks_are_whole_rows_that_divide_the_repeats(simulator, repeats, columns, rows):
+    assert simulator._block_rows(repeats, columns) == rows
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf], ids=str)
+def test_a_column_that_is_not_finite_is_masked_and_counted_alone(run, result, theta, episodes, value):
+    broken = theta.copy()
+    broken[:, 2] = value
+    found = jax.tree.map(np.asarray, run(broken, episodes))
+    good = [0, 1, 3]
+    assert not found.finite[:, 2].any() and found.finite[:, good].all()
+    assert np.isnan(found.returns[:, 2]).all()
+    assert (found.outcome[:, 2] == MISSED).all()
+    assert found.observation_counts[2] == 0 and not found.observation_sums[..., 2].any()
+    np.testing.assert_array_equal(found.returns[:, good], result.returns[:, good])
+    np.testing.assert_array_equal(found.observation_sums[..., good], result.observation_sums[..., good])
+
+
+def test_a_ball_that_is_not_finite_fails_its_episode_alone(run, result, theta, episodes):
+    position = np.array(episodes.ball.position)
+    position[1, 3, 1] = np.nan
+    found = run(theta, replace(episodes, ball=replace(episodes.ball, position=jnp.asarray(position))))
+    expected = np.ones((R, P), bool)
+    expected[3, 1] = False
+    np.testing.assert_array_equal(found.finite, expected)
+    np.testing.assert_array_equal(np.asarray(found.returns)[expected], result.returns[expected])
+    assert int(found.observation_counts[1]) == result.observation_counts[1] - result.steps[3, 1]
+
+
+def test_repeats_are_sorted_by_arrival_and_balls_are_the_pools(episodes, pool):
+    starts = np.concatenate([pool.state.position, pool.state.velocity])
+    drawn = np.concatenate([episodes.ball.position, episodes.ball.velocity])
+    which = (starts[:, :, None, None] == drawn[:, None]).all(axis=0)  # (64, R, P)
+    assert (which.sum(axis=0) == 1).all()
+    arrival = np.asarray(pool.arrival)[which.argmax(axis=0)]
+    assert (np.diff(arrival, axis=0) >= 0).all() and np.ptp(arrival) > 0
+    assert len(np.unique(which.argmax(axis=0))) > R * P / 2
+
+
+def test_every_episode_draws_its_own_chance(episodes):
+    assert episodes.latency.shape == (5, R, P)
+    assert len(np.unique(episodes.latency)) == 5 * R * P
+    assert len(np.unique(episodes.seed)) == R * P
+    restitution = np.asarray(episodes.model.ball.table.restitution)
+    assert restitution.shape == (R, P) and len(np.unique(restitution)) == R * P
+    assert 0.88 <= restitution.min() and restitution.max() <= 0.97
+    assert np.shape(episodes.model.ball.net.restitution) == ()
+
+
+def test_spin_of_the_balls_changes_nothing_else_that_is_drawn(simulator, pool, episodes):
+    spinning = models.with_values(SimModel(), {"ball_spin.mean_x": 80.0, "ball_spin.std_y": 10.0})
+    drawn = jax.jit(lambda key: simulator.draw(key, pool, spinning, RANDOMISE, R, P))(jax.random.key(1))
+    spin = np.asarray(drawn.ball.spin)
+    np.testing.assert_array_equal(spin[[0, 2]], np.array([80.0, 0.0])[:, None, None] + np.zeros((2, R, P)))
+    assert len(np.unique(spin[1])) == R * P and 3 < spin[1].std() < 20
+    assert not np.asarray(episodes.ball.spin).any()
+    with_old_spin = replace(drawn, ball=replace(drawn.ball, spin=episodes.ball.spin), model=episodes.model)
+    jax.tree.map(np.testing.assert_array_equal, with_old_spin, episodes)
+
+
+def test_nominal_effects_are_no_part_of_the_program(simulator, pool, episodes):
+    """Only what departs from nominal, or may, costs anything in the loop."""
+    left_out = {path for path, value in models.paths(episodes.model).items() if value is None}
+    assert {"ball.table.tilt_x", "ball.paddle.offset", "sensing.jitter", "sensing.camera_scale"} <= left_out
+    assert episodes.model.drives is None
+    values = {"drives.joint_2.lag": 0.02, "drives.joint_3.lag": 0.0, "sensing.jitter": 1e-3}
+    some = models.with_values(SimModel(), values)
+    drawn = simulator.draw(jax.random.key(1), pool, some, (), R, P).model
+    kept = {path for path, value in models.paths(drawn).items() if value is not None}
+    nominal = {path for path, value in models.paths(episodes.model).items() if value is not None} - {
+        path for path in models.paths() if path.startswith("drives.")
+    }
+    assert kept == nominal | {"drives.joint_2.lag", "sensing.jitter"}
+
+
+def test_a_randomised_drive_shows_in_the_rollout(simulator, pool, theta, episodes, result):
+    """The same episodes with one joint slowed down: the same balls and delays, another way to meet them."""
+    ranges = (*RANDOMISE, Range("drives.joint_1.lag", 0.05, 0.1))
+    slow = jax.jit(lambda key: simulator.draw(key, pool, SimModel(), ranges, R, P))(jax.random.key(1))
+    np.testing.assert_array_equal(slow.ball.position, episodes.ball.position)
+    found = jax.jit(lambda theta, episodes: simulator.rollout(theta, MEAN, INVERSE_SCALE, episodes))(theta, slow)
+    assert np.asarray(found.finite).all()
+    assert (np.abs(np.asarray(found.returns) - result.returns) > 1e-4).mean() > 0.5
+
+
+def test_replay_shows_the_same_episode(simulator, theta, episodes, played):
+    one = jax.tree.map(lambda x: x[..., :1] if x.ndim >= 2 else x, episodes)
+    qpos, ball, length = jax.jit(simulator.replay)(theta[:, 0], MEAN, INVERSE_SCALE, one)
+    columns = np.arange(0, R * P, P)
+    np.testing.assert_allclose(qpos[1:121], played.qpos[..., columns], atol=1e-4)
+    for i, b in enumerate(columns):
+        live = int(played.live[:, b].sum())
+        np.testing.assert_allclose(ball[1 : live + 1, :, i], played.ball[:live, :, b], atol=1e-4)
+        assert live < length[i] <= simulator.config.max_steps
+
+
+def test_mistakes_are_named(simulator, theta, episodes):
+    with pytest.raises(ValueError, match="theta has 3 columns, the episodes 4"):
+        simulator.rollout(theta[:, :3], MEAN, INVERSE_SCALE, episodes)
+    with pytest.raises(ValueError, match="99 devices wanted, this process has 2"):
+        Simulator(TaskConfig(), devices=99)
+    two = Simulator(TaskConfig(), devices=2)
+    with pytest.raises(ValueError, match="3 perturbations cannot be split evenly over 2 devices"):
+        two.on_devices(lambda x: two.local(x), out_specs=jax.sharding.PartitionSpec())(jnp.zeros((N_OBSERVATION, 3)))

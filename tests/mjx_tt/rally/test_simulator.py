@@ -1,0 +1,344 @@
+"""Rallies: the robot's turns against the rollout, touches against the log, every row of the table of ends by its ball."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ballmodel import flight
+from ballmodel import registry as paper
+from ballmodel.flight import ball_params
+from ballmodel.partial_params import without_nominal
+from ballmodel.sampling import sample_pool
+from ballmodel.state import BallState
+from mjx_tt.env.policy import PolicyController, initial_theta
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import MISSED, RETURNED, Episodes, TaskConfig
+from mjx_tt.rally import human_player
+from mjx_tt.rally.ball_flights import Sent, homeward, meeting
+from mjx_tt.rally.end_reasons import ROWS, End, ending
+from mjx_tt.rally.human_player import Spread
+from mjx_tt.rally.simulator import Box, RallySimulator, RallyState
+from mjx_tt.sim.model import LATENCIES, SimModel, with_values
+from robot_io.contract import LIMITS, N_JOINTS, N_OBSERVATION, n_parameters, unflatten
+
+CONFIG = TaskConfig(sim_rate=150.0, max_steps=120)
+LANES = 12
+EXACT = with_values(SimModel(), {f"latency.{name}_std": 0.0 for name in LATENCIES} | {"sensing.ball_noise": 0.0})
+# A blade like a wall that takes no speed, in thin air: a hard lob comes back from it.
+WALL = with_values(
+    EXACT,
+    {
+        "ball.paddle.radius": 1.2,
+        "ball.paddle.tilt": 0.01,
+        "ball.paddle.restitution": 1.0,
+        "ball.paddle.restitution_slope": 0.0,
+        "ball.paddle.tangential_gain": 0.0,
+        "ball.flight.drag_coefficient": 0.1,
+    },
+)
+STILL = np.zeros((n_parameters(), LANES), np.float32)
+NORMALISER = (np.zeros(N_OBSERVATION, np.float32), np.ones(N_OBSERVATION, np.float32))
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    return RallySimulator(CONFIG)
+
+
+def spread(model):
+    """The model with every leaf of a lane's own: one compiled program serves all worlds."""
+    return jax.tree.map(lambda leaf: jnp.full(LANES, leaf, jnp.float32), without_nominal(model))
+
+
+def stacked(**changes):
+    """Player 3 in every lane, who hits hard; with those changes."""
+    player = human_player.load("player3")
+    first = replace(
+        player.first, y=Spread(1.2, 1.3, 1.4), z=Spread(0.35, 0.4, 0.45), forward=Spread(5.5, 6.0, 6.5),
+        climb=Spread(0.0, 0.8, 2.0), landing=Spread(-1.0, -0.85, -0.7), sideways=Spread(-0.1, 0.0, 0.1),
+    )  # fmt: skip
+    player = replace(player, first=first, strokes=replace(player.strokes, speed=Spread(6.5, 6.8, 7.0), attack=0.0))
+    for group, values in changes.items():
+        player = replace(player, **{group: replace(getattr(player, group), **values)})
+    return human_player.stack([player] * LANES)
+
+
+def shots(simulator, balls, touches, theta=STILL, model=EXACT, box=None, start=None, key=0):
+    """One turn from hand-made balls [(position, velocity), ...], repeated over the lanes."""
+    position, velocity = (jnp.asarray([balls[i % len(balls)][k] for i in range(LANES)], jnp.float32).T for k in (0, 1))
+    home = jnp.repeat(jnp.asarray(simulator.task.home, jnp.float32)[:, None], LANES, axis=1)
+    state = RallyState(
+        player=human_player.fresh((LANES,)), ball=BallState(position, velocity, jnp.zeros_like(position)),
+        touches=jnp.full(LANES, touches, jnp.int32), start=home if start is None else start, dummy=jnp.zeros(LANES, bool),
+    )  # fmt: skip
+    everything = Box(jnp.full(8, -99.0), jnp.full(8, 99.0)) if box is None else box
+    state, result = simulator.shots(
+        theta, *NORMALISER, stacked(), without_nominal(spread(model)), state, jax.random.key(key), everything
+    )
+    return state, jax.tree.map(np.asarray, result)
+
+
+def test_the_table_of_ends_has_the_papers_fifteen_rows_in_order():
+    assert [int(row[0]) for row in ROWS] == list(range(17))
+    # The paper's table: did the robot end the rally, is the rally filtered.
+    said = [(None, True), (None, True), (True, False), (None, True), (True, False), (False, False), (False, False),
+            (True, False), (None, True), (None, True), (False, False), (False, False), (True, False), (None, True), (None, True)]  # fmt: skip
+    assert [row[2:] for row in ROWS[:15]] == said
+
+
+def test_a_turn_of_the_robot_is_the_rollouts_episode(simulator):
+    world = with_values(WALL, {"ball.paddle.radius": 0.4})  # some balls pass the blade
+    pool = sample_pool(jax.random.key(0), paper.load("player3/M0"), world.ball, LANES)
+    theta = np.stack([initial_theta(jax.random.key(i), 0.3) for i in range(LANES)], axis=1)
+    state, result = shots(
+        simulator, [(pool.state.position[:, i], pool.state.velocity[:, i]) for i in range(LANES)], 1, theta, world
+    )
+    rollout = Simulator(CONFIG)
+    seconds = jnp.array([getattr(EXACT.latency, name) for name in LATENCIES])
+    episodes = Episodes(
+        pool.state, jnp.repeat(seconds[:, None], LANES, axis=1), jnp.zeros(LANES, jnp.uint32), without_nominal(world)
+    )
+    row = jax.tree.map(lambda x: x[..., None, :] if x.ndim else x, replace(episodes, model=spread(world)))
+    expected = jax.jit(lambda t, e: rollout.rollout(t, *NORMALISER, e))(theta, row)
+    lanes = ~result.fault
+    assert lanes.sum() >= LANES // 2 and len(set(np.asarray(expected.outcome)[0][lanes])) > 1
+    np.testing.assert_array_equal(result.outcome[lanes], np.asarray(expected.outcome)[0][lanes])
+    np.testing.assert_allclose(result.terms[:, lanes], np.asarray(expected.terms)[:, 0][:, lanes], atol=2e-4)
+    hit = lanes & (result.outcome != MISSED)
+    np.testing.assert_allclose(result.return_landing[:, hit], np.asarray(expected.landing)[:, 0][:, hit], atol=2e-3)
+    np.testing.assert_allclose(result.landing, pool.landing, atol=5e-3)  # another integrator's step
+
+
+def aim(start, target, seconds):
+    """Velocity of the drag-only flight, from the independent fit of nothing: shooting in NumPy with Euler's small steps."""
+    velocity = (np.array(target) - start) / seconds + [0, 0, 0.5 * 9.81 * seconds]
+    k_d = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027)
+    for _ in range(6):
+        x, v = np.array(start, float), velocity.copy()
+        for _ in range(1000):
+            a = np.array([0, 0, -9.81]) - k_d * np.linalg.norm(v) * v
+            x, v = x + v * seconds / 1000 + 0.5 * a * (seconds / 1000) ** 2, v + a * seconds / 1000
+        velocity = velocity + (np.array(target) - x) / seconds
+    return velocity
+
+
+FROM = np.array([0.3, 1.2, 0.3])
+AT_PADDLE = (FROM, aim(FROM, [0.3, -0.9, 0.02], 0.5))  # meets the blade of a robot at home
+LOB = (FROM * [-1, 1, 1], aim(FROM * [-1, 1, 1], [-0.4, -0.9, 0.02], 0.5))  # does not
+CASES = {
+    # ball, touches -> end
+    "first to the net": ((FROM, aim(FROM, [0.3, 0.0, 0.08], 0.3)), 1, End.FIRST_NET),
+    "first over the table": ((FROM, aim(FROM, [0.3, -2.0, 0.02], 0.6)), 1, End.FIRST_OVER_TABLE),
+    "first beside the table": ((FROM, aim(FROM, [1.2, -0.9, 0.02], 0.5)), 1, End.FIRST_OVER_TABLE),
+    "nobody reacts": (LOB, 1, End.NO_REACTION),
+    "service": ((FROM, aim(FROM, [0.3, 0.5, 0.02], 0.15)), 1, End.SERVICE),
+    "grazes the net": ((FROM, aim(FROM, [0.3, 0.0, 0.166], 0.3)), 1, End.HUMAN_GRAZES_NET),
+    "later to the net": ((FROM, aim(FROM, [0.3, 0.0, 0.08], 0.3)), 3, End.HUMAN_OVER_TABLE),
+    "later over the table": ((FROM, aim(FROM, [0.3, -2.0, 0.02], 0.6)), 3, End.HUMAN_OVER_TABLE),
+    "later on the own side": ((FROM, aim(FROM, [0.3, 0.5, 0.02], 0.15)), 3, End.HUMAN_BOUNCES),
+    "later to the edge": ((FROM, aim(FROM, [0.74, -0.9, 0.02], 0.5)), 3, End.HUMAN_EDGE),
+    "later not reached by the robot": (LOB, 3, End.ROBOT_MISSED),
+    "later hit, but not returned": (AT_PADDLE, 3, End.ROBOT_OUT),
+}
+
+
+def test_every_ball_gets_its_row(simulator):
+    for touches in (1, 3):
+        chosen = [(name, *case) for name, case in CASES.items() if case[1] == touches]
+        _, result = shots(simulator, [ball for _, ball, *_ in chosen], touches)
+        for lane, (name, _, _, end) in enumerate(chosen):
+            assert End(result.end[lane]) == end, name
+    assert np.isnan(result.landing[0, 0])
+
+
+def test_balls_out_of_distribution(simulator):
+    narrow = Box.of(replace(paper.load("narrow"), landing_max=(0.2, -1.2), landing_min=(0.1, -1.3)))
+    box = Box(narrow.low, narrow.high)
+    _, later = shots(simulator, [LOB], 3, box=box)
+    assert set(later.end) == {End.OUT_OF_DISTRIBUTION}
+    # A first ball, and a robot that moves: it is not that it did not react.
+    theta = np.repeat(np.asarray(initial_theta(jax.random.key(3), 0.3))[:, None], LANES, axis=1)
+    _, first = shots(simulator, [LOB], 1, theta, box=box)
+    assert set(first.end[(first.outcome != RETURNED) & ~first.fault]) == {End.FIRST_OUT_OF_DISTRIBUTION}
+
+
+def test_a_robot_that_hits_itself_faults_and_gets_a_dummy_ball(simulator):
+    # Every action saturated: whatever the ball does, the arm runs into something or is stopped by its limits.
+    theta = np.asarray(jax.random.normal(jax.random.key(1), (n_parameters(), LANES))) * 5.0
+    state, result = shots(simulator, [LOB], 1, theta)
+    assert result.fault.any()
+    assert np.all(result.outcome[result.fault] == MISSED)
+    assert np.all(result.terms[3][result.fault] == -2.0) and np.all(result.terms[3][~result.fault] == 0.0)
+    played = simulator.play(
+        theta, *NORMALISER, stacked(), spread(EXACT), jax.random.key(0), 6, max_touches=20, capacity=64
+    )
+    end, length = np.asarray(played.end), np.asarray(played.length)
+    dummy = (end == End.DUMMY_BY_HAND) | (end == End.DUMMY_WITH_PADDLE)
+    assert (
+        dummy.any()
+        and np.all(length[end == End.DUMMY_BY_HAND] == 0)
+        and np.all(length[end == End.DUMMY_WITH_PADDLE] == 1)
+    )
+    assert not np.any(dummy[1:] & dummy[:-1])  # after a dummy ball the robot stands at its start again
+    before = end[:-1][dummy[1:]]
+    assert set(before) <= {End.ROBOT_MISSED, End.SERVICE, End.FIRST_NET, End.FIRST_OVER_TABLE, End.HUMAN_GRAZES_NET}
+
+
+@pytest.fixture(scope="module")
+def rallies(simulator):
+    result = simulator.play(
+        STILL, *NORMALISER, stacked(), spread(WALL), jax.random.key(5), 6, max_touches=20, capacity=64
+    )
+    return jax.tree.map(np.asarray, result)
+
+
+def test_touches_are_those_of_the_logged_hits(rallies):
+    """A rally's length, counted again from the log: each ball is one touch, each that the robot hit another."""
+    assert rallies.length.max() >= 5  # the wall rallies
+    for lane in range(LANES):
+        count = rallies.balls.count[lane]
+        assert count <= 64
+        rally, touch, hit = (getattr(rallies.balls, name)[:count, lane] for name in ("rally", "touch", "hit"))
+        for k in range(6):
+            mine = rally == k
+            assert rallies.length[k, lane] == mine.sum() + hit[mine].sum()
+            np.testing.assert_array_equal(touch[mine], 1 + 2 * np.arange(mine.sum()))
+            returned = rallies.balls.returned[:count, lane][mine]
+            assert np.all(returned[:-1])  # only what was returned went on
+
+
+def test_a_rally_that_went_on_after_the_robot_ended_with_the_row_of_its_last_ball(rallies):
+    by_human = {End.HUMAN_BOUNCES, End.ROBOT_GRAZES_NET, End.ROBOT_CORNER}
+    for lane in range(LANES):
+        count = rallies.balls.count[lane]
+        for k in range(6):
+            last = np.flatnonzero(rallies.balls.rally[:count, lane] == k)[-1]
+            end, returned = End(rallies.end[k, lane]), rallies.balls.returned[last, lane]
+            hit, touch = rallies.balls.hit[last, lane], rallies.balls.touch[last, lane]
+            assert end != End.NONE or rallies.length[k, lane] >= 20
+            if returned and end != End.NONE:
+                assert end in by_human
+            elif hit and end != End.NONE:
+                assert end in {End.ROBOT_OUT, End.NO_REACTION, End.HUMAN_EDGE}
+            if end in {End.FIRST_NET, End.FIRST_OVER_TABLE, End.NO_REACTION, End.SERVICE}:
+                assert touch == 1
+
+
+def test_the_same_key_plays_the_same_rallies(simulator, rallies):
+    again = simulator.play(
+        STILL, *NORMALISER, stacked(), spread(WALL), jax.random.key(5), 6, max_touches=20, capacity=64
+    )
+    np.testing.assert_array_equal(again.length, rallies.length)
+    np.testing.assert_array_equal(np.asarray(again.balls.position), rallies.balls.position)
+
+
+def test_every_service_is_filtered(simulator):
+    result = simulator.play(
+        STILL, *NORMALISER, stacked(first={"service": 1.0}, ability={"elevation": 0.0, "direction": 0.0, "pace": 0.0}),
+        spread(WALL), jax.random.key(5), 6, max_touches=20, capacity=64,
+    )  # fmt: skip
+    assert set(np.asarray(result.end).ravel()) == {End.SERVICE}
+    assert np.all(np.asarray(result.length) == 1)
+
+
+def test_players_meet_the_return_where_finer_steps_have_it():
+    """The contact, by the full ball simulation at 1,200 Hz."""
+    position = np.array([[0.2, -0.6, 0.3], [0.0, -1.2, 0.2], [-0.3, -1.0, 0.25], [0.1, -0.8, 0.3]])
+    target = np.array([[0.1, 0.7, 0.02], [0.5, 0.9, 0.02], [-0.2, 0.4, 0.02], [0.0, 1.0, 0.02]])
+    velocity = np.stack([aim(p, t, s) for p, t, s in zip(position, target, (0.45, 0.6, 0.6, 0.4))])
+    plane, height = np.array([1.3, 1.5, 1.6, 1.4]), np.array([0.2, -0.1, 0.25, 0.3])
+    ball = BallState(*(jnp.asarray(x.T, jnp.float32) for x in (position, velocity, 0 * velocity)))
+    fly = jax.jit(
+        lambda b: meeting(SimModel().ball, b, jnp.ones(4, bool), jnp.asarray(plane), jnp.asarray(height), 1 / 75)
+    )
+    met = jax.tree.map(np.asarray, fly(ball))
+    assert np.all(met.reached)
+    fine, params = 1200, ball_params()
+
+    def advance(state, _):
+        new, events = flight.step(params, state, 1.0 / fine)
+        return new, (new.position, new.velocity, events.table)
+
+    _, (positions, velocities, table) = jax.lax.scan(advance, ball, None, length=2 * fine)
+    for i in range(4):
+        bounce = int(np.argmax(table[:, i]))
+        np.testing.assert_allclose(met.incoming.landing[:, i], positions[bounce, :2, i], atol=0.01)
+        assert met.incoming.landing[1, i] == pytest.approx(target[i, 1], abs=0.02)
+        y, z, vz = positions[:, 1, i], positions[:, 2, i], velocities[:, 2, i]
+        ready = np.arange(len(y)) > bounce + 0.06 * fine
+        over = (y < 1.37) & (np.abs(positions[:, 0, i]) < 0.7625)
+        fallen = (z <= np.where(over, max(height[i], human_player.OVER_TABLE), height[i])) & (vz < 0)
+        first = int(np.argmax(ready & ((y >= plane[i]) | fallen)))
+        # The contact is looked for once per control period.
+        assert met.incoming.seconds[i] == pytest.approx((first + 1) / fine, abs=1.01 / 75)
+        late = round(met.incoming.seconds[i] * fine) - 1
+        np.testing.assert_allclose(met.incoming.ball.position[:, i], positions[late, :, i], atol=0.01)
+
+
+def test_corner_and_cord_of_the_robots_return():
+    """What the player cannot reach after a corner or a net cord is told by the row."""
+    position = np.array([[0.0, -1.0, 0.3], [0.3, -0.6, 0.25]])
+    velocity = np.stack([aim(position[0], [0.7, 1.3, 0.02], 0.6), aim(position[1], [0.3, 0.0, 0.168], 0.25)])
+    ball = BallState(*(jnp.asarray(x.T, jnp.float32) for x in (position, velocity, 0 * velocity)))
+    wish = jnp.array([1.5, 1.5]), jnp.array([0.2, 0.2])
+    met = jax.jit(lambda b: meeting(SimModel().ball, b, jnp.ones(2, bool), *wish, 1 / 75))(ball)
+    assert list(np.asarray(met.net)) == [False, True]
+    side, line = 0.7625 - abs(float(met.incoming.landing[0, 0])), 1.37 - float(met.incoming.landing[1, 0])
+    assert side < 0.25 and line < 0.25
+    sent = Sent(*(jnp.array([flag] * 2) for flag in (False, False, True)), jnp.array([[0.3] * 2, [-0.9] * 2]))
+    false = jnp.zeros(2, bool)
+    end = ending(false, sent, jnp.full(2, RETURNED), false, met, false, ~false)
+    assert [End(e) for e in np.asarray(end)] == [End.ROBOT_CORNER, End.ROBOT_GRAZES_NET]
+
+
+def test_the_robot_is_as_far_on_its_way_home_as_the_bridge_drives_it(simulator):
+    """Against the bridge's law of motion, stepped: speed min(half of the limit, sqrt(2 b d)), begun 0.1 s after the hit."""
+    rng = np.random.default_rng(0)
+    home = np.asarray(simulator.task.home)[:, None]
+    lower, upper = np.asarray(LIMITS.lower)[:, None], np.asarray(LIMITS.upper)[:, None]
+    qpos = np.clip(
+        home + rng.uniform(-1.0, 1.0, (N_JOINTS, 40)) * np.array([0.7, 0.4, *[1.2] * 6])[:, None], lower, upper
+    )
+    seconds = rng.uniform(0.0, 1.2, 40)
+    speed, braking = 0.5 * np.asarray(LIMITS.policy_velocity)[:, None], 0.3 * np.asarray(LIMITS.acceleration)[:, None]
+    at, dt = qpos.copy(), 1e-4
+    for k in range(12000):
+        moving = (k * dt >= 0.1) & (k * dt < seconds)
+        error = home - at
+        at = at + moving * np.sign(error) * np.minimum(
+            np.minimum(speed, np.sqrt(2 * braking * np.abs(error))) * dt, np.abs(error)
+        )
+    found = np.asarray(homeward(simulator.task.home, jnp.asarray(qpos, jnp.float32), jnp.asarray(seconds, jnp.float32)))
+    np.testing.assert_allclose(found, at, atol=2e-3)
+
+
+def test_a_turn_starts_where_the_robot_stands(simulator):
+    """A robot away from home is somewhere else when the ball arrives: a wall moved to the side lets it pass."""
+    home = jnp.repeat(jnp.asarray(simulator.task.home, jnp.float32)[:, None], LANES, axis=1)
+    aside = home.at[0].add(jnp.linspace(-0.8, 0.8, LANES))
+    wall = with_values(WALL, {"ball.paddle.radius": 0.3})
+    _, at_home = shots(simulator, [AT_PADDLE], 3, model=wall)
+    _, moved = shots(simulator, [AT_PADDLE], 3, model=wall, start=aside)
+    assert len(set(at_home.outcome)) == 1 and len(set(moved.outcome != MISSED)) == 2
+
+
+def test_every_lane_has_its_own_policy_and_normaliser():
+    """Lanes side by side act as each would alone."""
+    rng = np.random.default_rng(0)
+    theta = jnp.asarray(rng.normal(0, 0.3, (n_parameters(), 3)), jnp.float32)
+    mean, scale = (jnp.asarray(rng.uniform(0.5, 2.0, (N_OBSERVATION, 3)), jnp.float32) for _ in range(2))
+    seen = jnp.asarray(rng.normal(0, 1, (2, N_OBSERVATION, 3)), jnp.float32)
+
+    def action(columns):
+        controller = PolicyController(unflatten(theta[:, columns]), mean[:, columns], scale[:, columns])
+        return controller.act(0, controller.start(seen[0][:, columns]), seen[1][:, columns])[0]
+
+    alone = np.concatenate([action(slice(i, i + 1)) for i in range(3)], axis=1)
+    np.testing.assert_allclose(action(slice(0, 3)), alone, atol=1e-6)
+    one = PolicyController(unflatten(theta[:, :1]), mean[:, 0], scale[:, 0])  # a shared normaliser, as training has it
+    np.testing.assert_allclose(one.act(0, one.start(seen[0][:, :1]), seen[1][:, :1])[0], alone[:, :1], atol=1e-6)

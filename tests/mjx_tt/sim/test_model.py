@@ -1,0 +1,174 @@
+"""The simulation model: YAML there and back, drawing per episode, and errors that name what is wrong."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+import yaml
+from scipy import stats
+
+from mjx_tt.sim import bounds, model
+from mjx_tt.sim.actuators import JointDrive
+from mjx_tt.sim.model import LATENCIES, BallSpinParams, LatencyParams, ModelFile, Range, SimModel
+
+
+def test_yaml_keeps_every_parameter(tmp_path):
+    """Every leaf gets its own value, so none can be lost or swapped."""
+    values = {}
+    for i, path in enumerate(model.paths()):
+        low, high = np.clip(bounds.of(path), -200.0, 200.0)
+        values[path] = float(low + (0.2 + 0.003 * i) * (high - low))
+    values["ball.flight.integrator"] = "midpoint"
+    ranges = (Range("ball.table.restitution", 0.85, 0.95), Range("latency.abb_action", 0.06, 0.08))
+    file = ModelFile(model.with_values(SimModel(), values), ranges, {"source": "diagnosis of session 3", "gain": 0.12})
+    model.save(tmp_path / "a.yaml", file)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.yaml"]
+    read = model.load(tmp_path / "a.yaml")
+    assert read == file
+    assert model.paths(read.model) == values
+    assert len(values) > 140 and len(set(values.values())) == len(values)
+
+
+def test_every_parameter_has_bounds_and_the_nominal_model_lies_within_them():
+    for path, value in model.paths().items():
+        if not path.endswith("integrator"):
+            low, high = bounds.of(path)
+            assert low <= value <= high and low > -np.inf, path
+
+
+def test_numbers_are_read_as_in_every_other_yaml(tmp_path):
+    (tmp_path / "a.yaml").write_text("sensing: {ball_noise: 1e-3}\n")  # YAML 1.1 would call this text
+    assert model.load(tmp_path / "a.yaml").model.sensing.ball_noise == 0.001
+    (tmp_path / "b.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match=r"b\.yaml: not a text file"):
+        model.load(tmp_path / "b.yaml")
+
+
+def test_what_is_left_out_is_nominal(tmp_path):
+    (tmp_path / "a.yaml").write_text("ball: {table: {restitution: 0.9}}\nsensing:\n  ball_offset_x: 0.01\n")
+    read = model.load(tmp_path / "a.yaml")
+    expected = model.paths() | {"ball.table.restitution": 0.9, "sensing.ball_offset_x": 0.01}
+    assert model.paths(read.model) == expected
+    assert read.randomise == () and read.provenance == {}
+    (tmp_path / "empty.yaml").write_text("")
+    assert model.load(tmp_path / "empty.yaml").model == SimModel()
+
+
+def test_nominal_latencies_are_the_papers():
+    """Means and deviations in ms of the paper's table: ball, ABB and Festo observation, ABB and Festo action."""
+    nominal = LatencyParams()
+    means = [getattr(nominal, name) * 1e3 for name in LATENCIES]
+    deviations = [getattr(nominal, f"{name}_std") * 1e3 for name in LATENCIES]
+    np.testing.assert_allclose(means, [40, 29, 33, 71, 64.5])
+    np.testing.assert_allclose(deviations, [8.2, 8.2, 9.0, 5.7, 11.5])
+
+
+def test_some_drives_of_some_joints_are_enough(tmp_path):
+    text = "drives: {joint_2: {lag: 0.02}, gantry_x: {backlash: 0.001, velocity_gain: 0.9}}\n"
+    (tmp_path / "a.yaml").write_text(text)
+    read = model.load(tmp_path / "a.yaml")
+    given = {"drives.joint_2.lag": 0.02, "drives.gantry_x.backlash": 0.001, "drives.gantry_x.velocity_gain": 0.9}
+    assert model.paths(read.model) == model.paths() | given
+    assert read.model.drives.joint_1 == JointDrive()
+    model.save(tmp_path / "b.yaml", read)
+    assert model.load(tmp_path / "b.yaml") == read
+
+
+def test_a_model_without_drives_stays_without(tmp_path):
+    model.save(tmp_path / "a.yaml", ModelFile(SimModel()))
+    assert "drives" not in yaml.safe_load((tmp_path / "a.yaml").read_text())
+    assert model.load(tmp_path / "a.yaml").model == SimModel() and SimModel().drives is None
+    assert model.paths()["drives.joint_6.lag"] == 0.0
+
+
+@pytest.mark.parametrize("mean", [0.0, 30.0], ids=str)
+def test_spin_is_gaussian_about_its_mean(mean):
+    spin = BallSpinParams(mean_x=mean, mean_y=-5.0, std_x=20.0, std_z=2.0)
+    drawn = np.asarray(model.draw_spin(jax.random.key(2), spin, (50, 80))).reshape(3, -1)
+    assert stats.kstest(drawn[0], stats.norm(mean, 20.0).cdf).pvalue > 1e-3
+    np.testing.assert_array_equal(drawn[1], -5.0)
+    assert stats.kstest(drawn[2], stats.norm(0.0, 2.0).cdf).pvalue > 1e-3
+    assert abs(np.corrcoef(drawn[0], drawn[2])[0, 1]) < 4.5 / np.sqrt(4000)
+    assert model.draw_spin(jax.random.key(2), BallSpinParams(), (50, 80)) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("ball: {table: {restituton: 0.9}}", r"'ball.table.restituton'; did you mean 'ball.table.restitution'\?"),
+        ("zzz: 1", "unknown parameter 'zzz'; known are actuation, ball, ball_spin, drives, latency, sensing"),
+        ("ball: {table: {restitution: high}}", "ball.table.restitution = 'high', a finite number is needed"),
+        ("ball: {table: {restitution: .nan}}", "ball.table.restitution = nan, a finite number is needed"),
+        ("ball: {table: {restitution: true}}", "ball.table.restitution = True, a finite number is needed"),
+        ("ball: {table: {restitution: 93}}", r"ball.table.restitution = 93, allowed is 0 to 1.5 in SI units"),
+        ("sensing: {ball_noise: -1}", r"sensing.ball_noise = -1, allowed is 0 to 0.5"),
+        ("latency: {abb_action: 71}", r"latency.abb_action = 71, allowed is 0 to 1 "),
+        ("drives: {joint_2: {lag: -0.01}}", "drives.joint_2.lag = -0.01, allowed is 0 to 1 "),
+        ("randomise: {ball.flight.mass: [2.6, 2.8]}", "randomise.ball.flight.mass = 2.6, allowed is 0.0001 to 0.1"),
+        ("sensing: {ball_noise: 0.01, ball_noise: 0.02}", "key 'ball_noise' is given twice"),
+        ("ball: {flight: {integrator: rk4}}", r"ball.flight.integrator = 'rk4', allowed are \('paper', 'midpoint'\)"),
+        ("ball: {flight: {integrator: [paper]}}", "ball.flight.integrator = .*allowed are"),
+        ("drives: {joint_7: {lag: 0.02}}", r"'drives.joint_7.lag'; did you mean 'drives.joint_[1-6].lag'"),
+        ("drives: {joint_2: {lagg: 0.02}}", r"'drives.joint_2.lagg'; did you mean 'drives.joint_2.lag'"),
+        ("drives: {joint_2: 0.02}", "drives.joint_2 = 0.02, a mapping of its parameters is needed"),
+        ("ball: 3", "ball = 3, a mapping of its parameters is needed"),
+        ("[1, 2]", "a model is a mapping of parameter groups, got list"),
+        ("ball: [", "not valid YAML"),
+        ("1: {}\n2: 3", "unknown parameter '2'"),
+        ("randomise: {ball.table.restitution: 0.9}", r"ball.table.restitution = 0.9, a range is \[low, high\]"),
+        ("randomise: {ball.table.restitution: [0.9, 0.8]}", "low must not exceed high"),
+        ("randomise: {ball.table.friktion: [0, 1]}", r"randomise.ball.table.friktion: .* 'ball.table.friction'\?"),
+        ("randomise: {ball.flight.integrator: [0, 1]}", "randomise.ball.flight.integrator: unknown parameter"),
+        ("randomise: [1]", r"randomise = \[1\], a mapping is needed"),
+        ("randomise: {1: [0, 1]}", "randomise.1: unknown parameter"),
+        ("provenance: hello", "provenance = 'hello', a mapping is needed"),
+    ],
+)
+def test_mistakes_are_named_with_file_and_key(tmp_path, text, message):
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as error:
+        model.load(path)
+    assert str(error.value).startswith(str(path))
+
+
+def test_an_unknown_path_is_refused():
+    with pytest.raises(ValueError, match=r"'ball.table.restitutio'; did you mean 'ball.table.restitution'\?"):
+        model.with_values(SimModel(), {"ball.table.restitutio": 0.9})
+
+
+def test_ranges_are_drawn_uniformly_and_apart():
+    ranges = (Range("ball.table.restitution", 0.85, 0.95), Range("sensing.ball_offset_x", -0.01, 0.01))
+    drawn = model.draw(jax.random.key(0), SimModel(), ranges, (50, 40))
+    restitution, offset = np.asarray(drawn.ball.table.restitution), np.asarray(drawn.sensing.ball_offset_x)
+    assert restitution.shape == offset.shape == (50, 40)
+    assert stats.kstest(restitution.ravel(), "uniform", (0.85, 0.1)).pvalue > 1e-3
+    assert stats.kstest(offset.ravel(), "uniform", (-0.01, 0.02)).pvalue > 1e-3
+    assert abs(np.corrcoef(restitution.ravel(), offset.ravel())[0, 1]) < 4.5 / np.sqrt(2000)
+    untouched = model.paths() | {"ball.table.restitution": None, "sensing.ball_offset_x": None}
+    assert {k: None if np.ndim(v) else v for k, v in model.paths(drawn).items()} == untouched
+
+
+def test_latencies_are_gaussian_in_seconds_and_cut():
+    nominal = LatencyParams()
+    seconds = np.asarray(model.draw_latencies(jax.random.key(1), nominal, (4000,), 1.0))
+    assert seconds.shape == (5, 4000)
+    for name, values in zip(LATENCIES, seconds):
+        gaussian = stats.norm(getattr(nominal, name), getattr(nominal, f"{name}_std"))
+        assert stats.kstest(values, gaussian.cdf).pvalue > 1e-3
+    assert np.abs(np.corrcoef(seconds) - np.eye(5)).max() < 4.5 / np.sqrt(4000)
+    cut = np.asarray(model.draw_latencies(jax.random.key(1), nominal, (4000,), 0.05))
+    np.testing.assert_array_equal(cut, np.clip(seconds, 0, np.float32(0.05)))
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    """The new content goes to another name first: a write that fails half way destroys nothing."""
+    path = tmp_path / "a.yaml"
+    model.save(path, ModelFile(SimModel()))
+    before = path.read_text()
+    with pytest.raises(yaml.representer.RepresenterError):  # half way through the text
+        model.save(path, ModelFile(SimModel(), provenance={"new": object()}))
+    assert [p.name for p in tmp_path.iterdir()] == ["a.yaml"]
+    assert path.read_text() == before
+    assert yaml.safe_load(before)["provenance"] == {}

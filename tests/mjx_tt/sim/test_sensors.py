@@ -1,0 +1,114 @@
+"""The tracker's errors, each against its closed form or SciPy, in episodes with a ball that flies straight."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from ballmodel.partial_params import without_nominal
+from mjx_tt.sim import model, sensors
+from mjx_tt.sim.model import SensingParams
+from tests.support import scripted_episodes
+from tests.support.scripted_episodes import TICKS, episodes, play, task
+
+T = 1 / 75
+START, VELOCITY = np.array([0.2, 1.2, 0.5]), np.array([0.3, -0.6, 0.1])
+CAMERA = {"camera_scale": 1.01, "camera_rotation_x": 0.02, "camera_rotation_y": -0.03, "camera_rotation_z": 0.05,
+          "camera_distortion": 0.004}  # fmt: skip
+DELAY = 0.05
+# One episode each: what the tracker does in it.
+CASES = (
+    {}, CAMERA, {"smoothing": 0.03}, {"jitter": 0.004}, {"clock_rate": 1.2}, {"clock_rate": 3.0},
+    {"smoothing": 0.001}, CAMERA | {"smoothing": 0.05, "ball_offset_y": 0.01},
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Observed ball (TICKS, 3, P)."""
+    names = {name for case in CASES for name in case}
+    values = {f"sensing.{n}": jnp.array([c.get(n, getattr(SensingParams(), n)) for c in CASES]) for n in names}
+    still_air = {"ball.flight.drag_coefficient": 0.0}
+    with jax.enable_x64(True):
+        simulation = model.with_values(scripted_episodes.model(gravity=0.0), values | still_air)
+        batch = episodes(START, VELOCITY, {"ball_observation": DELAY}, simulation)
+        record = play(task(), batch)
+    assert record.live.all()
+    return record.controller[:, :3]
+
+
+def straight(delay):
+    """The ball (TICKS, 3), which stood still at its start before the episode."""
+    return START + VELOCITY * np.maximum(np.arange(TICKS) * T - delay, 0.0)[:, None]
+
+
+def through_camera(p):
+    """By SciPy: extrinsic turns about the table's x, y, then z axis."""
+    turned = Rotation.from_euler("xyz", [CAMERA[f"camera_rotation_{a}"] for a in "xyz"]).as_matrix()
+    bent = p * (1 + CAMERA["camera_distortion"] * (p**2).sum(axis=-1, keepdims=True))
+    return CAMERA["camera_scale"] * bent @ turned.T
+
+
+def filtered(tau, delay):
+    """By an adaptive solver of df/dt = (p - f) / tau."""
+    times = np.maximum(np.arange(TICKS) * T - delay, 0.0)
+    solution = solve_ivp(
+        lambda t, f: (START + VELOCITY * t - f) / tau, (0, TICKS * T), START, "Radau",
+        dense_output=True, rtol=1e-10, atol=1e-12,
+    )  # fmt: skip
+    return solution.sol(times).T
+
+
+def test_a_nominal_tracker_shows_the_truth(seen):
+    np.testing.assert_allclose(seen[..., 0], straight(DELAY), atol=1e-9)
+
+
+def test_camera_scales_turns_and_bends(seen):
+    np.testing.assert_allclose(seen[..., 1], through_camera(straight(DELAY)), atol=1e-9)
+    assert np.abs(seen[..., 1] - seen[..., 0]).max() > 0.02
+
+
+@pytest.mark.parametrize(("case", "tau"), [(2, 0.03), (6, 0.001)])
+def test_smoothing_is_a_first_order_filter(seen, case, tau):
+    """Between substeps the captured position is interpolated, which the first few milliseconds show."""
+    wanted = filtered(tau, DELAY)
+    np.testing.assert_allclose(seen[..., case], wanted, atol=3e-4)
+    late = np.arange(TICKS) * T > DELAY + 0.1
+    np.testing.assert_allclose(seen[late, :, case], wanted[late], atol=1e-6)
+    # Long after the start it trails a straight ball by its time constant.
+    np.testing.assert_allclose(seen[-1, :, case], straight(DELAY + tau)[-1], atol=1e-6)
+
+
+def test_camera_filter_and_offset_together(seen):
+    wanted = through_camera(filtered(0.05, DELAY)) + np.array([0.0, 0.01, 0.0])
+    np.testing.assert_allclose(seen[..., 7], wanted, atol=3e-4)
+
+
+def test_jitter_is_a_gaussian_error_in_time(seen):
+    error = (seen[..., 3] - seen[..., 0])[np.arange(TICKS) * T > DELAY + T]
+    late = error @ VELOCITY / (VELOCITY @ VELOCITY)
+    np.testing.assert_allclose(error, late[:, None] * VELOCITY, atol=1e-9)  # along the flight and nowhere else
+    assert stats.kstest(late, stats.norm(0.0, 0.004).cdf).pvalue > 1e-3
+    assert abs(np.corrcoef(late[1:], late[:-1])[0, 1]) < 4.5 / np.sqrt(len(late))
+
+
+def test_a_fast_clock_stretches_the_trackers_latency(seen):
+    np.testing.assert_allclose(seen[..., 4], straight(1.2 * DELAY), atol=1e-9)
+    longest = task().config.max_observation_latency
+    assert 3.0 * DELAY > longest
+    np.testing.assert_allclose(seen[..., 5], straight(longest), atol=1e-9)
+
+
+def test_a_tracker_without_errors_is_left_out():
+    left = {name: None for name in (*CAMERA, "smoothing", "jitter", "clock_rate")}
+    assert sensors.camera(replace(SensingParams(), **left)) is None
+    assert without_nominal(SensingParams()) == replace(SensingParams(), **left)
+    one = sensors.camera(without_nominal(SensingParams(camera_scale=1.02)))
+    np.testing.assert_allclose(one.seen(START), 1.02 * START, rtol=1e-6)

@@ -1,0 +1,677 @@
+"""The safety gate under requests, measurements and faults that try to get past it."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_tt.robot import model
+from robot_io.contract import JOINT_NAMES, LIMITS
+from robot_io.errors import RefusedError
+from robot_io.limits import limit_velocity
+from robot_io.safety.clearance import RobotGeometry
+from robot_io.safety.config import SLACK
+from robot_io.safety.faults import Cause, FaultLatch
+from robot_io.safety.gate import SafetyConfig, SafetyGate, State
+
+T = 1 / 75
+LOWER, UPPER, V_MAX, A_MAX, MARGIN = (
+    np.array(getattr(LIMITS, name)) for name in ("lower", "upper", "velocity", "acceleration", "margin")
+)
+STEP, JERK = A_MAX * T, 2 * A_MAX / T
+REST = math.ceil((V_MAX / STEP).max()) + 1  # commands until the fastest joint is at rest
+GEOMETRY = RobotGeometry.load()
+HOME, ZERO = GEOMETRY.home, np.zeros(8)
+MARGINS = np.array([{"table": 0.02, "self": 0.02, "floor": 0.17}[kind] for kind in GEOMETRY.kinds])
+
+
+class Ideal:
+    """A gate and a robot that is always where it is sent, ticking at 75 Hz."""
+
+    def __init__(self, config: SafetyConfig | None = None, position=HOME, arm: bool = True) -> None:
+        self.gate, self.now = SafetyGate(geometry=GEOMETRY, config=config), 100.0
+        self.position, self.velocity = np.array(position, float), np.zeros(8)
+        self.sent: list = []
+        if arm:
+            self.gate.arm(self.position, self.now, ZERO)
+
+    def tick(self, request=ZERO, measured=None):
+        sent = self.gate.command(request, self.position if measured is None else measured, self.velocity, self.now)
+        if np.isfinite(sent.position).all():
+            self.position, self.velocity = sent.position, sent.velocity
+        self.now += T
+        self.sent.append(sent)
+        return sent
+
+    @property
+    def velocities(self):  # (8, ticks), from rest
+        return np.stack([ZERO, *(s.velocity for s in self.sent)], axis=1)
+
+    @property
+    def positions(self):
+        return np.stack([s.position for s in self.sent], axis=1)
+
+
+def keeps_limits(velocities, positions):
+    """velocities (8, ticks, ...) from rest, positions (8, ticks, ...)."""
+    acceleration = np.diff(velocities, axis=1) / T
+    jerk = np.diff(acceleration, axis=1, prepend=np.zeros_like(acceleration[:, :1])) / T
+    column = (slice(None),) + (None,) * (velocities.ndim - 1)
+    for values, bound in ((velocities, V_MAX), (acceleration, A_MAX), (jerk, JERK)):
+        assert (np.abs(values) <= bound[column] * (1 + 1e-9)).all()
+    assert (positions <= (UPPER - MARGIN)[column] + 1e-9).all() and (positions >= (LOWER + MARGIN)[column] - 1e-9).all()
+    return np.abs(jerk).max(axis=tuple(range(1, jerk.ndim))) / JERK
+
+
+# --- a million requests, vectorised: the kinematic limiter
+
+
+def adversarial(kind, ticks, columns, rng):
+    """Requests (ticks, 8, columns)."""
+    shape, v = (ticks, 8, columns), V_MAX[:, None]
+    t = np.arange(ticks)[:, None, None]
+    sign = np.where(rng.random((8, columns)) < 0.5, 1.0, -1.0)
+    if kind == "random":
+        return rng.uniform(-2, 2, shape) * v
+    if kind == "bang_bang":
+        return np.where((t // rng.integers(1, 60, (8, columns))) % 2, 1.0, -1.0) * sign * 2 * v
+    if kind == "resonant":  # half a period to reach full speed and back, and around it
+        half = 2 * V_MAX[:, None] / (A_MAX[:, None] * T) * rng.uniform(0.5, 2.0, (8, columns))
+        return np.where((t // np.maximum(half, 1)) % 2, 1.0, -1.0) * sign * v
+    if kind == "drift":  # slowly into the limits, and along them
+        return np.broadcast_to(sign * v * 10.0 ** rng.uniform(-3, 0, (8, columns)), shape)
+    sizes = np.array([5e-324, 1e-310, -1e-308, 1e308, -1.7e308, 0.0, -0.0])  # "extreme"
+    return rng.choice(sizes, shape)
+
+
+@pytest.mark.parametrize("kind", ["random", "bang_bang", "resonant", "drift", "extreme"])
+def test_two_hundred_thousand_requests_of_each_kind_keep_every_limit(kind):
+    """Position, velocity, acceleration and jerk; and at every tick braking is within them: the limiter leaves the
+    braked velocity as it is, and the joints come to rest inside the range."""
+    ticks, columns = 800, 250
+    requests = adversarial(kind, ticks, columns, np.random.default_rng(0))
+    column, step = np.repeat(HOME[:, None], columns, axis=1), STEP[:, None]
+    velocity, velocities, positions = np.zeros_like(column), [np.zeros_like(column)], []
+    for request in requests:
+        velocity = limit_velocity(request, velocity, column, T)
+        column = column + velocity * T
+        velocities.append(velocity)
+        positions.append(column)
+        braked = velocity - np.clip(velocity, -step, step)
+        np.testing.assert_array_less(np.abs(limit_velocity(braked, velocity, column, T) - braked), 1e-12)
+    speed = np.moveaxis(np.array(velocities[1:]), 0, 1)
+    stop = np.moveaxis(np.array(positions), 0, 1) + np.sign(speed) * braking_distance(np.abs(speed))
+    low, high = (LOWER + MARGIN)[:, None, None], (UPPER - MARGIN)[:, None, None]
+    assert (stop <= high + 1e-9).all() and (stop >= low - 1e-9).all()
+    worst = keeps_limits(np.moveaxis(np.array(velocities), 0, 1), np.moveaxis(np.array(positions), 0, 1))
+    if kind in ("random", "bang_bang", "resonant"):
+        assert (worst > 0.99).all(), "the bound of the jerk is reached: 2 a / T is the smallest there is"
+
+
+def braking_distance(speed):
+    """Way (8, ...) after the present period when the speed falls by a T each period: an arithmetic series."""
+    column = (slice(None),) + (None,) * (speed.ndim - 1)
+    n = np.floor(speed / STEP[column] * (1 + 1e-12))
+    return T * (n * speed - STEP[column] * n * (n + 1) / 2)
+
+
+# --- thousands of requests through the whole gate
+
+
+def attack(position, rng):
+    """The velocity (8,) that makes the smallest gap over its margin fall the fastest, every joint at its full speed."""
+    q = position[:, None] + 1e-5 * np.concatenate([np.eye(8), -np.eye(8)], axis=1)
+    gaps = GEOMETRY.gaps(q) - MARGINS[:, None]
+    row = GEOMETRY.gaps(position[:, None])[:, 0] - MARGINS
+    row = int(row.argmin()) if rng.random() < 0.8 else int(rng.integers(len(row)))
+    slope = gaps[row, :8] - gaps[row, 8:]
+    return np.where(np.abs(slope) > 1e-12, -np.sign(slope), rng.choice([-1.0, 1.0], 8)) * V_MAX
+
+
+def adversary(rng):
+    """Requests by position, changing their mind at random: attacks, bang-bang, wandering, drift."""
+    while True:
+        kind, ticks = rng.integers(4), rng.integers(5, 60)
+        held = rng.choice([-2.0, 2.0], 8) * V_MAX
+        speed = rng.uniform(0.02, 1.0)
+        position = yield held
+        for _ in range(ticks):
+            request = (attack(position, rng), held, rng.uniform(-1, 1, 8) * V_MAX, 0.05 * attack(position, rng))[kind]
+            position = yield request * (speed if kind == 0 else 1.0)
+
+
+class Distances:
+    """MuJoCo's own distances of what the gate watches."""
+
+    def __init__(self) -> None:
+        self.model = model.load_model()
+        self.data = mujoco.MjData(self.model)
+        names = [row.replace("the table", "col_table").replace("the ", "").split(" to ") for row in GEOMETRY.rows]
+        self.pairs = [tuple(self.model.geom(n).id for n in pair) for pair in names]
+
+    def least(self, position):
+        """Smallest distance over its margin [m]."""
+        self.data.qpos[:] = position
+        mujoco.mj_kinematics(self.model, self.data)
+        distances = [mujoco.mj_geomDistance(self.model, self.data, *pair, 3.0, None) for pair in self.pairs]
+        return (np.array(distances) - MARGINS).min()
+
+
+@pytest.fixture(scope="module")
+def distances():
+    return Distances()
+
+
+@pytest.fixture(scope="module")
+def attacked():
+    """Eight robots under attack for 300 ticks each."""
+    robots = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        player, ideal = adversary(rng), Ideal()
+        request = next(player)
+        for _ in range(300):
+            ideal.tick(request)
+            request = player.send(ideal.position)
+        assert ideal.gate.state is State.ARMED
+        robots.append(ideal)
+    return robots
+
+
+def test_attacks_keep_every_limit_and_are_stopped_by_every_rule(attacked):
+    for ideal in attacked:
+        keeps_limits(ideal.velocities, ideal.positions)
+    changed = [name for ideal in attacked for sent in ideal.sent for name in sent.changed]
+    for name in ("velocity", "acceleration", "position", "clearance"):
+        assert changed.count(name) > 100
+
+
+def test_attacks_keep_the_margins_by_mujocos_distances(attacked, distances):
+    """At every tick and at two places between ticks; they come as close as allowed."""
+    closest = np.inf
+    for ideal in attacked:
+        before = HOME
+        for sent in ideal.sent:
+            for share, allowed in ((1 / 3, SLACK), (2 / 3, SLACK), (1.0, 0.0)):
+                gap = distances.least(before + share * (sent.position - before))
+                assert gap > -allowed - 1e-6
+                closest = min(closest, gap)
+            before = sent.position
+    assert closest < 0.002
+
+
+def test_without_the_look_ahead_the_same_attack_ends_in_contact(distances):
+    """So these attacks are some, and the margins are kept by the gate."""
+    rng = np.random.default_rng(0)
+    player, position, velocity = adversary(rng), HOME, ZERO
+    request, deepest = next(player), np.inf
+    for _ in range(300):
+        velocity = limit_velocity(request, velocity, position, T)
+        position = position + velocity * T
+        deepest = min(deepest, distances.least(position))
+        request = player.send(position)
+    assert deepest < -0.05
+
+
+def test_braking_from_every_accepted_state_is_safe_and_allowed(attacked, distances):
+    """Braking is played out from states on the attacked robots' ways: inside all limits, and clear by MuJoCo's
+    distances at every tick and half way between ticks."""
+    rng = np.random.default_rng(0)
+    for ideal in attacked:
+        for i in rng.integers(0, len(ideal.sent), 15):
+            position, velocity = ideal.sent[i].position, ideal.sent[i].velocity
+            for _ in range(REST):
+                braked = np.sign(velocity) * np.maximum(np.abs(velocity) - STEP, 0.0)
+                np.testing.assert_allclose(limit_velocity(braked, velocity, position, T), braked, atol=1e-12)
+                half, position, velocity = position + 0.5 * T * braked, position + braked * T, braked
+                assert distances.least(half) > -SLACK - 1e-6 and distances.least(position) > -1e-6
+            assert not velocity.any()
+
+
+def test_in_free_space_the_gate_is_the_simulations_limiter_bit_for_bit():
+    rng = np.random.default_rng(3)
+    for _ in range(10):
+        ideal, velocity, reference = Ideal(), ZERO, HOME
+        for tick in range(40):
+            if tick % 7 == 0:
+                request = rng.uniform(-1.5, 1.5, 8) * V_MAX * [1, 1, 0.3, 0.1, 0.1, 1, 0.5, 1]
+            velocity = limit_velocity(request, velocity, reference, T)
+            reference = reference + velocity * T
+            sent = ideal.tick(request)
+            np.testing.assert_array_equal(sent.velocity, velocity)
+            np.testing.assert_array_equal(sent.position, reference)
+            assert "clearance" not in sent.changed
+
+
+def test_what_was_changed_is_told():
+    ideal = Ideal()
+    assert ideal.tick(0.5 * STEP).changed == ()
+    assert ideal.tick(0.5 * STEP + 1.1 * STEP).changed == ("acceleration",)
+    assert ideal.tick(3 * V_MAX).changed == ("velocity", "acceleration")
+    assert ideal.tick(-np.eye(8)[0] * V_MAX).changed == ("acceleration",)
+
+
+def test_speed_scale_slows_requests_and_limits():
+    ideal = Ideal(SafetyConfig(speed_scale=0.1))
+    sent = ideal.tick(2 * STEP)
+    np.testing.assert_allclose(sent.velocity, 0.2 * STEP)
+    assert sent.changed == ("speed_scale",)
+    for _ in range(20):
+        sent = ideal.tick([5.0, 0, 0, 0, 0, 0, 0, 0])
+    assert sent.velocity[0] == pytest.approx(0.1 * V_MAX[0]) and sent.changed == ("speed_scale", "velocity")
+
+
+# --- arming
+
+
+def test_nothing_moves_before_arming():
+    rng = np.random.default_rng(0)
+    ideal = Ideal(arm=False)
+    for _ in range(200):
+        measured = HOME + rng.uniform(-0.1, 0.1, 8)
+        sent = ideal.tick(rng.uniform(-2, 2, 8) * V_MAX, measured)
+        assert not sent.velocity.any() and sent.state is State.DISARMED and sent.changed == ("disarmed",)
+        np.testing.assert_array_equal(sent.position, measured)
+    sent = ideal.tick(V_MAX, np.full(8, np.nan))
+    np.testing.assert_array_equal(sent.position, measured)  # the last that was known
+    assert not sent.velocity.any() and not ideal.gate.faults and Cause.NON_FINITE_FEEDBACK in ideal.gate.present
+
+
+def changed_home(joint, value):
+    return np.where(np.arange(8) == joint, value, HOME)
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity", "message"),
+    [
+        (changed_home(3, UPPER[3]), ZERO, r"joint_2 is at 1.9199, allowed is \[.*, 1.90\d+\] rad; jog it back"),
+        (changed_home(0, -2.0), ZERO, "gantry_x is at -2.0000, allowed is"),
+        (changed_home(7, np.nan), ZERO, "measured position: joint_6 is nan"),
+        (changed_home(7, np.inf), ZERO, "measured position: joint_6 is inf"),
+        (HOME[:6], ZERO, r"measured position is float64 \(6,\), needed are 8 real numbers"),
+        (["a"] * 8, ZERO, "needed are 8 real numbers"),
+        (HOME, np.eye(8)[2], "joint_1 1, allowed is 0.05 rad/s, it must be at rest"),
+        (HOME, np.nan * ZERO, "measured velocity: gantry_x is nan"),
+        (HOME, None, "no measured velocity yet"),
+        (np.array([0, 0.4, 0, 1.6, 0, 0, 0.1, 0]), ZERO, "col_.* to the table: -.* m; jog it away"),
+    ],
+)
+def test_arming_is_refused(position, velocity, message):
+    ideal = Ideal(arm=False)
+    with pytest.raises(RefusedError, match=message):
+        ideal.gate.arm(position, 0.0, velocity)
+    assert ideal.gate.state is State.DISARMED and not ideal.tick(V_MAX).velocity.any()
+
+
+def test_arming_is_refused_while_armed_moving_faulty_or_pressed():
+    ideal = Ideal()
+    with pytest.raises(RefusedError, match="armed or still stopping"):
+        ideal.gate.arm(HOME, 0.0, ZERO)
+    ideal.tick(V_MAX)
+    ideal.gate.brake(ideal.now)
+    with pytest.raises(RefusedError, match="still stopping"):
+        ideal.gate.arm(HOME, 0.0, ZERO)
+    with pytest.raises(RefusedError, match="still moves"):
+        ideal.gate.disarm(ideal.now)
+    ideal.gate.fault(Cause.OPERATOR, "asked to", ideal.now)
+    with pytest.raises(RefusedError, match="cannot reset: it still moves"):
+        ideal.gate.reset(ideal.now)
+    with pytest.raises(RefusedError, match="OPERATOR at .* asked to; reset it first"):
+        ideal.gate.arm(HOME, 0.0, ZERO)
+    pressed = Ideal(arm=False)
+    pressed.gate.condition(Cause.ARM_NOT_READY, True, "motors are off", 0.0)
+    with pytest.raises(RefusedError, match="not armed: ARM_NOT_READY: motors are off"):
+        pressed.gate.arm(HOME, 0.0, ZERO)
+    pressed.gate.condition(Cause.ARM_NOT_READY, False, "", 0.0)
+    pressed.gate.arm(HOME, 0.0, ZERO)
+
+
+def test_a_joint_a_little_inside_its_margin_is_led_out_of_it():
+    """A fifth of a T^2 beyond the limiter's margin: armed, and within the acceleration limit brought back."""
+    start = HOME.copy()
+    start[[0, 7]] = (UPPER - MARGIN + 0.2 * STEP * T)[[0, 7]]
+    ideal = Ideal(position=start)
+    for _ in range(5):
+        ideal.tick()
+    assert (ideal.position <= UPPER - MARGIN + 1e-9).all()
+    assert (np.abs(np.diff(ideal.velocities, axis=1)) <= STEP[:, None] * (1 + 1e-9)).all()
+
+
+def test_braking_holds_and_can_be_armed_again():
+    ideal = Ideal()
+    for _ in range(8):
+        ideal.tick([1.5, 0, 0, 0, 0, 0, 0, 2.0])
+    ideal.gate.brake(ideal.now)
+    for _ in range(REST):
+        sent = ideal.tick(V_MAX)
+        assert sent.state is State.STOPPING and sent.changed == ("stopping",)
+    assert ideal.gate.at_rest and not sent.velocity.any()
+    keeps_limits(ideal.velocities, ideal.positions)
+    held = sent.position
+    np.testing.assert_array_equal(ideal.tick(V_MAX).position, held)
+    ideal.gate.arm(held, ideal.now)
+    assert ideal.tick(0.1 * STEP).velocity.any()
+
+
+# --- inside a margin
+
+
+def test_inside_a_margin_only_motion_out_of_it_passes():
+    """Armed 1 cm above the table: no request brings it down, one upwards brings it out, and then the margin is kept."""
+    low, high = 0.0, 1.5
+    for _ in range(50):
+        q = np.array([0.0, 0.45, 0.0, 0.5 * (low + high), 0.0, 0.0, 0.1, 0.0])
+        low, high = (q[3], high) if GEOMETRY.gaps(q[:, None]).min() > 0.01 else (low, q[3])
+    ideal, rng = Ideal(position=q), np.random.default_rng(0)
+
+    def gap():
+        return GEOMETRY.gaps(ideal.position[:, None])[:, 0].min()
+
+    before = start = gap()
+    assert 0.0099 < start < 0.0101
+    for _ in range(40):
+        sent = ideal.tick(attack(ideal.position, rng))
+        assert gap() >= before - 1e-12
+        assert "escape" in sent.changed and (np.abs(sent.velocity) <= 0.05 * V_MAX + 1e-12).all()
+        assert sent.velocity.any() <= (gap() > before)
+        before = gap()
+    assert not ideal.tick(np.eye(8)[0]).velocity.any() and gap() == before  # along the table is not out of it
+    up = np.array([0, 0, 0, -1.0, 0, 0, 0, 0]) * V_MAX
+    for _ in range(60):
+        ideal.tick(up)
+    assert gap() > 0.02 and ideal.velocities[3].min() < -0.3 * V_MAX[3]  # fast again once it is out
+    for _ in range(60):
+        ideal.tick(attack(ideal.position, rng))
+        assert gap() > 0.02 - 1e-9
+
+
+# --- faults
+
+
+def bad_request(value):
+    return lambda ideal: ideal.tick(changed_home(5, value))
+
+
+EVENTS = {  # what makes each cause, of a robot at Ideal; those that last end with the next good tick unless they stay
+    Cause.NON_FINITE_COMMAND: bad_request(np.nan),
+    Cause.MALFORMED_COMMAND: lambda ideal: ideal.tick(np.zeros(7)),
+    Cause.NON_FINITE_FEEDBACK: lambda ideal: ideal.tick(ZERO, np.full(8, np.inf)),
+    Cause.LIMIT: lambda ideal: ideal.tick(ZERO, changed_home(2, 3.0)),
+    Cause.CLEARANCE: lambda ideal: ideal.tick(ZERO, np.array([0, 0.4, 0, 1.6, 0, 0, 0.1, 0])),
+    Cause.ESTOP: lambda ideal: ideal.gate.estop(True, ideal.now),
+    Cause.AXIS_LOST: lambda ideal: ideal.gate.condition(Cause.AXIS_LOST, True, "no answer", ideal.now),
+    Cause.ARM_NOT_READY: lambda ideal: ideal.gate.condition(Cause.ARM_NOT_READY, True, "motors are off", ideal.now),
+    Cause.INTERNAL: lambda ideal: ideal.gate.fault(Cause.INTERNAL, "made up", ideal.now),
+    Cause.OPERATOR: lambda ideal: ideal.gate.fault(Cause.OPERATOR, "asked to", ideal.now),
+    Cause.STALE_ARM: lambda ideal: ideal.gate.check(ideal.now, 0.06, 0, 0, True, 0),
+    Cause.STALE_AXES: lambda ideal: ideal.gate.check(ideal.now, 0, np.inf, 0, True, 0),
+    Cause.STALE_TRACKER: lambda ideal: ideal.gate.check(ideal.now, 0, 0, np.nan, True, 0),
+}
+ENDS = {
+    Cause.ESTOP: lambda ideal: ideal.gate.estop(False, ideal.now),
+    Cause.AXIS_LOST: lambda ideal: ideal.gate.condition(Cause.AXIS_LOST, False, "", ideal.now),
+    Cause.ARM_NOT_READY: lambda ideal: ideal.gate.condition(Cause.ARM_NOT_READY, False, "", ideal.now),
+    **{c: lambda ideal: ideal.gate.check(ideal.now, 0, 0, 0, True, 0)
+       for c in (Cause.STALE_ARM, Cause.STALE_AXES, Cause.STALE_TRACKER)},
+}  # fmt: skip
+
+
+def test_a_thousand_random_fault_sequences():
+    """A few ticks of motion, a fault, others while it brakes: the first stays the cause, all are listed, every joint is
+    at rest within v / a and stays there, no limit is passed on the way, and no reset works before the causes are
+    gone."""
+    rng = np.random.default_rng(0)
+    causes = list(EVENTS)
+    for _ in range(1000):
+        ideal = Ideal()
+        request = rng.uniform(-1, 1, 8) * V_MAX * rng.choice([0.2, 1.0])
+        for _ in range(rng.integers(1, 8)):
+            ideal.tick(request)
+        assert ideal.gate.state is State.ARMED
+        sequence = [causes[i] for i in rng.permutation(len(causes))[: rng.integers(1, 4)]]
+        speed = np.abs(ideal.gate.velocity)
+        sent_before = len(ideal.sent)
+        started = ideal.now
+        for cause in sequence:
+            EVENTS[cause](ideal)
+            assert ideal.gate.state is State.FAULT
+            if rng.random() < 0.5:
+                ideal.tick(request)
+        while len(ideal.sent) - sent_before < math.ceil((speed / STEP).max()):
+            ideal.tick(request)
+        assert ideal.gate.at_rest and not ideal.tick(request).velocity.any()
+        keeps_limits(ideal.velocities, ideal.positions)
+        braking = np.abs(ideal.velocities[:, sent_before:])
+        wanted = np.maximum(speed[:, None] - STEP[:, None] * np.arange(braking.shape[1]), 0.0)
+        np.testing.assert_allclose(braking, wanted, atol=1e-12)
+        assert [fault.cause for fault in ideal.gate.faults] == sequence
+        assert all(started <= fault.time <= ideal.now and fault.sentence for fault in ideal.gate.faults)
+        lasting = [cause for cause in sequence if cause in ENDS]
+        if lasting:
+            with pytest.raises(RefusedError, match=f"cannot reset while a cause is present.*{lasting[-1].name}"):
+                ideal.gate.reset(ideal.now)
+            assert [fault.cause for fault in ideal.gate.faults] == sequence
+        for cause in lasting:
+            ENDS[cause](ideal)
+        ideal.gate.reset(ideal.now)
+        assert ideal.gate.state is State.DISARMED and not ideal.gate.faults
+        assert not ideal.tick(V_MAX).velocity.any()
+        ideal.gate.arm(ideal.position, ideal.now)
+
+
+@pytest.mark.parametrize(
+    ("request_", "cause", "message"),
+    [
+        (changed_home(5, np.nan), Cause.NON_FINITE_COMMAND, "requested velocity: joint_4 is nan"),
+        (changed_home(0, -np.inf), Cause.NON_FINITE_COMMAND, "gantry_x is -inf"),
+        (changed_home(6, 1e-310), Cause.MALFORMED_COMMAND, "joint_5 is 1e-310, a subnormal number"),
+        (changed_home(6, 1e-40).astype(np.float32), Cause.MALFORMED_COMMAND, "joint_5 is .*, a subnormal number"),
+        (np.zeros((8, 1)), Cause.MALFORMED_COMMAND, r"float64 \(8, 1\), needed are 8 real numbers"),
+        (np.zeros(9), Cause.MALFORMED_COMMAND, r"\(9,\)"),
+        (np.zeros(8, complex), Cause.MALFORMED_COMMAND, "complex128"),
+        (None, Cause.MALFORMED_COMMAND, "object"),
+        ("12345678", Cause.MALFORMED_COMMAND, r"\(\)"),
+        ([[1, 2], [3]], Cause.MALFORMED_COMMAND, "requested velocity is not an array"),
+    ],
+)
+def test_a_request_that_is_no_velocity_brakes(request_, cause, message):
+    ideal = Ideal()
+    for _ in range(5):
+        ideal.tick(0.5 * V_MAX)
+    before = ideal.gate.velocity
+    sent = ideal.tick(request_)
+    np.testing.assert_allclose(np.abs(sent.velocity), np.maximum(np.abs(before) - STEP, 0.0))
+    assert sent.state is State.FAULT and sent.changed == ("fault",)
+    (fault,) = ideal.gate.faults
+    assert fault.cause is cause and fault.time == pytest.approx(ideal.now - T)
+    assert re.search(message, fault.sentence)
+    for _ in range(REST):
+        sent = ideal.tick(request_)
+    assert not sent.velocity.any()
+    with pytest.raises(RefusedError, match=cause.name):
+        ideal.gate.reset(ideal.now)
+    ideal.tick(ZERO)
+    ideal.gate.reset(ideal.now)
+
+
+def test_integers_and_single_precision_are_velocities():
+    ideal = Ideal()
+    ideal.tick([0] * 8)
+    ideal.tick(np.full(8, 0.01, np.float32))
+    assert ideal.gate.state is State.ARMED and ideal.sent[-1].velocity.dtype == np.float64
+
+
+class Delayed(Ideal):
+    """A robot that does what it was told ``delay`` ticks ago; joints listed as stuck stay where they are."""
+
+    def __init__(self, delay, stuck=(), **kwargs) -> None:
+        super().__init__(**kwargs)
+        self.delay, self.free = delay, np.array([name not in stuck for name in JOINT_NAMES])
+
+    def tick(self, request=ZERO, measured=None):
+        old = self.sent[-self.delay].position if len(self.sent) >= self.delay else HOME
+        self.velocity = ZERO
+        sent = super().tick(request, np.where(self.free, old, HOME))
+        self.velocity = ZERO
+        return sent
+
+
+def test_the_known_delay_is_no_following_error():
+    for delay in (1, 5, 8, 12):
+        ideal = Delayed(delay)
+        for tick in range(200):
+            ideal.tick(V_MAX * [0.5, 0.5, 1, 0.1, 0.1, 1, 0.5, 1] * np.sign(np.sin(tick / 7)))
+        assert ideal.gate.state is State.ARMED
+
+
+@pytest.mark.parametrize("joint", [0, 2, 7])
+def test_a_joint_that_does_not_follow_is_a_fault(joint):
+    ideal = Delayed(7, stuck=(JOINT_NAMES[joint],))
+    request = 0.5 * V_MAX * np.eye(8)[joint]
+    while ideal.gate.state is State.ARMED and len(ideal.sent) < 60:
+        ideal.tick(request)
+    (fault,) = ideal.gate.faults
+    assert fault.cause is Cause.FOLLOWING_ERROR and JOINT_NAMES[joint] in fault.sentence
+    assert fault.time - 100.0 < 0.5
+    for _ in range(REST):
+        ideal.tick(request)
+    ideal.gate.reset(ideal.now)  # an event: over when it has happened
+    ideal.gate.arm(HOME, ideal.now, ZERO)
+
+
+def test_measured_speed_far_above_its_limit_is_a_fault():
+    ideal = Ideal()
+    ideal.velocity = np.array([0, 0, 0, 0, 0, 0, 0, 1.6 * V_MAX[7]])
+    ideal.tick()
+    assert ideal.gate.faults[0].cause is Cause.LIMIT and "joint_6" in ideal.gate.faults[0].sentence
+
+
+# --- watchdogs and time
+
+FRESH = dict(arm_age=0.0, axes_age=0.0, tracker_age=0.0, ball_in_play=True, policy_age=0.0)
+
+
+@pytest.mark.parametrize(
+    ("age", "cause", "allowed"),
+    [
+        ("arm_age", Cause.STALE_ARM, 0.05),
+        ("axes_age", Cause.STALE_AXES, 0.05),
+        ("tracker_age", Cause.STALE_TRACKER, 0.035),
+        ("policy_age", Cause.STALE_POLICY, 0.05),
+    ],
+)
+def test_silence_is_a_fault(age, cause, allowed):
+    for value in (1.01 * allowed, math.inf, math.nan):
+        ideal = Ideal()
+        ideal.now += 10.0  # armed long ago
+        ideal.gate.check(ideal.now, **(FRESH | {age: 0.99 * allowed}))
+        assert ideal.gate.state is State.ARMED
+        ideal.gate.check(ideal.now, **(FRESH | {age: value}))
+        assert [f.cause for f in ideal.gate.faults] == [cause]
+        assert f"allowed is {allowed} s" in ideal.gate.faults[0].sentence
+
+
+def test_a_silent_tracker_without_a_ball_and_a_policy_before_arming_are_none():
+    ideal = Ideal()
+    ideal.gate.check(ideal.now, **(FRESH | dict(tracker_age=math.inf, ball_in_play=False)))
+    ideal.gate.check(ideal.now + 0.04, **(FRESH | dict(policy_age=5.0)))  # armed 0.04 s ago
+    assert ideal.gate.state is State.ARMED
+    ideal.gate.check(ideal.now + 0.06, **(FRESH | dict(policy_age=5.0)))
+    assert ideal.gate.faults[0].cause is Cause.STALE_POLICY
+    ideal.gate.check(ideal.now + 0.07, **(FRESH | dict(policy_age=5.0)))
+    ideal.gate.reset(ideal.now + 0.08)  # no policy has to run while nothing is armed
+
+
+def test_devices_that_are_not_there_yet_are_no_fault_but_nothing_is_armed():
+    ideal = Ideal(arm=False)
+    ideal.gate.check(ideal.now, **(FRESH | dict(arm_age=math.inf)))
+    assert ideal.gate.state is State.DISARMED
+    with pytest.raises(RefusedError, match="STALE_ARM: nothing heard from the arm's controller for inf s"):
+        ideal.gate.arm(HOME, ideal.now, ZERO)
+    ideal.gate.estop(True, ideal.now)  # the one condition that latches at all times
+    assert ideal.gate.state is State.FAULT
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([0.0, T, T + 0.06], "0.060 s between two commands, allowed is 0.05 s"),
+        ([0.0, T, 0.5 * T], "time went back by 0.0067 s"),
+        ([0.0, T, math.nan], "the time is nan"),
+        ([0.1 * T * i for i in range(5)], "commands come faster than every 0.01333 s"),
+    ],
+)
+def test_commands_out_of_time_are_a_fault(times, message):
+    ideal = Ideal()
+    for time in times:
+        assert ideal.gate.state is State.ARMED
+        ideal.gate.command(0.1 * STEP, ideal.gate.reference, ZERO, 100.0 + time)
+    assert ideal.gate.faults[0].cause is Cause.TIMING and message in ideal.gate.faults[0].sentence
+
+
+def test_late_ticks_that_catch_up_are_none():
+    ideal, rng = Ideal(), np.random.default_rng(0)
+    for i in range(300):
+        late = rng.choice([0.0, 0.004, 0.013])
+        ideal.gate.command(ZERO, HOME, ZERO, 100.0 + i * T + late)
+    assert ideal.gate.state is State.ARMED
+
+
+# --- the rest
+
+
+def test_a_mistake_of_the_gate_itself_brakes(monkeypatch):
+    """Of any kind: what raises, and what lets too much pass."""
+    for wrong in (lambda *_: 1 / 0, lambda wanted, braked: (braked + 2.1 * STEP, ())):
+        ideal = Ideal()
+        for _ in range(5):
+            ideal.tick(0.5 * V_MAX)
+        before = ideal.gate.velocity
+        monkeypatch.setattr(ideal.gate, "_allowed", wrong)
+        sent = ideal.tick(ZERO)
+        np.testing.assert_allclose(np.abs(sent.velocity), np.maximum(np.abs(before) - STEP, 0.0))
+        assert [f.cause for f in ideal.gate.faults] == [Cause.INTERNAL]
+
+
+def test_what_was_sent_is_the_callers_own():
+    ideal = Ideal()
+    sent = ideal.tick(STEP)
+    expected = sent.position.copy()
+    sent.position[:], sent.velocity[:] = 1e3, 1e3
+    np.testing.assert_array_equal(ideal.gate.reference, expected)
+
+
+def test_latch_keeps_the_first_cause_and_lists_the_others():
+    latch = FaultLatch()
+    assert not latch and latch.first is None
+    latch.event(Cause.LIMIT, "one", 1.0)
+    latch.condition(Cause.ESTOP, True, "two", 2.0)
+    latch.event(Cause.LIMIT, "again", 3.0)
+    latch.condition(Cause.STALE_ARM, True, "noted", 4.0, latch=False)
+    assert [(f.cause, f.time, f.sentence) for f in latch.all] == [(Cause.LIMIT, 1.0, "one"), (Cause.ESTOP, 2.0, "two")]
+    assert str(latch.first) == "LIMIT at 1.000 s: one"
+    with pytest.raises(RefusedError, match="ESTOP: two; STALE_ARM: noted"):
+        latch.reset()
+    latch.condition(Cause.ESTOP, False, "", 5.0)
+    latch.condition(Cause.STALE_ARM, False, "", 5.0)
+    assert len(latch.all) == 2
+    latch.reset()
+    assert not latch
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        dict(speed_scale=0.0), dict(speed_scale=1.5), dict(table_margin=-0.01), dict(self_margin=math.nan),
+        dict(late=0.0), dict(stale_arm=math.inf), dict(still=(1.0,) * 7), dict(following_error=(-1.0,) * 8),
+        dict(delay=(0.2, 0.1)),
+    ],
+)  # fmt: skip
+def test_a_wrong_configuration_is_refused(wrong):
+    with pytest.raises(ValueError, match=f"SafetyConfig.{next(iter(wrong))} is"):
+        replace(SafetyConfig(), **wrong)

@@ -1,0 +1,9 @@
+"""Places that the tests read from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]  # the repository
+DATA = ROOT.parent / "shared" / "data"  # measured balls, which are not part of the repository
+SCENE = ROOT / "mjx_tt" / "assets" / "scene.xml"
