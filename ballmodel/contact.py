@@ -101,9 +101,14 @@ def paddle_impact(params: PaddleParams, velocity, spin, normal, paddle_velocity,
     The arm is so much heavier than the ball (60 kg to 2.7 g) that the paddle keeps its speed.
     """
     return _apply(
-        velocity, spin, normal, paddle_velocity, radius, lambda s: restitution_at(params, s),
+        velocity,
+        spin,
+        normal,
+        paddle_velocity,
+        radius,
+        lambda s: restitution_at(params, s),
         lambda e, normal_speed, slip_speed: params.tangential_gain,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -115,9 +120,7 @@ class Box:
 
 
 TABLE = Box((0.0, 0.0, -c.TABLE_THICKNESS / 2), (c.TABLE_WIDTH / 2, c.TABLE_LENGTH / 2, c.TABLE_THICKNESS / 2))
-NET = Box(
-    (0.0, 0.0, c.NET_HEIGHT / 2), (c.TABLE_WIDTH / 2 + c.NET_OVERHANG, c.NET_THICKNESS / 2, c.NET_HEIGHT / 2)
-)
+NET = Box((0.0, 0.0, c.NET_HEIGHT / 2), (c.TABLE_WIDTH / 2 + c.NET_OVERHANG, c.NET_THICKNESS / 2, c.NET_HEIGHT / 2))
 
 
 class Frame(NamedTuple):
@@ -151,9 +154,7 @@ def surface_frame(surface: SurfaceParams) -> Frame | None:
     nz = 1.0 / jnp.sqrt(1.0 + a * a + b * b)
     nx, ny = -a * nz, -b * nz
     s = 1.0 / (1.0 + nz)
-    return Frame(
-        Vec(1.0 - nx * nx * s, -nx * ny * s, -nx), Vec(-nx * ny * s, 1.0 - ny * ny * s, -ny), Vec(nx, ny, nz)
-    )
+    return Frame(Vec(1.0 - nx * nx * s, -nx * ny * s, -nx), Vec(-nx * ny * s, 1.0 - ny * ny * s, -ny), Vec(nx, ny, nz))
 
 
 def elevation(surface: SurfaceParams, position):

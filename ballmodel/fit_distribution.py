@@ -72,7 +72,5 @@ def fit_human(
         raise ValueError(f"{measured.source}: none of {towards.size} balls lands on the robot's side: {outcomes}")
     landed, landing = jax.tree.map(lambda a: a[:, good], state), np.asarray(thrown.landing)[:, good]
     distribution, outliers = fit_distribution(landed, landing, eps, min_samples, name, measured.source)
-    report = HumanReport(
-        len(measured), too_short, int((~towards).sum()), outcomes, landed, landing, rms, outliers
-    )
+    report = HumanReport(len(measured), too_short, int((~towards).sum()), outcomes, landed, landing, rms, outliers)
     return distribution, report

@@ -166,9 +166,15 @@ def _levenberg_marquardt(flight, x0, v0, spin, steps, measured, mask, huber):
 
     cost, normal, right = linearise(x0, v0)
     carry = {
-        "x0": x0, "v0": v0, "cost": cost, "normal": normal, "right": right,
-        "damping": jnp.full_like(cost, 1e-6), "converged": cost < 0.0, "iteration": jnp.zeros((), jnp.int32),
-    }  # fmt: skip
+        "x0": x0,
+        "v0": v0,
+        "cost": cost,
+        "normal": normal,
+        "right": right,
+        "damping": jnp.full_like(cost, 1e-6),
+        "converged": cost < 0.0,
+        "iteration": jnp.zeros((), jnp.int32),
+    }
     carry = jax.lax.while_loop(unfinished, iterate, carry)
     x0, v0 = carry["x0"], carry["v0"]
     residual = measured - _shape(flight, v0, spin, steps) - x0[:, None]

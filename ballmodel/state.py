@@ -24,7 +24,9 @@ def ball_state(position, velocity, spin=None) -> BallState:
     spin = jnp.zeros_like(velocity) if spin is None else jnp.asarray(spin)
     for name, value in (("position", position), ("velocity", velocity), ("spin", spin)):
         if value.ndim < 1 or value.shape[0] != 3 or value.shape != position.shape:
-            raise ValueError(f"{name} has shape {value.shape}; position, velocity and spin must share one shape (3, ...)")
+            raise ValueError(
+                f"{name} has shape {value.shape}; position, velocity and spin must share one shape (3, ...)"
+            )
     return BallState(position, velocity, spin)
 
 

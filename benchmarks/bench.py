@@ -53,9 +53,14 @@ class Sizes:
 
 FULL = Sizes()
 QUICK = Sizes(
-    rounds=3, fused=(768, 1, 100), mjx=(256, 1, 40), rollout=(256, 100), pybullet=4_000,
-    scaling=((2, 15), (20, 15)), ticks=20,
-)  # fmt: skip
+    rounds=3,
+    fused=(768, 1, 100),
+    mjx=(256, 1, 40),
+    rollout=(256, 100),
+    pybullet=4_000,
+    scaling=((2, 15), (20, 15)),
+    ticks=20,
+)
 TRAINED = Path("runs/quickstart")  # measured too when it is there
 
 
@@ -135,7 +140,8 @@ def measure_update(sizes: Sizes, cores: list[int]) -> dict:
         asked["trained_policy"] = (None, dict(changes=[*scale, f"initial_policy={TRAINED}"], devices=n))
     with ExitStack() as stack:
         sides = {
-            name: [stack.enter_context(Worker("update", cpus, **arguments))] for name, (cpus, arguments) in asked.items()
+            name: [stack.enter_context(Worker("update", cpus, **arguments))]
+            for name, (cpus, arguments) in asked.items()
         }
         for (worker,) in sides.values():
             worker.wait_ready()
@@ -202,8 +208,9 @@ def show(report: dict, console: Console) -> None:
     console.print(table)
     console.print(
         f"all devices against one device on one core: {report['devices_speedup']:.2f} x; "
-        f"peak memory {report['peak_memory_mb']:,.0f} MB", highlight=False,
-    )  # fmt: skip
+        f"peak memory {report['peak_memory_mb']:,.0f} MB",
+        highlight=False,
+    )
 
     table = _table("Parts of a control step, one core", "part", "calls", "ns per episode", "share")
     for row in report["breakdown"]:
@@ -213,9 +220,12 @@ def show(report: dict, console: Console) -> None:
     table = _table("Batch", "episodes", "update [s]", "roll-outs [s]", "us per episode", "peak memory [MB]")
     for row in report["batch_scaling"]:
         table.add_row(
-            f"{row['episodes']:,}", f"{row['update_s']:.4f}", f"{row['rollout_s']:.4f}", f"{row['us_per_episode']:.1f}",
+            f"{row['episodes']:,}",
+            f"{row['update_s']:.4f}",
+            f"{row['rollout_s']:.4f}",
+            f"{row['us_per_episode']:.1f}",
             f"{row['peak_memory_mb']:,.0f}",
-        )  # fmt: skip
+        )
     console.print(table)
 
 
@@ -230,6 +240,8 @@ def _table(title: str, first: str, *columns: str) -> Table:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser("python -m benchmarks.bench", description=__doc__.split("\n")[0])
     parser.add_argument("--json", metavar="FILE", help="write the figures as JSON")
-    parser.add_argument("--quick", action="store_true", help="fewer and shorter runs: a first impression in two minutes")
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer and shorter runs: a first impression in two minutes"
+    )
     options = parser.parse_args()
     sys.exit(main(Console(), options.json, options.quick))

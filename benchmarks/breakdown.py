@@ -104,10 +104,12 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
     def signals(tick, state):
         """Delayed, noisy observation; limited, delayed command."""
         seen, sent, reference, previous, captured = state
-        delayed = jnp.concatenate([
-            latency.ring_read(seen[:, :3], tick - prepared.ball.periods),
-            latency.ring_read(seen[:, 3:], tick - prepared.joints.periods),
-        ])  # fmt: skip
+        delayed = jnp.concatenate(
+            [
+                latency.ring_read(seen[:, :3], tick - prepared.ball.periods),
+                latency.ring_read(seen[:, 3:], tick - prepared.joints.periods),
+            ]
+        )
         u = noise.symmetric_uniform(episodes.seed, tick, 3)
         observed = materialise(jnp.concatenate([delayed[:3] + 0.08 * u, delayed[3:]]))
         request = observed[3:] * jnp.asarray(LIMITS.policy_velocity)[:, None]
@@ -134,7 +136,9 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
         "policy": (1, policy, (first.controller, observation)),
         "clearances": (1, clearance, first.qpos),
         "delays, noise, limits": (
-            1, signals, (first.observations, first.commands, first.reference, zeros, jnp.zeros_like(observation))
+            1,
+            signals,
+            (first.observations, first.commands, first.reference, zeros, jnp.zeros_like(observation)),
         ),
         WHOLE: (1, whole, first),
-    }  # fmt: skip
+    }

@@ -55,9 +55,7 @@ class PyBulletRobot:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "robot.urdf"
             path.write_text(urdf(model), encoding="utf-8")
-            self.body = self.client.loadURDF(
-                str(path), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE
-            )
+            self.body = self.client.loadURDF(str(path), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE)
         self.client.setTimeStep(timestep)
         self._mode = pybullet.VELOCITY_CONTROL
 

@@ -29,14 +29,18 @@ class Worker:
     After ``close``, ``peak_memory`` [MB] holds its largest resident memory.
     """
 
-    def __init__(self, side: str, cpus: set[int] | None = None, environment: dict[str, str] | None = None, **sizes) -> None:
+    def __init__(
+        self, side: str, cpus: set[int] | None = None, environment: dict[str, str] | None = None, **sizes
+    ) -> None:
         request = json.dumps({"side": side, "cpus": sorted(cpus) if cpus else None, "sizes": sizes})
         path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
         self._process = subprocess.Popen(
             [sys.executable, "-m", "benchmarks.worker", request],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
             env=os.environ | {"PYTHONPATH": path} | (environment or {}),
-        )  # fmt: skip
+        )
         self.side = side
         self.peak_memory: float | None = None
 

@@ -61,7 +61,9 @@ def shape(
     if plus.ndim != 1 or plus.shape != minus.shape:
         raise ValueError(f"shaping.shape: plus {plus.shape} and minus {minus.shape} must both be (pairs,)")
     for name, given, allowed in (
-        ("rank", rank, RANKS), ("weighting", weighting, WEIGHTINGS), ("normalise", normalise, NORMALISATIONS),
+        ("rank", rank, RANKS),
+        ("weighting", weighting, WEIGHTINGS),
+        ("normalise", normalise, NORMALISATIONS),
     ):
         if given not in allowed:
             raise ValueError(f"shaping.shape: {name} = {given!r}, allowed are {allowed}")

@@ -155,9 +155,17 @@ def run(options: argparse.Namespace) -> int:
     from experiments.deploy import session
 
     return session.run(
-        Path(options.artefact), options.robot, options.balls, options.distribution, options.backend, Path(options.log),
-        options.rig, options.seed, options.seconds, _console(),
-    )  # fmt: skip
+        Path(options.artefact),
+        options.robot,
+        options.balls,
+        options.distribution,
+        options.backend,
+        Path(options.log),
+        options.rig,
+        options.seed,
+        options.seconds,
+        _console(),
+    )
 
 
 def finetune(options: argparse.Namespace) -> int:
@@ -170,9 +178,16 @@ def finetune(options: argparse.Namespace) -> int:
 
     run = Run(options.out or f"{Path(options.policy).resolve().name}-finetuned")
     report = session.finetune(
-        options.policy, settings, run, options.robot, options.distribution, options.rig, options.backend, options.seed,
+        options.policy,
+        settings,
+        run,
+        options.robot,
+        options.distribution,
+        options.rig,
+        options.backend,
+        options.seed,
         _console(),
-    )  # fmt: skip
+    )
     return 0 if report is not None else 130
 
 
@@ -247,9 +262,16 @@ def diagnose(options: argparse.Namespace) -> int:
     console, out = _console(), Path(options.out)
     without = tuple(name for part in options.without for name in part.split(",") if name)
     request = diagnosis.Request(
-        tuple(options.logs), out, options.model, options.spin, without, options.seed, options.randomise,
-        options.policy, options.retrain,
-    )  # fmt: skip
+        tuple(options.logs),
+        out,
+        options.model,
+        options.spin,
+        without,
+        options.seed,
+        options.randomise,
+        options.policy,
+        options.retrain,
+    )
     found = diagnosis.diagnose(request, console)
     extended = diagnosis.save(found, out)
     diagnosis.show(found, console)
@@ -289,7 +311,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
-    p = _command(commands, "train", train, "train experiments, evaluate them and export their policies", """\
+    p = _command(
+        commands,
+        "train",
+        train,
+        "train experiments, evaluate them and export their policies",
+        """\
   mjx-tt train quickstart.yaml
   mjx-tt train narrow.yaml medium.yaml --seeds 0,1,2        six runs: runs/narrow/seed0/ ... runs/medium/seed2/
   mjx-tt train player3_m2.yaml --seeds 0,1,2 --select       and name the best seed, as the paper does
@@ -297,7 +324,9 @@ def _parser() -> argparse.ArgumentParser:
 
 Run the same command again after an interruption: finished runs are skipped, others continue from their last
 checkpoint, bit for bit. Ctrl-C saves a checkpoint first.
-""" + SHIPPED_HINT)  # fmt: skip
+"""
+        + SHIPPED_HINT,
+    )
     p.add_argument("experiments", nargs="+", metavar="YAML")
     p.add_argument("--seeds", type=_seeds, default=(), metavar="0,1,2", help="one run per seed, in a folder of its own")
     p.add_argument("--select", action="store_true", help="play 50 episodes per seed and mark the best (needs --seeds)")
@@ -305,13 +334,19 @@ checkpoint, bit for bit. Ctrl-C saves a checkpoint first.
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one key of every file")
     _add_devices(p)
 
-    p = _command(commands, "evaluate", evaluate, "play a policy on fresh balls: rates, interval, pictures", """\
+    p = _command(
+        commands,
+        "evaluate",
+        evaluate,
+        "play a policy on fresh balls: rates, interval, pictures",
+        """\
   mjx-tt evaluate runs/quickstart
   mjx-tt evaluate runs/quickstart --balls player1/M1 --episodes 5000
   mjx-tt evaluate artefacts/anna --model measured.yaml --out anna-on-measured
 
 Without --out, a run on its own balls and model writes into its own folder; anything else into a folder beside it.
-""")  # fmt: skip
+""",
+    )
     _add_policy(p)
     p.add_argument("--episodes", type=_count, metavar="N", help="balls to play (default: the experiment's)")
     p.add_argument("--seed", type=int, metavar="K", help="another seed means other balls")
@@ -321,21 +356,33 @@ Without --out, a run on its own balls and model writes into its own folder; anyt
     p.add_argument("--out", metavar="FOLDER", help="for evaluation.json and plots/")
     _add_devices(p)
 
-    p = _command(commands, "export", export, "write a run's policy as an artefact that a robot can run", """\
+    p = _command(
+        commands,
+        "export",
+        export,
+        "write a run's policy as an artefact that a robot can run",
+        """\
   mjx-tt export runs/quickstart
   mjx-tt export runs/quickstart --out artefacts/anna
-""")  # fmt: skip
+""",
+    )
     p.add_argument("run", metavar="RUN", help="folder of a run")
     p.add_argument("--out", metavar="FOLDER", help="default: RUN/artefact")
     p.set_defaults(balls=None, model=None)
 
-    p = _command(commands, "fit-human", fit_human, "a human ball distribution from measured balls", """\
+    p = _command(
+        commands,
+        "fit-human",
+        fit_human,
+        "a human ball distribution from measured balls",
+        """\
   mjx-tt fit-human rallies.csv --out anna.yaml
   mjx-tt fit-human monday.mcap tuesday.mcap --out anna.yaml --name anna
   mjx-tt fit-human rallies.json --out deepmind.yaml          (DeepMind's ball states)
 
 Then write "balls: anna.yaml" in an experiment.
-""")  # fmt: skip
+""",
+    )
     p.add_argument("data", nargs="+", metavar="DATA", help=".csv, .mcap, .json (DeepMind) or .hdf5 (AIMY launcher)")
     p.add_argument("--out", required=True, metavar="YAML")
     p.add_argument("--name", default="", help="of the distribution (default: the name of the file written)")
@@ -345,38 +392,62 @@ Then write "balls: anna.yaml" in an experiment.
     p.add_argument("--min-samples", type=_count, default=5, metavar="N", help="balls that make a cluster (default: 5)")
     _add_format(p)
 
-    p = _command(commands, "import", import_, "convert measured trajectories to CSV or MCAP", """\
+    p = _command(
+        commands,
+        "import",
+        import_,
+        "convert measured trajectories to CSV or MCAP",
+        """\
   mjx-tt import launcher.hdf5 --out launcher.csv
   mjx-tt import rallies.csv --out rallies.mcap
-""")  # fmt: skip
+""",
+    )
     p.add_argument("data", metavar="DATA")
     p.add_argument("--out", required=True, metavar="FILE", help=".csv or .mcap")
     _add_format(p)
 
-    p = _command(commands, "render", render, "a picture or a video of a policy at play, without a display", """\
+    p = _command(
+        commands,
+        "render",
+        render,
+        "a picture or a video of a policy at play, without a display",
+        """\
   mjx-tt render runs/quickstart --out episode.png --out episode.mp4
   mjx-tt render runs/quickstart --out rally.gif --episodes 4 --camera human
-""")  # fmt: skip
+""",
+    )
     _add_policy(p)
     p.add_argument("--out", action="append", required=True, metavar="FILE", help=".png, .mp4 or .gif; may be repeated")
     p.add_argument("--episodes", type=_count, default=2, metavar="N", help="episodes in a video (default: 2)")
     p.add_argument("--camera", default="side", help="side, robot_back, human or top (default: side)")
     p.add_argument("--seed", type=int, metavar="K", help="another seed means other balls")
 
-    p = _command(commands, "curves", curves, "the learning curves of several trainings in one picture", """\
+    p = _command(
+        commands,
+        "curves",
+        curves,
+        "the learning curves of several trainings in one picture",
+        """\
   mjx-tt curves runs/quickstart runs/paper --out curves.png
-""")  # fmt: skip
+""",
+    )
     p.add_argument("runs", nargs="+", metavar="RUN", help="folder of a run, finished or under way")
     p.add_argument("--out", default="curves.png", metavar="PNG", help="the picture (default: curves.png)")
 
-    p = _command(commands, "run", run, "play: an exported policy on a robot, real or emulated", """\
+    p = _command(
+        commands,
+        "run",
+        run,
+        "play: an exported policy on a robot, real or emulated",
+        """\
   mjx-tt run runs/quickstart/artefact --robot rig --balls 30
   mjx-tt run runs/quickstart/artefact --robot robot.yaml
   mjx-tt run runs/quickstart/artefact --robot rig --rig worn.yaml --distribution player1/M1
 
 The robot needs the operator: p prepares the axes, a arms, the space bar stops. The rig is switched on, armed and fed
 with balls by itself. Read docs/safety.md and docs/hardware.md before a real arm moves.
-""")  # fmt: skip
+""",
+    )
     p.add_argument("artefact", metavar="ARTEFACT", help="folder of an exported policy")
     p.add_argument("--robot", required=True, metavar="YAML", help='a robot.yaml, or "rig" for the emulated robot')
     p.add_argument("--balls", type=_count, metavar="N", help="end after N balls (default: when the operator quits)")
@@ -385,13 +456,19 @@ with balls by itself. Read docs/safety.md and docs/hardware.md before a real arm
     p.add_argument("--log", default="runs/robot", metavar="FOLDER", help="for the MCAP log and the summary")
     _add_rig(p, None)
 
-    p = _command(commands, "finetune", finetune, "fine-tune a policy on a robot while a person plays", """\
+    p = _command(
+        commands,
+        "finetune",
+        finetune,
+        "fine-tune a policy on a robot while a person plays",
+        """\
   mjx-tt finetune runs/quickstart --robot robot.yaml --out runs/anna
   mjx-tt finetune runs/quickstart --robot rig --out runs/rig             the emulated robot, in real time
   mjx-tt finetune runs/quickstart --robot lockstep --rig worn.yaml       as fast as this machine allows
 
 Every ball is on disk before the next begins: the same command continues after an interruption, a crash or a power cut.
-""")  # fmt: skip
+""",
+    )
     p.add_argument("policy", metavar="RUN_OR_ARTEFACT", help="what to start from")
     p.add_argument("--robot", required=True, metavar="YAML", help='a robot.yaml, "rig" or "lockstep"')
     p.add_argument("--settings", metavar="YAML", help="of the fine-tuning (default: the paper's), docs/finetuning.md")
@@ -400,75 +477,120 @@ Every ball is on disk before the next begins: the same command continues after a
     p.add_argument("--backend", choices=("numpy", "jit"), default="numpy", help="what computes the policy")
     _add_rig(p, None)
 
-    p = _command(commands, "is2r", is2r, "simulate, play, refine: the iterative loop and its study", """\
+    p = _command(
+        commands,
+        "is2r",
+        is2r,
+        "simulate, play, refine: the iterative loop and its study",
+        """\
   mjx-tt is2r study_quick.yaml                              five virtual players, twenty minutes, ends in a report
   mjx-tt is2r study_full.yaml --set players=[player3]       the paper's scale
   mjx-tt is2r anna.yaml                                     with robot: robot.yaml in it: on a robot, docs/is2r.md
 
 Every finished step is kept: the same command continues after an interruption, a crash, or when people have played.
 A file name without a folder that is not in the current folder is looked up among the shipped studies.
-""")  # fmt: skip
+""",
+    )
     p.add_argument("study", metavar="YAML")
     p.add_argument("--out", default="runs", metavar="FOLDER", help="where the study's folder goes (default: runs)")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one key of the study")
     p.add_argument(
-        "--processes", type=_count, metavar="N",
+        "--processes",
+        type=_count,
+        metavar="N",
         help="how many do steps side by side, on a device each (default: one per processor core; one in all with --devices, "
         "on an accelerator or a robot)",
-    )  # fmt: skip
+    )
     _add_devices(p)
 
-    p = _command(commands, "study-report", study_report, "the report of a study, whole or under way: one HTML page", """\
+    p = _command(
+        commands,
+        "study-report",
+        study_report,
+        "the report of a study, whole or under way: one HTML page",
+        """\
   mjx-tt study-report runs/study-quick
 
 Writes report/index.html with its pictures and tables: the paper's figures with ours beside them. What a study lacks is named.
-""")  # fmt: skip
+""",
+    )
     p.add_argument("study", metavar="FOLDER", help="folder of a study")
 
-    p = _command(commands, "blind", blind, "policies under code names, for people who evaluate them", """\
+    p = _command(
+        commands,
+        "blind",
+        blind,
+        "policies under code names, for people who evaluate them",
+        """\
   mjx-tt blind make anna-evaluates is2r-ft100=runs/a/artefact s2r-ft100=runs/b/artefact --trainer anna --evaluator anna
   mjx-tt run anna-evaluates/policies/A --robot robot.yaml          and fill in anna-evaluates/sheet.csv; then B, C, ...
   mjx-tt blind sheet anna-evaluates                                how many rallies count so far
   mjx-tt blind open anna-evaluates                                 when all are played: which was which, and the means
 
 The key is sealed in FOLDER/key.sealed; it opens when every code has 50 rallies that count. docs/evaluation.md.
-""")  # fmt: skip
+""",
+    )
     p.add_argument("action", choices=("make", "sheet", "open"))
     p.add_argument("folder", metavar="FOLDER", help="of the blind evaluation")
     p.add_argument("policies", nargs="*", metavar="MODEL=POLICY", help="of make: a name and its artefact or run")
     p.add_argument("--trainer", default="", metavar="NAME", help="of make: who trained the policies")
     p.add_argument("--evaluator", default="", metavar="NAME", help="of make: who plays (default: the trainer)")
-    p.add_argument("--seed", type=int, default=0, metavar="K", help="of make: the study's seed that the policies belong to")
+    p.add_argument(
+        "--seed", type=int, default=0, metavar="K", help="of make: the study's seed that the policies belong to"
+    )
 
-    p = _command(commands, "compare", compare, "several learning algorithms on one task, also where none has trained", """\
+    p = _command(
+        commands,
+        "compare",
+        compare,
+        "several learning algorithms on one task, also where none has trained",
+        """\
   mjx-tt compare compare_quick.yaml                         BGS, ARS, PPO, SAC, QT-Opt: three minutes each
   mjx-tt compare mine.yaml --set budget.minutes=60 --set seeds=[0,1,2]
 
 Algorithms and seeds that are finished are kept: the same command continues, and one with more of them adds to it.
 A file name without a folder that is not in the current folder is looked up among the shipped comparisons.
-""")  # fmt: skip
+""",
+    )
     p.add_argument("comparison", metavar="YAML", help="docs/algorithms.md explains it")
     p.add_argument("--out", default="runs", metavar="FOLDER", help="where its folder goes (default: runs)")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one key")
 
-    p = _command(commands, "rig", rig, "the emulated robot alone, on real sockets", """\
+    p = _command(
+        commands,
+        "rig",
+        rig,
+        "the emulated robot alone, on real sockets",
+        """\
   mjx-tt rig --out rig.yaml          and in another terminal:  mjx-tt run ARTEFACT --robot rig.yaml
-""")  # fmt: skip
+""",
+    )
     p.add_argument("--ports", type=_ports, default=(6510, 6520, 5021, 5022), metavar="ARM,TRACKER,X,Y")
     p.add_argument("--out", default="rig-robot.yaml", metavar="YAML", help="where its robot.yaml is written")
     _add_rig(p, "player3/M0")
 
-    p = _command(commands, "log", log, "list, check, salvage or export the logs of a robot", """\
+    p = _command(
+        commands,
+        "log",
+        log,
+        "list, check, salvage or export the logs of a robot",
+        """\
   mjx-tt log list runs/robot
   mjx-tt log check runs/robot/20261121-153000.mcap
   mjx-tt log salvage runs/robot/20261121-153000.mcap.part
   mjx-tt log export runs/robot/20261121-153000.mcap --out tables/
-""")  # fmt: skip
+""",
+    )
     p.add_argument("action", choices=("list", "check", "salvage", "export"))
     p.add_argument("paths", nargs="+", metavar="LOG", help="an .mcap or .mcap.part; for list a folder")
     p.add_argument("--out", metavar="PATH", help="of salvage: the file; of export: the folder")
 
-    p = _command(commands, "diagnose", diagnose, "say what the simulation gets wrong about measured logs", """\
+    p = _command(
+        commands,
+        "diagnose",
+        diagnose,
+        "say what the simulation gets wrong about measured logs",
+        """\
   mjx-tt diagnose session1.csv session2.mcap --out diagnosis
   mjx-tt diagnose robot/ --out diagnosis                    a folder with command.csv and state.csv
   mjx-tt diagnose session1.csv --policy runs/quickstart --out diagnosis          what the defect costs in play
@@ -476,30 +598,47 @@ A file name without a folder that is not in the current folder is looked up amon
 
 Writes report.html (look at it first), verdict.json, extended.yaml and plots. Ball logs: session,trajectory,t,x,y,z as
 CSV, MCAP, or the launcher's HDF5; robot logs: command.csv (t,joint,velocity) and state.csv (t,joint,position).
-""")  # fmt: skip
+""",
+    )
     p.add_argument("logs", nargs="+", metavar="LOG", help="a file, or a folder of files")
     p.add_argument("--out", required=True, metavar="DIR", help="where report, verdict and extended model go")
     p.add_argument("--model", metavar="YAML", help="the model to judge; the nominal one by default")
     p.add_argument("--spin", choices=("none", "free"), default="none", help="whether the model's ball may spin (none)")
-    p.add_argument("--without", action="append", default=[], metavar="NAMES", help="effects to leave out of the catalogue")
+    p.add_argument(
+        "--without", action="append", default=[], metavar="NAMES", help="effects to leave out of the catalogue"
+    )
     p.add_argument("--randomise", action="store_true", help="extended.yaml draws what was fitted from its intervals")
     p.add_argument("--seed", type=int, default=0, help="of the bootstraps (0)")
     p.add_argument("--policy", metavar="POLICY", help="a run or artefact: what the defect costs it in play")
-    p.add_argument("--retrain", type=int, default=0, metavar="UPDATES", help="and what this much retraining brings back")
+    p.add_argument(
+        "--retrain", type=int, default=0, metavar="UPDATES", help="and what this much retraining brings back"
+    )
     p.add_argument("--episodes", type=int, default=2000, help="of each evaluation (2000)")
 
-    p = _command(commands, "bench", bench, "measure this machine: physics steps per second, time per update", """\
+    p = _command(
+        commands,
+        "bench",
+        bench,
+        "measure this machine: physics steps per second, time per update",
+        """\
   mjx-tt bench
   mjx-tt bench --json bench.json
-""")  # fmt: skip
+""",
+    )
     p.add_argument("--json", metavar="FILE", help="write the figures as JSON")
     _add_devices(p)
 
-    _command(commands, "schema", schema, "print the JSON schema of an experiment YAML, for your editor", """\
+    _command(
+        commands,
+        "schema",
+        schema,
+        "print the JSON schema of an experiment YAML, for your editor",
+        """\
   mjx-tt schema > schema.json
 and as the first line of a YAML:
   # yaml-language-server: $schema=schema.json
-""")  # fmt: skip
+""",
+    )
     _command(commands, "balls", balls, "list the paper's players and ball distributions", "  mjx-tt balls\n")
     return parser
 
@@ -525,7 +664,9 @@ def _add_policy(p: argparse.ArgumentParser) -> None:
 
 def _add_rig(p: argparse.ArgumentParser, distribution: str | None) -> None:
     trained = "the policy's" if distribution is None else distribution
-    p.add_argument("--distribution", default=distribution, metavar="NAME", help=f"balls that are thrown (default: {trained})")
+    p.add_argument(
+        "--distribution", default=distribution, metavar="NAME", help=f"balls that are thrown (default: {trained})"
+    )
     p.add_argument("--rig", metavar="YAML", help="another rig: world, delays, network faults")
     p.add_argument("--seed", type=int, default=0, metavar="K", help="of the balls that are thrown")
 

@@ -57,14 +57,20 @@ class JointLimits:
     def __post_init__(self) -> None:
         for name, values in asdict(self).items():
             if len(values) != N_JOINTS:
-                raise ValueError(f"JointLimits.{name} needs {N_JOINTS} numbers in the order {JOINT_NAMES}, got {len(values)}")
+                raise ValueError(
+                    f"JointLimits.{name} needs {N_JOINTS} numbers in the order {JOINT_NAMES}, got {len(values)}"
+                )
             if not np.all(np.isfinite(values)):
                 raise ValueError(f"JointLimits.{name} has a non-finite number: {values}")
         for i, joint in enumerate(JOINT_NAMES):
             if not self.upper[i] - self.lower[i] > 2 * self.margin[i] >= 0:
-                raise ValueError(f"{joint}: range [{self.lower[i]}, {self.upper[i]}] leaves no room inside a margin of {self.margin[i]}")
+                raise ValueError(
+                    f"{joint}: range [{self.lower[i]}, {self.upper[i]}] leaves no room inside a margin of {self.margin[i]}"
+                )
             if not 0 < self.policy_velocity[i] <= self.velocity[i]:
-                raise ValueError(f"{joint}: policy_velocity {self.policy_velocity[i]} must be in (0, {self.velocity[i]}]")
+                raise ValueError(
+                    f"{joint}: policy_velocity {self.policy_velocity[i]} must be in (0, {self.velocity[i]}]"
+                )
             if not self.acceleration[i] > 0:
                 raise ValueError(f"{joint}: acceleration {self.acceleration[i]} must be positive")
 

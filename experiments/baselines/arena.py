@@ -89,9 +89,11 @@ def draw_balls(experiment: Experiment, key, episodes: int) -> BallPool:
     balls = build.pool(experiment, key, -(-episodes // size) * size)
     order = np.argsort(np.asarray(balls.arrival))
     return replace(
-        balls, state=jax.tree.map(lambda x: x[:, order], balls.state),
-        arrival=balls.arrival[order], landing=balls.landing[:, order],
-    )  # fmt: skip
+        balls,
+        state=jax.tree.map(lambda x: x[:, order], balls.state),
+        arrival=balls.arrival[order],
+        landing=balls.landing[:, order],
+    )
 
 
 def _chunks(balls: BallPool) -> list[BallPool]:

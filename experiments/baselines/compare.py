@@ -237,5 +237,6 @@ def _say(console: Console, folder: Path, point: dict[str, Any]) -> None:
     console.print(
         f"{folder}: {point['episodes']:,} episodes, {point['seconds']:.0f} s: returned {point['return_rate']:.1%}, "
         f"touched {point['hit_rate']:.1%}, mean return {point['mean_return'] or float('nan'):.2f}",
-        highlight=False, soft_wrap=True,
-    )  # fmt: skip
+        highlight=False,
+        soft_wrap=True,
+    )

@@ -71,7 +71,9 @@ def read_logs(paths: Sequence[str]) -> diagnosis.Logs:
         if joints:
             records.append((str(file), joints))
     joints, notes = diagnosis.longest(records)
-    return diagnosis.Logs(tuple(balls), joints, {str(file): digest for file, digest in files.items()}, rest.notes + notes)
+    return diagnosis.Logs(
+        tuple(balls), joints, {str(file): digest for file, digest in files.items()}, rest.notes + notes
+    )
 
 
 def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
@@ -97,14 +99,20 @@ def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
     if request.model:
         provenance["model_sha256"] = hashlib.sha256(Path(request.model).read_bytes()).hexdigest()
     return checked(
-        ", ".join(request.logs), diagnosis.diagnose, logs, nominal.model, request.spin, tuple(request.without), request.seed, say,
-        provenance, request.randomise,
-    )  # fmt: skip
+        ", ".join(request.logs),
+        diagnosis.diagnose,
+        logs,
+        nominal.model,
+        request.spin,
+        tuple(request.without),
+        request.seed,
+        say,
+        provenance,
+        request.randomise,
+    )
 
 
-def play(
-    extended: Path, request: Request, episodes: int, console: Console
-) -> dict[str, dict | int | None]:
+def play(extended: Path, request: Request, episodes: int, console: Console) -> dict[str, dict | int | None]:
     """What the defect costs a policy: return rates with 95 % intervals under the nominal and the extended model.
 
     extended: the model file that was written, under which the policy is trained on for ``request.retrain`` updates; the
@@ -119,8 +127,9 @@ def play(
         report = evaluate.evaluate(experiment, who, episodes, trained.config.evaluation.seed, None).report
         console.print(
             f"  {name}: {report['return_rate']:.1%} of {report['episodes']} balls returned "
-            f"({report['low']:.1%} to {report['high']:.1%})", highlight=False,
-        )  # fmt: skip
+            f"({report['low']:.1%} to {report['high']:.1%})",
+            highlight=False,
+        )
         return {"rate": report["return_rate"], "low": report["low"], "high": report["high"]}
 
     rates = {

@@ -39,8 +39,10 @@ def check(paths: list[Path], console: Console) -> int:
         faulty += overview.state != "sound"
         console.print(
             f"{path}: {overview.state}, {overview.messages:,} messages in {overview.duration:.1f} s",
-            highlight=False, soft_wrap=True, markup=False,
-        )  # fmt: skip
+            highlight=False,
+            soft_wrap=True,
+            markup=False,
+        )
         for fault in overview.faults:
             console.print(f"  {fault}", highlight=False, soft_wrap=True, markup=False)
         for topic, count in sorted(overview.counts.items()):
@@ -53,8 +55,10 @@ def salvage(path: Path, out: Path | None, console: Console) -> Path:
     overview = checked("", log.salvage, path, out)
     console.print(
         f"{overview.path}: {overview.messages:,} messages, {overview.duration:.1f} s",
-        highlight=False, soft_wrap=True, markup=False,
-    )  # fmt: skip
+        highlight=False,
+        soft_wrap=True,
+        markup=False,
+    )
     for line in overview.metadata["salvage"]["faults"].splitlines():
         console.print(f"  lost: {line}", highlight=False, soft_wrap=True, markup=False)
     return overview.path

@@ -269,9 +269,13 @@ def apply_override(data: dict[str, Any], override: str) -> None:
 
 
 def read_mapping(
-    path: Path, overrides: tuple[str, ...], what: str, section: type[Section], shipped: dict[str, Path],
+    path: Path,
+    overrides: tuple[str, ...],
+    what: str,
+    section: type[Section],
+    shipped: dict[str, Path],
     absolute: Callable[[dict[str, Any], Path], None],
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """The keys of ``section`` that the file and the overrides "dotted.path=value" give; not checked. Raises ConfigError.
 
     what: "an experiment" or the like and ``shipped``: those that come with the program, for messages. absolute: makes the

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError
 
 from experiments.config import validation
-from experiments.config.experiment import (  # fmt: skip
+from experiments.config.experiment import (
     Constant,
     Count,
     Decay,

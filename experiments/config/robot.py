@@ -95,4 +95,6 @@ def throws_of(balls, model, count: int, seed: int) -> Throws:
 
     pool = checked(balls.name, sample_pool, jax.random.key(seed), balls, model.ball, count)
     order = np.random.default_rng(seed).permutation(count)  # a pool need not be in random order
-    return Throws(*(np.asarray(x, np.float64)[:, order] for x in (pool.state.position, pool.state.velocity, pool.state.spin)))
+    return Throws(
+        *(np.asarray(x, np.float64)[:, order] for x in (pool.state.position, pool.state.velocity, pool.state.spin))
+    )

@@ -74,9 +74,11 @@ class View:
 
     def _draw(self, s: dict[str, Any]) -> Group:
         head = Text.assemble(
-            (f"{self._title}  ", "bold"), (s["state"].upper(), COLOURS[s["state"]]),
-            "  holding" if s["paused"] else "", "  at home" if s["at_home"] else "",
-        )  # fmt: skip
+            (f"{self._title}  ", "bold"),
+            (s["state"].upper(), COLOURS[s["state"]]),
+            "  holding" if s["paused"] else "",
+            "  at home" if s["at_home"] else "",
+        )
         lines = [head]
         lines += [Text(f"FAULT {f['cause']}: {f['text']}", "red") for f in s["faults"]]
         if not s["faults"]:

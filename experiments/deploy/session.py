@@ -56,7 +56,9 @@ def rig_for(artefact: artefacts.Artefact, balls: str | None, params_path: str | 
 def _trained_on(artefact: artefacts.Artefact):
     config = (artefact.manifest.get("provenance") or {}).get("config") or {}
     if "balls" not in config:
-        raise ConfigError(f"{artefact.folder}: does not say on which balls it was trained; name some with --distribution")
+        raise ConfigError(
+            f"{artefact.folder}: does not say on which balls it was trained; name some with --distribution"
+        )
     return config["balls"]
 
 
@@ -181,9 +183,17 @@ class Session:
 
 
 def run(
-    artefact: Path, robot: str, balls: int | None, distribution: str | None, backend: str, log_folder: Path,
-    rig_params: str | None, seed: int, seconds: float | None, console: Console,
-) -> int:  # fmt: skip
+    artefact: Path,
+    robot: str,
+    balls: int | None,
+    distribution: str | None,
+    backend: str,
+    log_folder: Path,
+    rig_params: str | None,
+    seed: int,
+    seconds: float | None,
+    console: Console,
+) -> int:
     """Plays until ``balls`` outcomes are known, ``seconds`` have passed, or the operator quits; 0 when all went well."""
     loaded = artefacts.load(artefact)
     with ExitStack() as stack:
@@ -272,9 +282,13 @@ def _summary(loaded, config: RobotConfig, episodes: list, session: Session, log_
     returned = sum(e.outcome == "returned" for e in episodes)
     hit = sum(e.outcome != "missed" for e in episodes)
     report: dict[str, Any] = {
-        "artefact": str(loaded.folder), "artefact_sha256": loaded.digest, "robot": config.name,
-        "episodes": len(episodes), "returned": returned, "hit": hit,
-    }  # fmt: skip
+        "artefact": str(loaded.folder),
+        "artefact_sha256": loaded.digest,
+        "robot": config.name,
+        "episodes": len(episodes),
+        "returned": returned,
+        "hit": hit,
+    }
     if episodes:
         low, high = wilson(returned, len(episodes))
         report |= {"return_rate": returned / len(episodes), "low": low, "high": high, "hit_rate": hit / len(episodes)}
@@ -320,9 +334,16 @@ def _print(console: Console, report: dict[str, Any], path: Path) -> None:
 
 
 def finetune(
-    source: str, settings: FineTuning, run: run_dir.Run, robot: str, distribution: str | None, rig_params: str | None,
-    backend: str, seed: int, console: Console,
-) -> dict[str, Any] | None:  # fmt: skip
+    source: str,
+    settings: FineTuning,
+    run: run_dir.Run,
+    robot: str,
+    distribution: str | None,
+    rig_params: str | None,
+    backend: str,
+    seed: int,
+    console: Console,
+) -> dict[str, Any] | None:
     """Fine-tunes on a robot, the rig in real time, or the rig in lock-step; None when the operator stopped it."""
     from experiments.finetuning import loop as tuning
     from experiments.finetuning.bridge_robot import BridgeRobot
@@ -342,10 +363,18 @@ def finetune(
         text = robots.to_yaml(config)
         name = time.strftime("%Y%m%d-%H%M%S")
         options = process.ControlOptions(
-            str(artefact), backend, str(run.folder), name, (("git", json.dumps(run_dir.git_state())),), (("robot.yaml", text),)
+            str(artefact),
+            backend,
+            str(run.folder),
+            name,
+            (("git", json.dumps(run_dir.git_state())),),
+            (("robot.yaml", text),),
         )
         session = stack.enter_context(Session(config, options, console))
-        keyboard, view = stack.enter_context(Keyboard()), stack.enter_context(View(console, f"{source} on {config.name}"))
+        keyboard, view = (
+            stack.enter_context(Keyboard()),
+            stack.enter_context(View(console, f"{source} on {config.name}")),
+        )
         bridge = BridgeRobot(session, emulated, keyboard, view, config.name)
         if emulated:
             session.prepare(emulated)
@@ -374,10 +403,14 @@ def rig(balls: str, rig_params: str | None, seed: int, ports: tuple[int, ...], o
     throws = robots.throws_of(build.distribution(balls, "--distribution"), SimModel(), THROWS, seed)
     chosen = Ports(ports[0], ports[1], (ports[2], ports[3]))
     keys = {
-        "o": ("switch_on", "switch the arm on"), "b": ("throw", "throw balls, or stop"), "e": ("motors_off", "emergency stop"),
-        "f": ("fault", "drive fault"), "c": ("cable", "pull or plug an axis's cable"),
-        "t": ("drop_out", "tracker silent for 1 s"), "q": ("quit", "end"),
-    }  # fmt: skip
+        "o": ("switch_on", "switch the arm on"),
+        "b": ("throw", "throw balls, or stop"),
+        "e": ("motors_off", "emergency stop"),
+        "f": ("fault", "drive fault"),
+        "c": ("cable", "pull or plug an axis's cable"),
+        "t": ("drop_out", "tracker silent for 1 s"),
+        "q": ("quit", "end"),
+    }
     with Rig(scene(), throws, robots.load_rig(rig_params), chosen) as running, Keyboard() as keyboard:
         out.write_text(robots.to_yaml(running.robot), encoding="utf-8")
         console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}", highlight=False)

@@ -81,7 +81,9 @@ def read_curve(folder: str | Path) -> Curve:
     if not rows:
         raise RunError(f"{run.metrics}: holds no update yet")
     if "fault_rate" in rows[0]:
-        raise RunError(f"{folder}: is a fine-tuning, with another count of balls and time; wanted is a training in simulation")
+        raise RunError(
+            f"{folder}: is a fine-tuning, with another count of balls and time; wanted is a training in simulation"
+        )
     return Curve(str(folder), rows, 2 * optimiser.pairs * optimiser.repeats)
 
 
@@ -194,9 +196,16 @@ def _training(rows: list[dict[str, Any]], title: str) -> Figure:
             np.array([row[f"evaluation/{k}"] for row in evaluated]) for k in ("return_rate", "low", "high")
         )
         upper.errorbar(
-            at, rate, (rate - low, high - rate), color=INK, fmt="o-", markersize=4, linewidth=1, capsize=2,
+            at,
+            rate,
+            (rate - low, high - rate),
+            color=INK,
+            fmt="o-",
+            markersize=4,
+            linewidth=1,
+            capsize=2,
             label="evaluated policy: returned, 95 %",
-        )  # fmt: skip
+        )
     upper.set_ylim(0, 1.02)
     upper.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
     upper.grid(axis="y", alpha=0.25)
@@ -225,7 +234,9 @@ def _curves(curves: list[Curve]) -> Figure:
         for axes, x in zip(panels, (minutes, played)):
             axes.plot(x, rate, color=colour, label=f"{curve.name}, perturbed")
             if at:
-                axes.plot(x[evaluated], at, "o--", color=colour, markersize=4, linewidth=1, label=f"{curve.name}, evaluated")
+                axes.plot(
+                    x[evaluated], at, "o--", color=colour, markersize=4, linewidth=1, label=f"{curve.name}, evaluated"
+                )
     for axes, label in zip(panels, ("training time [min]", "balls")):
         axes.set_xscale("log")
         axes.set_xlim(left=max(line.get_xdata()[-1] for line in axes.lines) / 1000)  # the first updates say nothing

@@ -142,7 +142,9 @@ class Session:
         self.journal = Journal(run.folder / JOURNAL)
         self._played = {entry.place: entry for entry in self.journal.entries if not entry.discarded}
         if self.update > settings.updates:
-            raise RunError(f"{run.folder}: has {self.update} updates already, updates = {settings.updates} does not fit")
+            raise RunError(
+                f"{run.folder}: has {self.update} updates already, updates = {settings.updates} does not fit"
+            )
         self._log = MetricsLog(run.metrics, run.tensorboard, self.update)
         planned = 2 * settings.evaluation_balls + settings.updates * settings.episodes_per_update
         self._progress = FineTuningProgress(console, str(run.folder), planned, settings)
@@ -275,9 +277,7 @@ def _order(pairs: int) -> list[int]:
     return [member for pair in range(pairs) for member in (pair, pairs + pair)]
 
 
-def _open(
-    run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, first: TrainState, source: str
-) -> None:
+def _open(run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, first: TrainState, source: str) -> None:
     """Records what the run is, or checks that it is the one that is asked for. Raises RunError naming differences.
 
     Before the first ball there is nothing to protect: a start that failed must not stand in the way of the corrected one.

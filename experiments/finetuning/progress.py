@@ -28,9 +28,11 @@ class FineTuningProgress:
         self._live = None
         if console.is_terminal:
             columns = (
-                TextColumn("{task.description}", markup=False), BarColumn(None), MofNCompleteColumn(),
+                TextColumn("{task.description}", markup=False),
+                BarColumn(None),
+                MofNCompleteColumn(),
                 TextColumn("{task.fields[text]}", markup=False),
-            )  # fmt: skip
+            )
             self._live = Progress(*columns, console=console, expand=True)
             self._bar = self._live.add_task(name, total=planned, text="")
 
@@ -65,7 +67,13 @@ class FineTuningProgress:
         self._last = now
         self._rate = seconds if self._rate is None else self._rate + (seconds - self._rate) / min(self._played, 50)
         where = NAMES.get(entry.phase) or f"update {entry.update}/{self._settings.updates}"
-        outcome = "discarded" if entry.discarded else f"fault: {entry.summary.fault}" if entry.summary.fault else entry.summary.outcome
+        outcome = (
+            "discarded"
+            if entry.discarded
+            else f"fault: {entry.summary.fault}"
+            if entry.summary.fault
+            else entry.summary.outcome
+        )
         self._line(f"{where}  {outcome}{self._update_text}  {self._left()} left")
 
     def updated(self, update: int, row: dict[str, Any]) -> None:

@@ -93,13 +93,16 @@ def compare(entries: list[Entry], repeatable: bool) -> dict[str, Any]:
         "before": evaluated(before),
         "after": evaluated(after),
         "difference": {
-            "mean_return": difference, "low": low, "high": high, "paired": paired,
+            "mean_return": difference,
+            "low": low,
+            "high": high,
+            "paired": paired,
             "significant": low > 0.0 or high < 0.0,
         },
         "updates": updates,
         "episodes": sum(not e.discarded for e in training),
         "discarded": sum(e.discarded for e in entries),
-    }  # fmt: skip
+    }
 
 
 def sentence(evaluation: dict[str, Any]) -> str:
@@ -114,9 +117,13 @@ def sentence(evaluation: dict[str, Any]) -> str:
 
 def print_result(console: Console, result: dict[str, Any], title: str) -> None:
     """The comparison as a table."""
-    table = Table("", "before", "after", title=f"{title}: {result['updates']} updates on the robot", title_justify="left")
+    table = Table(
+        "", "before", "after", title=f"{title}: {result['updates']} updates on the robot", title_justify="left"
+    )
     both = [result["before"], result["after"]]
-    table.add_row("mean return", *(f"{e['mean_return']:.2f}  ({e['low']:.2f} to {e['high']:.2f})" for e in both), style="bold")
+    table.add_row(
+        "mean return", *(f"{e['mean_return']:.2f}  ({e['low']:.2f} to {e['high']:.2f})" for e in both), style="bold"
+    )
     table.add_row(
         "return rate",
         *(f"{e['return_rate']:.0%}  ({e['return_rate_low']:.0%} to {e['return_rate_high']:.0%})" for e in both),
@@ -131,8 +138,9 @@ def print_result(console: Console, result: dict[str, Any], title: str) -> None:
     verdict = "" if d["significant"] else "; no significant change"
     console.print(
         f"mean return {d['mean_return']:+.2f} (95 % interval {d['low']:+.2f} to {d['high']:+.2f}, {how}){verdict}",
-        highlight=False, soft_wrap=True,
-    )  # fmt: skip
+        highlight=False,
+        soft_wrap=True,
+    )
 
 
 def write_human_balls(path: Path, session: str, entries: list[Entry]) -> int:
@@ -173,14 +181,26 @@ def _figure(entries: list[Entry], result: dict[str, Any], title: str) -> Figure:
         count = len(by_update[updates[0]])
         upper.fill_between(updates, column["low"], column["high"], color=CURVE_COLOUR, alpha=0.18, linewidth=0)
         upper.plot(
-            updates, column["mean_return"], "o", color=CURVE_COLOUR, markersize=3, alpha=0.7,
+            updates,
+            column["mean_return"],
+            "o",
+            color=CURVE_COLOUR,
+            markersize=3,
+            alpha=0.7,
             label=f"perturbed policies, {count} balls an update, 95 %",
-        )  # fmt: skip
-        upper.plot(updates, smooth(column["mean_return"]), color=CURVE_COLOUR, linewidth=1.8, label=f"mean over {SMOOTHING} updates")
+        )
+        upper.plot(
+            updates,
+            smooth(column["mean_return"]),
+            color=CURVE_COLOUR,
+            linewidth=1.8,
+            label=f"mean over {SMOOTHING} updates",
+        )
         for name, colour, label in (
-            ("hit_rate", HIT_COLOUR, "touched"), ("return_rate", RETURNED_COLOUR, "returned"),
+            ("hit_rate", HIT_COLOUR, "touched"),
+            ("return_rate", RETURNED_COLOUR, "returned"),
             ("fault_rate", MISSED_COLOUR, "faults"),
-        ):  # fmt: skip
+        ):
             lower.plot(updates, smooth(column[name]), color=colour, label=label, linewidth=1.5)
     ends = (0, result["updates"] + 1)
     for at, name in zip(ends, (BEFORE, AFTER)):

@@ -41,9 +41,7 @@ class Robot(Protocol):
 
     repeatable: bool
 
-    def play(
-        self, theta: np.ndarray, mean: np.ndarray, inverse_scale: np.ndarray, episode_number: int
-    ) -> PlayedBall:
+    def play(self, theta: np.ndarray, mean: np.ndarray, inverse_scale: np.ndarray, episode_number: int) -> PlayedBall:
         """Plays the next ball with parameters (976,) and normaliser (11,), (11,), all float32.
 
         A fault that ends the episode is in its summary, and the robot stands ready again when this returns. Raises
@@ -92,9 +90,7 @@ class LockStepRobot:
         self._throws, self._params, self._scene = throws, params, scene
         self._world = World(scene, params.world)
 
-    def play(
-        self, theta: np.ndarray, mean: np.ndarray, inverse_scale: np.ndarray, episode_number: int
-    ) -> PlayedBall:
+    def play(self, theta: np.ndarray, mean: np.ndarray, inverse_scale: np.ndarray, episode_number: int) -> PlayedBall:
         policy = StreamingPolicy(contract.unflatten(theta), mean, inverse_scale)
         balls = BallRecorder()
         rig = LockStep(

@@ -27,10 +27,17 @@ _MARKS = (
     f"*/{artefacts.MANIFEST}",
     *(
         f"{place}/{CONFIG}"
-        for place in ("*", "training/*", "*/training/*", "player*/*", "player*/*/training/*",
-                      "seed*/player*/*", "seed*/player*/*/training/*")
+        for place in (
+            "*",
+            "training/*",
+            "*/training/*",
+            "player*/*",
+            "player*/*/training/*",
+            "seed*/player*/*",
+            "seed*/player*/*/training/*",
+        )
     ),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)

@@ -48,16 +48,28 @@ def play(
     low, high = (spread(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes))))
     rallies = settings.rallies // lanes
     result = reality.simulator.play(
-        theta, mean, inverse_scale, person, reality.known, build.key(seed, EVALUATION), rallies,
-        Box(low, high), settings.max_touches, LOGGED_TOUCHES * rallies,
-    )  # fmt: skip
+        theta,
+        mean,
+        inverse_scale,
+        person,
+        reality.known,
+        build.key(seed, EVALUATION),
+        rallies,
+        Box(low, high),
+        settings.max_touches,
+        LOGGED_TOUCHES * rallies,
+    )
     return jax.tree.map(np.asarray, result)
 
 
 def play_without(
-    study: Study, reality: VirtualReality, seed: int, models: list[tuple[str, str]], policies: list,
+    study: Study,
+    reality: VirtualReality,
+    seed: int,
+    models: list[tuple[str, str]],
+    policies: list,
     boxes: list[BallDistribution],
-) -> list[effect_costs.Outcome]:  # fmt: skip
+) -> list[effect_costs.Outcome]:
     """Rallies of each (player, model) in every world of ``effects.WORLDS``, ``evaluation.rallies`` each, in one call.
 
     policies: theta, mean and inverse_scale of each; boxes: what each one was trained for. What the study's own reality
@@ -84,9 +96,16 @@ def play_without(
     person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), human_player.stack(people))
     world = realities.side_by_side(worlds, len(models) * lanes)
     result = reality.simulator.play(
-        theta, mean, inverse_scale, person, world, build.key(seed, EFFECTS), settings.rallies // lanes,
-        Box(low, high), settings.max_touches,
-    )  # fmt: skip
+        theta,
+        mean,
+        inverse_scale,
+        person,
+        world,
+        build.key(seed, EFFECTS),
+        settings.rallies // lanes,
+        Box(low, high),
+        settings.max_touches,
+    )
     shape = (-1, len(worlds), len(models), lanes)
     length, end = (np.moveaxis(np.asarray(x).reshape(shape), 0, -1) for x in (result.length, result.end))
     counts = ~np.isin(end, [int(e) for e in scoring.FILTERED])
@@ -135,10 +154,20 @@ def save_logs(folder: Path, seed: int, pairings: list[tuple[str, str, str]], res
         number = log.rally[:, mine] * lanes + np.arange(lanes)
         arrays = {
             "rally": number[keep],
-            **{name: getattr(log, name)[..., mine][..., keep] for name in (
-                "touch", "first", "position", "velocity", "landing", "hit", "returned", "return_landing",
-            )},
-        }  # fmt: skip
+            **{
+                name: getattr(log, name)[..., mine][..., keep]
+                for name in (
+                    "touch",
+                    "first",
+                    "position",
+                    "velocity",
+                    "landing",
+                    "hit",
+                    "returned",
+                    "return_landing",
+                )
+            },
+        }
         path = folder / f"{seed}_{'_'.join(pairing)}.npz"
         with replacing(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, **arrays)

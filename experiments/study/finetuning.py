@@ -127,9 +127,16 @@ class VirtualReality:
         return evaluate.sparse_reward(np.asarray(outcome), np.asarray(fault))
 
     def _updates_of(
-        self, state: BGSState, rally: RallyState, statistics, player: Player, model: SimModel, key, play_key,
+        self,
+        state: BGSState,
+        rally: RallyState,
+        statistics,
+        player: Player,
+        model: SimModel,
+        key,
+        play_key,
         config: BGSConfig,
-    ):  # fmt: skip
+    ):
         """``_chunk`` updates: state and rally after them, and each one's (ShotResult, BGSInfo)."""
         settings, lanes = self._settings, self._settings.episodes_per_update
         frozen = [jnp.broadcast_to(x[:, None], (x.shape[0], lanes)) for x in normalizer.normaliser(statistics)]

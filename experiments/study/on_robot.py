@@ -76,8 +76,9 @@ class RobotWorld:
         self._console.print(
             f"{name}: {player} to the table, {balls:,} balls for {settings.updates} updates and twice "
             f"{settings.evaluation_balls} to compare; the operator's keys are those of mjx-tt finetune",
-            highlight=False, soft_wrap=True,
-        )  # fmt: skip
+            highlight=False,
+            soft_wrap=True,
+        )
         found = session.finetune(
             str(source), settings, Run(folder), study.robot, None, None, "numpy", _seed(name), self._console
         )
@@ -132,14 +133,24 @@ def exported(trained: Policy, console: Console) -> Path:
 
 
 def blind_steps(
-    folder: Path, seed: int, trainer: str, evaluator: str, runs_of: dict[str, Callable[[], Path]], inputs: tuple[Path, ...],
-    robot: str, console: Console,
-) -> list[Step]:  # fmt: skip
+    folder: Path,
+    seed: int,
+    trainer: str,
+    evaluator: str,
+    runs_of: dict[str, Callable[[], Path]],
+    inputs: tuple[Path, ...],
+    robot: str,
+    console: Console,
+) -> list[Step]:
     """Two steps: policies under code names with a scoring sheet; then, the sheet filled in, its rallies.
 
     folder: of this evaluation; runs_of: each model's run. What is played is ``mjx-tt run FOLDER/policies/CODE``.
     """
-    name, sheet, counted = f"seed{seed}/blind/{trainer}-{evaluator}", folder / protocol.SHEET, folder / protocol.EVALUATIONS
+    name, sheet, counted = (
+        f"seed{seed}/blind/{trainer}-{evaluator}",
+        folder / protocol.SHEET,
+        folder / protocol.EVALUATIONS,
+    )
 
     def make() -> str:
         if (folder / protocol.KEY).exists() and not sheet.exists():  # killed in between

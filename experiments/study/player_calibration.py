@@ -90,17 +90,25 @@ NUMBERS = tuple(
 FOLLOWS = tuple(
     ("M0", f"{number} {end}", "first", spread, ends[end == "max"])
     for number, spread, ends in (
-        ("position.x", "x", ("low", "high")), ("position.y", "y", ("low", "high")), ("position.z", "z", ("low", "high")),
-        ("velocity.x", "sideways", ("low", "high")), ("velocity.y", "forward", ("-high", "-low")),
-        ("velocity.z", "climb", ("low", "high")), ("landing.x", "side", ("low", "high")), ("landing.y", "landing", ("low", "high")),
+        ("position.x", "x", ("low", "high")),
+        ("position.y", "y", ("low", "high")),
+        ("position.z", "z", ("low", "high")),
+        ("velocity.x", "sideways", ("low", "high")),
+        ("velocity.y", "forward", ("-high", "-low")),
+        ("velocity.z", "climb", ("low", "high")),
+        ("landing.x", "side", ("low", "high")),
+        ("landing.y", "landing", ("low", "high")),
     )
     for end in ("min", "max")
 ) + (
-    ("M2", "position.y max", "strokes", "plane", "high"), ("M2", "position.z min", "strokes", "height", "low"),
-    ("M2", "velocity.y min", "strokes", "speed", "-high"), ("M2", "velocity.y max", "strokes", "speed", "-low"),
+    ("M2", "position.y max", "strokes", "plane", "high"),
+    ("M2", "position.z min", "strokes", "height", "low"),
+    ("M2", "velocity.y min", "strokes", "speed", "-high"),
+    ("M2", "velocity.y max", "strokes", "speed", "-low"),
     ("M2", "velocity.z max", "strokes", "climb", ""),
-    ("M2", "landing.x min", "strokes", "aim_x", "low"), ("M2", "landing.y max", "strokes", "aim_y", "high"),
-)  # fmt: skip
+    ("M2", "landing.x min", "strokes", "aim_x", "low"),
+    ("M2", "landing.y max", "strokes", "aim_y", "high"),
+)
 TUNING = 0.5  # share of what a number lacks by which its end is moved
 FARTHEST = 0.4  # [m], [m/s] that an end may be from the number that it follows
 
@@ -137,7 +145,10 @@ class Calibration:
         rng, reached = np.random.default_rng(seed), {}
         for p, name in enumerate(self.names):
             lobs = human_player.first_ball(
-                human_player.load(name), human_player.fresh((FIRST_BALLS,)), jax.random.fold_in(keys[1], p), (FIRST_BALLS,)
+                human_player.load(name),
+                human_player.fresh((FIRST_BALLS,)),
+                jax.random.fold_in(keys[1], p),
+                (FIRST_BALLS,),
             )
             data, numbers, counts = [jax.tree.map(np.asarray, lobs)], {}, {}
             for model, added in ROUNDS.items():
@@ -322,8 +333,11 @@ def picture(path: Path, rows: list[dict], lengths: list[dict]) -> None:
         axis.set_title("rally length: quartiles and mean", fontsize=10)
         figure.legend(
             handles=[plt.Line2D([], [], color=TARGET, linewidth=4), plt.Line2D([], [], color=REACHED, linewidth=4)],
-            labels=["the paper's player", "virtual player"], loc="outside lower center", ncols=2, frameon=False,
-        )  # fmt: skip
+            labels=["the paper's player", "virtual player"],
+            loc="outside lower center",
+            ncols=2,
+            frameon=False,
+        )
         with replacing(path) as temporary:
             figure.savefig(temporary, format="png", dpi=110)
         plt.close(figure)

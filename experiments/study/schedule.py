@@ -69,9 +69,17 @@ FRESH: tuple[Item, ...] = (
     Real("fresh-ft100", "fresh-sim3", 2),
 )
 MODELS = (
-    "is2r-sim1", "is2r-ft35", "is2r-sim2", "is2r-ft65", "is2r-sim3", "is2r-ft100",
-    "s2r-ft65", "s2r-ft100", "oracle-sim", "oracle-ft",
-)  # fmt: skip
+    "is2r-sim1",
+    "is2r-ft35",
+    "is2r-sim2",
+    "is2r-ft65",
+    "is2r-sim3",
+    "is2r-ft100",
+    "s2r-ft65",
+    "s2r-ft100",
+    "oracle-sim",
+    "oracle-ft",
+)
 CROSS_MODELS = ("is2r-ft100", "oracle-ft", "s2r-ft100")
 CROSS = {  # trainer: evaluators, the paper's table of cross-evaluations
     "player1": ("player4", "player5"),

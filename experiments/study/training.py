@@ -52,9 +52,15 @@ def configuration(study: Study, item: Simulated, balls: str | dict, source: Path
 
 
 def simulate(
-    study: Study, item: Simulated, folder: Path, human: Path | None, source: Path | None, name: str, console: Console,
+    study: Study,
+    item: Simulated,
+    folder: Path,
+    human: Path | None,
+    source: Path | None,
+    name: str,
+    console: Console,
     score: Callable[[Policy], float] | None,
-) -> str:  # fmt: skip
+) -> str:
     """Trains every seed of a model in ``folder``/training, or goes on with them, and writes the chosen policy.
 
     human: YAML of the human model; None: the distribution that the item names. source: run to start from. name: of the

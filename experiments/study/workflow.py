@@ -140,8 +140,10 @@ class Ledger:
         place, rest = self._total - len(self.left), remaining(self.left, self._journal, self._processes)
         self._console.print(
             f"[{place}/{self._total}] {step.name}: {text}  ({seconds:.1f} s; {rest})",
-            highlight=False, soft_wrap=True, markup=False,
-        )  # fmt: skip
+            highlight=False,
+            soft_wrap=True,
+            markup=False,
+        )
 
 
 def run_all(steps: list[Step], journal: Journal, console: Console) -> None:

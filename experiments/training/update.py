@@ -88,9 +88,7 @@ class Trainer:
         directions = strategy.ask(direction_key, state.bgs, config)
         theta = strategy.population(state.bgs, directions, config)
         columns = pairs if self._crn else 2 * pairs
-        episodes = self.simulator.draw(
-            episode_key, pool, self._model, self._randomise, self._repeats, columns
-        )
+        episodes = self.simulator.draw(episode_key, pool, self._model, self._randomise, self._repeats, columns)
         if self._crn:
             episodes = jax.tree.map(lambda x: jnp.concatenate([x, x], -1) if x.ndim >= 2 else x, episodes)
         mean, inverse_scale = normalizer.normaliser(state.statistics)
@@ -101,8 +99,10 @@ class Trainer:
         member = result.returns.mean(axis=0)  # NaN when one of its episodes was not finite
         failed = ~jnp.isfinite(member)
         place = jax.lax.axis_index(AXIS) * member.shape[0]
-        members = jnp.zeros((2, 2 * pairs)).at[:, place + jnp.arange(member.shape[0])].set(
-            jnp.stack([jnp.where(failed, 0.0, member), failed])
+        members = (
+            jnp.zeros((2, 2 * pairs))
+            .at[:, place + jnp.arange(member.shape[0])]
+            .set(jnp.stack([jnp.where(failed, 0.0, member), failed]))
         )
         sums, counts = result.observation_sums.sum(axis=-1), result.observation_counts.sum()
         shared = (members, sums, counts.astype(jnp.float32), totals(result))

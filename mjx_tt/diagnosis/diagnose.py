@@ -47,9 +47,15 @@ class Diagnosis:
 
 
 def diagnose(
-    logs: Logs, model: SimModel | None = None, spin: str = "none", without: Sequence[str] = (), seed: int = 0,
-    progress: Callable[[str], None] | None = None, provenance: dict | None = None, randomise: bool = False,
-) -> Diagnosis:  # fmt: skip
+    logs: Logs,
+    model: SimModel | None = None,
+    spin: str = "none",
+    without: Sequence[str] = (),
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+    provenance: dict | None = None,
+    randomise: bool = False,
+) -> Diagnosis:
     """Finds what ``model`` gets wrong about the logs.
 
     spin: "none" when the nominal ball does not spin, "free" when every ball may. without: effects of the catalogue to
@@ -89,10 +95,17 @@ def diagnose(
     if verdict.verdict in ("unexplained", "undetermined") and not (verdict.held_out and verdict.held_out.low > 0.0):
         values, ranges = {}, []  # names that are not to be relied on change the model only if they predict better
     extended = ModelFile(
-        models.with_values(model, values), tuple(ranges) if randomise else (),
-        {**(provenance or {}), "logs": logs.sources, "verdict": verdict.verdict,
-         "causes": {c.name: {p: [e.estimate, e.low, e.high] for p, e in c.parameters.items()} for c in verdict.causes}},
-    )  # fmt: skip
+        models.with_values(model, values),
+        tuple(ranges) if randomise else (),
+        {
+            **(provenance or {}),
+            "logs": logs.sources,
+            "verdict": verdict.verdict,
+            "causes": {
+                c.name: {p: [e.estimate, e.low, e.high] for p, e in c.parameters.items()} for c in verdict.causes
+            },
+        },
+    )
     return Diagnosis(verdict, extended, found, prediction, hits, robot)
 
 
@@ -174,9 +187,20 @@ def _verdict(found, prediction, hits, robot, without, seed, say) -> tuple[Verdic
     else:
         name = "named" if causes else "none"
     return (
-        Verdict(name, tuple(causes), unexplained, held, tuple(hidden), tuple(excited), steps, tuple(runners), tuple(warnings)),
-        values, ranges,
-    )  # fmt: skip
+        Verdict(
+            name,
+            tuple(causes),
+            unexplained,
+            held,
+            tuple(hidden),
+            tuple(excited),
+            steps,
+            tuple(runners),
+            tuple(warnings),
+        ),
+        values,
+        ranges,
+    )
 
 
 def _drive_values(cause, robot: RobotFindings) -> dict[str, float]:
@@ -234,10 +258,16 @@ def _ball_causes(found: BallFindings, without, seed: int) -> tuple[list[Cause], 
         shaken = shaking(found)
         if shaken is not None and shaken.shift > selection.FLOOR / 2:
             path = SENSING + "jitter"
-            causes.append(Cause(
-                "latency_jitter", ("latency_jitter",), 0.95, {path: Estimate(nominal[path], shaken.seconds, shaken.low, shaken.high, "s")},
-                1e3 * shaken.shift, "",
-            ))  # fmt: skip
+            causes.append(
+                Cause(
+                    "latency_jitter",
+                    ("latency_jitter",),
+                    0.95,
+                    {path: Estimate(nominal[path], shaken.seconds, shaken.low, shaken.high, "s")},
+                    1e3 * shaken.shift,
+                    "",
+                )
+            )
             values[path] = shaken.seconds
             ranges.append(Range(path, shaken.low, shaken.high))
     return causes, values, ranges
@@ -296,7 +326,9 @@ def _standing_in(cause: Cause, without, values: dict, ranges: list[Range]) -> Ca
     others = [name for name in cause.group if name not in (effect.name, twin.name)]
     text = cause.separating_measurement.removeprefix(f"{effect.name}: {effect.reading}; ") if others else ""
     parameters = {path: p for path, p in cause.parameters.items() if path != effect.path}
-    return replace(cause, name=twin.name, group=(twin.name, *others), parameters=parameters, separating_measurement=text)
+    return replace(
+        cause, name=twin.name, group=(twin.name, *others), parameters=parameters, separating_measurement=text
+    )
 
 
 def _spin_cause(found: BallFindings, confidence: float, values: dict, ranges: list, quantile: float) -> Cause:
@@ -327,9 +359,13 @@ def _spin_cause(found: BallFindings, confidence: float, values: dict, ranges: li
         values |= {f"ball_spin.mean_{axis}": float(mean), f"ball_spin.std_{axis}": float(std)}
     rms = float(np.sqrt(np.sum(choice.prior.std**2 + choice.prior.mean**2)))
     return Cause(
-        "magnus", ("magnus",), confidence, parameters, float(1e3 * rms * found.trial.spin_shift),
+        "magnus",
+        ("magnus",),
+        confidence,
+        parameters,
+        float(1e3 * rms * found.trial.spin_shift),
         "in flight only the product of coefficient and spin shows: " + BY_NAME["magnus"].reading,
-    )  # fmt: skip
+    )
 
 
 def _confidence(found: BallFindings, seed: int) -> list[float]:

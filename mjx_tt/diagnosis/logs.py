@@ -88,7 +88,9 @@ def longest(
         return (), ()
     name, chosen = max(records, key=lambda r: sum(joint.state_time.size for joint in r[1]))
     others = ", ".join(other for other, _ in records if other != name)
-    return chosen, (f"the joints are judged by {name} alone, the longest log of them; not by {others}",) if others else ()
+    return chosen, (
+        f"the joints are judged by {name} alone, the longest log of them; not by {others}",
+    ) if others else ()
 
 
 def _pairs(files: Iterable[Path]) -> dict[Path, tuple[Path, Path]]:
@@ -99,7 +101,9 @@ def _pairs(files: Iterable[Path]) -> dict[Path, tuple[Path, Path]]:
         mine = {f.name: f for f in robot if f.parent == folder}
         for name, other in (ROBOT_FILES, ROBOT_FILES[::-1]):
             if other not in mine:
-                raise ValueError(f"{mine[name]}: the joints' {other} is missing beside it: commands and positions are needed")
+                raise ValueError(
+                    f"{mine[name]}: the joints' {other} is missing beside it: commands and positions are needed"
+                )
         pairs[folder] = (mine["command.csv"], mine["state.csv"])
     return pairs
 

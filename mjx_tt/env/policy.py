@@ -86,7 +86,9 @@ def apply(theta, history):
     """The full convolution: theta (976,), normalised history (8, 11, ...) oldest first -> action (8, ...)."""
     rows = history
     for (kernel, bias, gated), dilation in zip(_layers(unflatten(theta)), DILATIONS):
-        rows = jnp.stack([_layer(kernel, bias, rows[t], rows[t + dilation], gated) for t in range(len(rows) - dilation)])
+        rows = jnp.stack(
+            [_layer(kernel, bias, rows[t], rows[t + dilation], gated) for t in range(len(rows) - dilation)]
+        )
     return rows[0]
 
 

@@ -124,9 +124,11 @@ def _search(simulator: Simulator, key, episodes: Episodes):
         knots = mean[:, :, None] + std[:, :, None] * noise
         knots = jnp.clip(knots, -1.0, 1.0).at[:, :, 0].set(mean)
         controller = MotionController(
-            knots.reshape(KNOTS, N_JOINTS, -1), jnp.tile(duration, CANDIDATES), simulator.config.period,
+            knots.reshape(KNOTS, N_JOINTS, -1),
+            jnp.tile(duration, CANDIDATES),
+            simulator.config.period,
             jnp.zeros(N_OBSERVATION),
-        )  # fmt: skip
+        )
         result = simulator.play(controller, many)
         score = jnp.nan_to_num(result.returns, nan=-1e3).reshape(CANDIDATES, mine)
         returned = (result.outcome == RETURNED).reshape(CANDIDATES, mine)

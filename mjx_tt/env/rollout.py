@@ -50,10 +50,16 @@ def _by_perturbation(rank: int) -> PartitionSpec:
 
 # How a result that is left on the devices is laid out: split along P.
 RESULT_SPECS = RolloutResult(
-    terms=_by_perturbation(3), returns=_by_perturbation(2), outcome=_by_perturbation(2), landing=_by_perturbation(3),
-    finite=_by_perturbation(2), steps=_by_perturbation(2), peak_velocity=_by_perturbation(3),
-    observation_sums=_by_perturbation(3), observation_counts=_by_perturbation(1),
-)  # fmt: skip
+    terms=_by_perturbation(3),
+    returns=_by_perturbation(2),
+    outcome=_by_perturbation(2),
+    landing=_by_perturbation(3),
+    finite=_by_perturbation(2),
+    steps=_by_perturbation(2),
+    peak_velocity=_by_perturbation(3),
+    observation_sums=_by_perturbation(3),
+    observation_counts=_by_perturbation(1),
+)
 
 
 class Simulator:

@@ -289,10 +289,24 @@ class Task:
         sums = self._accumulate(s, observation, controller.mean, command, command_acceleration, carried, pose, closest)
         ok = jnp.isfinite(sum(qpos[i] for i in range(N_JOINTS)) + sum(ball.position[i] for i in range(3)))
         return EpisodeState(
-            qpos, qvel, pose, command, command_acceleration, reference, commands,
+            qpos,
+            qvel,
+            pose,
+            command,
+            command_acceleration,
+            reference,
+            commands,
             latency.ring_write(s.observations, tick, captured),
-            controller_state, drive, filtered, ball, bounced, hit, live & ok, s.finite & (ok | ~s.live), sums,
-        )  # fmt: skip
+            controller_state,
+            drive,
+            filtered,
+            ball,
+            bounced,
+            hit,
+            live & ok,
+            s.finite & (ok | ~s.live),
+            sums,
+        )
 
     def _substeps(self, s: EpisodeState, episodes: Episodes, prepared: Prepared, old, new):
         """Robot and ball through one control period, with what the delayed sensors capture on the way."""

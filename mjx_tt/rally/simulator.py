@@ -151,9 +151,18 @@ class RallySimulator:
         return replace(state, dummy=jnp.zeros_like(state.dummy)), result
 
     def play(
-        self, theta, mean, inverse_scale, player: Player, model: SimModel, key, rallies: int,
-        box: Box | BallDistribution | None = None, max_touches: int = 400, capacity: int = 0,
-    ) -> RallyResult:  # fmt: skip
+        self,
+        theta,
+        mean,
+        inverse_scale,
+        player: Player,
+        model: SimModel,
+        key,
+        rallies: int,
+        box: Box | BallDistribution | None = None,
+        max_touches: int = 400,
+        capacity: int = 0,
+    ) -> RallyResult:
         """``rallies`` rallies of every lane, one after the other, in one compiled call.
 
         theta (976, L), mean and inverse_scale (11, L) or (11,); player and model: leaves scalar or (L,). box: what is out
@@ -162,9 +171,17 @@ class RallySimulator:
         """
         box = Box.of(box) if isinstance(box, BallDistribution) else box
         return self._play(
-            jnp.asarray(theta), mean, inverse_scale, player, without_nominal(model), key, box,
-            rallies=rallies, max_touches=max_touches, capacity=max(capacity, 1),
-        )  # fmt: skip
+            jnp.asarray(theta),
+            mean,
+            inverse_scale,
+            player,
+            without_nominal(model),
+            key,
+            box,
+            rallies=rallies,
+            max_touches=max_touches,
+            capacity=max(capacity, 1),
+        )
 
     # -- turns ---------------------------------------------------------------------------------------------------------
 
@@ -175,9 +192,17 @@ class RallySimulator:
         return RallyState(fresh, ball, jnp.ones(lanes, jnp.int32), home, jnp.zeros(lanes, bool))
 
     def _turn(
-        self, theta, mean, inverse_scale, player: Player, model: SimModel, state: RallyState, key, box,
+        self,
+        theta,
+        mean,
+        inverse_scale,
+        player: Player,
+        model: SimModel,
+        state: RallyState,
+        key,
+        box,
         max_touches: int = ENDLESS,
-    ):  # fmt: skip
+    ):
         """One ball of every lane. Returns the next state, the result and the paddle touches of each rally so far."""
         lanes = state.touches.shape[0]
         keys = iter(jax.random.split(key, 8))
@@ -218,11 +243,19 @@ class RallySimulator:
         steps = robot.sums.steps * self.config.period
         nowhere = jnp.full((2, lanes), jnp.nan)
         result = ShotResult(
-            ball=ball, first=first, touch=state.touches, landing=jnp.where(sent.valid, sent.landing, nowhere),
-            terms=terms, finite=finite, outcome=outcome, fault=fault, end=end.astype(jnp.int8),
-            return_landing=jnp.where(hit, back.landing, nowhere), robot_peak=robot.sums.peak_velocity,
+            ball=ball,
+            first=first,
+            touch=state.touches,
+            landing=jnp.where(sent.valid, sent.landing, nowhere),
+            terms=terms,
+            finite=finite,
+            outcome=outcome,
+            fault=fault,
+            end=end.astype(jnp.int8),
+            return_landing=jnp.where(hit, back.landing, nowhere),
+            robot_peak=robot.sums.peak_velocity,
             seconds=steps + jnp.where(returned, met.incoming.seconds, 0.0),
-        )  # fmt: skip
+        )
         return after, result, state.touches + hit
 
     def _robot(self, key, theta, mean, inverse_scale, model: SimModel, ball: BallState, start):
@@ -258,8 +291,10 @@ class RallySimulator:
         lane = jnp.arange(lanes)
         state = self._start_lanes(player, model, start_key, lanes)
         table = (
-            jnp.zeros((rallies, lanes), jnp.int32), jnp.full((rallies, lanes), End.NONE, jnp.int8), jnp.zeros((rallies, lanes)),
-        )  # fmt: skip
+            jnp.zeros((rallies, lanes), jnp.int32),
+            jnp.full((rallies, lanes), End.NONE, jnp.int8),
+            jnp.zeros((rallies, lanes)),
+        )
         whole, some = jnp.zeros((capacity, lanes), jnp.int32), jnp.zeros((capacity, lanes), bool)
         three, two = (jnp.zeros((n, capacity, lanes)) for n in (3, 2))
         log = BallLog(whole, whole, three, three, three, two, some, some, two, jnp.zeros(lanes, jnp.int32))

@@ -83,7 +83,7 @@ def _unsupported_joints(model: mujoco.MjModel) -> Iterator[str]:
         if model.dof_frictionloss[dof]:
             yield f"{name}: frictionloss is not supported"
         if model.jnt_limited[joint] and limits_act:
-            yield f"{name}: joint limits need constraints to be disabled (<flag constraint=\"disable\"/>)"
+            yield f'{name}: joint limits need constraints to be disabled (<flag constraint="disable"/>)'
         if model.jnt_actfrclimited[joint]:
             yield f"{name}: actuatorfrcrange is not supported"
 

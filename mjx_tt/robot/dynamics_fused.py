@@ -113,9 +113,7 @@ def _articulated_body(chain: Chain, h: float, uniform_gravcomp: float | None, qp
         A2, C2 = f.congruence(R, Aa), f.congruence(R, Ca)
         B2 = f.matmul(f.matmul(R, Ba), f.transpose(R))
         PC, PBt = f.matmul(P, C2), f.matmul(P, f.transpose(B2))
-        shifted = f.mirror(
-            lambda r, c: f.add(A2[r][c], f.add(f.add(PBt[r][c], PBt[c][r]), f.dot(PC[r], P[c])))
-        )
+        shifted = f.mirror(lambda r, c: f.add(A2[r][c], f.add(f.add(PBt[r][c], PBt[c][r]), f.dot(PC[r], P[c]))))
         A[i - 1] = f.mirror(lambda r, c: f.add(A[i - 1][r][c], shifted[r][c]))
         B[i - 1] = f.madd(B[i - 1], f.madd(B2, PC))
         C[i - 1] = f.mirror(lambda r, c: f.add(C[i - 1][r][c], C2[r][c]))

@@ -42,13 +42,23 @@ def describe(model: mujoco.MjModel) -> dict:
     return {
         "format": FORMAT,
         "joints": [
-            {"name": link.name, "type": "slide" if link.slide else "hinge", "axis": _numbers(link.axis),
-             "pos": _numbers(link.pos), "rot": _numbers(link.rot)}
+            {
+                "name": link.name,
+                "type": "slide" if link.slide else "hinge",
+                "axis": _numbers(link.axis),
+                "pos": _numbers(link.pos),
+                "rot": _numbers(link.rot),
+            }
             for link in centred_on_anchors(chain).links
         ],
         "capsules": [
-            {"name": c.name, "joint": JOINT_NAMES[c.link], "p0": _numbers(c.p0 - anchors[c.link]),
-             "p1": _numbers(c.p1 - anchors[c.link]), "radius": c.radius}
+            {
+                "name": c.name,
+                "joint": JOINT_NAMES[c.link],
+                "p0": _numbers(c.p0 - anchors[c.link]),
+                "p1": _numbers(c.p1 - anchors[c.link]),
+                "radius": c.radius,
+            }
             for c in robot.capsules(model)
             if c.link != robot.WORLD
         ],
@@ -58,7 +68,7 @@ def describe(model: mujoco.MjModel) -> dict:
         "blade_capsules": list(BLADE_CAPSULES),
         "self_pairs": [[first, other] for first, others in SELF_PAIRS for other in others],
         "home": _numbers(robot.home_qpos(model)),
-    }  # fmt: skip
+    }
 
 
 def text(model: mujoco.MjModel) -> str:
@@ -80,7 +90,9 @@ def path() -> Path:
 
 def main(arguments: list[str]) -> int:
     if arguments not in ([], ["--check"]):
-        print(f"unknown arguments {arguments}; usage: python -m mjx_tt.robot.geometry_export [--check]", file=sys.stderr)
+        print(
+            f"unknown arguments {arguments}; usage: python -m mjx_tt.robot.geometry_export [--check]", file=sys.stderr
+        )
         return 2
     wanted, file = text(robot.load_model()), path()
     if arguments:

@@ -19,9 +19,7 @@ def centred_on_anchors(chain: Chain) -> Chain:
     for link in chain.links:
         anchor = np.array(link.anchor)
         pos = np.array(link.pos) + np.array(link.rot) @ anchor - parent_anchor
-        links.append(
-            replace(link, anchor=f.ZERO3, pos=f.constants(pos), com=f.constants(np.array(link.com) - anchor))
-        )
+        links.append(replace(link, anchor=f.ZERO3, pos=f.constants(pos), com=f.constants(np.array(link.com) - anchor)))
         parent_anchor = anchor
     return replace(chain, links=tuple(links))
 

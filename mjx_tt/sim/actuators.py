@@ -116,9 +116,7 @@ def by_effect(params: DriveParams | None, shape: tuple[int, ...], dtype) -> Driv
 
 def at_rest(drives: Drives, qpos) -> DriveState:
     """The drives of a robot that stands at qpos (8, ...), in the middle of every play."""
-    return DriveState(
-        jnp.zeros_like(qpos) if drives.follows else None, qpos if drives.backlash is not None else None
-    )
+    return DriveState(jnp.zeros_like(qpos) if drives.follows else None, qpos if drives.backlash is not None else None)
 
 
 def reachable(drives: Drives, command):

@@ -405,7 +405,9 @@ class Bridge:
             faults = self.gate.faults
             if len(faults) > self._logged_faults:
                 for fault in faults[self._logged_faults :]:
-                    self._event(now, Level.ERROR, "fault", json.dumps({"cause": fault.cause.value, "text": fault.sentence}))
+                    self._event(
+                        now, Level.ERROR, "fault", json.dumps({"cause": fault.cause.value, "text": fault.sentence})
+                    )
                 if self._logged_faults == 0:
                     self._abort_episodes(faults[0].cause.value, now)
                     self._change(State.DISARMED, now, f"fault: {faults[0].sentence}")

@@ -217,9 +217,19 @@ class Episode:
         """Raises nothing; meaningful once ``decided``."""
         outcome = RETURNED if self.returned else HIT if self.hit else MISSED
         return EpisodeSummary(
-            self.number, self.ball, self.started, self.ended, self.steps, outcome, self.closest, self.crossed,
-            self.net_height, self.landing, self.fault, self.discarded,
-        )  # fmt: skip
+            self.number,
+            self.ball,
+            self.started,
+            self.ended,
+            self.steps,
+            outcome,
+            self.closest,
+            self.crossed,
+            self.net_height,
+            self.landing,
+            self.fault,
+            self.discarded,
+        )
 
 
 def _slope(samples: list[_Seen]) -> np.ndarray:

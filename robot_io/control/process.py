@@ -91,7 +91,9 @@ class Control:
     def __init__(self, config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
         self._config, self._options, self._pipe = config, options, pipe
         loaded = artefacts.load(options.artefact)
-        policy = make_policy(options.backend, loaded.parameters, loaded.normaliser_mean, loaded.normaliser_inverse_scale)
+        policy = make_policy(
+            options.backend, loaded.parameters, loaded.normaliser_mean, loaded.normaliser_inverse_scale
+        )
         self.timings = Timings()
         self._opened: list = []
         try:

@@ -65,10 +65,13 @@ class LockStep:
             AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)
             for _ in FESTO_JOINTS
         ]
-        self.axes = FestoAxes([
-            Axis(name, DirectLink(emulator), PROFILES[params.axis_profile](), *axis_range(i))
-            for i, (name, emulator) in enumerate(zip(("gantry_x", "gantry_y"), self.emulators))
-        ], AXES_CONFIG)  # fmt: skip
+        self.axes = FestoAxes(
+            [
+                Axis(name, DirectLink(emulator), PROFILES[params.axis_profile](), *axis_range(i))
+                for i, (name, emulator) in enumerate(zip(("gantry_x", "gantry_y"), self.emulators))
+            ],
+            AXES_CONFIG,
+        )
         seed = np.random.SeedSequence([params.seed, first]).generate_state(4)
         self.cameras = TrackerEmulator(params.tracker, int(seed[0]))
         self._to_bridge = Network(params.arm_network, int(seed[1]))
@@ -78,9 +81,15 @@ class LockStep:
         self.summaries: deque[EpisodeSummary] = deque()
         session = EgmSession(EgmConfig(controller_address=CONTROLLER[0]))
         self.bridge = Bridge(
-            session, self.axes, Tracker(TrackerConfig()), SafetyGate(config=safety), policy, config, recorder,
+            session,
+            self.axes,
+            Tracker(TrackerConfig()),
+            SafetyGate(config=safety),
+            policy,
+            config,
+            recorder,
             self.summaries.append,
-        )  # fmt: skip
+        )
         self._clock = 0
         self._setpoint = np.zeros(N_JOINTS)
         self.throwing = False

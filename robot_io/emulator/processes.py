@@ -73,8 +73,11 @@ class Rig:
         self._shared["silent_until"][0] = -1.0
         context = multiprocessing.get_context("spawn")
         jobs: dict[str, tuple[Callable, tuple]] = {
-            "world": (_world, (scene, throws)), "arm": (_arm, ()), "axes": (_axes, ()), "tracker": (_tracker, ()),
-        }  # fmt: skip
+            "world": (_world, (scene, throws)),
+            "arm": (_arm, ()),
+            "axes": (_axes, ()),
+            "tracker": (_tracker, ()),
+        }
         self._processes, self._pipes = {}, {}
         for name, (job, arguments) in jobs.items():
             mine, theirs = context.Pipe()
@@ -290,7 +293,10 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
 
 
 def _tracker(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
-    cameras, network = TrackerEmulator(params.tracker, params.seed + 2), Network(params.tracker_network, params.seed + 3)
+    cameras, network = (
+        TrackerEmulator(params.tracker, params.seed + 2),
+        Network(params.tracker_network, params.seed + 3),
+    )
     period = 1.0 / params.tracker.rate
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.bind((HOST, 0))
@@ -310,5 +316,3 @@ def _tracker(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
                     wire.sendto(datagram, (HOST, ports.tracker))
                 except OSError:
                     pass
-
-

@@ -13,9 +13,21 @@ import numpy as np
 from robot_io.contract import N_JOINTS
 
 _FIELDS = {
-    "version": 1, "time": 1, "qpos": N_JOINTS, "qvel": N_JOINTS, "ball": 3, "ball_number": 1, "ball_in_play": 1,
-    "collisions": 1, "setpoint": N_JOINTS, "throwing": 1, "thrown": 1, "finish": 1, "estop": 1, "silent_until": 1,
-}  # fmt: skip
+    "version": 1,
+    "time": 1,
+    "qpos": N_JOINTS,
+    "qvel": N_JOINTS,
+    "ball": 3,
+    "ball_number": 1,
+    "ball_in_play": 1,
+    "collisions": 1,
+    "setpoint": N_JOINTS,
+    "throwing": 1,
+    "thrown": 1,
+    "finish": 1,
+    "estop": 1,
+    "silent_until": 1,
+}
 
 
 class Shared:

@@ -238,12 +238,20 @@ def _model(scene: str, robot: mujoco.MjModel, params: WorldParams) -> mujoco.MjM
     half = rotation.reshape(3, 3)[:, 2] * PADDLE_HALF_THICKNESS
     centre = np.array(site.pos)
     hand.add_geom(
-        name="rig_paddle", type=mujoco.mjtGeom.mjGEOM_CYLINDER, fromto=[*(centre - half), *(centre + half)],
-        size=[PADDLE_RADIUS, 0, 0], contype=0, conaffinity=0, mass=0.0, group=3,
-    )  # fmt: skip
+        name="rig_paddle",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        fromto=[*(centre - half), *(centre + half)],
+        size=[PADDLE_RADIUS, 0, 0],
+        contype=0,
+        conaffinity=0,
+        mass=0.0,
+        group=3,
+    )
     restitutions = {
-        "col_table": params.table_restitution, "net": NET[0], "rig_paddle": params.paddle_restitution,
-    }  # fmt: skip
+        "col_table": params.table_restitution,
+        "net": NET[0],
+        "rig_paddle": params.paddle_restitution,
+    }
     for name, restitution in restitutions.items():
         damping = damping_for(restitution, STIFFNESS, params.timestep / FINE)
         spec.add_pair(geomname1="ball", geomname2=name, condim=1, solref=[-STIFFNESS, -damping], solimp=SOLIMP)

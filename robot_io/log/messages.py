@@ -200,9 +200,15 @@ class Tick:
 
     def pack(self) -> bytes:
         return _TICK.pack(
-            self.KIND, self.tick, self.time,
-            self.lateness, self.policy_seconds, self.ball_age, self.gantry_age, self.arm_age,
-        )  # fmt: skip
+            self.KIND,
+            self.tick,
+            self.time,
+            self.lateness,
+            self.policy_seconds,
+            self.ball_age,
+            self.gantry_age,
+            self.arm_age,
+        )
 
     @classmethod
     def unpack(cls, data: bytes) -> Tick:
@@ -315,9 +321,9 @@ def episode_start(time: float, episode: int, **details: Any) -> Event:
 def episode_end(time: float, episode: int, outcome: str, reward: Mapping[str, float], **details: Any) -> Event:
     """The event of an episode's end: ``outcome`` is a short enumerated name, ``reward`` its terms by name."""
     terms = {name: float(value) for name, value in reward.items()}
-    return Event(time, Level.INFO, "episode_end", _json(
-        {"episode": episode, "outcome": outcome, "reward": terms, **details}
-    ))  # fmt: skip
+    return Event(
+        time, Level.INFO, "episode_end", _json({"episode": episode, "outcome": outcome, "reward": terms, **details})
+    )
 
 
 def as_strings(entries: Mapping[str, Any]) -> dict[str, str]:

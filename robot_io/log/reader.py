@@ -240,11 +240,9 @@ def _assemble(scan, metadata, attachments, columns, events) -> SessionLog:
         observations=_policy(arrays[schema.OBSERVATION.name]),
         actions=_policy(arrays[schema.ACTION.name]),
         ticks=TickSeries(tick, tick_time, *tick_numbers),
-        events=tuple(
-            Event((stamp - offset) / NANO, event.level, event.name, event.text) for stamp, event in events
-        ),
+        events=tuple(Event((stamp - offset) / NANO, event.level, event.name, event.text) for stamp, event in events),
         faults=tuple(scan.faults),
-    )  # fmt: skip
+    )
 
 
 def _policy(arrays: tuple[np.ndarray, ...]) -> PolicySeries:

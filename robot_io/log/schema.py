@@ -37,9 +37,12 @@ def _own_messages() -> tuple[type, type]:
     for name, doubles in fields.items():
         message = file.message_type.add(name=name)
         message.field.add(
-            name="timestamp", number=1, label=field_type.LABEL_OPTIONAL,
-            type=field_type.TYPE_MESSAGE, type_name=".google.protobuf.Timestamp",
-        )  # fmt: skip
+            name="timestamp",
+            number=1,
+            label=field_type.LABEL_OPTIONAL,
+            type=field_type.TYPE_MESSAGE,
+            type_name=".google.protobuf.Timestamp",
+        )
         message.field.add(name="tick", number=2, label=field_type.LABEL_OPTIONAL, type=field_type.TYPE_UINT64)
         for number, (double, label) in enumerate(doubles, start=3):
             message.field.add(name=double, number=number, label=label, type=field_type.TYPE_DOUBLE)
@@ -120,15 +123,17 @@ BALL = Topic("/ball", Point3InFrame, 3, _point, {"frame": FRAME, "unit": "m"})
 JOINT_STATES = Topic("/joint_states", JointStates, 2 * N_JOINTS, _joints("position", "velocity"), _JOINT_METADATA)
 REQUESTED = Topic("/commands/requested", JointStates, N_JOINTS, _joints("velocity"), _JOINT_METADATA)
 SENT = Topic("/commands/sent", JointStates, 2 * N_JOINTS, _joints("position", "velocity"), _JOINT_METADATA)
-OBSERVATION = Topic("/observation", Values, N_OBSERVATION, _values(N_OBSERVATION), {
-    "names": " ".join(OBSERVATION_NAMES), "units": " ".join(OBSERVATION_UNITS)
-})  # fmt: skip
+OBSERVATION = Topic(
+    "/observation",
+    Values,
+    N_OBSERVATION,
+    _values(N_OBSERVATION),
+    {"names": " ".join(OBSERVATION_NAMES), "units": " ".join(OBSERVATION_UNITS)},
+)
 ACTION = Topic("/action", Values, N_JOINTS, _values(N_JOINTS), {"names": " ".join(JOINT_NAMES), "units": "1"})
 TICK = Topic("/tick", TickMessage, len(TICK_FIELDS), _tick, {"unit": "s"})
 EVENT = Topic("/event", Log)
-TOPICS = {
-    topic.name: topic for topic in (BALL, JOINT_STATES, REQUESTED, SENT, OBSERVATION, ACTION, TICK, EVENT)
-}  # fmt: skip
+TOPICS = {topic.name: topic for topic in (BALL, JOINT_STATES, REQUESTED, SENT, OBSERVATION, ACTION, TICK, EVENT)}
 
 
 @dataclass(frozen=True, slots=True)

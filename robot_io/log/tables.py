@@ -35,13 +35,15 @@ def export(log: SessionLog, folder: str | Path) -> list[Path]:
         "ball.csv": ("session,trajectory,t,x,y,z", _balls(log)),
         "command.csv": ("t,joint,velocity", _by_joint(commands.time - start, commands.sent)),
         "state.csv": ("t,joint,position", _by_joint(joints.time - start, joints.position)),
-        "events.csv": ("t,level,name,text", (
-            (_seconds(event.time - start), event.level.name.lower(), event.name, event.text) for event in log.events
-        )),
-        "ticks.csv": ("tick,t,lateness,policy_seconds,ball_age,gantry_age,arm_age", (
-            (int(tick), *map(_seconds, row)) for tick, *row in zip(ticks.tick, *seconds)
-        )),
-    }  # fmt: skip
+        "events.csv": (
+            "t,level,name,text",
+            ((_seconds(event.time - start), event.level.name.lower(), event.name, event.text) for event in log.events),
+        ),
+        "ticks.csv": (
+            "tick,t,lateness,policy_seconds,ball_age,gantry_age,arm_age",
+            ((int(tick), *map(_seconds, row)) for tick, *row in zip(ticks.tick, *seconds)),
+        ),
+    }
     paths = []
     for name, (header, rows) in tables.items():
         path = folder / name

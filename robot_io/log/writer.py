@@ -56,9 +56,7 @@ class Session:
 
     def to_json(self) -> bytes:
         attachments = {name: base64.b64encode(content).decode() for name, content in self.attachments.items()}
-        return json.dumps(
-            [str(self.folder), self.name, self.metadata, attachments, self.clock_offset_ns]
-        ).encode()  # fmt: skip
+        return json.dumps([str(self.folder), self.name, self.metadata, attachments, self.clock_offset_ns]).encode()
 
     @classmethod
     def from_json(cls, data: bytes) -> Session:
@@ -199,12 +197,17 @@ class SessionWriter:
     def finish(self, malformed: int = 0) -> Path:
         """Completes the file and gives it its name; ``malformed`` records were refused by ``write``."""
         end = self._end or End(0, 0)
-        self._add_metadata("end", as_strings({
-            "closed": self._end is not None,
-            "dropped": end.dropped if self._end else "unknown",
-            "malformed": end.malformed + malformed,
-            "messages": self.messages,
-        }))  # fmt: skip
+        self._add_metadata(
+            "end",
+            as_strings(
+                {
+                    "closed": self._end is not None,
+                    "dropped": end.dropped if self._end else "unknown",
+                    "malformed": end.malformed + malformed,
+                    "messages": self.messages,
+                }
+            ),
+        )
         self._writer.finish()
         self._file.flush()
         os.fsync(self._file.fileno())

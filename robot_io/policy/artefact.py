@@ -32,7 +32,14 @@ HASHED_FILES = (PARAMETERS, GOLDEN, ONNX, JAX_EXPORT)  # by the manifest, which 
 FILES = (MANIFEST, MANIFEST_DIGEST, *HASHED_FILES)
 
 MANIFEST_KEYS = (
-    "schema_version", "contract", "architecture", "normaliser", "golden", "files", "provenance", "written_with",
+    "schema_version",
+    "contract",
+    "architecture",
+    "normaliser",
+    "golden",
+    "files",
+    "provenance",
+    "written_with",
 )
 
 _REEXPORT = "export the policy again with this version of the program"
@@ -87,14 +94,20 @@ def load(folder: str | Path) -> Artefact:
         found, expected = sha256(contents[name]), manifest["files"].get(name)
         if found != expected:
             raise ArtefactError(f"{folder / name}: SHA-256 is {found}, the manifest says {expected}; {_RECOPY}")
-    parameters = _arrays(folder / PARAMETERS, contents[PARAMETERS], {
-        name: (shape, "float32") for name, shape in contract.parameter_shapes().items()
-    })
+    parameters = _arrays(
+        folder / PARAMETERS,
+        contents[PARAMETERS],
+        {name: (shape, "float32") for name, shape in contract.parameter_shapes().items()},
+    )
     golden_count = manifest["golden"].get("count")
-    golden = _arrays(folder / GOLDEN, contents[GOLDEN], {
-        "history": ((contract.HISTORY, contract.N_OBSERVATION, golden_count), "float32"),
-        "action": ((contract.N_JOINTS, golden_count), "float64"),
-    })
+    golden = _arrays(
+        folder / GOLDEN,
+        contents[GOLDEN],
+        {
+            "history": ((contract.HISTORY, contract.N_OBSERVATION, golden_count), "float32"),
+            "action": ((contract.N_JOINTS, golden_count), "float64"),
+        },
+    )
     mean, inverse_scale = _normaliser(folder / MANIFEST, manifest["normaliser"])
     artefact = Artefact(
         folder=folder,

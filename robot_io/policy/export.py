@@ -33,6 +33,7 @@ GOLDEN_COUNT = 64
 ONNX_OPSET = 17
 ONNX_IR_VERSION = 8  # the IR that came with opset 17, so older runtimes load it too
 
+
 def write(
     folder: str | Path,
     theta: np.ndarray,
@@ -89,12 +90,14 @@ def verify(folder: str | Path, histories: int = 1000, seed: int = 0) -> dict[str
     with jax.default_device(jax.devices("cpu")[0]):
         actions = {
             "numpy": artefact.forward(history),
-            "jit": np.asarray(_jitted_forward(
-                artefact.parameters,
-                artefact.normaliser_mean.astype(np.float32),
-                artefact.normaliser_inverse_scale.astype(np.float32),
-                history,
-            )),
+            "jit": np.asarray(
+                _jitted_forward(
+                    artefact.parameters,
+                    artefact.normaliser_mean.astype(np.float32),
+                    artefact.normaliser_inverse_scale.astype(np.float32),
+                    history,
+                )
+            ),
             "onnxruntime": session.run(["action"], {"history": history})[0],
             "jax_export": np.asarray(exported.call(history)),
         }
@@ -157,10 +160,15 @@ def onnx_model(parameters: dict[str, np.ndarray], mean: np.ndarray, inverse_scal
     for i, (dilation, gated) in enumerate(zip(contract.DILATIONS, contract.GATED), start=1):
         constants[f"kernel{i}"] = np.ascontiguousarray(parameters[f"conv{i}/kernel"].transpose(2, 1, 0))
         constants[f"bias{i}"] = parameters[f"conv{i}/bias"]
-        nodes.append(helper.make_node(
-            "Conv", [f"layer{i - 1}", f"kernel{i}", f"bias{i}"], [f"conv{i}"],
-            kernel_shape=[contract.KERNEL], dilations=[dilation],
-        ))
+        nodes.append(
+            helper.make_node(
+                "Conv",
+                [f"layer{i - 1}", f"kernel{i}", f"bias{i}"],
+                [f"conv{i}"],
+                kernel_shape=[contract.KERNEL],
+                dilations=[dilation],
+            )
+        )
         if gated:
             nodes += [
                 helper.make_node("Split", [f"conv{i}"], [f"signal{i}", f"gate{i}"], axis=1),

@@ -290,13 +290,20 @@ def _check(data: Any, where: str) -> None:
         if types != sorted(types, key=("slide", "hinge").index):
             raise GeometryError(f"{where}: joint types are {types}; slides must come before hinges")
         numbers = [
-            *(np.array(joint[key], float).reshape(shape) for joint in data["joints"]
-              for key, shape in (("axis", 3), ("pos", 3), ("rot", (3, 3)))),
-            *(np.array(c[key], float).reshape(shape) for c in data["capsules"]
-              for key, shape in (("p0", 3), ("p1", 3), ("radius", ()))),
+            *(
+                np.array(joint[key], float).reshape(shape)
+                for joint in data["joints"]
+                for key, shape in (("axis", 3), ("pos", 3), ("rot", (3, 3)))
+            ),
+            *(
+                np.array(c[key], float).reshape(shape)
+                for c in data["capsules"]
+                for key, shape in (("p0", 3), ("p1", 3), ("radius", ()))
+            ),
             *(np.array(data["table"][key], float).reshape(3) for key in ("centre", "half")),
-            np.array(data["home"], float).reshape(N_JOINTS), np.array(data["floor"], float).reshape(()),
-        ]  # fmt: skip
+            np.array(data["home"], float).reshape(N_JOINTS),
+            np.array(data["floor"], float).reshape(()),
+        ]
         if any(c["joint"] not in JOINT_NAMES for c in data["capsules"]):
             raise GeometryError(f"{where}: a capsule is on a joint that is none of {JOINT_NAMES}; {rewrite}")
     except (KeyError, TypeError, ValueError) as error:

@@ -75,11 +75,15 @@ class SafetyGate:
         self.geometry = geometry or RobotGeometry.load()
         self.period = period
         scale = config.speed_scale
-        self.limits = limits if scale == 1.0 else replace(
-            limits,
-            velocity=tuple(scale * v for v in limits.velocity),
-            policy_velocity=tuple(scale * v for v in limits.policy_velocity),
-        )  # fmt: skip
+        self.limits = (
+            limits
+            if scale == 1.0
+            else replace(
+                limits,
+                velocity=tuple(scale * v for v in limits.velocity),
+                policy_velocity=tuple(scale * v for v in limits.policy_velocity),
+            )
+        )
         self._v_max, self._a = np.array(self.limits.velocity), np.array(limits.acceleration)
         self._step = self._a * period
         # Beyond the limiter's own margin by this the limiter still leads back within a period or two.
@@ -283,8 +287,10 @@ class SafetyGate:
         clipped = np.clip(scaled, -self._v_max, self._v_max)
         rated = np.clip(clipped, self._velocity - self._step, self._velocity + self._step)
         for name, before, after in (
-            ("velocity", scaled, clipped), ("acceleration", clipped, rated), ("position", rated, velocity),
-        ):  # fmt: skip
+            ("velocity", scaled, clipped),
+            ("acceleration", clipped, rated),
+            ("position", rated, velocity),
+        ):
             if (before != after).any():
                 rules.append(name)
         if (velocity == braked).all():  # cleared before, or at rest

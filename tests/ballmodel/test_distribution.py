@@ -18,7 +18,7 @@ from ballmodel.state import BallState, ball_state
 
 BOX = BallDistribution(
     (0.0, 1.2, 0.2), (0.3, 1.5, 0.5), (-0.8, -6.5, 0.0), (0.8, -4.0, 1.8), (-0.3, -1.2), (0.5, -0.4), "box"
-)  # fmt: skip
+)
 
 
 # --- the paper's tables

@@ -65,9 +65,7 @@ def test_converges_to_the_differential_equation_at_the_order_of_its_integrator()
         params = FlightParams(magnus_coefficient=0.6, spin_decay=0.4, integrator=integrator)
         exact = reference(params, position, velocity, spin, 0.5)
         state = ball_state(position, velocity, spin)
-        coarse, fine = (
-            np.linalg.norm(fly(params, state, 0.5 / n, n).position - exact) for n in (150, 300)
-        )
+        coarse, fine = (np.linalg.norm(fly(params, state, 0.5 / n, n).position - exact) for n in (150, 300))
         assert coarse / fine == pytest.approx(2.0**order, rel=0.1)
 
 
@@ -277,9 +275,11 @@ def test_paddle_impact_is_the_same_seen_from_a_moving_frame():
             params, ball_state(position, velocity, spin), 0.01, still_pose([0, 0, 0.5], normal, paddle_velocity)
         )
         moving, e2 = step(
-            params, ball_state(position, velocity + boost, spin), 0.01,
+            params,
+            ball_state(position, velocity + boost, spin),
+            0.01,
             still_pose([0, 0, 0.5], normal, paddle_velocity + boost),
-        )  # fmt: skip
+        )
         assert bool(e1.paddle) and bool(e2.paddle)
         np.testing.assert_allclose(moving.velocity, rest.velocity + boost, atol=1e-10)
         np.testing.assert_allclose(moving.spin, rest.spin, atol=1e-9)

@@ -128,7 +128,9 @@ def test_gradient_of_a_quadratic_is_exact():
 
 def test_population_is_all_plus_then_all_minus():
     config = bgs.BGSConfig(sigma=0.5)
-    members = bgs.population(bgs.init(jnp.array([1.0, 2.0]), config), jnp.array([[1.0, 0.0, 2.0], [0.0, 1.0, 4.0]]), config)
+    members = bgs.population(
+        bgs.init(jnp.array([1.0, 2.0]), config), jnp.array([[1.0, 0.0, 2.0], [0.0, 1.0, 4.0]]), config
+    )
     np.testing.assert_array_equal(members, [[1.5, 1.0, 2.0, 0.5, 1.0, 0.0], [2.0, 2.5, 4.0, 2.0, 1.5, 0.0]])
 
 
@@ -254,8 +256,17 @@ def test_equal_configurations_share_one_compilation():
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("pairs", 0), ("pairs", 2.5), ("sigma", 0.0), ("sigma", math.nan), ("keep", 0.0), ("keep", 1.1),
-        ("rank", "top"), ("weighting", "z"), ("normalise", "max"), ("scale", "unit"), ("average", 1.0),
+        ("pairs", 0),
+        ("pairs", 2.5),
+        ("sigma", 0.0),
+        ("sigma", math.nan),
+        ("keep", 0.0),
+        ("keep", 1.1),
+        ("rank", "top"),
+        ("weighting", "z"),
+        ("normalise", "max"),
+        ("scale", "unit"),
+        ("average", 1.0),
         ("step", "adam"),
     ],
 )

@@ -194,8 +194,12 @@ def sysid(linear: Linear) -> tuple[str, ...]:
 
 
 METHODS: dict[str, Callable[[Linear], tuple[str, ...]]] = {
-    "best single": best_single, "BIC": bic, "LASSO": lasso, "SINDy": sindy, "sysid": sysid,
-}  # fmt: skip
+    "best single": best_single,
+    "BIC": bic,
+    "LASSO": lasso,
+    "SINDy": sindy,
+    "sysid": sysid,
+}
 
 
 def answer(names: tuple[str, ...]) -> dict:
@@ -233,18 +237,25 @@ def run_all(cases: list[dict], folder: Path) -> list[dict]:
 
 # Kinds side by side, and which outcomes are good there.
 COMPARED = {
-    "none": ("right",), "noise": ("right",), "single": ("right",), "pair": ("right",), "triple": ("right",),
-    "deleted": ("right", "flagged"), "invented": ("flagged",),
-}  # fmt: skip
+    "none": ("right",),
+    "noise": ("right",),
+    "single": ("right",),
+    "pair": ("right",),
+    "triple": ("right",),
+    "deleted": ("right", "flagged"),
+    "invented": ("flagged",),
+}
 
 
 def side_by_side(ours: list[dict], theirs: list[dict]) -> list[str]:
     """Markdown: share of good answers by kind and method, and the sign test of ours against the method's."""
     by_key = {r["key"]: r["outcome"] for r in ours}
     lines = [
-        "Share of good answers on the same cases; in brackets p of the sign test that the diagnosis is no better.", "",
-        f"| kind | cases | diagnosis | {' | '.join(METHODS)} |", "|---|---|---|" + "---|" * len(METHODS),
-    ]  # fmt: skip
+        "Share of good answers on the same cases; in brackets p of the sign test that the diagnosis is no better.",
+        "",
+        f"| kind | cases | diagnosis | {' | '.join(METHODS)} |",
+        "|---|---|---|" + "---|" * len(METHODS),
+    ]
     for kind, good in COMPARED.items():
         rows = [r for r in theirs if r["case"]["kind"] == kind and r["key"] in by_key]
         if not rows:

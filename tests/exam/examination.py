@@ -56,9 +56,7 @@ ALONE = ("11", "12")  # time and real data: no drawn cases
 def plan(bars: list[str], count: int, seed: int) -> list[Case]:
     """The cases of the bars, the kinds taking turns. A kind that two bars need is drawn once."""
     wanted = {(kind, size): share for bar in bars for kind, size, share in BARS.get(bar, ())}
-    queues = [
-        drawing.draw(kind, max(1, round(count * share)), seed, size) for (kind, size), share in wanted.items()
-    ]
+    queues = [drawing.draw(kind, max(1, round(count * share)), seed, size) for (kind, size), share in wanted.items()]
     # By its place in its own queue: after a tenth of the run, a tenth of each kind is done.
     order = sorted((i / len(q), n, case) for n, q in enumerate(queues) for i, case in enumerate(q))
     return [case for _, _, case in sorted(order, key=lambda item: item[:2])]
@@ -97,7 +95,13 @@ def examine(case: Case, folder: Path) -> dict:
         verdict = diagnose(files, folder / "out", _options(case))
     except (Exception, SystemExit) as error:
         (folder / "error.txt").write_text(traceback.format_exc())
-        record |= {"outcome": "error", "verdict": "error", "answer": "error", "twins": {}, "error": f"{type(error).__name__}: {error}"[:500]}
+        record |= {
+            "outcome": "error",
+            "verdict": "error",
+            "answer": "error",
+            "twins": {},
+            "error": f"{type(error).__name__}: {error}"[:500],
+        }
         return record | {"seconds": time.perf_counter() - started}
     record |= {"seconds": time.perf_counter() - started, "cpu_seconds": time.process_time() - worked}
     truth = json.loads(sealed.read_text())
@@ -291,4 +295,3 @@ def main(arguments: list[str] | None = None) -> int:
         compared = baselines.run_all([r["case"] for r in records], options.out)
     print(summarise(records, alone, compared, options.out))
     return 0
-

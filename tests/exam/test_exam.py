@@ -46,9 +46,21 @@ def test_the_generator_imports_nothing_that_it_tests():
 
 
 WORLD = World(
-    drag_coefficient=0.5, magnus_coefficient=0.7, spin_decay=0.2, buoyancy=0.01, gravity_x=0.1, wind_x=0.4, wind_y=-0.3,
-    wind_z=0.2, restitution=0.9, restitution_slope=0.01, friction=0.2, height=0.004, tilt_x=0.02, tilt_y=-0.01,
-)  # fmt: skip
+    drag_coefficient=0.5,
+    magnus_coefficient=0.7,
+    spin_decay=0.2,
+    buoyancy=0.01,
+    gravity_x=0.1,
+    wind_x=0.4,
+    wind_y=-0.3,
+    wind_z=0.2,
+    restitution=0.9,
+    restitution_slope=0.01,
+    friction=0.2,
+    height=0.004,
+    tilt_x=0.02,
+    tilt_y=-0.01,
+)
 START = np.array([0.1, 1.4, 0.3, -0.2, -5.5, 0.8, 60.0, -20.0, 30.0])
 
 
@@ -236,18 +248,22 @@ def test_joint_responses_have_their_closed_forms():
         "lag": (replace(none, lag=0.2), [1, 1, 1], ramp - 0.2 * (1 - np.exp(-query / 0.2))),
         "limit": (replace(none, velocity_limit=0.4), [1, 1, 1], 0.4 * ramp),
         "acceleration": (
-            replace(none, acceleration_limit=2.0), [1, 1, 1], np.where(query < 0.5, query**2, query - 0.25)
+            replace(none, acceleration_limit=2.0),
+            [1, 1, 1],
+            np.where(query < 0.5, query**2, query - 0.25),
         ),
         "deadband": (replace(none, deadband=0.5), [0.4, 1, -1], np.clip(query - 1, 0, 1) - np.clip(query - 2, 0, 1)),
         "friction": (
-            replace(none, coulomb_friction=0.3), [1, 0.2, -1],
-            0.7 * np.clip(query, 0, 1) - 0.7 * np.clip(query - 2, 0, 1)
+            replace(none, coulomb_friction=0.3),
+            [1, 0.2, -1],
+            0.7 * np.clip(query, 0, 1) - 0.7 * np.clip(query - 2, 0, 1),
         ),
         "backlash": (
-            replace(none, backlash=0.2), [1, -1, 0],
+            replace(none, backlash=0.2),
+            [1, -1, 0],
             np.where(query < 1.2, np.clip(query - 0.1, 0.0, 0.9), np.maximum(2.1 - query, 0.1)),
         ),
-    }  # fmt: skip
+    }
     for name, (joint, values, wanted) in cases_.items():
         position = robot.respond(joint, *steps(values), query)
         np.testing.assert_allclose(position, wanted, atol=2e-3 if name != "pure" else 1e-9, err_msg=name)

@@ -20,8 +20,21 @@ from robot_io import contract
 from robot_io.policy import artefact
 from tests.support.paths import ROOT
 
-COMMANDS = ("train", "evaluate", "export", "fit-human", "import", "render", "bench", "schema", "balls",
-            "run", "rig", "finetune", "log")  # fmt: skip
+COMMANDS = (
+    "train",
+    "evaluate",
+    "export",
+    "fit-human",
+    "import",
+    "render",
+    "bench",
+    "schema",
+    "balls",
+    "run",
+    "rig",
+    "finetune",
+    "log",
+)
 EXPERIMENT = """
 name: tiny
 balls: player5/M0
@@ -85,8 +98,12 @@ def test_train_leaves_evaluation_artefact_pictures_and_measurements(trained):
     assert [row["update"] for row in rows] == [1, 2, 3] and notes["update"] == 3
     assert ["evaluation/return_rate" in row for row in rows] == [False, True, False]
     assert {path.stem for path in (run / "plots").glob("*.png")} == {
-        "landing_map", "return_rate_map", "rewards", "joint_speeds", "training",
-    }  # fmt: skip
+        "landing_map",
+        "return_rate_map",
+        "rewards",
+        "joint_speeds",
+        "training",
+    }
     for path in (run / "evaluation.json", run / "plots", run / "artefact"):
         assert str(path) in output.replace("\n", "")
 

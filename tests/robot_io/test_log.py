@@ -91,9 +91,8 @@ def expect_ticks(session: log.SessionLog, count: int) -> None:
 def test_a_packed_ball_is_these_bytes():
     packed = log.Ball(1.5, 2.0, [0.0, -1.0, 0.25], 7).pack()
     assert packed.hex() == (
-        "01" "000000000000f83f" "0000000000000040" "07000000"
-        "0000000000000000" "000000000000f0bf" "000000000000d03f"
-    )  # fmt: skip
+        "01000000000000f83f0000000000000040070000000000000000000000000000000000f0bf000000000000d03f"
+    )
 
 
 def test_records_survive_packing():
@@ -161,8 +160,10 @@ def test_round_trip_through_the_recorder_process(tmp_path):
     assert session.attachments == {"robot.yaml": b"a: 1\n"}
     assert (session.name, session.dropped, session.faults) == ("monday", 0, ())
     assert [(e.level, e.name) for e in session.events] == [
-        (log.Level.INFO, "episode_start"), (log.Level.FATAL, "fault"), (log.Level.INFO, "episode_end")
-    ]  # fmt: skip
+        (log.Level.INFO, "episode_start"),
+        (log.Level.FATAL, "fault"),
+        (log.Level.INFO, "episode_end"),
+    ]
     (episode,) = session.episodes
     assert (episode.number, episode.outcome, episode.reward) == (7, "missed", {"hit": 0.0})
     assert episode.details["ball"] == "player1/M0"
@@ -176,9 +177,15 @@ def test_standard_readers_open_the_file(recording):
         summary = reader.get_summary()
         counts = summary.statistics.channel_message_counts
         assert {summary.channels[i].topic: n for i, n in counts.items()} == {
-            "/ball": 300, "/joint_states": 300, "/commands/requested": 300, "/commands/sent": 300,
-            "/observation": 300, "/action": 300, "/tick": 300, "/event": 2,
-        }  # fmt: skip
+            "/ball": 300,
+            "/joint_states": 300,
+            "/commands/requested": 300,
+            "/commands/sent": 300,
+            "/observation": 300,
+            "/action": 300,
+            "/tick": 300,
+            "/event": 2,
+        }
         messages = {}
         for schema, channel, message, decoded in reader.iter_decoded_messages():
             messages.setdefault(channel.topic, []).append((schema.name, message, decoded))

@@ -21,11 +21,25 @@ from experiments.study.blind import protocol
 from mjx_tt.rally.end_reasons import End
 
 MEANS = {
-    "is2r-sim1": 3.0, "is2r-ft35": 5.5, "is2r-sim2": 4.5, "is2r-ft65": 8.5, "is2r-sim3": 6.5, "is2r-ft100": 9.0,
-    "s2r-ft65": 5.0, "s2r-ft100": 5.5, "oracle-sim": 6.0, "oracle-ft": 8.8,
-    "fresh-sim2": 4.2, "fresh-ft65": 7.0, "fresh-sim3": 6.0, "fresh-ft100": 8.0,
-    "large": 3.5, "medium": 5.8, "narrow": 3.0, "oracle": 6.0,
-}  # fmt: skip
+    "is2r-sim1": 3.0,
+    "is2r-ft35": 5.5,
+    "is2r-sim2": 4.5,
+    "is2r-ft65": 8.5,
+    "is2r-sim3": 6.5,
+    "is2r-ft100": 9.0,
+    "s2r-ft65": 5.0,
+    "s2r-ft100": 5.5,
+    "oracle-sim": 6.0,
+    "oracle-ft": 8.8,
+    "fresh-sim2": 4.2,
+    "fresh-ft65": 7.0,
+    "fresh-sim3": 6.0,
+    "fresh-ft100": 8.0,
+    "large": 3.5,
+    "medium": 5.8,
+    "narrow": 3.0,
+    "oracle": 6.0,
+}
 SKILL = {"player3": 1.0, "player5": 1.4, "player4": 2.0, "player2": 2.4, "player1": 2.8}
 KEPT = {"is2r-ft100": 0.7, "s2r-ft100": 0.35, "oracle-ft": 0.65}
 RALLIES = 80
@@ -66,10 +80,17 @@ def make(folder: Path, seeds=(0,), names=BY_SKILL, balls: int = 60, rallies: int
                 parts.append(one)
                 if model in (*FINAL, "is2r-ft35", "is2r-ft65"):
                     _log(folder / "evaluations" / f"{seed}_{player}_{evaluator}_{model}.npz", one, pools[-1], rng)
-        effect_costs.write(folder / f"seed{seed}" / effect_costs.FILE, [
-            effect_costs.Outcome(seed, player, model, world, 60, mean_length(player, model) * WITHOUT.get(world, 1.0))
-            for player in names for model in effect_costs.MODELS for world in effect_costs.WORLDS
-        ])  # fmt: skip
+        effect_costs.write(
+            folder / f"seed{seed}" / effect_costs.FILE,
+            [
+                effect_costs.Outcome(
+                    seed, player, model, world, 60, mean_length(player, model) * WITHOUT.get(world, 1.0)
+                )
+                for player in names
+                for model in effect_costs.MODELS
+                for world in effect_costs.WORLDS
+            ],
+        )
         (folder / f"seed{seed}" / "reality.yaml").write_text("ball: {flight: {magnus: 0.00037}}\n")
     scoring.write(folder / "evaluations.csv", scoring.join(parts))
     return folder
@@ -105,9 +126,17 @@ def _log(path: Path, rallies: scoring.Rallies, balls: np.ndarray, rng) -> None:
     back = rng.normal((0.0, 0.75), (0.35, 0.35), (rally.size, 2)).T
     inside = (np.abs(back[0]) < c.TABLE_WIDTH / 2) & (back[1] > 0.0) & (back[1] < c.TABLE_LENGTH / 2)
     np.savez_compressed(
-        path, rally=rally, touch=touch, first=touch == 1, position=drawn[:3], velocity=drawn[3:6], landing=drawn[6:],
-        hit=hit, returned=hit & ~last & inside, return_landing=np.where(hit, back, np.nan),
-    )  # fmt: skip
+        path,
+        rally=rally,
+        touch=touch,
+        first=touch == 1,
+        position=drawn[:3],
+        velocity=drawn[3:6],
+        landing=drawn[6:],
+        hit=hit,
+        returned=hit & ~last & inside,
+        return_landing=np.where(hit, back, np.nan),
+    )
 
 
 def _balls(folder: Path, player: str, count: int, rng) -> list[np.ndarray]:

@@ -49,8 +49,12 @@ PLAYS = 2.0  # touches; the shortest rally in the paper's table of player skill
 LARGEST = 1e4  # number that is printed as one
 SHORT = 5  # touches; the paper's "shorter" rallies
 AGREES, DIRECTION, DIFFERS, UNDECIDED, NOT_COMPARABLE = (
-    "agrees", "agrees in direction", "differs", "undecided", "not comparable",
-)  # fmt: skip
+    "agrees",
+    "agrees in direction",
+    "differs",
+    "undecided",
+    "not comparable",
+)
 VERDICTS = (AGREES, DIRECTION, DIFFERS, UNDECIDED, NOT_COMPARABLE)
 RATIO, DIFFERENCE, SHARE, HITS = "ratio", "difference", "share", "hits"
 NULL = {RATIO: 1.0, DIFFERENCE: 0.0, SHARE: 0.5}
@@ -351,7 +355,7 @@ _MEASURES: dict[str, tuple[str, str, Callable]] = {
     "large": ("less", RATIO, _ratio("large", "oracle", "all")),
     "medium": ("alike", RATIO, _ratio("medium", "oracle", "all")),
     "carried": ("open", RATIO, _ratio(IS2R, "fresh-ft100", "all")),
-}  # fmt: skip
+}
 
 
 def _changes(models) -> tuple[float, float]:

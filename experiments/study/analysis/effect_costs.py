@@ -74,11 +74,16 @@ def read(path: Path) -> list[Outcome]:
         try:
             out.append(
                 Outcome(
-                    int(row["seed"]), row["player"], row["model"], row["without"], int(row["rallies"]),
+                    int(row["seed"]),
+                    row["player"],
+                    row["model"],
+                    row["without"],
+                    int(row["rallies"]),
                     float(row["length"]),
-                )  # fmt: skip
+                )
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(f"{path}: line {number}: {row}: {error!r}; wanted are "
-                              f"{', '.join(f.name for f in fields(Outcome))}") from None  # fmt: skip
+            raise ConfigError(
+                f"{path}: line {number}: {row}: {error!r}; wanted are {', '.join(f.name for f in fields(Outcome))}"
+            ) from None
     return out

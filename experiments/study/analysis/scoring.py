@@ -27,8 +27,18 @@ NUMBERS = {str(number): end for number, (end, *_) in enumerate(ROWS, 1)}
 """What a scoring sheet says: the number of the row in the paper's table."""
 UNKNOWN = -1  # whether the robot ended the rally, where the table has no entry
 COLUMNS = (
-    "seed", "trainer", "evaluator", "model", "blind", "rally", "length", "end", "robot_ended", "filtered", "selected",
-)  # fmt: skip
+    "seed",
+    "trainer",
+    "evaluator",
+    "model",
+    "blind",
+    "rally",
+    "length",
+    "end",
+    "robot_ended",
+    "filtered",
+    "selected",
+)
 
 
 def end_of(text: str) -> End:

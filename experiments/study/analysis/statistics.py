@@ -114,12 +114,14 @@ class Bootstrap:
         if not groups:
             return None
         points, draws = (
-            np.array([
-                np.mean([np.mean([table[c] for c in members], axis=0) for members in by_trainer.values()], axis=0)
-                for by_trainer in groups.values()
-            ])
+            np.array(
+                [
+                    np.mean([np.mean([table[c] for c in members], axis=0) for members in by_trainer.values()], axis=0)
+                    for by_trainer in groups.values()
+                ]
+            )
             for table in (self.point, self._draws)
-        )  # fmt: skip
+        )
         chosen = self._chosen.get(len(groups))
         drawn = draws.mean(axis=0) if chosen is None else np.take_along_axis(draws, chosen, axis=0).mean(axis=0)
         return Estimate(float(points.mean()), drawn, sum(self.cells[cell].size for cell in found))

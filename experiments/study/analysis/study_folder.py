@@ -26,8 +26,17 @@ from mjx_tt.rally.human_player import FOLDER as VIRTUAL_PLAYERS
 ROUNDS = ("M0", "M1", "M2")
 DATASETS = ("D0", "D1", "D2")
 SETTINGS, EVALUATIONS = "study.yaml", "evaluations.csv"
-LOG = {"rally": 0, "touch": 0, "first": 0, "position": 3, "velocity": 3, "landing": 2, "hit": 0, "returned": 0,
-       "return_landing": 2}  # fmt: skip
+LOG = {
+    "rally": 0,
+    "touch": 0,
+    "first": 0,
+    "position": 3,
+    "velocity": 3,
+    "landing": 2,
+    "hit": 0,
+    "returned": 0,
+    "return_landing": 2,
+}
 """Arrays of a BallLog with their rows; 0 for a plain list of balls."""
 NUMBERS = tuple(f"{part} {axis} {end}" for part, axes in AXES.items() for axis in axes for end in ("min", "max"))
 """Names of the 16 numbers of a human model."""
@@ -155,12 +164,14 @@ class Study:
 def numbers(distribution: BallDistribution) -> np.ndarray:
     """(16,) the numbers of a human model in the order of NUMBERS."""
     d = distribution
-    return np.array([
-        value
-        for part, axes in AXES.items()
-        for k in range(len(axes))
-        for value in (getattr(d, f"{part}_min")[k], getattr(d, f"{part}_max")[k])
-    ])  # fmt: skip
+    return np.array(
+        [
+            value
+            for part, axes in AXES.items()
+            for k in range(len(axes))
+            for value in (getattr(d, f"{part}_min")[k], getattr(d, f"{part}_max")[k])
+        ]
+    )
 
 
 def paper_models(player: str) -> dict[str, BallDistribution]:

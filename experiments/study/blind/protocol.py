@@ -148,9 +148,13 @@ def make(
     begun.touch()
     digests = {model: _copy(loaded[model], folder / POLICIES / code) for model, code in key.items()}
     content = {
-        "codes": key, "digests": digests, "originals": {model: a.digest for model, a in loaded.items()},
-        "trainer": trainer, "evaluator": evaluator, "seed": seed,
-    }  # fmt: skip
+        "codes": key,
+        "digests": digests,
+        "originals": {model: a.digest for model, a in loaded.items()},
+        "trainer": trainer,
+        "evaluator": evaluator,
+        "seed": seed,
+    }
     blank_sheet(folder / SHEET, tuple(key.values()))
     seal(folder / KEY, content)
     begun.unlink()

@@ -54,7 +54,9 @@ def make(folder: Path, given: list[str], trainer: str, evaluator: str, seed: int
         soft_wrap=True,
     )
     console.print(
-        f"sheet: {folder / protocol.SHEET}; the key is sealed in {folder / protocol.KEY}", highlight=False, soft_wrap=True
+        f"sheet: {folder / protocol.SHEET}; the key is sealed in {folder / protocol.KEY}",
+        highlight=False,
+        soft_wrap=True,
     )
 
 
@@ -74,4 +76,6 @@ def show_opened(rallies: scoring.Rallies, folder: Path, console: Console) -> Non
         mean = t_mean(mine.length)
         table.add_row(str(mine.blind[0]), model, str(mean.n), f"{mean.value:.1f} ({mean.low:.1f} to {mean.high:.1f})")
     console.print(table)
-    console.print(f"{folder / protocol.EVALUATIONS}, key in {folder / protocol.OPENED}", highlight=False, soft_wrap=True)
+    console.print(
+        f"{folder / protocol.EVALUATIONS}, key in {folder / protocol.OPENED}", highlight=False, soft_wrap=True
+    )

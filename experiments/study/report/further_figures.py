@@ -135,10 +135,12 @@ def effects_left_out(study: Study) -> Figure | None:
     }
     if not any(table.values()):
         return None
-    ratio = np.array([
-        [np.nan if (g := table[model, world]) is None else g.value for model in effect_costs.MODELS]
-        for world in effect_costs.WORLDS[1:]
-    ])  # fmt: skip
+    ratio = np.array(
+        [
+            [np.nan if (g := table[model, world]) is None else g.value for model in effect_costs.MODELS]
+            for world in effect_costs.WORLDS[1:]
+        ]
+    )
     figure = Figure(figsize=(8.6, 4.6))
     axes = figure.subplots()
     limit = max(np.log2(1.5), float(np.nanmax(np.abs(np.log2(ratio)))))
@@ -148,9 +150,21 @@ def effects_left_out(study: Study) -> Figure | None:
             found = table[effect_costs.MODELS[column], effect_costs.WORLDS[1 + row]]
             sure = not (np.isnan(found.low) or found.low <= 1.0 <= found.high)
             dark = abs(np.log2(value)) > 0.6 * limit
-            axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=9, color="white" if dark else INK,
-                      fontweight="bold" if sure else "normal")  # fmt: skip
-    axes.set_xticks(range(len(effect_costs.MODELS)), [BY_KEY[k].label.replace(" fine", "\nfine") for k in effect_costs.MODELS], fontsize=8)
+            axes.text(
+                column,
+                row,
+                f"{value:.2f}",
+                ha="center",
+                va="center",
+                fontsize=9,
+                color="white" if dark else INK,
+                fontweight="bold" if sure else "normal",
+            )
+    axes.set_xticks(
+        range(len(effect_costs.MODELS)),
+        [BY_KEY[k].label.replace(" fine", "\nfine") for k in effect_costs.MODELS],
+        fontsize=8,
+    )
     axes.set_yticks(range(len(effect_costs.WORLDS) - 1), effect_costs.WORLDS[1:])
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)

@@ -42,7 +42,7 @@ def grid(landing: np.ndarray, place: np.ndarray, returned: np.ndarray) -> tuple[
         _cell(landing[1], -c.TABLE_LENGTH / 2, c.TABLE_LENGTH / 2),
         _cell(place[0], -c.TABLE_WIDTH / 2, c.TABLE_WIDTH),
         _cell(place[1], 0.0, c.TABLE_LENGTH / 2),
-    )  # fmt: skip
+    )
     count, back = np.zeros((CELLS,) * 4), np.zeros((CELLS,) * 4)
     np.add.at(count, tuple(i[good] for i in index), 1)
     np.add.at(back, tuple(i[good & returned] for i in index), 1)
@@ -97,9 +97,14 @@ def _draw(axes: Axes, count: np.ndarray, back: np.ndarray) -> None:
             axes.add_patch(Rectangle(corner, 1, 1, facecolor=face, edgecolor="#d0d4d9", linewidth=0.5))
             if n:
                 axes.text(
-                    x0 + k + 0.5, y0 + m + 0.5, f"{100 * n / total:.1f}", ha="center", va="center", fontsize=7.5,
+                    x0 + k + 0.5,
+                    y0 + m + 0.5,
+                    f"{100 * n / total:.1f}",
+                    ha="center",
+                    va="center",
+                    fontsize=7.5,
                     color="white" if rate > 0.6 else INK,
-                )  # fmt: skip
+                )
         axes.add_patch(Rectangle((x0, y0), CELLS, CELLS, facecolor="none", edgecolor=INK, linewidth=1.2))
         share = f"{100 * count[i, j].sum() / total:.1f} %"
         axes.text(x0, y0 + CELLS + 0.06, share, fontsize=8.5, fontweight="bold", va="bottom")

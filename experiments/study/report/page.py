@@ -12,7 +12,7 @@ from pathlib import Path
 
 import yaml
 
-from experiments.study.analysis.claims import NOT_COMPARABLE, VERDICTS, Measurements, findings, show, span  # fmt: skip
+from experiments.study.analysis.claims import NOT_COMPARABLE, VERDICTS, Measurements, findings, show, span
 from experiments.study.analysis.claims import __doc__ as RULES
 from experiments.study.analysis.paper import LEVELS, RALLIES, WITHOUT
 from experiments.study.analysis.statistics import Estimate
@@ -57,11 +57,26 @@ class _Report:
 
     def compose(self) -> None:
         for part in (
-            self._top, self._aggregated, self._skill, self._without, self._checkpoints, self._zero_shot,
+            self._top,
+            self._aggregated,
+            self._skill,
+            self._without,
+            self._checkpoints,
+            self._zero_shot,
             self._human_model,
-            self._effects, self._cross, self._players, self._balls, self._heatmaps, self._ablation, self._variant, self._ends,
-            self._statistics, self._calibration, self._all_claims, self._about,
-        ):  # fmt: skip
+            self._effects,
+            self._cross,
+            self._players,
+            self._balls,
+            self._heatmaps,
+            self._ablation,
+            self._variant,
+            self._ends,
+            self._statistics,
+            self._calibration,
+            self._all_claims,
+            self._about,
+        ):
             part()
 
     # Parts of the page
@@ -69,24 +84,24 @@ class _Report:
     def _top(self) -> None:
         self.page.section("findings", "What was found")
         self.page.add(
-            "<ul>"
-            + "".join(f"<li>{escape(s)}</li>" for s in words.sentences(self.measured, self.findings))
-            + "</ul>"
+            "<ul>" + "".join(f"<li>{escape(s)}</li>" for s in words.sentences(self.measured, self.findings)) + "</ul>"
         )
         self._picture(
-            "summary", further_figures.summary(list(self.findings.values())),
+            "summary",
+            further_figures.summary(list(self.findings.values())),
             "Ratios of mean rally lengths in this study, with 95 % intervals over seeds and rallies, and the paper's "
             "numbers where "
             "its text states them. On the right the verdict, by the rules at the end of this page.",
-        )  # fmt: skip
+        )
         counts = {v: sum(f.verdict == v for f in self.findings.values()) for v in VERDICTS}
         self.page.add("<p>" + " ".join(f"{_badge(v)} {n}" for v, n in counts.items()) + "</p>")
         if len(self.study.seeds) == 1:
             self.page.paragraph(
                 "One seed: the intervals hold for these policies and this reality; how much another training or "
                 "another reality "
-                "would change is not known from it.", "note",
-            )  # fmt: skip
+                "would change is not known from it.",
+                "note",
+            )
         if self.study.missing:
             lines = "".join(f"<li>{escape(line)}</li>" for line in self.study.missing)
             first = "; ".join(self.study.missing[:MOST_MISSING])
@@ -100,15 +115,17 @@ class _Report:
     def _aggregated(self) -> None:
         self.page.section("aggregated", "Over all players")
         self._picture(
-            "aggregated", figures.aggregated(self.study, self.measured),
+            "aggregated",
+            figures.aggregated(self.study, self.measured),
             "The paper's figure all_player_results. White circle: mean; line: median; box: quartiles. Normalised: "
             "minus the mean, over "
             "the standard deviation of the player's rallies with all ten models.",
-        )  # fmt: skip
+        )
         self._picture(
-            "aggregated_means", figures.means(self.study, self.measured),
+            "aggregated_means",
+            figures.means(self.study, self.measured),
             "The paper's figure app_summary: means with 95 % intervals over seeds and rallies.",
-        )  # fmt: skip
+        )
         self._claims("all-ratio", "all-raw", "all-normalised", "all-oracle", "short", "mean")
         self._table(
             "normalised",
@@ -119,11 +136,12 @@ class _Report:
     def _skill(self) -> None:
         self.page.section("skill", "By skill level")
         self._picture(
-            "by_skill", figures.by_skill(self.study, self.measured),
+            "by_skill",
+            figures.by_skill(self.study, self.measured),
             "The paper's figures main_summary_by_skill_level (above) and app_summary_by_skill_level_means (below). "
             "S2R-Oracle+FT has "
             "35 % of the real training of the others.",
-        )  # fmt: skip
+        )
         self._claims(
             "beginner", "intermediate", "advanced", "players", "oracle-beginner", "oracle-intermediate", "over"
         )
@@ -136,19 +154,21 @@ class _Report:
     def _without(self) -> None:
         self.page.section("without", "Without the advanced player")
         self._picture(
-            "without_advanced", figures.means(self.study, self.measured, WITHOUT),
+            "without_advanced",
+            figures.means(self.study, self.measured, WITHOUT),
             "The paper's figure app_summary_all_except_outlier, the advanced player left out.",
-        )  # fmt: skip
+        )
         self._claims("without-raw", "without-normalised")
 
     def _checkpoints(self) -> None:
         self.page.section("checkpoints", "On the way: the ten models")
         self._picture(
-            "checkpoints", figures.checkpoints(self.study, self.measured),
+            "checkpoints",
+            figures.checkpoints(self.study, self.measured),
             "The paper's figure main_training_curves. Hollow: from simulation; filled: fine-tuned. S2R shares its "
             "first two models "
             "with i-S2R.",
-        )  # fmt: skip
+        )
         self._claims(
             "converge-beginner",
             "converge-intermediate",
@@ -161,19 +181,21 @@ class _Report:
     def _zero_shot(self) -> None:
         self.page.section("zero-shot", "Zero-shot and fine-tuned")
         self._picture(
-            "zero_shot", further_figures.zero_shot(self.study, self.measured),
+            "zero_shot",
+            further_figures.zero_shot(self.study, self.measured),
             "Each policy as it came from simulation, and after its fine-tuning in reality, by skill level. The paper "
             "has it as the "
             "steps of its training curves.",
-        )  # fmt: skip
+        )
         self._claims("fine-tuning")
         self._picture(
-            "fine_tuning", further_figures.fine_tuning(self.study, self.measured),
+            "fine_tuning",
+            further_figures.fine_tuning(self.study, self.measured),
             "Balls that the perturbed policies return while they are fine-tuned in reality (mean over 7 updates; "
             "thick: mean over players "
             "and seeds). The first cycle is the same for both methods; at the gaps i-S2R goes back to simulation, "
             "S2R does not.",
-        )  # fmt: skip
+        )
         cells = []
         for name in LEVELS:
             found = [self.measured.ratio(b, a, name) for a, b in further_figures.PAIRS]
@@ -188,17 +210,19 @@ class _Report:
     def _human_model(self) -> None:
         self.page.section("human-model", "The human model, round by round")
         self._picture(
-            "evolution", human_model_figures.evolution(self.study, self.measured),
+            "evolution",
+            human_model_figures.evolution(self.study, self.measured),
             "The paper's figure sim_param_evolution and table ball_dist: the interval of each quantity in M0, M1 and "
             "M2. Bars of several "
             "seeds are means, with the smallest and largest end as whiskers.",
-        )  # fmt: skip
+        )
         self._picture(
-            "changes", human_model_figures.changes(self.study, self.measured),
+            "changes",
+            human_model_figures.changes(self.study, self.measured),
             "How far the model moves between rounds: mean over the 16 numbers of the change, each in units of its "
             "quantity's width over "
             "the three models. The paper's follow from its table.",
-        )  # fmt: skip
+        )
         self._claims("model-change", "change-levels")
         self._table(
             "distances",
@@ -220,21 +244,23 @@ class _Report:
     def _effects(self) -> None:
         self.page.section("effects", "What each hidden effect costs")
         self._picture(
-            "effects", further_figures.effects_left_out(self.study),
+            "effects",
+            further_figures.effects_left_out(self.study),
             "Not in the paper: the same policies, not trained again, in a reality that lacks one of the effects that "
             "training does not know, and one that lacks all. Mean rally length over that in the whole reality, geometric "
             "mean over players and seeds; bold where its 95 % interval excludes 1.",
-        )  # fmt: skip
+        )
         self._table("effects", tables.effects_left_out(self.study), "Rally length without an effect over that with all")
 
     def _cross(self) -> None:
         self.page.section("cross", "With players who did not train the policy")
         self._picture(
-            "cross", figures.cross(self.study, self.measured),
+            "cross",
+            figures.cross(self.study, self.measured),
             "The paper's figure main_cross_eval_summary. Normalised: by mean and standard deviation of the trainer's "
             "own evaluation of "
             "that model. Right: mean with others over mean with the trainer.",
-        )  # fmt: skip
+        )
         self._claims(
             "cross", "cross-normalised", "cross-advanced", "cross-oracle", "keeps-is2r", "keeps-s2r", "keeps-less"
         )
@@ -244,18 +270,20 @@ class _Report:
             "Trainers and evaluators (the paper's table cross_eval): mean rally length",
         )
         self._picture(
-            "cross_players", figures.cross_by_player(self.study, self.measured),
+            "cross_players",
+            figures.cross_by_player(self.study, self.measured),
             "The paper's figure app:cross_eval_details, ordered by the trainer's skill.",
-        )  # fmt: skip
+        )
 
     def _players(self) -> None:
         self.page.section("players", "Player by player")
         self._picture(
-            "players", figures.by_player(self.study, self.measured),
+            "players",
+            figures.by_player(self.study, self.measured),
             "The paper's figure app:trainer_details: mean and distribution of the rally length of the ten models, "
             "players from the lowest "
             "to the highest skill. Dashed: the paper's mean over the ten models of that player.",
-        )  # fmt: skip
+        )
         self._not_drawn(
             "The paper gives these figures as pictures only; what its text says about players stands above."
         )
@@ -268,22 +296,25 @@ class _Report:
             planes = [plane for plane in found if plane is not None]
         seed = f"Seed {self.study.seeds[0]}. " if self.study.seeds else ""
         self._picture(
-            "tsne_training", tsne.training(planes),
+            "tsne_training",
+            tsne.training(planes),
             f"{seed}The paper's figure app:ball-dist-evo-train: D0, and what the first and second fine-tuning add. "
             "One plane per player "
             "for all three sets of pictures, so a place means the same ball in all; grey: all balls of the player.",
-        )  # fmt: skip
+        )
         self._picture(
-            "tsne_evaluation", tsne.evaluation(planes),
+            "tsne_evaluation",
+            tsne.evaluation(planes),
             "The paper's figure app:ball-dist-evo-train-eval: training balls up to a round, and the balls of the "
             "evaluation after it.",
-        )  # fmt: skip
+        )
         self._picture(
-            "tsne_methods", tsne.methods(planes),
+            "tsne_methods",
+            tsne.methods(planes),
             "The paper's figure app:ball-dist-is2r-s2r: i-S2R left, S2R+FT right. S2R was trained in simulation on "
             "D0 alone; ΔD1 are the "
             "balls of the fine-tuning that it shares with i-S2R.",
-        )  # fmt: skip
+        )
         self._not_drawn(
             "The paper draws these without a statement in numbers. Numbers from here: the share of evaluation balls "
             "inside each human model."
@@ -298,43 +329,48 @@ class _Report:
             "rate. Numbers: percent of all balls of the picture; those of a small grid add up to the number above it."
         )
         self._picture(
-            "heatmap_incoming", heatmaps.heatmaps(self.study, heatmaps.incoming),
+            "heatmap_incoming",
+            heatmaps.heatmaps(self.study, heatmaps.incoming),
             f"The paper's figure app:heatmap-incoming. {how} Small grid: from where on the human's half it was hit.",
-        )  # fmt: skip
+        )
         self._picture(
-            "heatmap_outgoing", heatmaps.heatmaps(self.study, heatmaps.outgoing),
+            "heatmap_outgoing",
+            heatmaps.heatmaps(self.study, heatmaps.outgoing),
             f"The paper's figure app:heatmap-outgoing. {how} Small grid: where on the human's half the robot's "
             "return came down (beside it: "
             "the nearest square), of the balls that it touched.",
-        )  # fmt: skip
+        )
         self._claims("middle-in", "middle-out")
 
     def _ablation(self) -> None:
         self.page.section("ablation", "Which distribution to train on")
         self._picture(
-            "ablation", figures.ablation(self.study, self.measured),
+            "ablation",
+            figures.ablation(self.study, self.measured),
             "The paper's figure arbitarary_distributions: zero-shot rallies of policies trained on hand-made "
             "distributions and on the Oracle's.",
-        )  # fmt: skip
+        )
         self._claims("large", "medium")
 
     def _variant(self) -> None:
         self.page.section("variant", "Are the weights worth carrying back?")
         self._picture(
-            "variant", further_figures.variant(self.study, self.measured),
+            "variant",
+            further_figures.variant(self.study, self.measured),
             "i-S2R, which goes on in simulation from the weights fine-tuned in reality, against the variant that "
             "goes on from its own "
             "weights in simulation and takes only the new human model.",
-        )  # fmt: skip
+        )
         self._claims("carried")
 
     def _ends(self) -> None:
         self.page.section("ends", "Who ends the rallies")
         self._picture(
-            "ends", further_figures.ends(self.study, self.measured),
+            "ends",
+            further_figures.ends(self.study, self.measured),
             "Shares of the rallies that count, played with the own trainer, that the robot (coloured) and the human "
             "(grey) ended.",
-        )  # fmt: skip
+        )
         self._claims("robot-ends")
         self._table(
             "ends",
@@ -352,9 +388,10 @@ class _Report:
     def _statistics(self) -> None:
         self.page.section("statistics", "Intervals, significance, and what the selection does")
         self._picture(
-            "unselected", further_figures.unselected(self.study, self.measured),
+            "unselected",
+            further_figures.unselected(self.study, self.measured),
             f"The paper reports the {RALLIES} longest of 60 rallies. The same comparison on every rally that counts.",
-        )  # fmt: skip
+        )
         self._table(
             "significance",
             tables.significance(self.measured),
@@ -366,8 +403,9 @@ class _Report:
             "p policies takes a "
             "pair of policies (one player, one seed) as the unit; with n pairs it cannot fall below 2 / 2^n. Holm: "
             "adjusted for the "
-            "number of rows.", "note",
-        )  # fmt: skip
+            "number of rows.",
+            "note",
+        )
         self._table(
             "models",
             tables.models(self.study, self.measured),
@@ -384,20 +422,23 @@ class _Report:
             )
             return
         self._picture(
-            "calibration", human_model_figures.calibration(found),
+            "calibration",
+            human_model_figures.calibration(found),
             "Virtual players without a study: their balls fitted as a human model is, beside the paper's, and their "
             "rallies with policies "
             "of mixed quality. Dotted: 15 % of a range.",
-        )  # fmt: skip
+        )
         medians = found.get("medians", {})
         rows = [
             (player, *(f"{100 * by[m]:.0f} %" if m in by else "" for m in ("M0", "M1", "M2")))
             for player, by in medians.items()
         ]
         self._table(
-            "calibration_medians", tables.Table(("player", "M0", "M1", "M2"), rows, (1, 2, 3)),
-            "Median deviation over the 16 numbers, as a share of each quantity's range", opened=True,
-        )  # fmt: skip
+            "calibration_medians",
+            tables.Table(("player", "M0", "M1", "M2"), rows, (1, 2, 3)),
+            "Median deviation over the 16 numbers, as a share of each quantity's range",
+            opened=True,
+        )
         for name, title in (
             ("numbers", "Target and reached, number by number"),
             ("rallies", "Rally statistics, target and reached"),
@@ -458,10 +499,16 @@ class _Report:
                 if f.interval is None
                 else f"<b>{show(f.unit, f.interval.value)}</b> ({span(f.unit, f.interval)})"
             )
-            rows.append((
-                _badge(f.verdict), f"{escape(f.claim.text)}<br><span class=note>{escape(f.claim.source)}</span>",
-                escape(f.claim.quantity), paper, ours, escape(f.why),
-            ))  # fmt: skip
+            rows.append(
+                (
+                    _badge(f.verdict),
+                    f"{escape(f.claim.text)}<br><span class=note>{escape(f.claim.source)}</span>",
+                    escape(f.claim.quantity),
+                    paper,
+                    ours,
+                    escape(f.why),
+                )
+            )
         self.page.add(table(("", "the paper says", "measured", "paper", "here (95 %)", "why"), rows, (3,)))
 
     def _not_drawn(self, text: str) -> None:

@@ -70,13 +70,20 @@ def boxes(
     for k, (values, key) in enumerate(zip(samples, keys)):
         if not values.size:
             continue
-        parts = axes.boxplot(values, positions=[k], widths=0.62, patch_artist=True, showmeans=True, manage_ticks=False,
+        parts = axes.boxplot(
+            values,
+            positions=[k],
+            widths=0.62,
+            patch_artist=True,
+            showmeans=True,
+            manage_ticks=False,
             boxprops={"facecolor": colour(key), "edgecolor": INK, "linewidth": 0.8},
             medianprops={"color": INK, "linewidth": 1.6},
-            whiskerprops={"color": INK, "linewidth": 0.8}, capprops={"color": INK, "linewidth": 0.8},
+            whiskerprops={"color": INK, "linewidth": 0.8},
+            capprops={"color": INK, "linewidth": 0.8},
             meanprops={"marker": "o", "markerfacecolor": "white", "markeredgecolor": INK, "markersize": 6},
-            flierprops={"marker": ".", "markersize": 2.5, "markerfacecolor": FAINT,
-                        "markeredgecolor": FAINT})  # fmt: skip
+            flierprops={"marker": ".", "markersize": 2.5, "markerfacecolor": FAINT, "markeredgecolor": FAINT},
+        )
         for mean in parts["means"]:
             mean.set_zorder(5)
     if log:

@@ -84,16 +84,36 @@ def models(study: Study, m: Measurements) -> Table:
             t, every = t_mean(chosen.length), study.pick(model.key, of_level(group), selected=False)
             rallies, seeds = (b.raw.mean(model.key, of_level(group)).interval for b in (fixed, m))
             quartiles = (f"{q:.0f}" for q in np.percentile(chosen.length, (25, 50, 75)))
-            rows.append((
-                group, model.key, str(t.n), f"{seeds.value:.1f}",
-                span("hits", t), span("hits", rallies), span("hits", seeds),
-                *quartiles, f"{chosen.length.max()}", f"{every.length.mean():.1f}", str(len(every)),
-            ))  # fmt: skip
+            rows.append(
+                (
+                    group,
+                    model.key,
+                    str(t.n),
+                    f"{seeds.value:.1f}",
+                    span("hits", t),
+                    span("hits", rallies),
+                    span("hits", seeds),
+                    *quartiles,
+                    f"{chosen.length.max()}",
+                    f"{every.length.mean():.1f}",
+                    str(len(every)),
+                )
+            )
     head = (
-        "players", "model", "rallies", "mean", "t over rallies", "bootstrap over rallies",
+        "players",
+        "model",
+        "rallies",
+        "mean",
+        "t over rallies",
+        "bootstrap over rallies",
         "bootstrap over seeds and rallies",
-        "25 %", "median", "75 %", "max", "mean, unselected", "rallies, unselected",
-    )  # fmt: skip
+        "25 %",
+        "median",
+        "75 %",
+        "max",
+        "mean, unselected",
+        "rallies, unselected",
+    )
     return Table(head, rows, tuple(range(2, len(head))))
 
 
@@ -103,16 +123,33 @@ def significance(m: Measurements) -> Table:
     adjusted = holm(d.p_rallies for *_, d in found)
     rows = [
         (
-            group, scale, f"{SHORT[a]} − {SHORT[b]}", f"{d.bootstrap.value:+.2f}", span("difference", d.bootstrap),
-            span("difference", d.welch), _p(d.p_welch), _p(d.p_rallies), _p(p), _p(d.p_policies), str(d.pairs),
+            group,
+            scale,
+            f"{SHORT[a]} − {SHORT[b]}",
+            f"{d.bootstrap.value:+.2f}",
+            span("difference", d.bootstrap),
+            span("difference", d.welch),
+            _p(d.p_welch),
+            _p(d.p_rallies),
+            _p(p),
+            _p(d.p_policies),
+            str(d.pairs),
         )
         for (group, scale, a, b, d), p in zip(found, adjusted)
-    ]  # fmt: skip
+    ]
     head = (
-        "players", "scale", "difference", "mean", "95 %, seeds and rallies", "95 %, Welch", "p Welch",
-        "p permuted", "p permuted, Holm",
-        "p policies", "pairs of policies",
-    )  # fmt: skip
+        "players",
+        "scale",
+        "difference",
+        "mean",
+        "95 %, seeds and rallies",
+        "95 %, Welch",
+        "p Welch",
+        "p permuted",
+        "p permuted, Holm",
+        "p policies",
+        "pairs of policies",
+    )
     return Table(head, rows, tuple(range(3, len(head))))
 
 

@@ -75,14 +75,22 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
         )
 
     quantity_names = {
-        "x": "across the table", "y": "along the table", "z": "with height", "speed": "with speed",
-        "session": "over the time in a session", "flight": "along the flight",
-    }  # fmt: skip
+        "x": "across the table",
+        "y": "along the table",
+        "z": "with height",
+        "speed": "with speed",
+        "session": "over the time in a session",
+        "flight": "along the flight",
+    }
     ages = np.broadcast_to(age, g.time.shape)
     for name, quantity, unit in (
-        ("x", position[0], "m"), ("y", position[1], "m"), ("z", position[2], "m"), ("speed", speed, "m/s"),
-        ("session", ages, "of it"), ("flight", g.time, "s"),
-    ):  # fmt: skip
+        ("x", position[0], "m"),
+        ("y", position[1], "m"),
+        ("z", position[2], "m"),
+        ("speed", speed, "m/s"),
+        ("session", ages, "of it"),
+        ("flight", g.time, "s"),
+    ):
         spline(f"force over {name}", quantity, unit, response, along=FORCES)
     for name, quantity, unit in (("x", position[0], "m"), ("y", position[1], "m"), ("z", position[2], "m")):
         spline(f"measured position over {name}", quantity, unit, lambda phi, d: _shift(phi, d), 5)

@@ -47,9 +47,13 @@ def predictions(found: BallFindings, seed: int = 0) -> Prediction:
     for f in range(FOLDS):
         rest = fold != f
         part = evidence.Scores(
-            scores.ball_gram[rest].sum(axis=0), scores.ball_right[rest].sum(axis=0), scores.ball_gram[rest],
-            scores.ball_right[rest], 0.0, scores.always,
-        )  # fmt: skip
+            scores.ball_gram[rest].sum(axis=0),
+            scores.ball_right[rest].sum(axis=0),
+            scores.ball_gram[rest],
+            scores.ball_right[rest],
+            0.0,
+            scores.always,
+        )
         values = evidence.solve(part, chosen) if chosen else np.zeros(0)
         mine = np.flatnonzero(~rest)
         for j, value in zip(chosen, values):

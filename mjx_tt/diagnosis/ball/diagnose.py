@@ -37,8 +37,10 @@ MAGNUS_KEPT = (0.2, 1.5)  # of the coefficient k about which derivatives are tak
 # product shows, at the bounce the spin alone.
 FAST_SPINS = tuple(
     (k, tuple(sign * w * (a == axis) for a in range(3)))
-    for k, w in ((0.6, 100.0), (0.3, 200.0)) for axis in (0, 2) for sign in (1.0, -1.0)
-)  # fmt: skip
+    for k, w in ((0.6, 100.0), (0.3, 200.0))
+    for axis in (0, 2)
+    for sign in (1.0, -1.0)
+)
 FAST_STD = np.full(3, 80.0)  # [rad/s] how far a ball's own spin may then be from it
 FEW = 24  # balls on which the spins are tried
 CORNER = 5e-4  # [s] about the bounce of a spinning ball in which no sample counts
@@ -104,9 +106,13 @@ def first_fit(
 
 
 def diagnose_balls(
-    trajectories: Sequence[Trajectory], model: SimModel, spin: str = "none", without: Sequence[str] = (), seed: int = 0,
+    trajectories: Sequence[Trajectory],
+    model: SimModel,
+    spin: str = "none",
+    without: Sequence[str] = (),
+    seed: int = 0,
     progress: Callable[[str], None] | None = None,
-) -> BallFindings:  # fmt: skip
+) -> BallFindings:
     """``_diagnose``, and once more without the samples around the bounce where the time stamps prove to be shaky.
 
     A jitter of the time stamps rounds the corner of the bounce as a tracker's filter does.
@@ -125,9 +131,15 @@ def diagnose_balls(
 
 
 def _diagnose(
-    trajectories: Sequence[Trajectory], model: SimModel, spin: str, without: Sequence[str], seed: int,
-    progress: Callable[[str], None] | None, hidden: np.ndarray | None = None, before: BallFindings | None = None,
-) -> BallFindings:  # fmt: skip
+    trajectories: Sequence[Trajectory],
+    model: SimModel,
+    spin: str,
+    without: Sequence[str],
+    seed: int,
+    progress: Callable[[str], None] | None,
+    hidden: np.ndarray | None = None,
+    before: BallFindings | None = None,
+) -> BallFindings:
     """Chooses the causes.
 
     spin: "none" when the nominal ball does not spin, so that spin is a cause; "free" when every ball may.
@@ -217,9 +229,13 @@ class Settled:
 
 
 def search(
-    problem: BallProblem, trial: Trial, at: Situation, prior: SpinPrior | None, say: Callable[[str], None],
+    problem: BallProblem,
+    trial: Trial,
+    at: Situation,
+    prior: SpinPrior | None,
+    say: Callable[[str], None],
     linear: Linear | None = None,
-) -> Settled:  # fmt: skip
+) -> Settled:
     """Chooses causes and linearises about them until the choice settles.
 
     prior: of the spins at the situation to start from, None where nothing spins. linear: the derivatives there.
@@ -384,7 +400,7 @@ def _left(linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid) 
 
 def _move(
     problem: BallProblem, start: np.ndarray, theta: np.ndarray, choice: Choice, noise_now: noise.Noise, g: Grid
-) -> tuple[Situation, np.ndarray | None]:  # fmt: skip
+) -> tuple[Situation, np.ndarray | None]:
     """The situation at the chosen causes, starts fitted again; and where balls spin, when each bounces (n,) by its own."""
     if not choice.spin:
         return Situation(theta, fit_starts(problem, theta, start, g, noise_now, rounds=3)), None

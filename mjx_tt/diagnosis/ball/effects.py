@@ -79,7 +79,12 @@ def _inverse(nominal, ratio):
 
 EFFECTS: tuple[Effect, ...] = (
     Effect(
-        "drag_coefficient", "ball", FLIGHT + "drag_coefficient", 0.05, "1", "a barometer, a thermometer and scales",
+        "drag_coefficient",
+        "ball",
+        FLIGHT + "drag_coefficient",
+        0.05,
+        "1",
+        "a barometer, a thermometer and scales",
         twins=(
             Twin("air_density", FLIGHT + "air_density", _same, "kg/m^3", "a barometer and a thermometer"),
             Twin("ball_mass", FLIGHT + "mass", _inverse, "kg", "scales"),
@@ -88,25 +93,45 @@ EFFECTS: tuple[Effect, ...] = (
     ),
     Effect("magnus", "ball", "ball_spin", 30.0, "rad/s", "a marked ball filmed from the side", fit=False),
     Effect(
-        "magnus_coefficient", "ball", FLIGHT + "magnus_coefficient", 0.2, "1", "a marked ball filmed from the side",
+        "magnus_coefficient",
+        "ball",
+        FLIGHT + "magnus_coefficient",
+        0.2,
+        "1",
+        "a marked ball filmed from the side",
         needs_spin=True,
     ),
-    Effect("spin_decay", "ball", FLIGHT + "spin_decay", 0.3, "1/s", "a marked ball over a long flight", needs_spin=True),
+    Effect(
+        "spin_decay", "ball", FLIGHT + "spin_decay", 0.3, "1/s", "a marked ball over a long flight", needs_spin=True
+    ),
     Effect("wind_x", "ball", FLIGHT + "wind_x", 0.3, "m/s", "an anemometer across the table"),
     Effect("wind_y", "ball", FLIGHT + "wind_y", 0.3, "m/s", "an anemometer along the table, or balls both ways"),
     Effect("wind_z", "ball", FLIGHT + "wind_z", 0.3, "m/s", "an anemometer above the table"),
-    Effect("gravity_tilt_x", "ball", FLIGHT + "gravity_x", 0.01, "rad", "a spirit level on the camera's frame", _tilt("x")),
-    Effect("gravity_tilt_y", "ball", FLIGHT + "gravity_y", 0.01, "rad", "a spirit level on the camera's frame", _tilt("y")),
     Effect(
-        "gravity_scale", "ball", FLIGHT + "gravity_z", 0.02, "1", "a ball dropped beside a ruler, timed by another clock",
+        "gravity_tilt_x", "ball", FLIGHT + "gravity_x", 0.01, "rad", "a spirit level on the camera's frame", _tilt("x")
+    ),
+    Effect(
+        "gravity_tilt_y", "ball", FLIGHT + "gravity_y", 0.01, "rad", "a spirit level on the camera's frame", _tilt("y")
+    ),
+    Effect(
+        "gravity_scale",
+        "ball",
+        FLIGHT + "gravity_z",
+        0.02,
+        "1",
+        "a ball dropped beside a ruler, timed by another clock",
         _times(FLIGHT + "gravity_z"),
         twins=(
-            Twin("buoyancy", FLIGHT + "buoyancy", lambda b, ratio: 1.0 - (1.0 - b) * ratio, "1", "scales and a calliper"),
+            Twin(
+                "buoyancy", FLIGHT + "buoyancy", lambda b, ratio: 1.0 - (1.0 - b) * ratio, "1", "scales and a calliper"
+            ),
             Twin("clock_rate", SENSING + "clock_rate", lambda c, ratio: c / np.sqrt(ratio), "1", "a hardware clock"),
         ),
     ),
     Effect("table_restitution", "bounce", TABLE + "restitution", 0.03, "1", "a ball dropped on the table from 30 cm"),
-    Effect("table_restitution_speed", "bounce", TABLE + "restitution_slope", 0.01, "s/m", "drops from 10 cm and from 2 m"),
+    Effect(
+        "table_restitution_speed", "bounce", TABLE + "restitution_slope", 0.01, "s/m", "drops from 10 cm and from 2 m"
+    ),
     Effect("table_friction", "bounce", TABLE + "friction", 0.06, "1", "flat and fast balls, or a sled on the table"),
     Effect("table_height", "bounce", TABLE + "height", 0.005, "m", "a ruler, or a ball laid on the table"),
     Effect("table_tilt_x", "bounce", TABLE + "tilt_x", 0.01, "rad", "a spirit level on the table"),
@@ -115,18 +140,32 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("camera_rotation_x", "sensing", SENSING + "camera_rotation_x", 0.01, "rad", "the table's corners"),
     Effect("camera_rotation_y", "sensing", SENSING + "camera_rotation_y", 0.01, "rad", "the table's corners"),
     Effect("camera_rotation_z", "sensing", SENSING + "camera_rotation_z", 0.01, "rad", "the table's edges", fit=False),
-    Effect("camera_distortion", "sensing", SENSING + "camera_distortion", 0.005, "1/m^2", "balls laid on the table's lines"),
+    Effect(
+        "camera_distortion", "sensing", SENSING + "camera_distortion", 0.005, "1/m^2", "balls laid on the table's lines"
+    ),
     Effect("paddle_restitution", "paddle", PADDLE + "restitution", 0.05, "1", "balls dropped on the clamped paddle"),
-    Effect("paddle_friction", "paddle", PADDLE + "tangential_gain", 0.1, "1", "spinning balls dropped on the clamped paddle"),
+    Effect(
+        "paddle_friction",
+        "paddle",
+        PADDLE + "tangential_gain",
+        0.1,
+        "1",
+        "spinning balls dropped on the clamped paddle",
+    ),
     Effect("paddle_tilt", "paddle", PADDLE + "tilt", 0.02, "rad", "a protractor on the blade in the home pose"),
     Effect("paddle_offset", "paddle", PADDLE + "offset", 0.005, "m", "a ruler from the flange to the blade"),
     Effect(
-        "ball_latency", "paddle", "latency.ball_observation", 0.01, "s", "a light that the camera and a joint's log both see"
+        "ball_latency",
+        "paddle",
+        "latency.ball_observation",
+        0.01,
+        "s",
+        "a light that the camera and a joint's log both see",
     ),
     Effect(
         "tracker_smoothing", "sensing", SENSING + "smoothing", 0.008, "s", "a ball stopped by hand", step=0.006, low=0.0
     ),
-)  # fmt: skip
+)
 BY_NAME = {effect.name: effect for effect in EFFECTS}
 # What no log of the ball's positions shows, with why; the last one only without the joints' log.
 INVISIBLE = {

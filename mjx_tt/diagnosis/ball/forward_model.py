@@ -110,7 +110,12 @@ def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray
             some = ball[mine]
             paddle = g.paddle and jax.tree.map(lambda x: np.moveaxis(x[..., some], 1, 0), g.paddle)
             flown = _fly(
-                model, {k: x[mine] for k, x in flat.items()}, columns[:, mine], g.steps[:, some], g.index[:, some], paddle
+                model,
+                {k: x[mine] for k, x in flat.items()},
+                columns[:, mine],
+                g.steps[:, some],
+                g.index[:, some],
+                paddle,
             )
             keep = min(WIDTH, v * n - first)
             parts.append([np.asarray(x)[..., :keep] for x in flown])

@@ -100,10 +100,20 @@ class BallProblem:
         state = np.concatenate([flown.position, flown.velocity])[:, :, :7]
         transition = (state[:, :, 1:] - state[:, :, :1]) / START_STEPS[None, None, :6, None]
         residual = np.where(g.mask, g.measured - base, 0.0)
-        one = Flown(*(x[..., :1, :] for x in (
-            flown.measured, flown.position, flown.velocity, flown.bounce_time, flown.bounce, flown.bounce_velocity,
-            flown.hit_time,
-        )))  # fmt: skip
+        one = Flown(
+            *(
+                x[..., :1, :]
+                for x in (
+                    flown.measured,
+                    flown.position,
+                    flown.velocity,
+                    flown.bounce_time,
+                    flown.bounce,
+                    flown.bounce_velocity,
+                    flown.hit_time,
+                )
+            )
+        )
         return Linear(residual, starts, effects, one, np.moveaxis(transition, (3, 1), (0, 1)))
 
 
@@ -155,9 +165,15 @@ class StartsOut:
         effects = remove(self._basis, rows(columns, self._noise, self._weight, self._grid))
         et, st = effects.swapaxes(1, 2), self._spins.swapaxes(1, 2)
         return Projected(
-            self._weight, self._noise, et @ effects, (et @ self._target)[..., 0], st @ self._spins, st @ effects,
-            (st @ self._target)[..., 0], coefficient,
-        )  # fmt: skip
+            self._weight,
+            self._noise,
+            et @ effects,
+            (et @ self._target)[..., 0],
+            st @ self._spins,
+            st @ effects,
+            (st @ self._target)[..., 0],
+            coefficient,
+        )
 
 
 def remove(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -166,9 +182,15 @@ def remove(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def fit_starts(
-    problem: BallProblem, theta: np.ndarray, start: np.ndarray, g: Grid, noise: Noise | None = None,
-    prior: tuple[np.ndarray, np.ndarray] | None = None, rounds: int = 4, keep: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
+    problem: BallProblem,
+    theta: np.ndarray,
+    start: np.ndarray,
+    g: Grid,
+    noise: Noise | None = None,
+    prior: tuple[np.ndarray, np.ndarray] | None = None,
+    rounds: int = 4,
+    keep: np.ndarray | None = None,
+) -> np.ndarray:
     """Starts (9, n) of all balls for given changes theta, (K,) or (K, n), by damped Gauss-Newton with robust weights.
 
     prior: mean and standard deviation (3,) of the spin; without it the balls do not spin (or keep the spin given).

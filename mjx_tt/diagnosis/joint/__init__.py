@@ -18,6 +18,13 @@ from mjx_tt.diagnosis.joint.forward_model import JointResponse
 from mjx_tt.diagnosis.joint.records import JointRecord, read_robot_csv
 
 __all__ = [
-    "JointRecord", "JointResidual", "JointResponse", "RobotCause", "RobotFindings", "RobotGain", "Undecided",
-    "diagnose_robot", "read_robot_csv",
-]  # fmt: skip
+    "JointRecord",
+    "JointResidual",
+    "JointResponse",
+    "RobotCause",
+    "RobotFindings",
+    "RobotGain",
+    "Undecided",
+    "diagnose_robot",
+    "read_robot_csv",
+]

@@ -59,9 +59,7 @@ def _check(joints: Sequence[str], nominal: Mapping, without: Sequence[str], home
         raise ValueError("no record of a joint to diagnose")
     twice = sorted({name for name in joints if joints.count(name) > 1})
     if twice:
-        raise ValueError(
-            f"{', '.join(twice)}: more than one record; join the logs of one joint in order of time first"
-        )
+        raise ValueError(f"{', '.join(twice)}: more than one record; join the logs of one joint in order of time first")
     for joint in joints:
         if joint not in nominal:
             raise ValueError(f"no nominal response of {joint}; there are {', '.join(nominal)}")

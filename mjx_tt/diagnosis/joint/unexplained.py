@@ -47,9 +47,7 @@ def find(fitter: Fitter, fit: Fit, sigma: float) -> Leftover | None:
         explained = y @ (columns @ coefficients) / judge.sigma**2 / judge.inflation
         count = columns.shape[1]
         score = explained - count - 6.0 * math.sqrt(2.0 * count) - 20.0 - 2.0 * math.log(block.tried)
-        predicted = np.where(
-            even, columns @ _ridge(columns[~even], y[~even]), columns @ _ridge(columns[even], y[even])
-        )
+        predicted = np.where(even, columns @ _ridge(columns[~even], y[~even]), columns @ _ridge(columns[even], y[even]))
         size = math.sqrt(max(np.mean(y * y) - np.mean((y - predicted) ** 2), 0.0))
         if score > highest and size > FLOOR:
             best, highest = Leftover(block, size, *block.where(coefficients)), score

@@ -427,7 +427,9 @@ def _lines(lines: Sequence[str]) -> str:
         why = (
             whys[0]
             if len(whys) == 1
-            else f"for instance {members[0][0]}: {whys[0]}" if whys else words.MEANING.get(effect, "")
+            else f"for instance {members[0][0]}: {whys[0]}"
+            if whys
+            else words.MEANING.get(effect, "")
         )
         rows.append((_code(effect), escape(joints), escape(why)))
     if any(r[1] for r in rows):
@@ -544,7 +546,10 @@ def _play(play: dict, page: Page) -> str:
         right=(1, 2),
     )
     figure = page.picture(
-        "play", figures.play(rates), f"Return rate on {int(play['balls']):,} balls each, with intervals.", "Return rates"
+        "play",
+        figures.play(rates),
+        f"Return rate on {int(play['balls']):,} balls each, with intervals.",
+        "Return rates",
     )
     return text + ".</p>" + rows + figure
 

@@ -179,10 +179,14 @@ CLAIMS: dict[str, tuple[str, str, str]] = {
     "wind_y": ("human (+y)", "robot (-y)", "The air moves along the table, towards the {way}, at {size}"),
     "wind_z": ("rises", "sinks", "The air {way} at {size}"),
     "gravity_tilt_x": (
-        "+x", "-x", "Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned across the table",
+        "+x",
+        "-x",
+        "Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned across the table",
     ),
     "gravity_tilt_y": (
-        "+y", "-y", "Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned along the table",
+        "+y",
+        "-y",
+        "Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned along the table",
     ),
     "gravity_scale": ("more slowly", "faster", "Balls fall {way} than the model says, acceleration {instead}"),
     "table_restitution": ("more", "less", "The table returns {way} speed than the model says, restitution {instead}"),
@@ -199,13 +203,15 @@ CLAIMS: dict[str, tuple[str, str, str]] = {
     "latency_jitter": ("", "", "The time stamps of the ball's positions scatter by {value}"),
     "tracker_smoothing": ("", "", "The tracker smooths the ball's positions, time constant {instead}"),
     "paddle_restitution": (
-        "more", "less", "The paddle gives back {way} of the ball's speed than the model says, {instead}",
+        "more",
+        "less",
+        "The paddle gives back {way} of the ball's speed than the model says, {instead}",
     ),
     "paddle_friction": ("more", "less", "The rubber grips {way} than the model says, tangential gain {instead}"),
     "paddle_tilt": ("downwards", "upwards", "The blade looks {way} by {value}"),
     "paddle_offset": ("ahead of", "behind", "The blade lies {way} where the model has it, by {size}"),
     "ball_latency": ("later", "sooner", "The ball is measured {way} against the joints than the model says, {instead}"),
-}  # fmt: skip
+}
 ROBOT_CLAIMS: dict[str, tuple[str, str, str]] = {
     "action_delay": ("later", "sooner", "acts {way} on a command than the model says, delay {instead}"),
     "observation_delay": ("later", "sooner", "is read {way} than the model says, delay {instead}"),

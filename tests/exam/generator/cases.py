@@ -47,9 +47,7 @@ def _times(value, a):
 
 def _drag(a):
     f = "ball.flight."
-    return {
-        f + "drag_coefficient": 0.47 * (1 + a), f + "air_density": 1.29 * (1 + a), f + "mass": 0.0027 / (1 + a)
-    }  # fmt: skip
+    return {f + "drag_coefficient": 0.47 * (1 + a), f + "air_density": 1.29 * (1 + a), f + "mass": 0.0027 / (1 + a)}
 
 
 def _gravity(a):
@@ -102,7 +100,12 @@ EFFECTS: dict[str, Effect] = {
     "clock_rate": _gravity_effect("clock_rate", "clock_rate", lambda c, a: c * (1 + a) ** -0.5),
     # A ball that gains energy at the table does not exist: only less restitution, and less of it at speed.
     "table_restitution": Effect(
-        "restitution", _plus, 0.015, _one("ball.table.restitution", 0.93), (-1,), kin=_others(_BOUNCE, "table_restitution")
+        "restitution",
+        _plus,
+        0.015,
+        _one("ball.table.restitution", 0.93),
+        (-1,),
+        kin=_others(_BOUNCE, "table_restitution"),
     ),
     "table_restitution_speed": Effect(
         "restitution_slope", _plus, 0.005, _one("ball.table.restitution_slope"), (1,), kin=("table_restitution",)
@@ -121,18 +124,27 @@ EFFECTS: dict[str, Effect] = {
     "camera_distortion": Effect("camera_distortion", _plus, 0.004, _one("sensing.camera_distortion")),
     "latency_jitter": Effect("jitter", _plus, 0.005, _one("sensing.jitter"), (1,)),
     "tracker_smoothing": Effect("smoothing", _plus, 0.008, _one("sensing.smoothing"), (1,)),
-}  # fmt: skip
+}
 # Pairs whose effects on a log, the balls' states projected out, have a cosine above 0.97: measured with the generator's
 # own physics (tests/exam/test_exam.py). One of a pair in place of the other is a twin as the data can tell it.
 LOOKALIKES = (
-    ("wind_x", "gravity_tilt_x"), ("wind_y", "gravity_tilt_y"), ("table_restitution", "table_restitution_speed"),
+    ("wind_x", "gravity_tilt_x"),
+    ("wind_y", "gravity_tilt_y"),
+    ("table_restitution", "table_restitution_speed"),
     ("table_tilt_y", "camera_rotation_x"),
-)  # fmt: skip
+)
 # No ball log shows it, so that its size is not millimetres but [rad]; the right answer is that nothing can be named.
 INVISIBLE = {"camera_rotation_z": 0.02}
 # Of a pair, one member of each family at most: two that look alike make one case of the other.
-FAMILIES = (_DRAG, (*_GRAVITY, "camera_scale", "wind_z"), _TILT_X, _TILT_Y, (*_BOUNCE, "table_height"),
-            ("tracker_smoothing",), ("latency_jitter",))  # fmt: skip
+FAMILIES = (
+    _DRAG,
+    (*_GRAVITY, "camera_scale", "wind_z"),
+    _TILT_X,
+    _TILT_Y,
+    (*_BOUNCE, "table_height"),
+    ("tracker_smoothing",),
+    ("latency_jitter",),
+)
 
 # Robot effects: number of Joint, drawn range at full excitation, relative to the joint's stroke speed where marked.
 ROBOT_EFFECTS: dict[str, tuple[float, float]] = {
@@ -198,13 +210,16 @@ class BallCase:
             if cause in EFFECTS and self.case.kind != "rare":
                 values |= EFFECTS[cause].truth(amount)
         return {
-            "case": asdict(self.case), "amounts": self.amounts, "parameters": values,
+            "case": asdict(self.case),
+            "amounts": self.amounts,
+            "parameters": values,
             "spin": {"k": MAGNUS, "mean": self.spin_mean.tolist(), "std": self.spin_std.tolist()}
-            if self.spin_std.any() else None,
+            if self.spin_std.any()
+            else None,
             "twins": {c: EFFECTS[c].twins for c in self.amounts if c in EFFECTS},
             "kin": {c: EFFECTS[c].kin for c in self.amounts if c in EFFECTS},
             "lookalikes": {c: [o for pair in LOOKALIKES if c in pair for o in pair if o != c] for c in self.amounts},
-        }  # fmt: skip
+        }
 
 
 def _generator(case: Case, use: str) -> np.random.Generator:
@@ -320,8 +335,15 @@ class RobotCase:
             for name in names:
                 joint, effect = name.split(".")
                 values[name] = getattr(robot.nominal(joint), effect) + self.amounts[cause]
-        return {"case": asdict(self.case), "amounts": self.amounts, "parameters": values, "spin": None,
-                "twins": twins, "kin": {}, "lookalikes": {}}  # fmt: skip
+        return {
+            "case": asdict(self.case),
+            "amounts": self.amounts,
+            "parameters": values,
+            "spin": None,
+            "twins": twins,
+            "kin": {},
+            "lookalikes": {},
+        }
 
 
 def _delay_twin(cause: str) -> tuple[str, ...]:
@@ -352,8 +374,21 @@ def build_robot(case: Case) -> RobotCase:
 
 
 SIZES = (5.0, 10.0, 20.0)
-KINDS = ("none", "noise", "invisible", "single", "pair", "triple", "gauge", "deleted", "invented", "rare", "robot",
-         "unexcited", "robot_none")  # fmt: skip
+KINDS = (
+    "none",
+    "noise",
+    "invisible",
+    "single",
+    "pair",
+    "triple",
+    "gauge",
+    "deleted",
+    "invented",
+    "rare",
+    "robot",
+    "unexcited",
+    "robot_none",
+)
 
 
 def draw(kind: str, count: int, seed: int, size_mm: float | None = None) -> list[Case]:

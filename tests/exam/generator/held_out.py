@@ -21,10 +21,15 @@ ROUNDS = 6
 HUBER = 3.0  # deviations beyond which a sample counts linearly
 # Dotted paths of a model file and the World's numbers, where the last part is not already the name.
 PATHS = {
-    "ball.table.restitution": "restitution", "ball.table.restitution_slope": "restitution_slope",
-    "ball.table.friction": "friction", "ball.table.height": "height", "ball.table.tilt_x": "tilt_x",
-    "ball.table.tilt_y": "tilt_y", "sensing.smoothing": "smoothing", "sensing.jitter": "jitter",
-}  # fmt: skip
+    "ball.table.restitution": "restitution",
+    "ball.table.restitution_slope": "restitution_slope",
+    "ball.table.friction": "friction",
+    "ball.table.height": "height",
+    "ball.table.tilt_x": "tilt_x",
+    "ball.table.tilt_y": "tilt_y",
+    "sensing.smoothing": "smoothing",
+    "sensing.jitter": "jitter",
+}
 
 
 @dataclass(frozen=True)

@@ -258,9 +258,10 @@ def _gain_rows(records: list[dict]) -> list[Row]:
 
 def _delays(records: list[dict]) -> list[dict]:
     return [
-        r for r in records
+        r
+        for r in records
         if r["outcome"] == "right" and r["case"]["causes"][0].endswith("_delay") and math.isfinite(_delay_error(r))
-    ]  # fmt: skip
+    ]
 
 
 def _delay_error(record: dict) -> float:

@@ -57,9 +57,7 @@ def draw_starts(rng: np.random.Generator, count: int, human: bool) -> np.ndarray
         x, z = rng.uniform(-0.6, 0.6, n), rng.uniform(0.1, 0.5, n)
         speed, climb = rng.uniform(4.0, 7.0, n), rng.uniform(-0.15, 0.6, n)
         aim = np.arctan2(rng.uniform(-0.6, 0.6, n) - x, y + 0.9)
-        velocity = speed * np.array(
-            [np.cos(climb) * np.sin(aim), -np.cos(climb) * np.cos(aim), np.sin(climb)]
-        )  # fmt: skip
+        velocity = speed * np.array([np.cos(climb) * np.sin(aim), -np.cos(climb) * np.cos(aim), np.sin(climb)])
         start = np.concatenate([[x, y, z], velocity, np.zeros((3, n))])
         flight = fly(World(), start, 0.7, step=1e-2)
         meets = np.isfinite(flight.bounce_time)

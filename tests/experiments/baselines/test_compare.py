@@ -63,14 +63,21 @@ REPLAY = Replay(environments=16, capacity=20_000, random_steps=2_000, gradient_s
     "learner, calls, left",
     [
         (
-            PpoLearner(Ppo(kind="ppo", environments=256, unroll=4, minibatches=4, learning_rate=1e-3, gae_lambda=1.0), Aim()),
-            120, 0.4,
+            PpoLearner(
+                Ppo(kind="ppo", environments=256, unroll=4, minibatches=4, learning_rate=1e-3, gae_lambda=1.0), Aim()
+            ),
+            120,
+            0.4,
         ),
         (OffPolicyLearner(REPLAY, Aim(), SacAgent(Sac(kind="sac", learning_rate=1e-3, layers=[64, 64]))), 40, 0.4),
-        (OffPolicyLearner(REPLAY, Aim(), QtOptAgent(QtOpt(kind="qt_opt", learning_rate=1e-3, layers=[64, 64]))), 40, 0.6),
+        (
+            OffPolicyLearner(REPLAY, Aim(), QtOptAgent(QtOpt(kind="qt_opt", learning_rate=1e-3, layers=[64, 64]))),
+            40,
+            0.6,
+        ),
     ],
     ids=["PPO", "SAC", "QT-Opt"],
-)  # fmt: skip
+)
 def test_a_learner_comes_near_the_best_action(learner, calls, left):
     """``left``: share of the squared distance that standing still leaves."""
     state = learner.init(jax.random.key(0))
@@ -166,14 +173,17 @@ def test_the_buffer_holds_the_last_transitions():
 SMALL = {
     "name": "small",
     "experiment": {
-        "name": "small", "balls": "player3/M0", "task": {"sim_rate": 150}, "training": {"pool": 64},
+        "name": "small",
+        "balls": "player3/M0",
+        "task": {"sim_rate": 150},
+        "training": {"pool": 64},
         "evaluation": {"episodes": 512, "sim_rate": 150},
     },
     "reality": {"ball_spin": {"mean_x": 300.0}},
     "algorithms": {"ES": {"kind": "bgs", "optimiser": {"pairs": 2, "repeats": 2}}},
     "budget": {"episodes": 40},
     "curve": {"points": 2, "episodes": 512},
-}  # fmt: skip
+}
 
 
 def write(folder, data):
@@ -203,9 +213,7 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
     assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*.*")}
 
     def missing(*overrides):
-        return compare.unfinished(
-            compare.prepare(*baselines.load(path, overrides), str(path), tmp_path, console)
-        )  # fmt: skip
+        return compare.unfinished(compare.prepare(*baselines.load(path, overrides), str(path), tmp_path, console))
 
     assert missing() == {"ES": []}
     assert missing("seeds=[0, 3]") == {"ES": [3]}

@@ -126,7 +126,9 @@ def test_robot_yaml_survives_a_round_trip(tmp_path):
 
 def robot_at(ports) -> RobotConfig:
     axes = [{"port": port} for port in ports.axes]
-    return robot.fill(RobotConfig, {"arm": {"port": ports.arm}, "tracker": {"port": ports.tracker}, "axes": axes}, "test")
+    return robot.fill(
+        RobotConfig, {"arm": {"port": ports.arm}, "tracker": {"port": ports.tracker}, "axes": axes}, "test"
+    )
 
 
 def test_port_in_use_is_refused(policy):
@@ -202,7 +204,10 @@ def test_emergency_stop_of_the_arm_is_a_latched_fault(playing):
     while time.monotonic() < end and not (session.status or {}).get("faults"):
         list(session.messages(0.1))
     assert session.status["state"] == "fault"
-    assert "motors are off" in session.status["faults"][0]["text"] or session.status["faults"][0]["cause"] == "arm_not_ready"
+    assert (
+        "motors are off" in session.status["faults"][0]["text"]
+        or session.status["faults"][0]["cause"] == "arm_not_ready"
+    )
     with pytest.raises(RefusedError, match="cannot reset"):
         session.reset()
     session.recover(rig)

@@ -92,7 +92,9 @@ def test_an_evaluation_plays_the_spin_of_its_model():
     for i, steps in zip(order[missed], played.steps.ravel()[missed]):
         ball = jax.tree.map(lambda x: np.asarray(x, float)[:, i], evaluator.balls.state)
         start = ball_flight.Touch(0.0, ball.position, ball.velocity, np.array([topspin, 0.0, 0.0]))
-        end, _ = ball_flight.fly(ball_flight.on_table(start), lambda p: min(p[1] - OUT_OF_REACH[0], p[2] - OUT_OF_REACH[1]))
+        end, _ = ball_flight.fly(
+            ball_flight.on_table(start), lambda p: min(p[1] - OUT_OF_REACH[0], p[2] - OUT_OF_REACH[1])
+        )
         assert steps == pytest.approx(end * experiment.task.control_rate, abs=1.5)
 
 
@@ -170,7 +172,9 @@ def test_curves_of_several_trainings_are_drawn_over_time_and_balls(tmp_path):
     assert balls["two, evaluated"].tolist() == [[30_000, 0.4]]
     np.testing.assert_allclose(minutes["one, perturbed"][:, 0], 2 * minutes["two, perturbed"][:, 0])
     assert balls["one, perturbed"][-1] == pytest.approx((6000, np.mean(np.arange(35, 60) / 60)))
-    assert share(figures.draw_curves(tmp_path / "a" / "curves.png", [figures.Curve("one", rows, 100)]), "#1f77b4") > 0.0005
+    assert (
+        share(figures.draw_curves(tmp_path / "a" / "curves.png", [figures.Curve("one", rows, 100)]), "#1f77b4") > 0.0005
+    )
 
 
 def test_what_has_no_learning_curve_is_named(tmp_path):

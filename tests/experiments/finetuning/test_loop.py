@@ -120,14 +120,21 @@ def last_theta(folder: Path) -> np.ndarray:
 def test_the_defaults_are_the_papers_real_settings():
     chosen = finetuning.load()
     assert (chosen.step.learning_rate, chosen.sigma, chosen.pairs, chosen.repeats, chosen.keep) == (
-        0.00375, 0.025, 5, 3, 0.6,
-    )  # fmt: skip
+        0.00375,
+        0.025,
+        5,
+        3,
+        0.6,
+    )
     assert chosen.step.kind == "sgd" and chosen.step.schedule.kind == "constant" and chosen.orthogonal
     assert chosen.updates in (60, 70) and chosen.episodes_per_update == 30
     weights = dict(zip(loop.rewards.TERMS, build.reward_weights(chosen.rewards)))
     assert {name: weight for name, weight in weights.items() if weight} == {
-        "state_transition": 1.0, "net_clearance": 1.0, "hit_and_land": 0.1, "fault": 1.0,
-    }  # fmt: skip
+        "state_transition": 1.0,
+        "net_clearance": 1.0,
+        "hit_and_land": 0.1,
+        "fault": 1.0,
+    }
 
 
 def test_settings_come_from_file_then_command_line(tmp_path):
@@ -187,9 +194,11 @@ def test_an_update_follows_the_journal_by_the_papers_rule(source, tmp_path):
             member = theta + sign * np.float32(0.025) * directions[:, entry.member % 3]
             np.testing.assert_allclose(thetas[entry.episode], member, atol=1e-6)
             assert entry.returns == pytest.approx(
-                entry.terms["state_transition"] + entry.terms["net_clearance"]
-                + 0.1 * entry.terms["hit_and_land"] + entry.terms["fault"]
-            )  # fmt: skip
+                entry.terms["state_transition"]
+                + entry.terms["net_clearance"]
+                + 0.1 * entry.terms["hit_and_land"]
+                + entry.terms["fault"]
+            )
             returns[entry.member, entry.repeat] = entry.returns
         plus, minus = np.split(returns.mean(axis=1), 2)
         elite = np.argsort(-np.abs(plus - minus))[: int(0.6 * 3)]

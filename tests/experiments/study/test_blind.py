@@ -95,8 +95,10 @@ def test_people_evaluate_without_knowing_what(tmp_path, artefacts, capsys):
     late = {("B", rally) for rally in range(40, 71)}
     fill(folder / "sheet.csv", lengths, late)
     assert [(p.code, p.counted, p.complete) for p in protocol.progress(folder)] == [
-        ("A", 70, True), ("B", 39, False), ("C", 70, True),
-    ]  # fmt: skip
+        ("A", 70, True),
+        ("B", 39, False),
+        ("C", 70, True),
+    ]
     assert cli.main(["blind", "open", str(folder)]) == 1
     message = capsys.readouterr().err
     assert "stays sealed" in message and "B has 39" in message and not any(model in message for model in MODELS)

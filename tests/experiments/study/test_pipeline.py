@@ -456,7 +456,10 @@ def test_a_study_leaves_what_it_says(finished):
 
 def test_worlds_side_by_side_are_those_that_were_drawn():
     """Also drives, which a world without them does not have at all."""
-    drawn = [target_domain.draw(3, left_out) for left_out in ((), ("drives", "encoders"), ("table",), tuple(target_domain.RANGES))]
+    drawn = [
+        target_domain.draw(3, left_out)
+        for left_out in ((), ("drives", "encoders"), ("table",), tuple(target_domain.RANGES))
+    ]
     together = models.paths(target_domain.side_by_side(drawn, 2))
     for path, value in together.items():
         wanted = [models.paths(world)[path] for world in drawn]
@@ -568,9 +571,11 @@ def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
     tuning = {"pairs": 1, "repeats": 1, "evaluation_balls": 2}
     small = [{"simulated": 2, "real": 1}] * 3
     what = study(
-        robot="lockstep", fine_tuning=tuning, simulation=TINY["simulation"] | {"rounds": small},
+        robot="lockstep",
+        fine_tuning=tuning,
+        simulation=TINY["simulation"] | {"rounds": small},
         recordings={"player3": str(finished / "seed0" / "player3" / "balls" / "D0.csv")},
-    )  # fmt: skip
+    )
     console, folder = quiet(), tmp_path / "robot"
     steps = is2r.Loop(what, folder, console).steps_of_play()
     names = [step.name for step in steps]

@@ -72,10 +72,14 @@ def test_the_interval_covers_as_often_as_it_says():
 
 
 def test_trainers_weigh_the_same_and_only_pairs_are_compared():
-    data = rallies({
-        (0, "player1", "player1", "a"): [10, 10], (0, "player1", "player1", "b"): [5] * 4,
-        (0, "player2", "player2", "a"): [4] * 6, (0, "player3", "player3", "b"): [99],
-    })  # fmt: skip
+    data = rallies(
+        {
+            (0, "player1", "player1", "a"): [10, 10],
+            (0, "player1", "player1", "b"): [5] * 4,
+            (0, "player2", "player2", "a"): [4] * 6,
+            (0, "player3", "player3", "b"): [99],
+        }
+    )
     boot = Bootstrap(data)
     names = ["player1", "player2", "player3"]
     assert boot.mean("a", names).value == 7.0
@@ -104,10 +108,14 @@ def test_tests_of_differences_are_scipys():
 
 
 def test_normalisation_both_ways_by_hand():
-    data = rallies({
-        (0, "player1", "player1", "a"): [2, 4], (0, "player1", "player1", "b"): [6, 8],
-        (0, "player1", "player4", "a"): [1, 3], (1, "player1", "player1", "a"): [10, 30],
-    })  # fmt: skip
+    data = rallies(
+        {
+            (0, "player1", "player1", "a"): [2, 4],
+            (0, "player1", "player1", "b"): [6, 8],
+            (0, "player1", "player4", "a"): [1, 3],
+            (1, "player1", "player1", "a"): [10, 30],
+        }
+    )
     own = data.take(data.own)
     by_player = statistics.normalised_by_player(own)
     spread = np.sqrt(20 / 3)  # of 2, 4, 6, 8 around 5
@@ -181,10 +189,16 @@ def test_grids_add_up_to_numpys_histogram():
     landing = rng.uniform([[-c.TABLE_WIDTH / 2], [-c.TABLE_LENGTH / 2]], [[c.TABLE_WIDTH / 2], [0.0]], (2, 500))
     place = rng.uniform([[-c.TABLE_WIDTH / 2], [0.0]], [[c.TABLE_WIDTH / 2], [c.TABLE_LENGTH / 2]], (2, 500))
     count, _ = heatmaps.grid(landing, place, np.ones(500, bool))
-    theirs, _ = np.histogramdd(np.concatenate([landing, place]).T, bins=3, range=[
-        (-c.TABLE_WIDTH / 2, c.TABLE_WIDTH / 2), (-c.TABLE_LENGTH / 2, 0.0), (-c.TABLE_WIDTH / 2, c.TABLE_WIDTH / 2),
-        (0.0, c.TABLE_LENGTH / 2),
-    ])  # fmt: skip
+    theirs, _ = np.histogramdd(
+        np.concatenate([landing, place]).T,
+        bins=3,
+        range=[
+            (-c.TABLE_WIDTH / 2, c.TABLE_WIDTH / 2),
+            (-c.TABLE_LENGTH / 2, 0.0),
+            (-c.TABLE_WIDTH / 2, c.TABLE_WIDTH / 2),
+            (0.0, c.TABLE_LENGTH / 2),
+        ],
+    )
     assert np.array_equal(count, theirs)
 
 
@@ -261,13 +275,34 @@ def test_the_report_is_one_page_that_needs_nothing_else(whole):
     assert not re.findall(r"(?:src|href)=[\"'](?!data:|#)", html) and "http" not in html
     pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', html)
     files = {path.name for path in report.glob("*.png")}
-    assert len(pictures) == len(files) and files >= {f"{name}.png" for name in (
-        "summary", "aggregated", "aggregated_means", "by_skill", "without_advanced", "checkpoints",
-        "zero_shot", "evolution",
-        "changes", "cross", "cross_players", "players", "tsne_training", "tsne_evaluation", "tsne_methods",
-        "heatmap_incoming",
-        "heatmap_outgoing", "fine_tuning", "effects", "calibration", "variant", "ends", "unselected",
-    )}  # fmt: skip
+    assert len(pictures) == len(files) and files >= {
+        f"{name}.png"
+        for name in (
+            "summary",
+            "aggregated",
+            "aggregated_means",
+            "by_skill",
+            "without_advanced",
+            "checkpoints",
+            "zero_shot",
+            "evolution",
+            "changes",
+            "cross",
+            "cross_players",
+            "players",
+            "tsne_training",
+            "tsne_evaluation",
+            "tsne_methods",
+            "heatmap_incoming",
+            "heatmap_outgoing",
+            "fine_tuning",
+            "effects",
+            "calibration",
+            "variant",
+            "ends",
+            "unselected",
+        )
+    }
     for data in pictures:
         image = Image.open(io.BytesIO(base64.b64decode(data))).convert("L")
         assert image.width > 600 and np.asarray(image).std() > 5.0  # something is drawn
@@ -331,13 +366,20 @@ DAMAGED = {  # file of a study: contents, what reads it
     "study.json": ([b"{", b"\xff\xfe", b"[1]"], study_data.load),
     "seed0/player5/balls/human_M1.yaml": ([b"garbage", b"\x80", b"position: 3"], study_data.load),
     "evaluations.csv": (
-        [b"\x80", b"seed\n", b"seed,trainer,evaluator,model,blind,rally,length,end\n0,a\n"], study_data.load
+        [b"\x80", b"seed\n", b"seed,trainer,evaluator,model,blind,rally,length,end\n0,a\n"],
+        study_data.load,
     ),
     "seed0/reality.yaml": ([b"{", b"\x80"], lambda folder: study_data.load(folder).realities),
     "seed0/effects.csv": ([b"\x80", b"seed\n1\n"], lambda folder: study_data.load(folder).effects),
     "calibration.json": (
-        [b"{", b"\x80", b"[]", b'{"numbers": 3}', b'{"medians": {"player1": {"M0": "x"}}}',
-         b'{"rallies": [{"player": "a"}]}'],
+        [
+            b"{",
+            b"\x80",
+            b"[]",
+            b'{"numbers": 3}',
+            b'{"medians": {"player1": {"M0": "x"}}}',
+            b'{"rallies": [{"player": "a"}]}',
+        ],
         lambda folder: study_data.load(folder).calibration,
     ),
     "seed0/player5/is2r-ft35/metrics.jsonl": (
@@ -349,9 +391,10 @@ DAMAGED = {  # file of a study: contents, what reads it
         lambda folder: study_data.load(folder).log(0, "player5", "player5", "is2r-ft100"),
     ),
     "seed0/player5/balls/D1.csv": (
-        [b"\x80", b"t,x\n1,2\n"], lambda folder: tsne.trained(study_data.load(folder), 0, "player5", "D1")
+        [b"\x80", b"t,x\n1,2\n"],
+        lambda folder: tsne.trained(study_data.load(folder), 0, "player5", "D1"),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,22 @@ from mjx_tt.rally.end_reasons import ROWS, End
 
 # Table end_of_rally_attribution, row by row as printed: did-robot-end-rally ("" where empty or a dash) and "Filter".
 PRINTED = [
-    ("", "Filter"), ("", "Filter"), ("Yes", ""), ("", "Filter"), ("Yes", ""), ("No", ""), ("No", ""), ("Yes", ""),
-    ("", "Filter"), ("", "Filter"), ("No", ""), ("No", ""), ("Yes", ""), ("", "Filter"), ("", "Filter"),
-]  # fmt: skip
+    ("", "Filter"),
+    ("", "Filter"),
+    ("Yes", ""),
+    ("", "Filter"),
+    ("Yes", ""),
+    ("No", ""),
+    ("No", ""),
+    ("Yes", ""),
+    ("", "Filter"),
+    ("", "Filter"),
+    ("No", ""),
+    ("No", ""),
+    ("Yes", ""),
+    ("", "Filter"),
+    ("", "Filter"),
+]
 
 
 def test_ends_are_attributed_as_in_the_papers_table():

@@ -212,8 +212,10 @@ def test_metrics_continue_after_the_checkpoint(tmp_path):
     log.write([{"update": 3, "loss": 30.0}])
     log.close()
     assert [json.loads(line) for line in path.read_text().splitlines()] == [
-        {"update": 1, "loss": 1.0}, {"update": 2, "loss": 2.0}, {"update": 3, "loss": 30.0},
-    ]  # fmt: skip
+        {"update": 1, "loss": 1.0},
+        {"update": 2, "loss": 2.0},
+        {"update": 3, "loss": 30.0},
+    ]
     assert len(list(board.glob("events.*"))) == 2
 
 

@@ -23,15 +23,24 @@ from tests.support.paths import DATA
 
 FITTED = tuple(e for e in EFFECTS if e.fit and e.group != AT_THE_PADDLE)
 CHANGED = {
-    "ball.flight.drag_coefficient": ("drag_coefficient", 0.55), "ball.flight.magnus_coefficient": ("magnus_coefficient", 0.6),
-    "ball.flight.spin_decay": ("spin_decay", 0.4), "ball.flight.wind_x": ("wind_x", 0.5), "ball.flight.wind_y": ("wind_y", -0.4),
-    "ball.flight.gravity_x": ("gravity_x", 0.2), "ball.table.restitution": ("restitution", 0.85),
-    "ball.table.restitution_slope": ("restitution_slope", 0.01), "ball.table.friction": ("friction", 0.15),
-    "ball.table.height": ("height", 0.01), "ball.table.tilt_x": ("tilt_x", 0.02), "ball.table.tilt_y": ("tilt_y", -0.015),
-    "sensing.camera_scale": ("camera_scale", 1.02), "sensing.camera_rotation_x": ("camera_rotation_x", 0.01),
-    "sensing.camera_rotation_y": ("camera_rotation_y", -0.02), "sensing.camera_rotation_z": ("camera_rotation_z", 0.03),
+    "ball.flight.drag_coefficient": ("drag_coefficient", 0.55),
+    "ball.flight.magnus_coefficient": ("magnus_coefficient", 0.6),
+    "ball.flight.spin_decay": ("spin_decay", 0.4),
+    "ball.flight.wind_x": ("wind_x", 0.5),
+    "ball.flight.wind_y": ("wind_y", -0.4),
+    "ball.flight.gravity_x": ("gravity_x", 0.2),
+    "ball.table.restitution": ("restitution", 0.85),
+    "ball.table.restitution_slope": ("restitution_slope", 0.01),
+    "ball.table.friction": ("friction", 0.15),
+    "ball.table.height": ("height", 0.01),
+    "ball.table.tilt_x": ("tilt_x", 0.02),
+    "ball.table.tilt_y": ("tilt_y", -0.015),
+    "sensing.camera_scale": ("camera_scale", 1.02),
+    "sensing.camera_rotation_x": ("camera_rotation_x", 0.01),
+    "sensing.camera_rotation_y": ("camera_rotation_y", -0.02),
+    "sensing.camera_rotation_z": ("camera_rotation_z", 0.03),
     "sensing.camera_distortion": ("camera_distortion", 0.004),
-}  # fmt: skip
+}
 
 
 def starts(n: int, seed: int = 0) -> np.ndarray:
@@ -139,9 +148,15 @@ def test_spins_are_estimated_as_a_distribution():
     target = np.einsum("nij,nj->ni", design, spins) + rng.normal(size=(n, 40))
     zero = np.zeros((n, 0, 0))
     p = Projected(
-        np.ones((n, 40)), None, zero, np.zeros((n, 0)),
-        design.swapaxes(1, 2) @ design, np.zeros((n, 3, 0)), np.einsum("nij,ni->nj", design, target), None,
-    )  # fmt: skip
+        np.ones((n, 40)),
+        None,
+        zero,
+        np.zeros((n, 0)),
+        design.swapaxes(1, 2) @ design,
+        np.zeros((n, 3, 0)),
+        np.einsum("nij,ni->nj", design, target),
+        None,
+    )
     prior = evidence.fit_spin(p, ())
     assert prior.mean == pytest.approx(mean, abs=0.4)
     assert prior.std == pytest.approx(std, rel=0.08)

@@ -14,9 +14,16 @@ from mjx_tt.diagnosis.joint import JointRecord, JointResponse, diagnose_robot, r
 DT = 2e-4
 NOMINAL = JointResponse(action_delay=0.071, observation_delay=0.029)
 IDEAL = {
-    "delay": 0.1, "lag": 0.0, "velocity_gain": 1.0, "velocity_limit": 1e9, "acceleration_limit": 1e9, "backlash": 0.0,
-    "coulomb_friction": 0.0, "deadband": 0.0, "joint_offset": 0.0,
-}  # fmt: skip
+    "delay": 0.1,
+    "lag": 0.0,
+    "velocity_gain": 1.0,
+    "velocity_limit": 1e9,
+    "acceleration_limit": 1e9,
+    "backlash": 0.0,
+    "coulomb_friction": 0.0,
+    "deadband": 0.0,
+    "joint_offset": 0.0,
+}
 
 
 def euler(times, commands, queries, truths, extra=None):
@@ -145,10 +152,11 @@ def diagnose(record, **kinds):
 
 def test_simulation_matches_fine_steps():
     truths = [
-        {"lag": 0.05, "acceleration_limit": 8.0}, {"lag": 0.05, "backlash": 0.02, "coulomb_friction": 0.1},
+        {"lag": 0.05, "acceleration_limit": 8.0},
+        {"lag": 0.05, "backlash": 0.02, "coulomb_friction": 0.1},
         {"acceleration_limit": 8.0, "backlash": 0.02, "velocity_gain": 0.9, "joint_offset": 0.1},
         {"lag": 0.03, "acceleration_limit": 10.0, "backlash": 0.02, "deadband": 0.2, "velocity_limit": 1.0},
-    ]  # fmt: skip
+    ]
     rng = np.random.default_rng(0)
     times, commands = zip(*(command(rng, 8.0, KINDS[i], 2.0) for i in range(4)))
     queries = [np.sort(rng.uniform(0.0, 8.0, 500)) for _ in truths]

@@ -126,8 +126,9 @@ def robot(folder, seconds=8.0, commands=1.0, states=1.0, speed=0.1, joint="joint
     folder.mkdir(exist_ok=True)
     time = np.arange(round(125 * seconds)) / 125
     for name, column, scale, values in (
-        ("command", "velocity", commands, speed * np.cos(time)), ("state", "position", states, speed * np.sin(time - 0.05)),
-    ):  # fmt: skip
+        ("command", "velocity", commands, speed * np.cos(time)),
+        ("state", "position", states, speed * np.sin(time - 0.05)),
+    ):
         rows = "".join(f"{scale * t:.6f},{joint},{v:.9f}\n" for t, v in zip(time, values))
         (folder / f"{name}.csv").write_text(f"t,joint,{column}\n{rows}")
     return folder

@@ -385,11 +385,7 @@ def test_claims_in_plain_words(name, estimate, text):
 
 def test_every_name_of_the_catalogue_has_words():
     effects = {e.name for e in catalogue.EFFECTS}
-    names = (
-        effects
-        | {t.name for e in catalogue.EFFECTS for t in e.twins}
-        | {"latency_jitter"}
-    )
+    names = effects | {t.name for e in catalogue.EFFECTS for t in e.twins} | {"latency_jitter"}
     assert names | set(NAMES) == set(words.MEANING)
     assert set(NAMES) == set(words.ROBOT_CLAIMS)
     assert effects - {"magnus"} <= set(words.CLAIMS)

@@ -45,7 +45,9 @@ def serves(blade):
         "back on the robot's side": ball_flight.serve([0.2, 1.2, 0.4], -5.0, *blade),
         "into the net": ball_flight.serve([0.2, 1.2, 0.5], -9.0, *blade),
         "volley": ball_flight.serve([0.2, 0.8, 0.5], -8.0, *blade, bounces=False),
-        "past the paddle": replace(ball_flight.serve([0.2, 1.2, 0.4], -5.0, *blade), position=np.array([-0.2, 1.2, 0.4])),
+        "past the paddle": replace(
+            ball_flight.serve([0.2, 1.2, 0.4], -5.0, *blade), position=np.array([-0.2, 1.2, 0.4])
+        ),
         "two bounces": lob,
         "human's side": Touch(0.0, np.array([0.0, 1.0, 0.3]), np.array([0.0, -1.0, -1.0]), np.zeros(3)),
     }
@@ -224,8 +226,11 @@ def test_weights_and_ranges_are_the_papers():
     assert len(TERMS) == 11
     assert list(rewards.SIM_WEIGHTS.values()) == [1.0, 1.0, 0.1, 0.0, 0.3, 0.3, 0.4, 1.0, 1.0, 0.5, 1.0]
     assert [name for name, weight in rewards.REAL_WEIGHTS.items() if weight] == [
-        "state_transition", "net_clearance", "hit_and_land", "fault",
-    ]  # fmt: skip
+        "state_transition",
+        "net_clearance",
+        "hit_and_land",
+        "fault",
+    ]
     assert rewards.REAL_WEIGHTS["hit_and_land"] == 0.1 and rewards.REAL_WEIGHTS["fault"] == 1.0
     # Term 1 rises from approach to hit, crossing, return and aim, within [0, 5]; term 2 within [0, 1].
     target = np.array([0.0, 0.685])

@@ -103,7 +103,9 @@ def test_first_balls_are_lobs_to_the_robots_right_and_sometimes_services_or_miss
 
 
 def test_balls_over_the_table_happen():
-    balls = [FIRST_BALL(human_player.load(name), human_player.fresh((N,)), jax.random.key(4), shape=(N,)) for name in NAMES]
+    balls = [
+        FIRST_BALL(human_player.load(name), human_player.fresh((N,)), jax.random.key(4), shape=(N,)) for name in NAMES
+    ]
     outcomes = np.concatenate([np.asarray(throw(ball_params(), b, *ROBOT_SIDE).outcome) for b in balls])
     assert 0 < np.mean(outcomes == MISSES) < 0.1
 
@@ -209,11 +211,14 @@ def test_files_come_back_as_they_were(tmp_path):
     [
         (lambda d: d["first"].update(x=[1.0, 0.0, 2.0]), r"first\.x = .*low <= usual <= high"),
         (lambda d: d["ability"].update(miss="often"), r"ability\.miss = 'often', a finite number"),
-        (lambda d: d["ability"].update(sped=1.0), r"unknown key ability\.sped; did you mean ability\.feet|unknown key ability\.sped"),
+        (
+            lambda d: d["ability"].update(sped=1.0),
+            r"unknown key ability\.sped; did you mean ability\.feet|unknown key ability\.sped",
+        ),
         (lambda d: d.pop("spin"), r"missing key spin"),
         (lambda d: d.update(person=3), r"person = 3, a mapping"),
     ],
-)  # fmt: skip
+)
 def test_errors_name_file_and_key(tmp_path, change, message):
     data = human_player.to_dict(human_player.load("player1"))
     change(data)

@@ -59,9 +59,14 @@ def stacked(**changes):
     """Player 3 in every lane, who hits hard; with those changes."""
     player = human_player.load("player3")
     first = replace(
-        player.first, y=Spread(1.2, 1.3, 1.4), z=Spread(0.35, 0.4, 0.45), forward=Spread(5.5, 6.0, 6.5),
-        climb=Spread(0.0, 0.8, 2.0), landing=Spread(-1.0, -0.85, -0.7), sideways=Spread(-0.1, 0.0, 0.1),
-    )  # fmt: skip
+        player.first,
+        y=Spread(1.2, 1.3, 1.4),
+        z=Spread(0.35, 0.4, 0.45),
+        forward=Spread(5.5, 6.0, 6.5),
+        climb=Spread(0.0, 0.8, 2.0),
+        landing=Spread(-1.0, -0.85, -0.7),
+        sideways=Spread(-0.1, 0.0, 0.1),
+    )
     player = replace(player, first=first, strokes=replace(player.strokes, speed=Spread(6.5, 6.8, 7.0), attack=0.0))
     for group, values in changes.items():
         player = replace(player, **{group: replace(getattr(player, group), **values)})
@@ -73,9 +78,12 @@ def shots(simulator, balls, touches, theta=STILL, model=EXACT, box=None, start=N
     position, velocity = (jnp.asarray([balls[i % len(balls)][k] for i in range(LANES)], jnp.float32).T for k in (0, 1))
     home = jnp.repeat(jnp.asarray(simulator.task.home, jnp.float32)[:, None], LANES, axis=1)
     state = RallyState(
-        player=human_player.fresh((LANES,)), ball=BallState(position, velocity, jnp.zeros_like(position)),
-        touches=jnp.full(LANES, touches, jnp.int32), start=home if start is None else start, dummy=jnp.zeros(LANES, bool),
-    )  # fmt: skip
+        player=human_player.fresh((LANES,)),
+        ball=BallState(position, velocity, jnp.zeros_like(position)),
+        touches=jnp.full(LANES, touches, jnp.int32),
+        start=home if start is None else start,
+        dummy=jnp.zeros(LANES, bool),
+    )
     everything = Box(jnp.full(8, -99.0), jnp.full(8, 99.0)) if box is None else box
     state, result = simulator.shots(
         theta, *NORMALISER, stacked(), without_nominal(spread(model)), state, jax.random.key(key), everything
@@ -86,8 +94,23 @@ def shots(simulator, balls, touches, theta=STILL, model=EXACT, box=None, start=N
 def test_the_table_of_ends_has_the_papers_fifteen_rows_in_order():
     assert [int(row[0]) for row in ROWS] == list(range(17))
     # The paper's table: did the robot end the rally, is the rally filtered.
-    said = [(None, True), (None, True), (True, False), (None, True), (True, False), (False, False), (False, False),
-            (True, False), (None, True), (None, True), (False, False), (False, False), (True, False), (None, True), (None, True)]  # fmt: skip
+    said = [
+        (None, True),
+        (None, True),
+        (True, False),
+        (None, True),
+        (True, False),
+        (False, False),
+        (False, False),
+        (True, False),
+        (None, True),
+        (None, True),
+        (False, False),
+        (False, False),
+        (True, False),
+        (None, True),
+        (None, True),
+    ]
     assert [row[2:] for row in ROWS[:15]] == said
 
 
@@ -239,9 +262,15 @@ def test_the_same_key_plays_the_same_rallies(simulator, rallies):
 
 def test_every_service_is_filtered(simulator):
     result = simulator.play(
-        STILL, *NORMALISER, stacked(first={"service": 1.0}, ability={"elevation": 0.0, "direction": 0.0, "pace": 0.0}),
-        spread(WALL), jax.random.key(5), 6, max_touches=20, capacity=64,
-    )  # fmt: skip
+        STILL,
+        *NORMALISER,
+        stacked(first={"service": 1.0}, ability={"elevation": 0.0, "direction": 0.0, "pace": 0.0}),
+        spread(WALL),
+        jax.random.key(5),
+        6,
+        max_touches=20,
+        capacity=64,
+    )
     assert set(np.asarray(result.end).ravel()) == {End.SERVICE}
     assert np.all(np.asarray(result.length) == 1)
 

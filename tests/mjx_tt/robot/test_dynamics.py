@@ -95,7 +95,9 @@ def test_whole_episodes_agree_with_mjx_in_float32():
     batch = scripted_episodes.episodes(
         [0.2, 1.2, 0.4], [0.0, -1.2, 0.0], delays, scripted_episodes.model(ball_noise=0.04, gravity=0.0), p=4
     )
-    fused, mjx = (scripted_episodes.play(scripted_episodes.task(engine), batch, policy, ticks=200) for engine in ("fused", "mjx"))
+    fused, mjx = (
+        scripted_episodes.play(scripted_episodes.task(engine), batch, policy, ticks=200) for engine in ("fused", "mjx")
+    )
     assert fused.paddle.dtype == mjx.paddle.dtype == np.float32
     assert fused.live.all() and mjx.live.all()
     assert np.linalg.norm(fused.paddle - mjx.paddle, axis=1).max() < 0.5e-3

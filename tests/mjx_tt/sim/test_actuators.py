@@ -31,18 +31,26 @@ CASES = (
     {"gantry_y.acceleration_limit": 5.0, "joint_1.acceleration_limit": 20.0, "joint_1.lag": 0.02},
     {"gantry_x.velocity_gain": 1.1, "joint_3.velocity_limit": 0.5, "joint_4.velocity_gain": 0.8},
     {
-        "gantry_y.coulomb_friction": 0.1, "gantry_y.deadband": 0.2,
-        "joint_5.coulomb_friction": 0.5, "joint_6.deadband": 1.0,
+        "gantry_y.coulomb_friction": 0.1,
+        "gantry_y.deadband": 0.2,
+        "joint_5.coulomb_friction": 0.5,
+        "joint_6.deadband": 1.0,
     },
     {"gantry_x.backlash": 0.01, "joint_2.backlash": 0.03},
     {"joint_1.action_delay": 0.02, "joint_1.observation_delay": 0.015, "joint_3.joint_offset": -0.05},
     {
-        "joint_2.action_delay": 0.04, "joint_2.observation_delay": 0.03, "joint_2.lag": 0.02,
-        "joint_2.velocity_gain": 0.9, "joint_2.joint_offset": 0.02, "joint_2.velocity_limit": 0.8,
-        "joint_2.acceleration_limit": 30.0, "joint_2.backlash": 0.02, "joint_2.coulomb_friction": 0.1,
+        "joint_2.action_delay": 0.04,
+        "joint_2.observation_delay": 0.03,
+        "joint_2.lag": 0.02,
+        "joint_2.velocity_gain": 0.9,
+        "joint_2.joint_offset": 0.02,
+        "joint_2.velocity_limit": 0.8,
+        "joint_2.acceleration_limit": 30.0,
+        "joint_2.backlash": 0.02,
+        "joint_2.coulomb_friction": 0.1,
         "joint_2.deadband": 0.15,
     },
-)  # fmt: skip
+)
 
 
 UNLIMITED = {"velocity_gain": 1.0, "velocity_limit": np.inf, "acceleration_limit": np.inf}
@@ -161,11 +169,14 @@ def effects(**values) -> Drives:
 @pytest.mark.parametrize(
     "case",
     [
-        {"lag": 0.03}, {"lag": 1e-4}, {"acceleration_limit": 7.0}, {"lag": 0.02, "acceleration_limit": 40.0},
+        {"lag": 0.03},
+        {"lag": 1e-4},
+        {"acceleration_limit": 7.0},
+        {"lag": 0.02, "acceleration_limit": 40.0},
         {"lag": 0.0, "acceleration_limit": 300.0},
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_velocity_follows_exactly_over_a_substep_of_any_length(case):
     """Velocity and way against fine steps of the differential equation, over a substep and over half a second."""
     v, u = np.random.default_rng(0).uniform(-2, 2, (2, 40))

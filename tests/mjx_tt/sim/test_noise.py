@@ -40,9 +40,7 @@ def test_every_seed_and_every_step_is_uniform_by_itself(noise):
         assert stats.kstest(values, "uniform").pvalue > 1e-3
 
 
-@pytest.mark.parametrize(
-    ("axis", "lag"), [(0, 1), (0, 2), (0, 7), (1, 1), (1, 2), (2, 1), (2, 13)]
-)
+@pytest.mark.parametrize(("axis", "lag"), [(0, 1), (0, 2), (0, 7), (1, 1), (1, 2), (2, 1), (2, 13)])
 def test_steps_axes_and_seeds_are_uncorrelated(noise, axis, lag):
     """axis 0: steps, 1: coordinates, 2: seeds; also the squares and magnitudes, which see what a sign hides."""
     along = np.moveaxis(noise, axis, 0)

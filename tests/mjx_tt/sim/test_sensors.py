@@ -20,14 +20,25 @@ from tests.support.scripted_episodes import TICKS, episodes, play, task
 
 T = 1 / 75
 START, VELOCITY = np.array([0.2, 1.2, 0.5]), np.array([0.3, -0.6, 0.1])
-CAMERA = {"camera_scale": 1.01, "camera_rotation_x": 0.02, "camera_rotation_y": -0.03, "camera_rotation_z": 0.05,
-          "camera_distortion": 0.004}  # fmt: skip
+CAMERA = {
+    "camera_scale": 1.01,
+    "camera_rotation_x": 0.02,
+    "camera_rotation_y": -0.03,
+    "camera_rotation_z": 0.05,
+    "camera_distortion": 0.004,
+}
 DELAY = 0.05
 # One episode each: what the tracker does in it.
 CASES = (
-    {}, CAMERA, {"smoothing": 0.03}, {"jitter": 0.004}, {"clock_rate": 1.2}, {"clock_rate": 3.0},
-    {"smoothing": 0.001}, CAMERA | {"smoothing": 0.05, "ball_offset_y": 0.01},
-)  # fmt: skip
+    {},
+    CAMERA,
+    {"smoothing": 0.03},
+    {"jitter": 0.004},
+    {"clock_rate": 1.2},
+    {"clock_rate": 3.0},
+    {"smoothing": 0.001},
+    CAMERA | {"smoothing": 0.05, "ball_offset_y": 0.01},
+)
 
 
 @pytest.fixture(scope="module")
@@ -60,9 +71,14 @@ def filtered(tau, delay):
     """By an adaptive solver of df/dt = (p - f) / tau."""
     times = np.maximum(np.arange(TICKS) * T - delay, 0.0)
     solution = solve_ivp(
-        lambda t, f: (START + VELOCITY * t - f) / tau, (0, TICKS * T), START, "Radau",
-        dense_output=True, rtol=1e-10, atol=1e-12,
-    )  # fmt: skip
+        lambda t, f: (START + VELOCITY * t - f) / tau,
+        (0, TICKS * T),
+        START,
+        "Radau",
+        dense_output=True,
+        rtol=1e-10,
+        atol=1e-12,
+    )
     return solution.sol(times).T
 
 

@@ -117,7 +117,10 @@ def test_mistakes_are_named(tmp_path, home):
         (lambda: rendering.render_png(tmp_path / "a.png", home[:7]), "qpos needs 8 joint positions, got 7"),
         (lambda: rendering.render_png(tmp_path / "a.png", home, [0, 0]), r"ball_position needs .* \(3\), got \(2,\)"),
         (lambda: rendering.render_png(tmp_path / "a.png", home, camera="front"), "no camera 'front'; it has .*'side'"),
-        (lambda: rendering.render_video(tmp_path / "a.mp4", many, many), r"ball needs the shape \(3, 3\), got \(3, 8\)"),
+        (
+            lambda: rendering.render_video(tmp_path / "a.mp4", many, many),
+            r"ball needs the shape \(3, 3\), got \(3, 8\)",
+        ),
         (lambda: rendering.render_video(tmp_path / "a.mp4", many[:0]), "at least one frame"),
         (lambda: rendering.render_video(tmp_path / "a.mp4", many, size=(321, 180)), "even width and height"),
     ):

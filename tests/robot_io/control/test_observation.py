@@ -96,7 +96,9 @@ def to_bridge(motion, delays, unit=FINEST):
         for j, emulator in zip(FESTO_JOINTS, emulators):
             emulator.step(now, float(state[3 + j]), 0.0)
         position = state[[3 + j for j in ABB_JOINTS]]
-        assert session.receive(encode_robot(i - warm_up, round(now * 1000), position, position, True, True, True), ADDRESS, now)
+        assert session.receive(
+            encode_robot(i - warm_up, round(now * 1000), position, position, True, True, True), ADDRESS, now
+        )
         assert bridge.arm_received(now) is not None
         frame = BallSample(i - warm_up, 1, now, None if i < 0 else state[:3])
         bridge.tracker_received(encode(frame), HOME, now)

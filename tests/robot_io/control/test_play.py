@@ -63,7 +63,9 @@ def returned(at, landing, seconds):
     target = np.array([*landing, 0.02])
 
     def miss(v):
-        return ball_flight.path(Touch(at.time, at.position, v, np.zeros(3)), [at.time, at.time + seconds])[:, -1] - target
+        return (
+            ball_flight.path(Touch(at.time, at.position, v, np.zeros(3)), [at.time, at.time + seconds])[:, -1] - target
+        )
 
     v = fsolve(miss, (target - at.position) / seconds + [0, 0, 4.9 * seconds])
     return Touch(at.time, at.position, v, np.zeros(3))
@@ -126,8 +128,16 @@ def test_balls_that_are_missed(noise):
         first = ball_flight.on_table(lob)
         second = ball_flight.on_table(first)
         assert first.position[1] < 0 and second.position[1] > -1.37
-        late = returned(Touch(second.time + 0.15, *ball_flight.path(second, [second.time, second.time + 0.15])[:, -1:].T,
-                              np.zeros(3), np.zeros(3)), (0.3, 0.7), 0.5)  # fmt: skip
+        late = returned(
+            Touch(
+                second.time + 0.15,
+                *ball_flight.path(second, [second.time, second.time + 0.15])[:, -1:].T,
+                np.zeros(3),
+                np.zeros(3),
+            ),
+            (0.3, 0.7),
+            0.5,
+        )
         twice = flight(lob, first, second, late, ball_flight.on_table(late))
         assert followed(twice, noise, seed, blade=late.position).outcome == MISSED
         short = Touch(0.0, np.array([0.2, 1.2, 0.4]), np.array([0.0, -3.0, -1.5]), np.zeros(3))

@@ -285,9 +285,12 @@ def joint_bytes(values):
 
 COMMAND_SPEED = np.array([10.0, -20.0, 30.0, -40.0, 50.0, -60.0])  # [deg/s]
 COMMAND = (  # an EgmSensor by hand: header (sequence 5, correction), planned, speedRef
-    b"\x0a\x04\x08\x05\x18\x03" + b"\x12\x38" + joint_bytes([1.0, -2.0, 3.0, -4.0, 5.0, -6.0])
-    + b"\x1a\x38" + joint_bytes(COMMAND_SPEED)
-)  # fmt: skip
+    b"\x0a\x04\x08\x05\x18\x03"
+    + b"\x12\x38"
+    + joint_bytes([1.0, -2.0, 3.0, -4.0, 5.0, -6.0])
+    + b"\x1a\x38"
+    + joint_bytes(COMMAND_SPEED)
+)
 PAYLOAD = [o + i for start in (10, 68) for o in range(start + 1, start + 54, 9) for i in range(8)]
 
 

@@ -226,7 +226,9 @@ def test_loaded_artefact_is_what_was_written(exported):
 
 
 def test_loading_needs_no_jax():
-    code = "import sys, robot_io.policy.artefact; sys.exit(any(m in sys.modules for m in ('jax', 'onnx', 'onnxruntime')))"
+    code = (
+        "import sys, robot_io.policy.artefact; sys.exit(any(m in sys.modules for m in ('jax', 'onnx', 'onnxruntime')))"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -416,9 +416,11 @@ ENDS = {
     Cause.ESTOP: lambda ideal: ideal.gate.estop(False, ideal.now),
     Cause.AXIS_LOST: lambda ideal: ideal.gate.condition(Cause.AXIS_LOST, False, "", ideal.now),
     Cause.ARM_NOT_READY: lambda ideal: ideal.gate.condition(Cause.ARM_NOT_READY, False, "", ideal.now),
-    **{c: lambda ideal: ideal.gate.check(ideal.now, 0, 0, 0, True, 0)
-       for c in (Cause.STALE_ARM, Cause.STALE_AXES, Cause.STALE_TRACKER)},
-}  # fmt: skip
+    **{
+        c: lambda ideal: ideal.gate.check(ideal.now, 0, 0, 0, True, 0)
+        for c in (Cause.STALE_ARM, Cause.STALE_AXES, Cause.STALE_TRACKER)
+    },
+}
 
 
 def test_a_thousand_random_fault_sequences():
@@ -667,11 +669,17 @@ def test_latch_keeps_the_first_cause_and_lists_the_others():
 @pytest.mark.parametrize(
     "wrong",
     [
-        dict(speed_scale=0.0), dict(speed_scale=1.5), dict(table_margin=-0.01), dict(self_margin=math.nan),
-        dict(late=0.0), dict(stale_arm=math.inf), dict(still=(1.0,) * 7), dict(following_error=(-1.0,) * 8),
+        dict(speed_scale=0.0),
+        dict(speed_scale=1.5),
+        dict(table_margin=-0.01),
+        dict(self_margin=math.nan),
+        dict(late=0.0),
+        dict(stale_arm=math.inf),
+        dict(still=(1.0,) * 7),
+        dict(following_error=(-1.0,) * 8),
         dict(delay=(0.2, 0.1)),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_configuration_is_refused(wrong):
     with pytest.raises(ValueError, match=f"SafetyConfig.{next(iter(wrong))} is"):
         replace(SafetyConfig(), **wrong)
