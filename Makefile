@@ -3,6 +3,7 @@
 # make study-quick  the whole study in small: five virtual players, all methods, a report (twenty minutes on two cores; resumable)
 # make test   set up and run the tests
 # make exam   hide causes in logs and let the diagnosis find them: the large examination (hours; resumable)
+# make docs   set up and build the documentation into docs/_build/html; a dead link or an unknown name is an error
 # make bench  set up and measure speed against MJX, MuJoCo C and PyBullet
 PYTHON ?= python3
 VENV   := .venv
@@ -10,7 +11,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo rig-demo study-quick test exam bench setup clean
+.PHONY: demo rig-demo study-quick test exam docs bench setup clean
 
 demo: $(READY)
 	$(BIN)/mjx-tt train quickstart.yaml --out runs
@@ -28,6 +29,11 @@ test: $(READY)
 exam: $(READY)
 	$(BIN)/python -m tests.exam
 
+docs: $(READY)
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
+
 bench: $(READY)
 	$(BIN)/pip install -q --disable-pip-version-check -e ".[bench]" || echo "PyBullet has no wheel for this Python: measured without it"
 	$(BIN)/mjx-tt bench
@@ -41,4 +47,4 @@ $(READY): pyproject.toml constraints.txt
 	touch $(READY)
 
 clean:
-	rm -rf $(VENV) .cache build *.egg-info
+	rm -rf $(VENV) .cache docs/_build docs/reference/generated build *.egg-info

@@ -445,7 +445,7 @@ Then write "balls: anna.yaml" in an experiment.
   mjx-tt run runs/quickstart/artefact --robot rig --rig worn.yaml --distribution player1/M1
 
 The robot needs the operator: p prepares the axes, a arms, the space bar stops. The rig is switched on, armed and fed
-with balls by itself. Read docs/safety.md and docs/hardware.md before a real arm moves.
+with balls by itself. Read docs/concepts/safety.md and docs/how-to/run-on-the-robot.md before a real arm moves.
 """,
     )
     p.add_argument("artefact", metavar="ARTEFACT", help="folder of an exported policy")
@@ -471,7 +471,7 @@ Every ball is on disk before the next begins: the same command continues after a
     )
     p.add_argument("policy", metavar="RUN_OR_ARTEFACT", help="what to start from")
     p.add_argument("--robot", required=True, metavar="YAML", help='a robot.yaml, "rig" or "lockstep"')
-    p.add_argument("--settings", metavar="YAML", help="of the fine-tuning (default: the paper's), docs/finetuning.md")
+    p.add_argument("--settings", metavar="YAML", help="settings (default: the paper's), docs/how-to/fine-tune.md")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one setting")
     p.add_argument("--out", metavar="FOLDER", help="of the run (default: POLICY-finetuned)")
     p.add_argument("--backend", choices=("numpy", "jit"), default="numpy", help="what computes the policy")
@@ -485,7 +485,7 @@ Every ball is on disk before the next begins: the same command continues after a
         """\
   mjx-tt is2r study_quick.yaml                              five virtual players, twenty minutes, ends in a report
   mjx-tt is2r study_full.yaml --set players=[player3]       the paper's scale
-  mjx-tt is2r anna.yaml                                     with robot: robot.yaml in it: on a robot, docs/is2r.md
+  mjx-tt is2r anna.yaml                                     with "robot: robot.yaml": docs/how-to/run-a-study.md
 
 Every finished step is kept: the same command continues after an interruption, a crash, or when people have played.
 A file name without a folder that is not in the current folder is looked up among the shipped studies.
@@ -527,7 +527,8 @@ Writes report/index.html with its pictures and tables: the paper's figures with 
   mjx-tt blind sheet anna-evaluates                                how many rallies count so far
   mjx-tt blind open anna-evaluates                                 when all are played: which was which, and the means
 
-The key is sealed in FOLDER/key.sealed; it opens when every code has 50 rallies that count. docs/evaluation.md.
+The key is sealed in FOLDER/key.sealed; it opens when every code has 50 rallies that count.
+docs/how-to/evaluate-blind.md describes the procedure.
 """,
     )
     p.add_argument("action", choices=("make", "sheet", "open"))
@@ -552,7 +553,7 @@ Algorithms and seeds that are finished are kept: the same command continues, and
 A file name without a folder that is not in the current folder is looked up among the shipped comparisons.
 """,
     )
-    p.add_argument("comparison", metavar="YAML", help="docs/algorithms.md explains it")
+    p.add_argument("comparison", metavar="YAML", help="docs/how-to/compare-algorithms.md explains it")
     p.add_argument("--out", default="runs", metavar="FOLDER", help="where its folder goes (default: runs)")
     p.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change one key")
 

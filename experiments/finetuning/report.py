@@ -144,7 +144,7 @@ def print_result(console: Console, result: dict[str, Any], title: str) -> None:
 
 
 def write_human_balls(path: Path, session: str, entries: list[Entry]) -> int:
-    """Writes the measured balls as ``session,trajectory,t,x,y,z`` (docs/data.md); returns their number."""
+    """Writes the measured balls as ``session,trajectory,t,x,y,z`` (docs/reference/measured-balls.md); returns their number."""
     count = 0
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

@@ -1,4 +1,4 @@
-"""What a diagnosis says: plain data, and its JSON (docs/verdict.schema.json)."""
+"""What a diagnosis says: plain data, and its JSON (docs/reference/verdict.schema.json)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log of a session at the robot: records, recorders, reader, tables. docs/log_format.md describes the file."""
+"""Log of a session at the robot: records, recorders, reader, tables. Format: docs/reference/log-format.md."""
 
 from robot_io.log.messages import Action as Action
 from robot_io.log.messages import Ball as Ball

@@ -178,8 +178,8 @@ def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
     With ``salvage`` a damaged or unfinished file gives what is sound of it, and ``faults`` says what is not. Without,
     it is an error that says where the file is damaged and how much can be had.
 
-    Raises LogError for such files, files that are no session log, and messages that are not as docs/log_format.md says;
-    OSError when the file cannot be read.
+    Raises LogError for such files, files that are no session log, and messages that break the format
+    (docs/reference/log-format.md); OSError when the file cannot be read.
     """
     scan = Scan(path)
     columns = {name: _Column(topic) for name, topic in TOPICS.items() if topic.width}
@@ -262,7 +262,7 @@ def _topic(path: str | os.PathLike, channel: Channel, schemas: dict[int, str]) -
         if channel.message_encoding != "protobuf" or found != expected:
             raise LogError(
                 f"{path}: {channel.topic} holds {found!r} in {channel.message_encoding!r}, expected {expected!r} in "
-                "'protobuf'; see docs/log_format.md"
+                "'protobuf'; see docs/reference/log-format.md"
             )
     return topic
 

@@ -1,4 +1,4 @@
-"""An exported policy on disk: load it, or say exactly why not. The format is described in docs/artefact.md.
+"""An exported policy on disk: load it, or say exactly why not. The format is described in docs/reference/artefact.md.
 
 NumPy only: this module runs on the robot. ``robot_io.policy.export`` makes artefacts.
 """

@@ -1,4 +1,6 @@
-"""The last gate that every velocity command passes on its way to the robot, once per control period: docs/safety.md.
+"""The gate that every velocity command passes last on its way to the robot, once per control period.
+
+Concepts, proofs and limits: docs/concepts/safety.md.
 
 The gate keeps a reference: the joint positions that its commands add up to. What it has accepted so far can always be
 braked: from the reference and the last velocity every joint, slowing down at its acceleration limit, comes to rest

@@ -4,7 +4,8 @@
 
 Every finished case is a line of OUT/cases.jsonl; a run that was stopped goes on where it was. OUT/summary.md and
 summary.json hold the bars with Clopper-Pearson intervals and the confusion matrix. Cases of the kinds take turns, so an
-unfinished examination has some of each. --cases is the number for each test; docs/exam.md says what they are.
+unfinished examination has some of each. --cases is the number for each test; docs/results/examination.md
+describes them.
 """
 
 from __future__ import annotations

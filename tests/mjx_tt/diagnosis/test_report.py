@@ -36,7 +36,7 @@ PLAY = {
     "retrained": {"rate": 0.9, "low": 0.88, "high": 0.92},
     "balls": 1000,
 }
-SCHEMA = json.loads((ROOT / "docs" / "verdict.schema.json").read_text(encoding="utf-8"))
+SCHEMA = json.loads((ROOT / "docs" / "reference" / "verdict.schema.json").read_text(encoding="utf-8"))
 WIND = 0.35  # [m/s] towards -x
 VOID = {"meta", "link", "br", "img", "hr", "wbr", "input"}
 

@@ -66,7 +66,7 @@ def _replace_file(folder, name, content):
 
 
 def _forward_by_loops(theta, mean, inverse_scale, history):
-    """The network written out number by number from docs/artefact.md, with its own slicing of theta."""
+    """The network written out number by number from docs/reference/artefact.md, with its own slicing of theta."""
     layers, start, inputs = [], 0, 11
     for outputs in (16, 24, 8):
         at = lambda k, i, o: theta[start + (k * inputs + i) * outputs + o]  # noqa: E731, B023
@@ -264,7 +264,7 @@ def test_truncated_missing_and_extra_files_are_refused(copy, name):
 
 
 def test_program_in_the_documentation_reproduces_the_golden_outputs(copy):
-    page = (ROOT / "docs" / "artefact.md").read_text()
+    page = (ROOT / "docs" / "reference" / "artefact.md").read_text()
     program = page.split("```python\n")[1].split("```")[0]
     command = [sys.executable, "-c", program]
     subprocess.run(command, cwd=copy, check=True)

@@ -1,0 +1,268 @@
+"""Sphinx extension: writes the reference pages that follow from the source, before every build.
+
+Configuration keys and the verdict come from JSON schemas, the command line from its parser, the Python API from the
+packages' public names. All pages land in ``docs/reference/generated/``; a page is written only when its text changes,
+so that an incremental build reads nothing twice.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import json
+import os
+import re
+import types
+import typing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+REFERENCE = Path(__file__).resolve().parents[1] / "reference"
+GENERATED = REFERENCE / "generated"
+PACKAGES = ("mjx_tt", "ballmodel", "bgs", "robot_io")
+WIDTH = "100"  # of the help texts [characters]
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Entry point of the extension."""
+    app.connect("builder-inited", lambda app: write_all())
+    app.connect("autodoc-process-docstring", _readable)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+def write_all() -> None:
+    """Write every generated page."""
+    from experiments.config import baselines, experiment, study
+    from experiments.config.finetuning import FineTuning
+    from robot_io.control.config import RobotConfig
+    from robot_io.emulator.config import RigParams
+
+    GENERATED.mkdir(parents=True, exist_ok=True)
+    known: dict[str, str] = {}  # name of a section: its anchor; sections shared by several files are described once
+    _write("experiment", schema_page("Experiment", "mjx-tt train", experiment.json_schema(), known))
+    _write("study", schema_page("Study", "mjx-tt is2r", study.Study.model_json_schema(), known))
+    _write("fine-tuning", schema_page("Fine-tuning", "mjx-tt finetune", FineTuning.model_json_schema(), known))
+    _write("comparison", schema_page("Comparison", "mjx-tt compare", baselines.Comparison.model_json_schema(), known))
+    _write(
+        "verdict", schema_page("Verdict", "", json.loads((REFERENCE / "verdict.schema.json").read_text("utf-8")), {})
+    )
+    _write("robot", dataclass_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", RobotConfig))
+    _write("rig", dataclass_page("rig.yaml", "mjx-tt run --robot rig --rig", RigParams))
+    _write("command-line", command_line_page())
+    for package in PACKAGES:
+        _write(f"api-{package}", api_page(package))
+
+
+def schema_page(title: str, command: str, schema: dict[str, Any], known: dict[str, str]) -> str:
+    """Page with one table per section of a JSON schema; ``known`` holds the anchors of sections described before."""
+    page = title.lower()
+    definitions = schema.get("$defs", {})
+    own = [name for name in _in_order(schema, definitions) if name not in known and _has_keys(definitions[name])]
+    anchors = known | {name: f"{page}-{name.lower()}" for name in own}
+    lines = [f"# {title}", ""]
+    if command:
+        lines += [f"The YAML of `{command}`. Keys without a default are required.", ""]
+    else:
+        lines += [schema.get("description", ""), ""]
+    lines += _table(schema, definitions, anchors)
+    for name in own:
+        section = definitions[name]
+        lines += ["", f"({anchors[name]})=", f"## {name}", "", _cell(section.get("description", "")), ""]
+        lines += _table(section, definitions, anchors)
+    known |= anchors
+    return "\n".join(lines) + "\n"
+
+
+def _in_order(schema: dict[str, Any], definitions: dict[str, Any]) -> list[str]:
+    """Names of the definitions in the order in which the schema refers to them, depth first."""
+    found: list[str] = []
+
+    def visit(node: Any) -> None:
+        if isinstance(node, dict):
+            name = node.get("$ref", "").removeprefix("#/$defs/")
+            if name and name not in found:
+                found.append(name)
+                visit(definitions[name])
+            for key, value in node.items():
+                if key not in ("$defs", "default", "discriminator"):
+                    visit(value)
+        elif isinstance(node, list):
+            for value in node:
+                visit(value)
+
+    visit(schema)
+    return found
+
+
+def _has_keys(definition: dict[str, Any]) -> bool:
+    return bool(definition.get("properties"))
+
+
+def _table(section: dict[str, Any], definitions: dict[str, Any], anchors: dict[str, str]) -> list[str]:
+    required = section.get("required", [])
+    with_default = any("default" in key for key in section["properties"].values())
+    rows = ["| key | allowed |" + (" default |" if with_default else "") + " meaning |"]
+    rows.append("|---|---|" + ("---|" if with_default else "") + "---|")
+    for name, key in section["properties"].items():
+        allowed = _type(key, definitions, anchors)
+        default = _default(key, definitions) if name not in required else "required"
+        meaning = _cell(key.get("description") or _section(key, definitions).get("description", ""))
+        rows.append(f"| `{name}` | {allowed} |" + (f" {default} |" if with_default else "") + f" {meaning} |")
+    return rows
+
+
+def _type(key: dict[str, Any], definitions: dict[str, Any], anchors: dict[str, str]) -> str:
+    """Allowed values of a key, in words."""
+    if "$ref" in key:
+        name = key["$ref"].removeprefix("#/$defs/")
+        return f"[{name}](#{anchors[name]})" if name in anchors else _type(definitions[name], definitions, anchors)
+    for several in ("anyOf", "oneOf"):
+        if several in key:
+            return " or ".join(dict.fromkeys(_type(each, definitions, anchors) for each in key[several]))
+    if "const" in key:
+        return f"`{key['const']}`"
+    if "enum" in key:
+        return ", ".join(f"`{value}`" for value in key["enum"])
+    kind = key.get("type", "any value")
+    if isinstance(kind, list):
+        return " or ".join(_type(key | {"type": each}, definitions, anchors) for each in kind)
+    if kind == "array":
+        return "list of: " + _type(key["items"], definitions, anchors)
+    if kind == "object":
+        values = key.get("additionalProperties")
+        return (
+            "mapping to: " + _type(values, definitions, anchors) if isinstance(values, dict) and values else "mapping"
+        )
+    if kind in ("number", "integer"):
+        signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+        bounds = [f"{sign} {key[bound]:,}" for bound, sign in signs.items() if bound in key]
+        return " ".join(["whole number" if kind == "integer" else "number", ", ".join(bounds)]).strip()
+    return {"string": "text", "boolean": "true, false", "null": "`null`"}.get(kind, kind)
+
+
+def dataclass_page(title: str, command: str, kind: type) -> str:
+    """Page with one table per dataclass that a YAML fills."""
+    lines = [f"# {title}", "", f"The YAML of `{command}`. Every key has a default."]
+    waiting, done = [("", kind)], []
+    while waiting:
+        path, kind = waiting.pop(0)
+        if kind in done:
+            continue
+        done.append(kind)
+        hints = typing.get_type_hints(kind)
+        lines += ["", f"## {path}" if path else "", "", "```text", inspect.getdoc(kind) or "", "```", ""]
+        lines += ["| key | type | default |", "|---|---|---|"]
+        for field in dataclasses.fields(kind):
+            hint = hints[field.name]
+            inner = next((h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h)), None)
+            below = f"{path}.{field.name}".lstrip(".")
+            if inner is not None:
+                waiting.append((below, inner))
+                lines.append(f"| `{field.name}` | mapping | section `{below}` |")
+            else:
+                text = hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
+                lines.append(f"| `{field.name}` | {_cell(text.replace('typing.', ''))} | `{_plain(field)}` |")
+    return "\n".join(lines) + "\n"
+
+
+def _plain(field: dataclasses.Field) -> str:
+    if field.default is not dataclasses.MISSING:
+        return repr(field.default)
+    if field.default_factory is not dataclasses.MISSING:
+        return repr(field.default_factory())
+    return "required"
+
+
+def _default(key: dict[str, Any], definitions: dict[str, Any]) -> str:
+    """Default of a key; of a section only what differs from the section's own defaults."""
+    if "default" not in key:
+        return ""
+    value, section = key["default"], _section(key, definitions).get("properties", {})
+    if isinstance(value, dict) and section:
+        value = {name: v for name, v in value.items() if v != section.get(name, {}).get("default")}
+        return f"`{json.dumps(value)}`" if value else "its own"
+    return f"`{json.dumps(value)}`"
+
+
+def _section(key: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    """Definition of the section that a key holds; empty for other keys."""
+    for each in (key, *key.get("anyOf", [])):
+        if "$ref" in each:
+            return definitions[each["$ref"].removeprefix("#/$defs/")]
+    return {}
+
+
+def _cell(text: str) -> str:
+    """Text on one line, for a cell of a table."""
+    return " ".join(text.split()).replace("``", "`").replace("|", "\\|")
+
+
+def command_line_page() -> str:
+    """Help of every command, as the terminal shows it."""
+    os.environ["COLUMNS"] = WIDTH
+    from experiments import cli
+
+    parser = cli._parser()
+    actions = next(action for action in parser._actions if action.choices)
+    lines = ["# Command line", "", "```text", parser.format_help().rstrip(), "```"]
+    for name, command in actions.choices.items():
+        lines += ["", f"(mjx-tt-{name})=", f"## mjx-tt {name}", "", "```text", command.format_help().rstrip(), "```"]
+    return "\n".join(lines) + "\n"
+
+
+def api_page(package: str) -> str:
+    """Public names of a package: those that its ``__init__`` shows."""
+    module = importlib.import_module(package)
+    names = getattr(module, "__all__", None) or [name for name in dir(module) if not name.startswith("_")]
+    public = {name: getattr(module, name) for name in names if not name.startswith("_")}
+    public = {
+        name: value
+        for name, value in public.items()
+        if not isinstance(value, types.ModuleType) and name != "annotations"
+    }
+    summary = (inspect.getdoc(module) or "").strip()
+    rest = [package, "=" * len(package), "", *_as_rest(summary.splitlines()), ""]
+    if public:
+        rest += [".. autosummary::", "   :nosignatures:", "", *(f"   {package}.{name}" for name in sorted(public)), ""]
+    for name in sorted(public):
+        value = public[name]
+        kind = "class" if inspect.isclass(value) else "function" if callable(value) else "data"
+        rest += [f".. auto{kind}:: {package}.{name}", *(["   :members:"] if kind == "class" else []), ""]
+    return "\n".join(rest)
+
+
+def _readable(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
+    lines[:] = _as_rest(lines)
+
+
+def _as_rest(lines: list[str]) -> list[str]:
+    """Docstring as reStructuredText: paragraphs as they are, indented blocks as literal text, stray marks escaped."""
+    found: list[str] = []
+    literal = False
+    for line in lines:
+        if line.startswith(" ") and line.strip():
+            if not literal and not (found and found[-1].startswith(("- ", "  "))):
+                found += ["", ".. code-block:: text", ""]
+                literal = True
+            found.append("   " + line if literal else line)
+            continue
+        if line.strip() and literal:
+            literal = False
+            found.append("")
+        found.append(_escaped(line))
+    return found
+
+
+def _escaped(line: str) -> str:
+    parts = re.split(r"(``.*?``)", line)
+    return "".join(p if p.startswith("``") else re.sub(r"([*|`\\]|_(?=\W|$))", r"\\\1", p) for p in parts)
+
+
+def _write(name: str, text: str) -> None:
+    path = GENERATED / f"{name}{'.rst' if name.startswith('api-') else '.md'}"
+    if not path.exists() or path.read_text("utf-8") != text:
+        path.write_text(text, encoding="utf-8")
