@@ -165,8 +165,11 @@ def _paper_trainer(changes: list[str]):
     import jax
 
     from experiments.config import build, experiment
+    from experiments.training import update as training
 
-    trainer = build.trainer(build.experiment(experiment.load(experiment.shipped()["paper"], tuple(changes)), "paper"))
+    trainer = training.trainer(
+        build.experiment(experiment.load(experiment.shipped()["paper"], tuple(changes)), "paper")
+    )
     return trainer, trainer.init(jax.random.key(0))
 
 

@@ -197,10 +197,10 @@ def is2r(options: argparse.Namespace) -> int:
     study = study_config.load(_file(options.study, study_config.shipped()), tuple(options.set))
     devices = study.simulation.devices
     _start_jax(options.devices or (None if devices == "auto" else devices))
-    from experiments.study import pipeline, workers
+    from experiments.study import session, workers
 
     side_by_side = workers.choose(study, options.processes, options.devices)
-    return 0 if pipeline.run(study, Path(options.out) / study.name, _console(), side_by_side) else 130
+    return 0 if session.run(study, Path(options.out) / study.name, _console(), side_by_side) else 130
 
 
 def study_report(options: argparse.Namespace) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -13,26 +12,11 @@ from ballmodel import registry
 from ballmodel.distribution import AXES, BallDistribution, save_distribution
 from ballmodel.fit_distribution import HumanReport, fit_human
 from ballmodel.flight import ball_params
-from ballmodel.io import MeasuredStates, read, write_mcap
-from ballmodel.io.atomic_files import replacing
-from ballmodel.io.csv import COLUMNS
+from ballmodel.io import read, write_mcap
 from ballmodel.trajectory import Dataset
 from experiments.errors import ConfigError, checked
+from experiments.measurements import read_all, write_csv
 from mjx_tt import diagnosis
-
-
-def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
-    """The balls of several files together. Raises ConfigError for files that hold different kinds of measurements."""
-    parts = [checked("", read, path, format) for path in paths]
-    source = ", ".join(part.source for part in parts)
-    if all(isinstance(part, Dataset) for part in parts):
-        return Dataset(tuple(trajectory for part in parts for trajectory in part), source)
-    if len(parts) == 1:
-        return parts[0]
-    kinds = ", ".join(
-        f"{path}: {'trajectories' if isinstance(p, Dataset) else 'states'}" for path, p in zip(paths, parts)
-    )
-    raise ConfigError(f"several files must all hold trajectories ({kinds}); fit the others one by one")
 
 
 def fit(
@@ -74,16 +58,6 @@ def convert(path: str, format: str | None, out: Path, console: Console) -> None:
     writers[out.suffix](out, data)
     samples = sum(len(trajectory) for trajectory in data)
     console.print(f"{out}: {len(data):,} trajectories, {samples:,} samples", highlight=False)
-
-
-def write_csv(path: Path, dataset: Dataset) -> None:
-    """Writes ``session,trajectory,t,x,y,z``, which ``ballmodel.io.read_csv`` reads back exactly."""
-    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(COLUMNS)
-        for trajectory in dataset:
-            rows = zip(trajectory.time, *trajectory.position)
-            writer.writerows((trajectory.session, trajectory.name, *(repr(float(v)) for v in row)) for row in rows)
 
 
 def print_catalogue(console: Console) -> None:

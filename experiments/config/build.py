@@ -1,4 +1,4 @@
-"""From a configuration to the objects it describes: balls, simulation model, task, optimiser, trainer."""
+"""From a configuration to the objects it describes: balls, simulation model, task, optimiser."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from bgs import optimizers
 from bgs.strategy import BGSConfig
 from experiments.config.experiment import Config, Optimiser, Rewards, Task, Training
 from experiments.errors import ConfigError, checked
-from experiments.training.update import Trainer
 from mjx_tt.env import rewards
-from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile
@@ -140,23 +138,6 @@ def key(seed: int, purpose: int) -> jax.Array:
 def pool(experiment: Experiment, key: jax.Array, n: int) -> BallPool:
     """``n`` balls of the experiment's distribution under its nominal ball model. Raises ConfigError."""
     return checked("balls", sample_pool, key, experiment.distribution, experiment.model.model.ball, n)
-
-
-def trainer(experiment: Experiment) -> Trainer:
-    """The trainer with its pool of balls drawn. Raises ConfigError."""
-    config = experiment.config
-    simulator = checked("training.devices", Simulator, experiment.task, device_count(config))
-    return Trainer(
-        simulator,
-        experiment.bgs,
-        pool(experiment, key(config.training.seed, TRAINING_BALLS), config.training.pool),
-        experiment.model.model,
-        experiment.model.randomise,
-        config.optimiser.repeats,
-        config.optimiser.common_random_numbers,
-        config.optimiser.initial_scale,
-        later_weights(config.training),
-    )
 
 
 def _mapping(model: str | dict[str, Any], where: str) -> dict[str, Any]:

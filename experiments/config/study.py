@@ -67,7 +67,7 @@ class Simulation(Section):
 
 
 class Reality(Section):
-    """The virtual reality: what it has that training does not know, drawn per seed (``experiments.study.target_domain``)."""
+    """The virtual reality: what it has that training does not know, drawn per seed (``experiments.study.target_domain.hidden_effects``)."""
 
     without: list[Literal[EFFECTS]] = []
     """Effects that are left out: there, reality is what training believes."""

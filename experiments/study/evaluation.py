@@ -13,10 +13,10 @@ from ballmodel.distribution import BallDistribution
 from ballmodel.io.atomic_files import replacing
 from experiments.config import build
 from experiments.config.study import Study
-from experiments.study import target_domain as realities
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.blind import protocol
-from experiments.study.finetuning import VirtualReality
+from experiments.study.target_domain import hidden_effects as realities
+from experiments.study.target_domain.finetuning import VirtualReality
 from mjx_tt.rally import human_player
 from mjx_tt.rally.simulator import Box, RallyResult
 

@@ -2,7 +2,7 @@
 
 For every seed and player: balls without a robot, a human model, training in simulation, fine-tuning in reality while the
 player's balls are measured, the next human model, and so on; then rallies of all models, and the report. Reality is a
-virtual one (``experiments.study.finetuning``) or a robot with its operator (``experiments.study.on_robot``).
+virtual one (``experiments.study.target_domain.finetuning``) or a robot with its operator (``experiments.study.target_domain.on_robot``).
 """
 
 from __future__ import annotations
@@ -16,28 +16,26 @@ from ballmodel.distribution import BallDistribution, load_distribution, save_dis
 from ballmodel.fit_distribution import fit_human
 from ballmodel.flight import ball_params
 from ballmodel.trajectory import Dataset
-from experiments.commands import measurements
+from experiments import measurements
 from experiments.config import build
 from experiments.config.experiment import read_yaml
-from experiments.config.study import Study, parse
+from experiments.config.study import Study
 from experiments.errors import RunError, checked
 from experiments.runs import load_policy, run_dir
-from experiments.runs.run_dir import Run
 from experiments.study import evaluation, training
-from experiments.study import target_domain as realities
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis import study_folder as study_data
 from experiments.study.blind import protocol
-from experiments.study.finetuning import VirtualReality
 from experiments.study.schedule import ORACLE, Human, Item, Real, Simulated, items, pairings, updates
+from experiments.study.target_domain import hidden_effects as realities
+from experiments.study.target_domain import on_robot
+from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.study.target_domain.world import VirtualWorld, World
 from experiments.study.training import POLICY
-from experiments.study.workers import run_side_by_side
-from experiments.study.workflow import JOURNAL, Journal, Step, Waiting, run_all
-from experiments.study.world import VirtualWorld, World
+from experiments.study.workflow import Step
 
-SETTINGS, SESSIONS, CONVERGENCE = "study.yaml", "study.json", "convergence.json"
+CONVERGENCE = "convergence.json"
 REPORT = Path("report") / "index.html"
-CHANGEABLE = ("players", "seeds", "simulation.checkpoint_seconds", "simulation.devices")
 
 
 class Loop:
@@ -50,9 +48,7 @@ class Loop:
             shared = VirtualReality(study, study.seeds[0])
             self._world = {seed: VirtualWorld(study, seed, shared) for seed in study.seeds}
         else:
-            from experiments.study.on_robot import RobotWorld
-
-            self._world = dict.fromkeys(study.seeds, RobotWorld(study, console))
+            self._world = dict.fromkeys(study.seeds, on_robot.RobotWorld(study, console))
 
     # -- places --------------------------------------------------------------------------------------------------------
 
@@ -271,8 +267,6 @@ class Loop:
 
     def _blind(self, seed: int) -> list[Step]:
         """The evaluation by people: for every trainer and evaluator a folder with code names and a scoring sheet."""
-        from experiments.study.on_robot import blind_steps
-
         found = []
         pairs = pairings(self.study)
         for trainer, evaluator in dict.fromkeys((t, e) for t, e, _ in pairs):
@@ -281,7 +275,9 @@ class Loop:
             runs_of = {m: partial(self.run_of, seed, trainer, place.parent.name) for m, place in places.items()}
             folder = self.seed_folder(seed) / "blind" / f"{trainer}-{evaluator}"
             inputs = tuple(dict.fromkeys(places.values()))
-            found += blind_steps(folder, seed, trainer, evaluator, runs_of, inputs, self.study.robot, self.console)
+            found += on_robot.blind_steps(
+                folder, seed, trainer, evaluator, runs_of, inputs, self.study.robot, self.console
+            )
         return found
 
     def _collect(self, before: list[Step]) -> Step:
@@ -294,73 +290,3 @@ class Loop:
             return f"{len(rallies):,} rallies"
 
         return Step("evaluations", "evaluations", len(sources), sources, (path,), run)
-
-
-def run(study: Study, folder: Path, console: Console, processes: int = 1) -> bool:
-    """Does, or goes on with, a study in ``folder``, up to its report; False when it waits for people.
-
-    processes: that do steps which need nothing of each other side by side, each on its share of the cores; 1: this one
-    does them all. Raises RunError for a folder of another study, naming the differences, ConfigError for what the study
-    names and is not there, and what the steps raise.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with Run(folder).locked():
-        if not Journal(folder / JOURNAL).entries:  # later on, what is no longer read may be gone
-            look_up(study)
-        loop = Loop(study, folder, console)
-        _open(study, folder)
-        try:
-            steps, journal = loop.steps(), Journal(folder / JOURNAL)
-            if processes > 1:
-                run_side_by_side(study, folder, steps, journal, console, processes)
-            else:
-                run_all(steps, journal, console)
-        except Waiting as waiting:
-            console.print(str(waiting), highlight=False, soft_wrap=True, markup=False)
-            return False
-        except OSError as error:
-            raise RunError(
-                f"{error.filename or folder}: {error.strerror or error}; every finished step is kept. "
-                "Make room or repair the folder, then run the same command again to continue"
-            ) from error
-        except KeyboardInterrupt as stopped:
-            raise KeyboardInterrupt(
-                f"{stopped}\n{folder}: stopped; the same command continues the study".lstrip()
-            ) from None
-    console.print(f"report: {folder / REPORT}", highlight=False, soft_wrap=True)
-    return True
-
-
-def look_up(study: Study) -> None:
-    """Raises ConfigError for what a study names and is not there, before hours are spent on its first steps."""
-    for balls in study.ablation.balls if study.ablation else ():
-        build.distribution(balls, "ablation.balls")
-    for item in items(study, study.players[0]):
-        if isinstance(item, Simulated) and item.source is None:
-            build.experiment(training.configuration(study, item, "narrow", None, 0), "simulation")
-    if study.robot is not None:
-        from experiments.study.on_robot import look_up as look_up_robot
-
-        look_up_robot(study)
-
-
-def _open(study: Study, folder: Path) -> None:
-    """Records what the study is and this session, or checks that it is the one that is asked for.
-
-    Where no step is done yet there is nothing that belongs to another study.
-    """
-    path = folder / SETTINGS
-    if path.exists() and Journal(folder / JOURNAL).entries:
-        found = parse(read_yaml(checked(str(path), path.read_text, "utf-8"), str(path)), str(path))
-        changed = run_dir.differences(found.to_dict(), study.to_dict(), CHANGEABLE.__contains__, "study")
-        if changed:
-            raise RunError(f"{folder}: is another study:\n{changed}\nRestore these values or choose another --out")
-    run_dir.write_yaml(path, study.to_dict())
-    sessions = folder / SESSIONS
-    before = []
-    if sessions.exists():
-        found = read_yaml(checked(str(sessions), sessions.read_text, "utf-8"), str(sessions))
-        before = found.get("sessions") if isinstance(found, dict) else None
-        if not isinstance(before, list):
-            raise RunError(f"{sessions}: holds no list of sessions; restore the file or remove it")
-    run_dir.write_json(sessions, {"sessions": [*before, run_dir.provenance()]})

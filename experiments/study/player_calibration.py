@@ -32,7 +32,7 @@ from ballmodel.state import BallState
 from ballmodel.trajectory import Dataset
 from experiments.evaluation.figures import STYLE
 from experiments.runs import load_policy
-from experiments.study import target_domain
+from experiments.study.target_domain import hidden_effects
 from mjx_tt import platform
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.rally import human_player
@@ -159,7 +159,7 @@ class Calibration:
                     order = rng.permutation(inside.sum())[:added]
                     data.append(BallState(*(x[:, order] for x in found)))
                 balls = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *data)
-                seen = target_domain.measure(self.model, balls, NOISE, jax.random.fold_in(keys[2], 3 * p + len(data)))
+                seen = hidden_effects.measure(self.model, balls, NOISE, jax.random.fold_in(keys[2], 3 * p + len(data)))
                 dataset = Dataset(tuple(seen.trajectories(name)), name)
                 fitted, _ = fit_human(dataset, self.model.ball)
                 numbers[model], counts[model] = sixteen(fitted), len(dataset)

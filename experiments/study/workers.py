@@ -23,6 +23,7 @@ from rich.console import Console
 from experiments.config.study import Study
 from experiments.errors import ConfigError, RunError
 from experiments.study.workflow import Journal, Ledger, Step, perform
+from mjx_tt import platform
 
 
 def choose(study: Study, processes: int | None, devices: int | None) -> int:
@@ -148,10 +149,8 @@ def _start(study: Study, folder: Path, cache: str | None, shares, started, stopp
     threading.Thread(target=_end_with_parent, daemon=True).start()
     started.put(os.getpid())
     os.sched_setaffinity(0, shares.get())
-    from mjx_tt import platform
-
     platform.configure(1, cache)
-    from experiments.study.pipeline import Loop
+    from experiments.study.pipeline import Loop  # its libraries count the cores when they load
 
     simulation = study.simulation.model_copy(update={"devices": 1})
     console = Console(force_terminal=False)  # live bars of several processes would overwrite each other

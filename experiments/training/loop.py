@@ -22,7 +22,7 @@ from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import Run
 from experiments.training.progress import TrainingProgress
-from experiments.training.update import Trainer, TrainState
+from experiments.training.update import Trainer, TrainState, trainer
 
 _programs: dict[str, Any] = {}  # compiled updates by what decides them
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
@@ -55,7 +55,7 @@ class Session:
 
     def __init__(self, experiment: Experiment, run: Run, console: Console) -> None:
         self._config, self._run, self._console = experiment.config, run, console
-        self._trainer = build.trainer(experiment)
+        self._trainer = trainer(experiment)
         self.state, notes = _start(self._config, run, self._trainer)
         self.update, self.seconds, self.return_rate = notes["update"], notes["seconds"], notes["return_rate"]
         self._saved = (self.update, time.monotonic())

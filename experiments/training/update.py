@@ -16,6 +16,9 @@ from jax.sharding import PartitionSpec
 from ballmodel.sampling import BallPool
 from bgs import normalizer, strategy
 from bgs.strategy import BGSConfig, BGSState
+from experiments.config import build
+from experiments.config.build import Experiment
+from experiments.errors import checked
 from mjx_tt.env import rewards
 from mjx_tt.env.policy import initial_theta
 from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
@@ -150,3 +153,20 @@ def means(total: dict) -> dict:
     over = {k: total[k] / count for k in ("mean_return", "return_rate", "hit_rate", "steps")}
     terms = {f"reward/{name}": total["terms"][i] / count for i, name in enumerate(rewards.TERMS)}
     return {**over, "non_finite": total["non_finite"], **terms}
+
+
+def trainer(experiment: Experiment) -> Trainer:
+    """The trainer with its pool of balls drawn. Raises ConfigError."""
+    config = experiment.config
+    simulator = checked("training.devices", Simulator, experiment.task, build.device_count(config))
+    return Trainer(
+        simulator,
+        experiment.bgs,
+        build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool),
+        experiment.model.model,
+        experiment.model.randomise,
+        config.optimiser.repeats,
+        config.optimiser.common_random_numbers,
+        config.optimiser.initial_scale,
+        build.later_weights(config.training),
+    )

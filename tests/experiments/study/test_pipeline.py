@@ -30,13 +30,14 @@ from experiments.config import build, experiment
 from experiments.config import study as study_config
 from experiments.errors import ConfigError, RunError
 from experiments.runs import load_policy
-from experiments.study import evaluation, schedule, target_domain, training, workers
+from experiments.study import evaluation, schedule, session, training, workers
 from experiments.study import pipeline as is2r
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.blind import protocol
-from experiments.study.finetuning import VirtualReality
-from experiments.study.on_robot import blind_steps
 from experiments.study.schedule import Human, Real, Simulated
+from experiments.study.target_domain import hidden_effects
+from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.study.target_domain.on_robot import blind_steps
 from experiments.study.workflow import Journal, Step, Waiting, remaining, run_all, unfinished
 from mjx_tt.env import rewards
 from mjx_tt.env.policy import initial_theta
@@ -72,8 +73,8 @@ from mjx_tt import platform
 platform.configure(devices=2, cache=Path(".cache/jax"))
 from rich.console import Console
 from experiments.config import study as config
-from experiments.study import pipeline
-pipeline.run(config.parse(json.loads(sys.argv[1]), "test"), Path(sys.argv[2]), Console(), processes=2)
+from experiments.study import session
+session.run(config.parse(json.loads(sys.argv[1]), "test"), Path(sys.argv[2]), Console(), processes=2)
 """
 
 
@@ -161,21 +162,21 @@ def test_a_mistake_across_keys_names_them_and_no_more(changes, text):
 )
 def test_what_a_study_names_is_looked_up_before_it_begins(tmp_path, changes, message):
     with pytest.raises(ConfigError, match=message):
-        is2r.run(study(**changes), tmp_path / "tiny", quiet())
+        session.run(study(**changes), tmp_path / "tiny", quiet())
     assert [path.name for path in (tmp_path / "tiny").iterdir()] == [".lock"]
 
 
 def test_a_start_that_came_to_no_step_does_not_block_another(tmp_path):
-    is2r._open(study(), tmp_path)
-    is2r._open(study(first_balls=61), tmp_path)
-    assert "first_balls: 61" in (tmp_path / is2r.SETTINGS).read_text()
+    session._open(study(), tmp_path)
+    session._open(study(first_balls=61), tmp_path)
+    assert "first_balls: 61" in (tmp_path / session.SETTINGS).read_text()
     Journal(tmp_path / "steps.jsonl").append(Step("seed0/player3/D0", "first balls", 1, (), (), lambda: ""), 1.0)
     with pytest.raises(RunError, match="first_balls: the study has 61, now 62"):
-        is2r._open(study(first_balls=62), tmp_path)
+        session._open(study(first_balls=62), tmp_path)
     for content in (b"[1]", b"\x80", b"{"):
-        (tmp_path / is2r.SESSIONS).write_bytes(content)
+        (tmp_path / session.SESSIONS).write_bytes(content)
         with pytest.raises((RunError, ConfigError), match="study.json"):
-            is2r._open(study(first_balls=61), tmp_path)
+            session._open(study(first_balls=61), tmp_path)
 
 
 def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_there():
@@ -233,30 +234,30 @@ def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
 
 
 def test_leaving_out_an_effect_changes_no_other_and_seeds_differ():
-    everything = target_domain.differences(target_domain.draw(3))
-    ranges = {path: bounds for group in target_domain.RANGES.values() for path, bounds in group.items()}
+    everything = hidden_effects.differences(hidden_effects.draw(3))
+    ranges = {path: bounds for group in hidden_effects.RANGES.values() for path, bounds in group.items()}
     assert everything.keys() == ranges.keys()
     assert all(low <= everything[path] <= high for path, (low, high) in ranges.items())
-    for effect in target_domain.RANGES:
-        left = target_domain.differences(target_domain.draw(3, (effect,)))
-        assert left == {path: value for path, value in everything.items() if path not in target_domain.RANGES[effect]}
-    assert tuple(target_domain.RANGES) == study_config.EFFECTS
-    assert target_domain.draw(3, study_config.EFFECTS) == models.with_values(SimModel(), {})
-    other = target_domain.differences(target_domain.draw(4))
+    for effect in hidden_effects.RANGES:
+        left = hidden_effects.differences(hidden_effects.draw(3, (effect,)))
+        assert left == {path: value for path, value in everything.items() if path not in hidden_effects.RANGES[effect]}
+    assert tuple(hidden_effects.RANGES) == study_config.EFFECTS
+    assert hidden_effects.draw(3, study_config.EFFECTS) == models.with_values(SimModel(), {})
+    other = hidden_effects.differences(hidden_effects.draw(4))
     assert all(other[path] != value for path, value in everything.items())
     with pytest.raises(ValueError, match="no effect is called 'magic'; there are rubber"):
-        target_domain.draw(3, ("magic",))
+        hidden_effects.draw(3, ("magic",))
 
 
 def test_measured_balls_are_the_flight_as_the_camera_sees_it():
     """Against the equations of motion integrated by SciPy and a rotation by SciPy."""
-    world = target_domain.draw(1)
+    world = hidden_effects.draw(1)
     rng = np.random.default_rng(0)
     n, noise = 40, 0.002
     position = np.array([[0.3], [1.3], [0.3]]) + 0.05 * rng.normal(size=(3, n))
     velocity = np.array([[-0.2], [-5.0], [1.6]]) + 0.2 * rng.normal(size=(3, n))
     spin = 60.0 * rng.normal(size=(3, n))
-    measured = target_domain.measure(world, BallState(position, velocity, spin), noise, jax.random.key(0))
+    measured = hidden_effects.measure(world, BallState(position, velocity, spin), noise, jax.random.key(0))
     flight, sensor = world.ball.flight, world.sensing
     drag, lift = float(drag_factor(flight)), float(magnus_factor(flight))
     angles = [sensor.camera_rotation_x, sensor.camera_rotation_y, sensor.camera_rotation_z]
@@ -271,7 +272,7 @@ def test_measured_balls_are_the_flight_as_the_camera_sees_it():
             return [*v, *(-drag * np.linalg.norm(v) * v + lift * np.cross(turning, v) + [0, 0, flight.gravity_z])]
 
         frames = 30  # before any of them bounces
-        times = np.arange(frames) / target_domain.CAMERA_RATE
+        times = np.arange(frames) / hidden_effects.CAMERA_RATE
         path = solve_ivp(motion, (0, 1), [*position[:, i], *velocity[:, i]], t_eval=times, rtol=1e-9, atol=1e-9).y[:3]
         assert path[2].min() > 0.03
         residuals.append(measured.position[:frames, :, i].T - (camera @ path + offset[:, None]))
@@ -411,7 +412,7 @@ def finished(tmp_path_factory) -> Path:
 def loop(what: study_config.Study, folder: Path) -> None:
     """The study without its report, which has tests of its own."""
     folder.mkdir(parents=True, exist_ok=True)
-    is2r._open(what, folder)
+    session._open(what, folder)
     run_all(is2r.Loop(what, folder, quiet()).steps_of_play(), Journal(folder / "steps.jsonl"), quiet())
 
 
@@ -448,7 +449,7 @@ def test_a_study_leaves_what_it_says(finished):
     for a, b in (("M0", "M1"), ("M1", "M2")):
         assert found[f"{a}-{b}"] == pytest.approx(np.mean(np.abs(intervals[b] - intervals[a]) / width[:, None]))
     opened = (finished / "seed0" / "reality.yaml").read_text()
-    drawn = target_domain.draw(0, ("drives", "encoders"))
+    drawn = hidden_effects.draw(0, ("drives", "encoders"))
     assert f"ball.paddle.restitution: {drawn.ball.paddle.restitution}" in opened
     assert str(drawn.ball.paddle.restitution) not in (finished / "seed0" / "reality.sealed").read_text()
     assert protocol.unseal(finished / "seed0" / "reality.sealed")["seed"] == 0
@@ -457,10 +458,10 @@ def test_a_study_leaves_what_it_says(finished):
 def test_worlds_side_by_side_are_those_that_were_drawn():
     """Also drives, which a world without them does not have at all."""
     drawn = [
-        target_domain.draw(3, left_out)
-        for left_out in ((), ("drives", "encoders"), ("table",), tuple(target_domain.RANGES))
+        hidden_effects.draw(3, left_out)
+        for left_out in ((), ("drives", "encoders"), ("table",), tuple(hidden_effects.RANGES))
     ]
-    together = models.paths(target_domain.side_by_side(drawn, 2))
+    together = models.paths(hidden_effects.side_by_side(drawn, 2))
     for path, value in together.items():
         wanted = [models.paths(world)[path] for world in drawn]
         if isinstance(value, jax.Array):
@@ -485,7 +486,7 @@ def test_an_effect_is_left_out_for_the_policy_it_says(finished):
     theta, mean, inverse_scale = (np.stack(part, axis=-1)[:, layout[1]] for part in zip(*policies))
     low, high = (np.stack(ends, axis=-1)[:, layout[1]] for ends in zip(*((b.low, b.high) for b in map(Box.of, boxes))))
     for world in ("latency", "spin"):
-        drawn = target_domain.draw(0, ("drives", "encoders", world))
+        drawn = hidden_effects.draw(0, ("drives", "encoders", world))
         person = human_player.load("player3")
         person = human_player.without_spin(person) if world == "spin" else person
         model, person = (jax.tree.map(lambda x: jnp.full(layout.shape[1], x, jnp.float32), t) for t in (drawn, person))
@@ -560,7 +561,7 @@ def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tm
 
 def test_a_folder_belongs_to_one_study(finished):
     with pytest.raises(RunError, match="first_balls: the study has 60, now 61"):
-        is2r._open(study(first_balls=61), finished)
+        session._open(study(first_balls=61), finished)
 
 
 # On a robot

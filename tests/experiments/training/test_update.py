@@ -15,6 +15,7 @@ from ballmodel.sampling import sample_pool
 from bgs import normalizer, optimizers, strategy
 from bgs.strategy import BGSConfig
 from experiments.config import build, experiment
+from experiments.training import update as training
 from experiments.training.update import Trainer
 from mjx_tt.env import rewards
 from mjx_tt.env.rollout import Simulator
@@ -152,7 +153,7 @@ def test_the_same_yaml_trains_under_both_engines():
     returns = {}
     for engine in ("fused", "mjx"):
         settings = experiment.parse(experiment.read_yaml(TINY.format(engine=engine), "tiny.yaml"), "tiny.yaml")
-        trainer = build.trainer(build.experiment(settings, "tiny.yaml"))
+        trainer = training.trainer(build.experiment(settings, "tiny.yaml"))
         state, metrics = trainer.update(trainer.init(build.key(0, build.INITIAL_STATE)))
         assert trainer.simulator.task.engine.name == engine
         assert int(state.bgs.updates) == 1 and np.isfinite(state.bgs.theta).all()

@@ -17,7 +17,7 @@ from experiments.config.study import Study
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.load_policy import Policy
 from experiments.runs.run_dir import CONFIG, Run
-from experiments.study.finetuning import VirtualReality
+from experiments.study.target_domain.finetuning import VirtualReality
 
 STUDY = 6  # purpose of a key, beside those of experiments.config.build
 

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from ballmodel.io import read
 from ballmodel.trajectory import Dataset
-from experiments.commands import measurements
+from experiments import measurements
 from experiments.config import build
 from experiments.config import robot as robots
 from experiments.config.study import Study

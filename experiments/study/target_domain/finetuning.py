@@ -22,7 +22,7 @@ from bgs.strategy import BGSConfig, BGSState
 from experiments.config import build
 from experiments.config.study import Study
 from experiments.evaluation import evaluate
-from experiments.study import target_domain
+from experiments.study.target_domain import hidden_effects
 from experiments.training.update import TrainState
 from mjx_tt.env import rewards
 from mjx_tt.env.task import MISSED, RETURNED, TaskConfig
@@ -67,7 +67,7 @@ class VirtualReality:
         self._compared = jax.jit(self._shots_of, static_argnames="turns")
 
     def _draw(self, seed: int) -> None:
-        self.model = target_domain.draw(seed, tuple(self._study.reality.without))
+        self.model = hidden_effects.draw(seed, tuple(self._study.reality.without))
         self.known = without_nominal(self.model)
 
     def at(self, seed: int) -> VirtualReality:
@@ -85,7 +85,7 @@ class VirtualReality:
         """D0: balls across the table without a robot, as the cameras measured them."""
         ball_key, camera_key = jax.random.split(key)
         balls = self._lobs(player, human_player.fresh((count,)), ball_key, (count,))
-        measured = target_domain.measure(self.model, balls, self._study.reality.camera_noise, camera_key)
+        measured = hidden_effects.measure(self.model, balls, self._study.reality.camera_noise, camera_key)
         return Dataset(measured.trajectories(session), session)
 
     def fine_tune(self, player: Player, theta, statistics, updates: int, key, session: str) -> Cycle:
@@ -107,7 +107,7 @@ class VirtualReality:
         shots, info = jax.tree.map(lambda *x: np.concatenate(x), *found)
         hits = jax.tree.map(lambda x: np.moveaxis(x, 1, 0).reshape(3, -1), shots.ball)  # (updates, 3, L) -> (3, n)
         finite = shots.finite.reshape(-1)
-        measured = target_domain.measure(
+        measured = hidden_effects.measure(
             self.model, jax.tree.map(lambda x: x[:, finite], hits), self._study.reality.camera_noise, camera_key
         )
         rows = [
