@@ -484,7 +484,7 @@ Every ball is on disk before the next begins: the same command continues after a
         "simulate, play, refine: the iterative loop and its study",
         """\
   mjx-tt is2r study_quick.yaml                              five virtual players, twenty minutes, ends in a report
-  mjx-tt is2r study_full.yaml --set players=[player3]       the paper's scale
+  mjx-tt is2r study_full.yaml --set players=[player3]       the paper's number of balls
   mjx-tt is2r anna.yaml                                     with "robot: robot.yaml": docs/how-to/run-a-study.md
 
 Every finished step is kept: the same command continues after an interruption, a crash, or when people have played.
