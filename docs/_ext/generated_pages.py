@@ -8,11 +8,13 @@ so that an incremental build reads nothing twice.
 from __future__ import annotations
 
 import dataclasses
+import fnmatch
 import importlib
 import inspect
 import json
 import os
 import re
+import textwrap
 import types
 import typing
 from pathlib import Path
@@ -31,6 +33,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Entry point of the extension."""
     app.connect("builder-inited", lambda app: write_all())
     app.connect("autodoc-process-docstring", _readable)
+    app.connect("autodoc-process-signature", _short)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
@@ -139,8 +142,8 @@ def _type(key: dict[str, Any], definitions: dict[str, Any], anchors: dict[str, s
         )
     if kind in ("number", "integer"):
         signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-        bounds = [f"{sign} {key[bound]:,}" for bound, sign in signs.items() if bound in key]
-        return " ".join(["whole number" if kind == "integer" else "number", ", ".join(bounds)]).strip()
+        bounds = [f"{sign}\u00a0{key[bound]:,}" for bound, sign in signs.items() if bound in key]
+        return "\u00a0".join(["whole number" if kind == "integer" else "number", ", ".join(bounds)]).rstrip("\u00a0")
     return {"string": "text", "boolean": "true, false", "null": "`null`"}.get(kind, kind)
 
 
@@ -154,19 +157,34 @@ def dataclass_page(title: str, command: str, kind: type) -> str:
             continue
         done.append(kind)
         hints = typing.get_type_hints(kind)
-        lines += ["", f"## {path}" if path else "", "", "```text", inspect.getdoc(kind) or "", "```", ""]
-        lines += ["| key | type | default |", "|---|---|---|"]
+        summary, meanings = _field_notes(kind)
+        lines += ["", f"## {path}" if path else "", "", _cell(summary), ""]
+        told = bool(meanings) or any(map(dataclasses.is_dataclass, hints.values()))
+        lines += ["| key | type | default |" + " meaning |" * told, "|---|---|---|" + "---|" * told]
         for field in dataclasses.fields(kind):
             hint = hints[field.name]
             inner = next((h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h)), None)
             below = f"{path}.{field.name}".lstrip(".")
             if inner is not None:
                 waiting.append((below, inner))
-                lines.append(f"| `{field.name}` | mapping | section `{below}` |")
+                lines.append(f"| `{field.name}` | mapping | section `{below}` | {_cell(_field_notes(inner)[0])} |")
             else:
                 text = hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
-                lines.append(f"| `{field.name}` | {_cell(text.replace('typing.', ''))} | `{_plain(field)}` |")
+                meaning = f" {_cell(meanings.get(field.name, ''))} |" * told
+                lines.append(f"| `{field.name}` | {_cell(text)} | `{_plain(field)}` |{meaning}")
     return "\n".join(lines) + "\n"
+
+
+def _field_notes(kind: type) -> tuple[str, dict[str, str]]:
+    """First paragraph of a dataclass's docstring, and what docstring and comments say of each field."""
+    blocks = (inspect.getdoc(kind) or "").split("\n\n")
+    notes = dict(re.findall(r"^    (\w+): .*?  # (.+)$", inspect.getsource(kind), re.MULTILINE))
+    for block in blocks[1:]:
+        for names, text in _entries(block.splitlines()).items():
+            for field in dataclasses.fields(kind):
+                if any(fnmatch.fnmatch(field.name, name) for name in names.split(", ")):
+                    notes[field.name] = text
+    return blocks[0], notes
 
 
 def _plain(field: dataclasses.Field) -> str:
@@ -239,22 +257,65 @@ def _readable(app: Sphinx, what: str, name: str, value: Any, options: Any, lines
     lines[:] = _as_rest(lines)
 
 
+def _short(app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str, returns: str) -> Any:
+    """Signature without the modules of its types."""
+    if signature is None:
+        return None
+    return tuple(
+        part and re.sub(r"~?(?:[A-Za-z_]\w*\.)+(\w+)", r"\1", part).replace("<factory>", "...")
+        for part in (signature, returns)
+    )
+
+
 def _as_rest(lines: list[str]) -> list[str]:
-    """Docstring as reStructuredText: paragraphs as they are, indented blocks as literal text, stray marks escaped."""
+    """Docstring as reStructuredText: lists of names as definitions, indented blocks as literal text, marks escaped."""
     found: list[str] = []
-    literal = False
-    for line in lines:
-        if line.startswith(" ") and line.strip():
-            if not literal and not (found and found[-1].startswith(("- ", "  "))):
-                found += ["", ".. code-block:: text", ""]
-                literal = True
-            found.append("   " + line if literal else line)
-            continue
-        if line.strip() and literal:
-            literal = False
-            found.append("")
-        found.append(_escaped(line))
+    for block in "\n".join(lines).split("\n\n"):
+        rows = [row for row in block.splitlines() if row.strip()]
+        entries = _entries(rows)
+        if entries:
+            for name, text in entries.items():
+                found += [f"``{name}``", f"   {_escaped(text)}"]
+        elif rows and rows[0].startswith(" "):
+            found += [".. code-block:: text", "", *("   " + row for row in rows)]
+        else:
+            found += _paragraph(rows)
+        found.append("")
     return found
+
+
+def _paragraph(rows: list[str]) -> list[str]:
+    """Plain rows; from the first indented row behind a colon on, and behind rows of code, literal text."""
+    for i, row in enumerate(rows[:-1]):
+        if rows[i + 1].startswith("  ") and row.endswith(":"):
+            literal = [".. code-block:: text", "", *("   " + r for r in rows[i + 1 :])]
+            return [*map(_escaped, rows[: i + 1]), "", *literal]
+    return [
+        _escaped(row) if row.startswith(("- ", "  ")) and rows[0].startswith("- ") else _escaped(row.strip())
+        for row in rows
+    ]
+
+
+def _entries(rows: list[str]) -> dict[str, str]:
+    """Rows "name   description", in columns, continued by indented rows; empty for anything else."""
+    entries: dict[str, str] = {}
+    names = r"[a-z][\w.]*\*?(?:, [a-z][\w.]*\*?)*"
+    rows = textwrap.dedent("\n".join(rows)).splitlines()
+    first = next(filter(None, (re.match(rf"{names} {{2,}}(?=\S)", row) for row in rows)), None)
+    if first is None:
+        return {}
+    for row in rows:
+        head, text = row[: first.end()], row[first.end() :]
+        long = re.match(rf"({names})(?: {{2,}}| (?=[(\[]))(\S.*)$", row)
+        if head.endswith(" ") and re.fullmatch(names, head.strip()):
+            entries[head.strip()] = text
+        elif long:
+            entries[long[1]] = long[2]
+        elif entries and row.startswith("    "):
+            entries[list(entries)[-1]] += " " + row.strip()
+        else:
+            return {}
+    return entries
 
 
 def _escaped(line: str) -> str:
