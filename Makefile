@@ -18,7 +18,7 @@ demo: $(READY)
 
 rig-demo: $(READY)
 	test -e runs/quickstart/artefact/manifest.json || $(BIN)/mjx-tt train quickstart.yaml --out runs
-	$(BIN)/mjx-tt run runs/quickstart/artefact --robot rig --balls 30 --log runs/rig-demo
+	$(BIN)/mjx-tt run runs/quickstart --robot rig --balls 30 --log runs/rig-demo
 
 study-quick: $(READY)
 	$(BIN)/mjx-tt is2r study_quick.yaml --out runs
@@ -36,15 +36,17 @@ docs: $(READY)
 
 bench: $(READY)
 	$(BIN)/pip install -q --disable-pip-version-check -e ".[bench]" || echo "PyBullet has no wheel for this Python: measured without it"
-	$(BIN)/mjx-tt bench
+	$(BIN)/python -m benchmarks.bench
 
 setup: $(READY)
 
 # The stamp is made last, so an interrupted set-up is repeated; a change of the dependencies renews it.
 $(READY): pyproject.toml constraints.txt
+	@echo "set-up: a virtual environment in $(VENV), with what constraints.txt names (minutes, about 2 GB); once only"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[dev]"
-	touch $(READY)
+	@touch $(READY)
+	@echo "set-up: done; $(BIN)/mjx-tt --help shows the commands"
 
 clean:
 	rm -rf $(VENV) .cache docs/_build docs/reference/generated build *.egg-info

@@ -1,6 +1,6 @@
 """The benchmark: physics against other engines, the time of an update and where it goes, memory, growth with the batch.
 
-    python -m benchmarks.bench --json bench.json          or    mjx-tt bench --json bench.json
+    python -m benchmarks.bench --json bench.json
 
 Everything is measured in one run; sides that are compared take turns, and medians are compared. This process itself
 never starts JAX, so it disturbs nobody and its own memory is in no figure.

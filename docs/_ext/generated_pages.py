@@ -11,8 +11,8 @@ import dataclasses
 import fnmatch
 import importlib
 import inspect
+import io
 import json
-import os
 import re
 import textwrap
 import types
@@ -20,13 +20,15 @@ import typing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
+
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 GENERATED = REFERENCE / "generated"
 PACKAGES = ("mjx_tt", "ballmodel", "bgs", "robot_io")
-WIDTH = "100"  # of the help texts [characters]
+WIDTH = 120  # of the help texts [characters]
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -221,14 +223,17 @@ def _cell(text: str) -> str:
 
 def command_line_page() -> str:
     """Help of every command, as the terminal shows it."""
-    os.environ["COLUMNS"] = WIDTH
     from experiments import cli
 
-    parser = cli._parser()
-    actions = next(action for action in parser._actions if action.choices)
-    lines = ["# Command line", "", "```text", parser.format_help().rstrip(), "```"]
-    for name, command in actions.choices.items():
-        lines += ["", f"(mjx-tt-{name})=", f"## mjx-tt {name}", "", "```text", command.format_help().rstrip(), "```"]
+    def shown(*command: str) -> list[str]:
+        stream = io.StringIO()
+        cli.app.help_print(command, console=Console(file=stream, width=WIDTH))
+        return ["", "```text", stream.getvalue().rstrip(), "```"]
+
+    lines = ["# Command line", *shown()]
+    for command in cli.COMMANDS:
+        name = command.name[0]
+        lines += ["", f"(mjx-tt-{name})=", f"## mjx-tt {name}", *shown(name)]
     return "\n".join(lines) + "\n"
 
 

@@ -1,20 +1,55 @@
-"""Logs of sessions at the robot on the command line: list, check, salvage, export."""
+"""``mjx-tt log``: logs of sessions at the robot, to list, check, salvage and export."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from rich.console import Console
-from rich.table import Table
+from cyclopts import Parameter
 
+from experiments.commands.options import command, console, option
 from experiments.errors import ConfigError, checked
-from robot_io import log
-from robot_io.log.scan import glance
-from robot_io.log.writer import SUFFIX, UNFINISHED
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+app = command(
+    "log",
+    "list, check, salvage or export the logs of a robot",
+    """\
+  mjx-tt log list runs/robot
+  mjx-tt log check runs/robot/20261121-153000.mcap
+  mjx-tt log salvage runs/robot/20261121-153000.mcap.part
+  mjx-tt log export runs/robot/20261121-153000.mcap --out tables/
+""",
+)
+
+
+@app.default
+def log(
+    action: Annotated[Literal["list", "check", "salvage", "export"], Parameter("ACTION")],
+    /,
+    *paths: Annotated[str, Parameter("LOG", help="an .mcap or .mcap.part; for list a folder", required=True)],
+    out: Annotated[str | None, option("PATH", "of salvage: the file; of export: the folder")] = None,
+) -> int:
+    """Returns 1 where a checked log is not sound."""
+    screen, target = console(), Path(out) if out else None
+    if action == "list":
+        list_logs(Path(paths[0]), screen)
+    elif action == "check":
+        return 1 if check([Path(path) for path in paths], screen) else 0
+    else:
+        for path in paths:
+            (salvage if action == "salvage" else export)(Path(path), target, screen)
+    return 0
 
 
 def list_logs(folder: Path, console: Console) -> None:
     """Prints the logs of a folder, oldest first; finished ones are not read through. Raises ConfigError for none."""
+    from rich.table import Table
+
+    from robot_io.log.scan import glance
+
     paths = _logs_in(folder)
     table = Table("log", "started (UTC)", "duration", "messages", "lost", "state", title_justify="left")
     for path in sorted(paths, key=lambda path: path.stat().st_mtime):
@@ -33,6 +68,8 @@ def list_logs(folder: Path, console: Console) -> None:
 
 def check(paths: list[Path], console: Console) -> int:
     """Reads logs through, checks every checksum and prints what is wrong; returns how many are not sound."""
+    from robot_io import log
+
     faulty = 0
     for path in paths:
         overview = checked("", log.check, path)
@@ -52,6 +89,8 @@ def check(paths: list[Path], console: Console) -> int:
 
 def salvage(path: Path, out: Path | None, console: Console) -> Path:
     """Writes what is sound of a damaged or unfinished log as a proper file, and returns its path."""
+    from robot_io import log
+
     overview = checked("", log.salvage, path, out)
     console.print(
         f"{overview.path}: {overview.messages:,} messages, {overview.duration:.1f} s",
@@ -66,6 +105,9 @@ def salvage(path: Path, out: Path | None, console: Console) -> Path:
 
 def export(path: Path, out: Path | None, console: Console) -> list[Path]:
     """Writes the tables of a log into a folder (its name without the suffix, if not given); returns their paths."""
+    from robot_io import log
+    from robot_io.log.writer import SUFFIX
+
     session = checked("", log.read, path)
     written = checked("", log.export, session, out or path.with_name(path.name.removesuffix(SUFFIX)))
     for table in written:
@@ -76,6 +118,8 @@ def export(path: Path, out: Path | None, console: Console) -> list[Path]:
 
 
 def _logs_in(folder: Path) -> list[Path]:
+    from robot_io.log.writer import SUFFIX, UNFINISHED
+
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder")
     paths = [path for path in folder.iterdir() if path.name.endswith((SUFFIX, UNFINISHED)) and path.is_file()]

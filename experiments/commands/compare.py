@@ -1,0 +1,44 @@
+"""``mjx-tt compare``: several learning algorithms on one task."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from experiments.commands.options import changes, command, console, option, shipped_or_own, start_jax, writable
+
+app = command(
+    "compare",
+    "several learning algorithms on one task, also where none has trained",
+    """\
+  mjx-tt compare compare_quick.yaml                         BGS, ARS, PPO, SAC, QT-Opt: three minutes each
+  mjx-tt compare mine.yaml --set budget.minutes=60 --set seeds=[0,1,2]
+
+Algorithms and seeds that are finished are kept: the same command continues, and one with more of them adds to it.
+A file name without a folder that is not in the current folder is looked up among the shipped comparisons.
+""",
+)
+
+
+@app.default
+def compare(
+    comparison: Annotated[str, Parameter("YAML", help="docs/results/algorithms.md explains it")],
+    /,
+    *,
+    out: Annotated[str, option("FOLDER", "where its folder goes (default: runs)")] = "runs",
+    overrides: Annotated[tuple[str, ...], changes("change one key")] = (),
+) -> None:
+    """Prints where the comparison is."""
+    from experiments.config import baselines
+
+    path = shipped_or_own(comparison, baselines.shipped())
+    loaded, experiment = baselines.load(path, overrides)
+    writable(out)
+    start_jax(1)
+    from experiments.baselines import compare as comparing
+
+    screen = console()
+    folder = comparing.compare(loaded, experiment, str(path), Path(out), screen)
+    screen.print(f"{folder}/comparison.md, with its pictures beside it", highlight=False, soft_wrap=True)

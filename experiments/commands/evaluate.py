@@ -1,0 +1,122 @@
+"""``mjx-tt evaluate``: a policy on fresh balls; ``mjx-tt export``: a run's policy as an artefact."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from experiments.commands.options import (
+    RUN,
+    Balls,
+    BallSeed,
+    Devices,
+    Model,
+    PolicyFolder,
+    command,
+    console,
+    count,
+    existing,
+    existing_policy,
+    experiment_of,
+    option,
+    run_of,
+    start_jax,
+    writable,
+)
+
+app = command(
+    "evaluate",
+    "play a policy on fresh balls: rates, interval, pictures",
+    """\
+  mjx-tt evaluate runs/quickstart
+  mjx-tt evaluate runs/quickstart --balls player1/M1 --episodes 5000
+  mjx-tt evaluate artefacts/anna --model measured.yaml --out anna-on-measured
+
+Without --out, a run on its own balls and model writes into its own folder; anything else into a folder beside it.
+""",
+)
+export_app = command(
+    "export",
+    "write a run's policy as an artefact that a robot can run",
+    """\
+  mjx-tt export runs/quickstart
+  mjx-tt export runs/quickstart --out artefacts/anna
+""",
+)
+
+
+@app.default
+def evaluate(
+    policy: PolicyFolder,
+    /,
+    *,
+    balls: Balls = None,
+    model: Model = None,
+    episodes: Annotated[int | None, count("balls to play (default: the experiment's)")] = None,
+    seed: BallSeed = None,
+    no_reachable: Annotated[bool, Parameter(help="skip the minute that the bound on what is in reach takes")] = False,
+    out: Annotated[str | None, option("FOLDER", "for evaluation.json and plots/")] = None,
+    devices: Devices = None,
+) -> None:
+    """Writes evaluation.json and plots, and prints the report."""
+    existing_policy(policy)
+    existing(model, key="--model")
+    folder = Path(out) if out else _folder(Path(policy), balls, model)
+    writable(folder)
+    start_jax(devices)
+    from experiments.evaluation import evaluate as evaluation
+    from experiments.runs import load_policy
+    from experiments.training import finalize
+
+    screen = console()
+    trained = load_policy.load(policy)
+    experiment = experiment_of(trained, balls, model)
+    settings = experiment.config.evaluation
+    played = evaluation.evaluate(
+        experiment,
+        trained,
+        episodes or settings.episodes,
+        settings.seed if seed is None else seed,
+        None if no_reachable else settings.reachable_balls,
+    )
+    finalize.save_evaluation(folder, played, experiment.task.reward_weights)
+    finalize.print_report(screen, played.report, str(trained.source))
+    screen.print(f"  {folder}/evaluation.json, pictures in {folder}/plots", highlight=False, soft_wrap=True)
+
+
+def _folder(policy: Path, *others: str | None) -> Path:
+    """Where an evaluation goes by default; ``others``: balls and model that are not the policy's own."""
+    changed = [Path(text).with_suffix("").as_posix().replace("/", "-") for text in others if text]
+    if (policy / RUN).exists():
+        return policy / f"evaluation-{'-'.join(changed)}" if changed else policy
+    return policy.with_name("-".join([f"{policy.name}-evaluation", *changed]))  # an artefact holds its own files only
+
+
+@export_app.default
+def export(
+    folder: Annotated[str, Parameter("RUN", help="folder of a run")],
+    /,
+    *,
+    out: Annotated[str | None, option("FOLDER", "default: RUN/artefact")] = None,
+) -> int:
+    """Returns 1 for a policy that the robot cannot run."""
+    existing_policy(folder)
+    folder = run_of(folder)
+    from experiments.runs.run_dir import Run
+
+    run = Run(folder)
+    artefact = Path(out) if out else run.artefact
+    writable(artefact)
+    start_jax(1)
+    from experiments.runs import load_policy
+    from experiments.training import finalize
+
+    screen = console()
+    trained = load_policy.load(folder)
+    report = run.read_evaluation() if run.evaluation.exists() else None
+    written = finalize.export_policy(artefact, trained, experiment_of(trained), report, screen)
+    if written:
+        screen.print(f"artefact: {artefact}", highlight=False)
+    return 0 if written else 1

@@ -1,0 +1,67 @@
+"""``mjx-tt finetune``: a policy fine-tuned on a robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from experiments.commands.options import (
+    RigFile,
+    RigSeed,
+    changes,
+    command,
+    console,
+    existing,
+    existing_policy,
+    option,
+    start_jax,
+    writable,
+)
+from experiments.commands.run import Backend, Distribution
+
+app = command(
+    "finetune",
+    "fine-tune a policy on a robot while a person plays",
+    """\
+  mjx-tt finetune runs/quickstart --robot robot.yaml --out runs/anna
+  mjx-tt finetune runs/quickstart --robot rig --out runs/rig             the emulated robot, in real time
+  mjx-tt finetune runs/quickstart --robot lockstep --rig worn.yaml       as fast as this machine allows
+
+Every ball is on disk before the next begins: the same command continues after an interruption, a crash or a power cut.
+""",
+)
+
+
+@app.default
+def finetune(
+    policy: Annotated[str, Parameter("RUN_OR_ARTEFACT", help="what to start from")],
+    /,
+    *,
+    robot: Annotated[str, option("YAML", 'a robot.yaml, "rig" or "lockstep"')],
+    settings: Annotated[
+        str | None, option("YAML", "of the fine-tuning (default: the paper's), docs/how-to/fine-tune.md")
+    ] = None,
+    overrides: Annotated[tuple[str, ...], changes("change one setting")] = (),
+    out: Annotated[str | None, option("FOLDER", "of the run (default: POLICY-finetuned)")] = None,
+    backend: Backend = "numpy",
+    distribution: Distribution = None,
+    rig: RigFile = None,
+    seed: RigSeed = 0,
+) -> int:
+    """Returns 130 where it was stopped."""
+    from experiments.config import finetuning
+
+    chosen = finetuning.load(settings, overrides)
+    existing_policy(policy)
+    existing(None if robot in ("rig", "lockstep") else robot, key="--robot")
+    existing(rig, key="--rig")
+    folder = out or f"{Path(policy).resolve().name}-finetuned"
+    writable(folder)
+    start_jax(1)
+    from experiments.deploy import session
+    from experiments.runs.run_dir import Run
+
+    report = session.finetune(policy, chosen, Run(folder), robot, distribution, rig, backend, seed, console())
+    return 0 if report is not None else 130

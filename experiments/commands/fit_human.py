@@ -1,0 +1,184 @@
+"""``mjx-tt fit-human`` and ``mjx-tt import``: measured balls to a distribution or another format; ``mjx-tt balls``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from experiments.commands.options import (
+    Format,
+    command,
+    console,
+    count,
+    option,
+    start_jax,
+    suffix,
+)
+from experiments.errors import ConfigError, checked
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from ballmodel.distribution import BallDistribution
+    from ballmodel.fit_distribution import HumanReport
+
+app = command(
+    "fit-human",
+    "a human ball distribution from measured balls",
+    """\
+  mjx-tt fit-human rallies.csv --out anna.yaml
+  mjx-tt fit-human monday.mcap tuesday.mcap --out anna.yaml --name anna
+  mjx-tt fit-human rallies.json --out deepmind.yaml          (DeepMind's ball states)
+
+Then write "balls: anna.yaml" in an experiment.
+""",
+)
+import_app = command(
+    "import",
+    "convert measured trajectories to CSV or MCAP",
+    """\
+  mjx-tt import launcher.hdf5 --out launcher.csv
+  mjx-tt import rallies.csv --out rallies.mcap
+""",
+)
+balls_app = command("balls", "list the paper's players and ball distributions", "  mjx-tt balls\n")
+
+
+@app.default
+def fit_human(
+    *data: Annotated[
+        str, Parameter("DATA", help=".csv, .mcap, .json (DeepMind) or .hdf5 (AIMY launcher)", required=True)
+    ],
+    out: Annotated[str, option("YAML", "the file to write")],
+    name: Annotated[str, option("NAME", "of the distribution (default: the name of the file written)")] = "",
+    eps: Annotated[
+        float | None, option("R", "radius of DBSCAN in robust standard deviations (default: from the data)")
+    ] = None,
+    min_samples: Annotated[int, count("balls that make a cluster (default: 5)")] = 5,
+    format: Format = None,
+) -> None:
+    """Fits a distribution, writes its YAML and prints its 16 numbers beside those of the paper's players.
+
+    Raises ConfigError, for balls that cannot be metres and seconds in the table frame with what they look like.
+    """
+    suffix(out, ".yaml", ".yml")
+    if eps is not None and not 0.0 < eps < float("inf"):
+        raise ConfigError(f"--eps {eps:g}: a positive number is wanted")
+    start_jax(None)
+    from ballmodel.distribution import save_distribution
+    from ballmodel.fit_distribution import fit_human as fit
+    from ballmodel.flight import ball_params
+    from ballmodel.trajectory import Dataset
+    from experiments.measurements import read_all
+    from mjx_tt import diagnosis
+
+    screen, path = console(), Path(out)
+    measured = read_all(list(data), format)
+    try:
+        distribution, report = fit(measured, ball_params(), eps, min_samples, name or path.stem)
+    except ValueError as error:
+        if isinstance(measured, Dataset):
+            checked("", diagnosis.check, measured.trajectories, measured.source)
+        raise ConfigError(f"{', '.join(data)}: {error}") from None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_distribution(path, distribution)
+    _print_report(report, screen)
+    _print_numbers(distribution, screen)
+    screen.print(f"distribution: {path}  (use it in an experiment as  balls: {path.name})", highlight=False)
+
+
+@import_app.default
+def import_(
+    data: Annotated[str, Parameter("DATA", help="trajectories")],
+    /,
+    *,
+    out: Annotated[str, option("FILE", ".csv or .mcap")],
+    format: Format = None,
+) -> None:
+    """Raises ConfigError for another suffix or without trajectories."""
+    start_jax(1)
+    from ballmodel.io import read, write_mcap
+    from ballmodel.trajectory import Dataset
+    from experiments.measurements import write_csv
+
+    path = Path(out)
+    measured = checked("", read, data, format)
+    if not isinstance(measured, Dataset):
+        raise ConfigError(f"{data}: holds start states, not trajectories; mjx-tt fit-human takes it as it is")
+    writers = {".csv": write_csv, ".mcap": write_mcap}
+    if path.suffix not in writers:
+        raise ConfigError(f"{path}: suffix {path.suffix!r}; allowed: {', '.join(writers)}")
+    if path.exists() and path.samefile(data):
+        raise ConfigError(f"--out {path}: is the file to be converted")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writers[path.suffix](path, measured)
+    samples = sum(len(trajectory) for trajectory in measured)
+    console().print(f"{path}: {len(measured):,} trajectories, {samples:,} samples", highlight=False)
+
+
+@balls_app.default
+def balls() -> None:
+    """Prints the paper's distributions with their 16 numbers, and the players' skill."""
+    from rich.table import Table
+
+    from ballmodel import registry
+
+    screen = console()
+    _print_numbers(None, screen, registry.names())
+    table = Table(
+        "player", "level", "mean rally", "std", "min", "max", title="Skill (hits per rally)", title_justify="left"
+    )
+    for player in sorted({name.split("/")[0] for name in registry.names() if "/" in name}):
+        skill = registry.skill(player)
+        table.add_row(player, skill.level, *(f"{v:g}" for v in (skill.mean, skill.std, skill.min, skill.max)))
+    screen.print(table)
+
+
+def _print_report(report: HumanReport, console: Console) -> None:
+    import numpy as np
+
+    console.print(
+        f"{report.measured:,} balls measured, {report.too_short} too short, {report.elsewhere} not towards the robot"
+    )
+    for outcome, number in report.outcomes.items():
+        if number:
+            console.print(f"  {number:,} {outcome}", highlight=False)
+    if report.fit_rms.size:
+        low, middle, high = (1e3 * np.percentile(report.fit_rms, [5, 50, 95])).round(1)
+        console.print(f"residual of the fitted flights: {middle} mm in the median, {low} to {high} mm in 90 % of them")
+    outliers = report.outliers
+    left_out = int(outliers.outlier.sum())
+    console.print(
+        f"{left_out} of {outliers.n} left out as outliers "
+        f"(DBSCAN, eps {outliers.eps:.3g}, min_samples {outliers.min_samples})"
+    )
+
+
+def _print_numbers(
+    distribution: BallDistribution | None, console: Console, names: tuple[str, ...] | None = None
+) -> None:
+    from rich.table import Table
+
+    from ballmodel import registry
+    from ballmodel.distribution import AXES
+
+    shown = [] if distribution is None else [(distribution.name, distribution)]
+    chosen = names if names is not None else tuple(n for n in registry.names() if n.endswith("/M2"))
+    shown += [(name, registry.load(name)) for name in chosen]
+    columns = [f"{part[0]}{axis}" for part, axes in AXES.items() for axis in axes]
+    table = Table(
+        "balls",
+        *columns,
+        title=r"Start position p \[m], velocity v \[m/s], landing point l \[m]: min ... max",
+        title_justify="left",
+    )
+    for name, each in shown:
+        pairs = [
+            f"{low:.2f}\n{high:.2f}"
+            for part in AXES
+            for low, high in zip(getattr(each, f"{part}_min"), getattr(each, f"{part}_max"), strict=True)
+        ]
+        table.add_row(name, *pairs, style="bold" if each is distribution else None, end_section=True)
+    console.print(table)

@@ -1,0 +1,81 @@
+"""``mjx-tt is2r``: a study; ``mjx-tt study-report``: its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from experiments.commands.options import (
+    Devices,
+    changes,
+    command,
+    console,
+    count,
+    option,
+    shipped_or_own,
+    start_jax,
+    writable,
+)
+
+app = command(
+    "is2r",
+    "simulate, play, refine: the iterative loop and its study",
+    """\
+  mjx-tt is2r study_quick.yaml                              five virtual players, twenty minutes, ends in a report
+  mjx-tt is2r study_full.yaml --set players=[player3]       the paper's number of balls
+  mjx-tt is2r anna.yaml                                     with "robot: robot.yaml": docs/how-to/run-a-study.md
+
+Every finished step is kept: the same command continues after an interruption, a crash, or when people have played.
+A file name without a folder that is not in the current folder is looked up among the shipped studies.
+""",
+)
+report_app = command(
+    "study-report",
+    "the report of a study, whole or under way: one HTML page",
+    """\
+  mjx-tt study-report runs/study-quick
+
+Writes report/index.html with its pictures and tables: the paper's figures with ours beside them. What a study lacks is
+named.
+""",
+)
+
+
+@app.default
+def is2r(
+    study: Annotated[str, Parameter("YAML")],
+    /,
+    *,
+    out: Annotated[str, option("FOLDER", "where the study's folder goes (default: runs)")] = "runs",
+    overrides: Annotated[tuple[str, ...], changes("change one key of the study")] = (),
+    processes: Annotated[
+        int | None,
+        count(
+            "how many do steps side by side, on a device each (default: one per processor core; one in all with "
+            "--devices, on an accelerator or a robot)"
+        ),
+    ] = None,
+    devices: Devices = None,
+) -> int:
+    """Returns 130 while the study waits for people."""
+    from experiments.config import study as study_config
+
+    loaded = study_config.load(shipped_or_own(study, study_config.shipped()), overrides)
+    writable(out)
+    own = loaded.simulation.devices
+    start_jax(devices or (None if own == "auto" else own))
+    from experiments.study import session, workers
+
+    side_by_side = workers.choose(loaded, processes, devices)
+    return 0 if session.run(loaded, Path(out) / loaded.name, console(), side_by_side) else 130
+
+
+@report_app.default
+def study_report(folder: Annotated[str, Parameter("FOLDER", help="folder of a study")], /) -> None:
+    """Prints where it is."""
+    start_jax(1)
+    from experiments.study.report import page
+
+    console().print(page.write(Path(folder)), highlight=False, soft_wrap=True)

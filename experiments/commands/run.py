@@ -1,0 +1,101 @@
+"""``mjx-tt run``: an exported policy on a robot, real or emulated; ``mjx-tt rig``: the emulated robot alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter, Token
+
+from experiments.commands.options import (
+    RigFile,
+    RigSeed,
+    artefact_of,
+    command,
+    console,
+    count,
+    existing,
+    option,
+    start_jax,
+    writable,
+)
+
+Distribution = Annotated[str | None, option("NAME", "balls that are thrown (default: the policy's)")]
+Backend = Annotated[Literal["numpy", "jit"], Parameter(help="what computes the policy")]
+
+app = command(
+    "run",
+    "play: an exported policy on a robot, real or emulated",
+    """\
+  mjx-tt run runs/quickstart --robot rig --balls 30
+  mjx-tt run runs/quickstart/artefact --robot robot.yaml
+  mjx-tt run runs/quickstart/artefact --robot rig --rig worn.yaml --distribution player1/M1
+
+The robot needs the operator: p prepares the axes, a arms, the space bar stops. The rig is switched on, armed and fed
+with balls by itself. Read docs/concepts/safety.md and docs/how-to/run-on-the-robot.md before a real arm moves.
+""",
+)
+rig_app = command(
+    "rig",
+    "the emulated robot alone, on real sockets",
+    """\
+  mjx-tt rig --out rig.yaml          and in another terminal:  mjx-tt run ARTEFACT --robot rig.yaml
+""",
+)
+
+
+@app.default
+def run(
+    artefact: Annotated[str, Parameter("ARTEFACT", help="folder of an exported policy, or of its run")],
+    /,
+    *,
+    robot: Annotated[str, option("YAML", 'a robot.yaml, or "rig" for the emulated robot')],
+    balls: Annotated[int | None, count("end after N balls (default: when the operator quits)")] = None,
+    seconds: Annotated[float | None, option("S", "end after S seconds")] = None,
+    backend: Backend = "numpy",
+    log: Annotated[str, option("FOLDER", "for the MCAP log and the summary")] = "runs/robot",
+    distribution: Distribution = None,
+    rig: RigFile = None,
+    seed: RigSeed = 0,
+) -> int:
+    """Returns the exit status."""
+    folder = artefact_of(artefact)
+    existing(folder)
+    existing(None if robot == "rig" else robot, key="--robot")
+    existing(rig, key="--rig")
+    writable(log)
+    start_jax(1)
+    from experiments.deploy import session
+
+    return session.run(Path(folder), robot, balls, distribution, backend, Path(log), rig, seed, seconds, console())
+
+
+def _ports(_type: Any, tokens: Sequence[Token]) -> tuple[int, ...]:
+    text = tokens[0].value
+    parts = text.split(",")
+    if len(parts) != 4 or not all(part.isdigit() and 0 < int(part) < 65536 for part in parts):
+        raise ValueError(f"{text!r}: four ports are needed, such as 6510,6520,5021,5022")
+    return tuple(map(int, parts))
+
+
+@rig_app.default
+def rig(
+    *,
+    ports: Annotated[tuple[int, ...], option("ARM,TRACKER,X,Y", "of the devices", converter=_ports)] = (
+        6510,
+        6520,
+        5021,
+        5022,
+    ),
+    out: Annotated[str, option("YAML", "where its robot.yaml is written")] = "rig-robot.yaml",
+    distribution: Annotated[str, option("NAME", "balls that are thrown (default: player3/M0)")] = "player3/M0",
+    rig: RigFile = None,
+    seed: RigSeed = 0,
+) -> int:
+    """Returns the exit status."""
+    existing(rig, key="--rig")
+    start_jax(1)
+    from experiments.deploy import session
+
+    return session.rig(distribution, rig, seed, ports, Path(out), console())
