@@ -19,7 +19,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from rich.console import Console
 
 from ballmodel.io import read as read_balls
-from experiments.commands import session_logs
+from experiments.commands import log as session_logs
 from experiments.errors import ConfigError
 from robot_io import log
 from robot_io.contract import JOINT_NAMES
