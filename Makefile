@@ -1,7 +1,9 @@
 # make demo   set up, train the quickstart, evaluate it, export it
 # make rig-demo  the same policy on the emulated robot, over real sockets in real time (trains it first if need be)
 # make study-quick  the whole study in small: five virtual players, all methods, a report (twenty minutes on two cores; resumable)
-# make test   set up and run the tests
+# make test   set up and run the tests but for the slow ones (eight minutes on two cores)
+# make test-all  the slow ones as well
+# make check  set up and check style, types and imports
 # make exam   hide causes in logs and let the diagnosis find them: the large examination (hours; resumable)
 # make docs   set up and build the documentation into docs/_build/html; a dead link or an unknown name is an error
 # make bench  set up and measure speed against MJX, MuJoCo C and PyBullet
@@ -11,7 +13,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo rig-demo study-quick test exam docs bench setup clean
+.PHONY: demo rig-demo study-quick test test-slow test-all check exam docs bench setup clean
 
 demo: $(READY)
 	$(BIN)/mjx-tt train quickstart.yaml --out runs
@@ -23,8 +25,25 @@ rig-demo: $(READY)
 study-quick: $(READY)
 	$(BIN)/mjx-tt is2r study_quick.yaml --out runs
 
+# Files of tests are spread over two processes; tests in real time run after them, one by one.
+PYTEST   := $(BIN)/python -m pytest
+PARALLEL := -n 2 --dist loadfile
+
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(PYTEST) $(PARALLEL) -m "not slow and not realtime"
+	$(PYTEST) -m "not slow and realtime"
+
+test-slow: $(READY)
+	$(PYTEST) $(PARALLEL) -m "slow and not realtime"
+	$(PYTEST) -m "slow and realtime"
+
+test-all: test test-slow
+
+check: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(PYTEST) tests/test_imports.py
 
 exam: $(READY)
 	$(BIN)/python -m tests.exam
