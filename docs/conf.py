@@ -21,6 +21,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "generated_pages",
+    "mentioned_files",
 ]
 exclude_patterns = ["_build", "_ext"]
 nitpicky = True
