@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ import numpy as np
 
 from experiments.runs import load_policy as policies
 from mjx_tt import platform
-from mjx_tt.env.policy import initial_theta
+from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.rally import human_player
 from mjx_tt.rally.end_reasons import End
@@ -37,20 +38,19 @@ def main(arguments=None) -> int:
     chosen = parser.parse_args(arguments)
     platform.configure(devices=1)
     if chosen.policy:
-        loaded = policies.load(chosen.policy)
-        theta, mean, inverse_scale = loaded.theta, loaded.mean, loaded.inverse_scale
+        policy = policies.load(chosen.policy).policy
     else:
-        theta, mean, inverse_scale = initial_theta(jax.random.key(0)), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION)
+        policy = Policy(initial_theta(jax.random.key(0)), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION))
     each = -(-chosen.rallies // chosen.lanes)
     names = human_player.names()
     people = human_player.stack([human_player.load(names[lane % len(names)]) for lane in range(chosen.lanes)])
-    columns = jnp.repeat(jnp.asarray(theta, jnp.float32)[:, None], chosen.lanes, axis=1)
-    normaliser = [jnp.asarray(x, jnp.float32) for x in (mean, inverse_scale)]
+    policy = jax.tree.map(jnp.asarray, policy.astype(np.float32))
+    policy = replace(policy, theta=jnp.repeat(policy.theta[:, None], chosen.lanes, axis=1))
     simulator = RallySimulator(TaskConfig(sim_rate=chosen.sim_rate))
 
     def play(seed):
         began = time.perf_counter()
-        result = simulator.play(columns, *normaliser, people, SimModel(), jax.random.key(seed), each)
+        result = simulator.play(policy, people, SimModel(), jax.random.key(seed), each)
         length, end = np.asarray(result.length), np.asarray(result.end)
         return time.perf_counter() - began, length, end, float(result.seconds.sum())
 

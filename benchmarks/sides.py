@@ -12,6 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mjx_tt.env.policy import Policy
+
 Side = tuple[dict, Callable[[], float | list]]
 
 SIM_RATE = 300.0
@@ -148,8 +150,8 @@ def rollout(changes: list[str], devices: int | None = None) -> Side:
     theta = state.bgs.theta[:, None] + 0.025 * jax.random.normal(jax.random.key(3), (state.bgs.theta.shape[0], columns))
 
     def play(theta, episodes):
-        mean, inverse_scale = jnp.zeros(11), jnp.ones(11)
-        return simulator.rollout(simulator.local(theta), mean, inverse_scale, simulator.local(episodes))
+        policy = Policy(simulator.local(theta), jnp.zeros(11), jnp.ones(11))
+        return simulator.rollout(policy, simulator.local(episodes))
 
     arguments = simulator.replicate((theta, episodes))
     compiled = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS)).lower(*arguments).compile()

@@ -21,16 +21,17 @@ PACKAGES = ("robot_io", "ballmodel", "bgs", "mjx_tt", "experiments")
 
 # By the longest matching prefix: modules of the project that a module may import besides those of its own package.
 ALLOWED = {
-    "robot_io": (),
+    "robot_io": ("ballmodel.constants", "ballmodel.io"),
     "ballmodel": (),
     "bgs": (),
-    "mjx_tt": ("ballmodel", "robot_io.contract", "robot_io.limits"),
+    "mjx_tt": ("ballmodel", "robot_io.contract", "robot_io.limits", "robot_io.policy"),
     "experiments": PACKAGES,
 }
 JAX = ("jax", "jaxlib", "flax", "optax", "brax", "equinox", "mujoco")
 # Of robot_io, whose other modules run on the robot: what some may import besides.
 JAX_ALLOWED = {
     "robot_io/policy/export.py": JAX,
+    "robot_io/policy/pytree.py": ("jax",),
     "robot_io/policy/jax_policy.py": ("jax", "jaxlib"),
     "robot_io/emulator/world.py": ("mujoco",),
 }

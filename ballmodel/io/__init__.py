@@ -1,10 +1,8 @@
-"""Readers of measured balls: CSV, MCAP, the DeepMind ball states, the AIMY launcher."""
+"""Measured balls from files, and files written whole: CSV, MCAP, the DeepMind ball states, the AIMY launcher, YAML.
 
-from ballmodel.io.aimy import read_aimy as read_aimy
-from ballmodel.io.csv import read_csv as read_csv
-from ballmodel.io.deepmind import MeasuredStates as MeasuredStates
-from ballmodel.io.deepmind import read_deepmind as read_deepmind
-from ballmodel.io.formats import FORMATS as FORMATS
-from ballmodel.io.formats import read as read
-from ballmodel.io.mcap import read_mcap as read_mcap
-from ballmodel.io.mcap import write_mcap as write_mcap
+The readers load when they are first used, so that a program at the robot can write files with NumPy alone.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

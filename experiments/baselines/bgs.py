@@ -5,8 +5,7 @@ from __future__ import annotations
 from bgs import normalizer
 from experiments.baselines.learner import Learner
 from experiments.training.update import Trainer, TrainState
-from mjx_tt.env.policy import PolicyController
-from robot_io.contract import unflatten
+from mjx_tt.env.policy import Policy, PolicyController
 
 
 class Evolution(Learner):
@@ -31,5 +30,4 @@ class Evolution(Learner):
         return advance
 
     def controller(self, state: TrainState) -> PolicyController:
-        mean, inverse_scale = normalizer.normaliser(state.statistics)
-        return PolicyController(unflatten(state.bgs.average), mean, inverse_scale)
+        return PolicyController.of(Policy(state.bgs.average, *normalizer.normaliser(state.statistics)))

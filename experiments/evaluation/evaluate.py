@@ -13,8 +13,9 @@ import numpy as np
 from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
-from experiments.runs.load_policy import Policy
+from experiments.runs.load_policy import TrainedPolicy
 from mjx_tt.env import reachability, rewards
+from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import RESULT_SPECS, RolloutResult, Simulator
 from mjx_tt.env.task import HIT, MISSED, RETURNED
 
@@ -51,21 +52,21 @@ class Evaluator:
         thrown = jax.tree.map(lambda x: x[:, order], self.balls.state)
         model = experiment.model
 
-        def play(theta, mean, inverse_scale, key, pool, thrown):
+        def play(policy, key, pool, thrown):
             drawn = simulator.draw(key, pool, model.model, model.randomise, rows, columns)
-            copies = jnp.repeat(theta[:, None], columns // simulator.devices, axis=1)
+            copies = jnp.repeat(policy.theta[:, None], columns // simulator.devices, axis=1)
             # Balls of a distribution do not spin: what the drawn ones do is the model's.
             spinning = replace(thrown, spin=thrown.spin + drawn.ball.spin)
-            return simulator.rollout(copies, mean, inverse_scale, simulator.local(replace(drawn, ball=spinning)))
+            return simulator.rollout(replace(policy, theta=copies), simulator.local(replace(drawn, ball=spinning)))
 
         spread = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
         fixed = simulator.replicate((self.balls, thrown))
         # One layout for arrays from training and from files: one compilation.
         self._play = lambda *policy_and_key: spread(*simulator.replicate(policy_and_key), *fixed)
 
-    def play(self, theta, mean, inverse_scale, key) -> RolloutResult:
-        """theta (976,), frozen normaliser (11,), (11,), key of latencies and noise; arrays are NumPy, (..., R, P)."""
-        return jax.tree.map(np.asarray, self._play(theta, mean, inverse_scale, key))
+    def play(self, policy: Policy, key) -> RolloutResult:
+        """Episodes under the key of latencies and noise; arrays are NumPy, (..., R, P)."""
+        return jax.tree.map(np.asarray, self._play(policy, key))
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Played:
 
 
 def evaluate(
-    experiment: Experiment, policy: Policy, episodes: int, seed: int, reachable_balls: int | None = None
+    experiment: Experiment, trained: TrainedPolicy, episodes: int, seed: int, reachable_balls: int | None = None
 ) -> Played:
     """Plays the policy on at least ``episodes`` balls that training has not seen.
 
@@ -94,7 +95,7 @@ def evaluate(
     simulator = Simulator(task, len(jax.devices()))
     evaluator = Evaluator(simulator, experiment, episodes, build.key(seed, build.EVALUATION_BALLS))
     key = build.key(seed, build.EVALUATION_EPISODES)
-    result = evaluator.play(policy.theta, policy.mean, policy.inverse_scale, key)
+    result = evaluator.play(trained.policy, key)
     conditions = {
         "balls": experiment.distribution.to_dict(),
         "acceptance": float(evaluator.balls.acceptance),
@@ -102,13 +103,13 @@ def evaluate(
         "sim_rate": task.sim_rate,
         "randomise": {r.path: [r.low, r.high] for r in experiment.model.randomise},
         "seed": seed,
-        "policy": str(policy.source),
-        "update": policy.notes.get("update"),
-        "training_seconds": policy.notes.get("seconds"),
+        "policy": str(trained.source),
+        "update": trained.notes.get("update"),
+        "training_seconds": trained.notes.get("seconds"),
     }
     reachable = None
     if reachable_balls is not None:
-        reachable = _reachable(experiment, simulator, evaluator.balls, key, reachable_balls, policy)
+        reachable = _reachable(experiment, simulator, evaluator.balls, key, reachable_balls, trained.policy)
     return Played(summary(result) | {"reachable": reachable} | conditions, result, evaluator.incoming)
 
 
@@ -116,8 +117,7 @@ def _reachable(
     experiment: Experiment, simulator: Simulator, balls: BallPool, key, count: int, policy: Policy
 ) -> dict[str, Any]:
     """What the policy or motions optimised ball by ball return, the balls known and without noise."""
-    known = (policy.theta, policy.mean, policy.inverse_scale)
-    found = reachability.reachable(simulator, balls, experiment.model.model, key, count, known)
+    found = reachability.reachable(simulator, balls, experiment.model.model, key, count, policy)
     low, high = wilson(found.returned, found.balls)
     return {"return_rate": found.rate, "low": low, "high": high, "balls": found.balls, "by_policy": found.by_policy}
 

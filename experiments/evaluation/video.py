@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.config import build
 from experiments.config.build import Experiment
-from experiments.runs.load_policy import Policy
+from experiments.runs.load_policy import TrainedPolicy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.viz import rendering
 
@@ -17,18 +17,20 @@ SIZE = (640, 360)
 PAUSE = 0.3  # [s] the last frame of an episode stays
 
 
-def replay(experiment: Experiment, policy: Policy, count: int, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def replay(
+    experiment: Experiment, trained: TrainedPolicy, count: int, seed: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """The first ``count`` episodes of a seed as they come: joint positions (T, 8) and ball positions (T, 3) [m]."""
     simulator = Simulator(experiment.task)
     balls = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), count)
     model = experiment.model
 
-    def play(theta, mean, inverse_scale, key, balls):
+    def play(policy, key, balls):
         drawn = simulator.draw(key, balls, model.model, model.randomise, count, 1)
-        return simulator.replay(theta, mean, inverse_scale, drawn)
+        return simulator.replay(policy, drawn)
 
     key = build.key(seed, build.EVALUATION_EPISODES)
-    played = jax.jit(play)(policy.theta, policy.mean, policy.inverse_scale, key, balls)
+    played = jax.jit(play)(trained.policy, key, balls)
     qpos, ball, length = (np.asarray(a) for a in played)
     return [(qpos[: length[i], :, i], ball[: length[i], :, i]) for i in range(count)]
 

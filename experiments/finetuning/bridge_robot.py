@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from experiments.deploy.operator_console import KEYS, Keyboard, View
 from experiments.deploy.session import RECOVERIES, Session
 from experiments.finetuning.robot import PlayedBall
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
+from robot_io.policy.policy import Policy
 
 
 class BridgeRobot:
@@ -29,11 +28,11 @@ class BridgeRobot:
     def describe(self) -> dict[str, Any]:
         return {"robot": self._name}
 
-    def play(self, theta: np.ndarray, mean: np.ndarray, inverse_scale: np.ndarray, episode_number: int) -> PlayedBall:
+    def play(self, policy: Policy, episode_number: int) -> PlayedBall:
         """Waits for the person's next ball. Raises RefusedError when the robot cannot be brought back after faults."""
         self._discarded = False
         session, failures = self._session, 0
-        self._ask_policy(theta, mean, inverse_scale)
+        session.ask("policy", policy)  # the robot may still be on its way home from the last ball
         session.ask("pause", False)
         while True:
             for message in session.messages(0.1):
@@ -56,10 +55,6 @@ class BridgeRobot:
                         raise RefusedError(f"the rig does not recover: {session.status['faults'][0]['text']}")
                     self._session.recover(self._rig)
                     session.ask("pause", False)
-
-    def _ask_policy(self, theta, mean, inverse_scale) -> None:
-        """Hands the policy over; the robot may still be on its way home from the last ball."""
-        self._session.ask("policy", np.asarray(theta), np.asarray(mean), np.asarray(inverse_scale))
 
     def _keys(self) -> None:
         key = self._keyboard.pressed()

@@ -37,6 +37,7 @@ from experiments.training.update import TrainState
 from mjx_tt.env import rewards
 from robot_io.control.episode import HIT, RETURNED, EpisodeSummary
 from robot_io.emulator.config import RigParams
+from robot_io.policy.policy import Policy
 
 SETTINGS = "finetuning.yaml"
 JOURNAL = "journal.jsonl"
@@ -222,7 +223,7 @@ class Session:
                     "are done; restore the file or start a new run"
                 )
             number = self._next_number(*place[:2])
-            played = self._robot.play(np.ascontiguousarray(theta), *self._normaliser, number)
+            played = self._robot.play(Policy(np.ascontiguousarray(theta), *self._normaliser), number)
             entry = self._entry(place, number, played)
             self.journal.append(entry)
             if not entry.discarded:

@@ -10,7 +10,6 @@ import numpy as np
 
 import mjx_tt
 from experiments.errors import RunError
-from robot_io import contract
 from robot_io.control.episode import EpisodeSummary
 from robot_io.emulator.ball_launcher import Throws
 from robot_io.emulator.config import RigParams
@@ -19,6 +18,7 @@ from robot_io.emulator.world import World
 from robot_io.log.messages import Ball
 from robot_io.log.recorder import NullRecorder
 from robot_io.policy.numpy_policy import StreamingPolicy
+from robot_io.policy.policy import Policy
 
 SCENE = Path(mjx_tt.__file__).parent / "assets" / "scene.xml"
 REPORTING = 1.0  # [s] within which the outcome of an episode that a fault ended is known
@@ -41,8 +41,8 @@ class Robot(Protocol):
 
     repeatable: bool
 
-    def play(self, theta: np.ndarray, mean: np.ndarray, inverse_scale: np.ndarray, episode_number: int) -> PlayedBall:
-        """Plays the next ball with parameters (976,) and normaliser (11,), (11,), all float32.
+    def play(self, policy: Policy, episode_number: int) -> PlayedBall:
+        """Plays the next ball with a policy in float32.
 
         A fault that ends the episode is in its summary, and the robot stands ready again when this returns. Raises
         RunError, RefusedError or DeviceError when no episode can be played; the fine-tuning can then be continued.
@@ -90,11 +90,16 @@ class LockStepRobot:
         self._throws, self._params, self._scene = throws, params, scene
         self._world = World(scene, params.world)
 
-    def play(self, theta: np.ndarray, mean: np.ndarray, inverse_scale: np.ndarray, episode_number: int) -> PlayedBall:
-        policy = StreamingPolicy(contract.unflatten(theta), mean, inverse_scale)
+    def play(self, policy: Policy, episode_number: int) -> PlayedBall:
         balls = BallRecorder()
         rig = LockStep(
-            self._scene, self._throws, policy, self._params, recorder=balls, first=episode_number, world=self._world
+            self._scene,
+            self._throws,
+            StreamingPolicy(policy),
+            self._params,
+            recorder=balls,
+            first=episode_number,
+            world=self._world,
         )
         rig.start()
         found = rig.play(1)

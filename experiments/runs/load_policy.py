@@ -17,7 +17,7 @@ from experiments.config.experiment import Config, parse
 from experiments.errors import RunError
 from experiments.runs import checkpoint
 from experiments.runs.run_dir import CONFIG, Run
-from robot_io import contract
+from mjx_tt.env.policy import Policy
 from robot_io.policy import artefact as artefacts
 
 SELECTION = "selection.json"  # beside several trainings of one model: which was chosen
@@ -41,26 +41,22 @@ _MARKS = (
 
 
 @dataclass(frozen=True)
-class Policy:
-    """A policy that can be played.
+class TrainedPolicy:
+    """A policy and its origin.
 
-    theta          (976,) parameters: a run's moving average
-    mean           (11,) of the normaliser, in the observation's units
-    inverse_scale  (11,) of the normaliser
-    source         folder that it came from
-    config         experiment that trained it; None when the artefact does not tell
-    notes          update and training seconds, or the artefact's provenance
+    policy  of a run: the moving average of theta
+    source  folder of the run or artefact
+    config  experiment that trained it; None where the artefact does not record it
+    notes   update and training seconds, or the artefact's provenance
     """
 
-    theta: np.ndarray
-    mean: np.ndarray
-    inverse_scale: np.ndarray
+    policy: Policy
     source: Path
     config: Config | None
     notes: dict[str, Any]
 
 
-def load(folder: str | Path) -> Policy:
+def load(folder: str | Path) -> TrainedPolicy:
     """Reads a run folder's newest checkpoint or an artefact.
 
     Raises RunError for a folder that is neither, CheckpointError or ArtefactError for a damaged one.
@@ -103,26 +99,24 @@ def load_statistics(folder: str | Path) -> tuple[np.ndarray, ObservationStatisti
     if (folder / CONFIG).is_file():
         arrays, _ = _read(folder)
         return arrays["bgs.average"], _statistics(arrays)
-    policy = load(folder)
-    std = np.where(policy.inverse_scale > 0, 1 / np.where(policy.inverse_scale > 0, policy.inverse_scale, 1), 0)
+    policy = load(folder).policy
+    std = np.where(policy.inv_std > 0, 1 / np.where(policy.inv_std > 0, policy.inv_std, 1), 0)
     count, m2 = jnp.array([0, 2], jnp.int32), jnp.asarray(std**2, jnp.float32)
     return policy.theta, ObservationStatistics(count, jnp.asarray(policy.mean, jnp.float32), m2)
 
 
-def _from_run(folder: Path) -> Policy:
+def _from_run(folder: Path) -> TrainedPolicy:
     arrays, notes = _read(folder)
-    mean, inverse_scale = (np.asarray(a) for a in normalizer.normaliser(_statistics(arrays)))
-    return Policy(arrays["bgs.average"], mean, inverse_scale, folder, Run(folder).config(), notes)
+    normaliser = (np.asarray(a) for a in normalizer.normaliser(_statistics(arrays)))
+    return TrainedPolicy(Policy(arrays["bgs.average"], *normaliser), folder, Run(folder).config(), notes)
 
 
-def _from_artefact(folder: Path) -> Policy:
+def _from_artefact(folder: Path) -> TrainedPolicy:
     artefact = artefacts.load(folder)
-    theta = np.concatenate([artefact.parameters[name].ravel() for name in contract.parameter_shapes()])
     provenance = artefact.manifest["provenance"]
     recorded = provenance.get("config") if isinstance(provenance, dict) else None
     config = parse(recorded, f"{folder}: provenance.config") if recorded else None
-    mean, inverse_scale = (a.astype(np.float32) for a in (artefact.normaliser_mean, artefact.normaliser_inverse_scale))
-    return Policy(theta, mean, inverse_scale, folder, config, provenance)
+    return TrainedPolicy(artefact.policy.astype(np.float32), folder, config, provenance)
 
 
 def _read(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -17,6 +17,7 @@ from experiments.study.analysis import effect_costs, scoring
 from experiments.study.blind import protocol
 from experiments.study.target_domain import hidden_effects as realities
 from experiments.study.target_domain.finetuning import VirtualReality
+from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
 from mjx_tt.rally.simulator import Box, RallyResult
 
@@ -30,27 +31,25 @@ def play(
     reality: VirtualReality,
     seed: int,
     pairings: list[tuple[str, str, str]],
-    policies: list,
+    policies: list[Policy],
     boxes: list[BallDistribution],
 ) -> RallyResult:
     """Rallies of each pairing (trainer, evaluator, model) in ``evaluation.lanes`` sessions side by side.
 
-    policies: theta, mean and inverse_scale of each; boxes: what each one was trained for. Arrays are NumPy.
+    boxes: what each policy was trained for. Arrays are NumPy.
     """
     lanes, settings = study.evaluation.lanes, study.evaluation
 
     def spread(arrays):  # one array (n, ...) per pairing -> (n, pairings x lanes)
         return jnp.repeat(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1), lanes, axis=-1)
 
-    theta, mean, inverse_scale = (spread(part) for part in zip(*policies))
+    policy = jax.tree.map(lambda *arrays: spread(arrays), *policies)
     people = human_player.stack([reality.player(evaluator) for _, evaluator, _ in pairings])
     person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), people)
     low, high = (spread(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes))))
     rallies = settings.rallies // lanes
     result = reality.simulator.play(
-        theta,
-        mean,
-        inverse_scale,
+        policy,
         person,
         reality.known,
         build.key(seed, EVALUATION),
@@ -67,12 +66,12 @@ def play_without(
     reality: VirtualReality,
     seed: int,
     models: list[tuple[str, str]],
-    policies: list,
+    policies: list[Policy],
     boxes: list[BallDistribution],
 ) -> list[effect_costs.Outcome]:
     """Rallies of each (player, model) in every world of ``effects.WORLDS``, ``evaluation.rallies`` each, in one call.
 
-    policies: theta, mean and inverse_scale of each; boxes: what each one was trained for. What the study's own reality
+    boxes: what each policy was trained for. What the study's own reality
     lacks is left out of all worlds.
     """
     lanes, settings = study.evaluation.lanes, study.evaluation
@@ -91,14 +90,12 @@ def play_without(
         each = jnp.stack([jnp.asarray(a) for a in arrays], axis=-1)
         return jnp.tile(jnp.repeat(each, lanes, axis=-1), len(worlds))
 
-    theta, mean, inverse_scale = (per_model(part) for part in zip(*policies))
+    policy = jax.tree.map(lambda *arrays: per_model(arrays), *policies)
     low, high = (per_model(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes))))
     person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), human_player.stack(people))
     world = realities.side_by_side(worlds, len(models) * lanes)
     result = reality.simulator.play(
-        theta,
-        mean,
-        inverse_scale,
+        policy,
         person,
         world,
         build.key(seed, EFFECTS),

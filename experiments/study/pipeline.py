@@ -33,6 +33,7 @@ from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.world import VirtualWorld, World
 from experiments.study.training import POLICY
 from experiments.study.workflow import Step
+from mjx_tt.env.policy import Policy
 
 CONVERGENCE = "convergence.json"
 REPORT = Path("report") / "index.html"
@@ -190,7 +191,7 @@ class Loop:
             hits, text = self._world[seed].fine_tune(player, source, updates(self.study, item), folder, name)
             if data is not None:
                 measurements.write_csv(data, hits)
-            training.save(folder, load_policy.load(folder))
+            load_policy.load(folder).policy.save(folder / training.POLICY)
             return text
 
         outputs = (folder / POLICY, *(() if data is None else (data,)))
@@ -223,7 +224,7 @@ class Loop:
 
         def run() -> str:
             lanes, world = self.study.evaluation.lanes, self._world[seed]
-            policies = [training.load(place.parent) for place in places]
+            policies = [Policy.load(place.parent / training.POLICY) for place in places]
             boxes = [self._box(seed, trainer, model) for trainer, _, model in pairs]
             result = evaluation.play(self.study, world.reality, seed, pairs, policies, boxes)
             codes = evaluation.code_names(seed, pairs)
@@ -243,7 +244,7 @@ class Loop:
         path = self.seed_folder(seed) / effect_costs.FILE
 
         def run() -> str:
-            policies = [training.load(place.parent) for place in places]
+            policies = [Policy.load(place.parent / training.POLICY) for place in places]
             boxes = [self._box(seed, player, model) for player, model in models]
             found = evaluation.play_without(self.study, self._world[seed].reality, seed, models, policies, boxes)
             effect_costs.write(path, found)

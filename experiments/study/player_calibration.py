@@ -119,14 +119,13 @@ class Calibration:
     def __init__(self, first, later, model_path=None) -> None:
         self.model = models.load(model_path).model if model_path else models.SimModel()
         self.first = len(first)
-        self.policies = [load_policy.load(folder) for folder in (*first, *later)]
+        self.policies = [load_policy.load(folder).policy for folder in (*first, *later)]
         self.names = human_player.names()
         self.simulator = RallySimulator(TaskConfig(sim_rate=150.0))
         self.lanes = [(p, k) for p in range(len(self.names)) for k in range(len(self.policies)) for _ in range(LANES)]
         columns = [self.policies[k] for _, k in self.lanes]
-        self.policy = tuple(
-            jnp.stack([jnp.asarray(getattr(c, name), jnp.float32) for c in columns], axis=1)
-            for name in ("theta", "mean", "inverse_scale")
+        self.policy = jax.tree.map(
+            lambda *arrays: jnp.stack([jnp.asarray(a, jnp.float32) for a in arrays], axis=1), *columns
         )
 
     def people(self):
@@ -137,7 +136,7 @@ class Calibration:
     def play(self, seed: int) -> dict[str, Reached]:
         """Plays and fits. Returns what each player reached."""
         keys = jax.random.split(jax.random.key(seed), 3)
-        result = self.simulator.play(*self.policy, self.people(), self.model, keys[0], RALLIES, capacity=CAPACITY)
+        result = self.simulator.play(self.policy, self.people(), self.model, keys[0], RALLIES, capacity=CAPACITY)
         result = jax.tree.map(np.asarray, result)
         person, who = np.array(self.lanes).T
         filtered = np.array([row[3] for row in ROWS])[result.end]

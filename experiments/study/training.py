@@ -6,16 +6,14 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from ballmodel.distribution import load_distribution
-from ballmodel.io.atomic_files import replacing
 from experiments.config import build
 from experiments.config.experiment import Config, Evaluation, Training
 from experiments.config.study import Study
 from experiments.runs import load_policy, run_dir
-from experiments.runs.load_policy import SELECTION, Policy
+from experiments.runs.load_policy import SELECTION, TrainedPolicy
 from experiments.runs.run_dir import Run
 from experiments.study.schedule import Simulated, updates
 from experiments.training.loop import train
@@ -59,7 +57,7 @@ def simulate(
     source: Path | None,
     name: str,
     console: Console,
-    score: Callable[[Policy], float] | None,
+    score: Callable[[TrainedPolicy], float] | None,
 ) -> str:
     """Trains every seed of a model in ``folder``/training, or goes on with them, and writes the chosen policy.
 
@@ -79,20 +77,8 @@ def simulate(
             scores[f"seed{k}"] = score(load_policy.load(run.folder))
     best = max(scores, key=scores.get) if scores else "seed0"
     chosen = load_policy.load(folder / "training" / best)
-    save(folder, chosen)
+    chosen.policy.save(folder / POLICY)
     run_dir.write_json(folder / SELECTION, {"best": f"training/{best}", "scores": scores})
     worth = f", worth {scores[best]:.2f} of 2 in reality" if scores else ""
     among = f", best of {len(scores)}" if len(scores) > 1 else ""
     return f"{updates(study, item)} updates{among}{worth}"
-
-
-def save(folder: Path, chosen: Policy) -> None:
-    """Writes a policy as plain arrays: theta (976,), mean (11,), inverse_scale (11,)."""
-    with replacing(folder / POLICY) as temporary, open(temporary, "wb") as file:
-        np.savez(file, theta=chosen.theta, mean=chosen.mean, inverse_scale=chosen.inverse_scale)
-
-
-def load(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The arrays of ``save``."""
-    with np.load(folder / POLICY) as data:
-        return tuple(np.asarray(data[name], np.float32) for name in ("theta", "mean", "inverse_scale"))

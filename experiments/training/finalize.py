@@ -12,7 +12,7 @@ from experiments.config.build import Experiment
 from experiments.evaluation import evaluate, figures, video
 from experiments.evaluation.evaluate import Played
 from experiments.runs import load_policy, metrics, run_dir
-from experiments.runs.load_policy import Policy
+from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
 from robot_io import contract
 from robot_io.policy import export
@@ -47,7 +47,7 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
     return played.report
 
 
-def show_episodes(experiment: Experiment, trained: Policy, paths: list[Path], console: Console) -> list[Path]:
+def show_episodes(experiment: Experiment, trained: TrainedPolicy, paths: list[Path], console: Console) -> list[Path]:
     """Writes the pictures that this machine can draw; says why where it cannot."""
     played = video.replay(experiment, trained, EPISODES_SHOWN, experiment.config.evaluation.seed)
     drawn = []
@@ -60,7 +60,7 @@ def show_episodes(experiment: Experiment, trained: Policy, paths: list[Path], co
 
 
 def export_policy(
-    folder: Path, trained: Policy, experiment: Experiment, report: dict[str, Any] | None, console: Console
+    folder: Path, trained: TrainedPolicy, experiment: Experiment, report: dict[str, Any] | None, console: Console
 ) -> bool:
     """Writes and verifies the artefact; False, with a line that says so, for a policy that the robot cannot run."""
     rate = experiment.task.control_rate
@@ -77,7 +77,7 @@ def export_policy(
         "update": trained.notes.get("update"),
         "evaluation": report,
     }
-    export.write(folder, trained.theta, trained.mean, trained.inverse_scale, provenance, overwrite=True)
+    export.write(folder, trained.policy, provenance, overwrite=True)
     return True
 
 

@@ -20,7 +20,7 @@ from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.errors import checked
 from mjx_tt.env import rewards
-from mjx_tt.env.policy import initial_theta
+from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
 from mjx_tt.env.task import MISSED, RETURNED
 from mjx_tt.sim.model import Range, SimModel
@@ -94,9 +94,9 @@ class Trainer:
         episodes = self.simulator.draw(episode_key, pool, self._model, self._randomise, self._repeats, columns)
         if self._crn:
             episodes = jax.tree.map(lambda x: jnp.concatenate([x, x], -1) if x.ndim >= 2 else x, episodes)
-        mean, inverse_scale = normalizer.normaliser(state.statistics)
+        mean, inv_std = normalizer.normaliser(state.statistics)
         simulator = self.simulator
-        result = simulator.rollout(simulator.local(theta), mean, inverse_scale, simulator.local(episodes))
+        result = simulator.rollout(Policy(simulator.local(theta), mean, inv_std), simulator.local(episodes))
         result = self._weighed(result, state.bgs.updates)
         # Everything that the devices have to share, in one sum: each fills in its own members.
         member = result.returns.mean(axis=0)  # NaN when one of its episodes was not finite

@@ -1,4 +1,4 @@
-"""The gated dilated CNN of 976 parameters in JAX, as a full convolution over the history and in streaming form.
+"""The gated dilated CNN of 976 parameters in JAX, in streaming form (in full: ``robot_io.policy.policy.forward``).
 
 Architecture and parameter order: ``robot_io.contract``. Streaming keeps one past input, two past outputs of layer 1 and
 four of layer 2, which is all that the dilations 1, 2, 4 reach back to: 928 multiply-adds a control step instead of 4,576.
@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 
 from mjx_tt.robot.scalar_algebra import materialise
-from robot_io.contract import DILATIONS, FILTERS, GATED, N_OBSERVATION, unflatten
+from robot_io.contract import DILATIONS, FILTERS, GATED, N_OBSERVATION
+from robot_io.policy.pytree import Policy as Policy
 
 
 @jax.tree_util.register_dataclass
@@ -82,27 +83,21 @@ def stream(parameters: dict, state: PolicyState, x):
     )
 
 
-def apply(theta, history):
-    """The full convolution: theta (976,), normalised history (8, 11, ...) oldest first -> action (8, ...)."""
-    rows = history
-    for (kernel, bias, gated), dilation in zip(_layers(unflatten(theta)), DILATIONS):
-        rows = jnp.stack(
-            [_layer(kernel, bias, rows[t], rows[t + dilation], gated) for t in range(len(rows) - dilation)]
-        )
-    return rows[0]
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PolicyController:
     """The streaming policy as a ``task.Controller``: parameters of P perturbations and a frozen normaliser.
 
-    mean, inverse_scale: (11,), or (11, P) where every episode has parameters of its own (one repeat).
+    mean, inv_std: (11,), or (11, P) where every episode has parameters of its own (one repeat).
     """
 
     parameters: dict
     mean: jax.Array
-    inverse_scale: jax.Array
+    inv_std: jax.Array
+
+    @classmethod
+    def of(cls, policy: Policy) -> PolicyController:
+        return cls(policy.parameters, policy.mean, policy.inv_std)
 
     def start(self, observation) -> PolicyState:
         return start(self.parameters, self._normalised(observation))
@@ -112,4 +107,4 @@ class PolicyController:
 
     def _normalised(self, x):
         column = self.mean.shape + (1,) * (x.ndim - self.mean.ndim)
-        return (x - self.mean.reshape(column)) * self.inverse_scale.reshape(column)
+        return (x - self.mean.reshape(column)) * self.inv_std.reshape(column)

@@ -22,7 +22,7 @@ from mjx_tt.env.policy import PolicyController
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, Task, TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Range, SimModel
-from robot_io.contract import unflatten
+from robot_io.policy.policy import Policy
 
 AXIS = "perturbation"
 CPU_BLOCK = 768  # episodes per block that keep the state inside a core's cache
@@ -126,16 +126,15 @@ class Simulator:
             raise ValueError(f"{x.shape[-1]} perturbations cannot be split evenly over {self.devices} devices")
         return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * width, width, axis=-1)
 
-    def rollout(self, theta, mean, inverse_scale, episodes: Episodes) -> RolloutResult:
-        """Runs theta (976, P), one column per perturbation, on episodes (R, P), with the normaliser (11,) frozen.
+    def rollout(self, policy: Policy, episodes: Episodes) -> RolloutResult:
+        """Runs P policies, theta (976, P) with one normaliser (11,), each on its column of episodes (R, P).
 
         Runs on the device it is called for; ``on_devices`` and ``local`` spread it.
         """
-        columns = theta.shape[-1]
+        columns = policy.theta.shape[-1]
         if columns != episodes.seed.shape[-1]:
             raise ValueError(f"theta has {columns} columns, the episodes {episodes.seed.shape[-1]}")
-        controller = PolicyController(unflatten(theta), mean, inverse_scale)
-        return self.play(controller, episodes)
+        return self.play(PolicyController.of(policy), episodes)
 
     def play(self, controller: Controller, episodes: Episodes) -> RolloutResult:
         """Runs any controller on episodes (R, P), in blocks of whole rows."""
@@ -201,14 +200,14 @@ class Simulator:
         )
         return result, observed, jnp.where(finite, steps, 0)
 
-    def replay(self, theta, mean, inverse_scale, episodes: Episodes):
-        """Plays single episodes for the camera: theta (976,), episodes (R, 1).
+    def replay(self, policy: Policy, episodes: Episodes):
+        """Plays single episodes for the camera: one policy, episodes (R, 1).
 
         Returns joint positions (max_steps, 8, R), ball positions (max_steps, 3, R) at the control ticks and the number of
         ticks (R,) until the ball came down.
         """
         task = self.task
-        controller = PolicyController(unflatten(theta[:, None]), mean, inverse_scale)
+        controller = PolicyController.of(replace(policy, theta=policy.theta[:, None]))
         prepared = task.prepare(episodes)
         state = task.reset(episodes, controller)
         grounded = jnp.zeros_like(state.live)

@@ -21,7 +21,7 @@ from ballmodel.distribution import BallDistribution
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, where
 from mjx_tt.env import rewards
-from mjx_tt.env.policy import PolicyController
+from mjx_tt.env.policy import Policy, PolicyController
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Episodes, Task, TaskConfig
 from mjx_tt.rally import ball_flights, human_player
 from mjx_tt.rally.ball_flights import column, homeward
@@ -29,7 +29,7 @@ from mjx_tt.rally.end_reasons import End, ending
 from mjx_tt.rally.human_player import Player, PlayerState
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
-from robot_io.contract import LIMITS, N_JOINTS, unflatten
+from robot_io.contract import LIMITS, N_JOINTS
 
 ENDLESS = 1_000_000  # touches
 FAULT = -2.0  # reward of a robot's fault, the paper's table of rewards
@@ -140,21 +140,19 @@ class RallySimulator:
         """Fresh players about to hit a first ball, the robot at home."""
         return self._start(player, without_nominal(model), key, lanes=lanes)
 
-    def shots(self, theta, mean, inverse_scale, player: Player, model: SimModel, state: RallyState, key, box=None):
+    def shots(self, policy: Policy, player: Player, model: SimModel, state: RallyState, key, box=None):
         """Every lane plays one ball: the player's answer where the rally goes on, else a new first ball.
 
-        theta (976, L), mean and inverse_scale (11, L) or (11,); player and model with leaves scalar or (L,); box: None, or
+        policy: theta (976, L), normaliser (11, L) or (11,); player and model with leaves scalar or (L,); box: None, or
         the ``Box`` beyond which balls are out of distribution. Returns the next state and the ShotResult. A lane whose
         robot stands still after a fault gets its dummy ball unseen, between two turns.
         """
-        state, result, _ = self._shots(theta, mean, inverse_scale, player, without_nominal(model), state, key, box)
+        state, result, _ = self._shots(policy, player, without_nominal(model), state, key, box)
         return replace(state, dummy=jnp.zeros_like(state.dummy)), result
 
     def play(
         self,
-        theta,
-        mean,
-        inverse_scale,
+        policy: Policy,
         player: Player,
         model: SimModel,
         key,
@@ -165,15 +163,13 @@ class RallySimulator:
     ) -> RallyResult:
         """``rallies`` rallies of every lane, one after the other, in one compiled call.
 
-        theta (976, L), mean and inverse_scale (11, L) or (11,); player and model: leaves scalar or (L,). box: what is out
+        policy: theta (976, L), normaliser (11, L) or (11,); player and model: leaves scalar or (L,). box: what is out
         of distribution, None: nothing is. A rally is broken off (End.NONE) at max_touches. capacity: human hits per lane
         that the log keeps.
         """
         box = Box.of(box) if isinstance(box, BallDistribution) else box
         return self._play(
-            jnp.asarray(theta),
-            mean,
-            inverse_scale,
+            policy,
             player,
             without_nominal(model),
             key,
@@ -193,9 +189,7 @@ class RallySimulator:
 
     def _turn(
         self,
-        theta,
-        mean,
-        inverse_scale,
+        policy: Policy,
         player: Player,
         model: SimModel,
         state: RallyState,
@@ -208,7 +202,7 @@ class RallySimulator:
         keys = iter(jax.random.split(key, 8))
         ball, first = state.ball, state.touches == 1
         sent = ball_flights.sent(model.ball, ball, self.config.period)
-        robot = self._robot(next(keys), theta, mean, inverse_scale, model, ball, state.start)
+        robot = self._robot(next(keys), policy, model, ball, state.start)
         blind = first & (jax.random.uniform(next(keys), (lanes,)) < BLIND)
         finite = robot.finite
         fault = ((robot.sums.collision > 0.0) | ~finite) & ~blind
@@ -258,7 +252,7 @@ class RallySimulator:
         )
         return after, result, state.touches + hit
 
-    def _robot(self, key, theta, mean, inverse_scale, model: SimModel, ball: BallState, start):
+    def _robot(self, key, policy: Policy, model: SimModel, ball: BallState, start):
         """The robot's part of one episode: its last state."""
         latency_key, seed_key = jax.random.split(key)
         lanes = ball.position.shape[1:]
@@ -270,7 +264,7 @@ class RallySimulator:
             model=model,
             start=start,
         )
-        task, controller = self.task, PolicyController(unflatten(theta), mean, inverse_scale)
+        task, controller = self.task, PolicyController.of(policy)
         prepared = task.prepare(episodes)
 
         def running(carry):
@@ -285,8 +279,8 @@ class RallySimulator:
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 
-    def _play_all(self, theta, mean, inverse_scale, player, model, key, box, *, rallies, max_touches, capacity):
-        lanes = theta.shape[-1]
+    def _play_all(self, policy: Policy, player, model, key, box, *, rallies, max_touches, capacity):
+        lanes = policy.theta.shape[-1]
         start_key, key = jax.random.split(key)
         lane = jnp.arange(lanes)
         state = self._start_lanes(player, model, start_key, lanes)
@@ -306,9 +300,7 @@ class RallySimulator:
         def advance(carry):
             turn, state, done, seconds, (length, end, spent), log = carry
             key_turn, key_dummy = jax.random.split(jax.random.fold_in(key, turn))
-            after, shot, touches = self._turn(
-                theta, mean, inverse_scale, player, model, state, key_turn, box, max_touches
-            )
+            after, shot, touches = self._turn(policy, player, model, state, key_turn, box, max_touches)
             # A dummy ball is a turn of its own in which nobody plays: the ball that waits is thrown afterwards.
             dummy, playing = state.dummy, done < rallies
             by_hand = jax.random.uniform(key_dummy, dummy.shape) < BY_HAND

@@ -2,7 +2,7 @@
 
 Started by ``start``; it talks with its owner over a pipe:
     to it    ("prepare",) ("arm",) ("stop",) ("reset",) ("discard",) ("pause", bool)
-             ("policy", theta, mean, inverse_scale) ("quit",)
+             ("policy", Policy) ("quit",)
     from it  ("ready", report) ("status", dict) ("episode", EpisodeSummary, ball (n, 4)) ("refused", sentence)
              ("failed", sentence) ("ended", statistics)
 When the owner goes away, the robot is stopped and the process ends.
@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 
 from robot_io import log
-from robot_io.contract import unflatten
 from robot_io.control import realtime
 from robot_io.control.bridge import Bridge, BridgeConfig, State
 from robot_io.control.config import RobotConfig, linear_axes
@@ -35,6 +34,7 @@ from robot_io.devices.tracker import Tracker, TrackerSocket
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
 from robot_io.policy.numpy_policy import StreamingPolicy
+from robot_io.policy.policy import Policy
 from robot_io.safety.gate import SafetyGate
 
 STATUS_PERIOD = 0.2  # [s]
@@ -53,14 +53,14 @@ class ControlOptions:
     attachments: tuple[tuple[str, str], ...] = ()
 
 
-def make_policy(backend: str, parameters, mean, inverse_scale):
+def make_policy(backend: str, policy: Policy):
     """A policy for the loop. Raises ValueError for an unknown backend."""
     if backend == "numpy":
-        return StreamingPolicy(parameters, mean, inverse_scale)
+        return StreamingPolicy(policy)
     if backend == "jit":
         from robot_io.policy.jax_policy import JitPolicy  # imports JAX
 
-        return JitPolicy(parameters, mean, inverse_scale)
+        return JitPolicy(policy)
     raise ValueError(f"policy backend {backend!r}, allowed: numpy, jit")
 
 
@@ -91,9 +91,7 @@ class Control:
     def __init__(self, config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
         self._config, self._options, self._pipe = config, options, pipe
         loaded = artefacts.load(options.artefact)
-        policy = make_policy(
-            options.backend, loaded.parameters, loaded.normaliser_mean, loaded.normaliser_inverse_scale
-        )
+        policy = make_policy(options.backend, loaded.policy)
         self.timings = Timings()
         self._opened: list = []
         try:
@@ -245,8 +243,7 @@ class Control:
             elif kind == "pause":
                 self.bridge.paused = bool(arguments[0])
             elif kind == "policy":
-                theta, mean, inverse_scale = arguments
-                self.bridge.set_policy(make_policy(self._options.backend, unflatten(theta), mean, inverse_scale))
+                self.bridge.set_policy(make_policy(self._options.backend, arguments[0]))
             elif kind == "quit":
                 self.bridge.stop(now)
                 self._done = True

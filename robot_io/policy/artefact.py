@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from robot_io import contract
-from robot_io.policy import numpy_policy
+from robot_io.policy.numpy_policy import StreamingPolicy
+from robot_io.policy.policy import Policy
 
 SCHEMA_VERSION = 1
 NORMALISER_FORMULA = "(observation - mean) * inverse_scale"
@@ -54,32 +55,24 @@ class ArtefactError(ValueError):
 class Artefact:
     """A verified policy.
 
-    folder                    where it was loaded from
-    digest                    SHA-256 of manifest.json: identifies the policy and everything about it
-    manifest                  the manifest as plain data
-    parameters                arrays shaped as ``contract.parameter_shapes``, float32
-    normaliser_mean           (11,) float64, in the observation's units
-    normaliser_inverse_scale  (11,) float64
-    golden_history            (8, 11, G) float32
-    golden_action             (8, G) float64: what the reference answers to ``golden_history``
+    folder          where it was loaded from
+    digest          SHA-256 of manifest.json: identifies the policy and everything about it
+    manifest        the manifest as plain data
+    policy          theta float32, normaliser float64
+    golden_history  (8, 11, G) float32
+    golden_action   (8, G) float64: the reference's answer to ``golden_history``
     """
 
     folder: Path
     digest: str
     manifest: dict[str, Any]
-    parameters: dict[str, np.ndarray]
-    normaliser_mean: np.ndarray
-    normaliser_inverse_scale: np.ndarray
+    policy: Policy
     golden_history: np.ndarray
     golden_action: np.ndarray
 
-    def forward(self, history: np.ndarray) -> np.ndarray:
-        """``policy_numpy.forward`` with this policy's numbers."""
-        return numpy_policy.forward(self.parameters, self.normaliser_mean, self.normaliser_inverse_scale, history)
-
-    def streaming(self) -> numpy_policy.StreamingPolicy:
+    def streaming(self) -> StreamingPolicy:
         """The policy for the control loop, at the start of an episode."""
-        return numpy_policy.StreamingPolicy(self.parameters, self.normaliser_mean, self.normaliser_inverse_scale)
+        return StreamingPolicy(self.policy)
 
 
 def load(folder: str | Path) -> Artefact:
@@ -108,18 +101,18 @@ def load(folder: str | Path) -> Artefact:
             "action": ((contract.N_JOINTS, golden_count), "float64"),
         },
     )
-    mean, inverse_scale = _normaliser(folder / MANIFEST, manifest["normaliser"])
+    mean, inv_std = _normaliser(folder / MANIFEST, manifest["normaliser"])
     artefact = Artefact(
         folder=folder,
         digest=sha256(contents[MANIFEST]),
         manifest=manifest,
-        parameters=parameters,
-        normaliser_mean=mean,
-        normaliser_inverse_scale=inverse_scale,
+        policy=Policy(
+            np.concatenate([parameters[name].ravel() for name in contract.parameter_shapes()]), mean, inv_std
+        ),
         golden_history=golden["history"],
         golden_action=golden["action"],
     )
-    difference = float(np.max(np.abs(artefact.forward(artefact.golden_history) - artefact.golden_action)))
+    difference = float(np.max(np.abs(artefact.policy.apply(artefact.golden_history) - artefact.golden_action)))
     if not difference <= GOLDEN_TOLERANCE:
         raise ArtefactError(
             f"{folder / GOLDEN}: this machine's policy differs from the golden outputs by {difference:.3g}, allowed is "

@@ -12,6 +12,7 @@ import os
 import secrets
 import shutil
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from robot_io import contract
 from robot_io.policy import artefact as artefacts
-from robot_io.policy import numpy_policy
 from robot_io.policy.artefact import ArtefactError
+from robot_io.policy.policy import forward
+from robot_io.policy.pytree import Policy
 
 AGREEMENT = 1e-5  # largest difference allowed between any two forms of the policy, of an action in [-1, 1]
 GOLDEN_COUNT = 64
@@ -36,13 +38,11 @@ ONNX_IR_VERSION = 8  # the IR that came with opset 17, so older runtimes load it
 
 def write(
     folder: str | Path,
-    theta: np.ndarray,
-    normaliser_mean: np.ndarray,
-    normaliser_inverse_scale: np.ndarray,
+    policy: Policy,
     provenance: dict[str, Any],
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Writes the policy theta (976,) with its normaliser (11,), (11,) as an artefact and returns ``verify``'s report.
+    """Writes a policy as an artefact and returns ``verify``'s report.
 
     ``provenance`` is plain JSON data kept in the manifest: training configuration, git state, seed, return rate.
     The artefact is built and verified in a hidden folder beside ``folder`` and renamed into place, so ``folder`` never
@@ -54,10 +54,12 @@ def write(
     """
     folder = Path(folder).resolve()
     _check_target(folder, overwrite)
-    theta = _finite(theta, "theta", (contract.n_parameters(),))
-    mean = _finite(normaliser_mean, "normaliser_mean", (contract.N_OBSERVATION,))
-    inverse_scale = _finite(normaliser_inverse_scale, "normaliser_inverse_scale", (contract.N_OBSERVATION,))
-    contents = _contents(contract.unflatten(theta), mean, inverse_scale, provenance)
+    policy = Policy(
+        _finite(policy.theta, "theta", (contract.n_parameters(),)),
+        _finite(policy.mean, "mean", (contract.N_OBSERVATION,)),
+        _finite(policy.inv_std, "inv_std", (contract.N_OBSERVATION,)),
+    )
+    contents = _contents(policy, provenance)
 
     folder.parent.mkdir(parents=True, exist_ok=True)
     staging = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}")
@@ -82,22 +84,15 @@ def verify(folder: str | Path, histories: int = 1000, seed: int = 0) -> dict[str
     form against the NumPy reference)}. Raises ArtefactError when the artefact does not load or its forms disagree.
     """
     artefact = artefacts.load(folder)
-    history = random_histories(artefact.normaliser_mean, artefact.normaliser_inverse_scale, histories, seed)
+    history = random_histories(artefact.policy, histories, seed)
     session = onnxruntime.InferenceSession(
         (artefact.folder / artefacts.ONNX).read_bytes(), providers=["CPUExecutionProvider"]
     )
     exported = jax.export.deserialize(bytearray((artefact.folder / artefacts.JAX_EXPORT).read_bytes()))
     with jax.default_device(jax.devices("cpu")[0]):
         actions = {
-            "numpy": artefact.forward(history),
-            "jit": np.asarray(
-                _jitted_forward(
-                    artefact.parameters,
-                    artefact.normaliser_mean.astype(np.float32),
-                    artefact.normaliser_inverse_scale.astype(np.float32),
-                    history,
-                )
-            ),
+            "numpy": artefact.policy.apply(history),
+            "jit": np.asarray(_jitted_forward(artefact.policy.astype(np.float32), history)),
             "onnxruntime": session.run(["action"], {"history": history})[0],
             "jax_export": np.asarray(exported.call(history)),
         }
@@ -119,39 +114,27 @@ def verify(folder: str | Path, histories: int = 1000, seed: int = 0) -> dict[str
     return report
 
 
-def forward_jax(
-    parameters: dict[str, jax.Array],
-    normaliser_mean: jax.Array,
-    normaliser_inverse_scale: jax.Array,
-    history: jax.Array,
-) -> jax.Array:
-    """``policy_numpy.forward`` for a batch in JAX: history (8, 11, B) to actions (8, B), in the inputs' precision."""
-    x = (history - normaliser_mean[:, None]) * normaliser_inverse_scale[:, None]
-    for i, (dilation, gated) in enumerate(zip(contract.DILATIONS, contract.GATED), start=1):
-        taps = jnp.stack([x[:-dilation], x[dilation:]])
-        x = jnp.einsum("kio,ktib->tob", parameters[f"conv{i}/kernel"], taps, precision=jax.lax.Precision.HIGHEST)
-        x = x + parameters[f"conv{i}/bias"][:, None]
-        if gated:
-            signal, gate = jnp.split(x, 2, axis=1)
-            x = jnp.tanh(signal) * jax.nn.sigmoid(gate)
-        else:
-            x = jnp.tanh(x)
-    return x[0]
+def _forward(policy: Policy, history: jax.Array) -> jax.Array:
+    """Histories (8, 11, B) to actions (8, B), not in an accelerator's short format."""
+    with jax.default_matmul_precision("highest"):
+        return forward(policy, history, xp=jnp)
 
 
-_jitted_forward = jax.jit(forward_jax)
+_jitted_forward = jax.jit(_forward)
 
 
-def random_histories(mean: np.ndarray, inverse_scale: np.ndarray, count: int, seed: int) -> np.ndarray:
+def random_histories(policy: Policy, count: int, seed: int) -> np.ndarray:
     """Observation histories (8, 11, count), float32, spread twice as wide as what the normaliser saw in training."""
-    scale = np.divide(1.0, inverse_scale, out=np.ones_like(inverse_scale), where=inverse_scale > 0)
+    mean, inv_std = policy.mean, policy.inv_std
+    scale = np.divide(1.0, inv_std, out=np.ones_like(inv_std), where=inv_std > 0)
     standard = np.random.default_rng(seed).standard_normal((contract.HISTORY, contract.N_OBSERVATION, count))
     return (mean[:, None] + 2.0 * scale[:, None] * standard).astype(np.float32)
 
 
-def onnx_model(parameters: dict[str, np.ndarray], mean: np.ndarray, inverse_scale: np.ndarray) -> onnx.ModelProto:
+def onnx_model(policy: Policy) -> onnx.ModelProto:
     """The policy with its normaliser as a graph of standard operators: "history" (8, 11, B) to "action" (8, B)."""
-    constants = {"mean": mean[:, None], "inverse_scale": inverse_scale[:, None]}
+    parameters = policy.parameters
+    constants = {"mean": policy.mean[:, None], "inverse_scale": policy.inv_std[:, None]}
     nodes = [
         helper.make_node("Sub", ["history", "mean"], ["centred"]),
         helper.make_node("Mul", ["centred", "inverse_scale"], ["normalised"]),
@@ -196,24 +179,22 @@ def onnx_model(parameters: dict[str, np.ndarray], mean: np.ndarray, inverse_scal
     return model
 
 
-def jax_export(parameters: dict[str, np.ndarray], mean: np.ndarray, inverse_scale: np.ndarray) -> bytes:
+def jax_export(policy: Policy) -> bytes:
     """The policy with its numbers inside, serialised by ``jax.export`` for the CPU, any batch size."""
-    policy = jax.jit(lambda history: forward_jax(parameters, mean, inverse_scale, history))
+    function = jax.jit(partial(_forward, policy))
     shape = jax.export.symbolic_shape(f"{contract.HISTORY}, {contract.N_OBSERVATION}, batch")
-    exported = jax.export.export(policy, platforms=["cpu"])(jax.ShapeDtypeStruct(shape, jnp.float32))
+    exported = jax.export.export(function, platforms=["cpu"])(jax.ShapeDtypeStruct(shape, jnp.float32))
     return bytes(exported.serialize())
 
 
-def _contents(
-    parameters: dict[str, np.ndarray], mean: np.ndarray, inverse_scale: np.ndarray, provenance: dict[str, Any]
-) -> dict[str, bytes]:
-    history = random_histories(mean, inverse_scale, GOLDEN_COUNT, seed=1)
-    action = numpy_policy.forward(parameters, mean, inverse_scale, history)
+def _contents(policy: Policy, provenance: dict[str, Any]) -> dict[str, bytes]:
+    history = random_histories(policy, GOLDEN_COUNT, seed=1)
+    action = policy.apply(history)
     contents = {
-        artefacts.PARAMETERS: _npz(parameters),
+        artefacts.PARAMETERS: _npz(policy.parameters),
         artefacts.GOLDEN: _npz({"history": history, "action": action}),
-        artefacts.ONNX: onnx_model(parameters, mean, inverse_scale).SerializeToString(),
-        artefacts.JAX_EXPORT: jax_export(parameters, mean, inverse_scale),
+        artefacts.ONNX: onnx_model(policy).SerializeToString(),
+        artefacts.JAX_EXPORT: jax_export(policy),
     }
     manifest = {
         "schema_version": artefacts.SCHEMA_VERSION,
@@ -221,8 +202,8 @@ def _contents(
         "architecture": artefacts.architecture(),
         "normaliser": {
             "formula": artefacts.NORMALISER_FORMULA,
-            "mean": [float(v) for v in mean],
-            "inverse_scale": [float(v) for v in inverse_scale],
+            "mean": [float(v) for v in policy.mean],
+            "inverse_scale": [float(v) for v in policy.inv_std],
         },
         "golden": {"file": artefacts.GOLDEN, "count": GOLDEN_COUNT, "tolerance": artefacts.GOLDEN_TOLERANCE},
         "files": {name: artefacts.sha256(content) for name, content in contents.items()},

@@ -1,32 +1,30 @@
-"""The policy compiled by JAX, for the control loop: the same numbers as ``policy_numpy.StreamingPolicy``.
+"""The policy compiled by JAX, for the control loop: the same numbers as ``numpy_policy.StreamingPolicy``.
 
-The only module besides ``export`` that needs JAX. It computes the whole history at every tick: on one column that costs
+It computes the whole history at every tick: on one column that costs
 less than a second call would.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from robot_io import contract
-from robot_io.policy.export import forward_jax
+from robot_io.policy.policy import forward
+from robot_io.policy.pytree import Policy
 
 
 class JitPolicy:
     """Fed one observation (11,) per tick. Parameters are arguments, so that another policy does not compile again."""
 
-    def __init__(
-        self, parameters: Mapping[str, np.ndarray], normaliser_mean: np.ndarray, normaliser_inverse_scale: np.ndarray
-    ) -> None:
+    def __init__(self, policy: Policy) -> None:
         # Answers come from the calling thread at once, not from a queue: a fifth of the latency.
         jax.config.update("jax_cpu_enable_async_dispatch", False)
-        arguments = (dict(parameters), normaliser_mean, normaliser_inverse_scale)
-        # On the device once, not at every tick.
-        self._arguments = jax.device_put(jax.tree.map(lambda x: np.asarray(x, np.float32), arguments))
-        self._forward = jax.jit(forward_jax)
+        self._policy = jax.device_put(policy.astype(np.float32))  # once, not at every tick
+        self._forward = jax.jit(partial(forward, xp=jnp))
         self._history = np.zeros((contract.HISTORY, contract.N_OBSERVATION, 1), np.float32)
         self._empty = True
         self.step(np.zeros(contract.N_OBSERVATION))  # compiles
@@ -46,4 +44,4 @@ class JitPolicy:
         else:
             self._history[:-1] = self._history[1:]
             self._history[-1, :, 0] = observation
-        return np.asarray(self._forward(*self._arguments, self._history))[:, 0]
+        return np.asarray(self._forward(self._policy, self._history))[:, 0]

@@ -17,7 +17,6 @@ from bgs import normalizer
 from experiments import cli
 from experiments.errors import RunError
 from experiments.runs import checkpoint, load_policy
-from robot_io import contract
 from robot_io.policy import artefact
 from tests.support.paths import ROOT
 
@@ -95,8 +94,7 @@ def test_train_leaves_evaluation_artefact_pictures_and_measurements(trained):
     assert sum(report["outcomes"].values()) == report["episodes"] == 8
     arrays, notes = checkpoint.read_latest(run / "checkpoints")
     exported = artefact.load(run / "artefact")
-    flat = np.concatenate([exported.parameters[name].ravel() for name in contract.parameter_shapes()])
-    np.testing.assert_array_equal(flat, arrays["bgs.average"])
+    np.testing.assert_array_equal(exported.policy.theta, arrays["bgs.average"])
     assert exported.manifest["provenance"]["config"]["name"] == "tiny"
     rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert [row["update"] for row in rows] == [1, 2, 3] and notes["update"] == 3
@@ -180,15 +178,15 @@ def test_selection_needs_seeds(tmp_path, capsys):
 def test_policy_is_the_same_from_run_and_from_artefact(trained):
     """An artefact keeps the normaliser, not the statistics: what training continues from gives the same normaliser."""
     _, runs, _ = trained
-    run = load_policy.load(runs / "tiny")
+    run = load_policy.load(runs / "tiny").policy
     for folder in (runs / "tiny", runs / "tiny" / "artefact"):
-        loaded = load_policy.load(folder)
+        loaded = load_policy.load(folder).policy
         theta, statistics = load_policy.load_statistics(folder)
         np.testing.assert_array_equal(loaded.theta, run.theta)
         np.testing.assert_array_equal(theta, run.theta)
-        for mean, inverse_scale in ((loaded.mean, loaded.inverse_scale), normalizer.normaliser(statistics)):
+        for mean, inverse_scale in ((loaded.mean, loaded.inv_std), normalizer.normaliser(statistics)):
             np.testing.assert_allclose(mean, run.mean, rtol=1e-6)
-            np.testing.assert_allclose(inverse_scale, run.inverse_scale, rtol=1e-5)
+            np.testing.assert_allclose(inverse_scale, run.inv_std, rtol=1e-5)
 
 
 def test_render(trained, tmp_path):

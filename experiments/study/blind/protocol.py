@@ -165,7 +165,7 @@ def _check_different(loaded: dict[str, Artefact]) -> None:
     """Raises ConfigError where two models are one policy, however often it was exported."""
     models: dict[str, str] = {}
     for model, policy in loaded.items():
-        numbers = (*policy.parameters.values(), policy.normaliser_mean, policy.normaliser_inverse_scale)
+        numbers = (*policy.policy.parameters.values(), policy.policy.mean, policy.policy.inv_std)
         digest = hashlib.sha256(b"".join(a.tobytes() for a in numbers)).hexdigest()
         if digest in models:
             raise ConfigError(

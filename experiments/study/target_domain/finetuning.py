@@ -25,6 +25,7 @@ from experiments.evaluation import evaluate
 from experiments.study.target_domain import hidden_effects
 from experiments.training.update import TrainState
 from mjx_tt.env import rewards
+from mjx_tt.env.policy import Policy
 from mjx_tt.env.task import MISSED, RETURNED, TaskConfig
 from mjx_tt.rally import human_player
 from mjx_tt.rally.human_player import Player
@@ -117,13 +118,10 @@ class VirtualReality:
         ]
         return Cycle(TrainState(state, statistics, ask_key), rows, measured.trajectories(session))
 
-    def score(self, player: Player, policy, balls: int, key) -> float:
-        """The paper's sparse reward by which a seed is chosen, over at least ``balls`` balls of rallies with the player.
-
-        policy: parameters (976,) and normaliser (11,), (11,).
-        """
+    def score(self, player: Player, policy: Policy, balls: int, key) -> float:
+        """The paper's sparse reward by which a seed is chosen, over at least ``balls`` balls of rallies with the player."""
         turns = -(-balls // SELECTION_LANES)
-        outcome, fault = self._compared(*map(jnp.asarray, policy), player, self.known, key, turns=turns)
+        outcome, fault = self._compared(policy, player, self.known, key, turns=turns)
         return evaluate.sparse_reward(np.asarray(outcome), np.asarray(fault))
 
     def _updates_of(
@@ -139,7 +137,7 @@ class VirtualReality:
     ):
         """``_chunk`` updates: state and rally after them, and each one's (ShotResult, BGSInfo)."""
         settings, lanes = self._settings, self._settings.episodes_per_update
-        frozen = [jnp.broadcast_to(x[:, None], (x.shape[0], lanes)) for x in normalizer.normaliser(statistics)]
+        frozen = [_per_lane(x, lanes) for x in normalizer.normaliser(statistics)]
 
         def update(carry, _):
             state, rally = carry
@@ -147,7 +145,7 @@ class VirtualReality:
             members = strategy.population(state, directions, config)
             theta = jnp.repeat(members, settings.repeats, axis=1)  # the lanes of a member side by side
             shot_key = jax.random.fold_in(play_key, state.updates)
-            rally, shots = self.simulator.shots(theta, *frozen, player, model, rally, shot_key)
+            rally, shots = self.simulator.shots(Policy(theta, *frozen), player, model, rally, shot_key)
             returns = self._returns(shots).reshape(2 * settings.pairs, settings.repeats).mean(axis=1)
             state, info = strategy.tell(state, directions, *jnp.split(returns, 2), config)
             return (state, rally), (shots, info)
@@ -160,13 +158,13 @@ class VirtualReality:
         terms = shots.terms.at[rewards.TERMS.index("fault")].set(jnp.where(shots.fault, FAULT, 0.0))
         return jnp.where(shots.finite, sum(w * terms[i] for i, w in enumerate(self._weights) if w), jnp.nan)
 
-    def _shots_of(self, theta, mean, inverse_scale, player: Player, model: SimModel, key, turns: int):
+    def _shots_of(self, policy: Policy, player: Player, model: SimModel, key, turns: int):
         """Outcomes and faults (turns, SELECTION_LANES) of one policy."""
-        policy = [jnp.broadcast_to(x[:, None], (x.shape[0], SELECTION_LANES)) for x in (theta, mean, inverse_scale)]
+        policy = jax.tree.map(lambda x: _per_lane(x, SELECTION_LANES), policy)
         start_key, play_key = jax.random.split(key)
 
         def shoot(rally, turn):
-            rally, shots = self.simulator.shots(*policy, player, model, rally, jax.random.fold_in(play_key, turn))
+            rally, shots = self.simulator.shots(policy, player, model, rally, jax.random.fold_in(play_key, turn))
             return rally, (shots.outcome, shots.fault | ~shots.finite)
 
         rally = self.simulator.start(player, model, start_key, SELECTION_LANES)
@@ -181,3 +179,8 @@ class VirtualReality:
             "hit_rate": float((shots.outcome != MISSED).mean()),
             "fault_rate": float(shots.fault.mean()),
         }
+
+
+def _per_lane(x, lanes: int):
+    """One column for each of the lanes: (n,) -> (n, L)."""
+    return jnp.broadcast_to(x[:, None], (x.shape[0], lanes))

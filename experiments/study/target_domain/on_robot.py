@@ -26,7 +26,7 @@ from experiments.errors import ConfigError, checked
 from experiments.finetuning import loop
 from experiments.finetuning.robot import LockStepRobot
 from experiments.runs import load_policy
-from experiments.runs.load_policy import Policy
+from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
 from experiments.study.analysis import scoring
 from experiments.study.blind import protocol
@@ -88,13 +88,13 @@ class RobotWorld:
         change = found["difference"]["mean_return"]
         return measured, f"{settings.updates} updates, {len(measured):,} balls, mean return changed by {change:+.2f}"
 
-    def score(self, player: str, name: str) -> Callable[[Policy], float] | None:
+    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
         """Plays ``selection_episodes`` balls with each policy and counts +1 hit, +1 returned, -2 fault."""
         if self._study.simulation.seeds == 1:
             return None
         return lambda trained: self._score(player, name, trained)
 
-    def _score(self, player: str, name: str, trained: Policy) -> float:
+    def _score(self, player: str, name: str, trained: TrainedPolicy) -> float:
         balls, robot = self._study.simulation.selection_episodes, self._study.robot
         experiment = loop.experiment_of(trained.source)
         if robot == session.LOCK_STEP:
@@ -112,9 +112,8 @@ class RobotWorld:
         return (found["hit"] + found["returned"] - 2.0 * len(found["faults"])) / found["episodes"]
 
 
-def _lock_step(robot: LockStepRobot, trained: Policy, number: int) -> float:
-    parts = (np.ascontiguousarray(a, np.float32) for a in (trained.theta, trained.mean, trained.inverse_scale))
-    summary = robot.play(*parts, number).summary
+def _lock_step(robot: LockStepRobot, trained: TrainedPolicy, number: int) -> float:
+    summary = robot.play(trained.policy.astype(np.float32), number).summary
     return -2.0 if summary.fault else float(summary.outcome != "missed") + float(summary.outcome == "returned")
 
 
@@ -122,7 +121,7 @@ def _seed(name: str) -> int:
     return zlib.crc32(name.encode()) >> 1
 
 
-def exported(trained: Policy, console: Console) -> Path:
+def exported(trained: TrainedPolicy, console: Console) -> Path:
     """The artefact of a run, exported if it has none. Raises ConfigError for a policy that the robot cannot run."""
     folder = Run(trained.source).artefact
     if not (folder / "manifest.json").exists():

@@ -15,7 +15,7 @@ from ballmodel.trajectory import Dataset
 from experiments.config import build
 from experiments.config.study import Study
 from experiments.runs import checkpoint, load_policy, run_dir
-from experiments.runs.load_policy import Policy
+from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import CONFIG, Run
 from experiments.study.target_domain.finetuning import VirtualReality
 
@@ -31,7 +31,7 @@ class World(Protocol):
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         """Fine-tunes the policy of the run ``source`` into the run ``folder``; the player's hits and a sentence."""
 
-    def score(self, player: str, name: str) -> Callable[[Policy], float] | None:
+    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
         """What says how good a policy is with the player; None where that is not asked."""
 
 
@@ -66,11 +66,11 @@ class VirtualWorld:
         text = f"{real_updates} updates, {len(cycle.balls):,} balls, returned {first:.0%} at first, {last:.0%} at last"
         return Dataset(cycle.balls, name), text
 
-    def score(self, player: str, name: str) -> Callable[[Policy], float] | None:
+    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
         if self._study.simulation.seeds == 1:
             return None
         person, balls, key = self.reality.player(player), self._study.simulation.selection_episodes, self._key(name)
-        return lambda p: self.reality.score(person, (p.theta, p.mean, p.inverse_scale), balls, key)
+        return lambda p: self.reality.score(person, p.policy, balls, key)
 
 
 def _write_lines(path: Path, rows: list[dict]) -> None:

@@ -25,6 +25,7 @@ from robot_io.emulator.config import RigParams
 from robot_io.emulator.processes import Rig, free_ports
 from robot_io.errors import DeviceError, RefusedError
 from robot_io.policy import artefact, export
+from robot_io.policy.policy import Policy
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def policy(tmp_path_factory):
     folder = tmp_path_factory.mktemp("policy") / "artefact"
     theta = 0.05 * np.random.default_rng(0).standard_normal(contract.n_parameters())
     mean, scale = np.zeros(contract.N_OBSERVATION), np.ones(contract.N_OBSERVATION)
-    export.write(folder, theta, mean, scale, {"config": {"balls": "narrow"}})
+    export.write(folder, Policy(theta, mean, scale), {"config": {"balls": "narrow"}})
     return folder
 
 

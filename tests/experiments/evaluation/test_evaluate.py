@@ -18,6 +18,7 @@ from experiments.evaluation.evaluate import Played
 from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
 from mjx_tt.env import rewards
+from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import RolloutResult, Simulator
 from mjx_tt.env.task import HIT, MISSED, OUT_OF_REACH, RETURNED
 from robot_io.contract import LIMITS, N_OBSERVATION, n_parameters
@@ -85,7 +86,7 @@ def test_an_evaluation_plays_the_spin_of_its_model():
     experiment = build.experiment(config.parse(data, "a"), "a")
     evaluator = evaluate.Evaluator(Simulator(experiment.task), experiment, 32, jax.random.key(0))
     eleven = np.ones(N_OBSERVATION, np.float32)
-    played = evaluator.play(np.zeros(n_parameters(), np.float32), 0.0 * eleven, eleven, jax.random.key(1))
+    played = evaluator.play(Policy(np.zeros(n_parameters(), np.float32), 0.0 * eleven, eleven), jax.random.key(1))
     order = np.argsort(np.asarray(evaluator.balls.arrival))
     missed = played.outcome.ravel() == MISSED
     assert missed.sum() > 16

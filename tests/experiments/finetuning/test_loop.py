@@ -35,7 +35,7 @@ from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journ
 from experiments.finetuning.robot import LockStepRobot, NoOperator, PlayedBall
 from experiments.runs import checkpoint, load_policy, metrics
 from experiments.runs.run_dir import Run
-from mjx_tt.env.policy import initial_theta
+from mjx_tt.env.policy import Policy, initial_theta
 from robot_io import contract
 from robot_io.control.episode import EpisodeSummary
 from robot_io.emulator.ball_launcher import Throws
@@ -62,7 +62,7 @@ def source(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("policy") / "artefact"
     experiment = config.parse({"name": "source", "balls": "player3/M0"}, "test")
     theta = np.asarray(initial_theta(jax.random.key(3), 0.1))
-    export.write(folder, theta, MEAN, INVERSE_SCALE, {"config": experiment.to_dict()})
+    export.write(folder, Policy(theta, MEAN, INVERSE_SCALE), {"config": experiment.to_dict()})
     return folder
 
 
@@ -75,8 +75,9 @@ class Toy:
         self.played: list[tuple[np.ndarray, np.ndarray, np.ndarray, int]] = []
         self.fault_at = fault_at
 
-    def play(self, theta, mean, inverse_scale, episode_number) -> PlayedBall:
-        self.played.append((theta.copy(), mean.copy(), inverse_scale.copy(), episode_number))
+    def play(self, policy, episode_number) -> PlayedBall:
+        theta = policy.theta
+        self.played.append((theta.copy(), policy.mean.copy(), policy.inv_std.copy(), episode_number))
         noise = np.random.default_rng(episode_number).normal()
         closest = 0.2 + float(np.linalg.norm(theta[:3] - 0.3)) + 0.002 * noise
         fault = "limit" if episode_number == self.fault_at else None
@@ -178,7 +179,7 @@ def test_an_update_follows_the_journal_by_the_papers_rule(source, tmp_path):
     """theta and every member are computed again in NumPy from the returns in the journal."""
     toy, settings = Toy(fault_at=9), FineTuning(updates=2, pairs=3, repeats=2, evaluation_balls=2)
     tune(source, tmp_path / "run", toy, updates=2, evaluation_balls=2)
-    theta = load_policy.load(source).theta.astype(np.float32)
+    theta = load_policy.load(source).policy.theta.astype(np.float32)
     bgs = build.bgs_config(settings.optimiser(), 2)
     trained = [entry for entry in entries(tmp_path / "run") if entry.phase == TRAINING]
     assert [entry.episode for entry in trained] == list(range(24))
@@ -226,11 +227,12 @@ def test_the_artefact_is_what_the_robot_played_last(source, tmp_path):
     tune(source, tmp_path / "run", toy, average=0.5)
     exported = artefacts.load(tmp_path / "run" / "artefact")
     theta, mean, inverse_scale, _ = toy.played[-1]
-    np.testing.assert_array_equal(exported.normaliser_mean, mean)
-    np.testing.assert_array_equal(exported.normaliser_inverse_scale, inverse_scale)
-    for name, wanted in contract.unflatten(theta).items():
-        np.testing.assert_array_equal(exported.parameters[name], wanted)
-    np.testing.assert_array_equal(toy.played[0][0], load_policy.load(source).theta)  # before: the policy as it came
+    np.testing.assert_array_equal(exported.policy.mean, mean)
+    np.testing.assert_array_equal(exported.policy.inv_std, inverse_scale)
+    np.testing.assert_array_equal(exported.policy.theta, theta)
+    np.testing.assert_array_equal(
+        toy.played[0][0], load_policy.load(source).policy.theta
+    )  # before: the policy as it came
     np.testing.assert_allclose(mean, MEAN, rtol=1e-6)
     np.testing.assert_allclose(inverse_scale, INVERSE_SCALE, rtol=1e-6)
 
@@ -470,14 +472,14 @@ def test_the_emulated_robots_balls_make_a_human_distribution(tmp_path):
     robot, thrown, played = LockStepRobot(throws()), throws(), []
     theta = np.zeros(contract.n_parameters(), np.float32)
     for number in range(BALLS):
-        ball = robot.play(theta, MEAN, INVERSE_SCALE, number)
+        ball = robot.play(Policy(theta, MEAN, INVERSE_SCALE), number)
         assert np.all(np.diff(ball.trajectory[:, 0]) > 0)
         np.testing.assert_allclose(ball.trajectory[0, 1:], thrown.position[:, number], atol=0.1)
         played.append(Entry(BEFORE, 0, 0, number, number, ball.summary, {}, 0.0, False, ball.trajectory))
-    again = robot.play(theta, MEAN, INVERSE_SCALE, 4)
+    again = robot.play(Policy(theta, MEAN, INVERSE_SCALE), 4)
     np.testing.assert_array_equal(again.trajectory, played[4].trajectory)
     assert again.summary == played[4].summary
-    other = robot.play(theta, MEAN, INVERSE_SCALE, 4 + BALLS)  # the same ball, seen with other noise
+    other = robot.play(Policy(theta, MEAN, INVERSE_SCALE), 4 + BALLS)  # the same ball, seen with other noise
     assert not np.array_equal(other.trajectory[:5], again.trajectory[:5])
 
     path = tmp_path / "balls.csv"

@@ -16,6 +16,7 @@ from experiments.errors import ConfigError
 from experiments.study.analysis import scoring
 from experiments.study.blind import protocol
 from robot_io.policy import artefact, export
+from robot_io.policy.policy import Policy
 
 MODELS = ("is2r-ft100", "s2r-ft100", "oracle-ft")
 
@@ -57,7 +58,7 @@ def artefacts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("policies")
     for k, model in enumerate(MODELS):
         theta = np.random.default_rng(k).normal(0.0, 0.1, 976)
-        export.write(folder / model / "artefact", theta, np.zeros(11), np.ones(11), {"model": model})
+        export.write(folder / model / "artefact", Policy(theta, np.zeros(11), np.ones(11)), {"model": model})
     return folder
 
 
@@ -114,8 +115,7 @@ def test_people_evaluate_without_knowing_what(tmp_path, artefacts, capsys):
         code = str(mine.blind[0])
         # The code is the folder whose policy is this model's: its numbers say so.
         played, original = (artefact.load(f) for f in (folder / "policies" / code, artefacts / model / "artefact"))
-        for name, array in original.parameters.items():
-            np.testing.assert_array_equal(played.parameters[name], array)
+        np.testing.assert_array_equal(played.policy.theta, original.policy.theta)
         assert mine.rally.tolist() == list(range(1, 71))  # as on the sheet
         assert mine.length.tolist() == lengths[code].tolist()
         assert sorted(mine.length[mine.selected]) == sorted(lengths[code][:60])[-50:]
@@ -187,7 +187,7 @@ def test_a_copy_does_not_say_which_model_it_is(tmp_path, artefacts):
 def test_one_policy_under_two_names_is_refused(tmp_path, artefacts, capsys):
     first = artefacts / MODELS[0]
     theta = np.random.default_rng(0).normal(0.0, 0.1, 976)
-    export.write(tmp_path / "again", theta, np.zeros(11), np.ones(11), {"model": "another name"})
+    export.write(tmp_path / "again", Policy(theta, np.zeros(11), np.ones(11)), {"model": "another name"})
     for other in (first, first / "artefact", tmp_path / "again"):
         assert cli.main(["blind", "make", str(tmp_path / "b"), f"a={first}", f"b={other}", "--trainer", "player3"]) == 1
         assert "a and b: are the same policy" in capsys.readouterr().err

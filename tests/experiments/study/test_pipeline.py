@@ -40,7 +40,7 @@ from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.on_robot import blind_steps
 from experiments.study.workflow import Journal, Step, Waiting, remaining, run_all, unfinished
 from mjx_tt.env import rewards
-from mjx_tt.env.policy import initial_theta
+from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.rally import human_player
 from mjx_tt.rally.simulator import Box
 from mjx_tt.sim import model as models
@@ -314,8 +314,7 @@ def test_an_update_is_the_papers_formula_of_what_the_robot_measures(virtual):
         members = np.concatenate([now[:, None] + 0.025 * delta, now[:, None] - 0.025 * delta], axis=1)
         shot_key = jax.random.fold_in(play_key, number)
         rally, shots = virtual.simulator.shots(
-            np.repeat(members, tuning.repeats, axis=1).astype(np.float32),
-            *frozen,
+            Policy(np.repeat(members, tuning.repeats, axis=1).astype(np.float32), *frozen),
             person,
             virtual.known,
             rally,
@@ -419,11 +418,13 @@ def loop(what: study_config.Study, folder: Path) -> None:
 def test_a_study_leaves_what_it_says(finished):
     player = finished / "seed0" / "player3"
     for key in schedule.MODELS:
-        theta, mean, inverse_scale = training.load(player / key)
-        assert theta.shape == (976,) and mean.shape == inverse_scale.shape == (N_OBSERVATION,)
-        assert np.isfinite(theta).all()
+        kept = Policy.load(player / key / training.POLICY)
+        assert kept.theta.shape == (976,) and kept.mean.shape == kept.inv_std.shape == (N_OBSERVATION,)
+        assert np.isfinite(kept.theta).all()
     # Weights are carried on: from simulation to reality and back.
-    tuned, trained, other = (training.load(player / key)[0] for key in ("is2r-ft35", "is2r-sim1", "oracle-sim"))
+    tuned, trained, other = (
+        Policy.load(player / key / training.POLICY).theta for key in ("is2r-ft35", "is2r-sim1", "oracle-sim")
+    )
     assert cosine(tuned, trained) > 0.9 and abs(cosine(other, trained)) < 0.3
     started = load_policy.load(player / "is2r-sim2" / "training" / "seed0").config.initial_policy
     assert started == str((player / "is2r-ft35").resolve())
@@ -479,11 +480,11 @@ def test_an_effect_is_left_out_for_the_policy_it_says(finished):
     rows = effect_costs.read(finished / "seed0" / effect_costs.FILE)
     assert [(r.model, r.without) for r in rows] == [(m, w) for m in effect_costs.MODELS for w in effect_costs.WORLDS]
     player = finished / "seed0" / "player3"
-    policies = [training.load(player / model) for model in effect_costs.MODELS]
+    policies = [Policy.load(player / model / training.POLICY) for model in effect_costs.MODELS]
     human = {"is2r-sim1": "M0", "s2r-ft100": "M0"}
     boxes = [load_distribution(player / "balls" / f"human_{human.get(m, 'M2')}.yaml") for m in effect_costs.MODELS]
     layout = np.array([(w, m) for w in range(len(effect_costs.WORLDS)) for m in range(6) for _ in range(lanes)]).T
-    theta, mean, inverse_scale = (np.stack(part, axis=-1)[:, layout[1]] for part in zip(*policies))
+    policy = jax.tree.map(lambda *parts: np.stack(parts, axis=-1)[:, layout[1]], *policies)
     low, high = (np.stack(ends, axis=-1)[:, layout[1]] for ends in zip(*((b.low, b.high) for b in map(Box.of, boxes))))
     for world in ("latency", "spin"):
         drawn = hidden_effects.draw(0, ("drives", "encoders", world))
@@ -491,7 +492,7 @@ def test_an_effect_is_left_out_for_the_policy_it_says(finished):
         person = human_player.without_spin(person) if world == "spin" else person
         model, person = (jax.tree.map(lambda x: jnp.full(layout.shape[1], x, jnp.float32), t) for t in (drawn, person))
         result = VirtualReality(what, 0).simulator.play(
-            theta, mean, inverse_scale, person, model, build.key(0, evaluation.EFFECTS), 5, Box(low, high), 8
+            policy, person, model, build.key(0, evaluation.EFFECTS), 5, Box(low, high), 8
         )
         for m, name in enumerate(effect_costs.MODELS):
             mine = (layout[0] == effect_costs.WORLDS.index(world)) & (layout[1] == m)
@@ -514,7 +515,8 @@ def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
     text = training.simulate(study(), by_key["is2r-sim1"], tmp_path / "again", human, None, "again", quiet(), None)
     assert text.startswith("6 updates")
     assert not compiled
-    one, two = training.load(tmp_path / "again")[0], training.load(finished / "seed0" / "player3" / "is2r-sim1")[0]
+    places = tmp_path / "again", finished / "seed0" / "player3" / "is2r-sim1"
+    one, two = (Policy.load(place / training.POLICY).theta for place in places)
     assert np.abs(one - two).max() > 1e-3  # another seed and other balls
 
 
@@ -587,7 +589,7 @@ def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
     measured = (folder / "seed0" / "player3" / "balls" / "D1.csv").read_text().splitlines()
     assert measured[0] == "session,trajectory,t,x,y,z" and len(measured) > 20
     assert (folder / "seed0" / "player3" / "is2r-ft35" / "journal.jsonl").read_text().count("\n") == 2 + 2 + 2
-    theta, _, _ = training.load(folder / "seed0" / "player3" / "is2r-ft35")
+    theta = Policy.load(folder / "seed0" / "player3" / "is2r-ft35" / training.POLICY).theta
     assert np.isfinite(theta).all()
 
 
@@ -610,4 +612,4 @@ def test_people_play_under_code_names_and_the_key_opens_when_the_sheet_is_full(f
     for model, code in codes.items():
         assert set(rallies.length[rallies.model == model].tolist()) == {length[code]}
     played = load_policy.load(folder / protocol.POLICIES / codes["is2r-ft65"])
-    np.testing.assert_array_equal(played.theta, training.load(player / "is2r-ft65")[0])
+    np.testing.assert_array_equal(played.policy.theta, Policy.load(player / "is2r-ft65" / training.POLICY).theta)

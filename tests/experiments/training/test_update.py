@@ -18,6 +18,7 @@ from experiments.config import build, experiment
 from experiments.training import update as training
 from experiments.training.update import Trainer
 from mjx_tt.env import rewards
+from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import SimModel
@@ -97,7 +98,7 @@ def test_update_is_the_step_that_the_returns_call_for(trainer, run):
     before, after = run[0][0], run[0][1]
     directions, episodes = drawn(trainer, before)
     theta = strategy.population(before.bgs, directions, BGS)
-    result = jax.jit(trainer.simulator.rollout)(theta, *normalizer.normaliser(before.statistics), episodes)
+    result = jax.jit(trainer.simulator.rollout)(Policy(theta, *normalizer.normaliser(before.statistics)), episodes)
     returns = np.asarray(result.returns, np.float64).mean(axis=0)
     plus, minus = returns[:PAIRS], returns[PAIRS:]
     gradient = np.asarray(directions) @ (plus - minus) / (PAIRS * returns.std())

@@ -10,11 +10,12 @@ import pytest
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
 from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis
-from mjx_tt.env.policy import apply, initial_theta
+from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import HIT, MISSED, RETURNED, TaskConfig
 from mjx_tt.sim.model import Range, SimModel
 from robot_io.contract import HISTORY, N_OBSERVATION
+from robot_io.policy.policy import forward
 
 B, STEPS = 64, 130
 MEAN = np.array([0.0, 0.5, 0.3, *[0.1] * 8], np.float32)
@@ -47,7 +48,7 @@ def played(env, theta):
     def policy(observation):
         history = jnp.moveaxis(observation.reshape(B, HISTORY, N_OBSERVATION), 0, -1)
         normalised = (history - MEAN[:, None]) * INVERSE_SCALE[:, None]
-        return apply(theta, normalised).T
+        return forward(Policy(theta, np.zeros(11), np.ones(11)), normalised, xp=jnp).T
 
     @jax.jit
     def play(episodes):
@@ -67,7 +68,7 @@ def simulated(env, theta, played):
     simulator = env._simulator
     episodes = jax.tree.map(lambda x: x[..., None, :] if x.ndim else x, played[0])
     columns = jnp.repeat(theta[:, None], B, axis=1)
-    result = jax.jit(simulator.rollout)(columns, MEAN, INVERSE_SCALE, episodes)
+    result = jax.jit(simulator.rollout)(Policy(columns, MEAN, INVERSE_SCALE), episodes)
     return jax.tree.map(np.asarray, result)
 
 

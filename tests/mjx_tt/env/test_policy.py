@@ -1,6 +1,8 @@
-"""The policy's two JAX forms against each other and against the NumPy reference."""
+"""The policy's forms in JAX, streaming and full, against each other and against the NumPy reference."""
 
 from __future__ import annotations
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +10,11 @@ import numpy as np
 import pytest
 
 from mjx_tt.env import policy
-from mjx_tt.env.policy import PolicyController
-from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION, n_parameters, unflatten
-from robot_io.policy import numpy_policy
+from mjx_tt.env.policy import Policy, PolicyController
+from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION, n_parameters
 from robot_io.policy.jax_policy import JitPolicy
+from robot_io.policy.numpy_policy import StreamingPolicy
+from robot_io.policy.policy import forward
 
 TICKS, P, R = 12, 5, 3
 PRECISION = pytest.mark.parametrize(("x64", "atol"), [(True, 1e-12), (False, 1e-6)], ids=["float64", "float32"])
@@ -29,13 +32,19 @@ def draw(x64, seed=0):
 @jax.jit
 def streamed(theta, mean, inverse_scale, observations):
     """Actions (ticks, 8, B) of the controller that the rollout uses."""
-    controller = PolicyController(unflatten(theta), mean, inverse_scale)
+    controller = PolicyController.of(Policy(theta, mean, inverse_scale))
 
     def tick(state, n):
         action, state = controller.act(n, state, observations[n])
         return state, action
 
     return jax.lax.scan(tick, controller.start(observations[0]), jnp.arange(TICKS))[1]
+
+
+def in_full(theta, mean, inverse_scale, observations):
+    """Actions (ticks, 8, B) of one policy, every tick from its whole history."""
+    full = jax.jit(jax.vmap(partial(forward, xp=jnp), (None, 0)))
+    return np.asarray(full(Policy(theta, mean, inverse_scale), histories(observations)))
 
 
 def histories(observations):
@@ -56,8 +65,7 @@ def test_full_equals_streaming(x64, atol):
     with jax.enable_x64(x64):
         theta, mean, inverse_scale, observations = draw(x64)
         theta = theta[:, 0]
-        x = (observations - mean[:, None]) * inverse_scale[:, None]
-        full = np.asarray(jax.jit(jax.vmap(policy.apply, (None, 0)))(theta, histories(x)))
+        full = in_full(theta, mean, inverse_scale, observations)
         stream = streamed(theta, mean, inverse_scale, observations)
     assert full.shape == (TICKS, N_JOINTS, R * P) and full.dtype == theta.dtype
     np.testing.assert_allclose(stream, full, rtol=0, atol=atol)
@@ -70,14 +78,14 @@ def test_both_forms_equal_numpy_for_every_perturbation(x64, atol):
     with jax.enable_x64(x64):
         theta, mean, inverse_scale, observations = draw(x64, seed=1)
         actions = np.asarray(streamed(theta, mean, inverse_scale, observations))
-        x = (observations - mean[:, None]) * inverse_scale[:, None]
-        full = np.asarray(jax.jit(jax.vmap(policy.apply, (None, 0)))(theta, histories(x)))
+        each = [in_full(theta[:, p], mean, inverse_scale, observations[..., p::P]) for p in range(P)]
+    full = np.stack(each, axis=-1).reshape(actions.shape)
     for b in range(R * P):
-        parameters = unflatten(theta[:, b % P])
-        exact = [numpy_policy.forward(parameters, mean, inverse_scale, h) for h in histories(observations[..., b])]
+        one = Policy(theta[:, b % P], mean, inverse_scale)
+        exact = [one.apply(h) for h in histories(observations[..., b])]
         np.testing.assert_allclose(actions[..., b], exact, rtol=0, atol=atol)
         np.testing.assert_allclose(full[..., b], exact, rtol=0, atol=atol)
-        robot = numpy_policy.StreamingPolicy(parameters, mean, inverse_scale)
+        robot = StreamingPolicy(one)
         np.testing.assert_allclose([robot.step(o) for o in observations[..., b]], exact, rtol=0, atol=1e-12)
 
 
@@ -107,10 +115,9 @@ def control_process():
 
 def test_the_compiled_policy_of_the_control_loop_equals_the_streaming_one(control_process):
     random = np.random.default_rng(3)
-    parameters = unflatten(0.3 * random.standard_normal(n_parameters()))
-    mean, inverse_scale = random.standard_normal((2, N_OBSERVATION))
-    kinds = JitPolicy, numpy_policy.StreamingPolicy
-    compiled, streaming = (kind(parameters, mean, inverse_scale) for kind in kinds)
+    theta = 0.3 * random.standard_normal(n_parameters())
+    policy = Policy(theta, *random.standard_normal((2, N_OBSERVATION)))
+    compiled, streaming = JitPolicy(policy), StreamingPolicy(policy)
     for _ in range(3):
         compiled.reset()
         streaming.reset()

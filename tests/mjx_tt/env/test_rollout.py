@@ -12,7 +12,7 @@ import pytest
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
 from mjx_tt.env import rewards, rollout
-from mjx_tt.env.policy import PolicyController, initial_theta
+from mjx_tt.env.policy import Policy, PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import HIT, MISSED, RETURNED, TaskConfig
 from mjx_tt.sim import model as models
@@ -53,7 +53,7 @@ def run(simulator, theta, episodes):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollout, "CPU_BLOCK", 2 * P)
         assert simulator._block_rows(R, P) == 2
-        roll = jax.jit(lambda theta, episodes: simulator.rollout(theta, MEAN, INVERSE_SCALE, episodes))
+        roll = jax.jit(lambda theta, episodes: simulator.rollout(Policy(theta, MEAN, INVERSE_SCALE), episodes))
         return roll.lower(theta, episodes).compile()
 
 
@@ -198,7 +198,9 @@ def test_a_randomised_drive_shows_in_the_rollout(simulator, pool, theta, episode
     ranges = (*RANDOMISE, Range("drives.joint_1.lag", 0.05, 0.1))
     slow = jax.jit(lambda key: simulator.draw(key, pool, SimModel(), ranges, R, P))(jax.random.key(1))
     np.testing.assert_array_equal(slow.ball.position, episodes.ball.position)
-    found = jax.jit(lambda theta, episodes: simulator.rollout(theta, MEAN, INVERSE_SCALE, episodes))(theta, slow)
+    found = jax.jit(lambda theta, episodes: simulator.rollout(Policy(theta, MEAN, INVERSE_SCALE), episodes))(
+        theta, slow
+    )
     assert np.asarray(found.finite).all()
     assert (np.abs(np.asarray(found.returns) - result.returns) > 1e-4).mean() > 0.5
 
@@ -216,7 +218,7 @@ def test_replay_shows_the_same_episode(simulator, theta, episodes, played):
 
 def test_mistakes_are_named(simulator, theta, episodes):
     with pytest.raises(ValueError, match="theta has 3 columns, the episodes 4"):
-        simulator.rollout(theta[:, :3], MEAN, INVERSE_SCALE, episodes)
+        simulator.rollout(Policy(theta[:, :3], MEAN, INVERSE_SCALE), episodes)
     with pytest.raises(ValueError, match="99 devices wanted, this process has 2"):
         Simulator(TaskConfig(), devices=99)
     two = Simulator(TaskConfig(), devices=2)

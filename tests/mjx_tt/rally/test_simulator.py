@@ -15,7 +15,7 @@ from ballmodel.flight import ball_params
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import sample_pool
 from ballmodel.state import BallState
-from mjx_tt.env.policy import PolicyController, initial_theta
+from mjx_tt.env.policy import Policy, PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import MISSED, RETURNED, Episodes, TaskConfig
 from mjx_tt.rally import human_player
@@ -86,7 +86,7 @@ def shots(simulator, balls, touches, theta=STILL, model=EXACT, box=None, start=N
     )
     everything = Box(jnp.full(8, -99.0), jnp.full(8, 99.0)) if box is None else box
     state, result = simulator.shots(
-        theta, *NORMALISER, stacked(), without_nominal(spread(model)), state, jax.random.key(key), everything
+        Policy(theta, *NORMALISER), stacked(), without_nominal(spread(model)), state, jax.random.key(key), everything
     )
     return state, jax.tree.map(np.asarray, result)
 
@@ -127,7 +127,7 @@ def test_a_turn_of_the_robot_is_the_rollouts_episode(simulator):
         pool.state, jnp.repeat(seconds[:, None], LANES, axis=1), jnp.zeros(LANES, jnp.uint32), without_nominal(world)
     )
     row = jax.tree.map(lambda x: x[..., None, :] if x.ndim else x, replace(episodes, model=spread(world)))
-    expected = jax.jit(lambda t, e: rollout.rollout(t, *NORMALISER, e))(theta, row)
+    expected = jax.jit(lambda t, e: rollout.rollout(Policy(t, *NORMALISER), e))(theta, row)
     lanes = ~result.fault
     assert lanes.sum() >= LANES // 2 and len(set(np.asarray(expected.outcome)[0][lanes])) > 1
     np.testing.assert_array_equal(result.outcome[lanes], np.asarray(expected.outcome)[0][lanes])
@@ -198,7 +198,7 @@ def test_a_robot_that_hits_itself_faults_and_gets_a_dummy_ball(simulator):
     assert np.all(result.outcome[result.fault] == MISSED)
     assert np.all(result.terms[3][result.fault] == -2.0) and np.all(result.terms[3][~result.fault] == 0.0)
     played = simulator.play(
-        theta, *NORMALISER, stacked(), spread(EXACT), jax.random.key(0), 6, max_touches=20, capacity=64
+        Policy(theta, *NORMALISER), stacked(), spread(EXACT), jax.random.key(0), 6, max_touches=20, capacity=64
     )
     end, length = np.asarray(played.end), np.asarray(played.length)
     dummy = (end == End.DUMMY_BY_HAND) | (end == End.DUMMY_WITH_PADDLE)
@@ -215,7 +215,7 @@ def test_a_robot_that_hits_itself_faults_and_gets_a_dummy_ball(simulator):
 @pytest.fixture(scope="module")
 def rallies(simulator):
     result = simulator.play(
-        STILL, *NORMALISER, stacked(), spread(WALL), jax.random.key(5), 6, max_touches=20, capacity=64
+        Policy(STILL, *NORMALISER), stacked(), spread(WALL), jax.random.key(5), 6, max_touches=20, capacity=64
     )
     return jax.tree.map(np.asarray, result)
 
@@ -254,7 +254,7 @@ def test_a_rally_that_went_on_after_the_robot_ended_with_the_row_of_its_last_bal
 
 def test_the_same_key_plays_the_same_rallies(simulator, rallies):
     again = simulator.play(
-        STILL, *NORMALISER, stacked(), spread(WALL), jax.random.key(5), 6, max_touches=20, capacity=64
+        Policy(STILL, *NORMALISER), stacked(), spread(WALL), jax.random.key(5), 6, max_touches=20, capacity=64
     )
     np.testing.assert_array_equal(again.length, rallies.length)
     np.testing.assert_array_equal(np.asarray(again.balls.position), rallies.balls.position)
@@ -262,8 +262,7 @@ def test_the_same_key_plays_the_same_rallies(simulator, rallies):
 
 def test_every_service_is_filtered(simulator):
     result = simulator.play(
-        STILL,
-        *NORMALISER,
+        Policy(STILL, *NORMALISER),
         stacked(first={"service": 1.0}, ability={"elevation": 0.0, "direction": 0.0, "pace": 0.0}),
         spread(WALL),
         jax.random.key(5),

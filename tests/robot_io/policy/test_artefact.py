@@ -8,6 +8,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -16,8 +17,10 @@ import pytest
 
 from robot_io import contract
 from robot_io.policy import artefact as artefacts
-from robot_io.policy import export, numpy_policy
+from robot_io.policy import export
 from robot_io.policy.artefact import ArtefactError
+from robot_io.policy.numpy_policy import StreamingPolicy
+from robot_io.policy.policy import Policy
 from tests.support.paths import ROOT
 
 PROVENANCE = {"config": {"player": "narrow"}, "git": "0" * 40, "seed": 3, "return_rate": 0.95}
@@ -25,7 +28,7 @@ PROVENANCE = {"config": {"player": "narrow"}, "git": "0" * 40, "seed": 3, "retur
 
 def _policy(seed=0):
     rng = np.random.default_rng(seed)
-    return (
+    return Policy(
         rng.normal(0, 0.3, contract.n_parameters()).astype(np.float32),
         rng.normal(0, 1, contract.N_OBSERVATION).astype(np.float32),
         rng.uniform(0.3, 4, contract.N_OBSERVATION).astype(np.float32),
@@ -39,7 +42,7 @@ def _histories(count, seed=5):
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("artefact") / "policy"
-    return folder, export.write(folder, *_policy(), PROVENANCE)
+    return folder, export.write(folder, _policy(), PROVENANCE)
 
 
 @pytest.fixture
@@ -100,14 +103,15 @@ def test_parameter_count():
 
 
 def test_forward_equals_explicit_loops():
-    theta, mean, inverse_scale = (a.astype(np.float64) for a in _policy())
+    policy = _policy().astype(np.float64)
+    theta, mean, inverse_scale = policy.theta, policy.mean, policy.inv_std
     histories = _histories(3)
-    actions = numpy_policy.forward(contract.unflatten(theta), mean, inverse_scale, histories)
+    actions = policy.apply(histories)
     assert actions.shape == (8, 3)
     for b in range(3):
         expected = _forward_by_loops(theta.tolist(), mean.tolist(), inverse_scale.tolist(), histories[:, :, b].tolist())
         np.testing.assert_allclose(actions[:, b], expected, atol=1e-13)
-        single = numpy_policy.forward(contract.unflatten(theta), mean, inverse_scale, histories[:, :, b])
+        single = policy.apply(histories[:, :, b])
         np.testing.assert_allclose(single, expected, atol=1e-13)
 
 
@@ -115,12 +119,13 @@ def test_forward_equals_explicit_loops():
 def test_one_wire_through_the_network_by_hand(tap, seen):
     # Only ball_z -> filter 5 -> filter 11 -> joint_6 is connected, through one tap: the newer taps see the newest
     # observation and the older taps the oldest, 1 + 2 + 4 steps back. An idle gate is sigmoid(0) = 1/2.
-    parameters = contract.unflatten(np.zeros(976))
+    theta = np.zeros(976)
+    parameters = contract.unflatten(theta)  # views
     parameters["conv1/kernel"][tap, 2, 5] = 1.5
     parameters["conv2/kernel"][tap, 5, 11] = -2.0
     parameters["conv3/kernel"][tap, 11, 7] = 3.0
     history = _histories(1)[:, :, 0]
-    action = numpy_policy.forward(parameters, np.full(11, 0.5), np.full(11, 2.0), history)
+    action = Policy(theta, np.full(11, 0.5), np.full(11, 2.0)).apply(history)
     layer_1 = 0.5 * math.tanh(1.5 * 2.0 * (history[seen, 2] - 0.5))
     expected = math.tanh(3.0 * 0.5 * math.tanh(-2.0 * layer_1))
     np.testing.assert_allclose(action, [0, 0, 0, 0, 0, 0, 0, expected], atol=1e-15)
@@ -128,26 +133,22 @@ def test_one_wire_through_the_network_by_hand(tap, seen):
 
 
 def test_streaming_equals_full_form():
-    theta, mean, inverse_scale = _policy(1)
-    parameters = contract.unflatten(theta)
-    policy = numpy_policy.StreamingPolicy(parameters, mean, inverse_scale)
+    whole = _policy(1)
+    policy = StreamingPolicy(whole)
     observations = np.random.default_rng(2).normal(size=(40, 11))
     for episode in (observations[:25], observations[25:]):
         policy.reset()
         history = [episode[0]] * contract.HISTORY  # the first observation fills the history
         for observation in episode:
             history = [*history[1:], observation]
-            expected = numpy_policy.forward(parameters, mean, inverse_scale, np.stack(history))
+            expected = whole.apply(np.stack(history))
             np.testing.assert_allclose(policy.step(observation), expected, rtol=0, atol=1e-12)
 
 
 def test_streaming_refuses_a_bad_observation_and_forgets_it():
-    theta, mean, inverse_scale = _policy()
     good, bad = np.linspace(-1, 1, 11), np.zeros(11)
     bad[1] = np.nan
-    disturbed, undisturbed = (
-        numpy_policy.StreamingPolicy(contract.unflatten(theta), mean, inverse_scale) for _ in range(2)
-    )
+    disturbed, undisturbed = (StreamingPolicy(_policy()) for _ in range(2))
     for policy in (disturbed, undisturbed):
         policy.step(good)
     with pytest.raises(ValueError, match="ball_y"):
@@ -158,10 +159,9 @@ def test_streaming_refuses_a_bad_observation_and_forgets_it():
 
 
 def test_history_of_another_shape_is_refused():
-    theta, mean, inverse_scale = _policy()
     for shape in ((11, 8), (8, 11, 2, 2), (11,)):
         with pytest.raises(ValueError, match="history has shape"):
-            numpy_policy.forward(contract.unflatten(theta), mean, inverse_scale, np.zeros(shape))
+            _policy().apply(np.zeros(shape))
 
 
 # --- agreement of the four forms --------------------------------------------------------------------------------------
@@ -177,9 +177,8 @@ def test_four_forms_agree_on_1000_histories(exported):
 @pytest.mark.parametrize("batch", [1, 5])
 def test_stored_forms_load_without_this_package_and_agree(exported, batch):
     folder, _ = exported
-    theta, mean, inverse_scale = _policy()
     histories = _histories(batch).astype(np.float32)
-    expected = numpy_policy.forward(contract.unflatten(theta), mean, inverse_scale, histories)
+    expected = _policy().apply(histories)
     onnx_action = onnxruntime.InferenceSession(folder / artefacts.ONNX).run(None, {"history": histories})[0]
     jax_action = jax.export.deserialize(bytearray((folder / artefacts.JAX_EXPORT).read_bytes())).call(histories)
     np.testing.assert_allclose(onnx_action, expected, atol=1e-5)
@@ -187,20 +186,20 @@ def test_stored_forms_load_without_this_package_and_agree(exported, batch):
 
 
 def test_constant_component_of_the_normaliser_has_no_effect(tmp_path):
-    theta, mean, inverse_scale = _policy()
-    inverse_scale[4] = 0.0
-    export.write(tmp_path / "policy", theta, mean, inverse_scale, {})
+    policy = _policy()
+    policy.inv_std[4] = 0.0
+    export.write(tmp_path / "policy", policy, {})
     history = _histories(1)[:, :, 0]
     loaded = artefacts.load(tmp_path / "policy")
-    before = loaded.forward(history)
+    before = loaded.policy.apply(history)
     history[:, 4] += 10
-    np.testing.assert_array_equal(loaded.forward(history), before)
+    np.testing.assert_array_equal(loaded.policy.apply(history), before)
 
 
 def test_forms_that_disagree_are_refused(copy):
-    theta, mean, inverse_scale = _policy()
-    theta[3] += 1e-2
-    other = export.onnx_model(contract.unflatten(theta), mean, inverse_scale).SerializeToString()
+    policy = _policy()
+    policy.theta[3] += 1e-2
+    other = export.onnx_model(policy).SerializeToString()
     _replace_file(copy, artefacts.ONNX, other)
     with pytest.raises(ArtefactError, match="differ by"):
         export.verify(copy)
@@ -212,17 +211,15 @@ def test_forms_that_disagree_are_refused(copy):
 def test_loaded_artefact_is_what_was_written(exported):
     folder, report = exported
     loaded = artefacts.load(folder)
-    theta, mean, inverse_scale = _policy()
-    np.testing.assert_array_equal(np.concatenate([a.ravel() for a in loaded.parameters.values()]), theta)
-    np.testing.assert_array_equal(loaded.normaliser_mean, mean)
-    np.testing.assert_array_equal(loaded.normaliser_inverse_scale, inverse_scale)
+    for name in ("theta", "mean", "inv_std"):
+        np.testing.assert_array_equal(getattr(loaded.policy, name), getattr(_policy(), name))
     assert loaded.manifest["provenance"] == PROVENANCE
     assert [joint["name"] for joint in loaded.manifest["contract"]["action"]] == list(contract.JOINT_NAMES)
     assert loaded.digest == report["digest"] == hashlib.sha256((folder / "manifest.json").read_bytes()).hexdigest()
     assert sorted(os.listdir(folder)) == sorted(artefacts.FILES)
     observation = np.linspace(-1, 1, 11)
     constant = np.tile(observation, (8, 1))
-    np.testing.assert_allclose(loaded.streaming().step(observation), loaded.forward(constant), atol=1e-12)
+    np.testing.assert_allclose(loaded.streaming().step(observation), loaded.policy.apply(constant), atol=1e-12)
 
 
 def test_loading_needs_no_jax():
@@ -337,33 +334,32 @@ def test_well_hashed_but_wrong_contents_are_refused(copy, tmp_path):
 @pytest.mark.parametrize("index", [0, 1, 2])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_non_finite_numbers_are_not_exported(tmp_path, index, bad):
-    policy = list(_policy())
-    policy[index][7] = bad
-    name = ("theta", "normaliser_mean", "normaliser_inverse_scale")[index]
+    policy, name = _policy(), ("theta", "mean", "inv_std")[index]
+    getattr(policy, name)[7] = bad
     with pytest.raises(ArtefactError, match=rf"{name}\[7\] is {bad}"):
-        export.write(tmp_path / "policy", *policy, PROVENANCE)
+        export.write(tmp_path / "policy", policy, PROVENANCE)
     assert not list(tmp_path.iterdir())
 
 
 def test_arrays_of_a_wrong_size_are_not_exported(tmp_path):
-    theta, mean, inverse_scale = _policy()
+    policy = replace(_policy(), theta=_policy().theta[:-1])
     with pytest.raises(ArtefactError, match=r"theta has shape \(975,\), expected \(976,\)"):
-        export.write(tmp_path / "policy", theta[:-1], mean, inverse_scale, PROVENANCE)
+        export.write(tmp_path / "policy", policy, PROVENANCE)
 
 
 @pytest.mark.parametrize("value", [math.nan, object()])
 def test_provenance_must_be_json(tmp_path, value):
     with pytest.raises(ArtefactError, match="provenance is not plain JSON"):
-        export.write(tmp_path / "policy", *_policy(), {"return_rate": value})
+        export.write(tmp_path / "policy", _policy(), {"return_rate": value})
     assert not list(tmp_path.iterdir())
 
 
 def test_existing_artefact_is_replaced_only_on_demand(copy):
     before = artefacts.load(copy).digest
     with pytest.raises(ArtefactError, match="already exists"):
-        export.write(copy, *_policy(1), PROVENANCE)
+        export.write(copy, _policy(1), PROVENANCE)
     assert artefacts.load(copy).digest == before
-    report = export.write(copy, *_policy(1), PROVENANCE, overwrite=True)
+    report = export.write(copy, _policy(1), PROVENANCE, overwrite=True)
     assert artefacts.load(copy).digest == report["digest"] != before
     assert os.listdir(copy.parent) == ["policy"]
 
@@ -371,7 +367,7 @@ def test_existing_artefact_is_replaced_only_on_demand(copy):
 def test_a_folder_of_something_else_is_never_overwritten(tmp_path):
     (tmp_path / "thesis.tex").write_text("x")
     with pytest.raises(ArtefactError, match="holds thesis.tex"):
-        export.write(tmp_path, *_policy(), PROVENANCE, overwrite=True)
+        export.write(tmp_path, _policy(), PROVENANCE, overwrite=True)
     assert (tmp_path / "thesis.tex").exists()
 
 
@@ -381,7 +377,7 @@ def test_existing_artefact_survives_a_disk_that_fills_up(copy):
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))  # params.npz is larger
     try:
         with pytest.raises(OSError, match="File too large"):
-            export.write(copy, *_policy(1), PROVENANCE, overwrite=True)
+            export.write(copy, _policy(1), PROVENANCE, overwrite=True)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert artefacts.load(copy).digest == before
