@@ -11,7 +11,6 @@ import dataclasses
 import fnmatch
 import importlib
 import inspect
-import io
 import json
 import re
 import textwrap
@@ -20,15 +19,13 @@ import typing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 if TYPE_CHECKING:
+    from cyclopts import App
     from sphinx.application import Sphinx
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 GENERATED = REFERENCE / "generated"
 PACKAGES = ("mjx_tt", "ballmodel", "bgs", "robot_io")
-WIDTH = 120  # of the help texts [characters]
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -222,19 +219,39 @@ def _cell(text: str) -> str:
 
 
 def command_line_page() -> str:
-    """Help of every command, as the terminal shows it."""
+    """Every command with its arguments and examples, from the definitions that the command line itself uses."""
     from experiments import cli
 
-    def shown(*command: str) -> list[str]:
-        stream = io.StringIO()
-        cli.app.help_print(command, console=Console(file=stream, width=WIDTH))
-        return ["", "```text", stream.getvalue().rstrip(), "```"]
-
-    lines = ["# Command line", *shown()]
+    lines = ["# Command line", "", "`mjx-tt COMMAND --help` shows the same in a terminal.", ""]
+    lines += ["| command | |", "|---|---|"]
+    lines += [f"| [`{c.name[0]}`](#mjx-tt-{c.name[0]}) | {_cell(c.help)} |" for c in cli.COMMANDS]
     for command in cli.COMMANDS:
         name = command.name[0]
-        lines += ["", f"(mjx-tt-{name})=", f"## mjx-tt {name}", *shown(name)]
+        lines += ["", f"(mjx-tt-{name})=", f"## mjx-tt {name}", "", _sentence(command.help), ""]
+        examples, remarks = _examples(command.help_epilogue)
+        lines += ["```text", *examples, "```", "", *remarks, ""]
+        lines += _arguments(command)
     return "\n".join(lines) + "\n"
+
+
+def _sentence(text: str) -> str:
+    return text[0].upper() + text[1:].rstrip(".") + "."
+
+
+def _examples(epilogue: str) -> tuple[list[str], list[str]]:
+    """Indented rows of a help text without their indentation, and its other rows."""
+    rows = epilogue.removeprefix("examples:\n").splitlines()
+    return [row[2:] for row in rows if row.startswith("  ")], [row for row in rows if not row.startswith("  ")]
+
+
+def _arguments(command: App) -> list[str]:
+    rows = []
+    for argument in command.assemble_argument_collection():
+        name, parameter = argument.names[0], argument.parameter
+        value = parameter.metavar or (" or ".join(typing.get_args(argument.hint)) if name.startswith("--") else "")
+        note = _cell(parameter.help or "") + (" (required)" if argument.required and name.startswith("--") else "")
+        rows.append(f"| `{f'{name} {value}'.strip()}` | {note} |")
+    return ["| argument | meaning |", "|---|---|", *rows] if rows else []
 
 
 def api_page(package: str) -> str:
