@@ -2,10 +2,9 @@
 
 One update, maximising the mean return F:
 
-    directions = ask(key, state, config)                            # delta_i, the columns of (d, N)
-    members = population(state, directions, config)                 # theta +/- sigma delta_i, the columns of (d, 2N)
+    population = ask(key, state, config)                      # members theta +/- sigma delta_i, the columns of (d, 2N)
     ... evaluate every member m times with frozen observation statistics, average ...
-    state, info = tell(state, directions, plus, minus, config)      # theta += alpha / (k s) sum_elites D_i delta_i
+    state, info = tell(state, population, returns, config)    # theta += alpha / (k s) sum_elites D_i delta_i
 
 Where the paper is silent or its Eq. 3 cannot be meant literally, the defaults follow the authors' library Iris. The
 observation statistics (``bgs.normalizer``) are not part of the state: the function being maximised may have no
@@ -96,6 +95,19 @@ class BGSState:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
+class Population:
+    """The antithetic pairs of an update.
+
+    members     (d, 2N) to evaluate: columns 0..N-1 are theta + sigma delta_i, columns N..2N-1 theta - sigma delta_i
+    directions  (d, N) delta_i
+    """
+
+    members: jax.Array
+    directions: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
 class BGSInfo:
     """Measures of one update, each a scalar.
 
@@ -123,34 +135,37 @@ def init(theta: jax.Array, config: BGSConfig) -> BGSState:
     return BGSState(theta, theta, config.step.init(theta), jnp.zeros((), jnp.int32))
 
 
+def ask(key: jax.Array, state: BGSState, config: BGSConfig) -> Population:
+    """The members to evaluate for the next update, in theta's precision."""
+    return perturb(state, _sample(key, state, config), config)
+
+
 @partial(jax.jit, static_argnames="config")
-def ask(key: jax.Array, state: BGSState, config: BGSConfig) -> jax.Array:
-    """Directions (d, N) of the next update, in theta's precision."""
-    return direction_sampling.sample(
-        key, state.theta.shape[0], config.pairs, config.orthogonal, config.scale, state.theta.dtype
-    )
+def _sample(key: jax.Array, state: BGSState, config: BGSConfig) -> jax.Array:
+    d, dtype = state.theta.shape[0], state.theta.dtype
+    return direction_sampling.sample(key, d, config.pairs, config.orthogonal, config.scale, dtype)
 
 
-def population(state: BGSState, directions: jax.Array, config: BGSConfig) -> jax.Array:
-    """Members (d, 2N) to evaluate: columns 0..N-1 are theta + sigma delta_i, columns N..2N-1 theta - sigma delta_i."""
+def perturb(state: BGSState, directions: jax.Array, config: BGSConfig) -> Population:
+    """The members along given directions (d, N): ``ask`` without its sampling."""
     sigma = config.sigma(state.updates) if callable(config.sigma) else config.sigma
     theta, offsets = state.theta[:, None], jnp.asarray(sigma, state.theta.dtype) * directions
-    return jnp.concatenate([theta + offsets, theta - offsets], axis=1)
+    return Population(jnp.concatenate([theta + offsets, theta - offsets], axis=1), directions)
 
 
 @partial(jax.jit, static_argnames="config")
-def tell(
-    state: BGSState, directions: jax.Array, plus: jax.Array, minus: jax.Array, config: BGSConfig
-) -> tuple[BGSState, BGSInfo]:
-    """One ascent step from the members' returns (N,), each averaged over its repeats.
+def tell(state: BGSState, population: Population, returns: jax.Array, config: BGSConfig) -> tuple[BGSState, BGSInfo]:
+    """One ascent step from the members' returns (2N,), each averaged over its repeats.
 
     A non-finite return marks a failed evaluation and drops its pair. When every pair failed, theta, the average and the
     optax state stay as they were (a step such as Adam's would otherwise move on momentum alone) and only ``updates``
-    advances. Raises ValueError when directions and returns do not fit together.
+    advances. Raises ValueError when population and returns do not fit together.
     """
-    expected = (state.theta.shape[0], plus.shape[0])
-    if directions.shape != expected:
-        raise ValueError(f"tell: directions {directions.shape}, but theta and the returns call for {expected}")
+    directions = population.directions
+    expected = (state.theta.shape[0], returns.shape[0] // 2)
+    if directions.shape != expected or returns.shape != (2 * expected[1],):
+        raise ValueError(f"tell: directions {directions.shape}, but theta and returns {returns.shape} need {expected}")
+    plus, minus = returns[: expected[1]], returns[expected[1] :]
     shaped = shaping.shape(plus, minus, config.keep, config.rank, config.weighting, config.normalise)
     # Accelerators would otherwise multiply float32 in a shorter format.
     gradient = jnp.matmul(directions, shaped.weights, precision=jax.lax.Precision.HIGHEST)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import yaml
 from rich.console import Console
@@ -183,8 +184,8 @@ class Session:
     def _advance(self) -> bool:
         """One update; False when the operator stopped it."""
         settings, number = self._settings, self.update + 1
-        directions = strategy.ask(jax.random.fold_in(self.state.key, self.update), self.state.bgs, self._bgs)
-        members = np.asarray(strategy.population(self.state.bgs, directions, self._bgs))
+        population = strategy.ask(jax.random.fold_in(self.state.key, self.update), self.state.bgs, self._bgs)
+        members = np.asarray(population.members)
         entries = []
         # The members take turns, so that a person who tires or warms up is the same to both of a pair.
         for repeat in range(settings.repeats):
@@ -196,8 +197,7 @@ class Session:
         returns = np.zeros(2 * settings.pairs)
         for entry in entries:
             returns[entry.member] += entry.returns / settings.repeats
-        plus, minus = np.split(returns.astype(np.float32), 2)
-        bgs, info = strategy.tell(self.state.bgs, directions, plus, minus, self._bgs)
+        bgs, info = strategy.tell(self.state.bgs, population, jnp.asarray(returns, jnp.float32), self._bgs)
         self.state, self.update = TrainState(bgs, self.state.statistics, self.state.key), number
         now = time.monotonic()
         self._seconds, self._moment = self._seconds + now - self._moment, now

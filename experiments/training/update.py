@@ -88,15 +88,16 @@ class Trainer:
     def _update_local(self, state: TrainState, pool: BallPool):
         config, pairs = self.bgs_config, self.bgs_config.pairs
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
-        directions = strategy.ask(direction_key, state.bgs, config)
-        theta = strategy.population(state.bgs, directions, config)
+        population = strategy.ask(direction_key, state.bgs, config)
         columns = pairs if self._crn else 2 * pairs
         episodes = self.simulator.draw(episode_key, pool, self._model, self._randomise, self._repeats, columns)
         if self._crn:
             episodes = jax.tree.map(lambda x: jnp.concatenate([x, x], -1) if x.ndim >= 2 else x, episodes)
         mean, inv_std = normalizer.normaliser(state.statistics)
         simulator = self.simulator
-        result = simulator.rollout(Policy(simulator.local(theta), mean, inv_std), simulator.local(episodes))
+        result = simulator.rollout(
+            Policy(simulator.local(population.members), mean, inv_std), simulator.local(episodes)
+        )
         result = self._weighed(result, state.bgs.updates)
         # Everything that the devices have to share, in one sum: each fills in its own members.
         member = result.returns.mean(axis=0)  # NaN when one of its episodes was not finite
@@ -112,7 +113,7 @@ class Trainer:
         flat, unravel = ravel_pytree(shared)
         members, sums, counts, total = unravel(jax.lax.psum(flat, AXIS))
         member = jnp.where(members[1] > 0, jnp.nan, members[0])
-        bgs, info = strategy.tell(state.bgs, directions, member[:pairs], member[pairs:], config)
+        bgs, info = strategy.tell(state.bgs, population, member, config)
         seen = normalizer.from_sums(counts.astype(jnp.int32), mean, sums[0], sums[1])
         metrics = {
             **{name: getattr(info, name) for name in ("gradient_norm", "update_norm", "failed_pairs", "elite_std")},

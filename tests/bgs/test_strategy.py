@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 import bgs
-from bgs import optimizers, shaping
+from bgs import optimizers, shaping, strategy
 
 # Five pairs in two dimensions whose elites differ under every ranking.
 DIRECTIONS = np.array([[1.0, 0.0, 1.0, 2.0, 0.0], [0.0, 1.0, 1.0, -1.0, 3.0]])
@@ -32,7 +32,13 @@ _shape = jax.jit(shaping.shape, static_argnames=("keep", "rank", "weighting", "n
 
 def _tell(config, directions=DIRECTIONS, plus=PLUS, minus=MINUS, theta=(1.0, -1.0), dtype=jnp.float32):
     state = bgs.init(jnp.asarray(theta, dtype), config)
-    return bgs.tell(state, *(jnp.asarray(a, dtype) for a in (directions, plus, minus)), config)
+    return _update(state, config, directions, plus, minus)
+
+
+def _update(state, config, directions=DIRECTIONS, plus=PLUS, minus=MINUS):
+    dtype = state.theta.dtype
+    population = bgs.perturb(state, jnp.asarray(directions, dtype), config)
+    return bgs.tell(state, population, jnp.asarray(np.concatenate([plus, minus]), dtype), config)
 
 
 def _config(**options):
@@ -86,7 +92,7 @@ def test_update_with_every_pair_failed_changes_nothing_but_the_counter():
     config = _config(step=optimizers.make("adam", 0.1), average=0.5)
     moving, _ = _tell(config)
     nan = np.full(5, np.nan, np.float32)
-    state, info = bgs.tell(moving, np.float32(DIRECTIONS), nan, nan, config)
+    state, info = _update(moving, config, plus=nan, minus=nan)
     jax.tree.map(np.testing.assert_array_equal, dataclasses.replace(state, updates=moving.updates), moving)
     assert (state.updates, info.failed_pairs, info.elites, info.update_norm) == (2, 5, 0, 0)
     assert np.isnan(info.mean_return)
@@ -120,26 +126,26 @@ def test_gradient_of_a_quadratic_is_exact():
         config = bgs.BGSConfig(pairs=d, keep=1.0, normalise="none", step=optimizers.make("sgd", 1.0))
         theta = rng.normal(size=d)
         state = bgs.init(theta, config)
-        directions = bgs.ask(jax.random.key(0), state, config)
-        plus, minus = np.split(value(np.asarray(bgs.population(state, directions, config))), 2)
-        after, _ = bgs.tell(state, directions, jnp.asarray(plus), jnp.asarray(minus), config)
+        population = bgs.ask(jax.random.key(0), state, config)
+        after, _ = bgs.tell(state, population, jnp.asarray(value(np.asarray(population.members))), config)
         np.testing.assert_allclose(after.theta - theta, 2 * config.sigma * (hessian @ theta + slope), rtol=1e-10)
 
 
 def test_population_is_all_plus_then_all_minus():
     config = bgs.BGSConfig(sigma=0.5)
-    members = bgs.population(
+    population = bgs.perturb(
         bgs.init(jnp.array([1.0, 2.0]), config), jnp.array([[1.0, 0.0, 2.0], [0.0, 1.0, 4.0]]), config
     )
-    np.testing.assert_array_equal(members, [[1.5, 1.0, 2.0, 0.5, 1.0, 0.0], [2.0, 2.5, 4.0, 2.0, 1.5, 0.0]])
+    np.testing.assert_array_equal(population.members, [[1.5, 1.0, 2.0, 0.5, 1.0, 0.0], [2.0, 2.5, 4.0, 2.0, 1.5, 0.0]])
 
 
 def test_perturbations_follow_their_schedule():
     config = bgs.BGSConfig(pairs=1, sigma=optimizers.cosine(0.4, 0.1, 10, hold=0.5), step=optimizers.make("sgd", 1e-9))
     state, spread, one = bgs.init(jnp.zeros(2), config), [], jnp.array([[1.0], [0.0]])
     for _ in range(12):
-        spread.append(float(bgs.population(state, one, config)[0, 0]))
-        state, _ = bgs.tell(state, one, jnp.ones(1), jnp.zeros(1), config)
+        population = bgs.perturb(state, one, config)
+        spread.append(float(population.members[0, 0]))
+        state, _ = bgs.tell(state, population, jnp.array([1.0, 0.0]), config)
     fall = [0.1 + 0.3 * (1 + math.cos(math.pi * k / 5)) / 2 for k in range(6)]
     np.testing.assert_allclose(spread, [0.4] * 5 + fall + [0.1], rtol=1e-6)
 
@@ -164,10 +170,9 @@ def test_finds_the_top_of_a_quadratic(config):
     stiffness = jnp.linspace(1, 5, d)[:, None]
 
     def update(state, key):
-        directions = bgs.ask(key, state, config)
-        members = bgs.population(state, directions, config)
-        returns = -jnp.sum(stiffness * (members - best[:, None]) ** 2, axis=0)
-        return bgs.tell(state, directions, *jnp.split(returns, 2), config)
+        population = bgs.ask(key, state, config)
+        returns = -jnp.sum(stiffness * (population.members - best[:, None]) ** 2, axis=0)
+        return bgs.tell(state, population, returns, config)
 
     start = bgs.init(jnp.zeros(d), config)
     end, info = jax.jit(lambda state: jax.lax.scan(update, state, jax.random.split(jax.random.key(0), 400)))(start)
@@ -189,8 +194,8 @@ def test_update_norm_in_pure_noise():
     norms = []
     for key in jax.random.split(jax.random.key(0), 6):
         key_directions, key_returns = jax.random.split(key)
-        plus, minus = jax.random.normal(key_returns, (2, 200))
-        norms.append(bgs.tell(state, bgs.ask(key_directions, state, config), plus, minus, config)[1].update_norm)
+        returns = jax.random.normal(key_returns, (2, 200)).reshape(-1)
+        norms.append(bgs.tell(state, bgs.ask(key_directions, state, config), returns, config)[1].update_norm)
     assert np.mean(norms) == pytest.approx(expected, rel=0.05)
 
 
@@ -199,7 +204,7 @@ def test_moving_average_in_closed_form():
     state = bgs.init(jnp.array([1.0, -1.0]), config)
     expected = 0.9**4 * np.array([1.0, -1.0])
     for t in range(1, 5):
-        state, _ = bgs.tell(state, *(jnp.asarray(a, jnp.float32) for a in (DIRECTIONS, PLUS + t, MINUS - t)), config)
+        state, _ = _update(state, config, plus=PLUS + t, minus=MINUS - t)
         expected += 0.1 * 0.9 ** (4 - t) * np.asarray(state.theta)
     np.testing.assert_allclose(state.average, expected, rtol=1e-6)
     off, _ = _tell(_config())
@@ -237,20 +242,18 @@ def test_piecewise_schedule():
 def test_schedule_advances_with_updates():
     config = _config(step=optimizers.make("sgd", optimizers.piecewise(0.1, ((1, 0.2),))))
     first, info_first = _tell(config)
-    _, info_second = bgs.tell(first, *(jnp.asarray(a, jnp.float32) for a in (DIRECTIONS, PLUS, MINUS)), config)
+    _, info_second = _update(first, config)
     np.testing.assert_allclose(info_second.update_norm, 2 * info_first.update_norm, rtol=1e-5)
 
 
 def test_equal_configurations_share_one_compilation():
-    before = bgs.ask._cache_size(), bgs.tell._cache_size()
+    before = strategy._sample._cache_size(), bgs.tell._cache_size()
     for seed in range(3):
         config = bgs.BGSConfig(pairs=7, step=optimizers.make("adam", optimizers.cosine(0.01, 0.001, 50)), average=0.98)
         state = bgs.init(jnp.zeros(11), config)
         for key in jax.random.split(jax.random.key(seed), 3):
-            directions = bgs.ask(key, state, config)
-            plus, minus = jax.random.normal(key, (2, 7))
-            state, _ = bgs.tell(state, directions, plus, minus, config)
-    assert (bgs.ask._cache_size() - before[0], bgs.tell._cache_size() - before[1]) == (1, 1)
+            state, _ = bgs.tell(state, bgs.ask(key, state, config), jax.random.normal(key, 14), config)
+    assert (strategy._sample._cache_size() - before[0], bgs.tell._cache_size() - before[1]) == (1, 1)
 
 
 @pytest.mark.parametrize(
@@ -294,9 +297,9 @@ def test_bad_steps_are_named(build, message):
 
 
 def test_shapes_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match=r"directions \(2, 5\).*\(2, 4\)"):
+    with pytest.raises(ValueError, match=r"directions \(2, 5\).*\(8,\) need \(2, 4\)"):
         _tell(_config(), plus=PLUS[:4], minus=MINUS[:4])
-    with pytest.raises(ValueError, match=r"plus \(5,\) and minus \(4,\)"):
+    with pytest.raises(ValueError, match=r"directions \(2, 5\).*\(9,\) need \(2, 4\)"):
         _tell(_config(), minus=MINUS[:4])
     with pytest.raises(ValueError, match="vector of floats"):
         bgs.init(jnp.zeros((2, 2)), _config())

@@ -141,13 +141,12 @@ class VirtualReality:
 
         def update(carry, _):
             state, rally = carry
-            directions = strategy.ask(jax.random.fold_in(key, state.updates), state, config)
-            members = strategy.population(state, directions, config)
-            theta = jnp.repeat(members, settings.repeats, axis=1)  # the lanes of a member side by side
+            population = strategy.ask(jax.random.fold_in(key, state.updates), state, config)
+            theta = jnp.repeat(population.members, settings.repeats, axis=1)  # the lanes of a member side by side
             shot_key = jax.random.fold_in(play_key, state.updates)
             rally, shots = self.simulator.shots(Policy(theta, *frozen), player, model, rally, shot_key)
             returns = self._returns(shots).reshape(2 * settings.pairs, settings.repeats).mean(axis=1)
-            state, info = strategy.tell(state, directions, *jnp.split(returns, 2), config)
+            state, info = strategy.tell(state, population, returns, config)
             return (state, rally), (shots, info)
 
         (state, rally), found = jax.lax.scan(update, (state, rally), None, length=self._chunk)

@@ -187,7 +187,7 @@ def test_an_update_follows_the_journal_by_the_papers_rule(source, tmp_path):
     thetas = {number: played for played, _, _, number in toy.played}
     for update in (1, 2):
         key = jax.random.fold_in(build.key(0, build.INITIAL_STATE), update - 1)
-        directions = np.asarray(strategy.ask(key, strategy.init(theta, bgs), bgs))
+        directions = np.asarray(strategy.ask(key, strategy.init(theta, bgs), bgs).directions)
         assert directions.T @ directions == pytest.approx(976 * np.eye(3), abs=0.01)
         returns = np.zeros((6, 2))
         for entry in (entry for entry in trained if entry.update == update):

@@ -310,7 +310,7 @@ def test_an_update_is_the_papers_formula_of_what_the_robot_measures(virtual):
     now = theta.astype(np.float64)
     for number in range(2):
         state = strategy.init(jnp.asarray(now, jnp.float32), settings)
-        delta = np.asarray(strategy.ask(jax.random.fold_in(ask_key, number), state, settings), np.float64)
+        delta = np.asarray(strategy.ask(jax.random.fold_in(ask_key, number), state, settings).directions, np.float64)
         members = np.concatenate([now[:, None] + 0.025 * delta, now[:, None] - 0.025 * delta], axis=1)
         shot_key = jax.random.fold_in(play_key, number)
         rally, shots = virtual.simulator.shots(

@@ -87,17 +87,17 @@ def test_two_devices_give_the_update_of_one(run, run_on_two):
 
 
 def drawn(trainer, state):
-    """Directions (976, pairs) and episodes (R, 2 x pairs) of the update of ``state``."""
+    """Population and episodes (R, 2 x pairs) of the update of ``state``."""
     direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
-    directions = strategy.ask(direction_key, state.bgs, BGS)
-    return directions, trainer.simulator.draw(episode_key, trainer.pool, SimModel(), (), REPEATS, 2 * PAIRS)
+    population = strategy.ask(direction_key, state.bgs, BGS)
+    return population, trainer.simulator.draw(episode_key, trainer.pool, SimModel(), (), REPEATS, 2 * PAIRS)
 
 
 def test_update_is_the_step_that_the_returns_call_for(trainer, run):
     """By hand from the returns: sum of D_i delta_i / (k s), times the learning rate; and statistics merged."""
     before, after = run[0][0], run[0][1]
-    directions, episodes = drawn(trainer, before)
-    theta = strategy.population(before.bgs, directions, BGS)
+    population, episodes = drawn(trainer, before)
+    theta, directions = population.members, population.directions
     result = jax.jit(trainer.simulator.rollout)(Policy(theta, *normalizer.normaliser(before.statistics)), episodes)
     returns = np.asarray(result.returns, np.float64).mean(axis=0)
     plus, minus = returns[:PAIRS], returns[PAIRS:]
@@ -119,7 +119,7 @@ def test_update_is_the_step_that_the_returns_call_for(trainer, run):
 def test_failed_episodes_are_counted_and_their_pairs_dropped(trainer, run, pool):
     """A ball of the pool that is not finite fails every member that draws it, and with it the member's pair."""
     start = run[0][0]
-    directions, episodes = drawn(trainer, start)
+    population, episodes = drawn(trainer, start)
     x = np.asarray(pool.state.position[0])
     thrown = np.asarray(episodes.ball.position[0])
     poisoned = next(i for i in range(len(x)) if (thrown == x[i]).any())
@@ -133,7 +133,7 @@ def test_failed_episodes_are_counted_and_their_pairs_dropped(trainer, run, pool)
     assert metrics["non_finite"] == (thrown == x[poisoned]).sum()
     assert np.isfinite(state.bgs.theta).all() and np.isfinite(state.statistics.mean).all()
     # The change lies in the span of the directions that are left.
-    directions = np.asarray(directions, np.float64)[:, ~pairs]
+    directions = np.asarray(population.directions, np.float64)[:, ~pairs]
     change = np.asarray(state.bgs.theta, np.float64) - np.asarray(start.bgs.theta, np.float64)
     left = change - directions @ np.linalg.lstsq(directions, change, rcond=None)[0]
     assert np.linalg.norm(change) > 1e-4 and np.linalg.norm(left) < 1e-3 * np.linalg.norm(change)
