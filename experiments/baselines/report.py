@@ -19,9 +19,9 @@ from matplotlib.ticker import PercentFormatter
 
 from ballmodel.io.atomic_files import replacing
 from experiments.config.baselines import Comparison
-from experiments.evaluation.evaluate import wilson
 from experiments.evaluation.figures import INK, STYLE
 from experiments.runs import run_dir
+from experiments.stats import wilson
 
 COLOURS = ("#1b7837", "#7fbf7b", "#762a83", "#2166ac", "#b35806", "#b2182b", "#542788", "#4d4d4d")
 WORLDS = {"simulation": "in the simulation it trained in", "reality": "in a world that it has never seen"}

@@ -17,8 +17,8 @@ from experiments.config import robot as robots
 from experiments.config.finetuning import FineTuning
 from experiments.deploy.operator_console import KEYS, Keyboard, View
 from experiments.errors import ConfigError
-from experiments.evaluation.evaluate import wilson
 from experiments.runs import run_dir
+from experiments.stats import wilson
 from robot_io.control import process
 from robot_io.control.config import RobotConfig
 from robot_io.emulator.processes import Ports, Rig

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,12 +13,12 @@ from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.runs.load_policy import TrainedPolicy
+from experiments.stats import wilson
 from mjx_tt.env import reachability, rewards
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import RESULT_SPECS, RolloutResult, Simulator
 from mjx_tt.env.task import HIT, MISSED, RETURNED
 
-CONFIDENCE_Z = 1.959963984540054  # normal quantile of a two-sided 95 % interval
 EVALUATION_COLUMNS = 256  # copies of one policy side by side, to fill the vector loops
 OUTCOMES = {"missed": MISSED, "hit": HIT, "returned": RETURNED}
 
@@ -148,21 +147,6 @@ def return_rate(result: RolloutResult) -> Rate:
     returned = result.finite & (result.outcome == RETURNED)
     low, high = wilson(int(returned.sum()), returned.size)
     return Rate(float(returned.mean()), low, high)
-
-
-def wilson(successes: int, trials: int, z: float = CONFIDENCE_Z) -> tuple[float, float]:
-    """Wilson's score interval of a share (Wilson 1927): it stays within [0, 1] and holds near both ends.
-
-    Raises ValueError without trials or with more successes than trials.
-    """
-    if not 0 <= successes <= trials or trials < 1:
-        raise ValueError(
-            f"{successes} successes in {trials} trials; at least one trial and no more successes are allowed"
-        )
-    share, spread = successes / trials, z * z / trials
-    centre = (share + spread / 2) / (1 + spread)
-    half = z * math.sqrt(share * (1 - share) / trials + spread / (4 * trials)) / (1 + spread)
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def selection_score(result: RolloutResult) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from pathlib import Path
 from typing import Any
 
@@ -16,38 +15,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
-from scipy import stats
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.csv import COLUMNS
-from experiments.evaluation.evaluate import wilson
 from experiments.evaluation.figures import HIT_COLOUR, INK, MISSED_COLOUR, RETURNED_COLOUR, STYLE
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry
+from experiments.stats import t_interval, welch_interval, wilson
 from robot_io.control.episode import HIT, RETURNED
 
 CURVE_COLOUR = "#4575b4"
 SMOOTHING = 7  # updates
 SHORTEST = 2  # samples of a ball that is worth keeping
-
-
-def t_interval(values, confidence: float = 0.95) -> tuple[float, float, float]:
-    """Mean and Student's t interval of the mean of independent values (at least two)."""
-    values = np.asarray(values, float)
-    mean = float(values.mean())
-    half = float(stats.t.ppf(0.5 + confidence / 2, values.size - 1) * values.std(ddof=1) / math.sqrt(values.size))
-    return mean, mean - half, mean + half
-
-
-def welch_interval(a, b, confidence: float = 0.95) -> tuple[float, float, float]:
-    """Mean of b minus mean of a with Welch's interval (Welch 1947), for independent samples of different spread."""
-    a, b = np.asarray(a, float), np.asarray(b, float)
-    parts = np.array([a.var(ddof=1) / a.size, b.var(ddof=1) / b.size])
-    difference = float(b.mean() - a.mean())
-    if not parts.sum():
-        return difference, difference, difference
-    freedom = parts.sum() ** 2 / (parts**2 / np.array([a.size - 1, b.size - 1])).sum()
-    half = float(stats.t.ppf(0.5 + confidence / 2, freedom) * math.sqrt(parts.sum()))
-    return difference, difference - half, difference + half
 
 
 def update_row(entries: list[Entry]) -> dict[str, float]:

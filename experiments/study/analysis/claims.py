@@ -28,6 +28,7 @@ from functools import cached_property
 import numpy as np
 
 from ballmodel import constants as c
+from experiments.stats import welch_interval
 from experiments.study.analysis.paper import CLAIMS, FINAL, GROUPS, TEN, WITHOUT, Claim, of_level
 from experiments.study.analysis.statistics import (
     DRAWS,
@@ -39,7 +40,6 @@ from experiments.study.analysis.statistics import (
     normalised_by_model,
     normalised_by_player,
     t_mean,
-    welch_interval,
 )
 from experiments.study.analysis.study_folder import BallLog, Study, change, paper_models, widths
 from mjx_tt.rally.end_reasons import End

@@ -14,7 +14,7 @@ from pathlib import Path
 from ballmodel.io.atomic_files import replacing
 from experiments.config.study import EFFECTS
 from experiments.errors import ConfigError
-from experiments.finetuning.report import t_interval
+from experiments.stats import t_interval
 from experiments.study.analysis.statistics import Interval
 
 FILE = "effects.csv"

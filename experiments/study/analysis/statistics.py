@@ -7,20 +7,16 @@ its interval holds for a policy that is trained again; players are always the sa
 
 from __future__ import annotations
 
-import itertools
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
-from experiments.finetuning.report import t_interval, welch_interval
+from experiments.stats import sign_flip, t_interval, welch_interval, welch_p
 from experiments.study.analysis.scoring import Rallies
 
 DRAWS = 2000
 PERMUTATIONS = 4000
-EXACT = 14  # units up to which all their sign patterns are tried
 Cell = tuple[int, str, str, str]  # seed, trainer, evaluator, model
 
 
@@ -207,17 +203,12 @@ def difference(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bo
         return None
     both = boot.pair(a, b, trainers, own)
     first, second = (np.concatenate(side) for side in zip(*pairs))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of samples without spread, whose p is set here
-        p_welch = stats.ttest_ind(first, second, equal_var=False).pvalue
-    if not np.isfinite(p_welch):
-        p_welch = float(first.mean() == second.mean())
     return Difference(
         (both[0] - both[1]).interval,
         Interval(*welch_interval(second, first), first.size + second.size),
-        float(p_welch),
+        welch_p(first, second),
         permutation(pairs),
-        sign_flip(np.array([x.mean() - y.mean() for x, y in pairs])),
+        sign_flip([x.mean() - y.mean() for x, y in pairs]),
         len(pairs),
     )
 
@@ -225,7 +216,8 @@ def difference(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bo
 def permutation(pairs: list[tuple[np.ndarray, np.ndarray]], draws: int = PERMUTATIONS, key: int = 0) -> float:
     """Two-sided p of the mean difference over pairs of samples, whose members are exchanged within each pair.
 
-    The share of permutations at least as extreme, the observed one among them (Phipson and Smyth 2010).
+    The share of permutations at least as extreme, the observed one among them (Phipson and Smyth 2010). SciPy's
+    permutation_test has no pairs of samples of different sizes.
     """
     rng = np.random.default_rng(key)
     observed, drawn = 0.0, np.zeros(draws)
@@ -237,29 +229,6 @@ def permutation(pairs: list[tuple[np.ndarray, np.ndarray]], draws: int = PERMUTA
         drawn += mixed[:, : x.size].mean(axis=1) - mixed[:, x.size :].mean(axis=1)
     extreme = np.abs(drawn) >= abs(observed) * (1.0 - 1e-12)
     return float((extreme.sum() + 1) / (draws + 1))
-
-
-def sign_flip(differences: np.ndarray, draws: int = PERMUTATIONS, key: int = 0) -> float:
-    """Two-sided p of a mean of zero, from the signs of the differences alone being exchangeable (Fisher's test).
-
-    Exact up to 14 differences. With n of them it cannot be smaller than 2 / 2^n.
-    """
-    d = np.asarray(differences, float)
-    if d.size <= EXACT:
-        signs = np.array(list(itertools.product((1.0, -1.0), repeat=d.size)))
-        return float(np.mean(np.abs(signs @ d) >= abs(d.sum()) * (1.0 - 1e-12)))
-    signs = np.random.default_rng(key).choice((1.0, -1.0), (draws, d.size))
-    return float((np.sum(np.abs(signs @ d) >= abs(d.sum()) * (1.0 - 1e-12)) + 1) / (draws + 1))
-
-
-def holm(p: Iterable[float]) -> list[float]:
-    """p-values adjusted for their number: one family in twenty has a false one below 0.05 (Holm 1979)."""
-    p = np.asarray(list(p), float)
-    order = np.argsort(p)
-    adjusted = np.maximum.accumulate((p.size - np.arange(p.size)) * p[order])
-    out = np.empty(p.size)
-    out[order] = np.minimum(adjusted, 1.0)
-    return out.tolist()
 
 
 def _is(own: bool | None, cell: Cell) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from ballmodel import registry
 from ballmodel.io.atomic_files import replacing
+from experiments.stats import holm
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis.claims import Finding, Measurements, paper_changes, show, span
 from experiments.study.analysis.paper import (
@@ -26,7 +27,7 @@ from experiments.study.analysis.paper import (
     level,
     of_level,
 )
-from experiments.study.analysis.statistics import holm, t_mean
+from experiments.study.analysis.statistics import t_mean
 from experiments.study.analysis.study_folder import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
 from mjx_tt.rally.end_reasons import End
 

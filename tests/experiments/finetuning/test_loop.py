@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import yaml
 from rich.console import Console
-from scipy import stats
+from scipy.stats import t as student
 
 from ballmodel.distribution import load_distribution
 from bgs import strategy
@@ -35,6 +35,7 @@ from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journ
 from experiments.finetuning.robot import LockStepRobot, NoOperator, PlayedBall
 from experiments.runs import checkpoint, load_policy, metrics
 from experiments.runs.run_dir import Run
+from experiments.stats import t_interval, welch_interval
 from mjx_tt.env.policy import Policy, initial_theta
 from robot_io import contract
 from robot_io.control.episode import EpisodeSummary
@@ -456,15 +457,16 @@ def test_fewer_updates_than_planned_are_an_end_too(source, tmp_path):
 # Measurements
 
 
-def test_intervals_are_those_of_scipy():
+def test_intervals_are_those_of_student_and_welch():
     chance = np.random.default_rng(0)
     a, b = chance.normal(1, 1, 30), chance.normal(2, 3, 20)
-    mean, low, high = finetune_report.t_interval(a)
-    wanted = stats.ttest_1samp(a, 0).confidence_interval(0.95)
-    assert (mean, low, high) == pytest.approx((a.mean(), wanted.low, wanted.high))
-    difference, low, high = finetune_report.welch_interval(a, b)
-    wanted = stats.ttest_ind(b, a, equal_var=False).confidence_interval(0.95)
-    assert (difference, low, high) == pytest.approx((b.mean() - a.mean(), wanted.low, wanted.high))
+    half = student.ppf(0.975, 29) * a.std(ddof=1) / np.sqrt(30)
+    assert t_interval(a) == pytest.approx((a.mean(), a.mean() - half, a.mean() + half))
+    spreads, sizes = np.array([a.var(ddof=1) / 30, b.var(ddof=1) / 20]), np.array([30, 20])
+    half = student.ppf(0.975, spreads.sum() ** 2 / (spreads**2 / (sizes - 1)).sum()) * np.sqrt(spreads.sum())
+    mean = b.mean() - a.mean()
+    assert welch_interval(a, b) == pytest.approx((mean, mean - half, mean + half))
+    assert t_interval([2.0, 2.0]) == (2.0, 2.0, 2.0) and welch_interval([1.0, 1.0], [3.0, 3.0]) == (2.0, 2.0, 2.0)
 
 
 def test_the_emulated_robots_balls_make_a_human_distribution(tmp_path):
