@@ -1,11 +1,13 @@
-"""The command line as a person meets it: in a process of its own, on a tiny experiment."""
+"""The command line as a person meets it, on a tiny experiment: trained in a process of its own, the rest in this one."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
 from importlib import metadata
+from io import StringIO
 
 import imageio.v2 as imageio
 import numpy as np
@@ -32,6 +34,15 @@ evaluation: {episodes: 8, reachable_balls: null}
 
 
 def mjx_tt(*arguments) -> subprocess.CompletedProcess:
+    """One command in this process."""
+    given = list(map(str, arguments))
+    with contextlib.redirect_stdout(StringIO()) as out, contextlib.redirect_stderr(StringIO()) as err:
+        status = cli.main(given)
+    return subprocess.CompletedProcess(given, status, out.getvalue(), err.getvalue())
+
+
+def process(*arguments) -> subprocess.CompletedProcess:
+    """One command in a process of its own, as a person starts it."""
     command = [sys.executable, "-m", "experiments.cli", *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
 
@@ -42,7 +53,7 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli")
     yaml = folder / "tiny.yaml"
     yaml.write_text(EXPERIMENT)
-    done = mjx_tt("train", yaml, "--out", folder / "runs", "--devices", 1)
+    done = process("train", yaml, "--out", folder / "runs", "--devices", 1)
     assert done.returncode == 0, done.stdout + done.stderr
     return yaml, folder / "runs", done.stdout
 

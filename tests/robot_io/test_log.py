@@ -314,6 +314,7 @@ def killed(folder: Path, ticks: int, also_recorder: bool) -> tuple[int, int]:
     return int(rest[-1]) if rest else last, heir
 
 
+@pytest.mark.realtime
 def test_when_the_control_process_is_killed_nothing_is_lost(tmp_path):
     last, heir = killed(tmp_path, 75, also_recorder=False)
     deadline = time.monotonic() + 30
@@ -327,6 +328,7 @@ def test_when_the_control_process_is_killed_nothing_is_lost(tmp_path):
     assert not (tmp_path / "dying.mcap.part").exists()
 
 
+@pytest.mark.realtime
 def test_when_both_are_killed_all_but_half_a_second_is_there(tmp_path):
     last, heir = killed(tmp_path, 100, also_recorder=True)
     os.kill(heir, signal.SIGKILL)

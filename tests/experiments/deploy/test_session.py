@@ -50,6 +50,7 @@ def run(policy, log_folder, balls=None) -> tuple[int, str]:
     return status, console.export_text()
 
 
+@pytest.mark.realtime
 def test_plays_on_the_rig_and_leaves_a_log_and_a_summary(policy, tmp_path):
     status, text = run(policy, tmp_path, balls=2)
     assert status == 0, text
@@ -140,6 +141,7 @@ def test_port_in_use_is_refused(policy):
             play.Session(robot_at(ports), process.ControlOptions(str(policy)), Console())
 
 
+@pytest.mark.realtime
 def test_missing_devices_are_named_and_arming_is_refused(policy, monkeypatch):
     monkeypatch.setattr(play, "PREPARE_TIME", 1.0)
     with play.Session(robot_at(free_ports()), process.ControlOptions(str(policy)), Console()) as session:
@@ -164,6 +166,7 @@ def playing(policy, tmp_path):
             yield rig, session, tmp_path
 
 
+@pytest.mark.realtime
 def test_killed_bridge_leaves_a_readable_log_and_the_arm_stops(playing):
     rig, session, folder = playing
     rig.throw(True)
@@ -184,6 +187,7 @@ def test_killed_bridge_leaves_a_readable_log_and_the_arm_stops(playing):
     assert session_log.ticks.time[-1] > killed - 0.5
 
 
+@pytest.mark.realtime
 def test_missed_ticks_are_in_the_log(playing):
     """The control process is held for 45 ms: late, but not yet a fault of timing."""
     _, session, folder = playing
@@ -198,6 +202,7 @@ def test_missed_ticks_are_in_the_log(playing):
     assert missed >= 5 and sum(json.loads(event.text)["missed"] for event in events) == missed
 
 
+@pytest.mark.realtime
 def test_emergency_stop_of_the_arm_is_a_latched_fault(playing):
     rig, session, _ = playing
     rig.motors_off()
@@ -215,6 +220,7 @@ def test_emergency_stop_of_the_arm_is_a_latched_fault(playing):
     assert session.status["state"] in ("ready", "active") and not session.status["faults"]
 
 
+@pytest.mark.realtime
 def test_pulled_cable_of_an_axis_is_a_latched_fault_and_can_be_mended(playing):
     rig, session, _ = playing
     rig.connect_axis(0, False)

@@ -252,6 +252,7 @@ def test_the_run_can_be_trained_from_and_tuned_again(source, tmp_path):
 # Interruptions
 
 
+@pytest.mark.slow
 def test_killed_at_random_moments_it_ends_in_the_same_parameters(source, tmp_path):
     """The emulated robot, SIGKILL three times; against a run that nothing disturbs."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"

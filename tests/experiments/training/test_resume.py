@@ -119,6 +119,7 @@ def test_killed_at_random_and_resumed_equals_uninterrupted(yaml, uninterrupted, 
     assert_same_run(tmp_path / "run", uninterrupted)
 
 
+@pytest.mark.slow
 def test_terminated_then_full_disk_then_resumed(yaml, uninterrupted, tmp_path):
     """SIGTERM saves a checkpoint; a disk that takes no more is said so and costs nothing; then the run goes on."""
     folder = tmp_path / "run"

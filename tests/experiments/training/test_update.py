@@ -24,6 +24,7 @@ from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import SimModel
 
 PAIRS, REPEATS = 4, 2
+TASK = TaskConfig(sim_rate=75.0)  # one substep: compiles in half the time
 BGS = BGSConfig(pairs=PAIRS, sigma=0.05, keep=1.0, step=optimizers.make("sgd", 0.01))
 
 
@@ -34,7 +35,7 @@ def pool():
 
 @pytest.fixture(scope="module")
 def trainer(pool):
-    return Trainer(Simulator(TaskConfig()), BGS, pool, SimModel(), repeats=REPEATS)
+    return Trainer(Simulator(TASK), BGS, pool, SimModel(), repeats=REPEATS)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +66,7 @@ def test_several_updates_compile_once(trainer, trainer_on_two, run, run_on_two, 
 
 @pytest.fixture(scope="module")
 def trainer_on_two(pool):
-    return Trainer(Simulator(TaskConfig(), devices=2), BGS, pool, SimModel(), repeats=REPEATS)
+    return Trainer(Simulator(TASK, devices=2), BGS, pool, SimModel(), repeats=REPEATS)
 
 
 @pytest.fixture(scope="module")
@@ -148,6 +149,7 @@ training: {{pool: 16, devices: 1}}
 """
 
 
+@pytest.mark.slow
 def test_the_same_yaml_trains_under_both_engines():
     """The smallest experiment: one pair, one episode each. Common random numbers give both members of a pair the same
     ball, latencies and noise, so without a difference in their parameters there is none in their returns."""
@@ -165,14 +167,14 @@ def test_the_same_yaml_trains_under_both_engines():
 
 def test_mistakes_are_named(pool):
     with pytest.raises(ValueError, match="repeats is 0, at least 1 is needed"):
-        Trainer(Simulator(TaskConfig()), BGS, pool, SimModel(), repeats=0)
+        Trainer(Simulator(TASK), BGS, pool, SimModel(), repeats=0)
 
 
 def test_later_weights_take_over_after_their_update(trainer, run, pool):
     """Before it nothing changes; from then on the step is that of a task with these weights."""
     weights = tuple(0.0 if name == "state_transition" else weight for name, weight in rewards.SIM_WEIGHTS.items())
-    changing = Trainer(Simulator(TaskConfig()), BGS, pool, SimModel(), repeats=REPEATS, later_weights=(2, weights))
-    other = Trainer(Simulator(TaskConfig(reward_weights=weights)), BGS, pool, SimModel(), repeats=REPEATS)
+    changing = Trainer(Simulator(TASK), BGS, pool, SimModel(), repeats=REPEATS, later_weights=(2, weights))
+    other = Trainer(Simulator(replace(TASK, reward_weights=weights)), BGS, pool, SimModel(), repeats=REPEATS)
     states, metrics = updates(changing)
     for i in (1, 2):
         np.testing.assert_allclose(states[i].bgs.theta, run[0][i].bgs.theta, rtol=0, atol=1e-6)

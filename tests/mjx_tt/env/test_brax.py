@@ -31,7 +31,7 @@ def pool():
 
 @pytest.fixture(scope="module")
 def env(pool):
-    task = TaskConfig(sim_rate=150.0, max_steps=110, reward_weights=tuple(np.linspace(0.4, 1.4, 11)))
+    task = TaskConfig(sim_rate=75.0, max_steps=110, reward_weights=tuple(np.linspace(0.4, 1.4, 11)))
     return TableTennis(Simulator(task, 1), pool, SimModel(), RANDOMISE)
 
 

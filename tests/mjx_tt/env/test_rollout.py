@@ -33,7 +33,7 @@ def pool():
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Simulator(TaskConfig())
+    return Simulator(TaskConfig(sim_rate=75.0))  # one substep: compiles in half the time
 
 
 @pytest.fixture(scope="module")

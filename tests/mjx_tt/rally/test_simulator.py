@@ -51,8 +51,12 @@ def simulator():
 
 
 def spread(model):
-    """The model with every leaf of a lane's own: one compiled program serves all worlds."""
-    return jax.tree.map(lambda leaf: jnp.full(LANES, leaf, jnp.float32), without_nominal(model))
+    """The model with every leaf of a lane's own and the wall's effects: one compiled program serves all worlds."""
+
+    def own(kept, leaf):
+        return None if kept is None else jnp.full(LANES, leaf, jnp.float32)
+
+    return jax.tree.map(own, without_nominal(WALL), model, is_leaf=lambda leaf: leaf is None)
 
 
 def stacked(**changes):
@@ -84,7 +88,7 @@ def shots(simulator, balls, touches, theta=STILL, model=EXACT, box=None, start=N
         start=home if start is None else start,
         dummy=jnp.zeros(LANES, bool),
     )
-    everything = Box(jnp.full(8, -99.0), jnp.full(8, 99.0)) if box is None else box
+    everything = Box(np.full(8, -99.0, np.float32), np.full(8, 99.0, np.float32)) if box is None else box
     state, result = simulator.shots(
         Policy(theta, *NORMALISER), stacked(), without_nominal(spread(model)), state, jax.random.key(key), everything
     )

@@ -131,7 +131,7 @@ def simulation():
     return model.with_values(scripted_episodes.model(gravity=0.0), values)
 
 
-@pytest.mark.parametrize("engine", ["fused", "mjx"])
+@pytest.mark.parametrize("engine", ["fused", pytest.param("mjx", marks=pytest.mark.slow)])
 def test_the_robot_follows_its_drives_equations_under_both_engines(engine):
     """Joints, paddle and observation of eight episodes with different drives, against MuJoCo C behind the equations."""
     rng = np.random.default_rng(5)

@@ -568,6 +568,7 @@ def wait_for(condition, seconds=10.0):
         time.sleep(0.005)
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("profile", ["cmmt", "fhpp"])
 def test_over_tcp_in_real_time(profile):
     with RealTime(profile) as rig:
@@ -590,6 +591,7 @@ def test_over_tcp_in_real_time(profile):
         assert "not running" in thread.problem(time.monotonic())
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("broken", [0, 1])
 def test_thread_stops_the_axes_when_it_breaks(broken):
     """An error that nobody thought of, in one axis's exchange: the other is stopped and switched off."""
@@ -608,6 +610,7 @@ def test_thread_stops_the_axes_when_it_breaks(broken):
             assert "restart the program" in thread.problem(time.monotonic())
 
 
+@pytest.mark.realtime
 def test_festos_own_client_runs_the_emulator():
     """festo-edcon pins another pymodbus, so it lives in an environment of its own."""
     python = os.environ.get(EDCON_PYTHON)
