@@ -194,3 +194,11 @@ def test_folders_and_modules_stay_small():
     assert {folder for folder, count in modules.items() if count > MOST_MODULES} == CROWDED
     lines = {path.relative_to(ROOT).as_posix(): len(path.read_text(encoding="utf-8").splitlines()) for path in paths}
     assert {path for path, count in lines.items() if count > MOST_LINES} == set(LONG)
+
+
+def test_tests_mirror_the_source():
+    """Each file of a package's tests is named after the module, or the folder, that it tests."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / "tests" / package).rglob("test_*.py")):
+            tested = ROOT / path.relative_to(ROOT / "tests").with_name(path.stem.removeprefix("test_"))
+            assert tested.is_dir() or tested.with_suffix(".py").exists(), f"{path.relative_to(ROOT)} tests no {tested}"

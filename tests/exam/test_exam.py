@@ -430,20 +430,26 @@ def test_an_examination_goes_on_where_it_was(tmp_path):
 # --- a small examination, fixed in time: the command line answers, then the seal is opened ----------------------------
 
 
+SLOW = pytest.mark.slow
 FIXED = [
     (Case("none", (), 0.0, "ar1", 11, count=200), ("right",)),
     (Case("single", ("wind_x",), 20.0, "range", 13, count=200), ("right",)),
-    (Case("single", ("drag_coefficient",), 20.0, "ar1", 14, count=200), ("right",)),
-    (Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",)),
-    (Case("invented", ("air_jet",), 20.0, "iid", 17, count=200), ("flagged",)),
-    (Case("deleted", ("table_friction",), 20.0, "iid", 18, without=("table_friction",), count=200), ("flagged",)),
+    pytest.param(Case("single", ("drag_coefficient",), 20.0, "ar1", 14, count=200), ("right",), marks=SLOW),
+    pytest.param(Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",), marks=SLOW),
+    pytest.param(Case("invented", ("air_jet",), 20.0, "iid", 17, count=200), ("flagged",), marks=SLOW),
+    pytest.param(
+        Case("deleted", ("table_friction",), 20.0, "iid", 18, without=("table_friction",), count=200),
+        ("flagged",),
+        marks=SLOW,
+    ),
     # Its exact twins were cleared by an instrument.
-    (
+    pytest.param(
         Case("single", ("air_density",), 20.0, "iid", 21, ("drag_coefficient", "ball_mass", "ball_radius"), 200),
         ("right",),
+        marks=SLOW,
     ),
     (Case("robot", ("joint_2.lag",), 0.0, "iid", 19), ("right",)),
-    (Case("unexcited", ("joint_3.acceleration_limit",), 0.0, "iid", 22), ("right",)),
+    pytest.param(Case("unexcited", ("joint_3.acceleration_limit",), 0.0, "iid", 22), ("right",), marks=SLOW),
     (Case("robot_none", (), 0.0, "iid", 20), ("right",)),
 ]
 
