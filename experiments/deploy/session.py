@@ -115,6 +115,8 @@ class Session:
                 message = self.pipe.recv()
             except (EOFError, OSError):
                 raise RefusedError(f"the control process has ended (status {self.process.exitcode})") from None
+            if message[0] == "failed":
+                raise RefusedError(f"the control process failed after it had stopped the robot: {message[1]}")
             if message[0] == "status":
                 self.status = message[1]
             yield message

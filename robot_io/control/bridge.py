@@ -6,15 +6,17 @@ ACTIVE    the policy plays the ball that is coming
 STOPPING  the operator's stop: slows down to rest, then DISARMED
 FAULT     slowed down and held until the operator resets it
 
-Everything that is sent has passed ``robot_io.safety.gate``. Times are seconds of one monotonic clock, passed in.
+Everything that is sent has passed ``robot_io.safety.gate``. An exception in here is a fault: ``tick`` and whatever takes
+what arrives never raise. Times are seconds of one monotonic clock, passed in.
 """
 
 from __future__ import annotations
 
-import json
 import math
+import traceback
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from enum import Enum
 from time import perf_counter
@@ -25,7 +27,7 @@ import numpy as np
 from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, JOINT_NAMES, LIMITS, N_JOINTS
 from robot_io.control.episode import Episode, EpisodeSummary, in_play
 from robot_io.control.observation import Feedback, ObservationDelays, joints, observe
-from robot_io.devices.egm.session import EgmSession
+from robot_io.devices.egm.session import ArmFeedback, EgmSession
 from robot_io.devices.tracker import Tracker
 from robot_io.errors import RefusedError
 from robot_io.history import History
@@ -37,9 +39,11 @@ from robot_io.log.messages import (
     Joints,
     Level,
     Observation,
+    Record,
     Tick,
     episode_end,
     episode_start,
+    json_text,
 )
 from robot_io.log.recorder import NullRecorder, SessionRecorder
 from robot_io.safety.clearance import RobotGeometry
@@ -49,6 +53,7 @@ from robot_io.safety.gate import State as GateState
 
 MAX_STEPS = 200  # control ticks of an episode, as in training
 AT_HOME = 0.02  # [m], [rad] of every joint
+LONGEST_STOP = 2.0  # [s] after which a stop ends although the measurement does not come to rest
 BLADE = "col_blade_axis"  # the capsule whose middle is the blade's centre
 
 
@@ -149,6 +154,11 @@ class Bridge:
         self._home_speed = config.home_speed * self._policy_limit
         self._home_braking = config.home_braking * np.array(LIMITS.acceleration)
         self._logged_faults = 0
+        self.unlogged = 0  # records that could not be logged
+        self._reported_unlogged = 0
+        self._log_failure = ""  # why the log's file cannot be written
+        self._errors: set[str] = set()  # of the program, each logged once
+        self._stopping_since = -math.inf
         self._waiting: deque[Episode] = deque()  # policy's part over, outcome open
         self._last_ball = -1  # number of the ball that was played last
         self._stop_wanted = False
@@ -195,11 +205,12 @@ class Bridge:
 
     def stop(self, now: float) -> None:
         """The operator's stop: slows down, holds, and ends DISARMED."""
-        self._event(now, Level.INFO, "operator", "stop")
         if self.state in (State.READY, State.ACTIVE):
-            self._abort_episodes("stopped", now)
             self.gate.brake(now)
+            self._stopping_since = now
+            self._abort_episodes("stopped", now)
             self._change(State.STOPPING, now, "stopped by the operator")
+        self.event(now, Level.INFO, "operator", "stop")
 
     def reset(self, now: float) -> None:
         """FAULT to DISARMED. Raises RefusedError without a fault, while a cause is present or the robot still moves."""
@@ -215,38 +226,67 @@ class Bridge:
 
     def discard(self, now: float) -> None:
         """Marks the ball in play, or the one before, as not to be used."""
-        self._event(now, Level.INFO, "operator", "discard")
+        self.event(now, Level.INFO, "operator", "discard")
         for episode in [self.episode, *self._waiting]:
             if episode is not None:
                 episode.discarded = True
 
+    def failed(self, error: BaseException, now: float) -> None:
+        """Brake for an error of the program, wherever it was raised, and latch it as INTERNAL."""
+        sentence = f"{type(error).__name__}: {error}"
+        self.gate.fault(Cause.INTERNAL, sentence, now)
+        if sentence not in self._errors and len(self._errors) < 100:
+            self._errors.add(sentence)
+            self.event(now, Level.FATAL, "error", "".join(traceback.format_exception(error)))
+
+    @contextmanager
+    def _guarded(self, now: float) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # whatever it is, the robot must be braked and the loop go on
+            self.failed(error, now)
+
     # What arrives
 
     def arm_received(self, now: float) -> bytes | None:
-        """To be called when the EGM session has taken a packet: the one answer to it."""
+        """Answer the packet that the EGM session has just taken; None when there is nothing to answer."""
         feedback = self.arm_session.feedback
         if feedback is None:
             return None
+        hold = feedback.position, np.zeros(len(ABB_JOINTS))
+        with self._guarded(now):
+            position, velocity = self._arm_reference(feedback, now) or hold
+            return self.arm_session.reply(position, velocity, now)
+        with self._guarded(now):
+            return self.arm_session.reply(*hold, now)
+        return None
+
+    def _arm_reference(self, feedback: ArmFeedback, now: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Position (6,) and velocity (6,) for the arm at ``now``; None: hold the measured place."""
         if self._feedback.arm.add(feedback.received, feedback.position):
             position, velocity = joints(self._feedback)
-            self.recorder.put(Joints(feedback.received, position, velocity))
+            self._log(Joints(feedback.received, position, velocity))
         # Where the old reference would lead a controller that was started anew, nobody has asked for.
         self._arm_restarted |= feedback.sequence < self._arm_sequence
         self._arm_sequence = feedback.sequence
         if self.gate.state is GateState.DISARMED or self._arm_restarted or not np.isfinite(self._start).all():
-            return self.arm_session.reply(feedback.position, np.zeros(len(ABB_JOINTS)), now)
+            return None
         rows = list(ABB_JOINTS)
         velocity = self.gate.velocity[rows]
         # A tick that is overdue must not let the reference run away.
         since = min(max(now - self._tick_time, 0.0), 2.0 * self.gate.period)
-        return self.arm_session.reply(self._start[rows] + velocity * since, velocity, now)
+        return self._start[rows] + velocity * since, velocity
 
     def tracker_received(self, datagram: bytes, source: str, now: float) -> None:
-        """One datagram of the tracker."""
+        """Take one datagram of the tracker."""
+        with self._guarded(now):
+            self._follow_ball(datagram, source, now)
+
+    def _follow_ball(self, datagram: bytes, source: str, now: float) -> None:
         sample = self.tracker.receive(datagram, source, now)
         if sample is None or sample.position is None:
             return
-        self.recorder.put(Ball(sample.captured, now, sample.position, sample.ball))
+        self._log(Ball(sample.captured, now, sample.position, sample.ball))
         if self.episode is not None and not self.episode.over and sample.ball == self.episode.ball:
             self._tracks[self.episode.number].append((sample.captured, *sample.position))
         following = [e for e in (self.episode, *self._waiting) if e is not None]
@@ -273,7 +313,33 @@ class Bridge:
     def tick(self, deadline: float, now: float) -> np.ndarray:
         """One control period: observe, decide, pass the gate, hand over to the devices. Returns the sent velocity (8,)."""
         self.counts.ticks += 1
-        measured, measured_velocity = joints(self._feedback)
+        self.policy_seconds, request = 0.0, np.zeros(N_JOINTS)
+        measured, measured_velocity = np.full(N_JOINTS, np.nan), np.zeros(N_JOINTS)
+        with self._guarded(now):
+            measured, measured_velocity = joints(self._feedback)
+            request = self._decide(now)
+        sent = self.gate.command(request, measured, measured_velocity, now)
+        self._start = self.gate.start if self.gate.engaged else measured
+        self._tick_time = now
+        with self._guarded(now):
+            if self.gate.engaged:
+                festo = list(FESTO_JOINTS)
+                self.axes.command(self._start[festo], sent.velocity[festo], now)
+        with self._guarded(now):
+            self._after(now)
+        with self._guarded(now):
+            ages, n = self._ages(now), self.counts.ticks
+            self._log(
+                Tick(n, now, now - deadline, self.policy_seconds, ages["ball"], ages["axes"], ages["arm"]),
+                Command(n, now, request, sent.velocity, self._start),
+            )
+        if self.unlogged > self._reported_unlogged:
+            self._reported_unlogged = self.unlogged
+            self.event(now, Level.WARNING, "log_error", json_text({"unlogged": self.unlogged}))
+        return sent.velocity
+
+    def _decide(self, now: float) -> np.ndarray:
+        """The requested velocity (8,), after a look at the devices and at the balls."""
         self._watch(now)
         self._settle_episodes(now)
         if self.paused:
@@ -281,26 +347,9 @@ class Bridge:
         if self.state is State.READY and not self.paused and self.at_home and in_play(self.tracker, now):
             if self.tracker.ball != self._last_ball:
                 self._begin(now)
-        self.policy_seconds, request = 0.0, np.zeros(N_JOINTS)
         if self.state is State.ACTIVE:
-            request = self._play(now)
-        elif self.state is State.READY:
-            request = self._homeward()
-        self._start = self.gate.reference if np.isfinite(self.gate.reference).all() else measured
-        sent = self.gate.command(request, measured, measured_velocity, now)
-        self._tick_time = now
-        if not self.gate.engaged:
-            self._start = measured
-        else:
-            festo = list(FESTO_JOINTS)
-            self.axes.command(self._start[festo], sent.velocity[festo], now)
-        self._after(sent, now)
-        ages = self._ages(now)
-        self.recorder.put(
-            Tick(self.counts.ticks, now, now - deadline, self.policy_seconds, ages["ball"], ages["axes"], ages["arm"]),
-            Command(self.counts.ticks, now, request, sent.velocity, self._start),
-        )
-        return sent.velocity
+            return self._play(now)
+        return self._homeward() if self.state is State.READY else np.zeros(N_JOINTS)
 
     def _ages(self, now: float) -> dict[str, float]:
         arm, seen = self.arm_session.feedback, self.tracker.received
@@ -324,8 +373,9 @@ class Bridge:
         if armed and self.arm_session.session_id != self._arm_session_id:
             self._arm_session_id = self.arm_session.session_id
             self.gate.fault(Cause.ARM_NOT_READY, "the arm's EGM session started anew: its reference is lost", now)
-        if armed and self.recorder.failure:
-            self.gate.fault(Cause.INTERNAL, self.recorder.failure, now)
+        log_failure = self.recorder.failure or self._log_failure
+        if armed and log_failure:
+            self.gate.fault(Cause.INTERNAL, log_failure, now)
 
     def _begin(self, now: float) -> None:
         self.counts.balls += 1
@@ -333,7 +383,7 @@ class Bridge:
         self.episode = Episode(self.counts.balls, self.tracker.ball, now)
         self._tracks[self.counts.balls] = [(t, *x) for t, x in self.tracker.track.samples()]
         self._policy.reset()
-        self.recorder.put(episode_start(now, self.episode.number, ball=self.episode.ball))
+        self._log(episode_start(now, self.episode.number, ball=self.episode.ball))
         self._change(State.ACTIVE, now, f"ball {self.episode.ball}")
 
     def _play(self, now: float) -> np.ndarray:
@@ -356,7 +406,7 @@ class Bridge:
             return np.zeros(N_JOINTS)
         self.policy_seconds = perf_counter() - began
         episode.steps += 1
-        self.recorder.put(Observation(self.counts.ticks, now, observation), Action(self.counts.ticks, now, action))
+        self._log(Observation(self.counts.ticks, now, observation), Action(self.counts.ticks, now, action))
         return action * self._policy_limit
 
     def _homeward(self) -> np.ndarray:
@@ -389,42 +439,55 @@ class Bridge:
         self.counts.rally = self.counts.rally + 1 if summary.outcome == "returned" else 0
         self.counts.longest_rally = max(self.counts.longest_rally, self.counts.rally)
         details = {k: v for k, v in asdict(summary).items() if k not in ("number", "outcome")}
-        self.recorder.put(episode_end(now, summary.number, summary.outcome, {}, **details))
-        if self._on_episode is not None:
-            self._on_episode(summary)
-        self._tracks.pop(summary.number, None)
+        self._log(episode_end(now, summary.number, summary.outcome, {}, **details))
+        try:
+            if self._on_episode is not None:
+                self._on_episode(summary)
+        finally:
+            self._tracks.pop(summary.number, None)
 
     def _abort_episodes(self, cause: str, now: float) -> None:
         for episode in (self.episode, *self._waiting):
             if episode is not None:
                 episode.abort(cause, now)
 
-    def _after(self, sent, now: float) -> None:
+    def _after(self, now: float) -> None:
         """Follows the gate's state."""
         if self.gate.state is GateState.FAULT:
             faults = self.gate.faults
             if len(faults) > self._logged_faults:
                 for fault in faults[self._logged_faults :]:
-                    self._event(
-                        now, Level.ERROR, "fault", json.dumps({"cause": fault.cause.value, "text": fault.sentence})
+                    self.event(
+                        now, Level.ERROR, "fault", json_text({"cause": fault.cause.value, "text": fault.sentence})
                     )
-                if self._logged_faults == 0:
+                first, self._logged_faults = self._logged_faults == 0, len(faults)
+                if first:
                     self._abort_episodes(faults[0].cause.value, now)
                     self._change(State.DISARMED, now, f"fault: {faults[0].sentence}")
-                self._logged_faults = len(faults)
             if self.gate.at_rest:
                 self.axes.stop()
         elif self._state is State.STOPPING and self.gate.at_rest:
             self.axes.stop()
-            self.gate.disarm(now)
-            self._change(State.DISARMED, now, "at rest")
+            if self.gate.settled or now - self._stopping_since > LONGEST_STOP:
+                self.gate.disarm(now)
+                self._change(State.DISARMED, now, "at rest")
 
     def _change(self, state: State, now: float, why: str) -> None:
-        self._event(now, Level.INFO, "state", json.dumps({"from": self._state.value, "to": state.value, "why": why}))
+        self.event(now, Level.INFO, "state", json_text({"from": self._state.value, "to": state.value, "why": why}))
         self._state = state
 
-    def _event(self, now: float, level: Level, name: str, text: str) -> None:
-        self.recorder.put(Event(now, level, name, text))
+    def event(self, now: float, level: Level, name: str, text: str) -> None:
+        """Log something that happened."""
+        self._log(Event(now, level, name, text))
+
+    def _log(self, *records: Record) -> None:
+        """Hand records to the recorder; what it raises is counted and never reaches the loop."""
+        try:
+            self.recorder.put(*records)
+        except Exception as error:
+            self.unlogged += len(records)
+            if isinstance(error, OSError):  # nothing more will get into the file
+                self._log_failure = f"the log cannot be written: {error}"
 
     def ball_track(self, summary: EpisodeSummary) -> np.ndarray:
         """(n, 4) t [s], x, y, z [m] of the incoming ball, from its first sight until it was played; while ``on_episode``."""

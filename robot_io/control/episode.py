@@ -27,6 +27,7 @@ UNSEEN = 0.25  # [s] without a sight of the ball after which it is out of play
 LONGEST_RETURN = 2.5  # [s] after the hit by which the outcome is decided
 GRAVITY, BALL_RADIUS = 9.81, 0.020
 HALF_WIDTH, HALF_LENGTH = 0.7625, 1.37  # [m] of the table
+FARTHEST = 3.0  # [m] of ball and blade, also where the blade's place is not known
 SIDE = 3  # samples before and after a moment in which a change of velocity is looked for
 LONGEST_WINDOW = 0.12  # [s] of these samples together
 
@@ -108,7 +109,7 @@ class Episode:
     decided: bool = False  # the outcome
     returned: bool = False
     crossed: bool = False
-    closest: float = 3.0
+    closest: float = FARTHEST
     net_height: float = 0.0
     landing: tuple[float, float] = (0.0, -HALF_LENGTH)
     fault: str | None = None
@@ -119,7 +120,7 @@ class Episode:
     _seen: float = -np.inf
 
     def follow(self, sample: BallSample, blade: np.ndarray, now: float) -> None:
-        """Takes an accepted sample with the blade's centre (3,) [m] at its capture."""
+        """Take an accepted sample with the blade's centre (3,) [m] at its capture, infinite where it is not known."""
         if self.decided or sample.position is None:
             return
         if sample.ball != self.ball:
@@ -127,7 +128,8 @@ class Episode:
             return
         self._seen = sample.captured
         last = self._recent[-1] if self._recent else None
-        seen = _Seen(sample.captured, sample.position, float(np.linalg.norm(sample.position - blade)))
+        distance = min(float(np.linalg.norm(sample.position - blade)), FARTHEST)
+        seen = _Seen(sample.captured, sample.position, distance)
         self._recent.append(seen)
         if not self.over:
             self._incoming(last, seen, now)

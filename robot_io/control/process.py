@@ -5,7 +5,7 @@ Started by ``start``; it talks with its owner over a pipe:
              ("policy", Policy) ("quit",)
     from it  ("ready", report) ("status", dict) ("episode", EpisodeSummary, ball (n, 4)) ("refused", sentence)
              ("failed", sentence) ("ended", statistics)
-When the owner goes away, the robot is stopped and the process ends.
+When the owner goes away, the robot is stopped and the process ends. An exception ends it too, once the robot stands.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from robot_io.safety.gate import SafetyGate
 
 STATUS_PERIOD = 0.2  # [s]
 STOP_TIME = 2.0  # [s] for coming to rest before the process ends
+AFTER_REST = 0.05  # [s] in which the arm is told to hold the place where it stands
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,7 @@ def _main(config: RobotConfig, options: ControlOptions, pipe: Connection) -> Non
     except Exception as error:
         pipe.send(("failed", f"{error}" or type(error).__name__))
         return
+    signal.signal(signal.SIGTERM, lambda *_: control.quit())
     with control:
         control.run()
 
@@ -116,7 +118,7 @@ class Control:
         except BaseException:
             self._close()
             raise
-        self._done = False
+        self._quit = False
         self._unsent: deque = deque()
         self._status_at = 0.0
         self._period = 1.0 / config.rate
@@ -132,10 +134,15 @@ class Control:
         self._close()
 
     def _close(self) -> None:
-        """In the opposite order: the axes stop before the log ends."""
-        for thing in reversed(self._opened):
-            thing.close()
-        self._opened.clear()
+        """Close everything in the opposite order, so that the axes stop before the log ends; then raise the first error."""
+        errors = []
+        while self._opened:
+            try:
+                self._opened.pop().close()
+            except Exception as error:  # the others must be closed all the same
+                errors.append(error)
+        if errors:
+            raise errors[0]
 
     @staticmethod
     def _warm_up(policy, gate: SafetyGate) -> None:
@@ -152,19 +159,48 @@ class Control:
         self._pipe.send(("ready", report))
         try:
             self._loop()
+        except BaseException as error:  # nothing leaves the loop before the robot stands
+            self._bring_to_rest(error)
+            self._send(("failed", f"{type(error).__name__}: {error}"))
+            raise
         finally:
             self._send(("ended", self.timings.summary()))
             while self._unsent and self._flush():
                 pass
 
+    def quit(self) -> None:
+        """Stop the robot and end the loop when it stands; from a signal handler too."""
+        self._quit = True
+
+    def _bring_to_rest(self, error: BaseException) -> None:
+        """Brake through the gate and answer the arm until the robot stands, with as little of the loop as possible."""
+        now = time.monotonic()
+        self.bridge.failed(error, now)
+        deadline, end = now, now + STOP_TIME
+        while now < end:
+            try:
+                if self.bridge.gate.settled:
+                    end = min(end, now + AFTER_REST)
+                if select.select([self._arm_socket.fileno()], [], [], max(deadline - now, 0.0))[0]:
+                    self._answer_arm()
+                now = time.monotonic()
+                if now >= deadline:
+                    deadline = now + self._period
+                    self._take_axes()
+                    self.bridge.tick(now, now)
+            except BaseException:  # whatever fails again: the next reply and the next tick still count
+                time.sleep(0.001)
+                now = time.monotonic()
+
     def _loop(self) -> None:
         spin, bridge = self._config.realtime.spin, self.bridge
         arm, tracker, pipe = self._arm_socket.fileno(), self._tracker_socket.fileno(), self._pipe.fileno()
         deadline = time.monotonic() + self._period
-        end = float("inf")
+        end: float | None = None
         while True:
             now = time.monotonic()
-            ready, _, _ = select.select([arm, tracker, pipe], [], [], max(deadline - now - spin, 0.0))
+            watched = [arm, tracker] if self._quit else [arm, tracker, pipe]
+            ready, _, _ = select.select(watched, [], [], max(deadline - now - spin, 0.0))
             if arm in ready:
                 self._answer_arm()
             if tracker in ready:
@@ -184,10 +220,14 @@ class Control:
             if missed > 0:
                 self.timings.missed += missed
                 deadline += missed * self._period
-                self._recorder.put(log.Event(now, log.Level.WARNING, "ticks_missed", json.dumps({"missed": missed})))
-            if self._done:
-                end = min(end, now + STOP_TIME)
-                if now >= end or bridge.gate.at_rest:
+                self.bridge.event(now, log.Level.WARNING, "ticks_missed", json.dumps({"missed": missed}))
+            if self._quit:
+                if end is None:
+                    end = now + STOP_TIME
+                    bridge.stop(now)
+                if bridge.gate.settled:
+                    end = min(end, now + AFTER_REST)
+                if now >= end:
                     return
 
     def _answer_arm(self) -> None:
@@ -198,10 +238,13 @@ class Control:
                 self._arm_socket.send(reply, self._session.endpoint)
                 self.timings.reply.add(time.monotonic() - began)
 
-    def _tick(self, deadline: float, now: float) -> None:
+    def _take_axes(self) -> None:
         state = self._axes.state
         if state is not None:
             self.bridge.axes_received(state.position, state.received)
+
+    def _tick(self, deadline: float, now: float) -> None:
+        self._take_axes()
         self.bridge.tick(deadline, now)
         self.timings.lateness.add(now - deadline)
         if self.bridge.policy_seconds:
@@ -217,12 +260,12 @@ class Control:
     # The owner
 
     def _listen(self) -> None:
-        """Takes the owner's messages; a pipe that ends means stop."""
+        """Take the owner's messages; a pipe that ends means stop."""
         try:
-            while self._pipe.poll():
+            while not self._quit and self._pipe.poll():
                 self._obey(self._pipe.recv())
         except (EOFError, OSError):
-            self._obey(("quit",))
+            self._quit = True
 
     def _obey(self, message: tuple) -> None:
         now = time.monotonic()
@@ -245,12 +288,13 @@ class Control:
             elif kind == "policy":
                 self.bridge.set_policy(make_policy(self._options.backend, arguments[0]))
             elif kind == "quit":
-                self.bridge.stop(now)
-                self._done = True
+                self._quit = True
             else:
                 raise RefusedError(f"unknown request {kind!r}")
         except RefusedError as error:
             self._send(("refused", str(error)))
+        except Exception as error:  # a request that cannot be carried out must not end the play
+            self._send(("refused", f"{kind}: {type(error).__name__}: {error}"))
 
     def _episode(self, summary) -> None:
         self._send(("episode", summary, self.bridge.ball_track(summary)))

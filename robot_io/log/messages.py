@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import enum
 import json
+import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -314,15 +315,15 @@ def unpack(data: bytes) -> Record:
 
 
 def episode_start(time: float, episode: int, **details: Any) -> Event:
-    """The event of an episode's start; ``details`` are JSON data."""
-    return Event(time, Level.INFO, "episode_start", _json({"episode": episode, **details}))
+    """Event of an episode's start; ``details`` as for ``json_text``."""
+    return Event(time, Level.INFO, "episode_start", json_text({"episode": episode, **details}))
 
 
 def episode_end(time: float, episode: int, outcome: str, reward: Mapping[str, float], **details: Any) -> Event:
     """The event of an episode's end: ``outcome`` is a short enumerated name, ``reward`` its terms by name."""
     terms = {name: float(value) for name, value in reward.items()}
     return Event(
-        time, Level.INFO, "episode_end", _json({"episode": episode, "outcome": outcome, "reward": terms, **details})
+        time, Level.INFO, "episode_end", json_text({"episode": episode, "outcome": outcome, "reward": terms, **details})
     )
 
 
@@ -331,14 +332,28 @@ def as_strings(entries: Mapping[str, Any]) -> dict[str, str]:
     strings = {}
     for key, value in entries.items():
         try:
-            strings[str(key)] = value if isinstance(value, str) else _json(value)
+            strings[str(key)] = value if isinstance(value, str) else json.dumps(value, allow_nan=False)
         except (TypeError, ValueError) as error:
             raise LogError(f"metadata {key!r}: {value!r} is no string and no JSON data ({error})") from None
     return strings
 
 
-def _json(value: Any) -> str:
-    return json.dumps(value, allow_nan=False)
+def json_text(value: Any) -> str:
+    """JSON of whatever there is to log, without raising: numbers that are not finite become null, unknown types their repr."""
+    try:
+        return json.dumps(_finite(value), allow_nan=False, default=repr)
+    except (TypeError, ValueError, RecursionError):  # keys of other types, circles
+        return json.dumps(repr(value))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    return value
 
 
 def _array(record: Record, name: str, length: int) -> bytes:

@@ -25,6 +25,7 @@ from robot_io.safety.config import SLACK
 from robot_io.safety.config import SafetyConfig as SafetyConfig
 from robot_io.safety.faults import Cause, Fault, FaultLatch
 from robot_io.safety.monitor import FeedbackMonitor, eight, worst
+from robot_io.safety.stopping import StopReference
 
 SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
 INSIDE = 1e-6  # [m] by which a gap must miss its margin to count as inside: more than rounding
@@ -96,11 +97,15 @@ class SafetyGate:
         self._inside = np.zeros(self._margin.shape, bool)  # gaps that have been below their margin since arming
         self._still = np.array(config.still)
         self._monitor = FeedbackMonitor(limits, self.geometry, config)
+        self._stop = StopReference(limits, config)
         self._latch = FaultLatch()
         self._mode = State.DISARMED  # apart from faults
         self._engaged = False  # whether the reference is ours, not the measured position
         self._velocity, self._acceleration = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
         self._reference = np.full(N_JOINTS, np.nan)
+        self._start = self._reference  # where the period in force starts
+        self._measured: tuple[np.ndarray, np.ndarray] | None = None  # position and velocity, when credible
+        self._unexplained = np.zeros(N_JOINTS)
         self._measured_velocity: np.ndarray | None = None
         self._last: float | None = None  # time of the command before
         self._lead = 0.0  # [s] that commands are ahead of the clock
@@ -129,6 +134,19 @@ class SafetyGate:
     def reference(self) -> np.ndarray:
         """Reference (8,) that was sent last."""
         return self._reference.copy()
+
+    @property
+    def start(self) -> np.ndarray:
+        """Reference (8,) at the start of the period in force, from which ``velocity`` goes on."""
+        return self._start.copy()
+
+    @property
+    def settled(self) -> bool:
+        """Nothing is commanded to move, and what was commanded before has come to rest as measured."""
+        if not self._engaged:
+            return True
+        velocity = None if self._measured is None else self._measured[1]
+        return velocity is not None and bool(self._stop.settled(velocity, self._last or 0.0).all())
 
     @property
     def faults(self) -> tuple[Fault, ...]:
@@ -177,8 +195,9 @@ class SafetyGate:
             raise RefusedError(f"not armed: {worst(velocity, self._still, '/s')}, it must be at rest")
         self._mode, self._engaged, self._armed_at = State.ARMED, True, now
         self._velocity, self._acceleration = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
-        self._reference = position
+        self._reference = self._start = position
         self._inside = np.ones(self._margin.shape, bool)
+        self._stop.restart()
         self._lead, self._last = 0.0, None
         self._monitor.restart(position, now)
 
@@ -252,7 +271,10 @@ class SafetyGate:
         self._watch(measured, measured_velocity, now)
         wanted = self._request(request, now)
         if not self._engaged:
+            self._start = self._reference
             return Sent(np.zeros(N_JOINTS), self._reference.copy(), (self.state.value,), self.state)
+        if self.state is not State.ARMED:
+            self._follow_the_arm(now)
         left = np.abs(self._velocity) - self._step
         braked = np.where(left > ROUNDING * self._step, np.copysign(left, self._velocity), 0.0)
         velocity, changed = braked, (self.state.value,)
@@ -267,9 +289,28 @@ class SafetyGate:
                 velocity, changed = braked, (self.state.value,)
         self._acceleration = (velocity - self._velocity) / self.period
         self._velocity = velocity
+        self._start = self._reference
         self._reference = self._reference + velocity * self.period
         self._monitor.sent(self._reference, now + self.period)
         return Sent(velocity.copy(), self._reference.copy(), changed, self.state)
+
+    def _follow_the_arm(self, now: float) -> None:
+        """While stopping: a reference that the measured arm explains. Without a credible measurement it stays."""
+        if self._measured is None:
+            return
+        position, velocity = self._measured
+        reference = self._stop.corrected(self._reference, self._velocity, position, velocity, self._unexplained, now)
+        if (reference == self._reference).all():
+            return
+        self._reference = reference
+        try:
+            way = self.braking_way(self._velocity)
+            clear = self.geometry.first_too_close(way, self._margin, SLACK) is None
+        except Exception:  # a mistake of ours must not keep the reference from the arm
+            clear = False
+        if not clear:  # of all places the one where the arm is needs no motion
+            self._stop.give_up()
+            self._reference = position.copy()
 
     def _allowed(self, wanted: np.ndarray, braked: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
         """The first velocity (8,) on the way from the limited request to braking that is clear, and the rules."""
@@ -379,13 +420,19 @@ class SafetyGate:
         problem = problem or second
         self.condition(Cause.NON_FINITE_FEEDBACK, bool(problem), problem, now)
         self._measured_velocity = None if problem else velocity
-        if problem:
+        self._measured = None
+        if problem or position is None or velocity is None:
             return
+        if self._stop.credible(position, now):
+            self._measured = (position, velocity)
         if not self._engaged:
             self._reference = position
         for cause, sentence in self._monitor.conditions(position, velocity).items():
             self.condition(cause, bool(sentence), sentence, now)
-        if self._engaged and not self._latch:
-            sentence = self._monitor.following_error(position, now)
+        if not self._engaged:
+            return
+        self._unexplained = self._monitor.unexplained(position, now)
+        if not self._latch:
+            sentence = self._monitor.following_error(self._unexplained)
             if sentence:
                 self.fault(Cause.FOLLOWING_ERROR, sentence, now)

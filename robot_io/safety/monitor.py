@@ -45,14 +45,18 @@ class FeedbackMonitor:
         row = int(gaps.argmin())
         return "" if gaps[row] > 0.0 else f"{self._geometry.rows[row]}: {gaps[row]:.4f} m"
 
-    def following_error(self, position: np.ndarray, now: float) -> str:
-        """How the measured position (8,) misses every place where the reference was while its effect was under way."""
+    def unexplained(self, position: np.ndarray, now: float) -> np.ndarray:
+        """Distance (8,) of the measured position from every place where the reference was during the actuation delay.
+
+        Zero or less: the commands that are under way explain the position.
+        """
         shortest, longest = self._config.delay
         self._forget(now - longest)
-        if not self._past:
-            return ""
         seen = [r for i, (_, r) in enumerate(self._past) if i == 0 or self._past[i - 1][0] < now - shortest]
-        error = np.maximum(np.min(seen, axis=0) - position, position - np.max(seen, axis=0))
+        return np.maximum(np.min(seen, axis=0) - position, position - np.max(seen, axis=0))
+
+    def following_error(self, error: np.ndarray) -> str:
+        """Following error over the actuation-delay window as a sentence; empty: none. ``error`` (8,): ``unexplained``."""
         self._off = self._off + 1 if (error > self._tolerance).any() else 0
         if self._off < self._config.following_ticks:
             return ""

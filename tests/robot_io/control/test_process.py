@@ -1,0 +1,184 @@
+"""The control process on a simulated clock: whatever is raised in its loop, the robot stands before it leaves."""
+
+from __future__ import annotations
+
+import multiprocessing
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robot_io import contract
+from robot_io.control import process, realtime
+from robot_io.control.config import RealTimeConfig, RobotConfig
+from robot_io.control.process import Control, ControlOptions
+from robot_io.policy import export
+from tests.support.simulated_clock import CONTROLLER, Simulation
+
+
+class Escaped(BaseException):
+    """Neither an error nor anything that somebody thought of."""
+
+
+class ArmSocket:
+    """What ``EgmSocket`` is to the control process."""
+
+    def __init__(self, simulation):
+        self._simulation = simulation
+
+    def fileno(self):
+        return "arm"
+
+    def drain(self, session, now):
+        packets, self._simulation.packets = self._simulation.packets, []
+        return any([session.receive(packet, CONTROLLER, now) for packet in packets])
+
+    def send(self, reply, endpoint):
+        self._simulation.answered(reply)
+
+    def close(self):
+        pass
+
+
+class FrameSocket(ArmSocket):
+    def fileno(self):
+        return "tracker"
+
+    def drain(self):
+        frames = self._simulation.frames
+        while frames and frames[0][0] <= self._simulation.now:
+            yield frames.popleft()[1], "127.0.0.1"
+
+
+class Simulated:
+    """A control process in this one; ``script``: what happens at moments [s] of its clock."""
+
+    def __init__(self, artefact, monkeypatch):
+        self.simulation = Simulation()
+        self.script = []
+        self.pipe, theirs = multiprocessing.Pipe()
+        monkeypatch.setattr(process, "EgmSocket", lambda *_: ArmSocket(self.simulation))
+        monkeypatch.setattr(process, "TrackerSocket", lambda *_: FrameSocket(self.simulation))
+        monkeypatch.setattr(process, "linear_axes", lambda _: None)
+        monkeypatch.setattr(process, "AxesThread", lambda _: self.simulation.axes)
+        monkeypatch.setattr(realtime, "prepare", lambda *_: [])
+        clock = SimpleNamespace(monotonic=lambda: self.simulation.now, sleep=self._sleep)
+        monkeypatch.setattr(process, "time", clock)
+        monkeypatch.setattr(process, "select", SimpleNamespace(select=self._select))
+        config = RobotConfig(realtime=RealTimeConfig(spin=0.0))
+        self.control = Control(config, ControlOptions(str(artefact)), theirs)
+        self.simulation.bridge = self.control.bridge
+
+    def _sleep(self, seconds):
+        self.simulation.advance()
+
+    def _select(self, read, write, _, seconds):
+        if write:
+            return [], write, []
+        simulation = self.simulation
+        end = simulation.now + seconds + 1e-9  # not before a deadline by rounding
+        while simulation.now < end and not simulation.packets:
+            simulation.advance()
+            while self.script and self.script[0][0] <= simulation.now:
+                self.script.pop(0)[1]()
+        ready = ["arm"] * bool(simulation.packets) + ["tracker"] * bool(simulation.frames)
+        return [f for f in read if f in ready or (isinstance(f, int) and self.pipe_waits())], [], []
+
+    def pipe_waits(self):
+        return self.control._pipe.poll()
+
+    def words(self):
+        found = []
+        while self.pipe.poll():
+            found.append(self.pipe.recv())
+        return found
+
+
+@pytest.fixture
+def simulated(tmp_path, monkeypatch):
+    theta = np.zeros(contract.n_parameters())
+    export.write(tmp_path / "artefact", theta, np.zeros(contract.N_OBSERVATION), np.ones(contract.N_OBSERVATION), {})
+    return Simulated(tmp_path / "artefact", monkeypatch)
+
+
+@pytest.mark.parametrize("part", ["_tick", "_obey", "status", "_answer_arm", "bridge.tracker_received", "bridge.tick"])
+@pytest.mark.parametrize("error", [Escaped, ValueError, KeyboardInterrupt])
+def test_an_exception_leaves_the_loop_after_the_robot_stands(simulated, part, error):
+    """Raised once, on the way to a home pose far away, at more than 1 rad/s."""
+    control, simulation = simulated.control, simulated.simulation
+    owner, name = (control.bridge, part[7:]) if part.startswith("bridge.") else (control, part)
+    before = getattr(owner, name)
+    moved = []
+
+    def escape(*_):
+        setattr(owner, name, before)
+        moved.append(control.bridge.gate.velocity)
+        raise error("made up")
+
+    def move():
+        control.bridge._home = control.bridge._home + [0.3, 0.1, 0.8, 0, 0, 1.0, 0, 1.0]
+        simulated.pipe.send(("arm",))
+
+    def spoil():
+        setattr(owner, name, escape)
+        if part == "_obey":
+            simulated.pipe.send(("discard",))
+
+    simulated.script = [(10.5, move), (10.8, spoil)]
+    with pytest.raises(error, match="made up"), control:
+        control.run()
+    assert np.abs(moved[0]).max() > 1.0
+    gate = control.bridge.gate
+    assert gate.settled and f"{error.__name__}: made up" in [fault.sentence for fault in gate.faults]
+    _, position, velocity = simulation.replies[-1]
+    np.testing.assert_allclose(position, simulation.arm, rtol=0, atol=1e-3)
+    assert not velocity.any() and simulation.axes.stops and simulation.axes.closed
+    words = simulated.words()
+    assert ("failed", f"{error.__name__}: made up") in words and words[-1][0] == "ended"
+    rest = simulation.arm.copy()
+    for _ in range(300):
+        simulation.advance()
+    np.testing.assert_allclose(simulation.arm, rest, rtol=0, atol=1e-3)
+
+
+def test_what_fails_for_ever_does_not_keep_the_process(simulated):
+    def escape(*_):
+        raise Escaped("made up")
+
+    simulated.script = [(10.5, lambda: setattr(simulated.control, "_answer_arm", escape))]
+    with pytest.raises(Escaped), simulated.control:
+        simulated.control.run()
+    assert simulated.simulation.now < 10.6 + process.STOP_TIME
+
+
+def test_a_request_that_fails_is_refused_and_play_goes_on(simulated):
+    pipe, control = simulated.pipe, simulated.control
+    wrong = ("policy", np.zeros(7), np.zeros(11), np.ones(11))
+    simulated.script = [
+        (10.2, lambda: pipe.send(wrong)),
+        (10.4, lambda: pipe.send(("nonsense",))),
+        (11.0, lambda: pipe.send(("quit",))),
+    ]
+    with control:
+        control.run()
+    words = simulated.words()
+    refused = [message[1] for message in words if message[0] == "refused"]
+    assert "theta has 7 parameters" in refused[0] and "nonsense" in refused[1]
+    assert words[-1][0] == "ended" and simulated.simulation.now >= 11.0
+
+
+def test_the_robot_stands_before_the_process_quits(simulated):
+    control = simulated.control
+
+    def move():
+        control.bridge._home = control.bridge._home + [0, 0, 0.8, 0, 0, 1.0, 0, 1.0]
+        simulated.pipe.send(("arm",))
+
+    simulated.script = [(10.5, move), (10.8, control.quit)]  # as a signal does
+    with control:
+        control.run()
+    simulation = simulated.simulation
+    rest = simulation.arm.copy()
+    for _ in range(300):
+        simulation.advance()
+    np.testing.assert_allclose(simulation.arm, rest, rtol=0, atol=1e-3)
