@@ -72,6 +72,7 @@ LONG = {
     "mjx_tt/diagnosis/report/page.py": "",
     "mjx_tt/env/task.py": "",
     "robot_io/control/bridge.py": "",
+    "robot_io/safety/gate.py": "",
 }
 
 

@@ -13,6 +13,7 @@ from robot_io.control import process, realtime
 from robot_io.control.config import RealTimeConfig, RobotConfig
 from robot_io.control.process import Control, ControlOptions
 from robot_io.policy import export
+from robot_io.policy.policy import Policy
 from tests.support.simulated_clock import CONTROLLER, Simulation
 
 
@@ -96,8 +97,8 @@ class Simulated:
 
 @pytest.fixture
 def simulated(tmp_path, monkeypatch):
-    theta = np.zeros(contract.n_parameters())
-    export.write(tmp_path / "artefact", theta, np.zeros(contract.N_OBSERVATION), np.ones(contract.N_OBSERVATION), {})
+    sizes = contract.n_parameters(), contract.N_OBSERVATION
+    export.write(tmp_path / "artefact", Policy(np.zeros(sizes[0]), np.zeros(sizes[1]), np.ones(sizes[1])), {})
     return Simulated(tmp_path / "artefact", monkeypatch)
 
 
@@ -153,7 +154,7 @@ def test_what_fails_for_ever_does_not_keep_the_process(simulated):
 
 def test_a_request_that_fails_is_refused_and_play_goes_on(simulated):
     pipe, control = simulated.pipe, simulated.control
-    wrong = ("policy", np.zeros(7), np.zeros(11), np.ones(11))
+    wrong = ("policy", Policy(np.zeros(7), np.zeros(11), np.ones(11)))
     simulated.script = [
         (10.2, lambda: pipe.send(wrong)),
         (10.4, lambda: pipe.send(("nonsense",))),
