@@ -8,7 +8,6 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from experiments.commands.options import (
-    RUN,
     Balls,
     BallSeed,
     Devices,
@@ -18,13 +17,13 @@ from experiments.commands.options import (
     console,
     count,
     existing,
-    existing_policy,
     experiment_of,
     option,
-    run_of,
     start_jax,
     writable,
 )
+from experiments.runs.locate import find_policy, run_of
+from experiments.runs.run_dir import CONFIG, Run
 
 app = command(
     "evaluate",
@@ -61,7 +60,7 @@ def evaluate(
     devices: Devices = None,
 ) -> None:
     """Writes evaluation.json and plots, and prints the report."""
-    existing_policy(policy)
+    find_policy(policy)
     existing(model, key="--model")
     folder = Path(out) if out else _folder(Path(policy), balls, model)
     writable(folder)
@@ -89,7 +88,7 @@ def evaluate(
 def _folder(policy: Path, *others: str | None) -> Path:
     """Where an evaluation goes by default; ``others``: balls and model that are not the policy's own."""
     changed = [Path(text).with_suffix("").as_posix().replace("/", "-") for text in others if text]
-    if (policy / RUN).exists():
+    if (policy / CONFIG).exists():
         return policy / f"evaluation-{'-'.join(changed)}" if changed else policy
     return policy.with_name("-".join([f"{policy.name}-evaluation", *changed]))  # an artefact holds its own files only
 
@@ -102,11 +101,7 @@ def export(
     out: Annotated[str | None, option("FOLDER", "default: RUN/artefact")] = None,
 ) -> int:
     """Returns 1 for a policy that the robot cannot run."""
-    existing_policy(folder)
-    folder = run_of(folder)
-    from experiments.runs.run_dir import Run
-
-    run = Run(folder)
+    run = Run(run_of(folder))
     artefact = Path(out) if out else run.artefact
     writable(artefact)
     start_jax(1)
@@ -114,7 +109,7 @@ def export(
     from experiments.training import finalize
 
     screen = console()
-    trained = load_policy.load(folder)
+    trained = load_policy.load(run.folder)
     report = run.read_evaluation() if run.evaluation.exists() else None
     written = finalize.export_policy(artefact, trained, experiment_of(trained), report, screen)
     if written:

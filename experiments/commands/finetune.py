@@ -14,7 +14,6 @@ from experiments.commands.options import (
     command,
     console,
     existing,
-    existing_policy,
     option,
     start_jax,
     writable,
@@ -32,6 +31,7 @@ app = command(
 Every ball is on disk before the next begins: the same command continues after an interruption, a crash or a power cut.
 """,
 )
+from experiments.runs.locate import find_policy
 
 
 @app.default
@@ -54,7 +54,7 @@ def finetune(
     from experiments.config import finetuning
 
     chosen = finetuning.load(settings, overrides)
-    existing_policy(policy)
+    find_policy(policy)
     existing(None if robot in ("rig", "lockstep") else robot, key="--robot")
     existing(rig, key="--rig")
     folder = out or f"{Path(policy).resolve().name}-finetuned"

@@ -18,12 +18,11 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from experiments.config.build import Experiment
-    from experiments.runs.load_policy import Policy
+    from experiments.runs.load_policy import TrainedPolicy
 
 SHIPPED_HINT = (
     "\nA file name without a folder that is not in the current folder is looked up among the shipped experiments.\n"
 )
-RUN, ARTEFACT = "config.yaml", "manifest.json"  # by which the folders of a run and of an artefact are known
 
 
 def command(name: str, summary: str, examples: str) -> App:
@@ -99,14 +98,6 @@ def existing(*paths: str | Path | None, key: str = "") -> None:
             raise ConfigError(f"{key and f'{key} '}{path}: no such file or folder")
 
 
-def existing_policy(folder: str) -> None:
-    """Raises ConfigError where there is no such folder."""
-    if not Path(folder).is_dir():
-        raise ConfigError(
-            f"{folder}: neither a run (holding {RUN}) nor an artefact (holding {ARTEFACT}); there is no such folder"
-        )
-
-
 def writable(folder: str | Path) -> None:
     """Raises ConfigError where the folder cannot be made or written to."""
     near = next(place for place in (Path(folder), *Path(folder).absolute().parents) if place.exists())
@@ -122,27 +113,10 @@ def suffix(path: str | Path, *allowed: str) -> None:
         raise ConfigError(f"--out {path}: suffix {given!r}; allowed: {', '.join(allowed)}")
 
 
-def run_of(folder: str) -> str:
-    """The run that holds an artefact; any other folder as it is."""
-    path = Path(folder)
-    inside = not (path / RUN).is_file() and (path / ARTEFACT).is_file() and (path.parent / RUN).is_file()
-    return str(path.parent) if inside else folder
-
-
-def artefact_of(folder: str) -> str:
-    """The artefact in the folder of a run; any other folder as it is. Raises ConfigError for a run without one."""
-    path = Path(folder)
-    if not (path / RUN).is_file() or (path / ARTEFACT).is_file():
-        return folder
-    if not (path / "artefact" / ARTEFACT).is_file():
-        raise ConfigError(f"{folder}: a run that was not exported yet: `mjx-tt export {folder}`")
-    return str(path / "artefact")
-
-
 # A policy's experiment
 
 
-def experiment_of(trained: Policy, balls: str | None = None, model: str | None = None) -> Experiment:
+def experiment_of(trained: TrainedPolicy, balls: str | None = None, model: str | None = None) -> Experiment:
     """The experiment that trained a policy, with the balls and model of the command line in place of its own."""
     from experiments.config import build
 

@@ -16,7 +16,6 @@ from experiments.commands.options import (
     console,
     count,
     existing,
-    existing_policy,
     experiment_of,
     option,
     start_jax,
@@ -39,6 +38,7 @@ curves_app = command(
   mjx-tt curves runs/quickstart runs/paper --out curves.png
 """,
 )
+from experiments.runs.locate import find_policy
 
 
 @app.default
@@ -54,7 +54,7 @@ def render(
     seed: BallSeed = None,
 ) -> None:
     """Writes every file of ``out``."""
-    existing_policy(policy)
+    find_policy(policy)
     existing(model, key="--model")
     for path in out:
         suffix(path, ".png", ".mp4", ".gif")

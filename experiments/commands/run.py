@@ -11,7 +11,6 @@ from cyclopts import Parameter, Token
 from experiments.commands.options import (
     RigFile,
     RigSeed,
-    artefact_of,
     command,
     console,
     count,
@@ -20,6 +19,7 @@ from experiments.commands.options import (
     start_jax,
     writable,
 )
+from experiments.runs.locate import artefact_of
 
 Distribution = Annotated[str | None, option("NAME", "balls that are thrown (default: the policy's)")]
 Backend = Annotated[Literal["numpy", "jit"], Parameter(help="what computes the policy")]
@@ -61,7 +61,6 @@ def run(
 ) -> int:
     """Returns the exit status."""
     folder = artefact_of(artefact)
-    existing(folder)
     existing(None if robot == "rig" else robot, key="--robot")
     existing(rig, key="--rig")
     writable(log)

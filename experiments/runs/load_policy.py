@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,28 +14,12 @@ from bgs.normalizer import ObservationStatistics
 from experiments.config.experiment import Config, parse
 from experiments.errors import RunError
 from experiments.runs import checkpoint
+from experiments.runs.locate import find_policy
 from experiments.runs.run_dir import CONFIG, Run
 from mjx_tt.env.policy import Policy
 from robot_io.policy import artefact as artefacts
 
-SELECTION = "selection.json"  # beside several trainings of one model: which was chosen
-LISTED = 6  # folders that a message names
 # Where runs and artefacts lie in a folder of trainings, a study's folder and those in it.
-_MARKS = (
-    f"*/{artefacts.MANIFEST}",
-    *(
-        f"{place}/{CONFIG}"
-        for place in (
-            "*",
-            "training/*",
-            "*/training/*",
-            "player*/*",
-            "player*/*/training/*",
-            "seed*/player*/*",
-            "seed*/player*/*/training/*",
-        )
-    ),
-)
 
 
 @dataclass(frozen=True)
@@ -61,32 +43,8 @@ def load(folder: str | Path) -> TrainedPolicy:
 
     Raises RunError for a folder that is neither, CheckpointError or ArtefactError for a damaged one.
     """
-    folder = Path(folder)
-    if (folder / CONFIG).is_file():
-        return _from_run(folder)
-    if (folder / artefacts.MANIFEST).is_file():
-        return _from_artefact(folder)
-    raise RunError(
-        f"{folder}: neither a run (holding {CONFIG}) nor an artefact (holding {artefacts.MANIFEST}){_inside(folder)}"
-    )
-
-
-def _inside(folder: Path) -> str:
-    """Which runs or artefacts lie in a folder that is neither, for a message; of several trainings the chosen one."""
-    if not folder.is_dir():
-        return "; there is no such folder"
-    found = [path.parent for marks in _MARKS for path in sorted(folder.glob(marks)) if path.parent != folder]
-    chosen = {}  # the folder with the choice: what was chosen
-    for place in {folder, *(parent for run in found for parent in run.parents if folder in parent.parents)}:
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            chosen[place] = place / json.loads((place / SELECTION).read_text(encoding="utf-8"))["best"]
-    if folder in chosen and (chosen[folder] / CONFIG).is_file():
-        return f"; of the trainings in it, {chosen[folder]} was chosen"
-    left = [run for run in found if all(run == best for place, best in chosen.items() if place in run.parents)]
-    if not left:
-        return ""
-    more = f" and {len(left) - LISTED} more" if len(left) > LISTED else ""
-    return f"; in it are {', '.join(map(str, left[:LISTED]))}{more}"
+    folder = find_policy(folder)
+    return _from_run(folder) if (folder / CONFIG).is_file() else _from_artefact(folder)
 
 
 def load_statistics(folder: str | Path) -> tuple[np.ndarray, ObservationStatistics]:

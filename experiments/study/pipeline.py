@@ -22,6 +22,7 @@ from experiments.config.experiment import read_yaml
 from experiments.config.study import Study
 from experiments.errors import RunError, checked
 from experiments.runs import load_policy, run_dir
+from experiments.runs.locate import SELECTION
 from experiments.study import evaluation, training
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis import study_folder as study_data
@@ -68,7 +69,7 @@ class Loop:
     def run_of(self, seed: int, player: str, model: str) -> Path:
         """The run that holds a model's policy: of several trainings the chosen one."""
         folder = self.model_folder(seed, player, model)
-        chosen = folder / load_policy.SELECTION
+        chosen = folder / SELECTION
         if not chosen.exists():
             return folder
         return folder / read_yaml(chosen.read_text(encoding="utf-8"), str(chosen))["best"]
@@ -180,7 +181,7 @@ class Loop:
 
         optimiser = self.study.simulation.optimiser
         work = updates(self.study, item) * optimiser.pairs * optimiser.repeats * self.study.simulation.seeds
-        return Step(name, "training", work, inputs, (folder / POLICY, folder / load_policy.SELECTION), run)
+        return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run)
 
     def _real(self, seed: int, player: str, item: Real) -> Step:
         folder, name = self.model_folder(seed, player, item.key), f"seed{seed}/{player}/{item.key}"

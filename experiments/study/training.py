@@ -13,7 +13,8 @@ from experiments.config import build
 from experiments.config.experiment import Config, Evaluation, Training
 from experiments.config.study import Study
 from experiments.runs import load_policy, run_dir
-from experiments.runs.load_policy import SELECTION, TrainedPolicy
+from experiments.runs.load_policy import TrainedPolicy
+from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
 from experiments.study.schedule import Simulated, updates
 from experiments.training.loop import train

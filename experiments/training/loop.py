@@ -23,6 +23,7 @@ from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import Run
 from experiments.training.progress import TrainingProgress
 from experiments.training.update import Trainer, TrainState, trainer
+from mjx_tt.env.policy import Policy
 
 _programs: dict[str, Any] = {}  # compiled updates by what decides them
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
@@ -124,7 +125,8 @@ class Session:
     def _evaluate(self) -> dict[str, float]:
         """The averaged parameters on the run's own set of fresh balls."""
         key = build.key(self._config.training.seed, build.PROGRESS_EPISODES)
-        result = self._evaluator.play(self.state.bgs.average, *normalizer.normaliser(self.state.statistics), key)
+        policy = Policy(self.state.bgs.average, *normalizer.normaliser(self.state.statistics))
+        result = self._evaluator.play(policy, key)
         rate = return_rate(result)
         self.return_rate = rate.value
         return {"evaluation/return_rate": rate.value, "evaluation/low": rate.low, "evaluation/high": rate.high}

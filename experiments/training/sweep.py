@@ -14,6 +14,7 @@ from experiments.config.experiment import Config
 from experiments.errors import ConfigError, explained
 from experiments.evaluation import evaluate
 from experiments.runs import load_policy, run_dir
+from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
 from experiments.training.finalize import finish
 from experiments.training.loop import train
@@ -89,7 +90,7 @@ def select(folder: Path, jobs: list[Job], console: Console) -> None:
         "scores": scores,
         "best": best,
     }
-    run_dir.write_json(folder / load_policy.SELECTION, selection)
+    run_dir.write_json(folder / SELECTION, selection)
     console.print(
         f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)", highlight=False
     )
