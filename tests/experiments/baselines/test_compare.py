@@ -175,9 +175,9 @@ SMALL = {
     "experiment": {
         "name": "small",
         "balls": "player3/M0",
-        "task": {"sim_rate": 150},
+        "task": {"sim_rate": 75},
         "training": {"pool": 64},
-        "evaluation": {"episodes": 512, "sim_rate": 150},
+        "evaluation": {"episodes": 512, "sim_rate": 75},
     },
     "reality": {"ball_spin": {"mean_x": 300.0}},
     "algorithms": {"ES": {"kind": "bgs", "optimiser": {"pairs": 2, "repeats": 2}}},

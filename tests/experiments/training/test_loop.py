@@ -19,7 +19,7 @@ UPDATES = 300
 EXPERIMENT = """
 name: tiny
 balls: player5/M0
-task: {max_steps: 60}
+task: {max_steps: 60, sim_rate: 75.0}
 optimiser: {pairs: 2, repeats: 2}
 training: {updates: %d, pool: 64, evaluate_every: null, checkpoint_seconds: 0.2, devices: 1}
 """
