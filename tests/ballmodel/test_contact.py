@@ -145,7 +145,7 @@ def test_a_tilted_surface_has_the_slopes_and_the_distance_of_its_plane(slopes):
     assert np.linalg.det(frame) == pytest.approx(1.0)
     np.testing.assert_allclose(frame[2], np.array([-a, -b, 1]) / np.sqrt(1 + a * a + b * b), atol=1e-12)
     rng = np.random.default_rng(5)
-    for x, y, z in zip(*rng.uniform(-0.5, 0.5, (2, 20)), rng.uniform(0.6, 1.0, 20)):
+    for x, y, z in zip(*rng.uniform(-0.5, 0.5, (2, 20)), rng.uniform(0.6, 1.0, 20), strict=True):
         gap, distance = surface_gap(TABLE, surface, np.array([x, y, z]))
         over = z - 0.05 - a * x - b * y
         assert float(elevation(surface, np.array([x, y, z]))) == pytest.approx(over, abs=1e-12)

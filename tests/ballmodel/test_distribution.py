@@ -177,7 +177,7 @@ def test_pool_is_distributed_like_brute_force_rejection():
     drawn = np.concatenate([pool.state.position, pool.state.velocity, pool.landing, pool.arrival[None]])
     reference = np.concatenate([proposal, landing, arrival[None]])[:, kept]
     assert kept.sum() > 500
-    for ours, theirs in zip(drawn, reference):
+    for ours, theirs in zip(drawn, reference, strict=True):
         assert ks_2samp(ours, theirs).pvalue > 1e-3
     # Correlations as well: the boundaries of what is kept are not along the axes.
     for pair in (3, 4, 5):

@@ -158,7 +158,7 @@ def test_truncated_mcap_is_an_error_and_its_complete_chunks_can_be_salvaged(reco
             read(cut)
         data = read_mcap(cut, salvage=True)
         salvaged.append(sum(len(t) for t in data))
-        for ours, theirs in zip(data, balls):
+        for ours, theirs in zip(data, balls, strict=True):
             np.testing.assert_array_equal(ours.position, theirs.position[:, : len(ours)])
     assert 0 < salvaged[0] < salvaged[1] < salvaged[2] < 6000
 

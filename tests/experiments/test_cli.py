@@ -1,4 +1,4 @@
-"""The command line as a person meets it, on a tiny experiment: trained in a process of its own, the rest in this one."""
+"""The command line as a person meets it, on a tiny experiment: one process that trains, the rest in this one."""
 
 from __future__ import annotations
 
@@ -69,9 +69,9 @@ def test_help_and_refusals_do_not_wait_for_jax(tmp_path):
     """Of commands that refuse what they are given, 1 or 2 is the status; 0 of those that only show something."""
     (tmp_path / "file").write_text("")
     refused = {
-        1: """train nowhere.yaml; train quickstart.yaml --out file; evaluate nowhere; export nowhere; render nowhere --out
-        a.png; render . --out a.txt; fit-human a.csv --out a.txt; fit-human a.csv --out a.yaml; import a.csv --out a.csv;
-        run nowhere --robot rig; finetune nowhere --robot rig; is2r nowhere.yaml; compare nowhere.yaml;
+        1: """train nowhere.yaml; train quickstart.yaml --out file; evaluate nowhere; export nowhere;
+        render nowhere --out a.png; render . --out a.txt; fit-human a.csv --out a.txt; fit-human a.csv --out a.yaml;
+        import a.csv --out a.csv; run nowhere --robot rig; finetune nowhere --robot rig; is2r nowhere.yaml; compare nowhere.yaml;
         study-report nowhere; evaluate . --model nowhere.yaml; curves nowhere""",
         2: "trian; train; evaluate . --episodes 0; rig --ports 1; log close a.mcap; run . --robot rig --backend tpu",
         0: "--version; --help",
@@ -228,7 +228,7 @@ def test_import_and_fit_human(tmp_path):
     starts = np.array([0.3, 1.3, 0.3, 0.0, -5.5, 1.2]) + rng.uniform(-0.05, 0.05, (n, 6))
     for i, start in enumerate(starts):
         flight = solve_ivp(drag_only, (0, 0.3), start, t_eval=times, rtol=1e-9, atol=1e-9)
-        lines += [f"{i},{t},{x},{y},{z}" for t, (x, y, z) in zip(times, flight.y[:3].T)]
+        lines += [f"{i},{t},{x},{y},{z}" for t, (x, y, z) in zip(times, flight.y[:3].T, strict=True)]
     (tmp_path / "a.csv").write_text("\n".join(lines))
     converted = mjx_tt("import", tmp_path / "a.csv", "--out", tmp_path / "a.mcap")
     assert converted.returncode == 0, converted.stderr

@@ -12,9 +12,9 @@ import mujoco
 
 OPTION = """<option integrator="implicitfast"><flag contact="disable" constraint="disable"/></option>"""
 
-SKEW = """
+SKEW = f"""
 <mujoco>
-  {option}
+  {OPTION}
   <default><geom contype="0" conaffinity="0"/></default>
   <worldbody>
     <body pos=".3 -.2 .5" euler="20 -35 50">
@@ -44,7 +44,7 @@ SKEW = """
     <velocity name="b3" joint="b3" kv="5" gear="1.5"/>
   </actuator>
 </mujoco>
-""".format(option=OPTION)
+"""
 
 CRANE = """
 <mujoco>
@@ -77,9 +77,9 @@ CRANE = """
 </mujoco>
 """
 
-CART = """
+CART = f"""
 <mujoco>
-  {option}
+  {OPTION}
   <default><geom contype="0" conaffinity="0"/></default>
   <worldbody>
     <body name="rail" pos=".2 0 .3" euler="5 -25 40" gravcomp=".3">
@@ -108,7 +108,7 @@ CART = """
     <position name="plunger" joint="plunger" kp="80" kv="6"/>
   </actuator>
 </mujoco>
-""".format(option=OPTION)
+"""
 
 PENDULUM = """
 <mujoco>

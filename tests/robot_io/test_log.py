@@ -370,7 +370,7 @@ def test_a_disk_that_takes_no_more_is_told_and_what_it_took_is_kept(tmp_path):
             break
         time.sleep(0.001)
     assert "big.mcap.part: the recorder process has ended ([Errno 27] File too large)" in recorder.failure
-    for again in range(2):
+    for _ in range(2):
         with pytest.raises(LogError, match="not finished"):
             recorder.close()
     overview = log.salvage(tmp_path / "big.mcap.part")

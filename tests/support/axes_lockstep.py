@@ -25,7 +25,7 @@ class LockStep:
         self.axes = FestoAxes(
             [
                 Axis(name, wrap(emulator), codec, lower, upper)
-                for name, emulator, lower, upper in zip(("x", "y"), self.emulators, LOWER, UPPER)
+                for name, emulator, lower, upper in zip(("x", "y"), self.emulators, LOWER, UPPER, strict=True)
             ],
             config or AxesConfig(),
         )
@@ -46,7 +46,7 @@ class LockStep:
 
     def step(self):
         self.velocity = np.array(
-            [e.step(self.now, x, v) for e, x, v in zip(self.emulators, self.position, self.velocity)]
+            [e.step(self.now, x, v) for e, x, v in zip(self.emulators, self.position, self.velocity, strict=True)]
         )
         self.log.append((self.now, *self.position, *self.velocity))
         self.position = self.position + self.velocity * STEP

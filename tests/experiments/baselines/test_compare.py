@@ -146,7 +146,9 @@ def test_qt_opt_fits_the_clipped_double_target():
 
     gradient = jax.grad(loss)(state.critic)
     # Adam's first step is the learning rate against the gradient's sign, wherever it is not tiny.
-    for before, now, target, g in zip(*map(jax.tree.leaves, (state.critic, after.critic, after.target, gradient))):
+    for before, now, target, g in zip(
+        *map(jax.tree.leaves, (state.critic, after.critic, after.target, gradient)), strict=True
+    ):
         clear = np.abs(g) > 1e-5
         np.testing.assert_allclose((now - before)[clear], (-3e-4 * np.sign(g))[clear], rtol=2e-3)
         np.testing.assert_allclose(target, 0.75 * before + 0.25 * now, rtol=1e-5, atol=1e-7)

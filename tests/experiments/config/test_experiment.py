@@ -171,7 +171,7 @@ def test_defaults_are_those_of_the_task_and_weights_follow_the_terms():
     assert experiment.task == TaskConfig()
     assert tuple(config.Rewards.model_fields)[1:] == rewards.TERMS
     changed = build.reward_weights(config.Rewards(base="real", style=2.5))
-    assert dict(zip(rewards.TERMS, changed)) == rewards.REAL_WEIGHTS | {"style": 2.5}
+    assert dict(zip(rewards.TERMS, changed, strict=True)) == rewards.REAL_WEIGHTS | {"style": 2.5}
 
 
 def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_current_folder(tmp_path, monkeypatch):

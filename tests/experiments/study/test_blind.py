@@ -109,7 +109,9 @@ def test_people_evaluate_without_knowing_what(tmp_path, artefacts, capsys):
     assert cli.main(["blind", "sheet", str(folder)]) == 0
     assert cli.main(["blind", "open", str(folder)]) == 0
     rallies = scoring.read(folder / "evaluations.csv")
-    assert set(zip(rallies.seed.tolist(), rallies.trainer.tolist(), rallies.evaluator.tolist())) == {(2, "anna", "ben")}
+    assert set(zip(rallies.seed.tolist(), rallies.trainer.tolist(), rallies.evaluator.tolist(), strict=True)) == {
+        (2, "anna", "ben")
+    }
     for model in MODELS:
         mine = rallies.take(rallies.model == model)
         code = str(mine.blind[0])

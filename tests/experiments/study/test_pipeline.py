@@ -192,7 +192,7 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
                 else {item.key} | ({item.data} if isinstance(item, Real) else set())
             )
         assert set(schedule.MODELS) <= made
-    # "the policy was fine-tuned for 70 updates per cycle for the last two cycles and 60 for the first": 200, oracle 35 %.
+    # "fine-tuned for 70 updates per cycle for the last two cycles and 60 for the first": 200, oracle 35 %.
     by_key = {item.key: item for item in schedule.LOOP if not isinstance(item, Human)}
     spent = {}
     for key, item in by_key.items():
@@ -211,7 +211,7 @@ def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
         assert len(others) == len(set(others)) == 6 and len({t for t, _ in others}) == 2
     codes = evaluation.code_names(0, pairs)
     for player in whole.players:
-        mine = [code for code, (_, e, _) in zip(codes, pairs) if e == player]
+        mine = [code for code, (_, e, _) in zip(codes, pairs, strict=True) if e == player]
         assert len(set(mine)) == 16
     assert codes != evaluation.code_names(1, pairs)
 
@@ -485,7 +485,10 @@ def test_an_effect_is_left_out_for_the_policy_it_says(finished):
     boxes = [load_distribution(player / "balls" / f"human_{human.get(m, 'M2')}.yaml") for m in effect_costs.MODELS]
     layout = np.array([(w, m) for w in range(len(effect_costs.WORLDS)) for m in range(6) for _ in range(lanes)]).T
     policy = jax.tree.map(lambda *parts: np.stack(parts, axis=-1)[:, layout[1]], *policies)
-    low, high = (np.stack(ends, axis=-1)[:, layout[1]] for ends in zip(*((b.low, b.high) for b in map(Box.of, boxes))))
+    low, high = (
+        np.stack(ends, axis=-1)[:, layout[1]]
+        for ends in zip(*((b.low, b.high) for b in map(Box.of, boxes)), strict=True)
+    )
     for world in ("latency", "spin"):
         drawn = hidden_effects.draw(0, ("drives", "encoders", world))
         person = human_player.load("player3")

@@ -35,7 +35,7 @@ def bare():
 
 def test_the_numbers_are_named_in_their_order():
     d = paper.load("player3/M1")
-    numbers = dict(zip(player_calibration.NUMBERS, player_calibration.sixteen(d)))
+    numbers = dict(zip(player_calibration.NUMBERS, player_calibration.sixteen(d), strict=True))
     assert (
         numbers["position.z min"] == -0.15 and numbers["velocity.y max"] == -2.19 and numbers["landing.x max"] == 0.76
     )

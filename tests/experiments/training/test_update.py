@@ -76,13 +76,13 @@ def run_on_two(trainer_on_two):
 
 def test_two_devices_give_the_update_of_one(run, run_on_two):
     """To the order of float32 sums, over several updates, so that statistics and normaliser take part."""
-    for before, one, two in zip(run[0], run[0][1:], run_on_two[0][1:]):
+    for before, one, two in zip(run[0][:-1], run[0][1:], run_on_two[0][1:], strict=True):
         change = np.asarray(one.bgs.theta) - np.asarray(before.bgs.theta)
         np.testing.assert_allclose(two.bgs.theta, one.bgs.theta, rtol=0, atol=1e-3 * np.abs(change).max())
         np.testing.assert_array_equal(two.statistics.count, one.statistics.count)
         np.testing.assert_allclose(two.statistics.mean, one.statistics.mean, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(two.statistics.m2, one.statistics.m2, rtol=1e-4)
-    for one, two in zip(run[1], run_on_two[1]):
+    for one, two in zip(run[1], run_on_two[1], strict=True):
         assert two == pytest.approx(one, rel=1e-3, abs=1e-5)
     assert {shard.device for shard in run_on_two[0][1].bgs.theta.addressable_shards} == set(jax.devices()[:2])
 
@@ -181,6 +181,6 @@ def test_later_weights_take_over_after_their_update(trainer, run, pool):
     expected, _ = other.update(states[2])
     np.testing.assert_allclose(states[3].bgs.theta, expected.bgs.theta, rtol=0, atol=1e-6)
     assert np.abs(np.asarray(states[3].bgs.theta - trainer.update(states[2])[0].bgs.theta)).max() > 1e-4
-    for measured, used in zip(metrics, (tuple(rewards.SIM_WEIGHTS.values()),) * 2 + (weights,)):
+    for measured, used in zip(metrics, (tuple(rewards.SIM_WEIGHTS.values()),) * 2 + (weights,), strict=True):
         terms = [measured[f"reward/{name}"] for name in rewards.TERMS]
         assert measured["mean_return"] == pytest.approx(np.dot(used, terms), rel=1e-5)

@@ -1,4 +1,4 @@
-"""Causes at the paddle, found in returns that other code played: MuJoCo C's kinematics, SciPy's flight, the rubber by hand."""
+"""Causes at the paddle, in returns of other code: MuJoCo C's kinematics, SciPy's flight, the rubber by hand."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BEFORE, AFTER = 0.45, 0.3  # [s] of each ball
 
 @dataclass(frozen=True)
 class Rubber:
-    """The truth: e = restitution - slope |v_n|, tangential impulse gain, mount errors, and how late balls are stamped."""
+    """The truth: e = restitution - slope |v_n|, tangential impulse gain, mount errors, latency of the tracker."""
 
     restitution: float = 0.917
     slope: float = 0.0217

@@ -1,4 +1,4 @@
-"""The brax environment: its rewards add up to the simulator's return, its episodes follow one another with fresh balls."""
+"""The brax environment: its rewards add up to the simulator's return, its episodes follow each other with new balls."""
 
 from __future__ import annotations
 

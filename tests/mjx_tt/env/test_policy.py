@@ -25,7 +25,9 @@ def draw(x64, seed=0):
     rng = np.random.default_rng(seed)
     dtype = np.float64 if x64 else np.float32
     shapes = (n_parameters(), P), (N_OBSERVATION,), (TICKS, N_OBSERVATION, R * P)
-    theta, mean, observations = (rng.normal(0, scale, shape) for scale, shape in zip((0.3, 0.5, 1.0), shapes))
+    theta, mean, observations = (
+        rng.normal(0, scale, shape) for scale, shape in zip((0.3, 0.5, 1.0), shapes, strict=True)
+    )
     return [x.astype(dtype) for x in (theta, mean, rng.uniform(0.5, 2, N_OBSERVATION), observations)]
 
 

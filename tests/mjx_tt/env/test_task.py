@@ -209,7 +209,7 @@ def test_pose_terms_equal_a_recount_in_mujoco(flailing):
             data.qpos[:] = flailing.qpos[tick, :, i]
             mujoco.mj_kinematics(mj, data)
             counts[:, i] += gap(own + table) <= 0, gap(low_pairs) < 0.05, data.site_xmat[site, 5] < 0.3
-    for name, count in zip(("collision", "paddle_height", "style"), counts):
+    for name, count in zip(("collision", "paddle_height", "style"), counts, strict=True):
         assert 0 < count.sum() < TICKS * P  # the flailing robot does all of it, but not all the time
         np.testing.assert_array_equal(flailing.terms[TERMS.index(name)], -count, err_msg=name)
 

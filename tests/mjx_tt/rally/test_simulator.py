@@ -1,4 +1,4 @@
-"""Rallies: the robot's turns against the rollout, touches against the log, every row of the table of ends by its ball."""
+"""Rallies: the robot's turns against the rollout, touches against the log, every kind of end by its ball."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_a_turn_of_the_robot_is_the_rollouts_episode(simulator):
 
 
 def aim(start, target, seconds):
-    """Velocity of the drag-only flight, from the independent fit of nothing: shooting in NumPy with Euler's small steps."""
+    """Velocity of the drag-only flight, by shooting in NumPy with Euler's small steps."""
     velocity = (np.array(target) - start) / seconds + [0, 0, 0.5 * 9.81 * seconds]
     k_d = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027)
     for _ in range(6):
@@ -282,7 +282,7 @@ def test_players_meet_the_return_where_finer_steps_have_it():
     """The contact, by the full ball simulation at 1,200 Hz."""
     position = np.array([[0.2, -0.6, 0.3], [0.0, -1.2, 0.2], [-0.3, -1.0, 0.25], [0.1, -0.8, 0.3]])
     target = np.array([[0.1, 0.7, 0.02], [0.5, 0.9, 0.02], [-0.2, 0.4, 0.02], [0.0, 1.0, 0.02]])
-    velocity = np.stack([aim(p, t, s) for p, t, s in zip(position, target, (0.45, 0.6, 0.6, 0.4))])
+    velocity = np.stack([aim(p, t, s) for p, t, s in zip(position, target, (0.45, 0.6, 0.6, 0.4), strict=True)])
     plane, height = np.array([1.3, 1.5, 1.6, 1.4]), np.array([0.2, -0.1, 0.25, 0.3])
     ball = BallState(*(jnp.asarray(x.T, jnp.float32) for x in (position, velocity, 0 * velocity)))
     fly = jax.jit(
@@ -329,7 +329,7 @@ def test_corner_and_cord_of_the_robots_return():
 
 
 def test_the_robot_is_as_far_on_its_way_home_as_the_bridge_drives_it(simulator):
-    """Against the bridge's law of motion, stepped: speed min(half of the limit, sqrt(2 b d)), begun 0.1 s after the hit."""
+    """Against the bridge's law of motion, stepped: speed min(half the limit, sqrt(2 b d)), begun 0.1 s after a hit."""
     rng = np.random.default_rng(0)
     home = np.asarray(simulator.task.home)[:, None]
     lower, upper = np.asarray(LIMITS.lower)[:, None], np.asarray(LIMITS.upper)[:, None]

@@ -23,7 +23,7 @@ FLUID = '<option integrator="implicitfast" {}="1.2"><flag contact="disable" cons
 def step_in_c(model, qpos, qvel, ctrl):
     """mj_step from every column of qpos (nq, n), qvel, ctrl: the next qpos and qvel."""
     data, after = mujoco.MjData(model), []
-    for q, v, u in zip(qpos.T, qvel.T, ctrl.T):
+    for q, v, u in zip(qpos.T, qvel.T, ctrl.T, strict=True):
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:], data.ctrl[:] = q, v, u
         mujoco.mj_step(model, data)
@@ -56,7 +56,7 @@ def test_fused_equals_mujoco_c_in_float64(model, timestep):
         ours = jax.jit(engine.step)(qpos, qvel, ctrl)
     model.opt.timestep = timestep or model.opt.timestep
     exact = step_in_c(model, qpos, qvel, ctrl)
-    for mine, theirs, before in zip(ours, exact, (qpos, qvel)):
+    for mine, theirs, before in zip(ours, exact, (qpos, qvel), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-9)
         assert np.median(np.abs(theirs - before)) > 1e-3  # a step that moves nothing would prove nothing
 
@@ -68,7 +68,7 @@ def test_fused_in_float32_stays_within_its_rounding():
     single = [x.astype(np.float32) for x in (qpos, qvel, ctrl)]
     after = jax.jit(FusedEngine(chain_from_model(model)).step)(*single)
     assert all(x.dtype == np.float32 for x in after)
-    for mine, theirs in zip(after, step_in_c(model, *(x.astype(float) for x in single))):
+    for mine, theirs in zip(after, step_in_c(model, *(x.astype(float) for x in single)), strict=True):
         np.testing.assert_allclose(mine, theirs, atol=2e-5)
 
 
@@ -81,7 +81,7 @@ def test_any_batch_shape_gives_the_same_numbers(batch):
         qpos, qvel, ctrl = (rng.uniform(-1, 1, (n, *batch)) for n in (model.nq, model.nv, model.nu))
         after = jax.jit(engine.step)(qpos, qvel, ctrl)
         flat = step_in_c(model, *(x.reshape(len(x), -1) for x in (qpos, qvel, ctrl)))
-    for mine, theirs in zip(after, flat):
+    for mine, theirs in zip(after, flat, strict=True):
         assert mine.shape == (model.nq, *batch)
         np.testing.assert_allclose(mine.reshape(model.nq, -1), theirs, rtol=1e-9, atol=1e-9)
 

@@ -60,7 +60,7 @@ def test_pose_and_velocity_of_a_site_match_mujoco(model, site, x64, atol):
         pose = jax.tree.map(np.asarray, jax.jit(kinematics.pose)(q, qd))
     for i in range(q.shape[1]):
         exact = site_in_mujoco(model, site, q[:, i], qd[:, i])
-        for name, wanted in zip(("position", "normal", "velocity", "angular_velocity"), exact):
+        for name, wanted in zip(("position", "normal", "velocity", "angular_velocity"), exact, strict=True):
             found = getattr(pose, name)
             assert found.dtype == q.dtype
             np.testing.assert_allclose(found[:, i], wanted, atol=atol * max(1.0, np.abs(wanted).max()), err_msg=name)

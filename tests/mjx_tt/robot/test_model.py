@@ -30,7 +30,7 @@ def link_frames(chain, q):
     """World pose (origin, rotation) of every link, by the formula in ``Link``'s docstring and Rodrigues' rotation."""
     origin, rotation = np.zeros(3), np.eye(3)
     frames = []
-    for link, angle in zip(chain.links, q):
+    for link, angle in zip(chain.links, q, strict=True):
         axis, anchor, rot = np.array(link.axis), np.array(link.anchor), np.array(link.rot)
         k = np.cross(np.eye(3), axis)  # k @ v = axis x v
         turn = np.eye(3) if link.slide else np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
@@ -87,14 +87,14 @@ def test_chain_inertias_and_forces_match_mujoco(model, site):
             for i, link in enumerate(chain.links)
         ]
         np.testing.assert_allclose(force, data.qfrc_actuator, rtol=1e-12, atol=1e-12)
-        friction = [-link.damping * v for link, v in zip(chain.links, qd)]
+        friction = [-link.damping * v for link, v in zip(chain.links, qd, strict=True)]
         np.testing.assert_allclose(friction, data.qfrc_damper, atol=1e-12)
 
 
 def kinetic_energy(chain, q, qd, eps=1e-5):
     ahead, behind, now = (link_frames(chain, q + s * eps * qd) for s in (1, -1, 0))
     energy = 0.0
-    for link, speed, (p1, r1), (p0, r0), (_, rotation) in zip(chain.links, qd, ahead, behind, now):
+    for link, speed, (p1, r1), (p0, r0), (_, rotation) in zip(chain.links, qd, ahead, behind, now, strict=True):
         velocity = (p1 + r1 @ np.array(link.com) - p0 - r0 @ np.array(link.com)) / (2 * eps)
         spin = rotation.T @ (r1 - r0) / (2 * eps)  # skew matrix of the angular velocity in the link's frame
         omega = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
@@ -107,7 +107,7 @@ def potential_energy(chain, q):
     """Of the weight that gravity compensation leaves."""
     return -sum(
         (1 - link.gravcomp) * link.mass * np.array(chain.gravity) @ (origin + rotation @ np.array(link.com))
-        for link, (origin, rotation) in zip(chain.links, link_frames(chain, q))
+        for link, (origin, rotation) in zip(chain.links, link_frames(chain, q), strict=True)
     )
 
 

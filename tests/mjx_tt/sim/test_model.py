@@ -154,7 +154,7 @@ def test_latencies_are_gaussian_in_seconds_and_cut():
     nominal = LatencyParams()
     seconds = np.asarray(model.draw_latencies(jax.random.key(1), nominal, (4000,), 1.0))
     assert seconds.shape == (5, 4000)
-    for name, values in zip(LATENCIES, seconds):
+    for name, values in zip(LATENCIES, seconds, strict=True):
         gaussian = stats.norm(getattr(nominal, name), getattr(nominal, f"{name}_std"))
         assert stats.kstest(values, gaussian.cdf).pvalue > 1e-3
     assert np.abs(np.corrcoef(seconds) - np.eye(5)).max() < 4.5 / np.sqrt(4000)

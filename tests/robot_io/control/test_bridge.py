@@ -1,4 +1,4 @@
-"""The bridge with the whole emulated robot in lock-step: states, faults with their causes, how fast it comes to rest."""
+"""The bridge with the whole emulated robot in lock-step: states, faults and their causes, how fast it comes to rest."""
 
 from __future__ import annotations
 

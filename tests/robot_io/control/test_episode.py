@@ -24,7 +24,7 @@ def flight(*touches: Touch, end: float = 0.4):
     """Positions (n, 3) every 8 ms of a ball that flies freely after each touch, the first one being its throw."""
     moments = np.arange(touches[0].time, touches[-1].time + end, DT)
     parts = []
-    for touch, following in zip(touches, [*touches[1:], None]):
+    for touch, following in zip(touches, [*touches[1:], None], strict=True):
         until = np.inf if following is None else following.time
         part = moments[(moments >= touch.time) & (moments < until)]
         if part.size:

@@ -35,7 +35,7 @@ DELAYS = (  # of ball, arm, axes [s]
     {"ball": 0.0417, "arm": 0.0033, "axes": 0.0271},
     {"ball": 0.0123, "arm": 0.0467, "axes": 0.0081},
 )
-NAMES = dict(zip(("ball", "arm", "axes"), LATENCIES[:3]))
+NAMES = dict(zip(("ball", "arm", "axes"), LATENCIES[:3], strict=True))
 MICROMETRE, FINEST = 1e-6, 1e-9  # [m] a count of the axes' position: the set-up's usual one; 32 bits at 2.1 m
 
 
@@ -55,14 +55,14 @@ class Recording:
 
 @pytest.fixture(scope="module")
 def played():
-    """Motion (TICKS * SUBSTEPS + 1, 11) at the substeps and what the simulator shows (TICKS, 11) under each of DELAYS."""
+    """Motion (TICKS * SUBSTEPS + 1, 11) at the substeps; observations (TICKS, 11) under each of DELAYS."""
     rng = np.random.default_rng(1)
     actions = np.repeat(rng.uniform(-0.12, 0.12, (TICKS // 5, N_JOINTS, 1)), 5, axis=0)
     actions[:15] = 0.0  # at home until the ball has been seen
     # Episode j of the first four sees the motion j + 1 substeps late: together they see every substep.
     late = {name: [H * (j + 1) for j in range(SUBSTEPS)] + [d[key] for d in DELAYS] for key, name in NAMES.items()}
     late = {name: np.array(seconds) for name, seconds in late.items()}
-    late |= {name: np.full(P, seconds) for name, seconds in zip(LATENCIES[3:], (0.055, 0.065))}
+    late |= {name: np.full(P, seconds) for name, seconds in zip(LATENCIES[3:], (0.055, 0.065), strict=True)}
     with jax.enable_x64(True):
         record = play(task(), episodes([0.3, 1.3, 0.5], [0.1, -4.5, 1.0], late, model()), script(actions), TICKS)
     seen = record.controller  # (TICKS, 11, P)
@@ -76,12 +76,15 @@ def played():
 
 
 def to_bridge(motion, delays, unit=FINEST):
-    """The motion as bytes through the bridge's own receivers: first tick of the policy, what it was shown, the bridge."""
+    """The motion as bytes through the bridge's own receivers: first tick of the policy, what it saw, the bridge."""
     drive = DriveParams(switch_on_time=0.01, homing_time=0.01, following_error=9.0)  # somebody else moves the carriage
     emulators = [AxisEmulator("cmmt", 0.0, 0.0, 10.0, drive, AxisUnits(position=unit)) for _ in FESTO_JOINTS]
     profile = CmmtProfile(position_unit=unit)
     axes = FestoAxes(
-        [Axis(name, DirectLink(emulator), profile, -0.99, 0.99) for name, emulator in zip("xy", emulators)],
+        [
+            Axis(name, DirectLink(emulator), profile, -0.99, 0.99)
+            for name, emulator in zip("xy", emulators, strict=True)
+        ],
         AxesConfig(max_error=9.0),
     )
     session = EgmSession(EgmConfig(controller_address=HOME))
@@ -93,7 +96,7 @@ def to_bridge(motion, delays, unit=FINEST):
     axes.enable()
     for i in range(warm_up, len(motion)):
         now, state = START + i * H, motion[max(i, 0)]
-        for j, emulator in zip(FESTO_JOINTS, emulators):
+        for j, emulator in zip(FESTO_JOINTS, emulators, strict=True):
             emulator.step(now, float(state[3 + j]), 0.0)
         position = state[[3 + j for j in ABB_JOINTS]]
         assert session.receive(

@@ -35,7 +35,10 @@ ROBOT = HEADER + DATA + FEEDBACK + PLANNED + STATES
 SENSOR = HEADER + CORRECTION + b"\x12\x38\x0a\x36" + JOINTS + b"\x1a\x38\x0a\x36" + JOINTS  # planned 2, speedRef 3
 
 
-def packet(sequence, time=None, position=np.zeros(6), motors=True, egm=True, rapid=True):
+STILL = np.zeros(6)
+
+
+def packet(sequence, time=None, position=STILL, motors=True, egm=True, rapid=True):
     time_ms = sequence * 4 if time is None else round(time * 1000)
     return encode_robot(sequence, time_ms, position, position, motors, egm, rapid)
 

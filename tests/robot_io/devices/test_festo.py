@@ -195,7 +195,7 @@ def test_modbus_link_survives_any_answer():
         links = [ModbusLink("127.0.0.1", server.getsockname()[1], timeout=0.02) for _ in [good, *answers]]
         assert links[0].exchange(0, [1], 0, 2) == [0x1234, 0x5678]
         links[0].close()
-        for link, data in zip(links[1:], answers):
+        for link, data in zip(links[1:], answers, strict=True):
             try:
                 registers = link.exchange(0, [1], 0, 2)
             except AxisLost:
@@ -535,7 +535,9 @@ class RealTime:
 
     def step(self, now, dt):
         self.position = self.position + self.velocity * dt
-        self.velocity = np.array([e.step(now, x, v) for e, x, v in zip(self.emulators, self.position, self.velocity)])
+        self.velocity = np.array(
+            [e.step(now, x, v) for e, x, v in zip(self.emulators, self.position, self.velocity, strict=True)]
+        )
 
     def run(self):
         last = time.monotonic()
@@ -558,7 +560,7 @@ class RealTime:
         # Generous times: what is tested is the order of things, on a machine that may be busy.
         config = AxesConfig(node_guard=1.0, command_timeout=0.5, state_timeout=0.5)
         links = [ModbusLink("127.0.0.1", s.port, timeout=0.5) for s in self.servers]
-        return FestoAxes([Axis(n, link, self.codec, -1.0, 1.0) for n, link in zip("xy", links)], config)
+        return FestoAxes([Axis(n, link, self.codec, -1.0, 1.0) for n, link in zip("xy", links, strict=True)], config)
 
 
 def wait_for(condition, seconds=10.0):

@@ -52,7 +52,9 @@ def test_trapezoid_from_motion():
 def test_trapezoid_is_exact_whatever_the_step():
     """Many steps end where one does, within speed and acceleration, for any state and target."""
     random = np.random.default_rng(0)
-    for x0, v0, target, duration in zip(*random.uniform([[-1], [-2], [-1], [0]], [[1], [2], [1], [2]], (4, 500))):
+    for x0, v0, target, duration in zip(
+        *random.uniform([[-1], [-2], [-1], [0]], [[1], [2], [1], [2]], (4, 500)), strict=True
+    ):
         speed, count = random.choice([0.01, 0.3, 1.0, 2.0]), int(random.integers(2, 40))
         x, v, dt = x0, v0, duration / count
         for _ in range(count):

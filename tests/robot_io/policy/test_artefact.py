@@ -79,11 +79,15 @@ def _forward_by_loops(theta, mean, inverse_scale, history):
         start += outputs
         inputs = outputs // 2
     x = [[(history[t][i] - mean[i]) * inverse_scale[i] for i in range(11)] for t in range(8)]
-    for (kernel, bias), dilation, gated in zip(layers, (1, 2, 4), (True, True, False)):
+    for (kernel, bias), dilation, gated in zip(layers, (1, 2, 4), (True, True, False), strict=True):
         after = []
         for t in range(dilation, len(x)):
             z = [
-                b + sum(old[o] * x[t - dilation][i] + new[o] * x[t][i] for i, (old, new) in enumerate(zip(*kernel)))
+                b
+                + sum(
+                    old[o] * x[t - dilation][i] + new[o] * x[t][i]
+                    for i, (old, new) in enumerate(zip(*kernel, strict=True))
+                )
                 for o, b in enumerate(bias)
             ]
             half = len(z) // 2

@@ -53,8 +53,8 @@ def simulated(model, poses):
 def mujocos(model, poses, ours):
     """MuJoCo's distances: of watched pairs of capsules and of capsules to the floor, both (rows, N)."""
     data, names = mujoco.MjData(model), [row.split(" to ") for row in ours.rows]
-    pairs = [n for n, kind in zip(names, ours.kinds) if kind == "self"]
-    floor = [(n[0], "floor") for n, kind in zip(names, ours.kinds) if kind == "floor"]
+    pairs = [n for n, kind in zip(names, ours.kinds, strict=True) if kind == "self"]
+    floor = [(n[0], "floor") for n, kind in zip(names, ours.kinds, strict=True) if kind == "floor"]
     found = np.empty((len(pairs) + len(floor), 300))
     for i in range(found.shape[1]):
         data.qpos[:] = poses[:, i]
@@ -92,7 +92,7 @@ def test_clearances_equal_the_simulations(model, ours, poses, monkeypatch):
 
 def test_gaps_equal_mujocos(ours, poses, mujocos):
     gaps = ours.gaps(poses[:, :300])
-    for kind, wanted in zip(("self", "floor"), mujocos):
+    for kind, wanted in zip(("self", "floor"), mujocos, strict=True):
         np.testing.assert_allclose(gaps[ours.kinds == kind], wanted, rtol=0, atol=1e-6)
         assert (wanted < 0).any() and (wanted > 0).any()
 
@@ -146,7 +146,7 @@ def test_a_cleared_motion_is_clear_between_its_points(ours):
     start = start[:, (gaps > 0.02) & (gaps < 0.1)][:, :600]
     end = start + rng.uniform(-0.6, 0.6, start.shape)
     dips = cleared = missed = 0
-    for a, b in zip(start.T, end.T):
+    for a, b in zip(start.T, end.T, strict=True):
         way = np.linspace(a, b, 3).T
         if (ours.gaps(way).min(0) < 0.02).any():
             continue
