@@ -27,7 +27,7 @@ study-quick: $(READY)
 
 # Files of tests are spread over two processes; tests in real time run after them, one by one.
 PYTEST   := $(BIN)/python -m pytest
-PARALLEL := -n 2 --dist loadfile
+PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(READY)
 	$(PYTEST) $(PARALLEL) -m "not slow and not realtime"
