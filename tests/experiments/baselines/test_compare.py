@@ -59,6 +59,7 @@ def best(observation):
 REPLAY = Replay(environments=16, capacity=20_000, random_steps=2_000, gradient_steps=2, batch=128)
 
 
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     "learner, calls, left",
     [
