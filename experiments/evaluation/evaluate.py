@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ballmodel.sampling import BallPool
@@ -15,11 +14,11 @@ from experiments.config.build import Experiment
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.stats import wilson
 from mjx_tt.env import reachability, rewards
+from mjx_tt.env.evaluator import COLUMNS, Evaluator
 from mjx_tt.env.policy import Policy
-from mjx_tt.env.rollout import RESULT_SPECS, RolloutResult, Simulator
+from mjx_tt.env.rollout import RolloutResult, Simulator
 from mjx_tt.env.task import HIT, MISSED, RETURNED
 
-EVALUATION_COLUMNS = 256  # copies of one policy side by side, to fill the vector loops
 OUTCOMES = {"missed": MISSED, "hit": HIT, "returned": RETURNED}
 
 
@@ -32,40 +31,10 @@ class Rate:
     high: float
 
 
-class Evaluator:
-    """Plays one policy at a time on a fixed set of balls, each of them once; compiled once.
-
-    balls     the pool: ``episodes`` balls or more, up to whole rows of at most ``EVALUATION_COLUMNS`` side by side
-    incoming  (2, R, P) [m] where the ball of each episode bounces on the robot's side
-
-    Drawing every ball once keeps the episodes independent, which their interval relies on.
-    """
-
-    def __init__(self, simulator: Simulator, experiment: Experiment, episodes: int, balls_key) -> None:
-        columns = -(-min(EVALUATION_COLUMNS, episodes) // simulator.devices) * simulator.devices
-        rows = -(-episodes // columns)
-        self.balls = build.pool(experiment, balls_key, rows * columns)
-        # Balls of similar arrival in one row: rows run together until their last episode ends.
-        order = np.argsort(np.asarray(self.balls.arrival)).reshape(rows, columns)
-        self.incoming = np.asarray(self.balls.landing)[:, order]
-        thrown = jax.tree.map(lambda x: x[:, order], self.balls.state)
-        model = experiment.model
-
-        def play(policy, key, pool, thrown):
-            drawn = simulator.draw(key, pool, model.model, model.randomise, rows, columns)
-            copies = jnp.repeat(policy.theta[:, None], columns // simulator.devices, axis=1)
-            # Balls of a distribution do not spin: what the drawn ones do is the model's.
-            spinning = replace(thrown, spin=thrown.spin + drawn.ball.spin)
-            return simulator.rollout(replace(policy, theta=copies), simulator.local(replace(drawn, ball=spinning)))
-
-        spread = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
-        fixed = simulator.replicate((self.balls, thrown))
-        # One layout for arrays from training and from files: one compilation.
-        self._play = lambda *policy_and_key: spread(*simulator.replicate(policy_and_key), *fixed)
-
-    def play(self, policy: Policy, key) -> RolloutResult:
-        """Episodes under the key of latencies and noise; arrays are NumPy, (..., R, P)."""
-        return jax.tree.map(np.asarray, self._play(policy, key))
+def draw_balls(experiment: Experiment, simulator: Simulator, episodes: int, key: jax.Array) -> BallPool:
+    """At least ``episodes`` fresh balls: whole rows of the width in which they are played."""
+    columns = -(-min(COLUMNS, episodes) // simulator.devices) * simulator.devices
+    return build.pool(experiment, key, -(-episodes // columns) * columns)
 
 
 @dataclass(frozen=True)
@@ -73,8 +42,8 @@ class Played:
     """One policy's evaluation.
 
     report    what evaluation.json holds
-    result    per episode, NumPy arrays (..., R, P)
-    incoming  (2, R, P) [m] where each ball bounced on the robot's side
+    result    per episode, NumPy arrays (..., n)
+    incoming  (2, n) [m] where each ball bounced on the robot's side
     """
 
     report: dict[str, Any]
@@ -92,12 +61,13 @@ def evaluate(
     config = experiment.config
     task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
     simulator = Simulator(task, len(jax.devices()))
-    evaluator = Evaluator(simulator, experiment, episodes, build.key(seed, build.EVALUATION_BALLS))
+    balls = draw_balls(experiment, simulator, episodes, build.key(seed, build.EVALUATION_BALLS))
+    evaluator = Evaluator(simulator, balls, experiment.model.model, experiment.model.randomise)
     key = build.key(seed, build.EVALUATION_EPISODES)
-    result = evaluator.play(trained.policy, key)
+    result, incoming = evaluator.play(trained.policy, key), np.asarray(balls.landing)[:, evaluator.order]
     conditions = {
         "balls": experiment.distribution.to_dict(),
-        "acceptance": float(evaluator.balls.acceptance),
+        "acceptance": float(balls.acceptance),
         "engine": task.engine,
         "sim_rate": task.sim_rate,
         "randomise": {r.path: [r.low, r.high] for r in experiment.model.randomise},
@@ -108,8 +78,8 @@ def evaluate(
     }
     reachable = None
     if reachable_balls is not None:
-        reachable = _reachable(experiment, simulator, evaluator.balls, key, reachable_balls, trained.policy)
-    return Played(summary(result) | {"reachable": reachable} | conditions, result, evaluator.incoming)
+        reachable = _reachable(experiment, simulator, balls, key, reachable_balls, trained.policy)
+    return Played(summary(result) | {"reachable": reachable} | conditions, result, incoming)
 
 
 def _reachable(

@@ -17,12 +17,13 @@ from bgs import normalizer
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.errors import RunError
-from experiments.evaluation.evaluate import Evaluator, return_rate
+from experiments.evaluation.evaluate import draw_balls, return_rate
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import Run
 from experiments.training.progress import TrainingProgress
 from experiments.training.update import Trainer, TrainState, trainer
+from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 
 _programs: dict[str, Any] = {}  # compiled updates by what decides them
@@ -120,7 +121,9 @@ class Session:
         if training.evaluate_every is None:
             return None
         key = build.key(training.seed, build.PROGRESS_BALLS)
-        return Evaluator(self._trainer.simulator, experiment, training.evaluate_episodes, key)
+        simulator, model = self._trainer.simulator, experiment.model
+        balls = draw_balls(experiment, simulator, training.evaluate_episodes, key)
+        return Evaluator(simulator, balls, model.model, model.randomise)
 
     def _evaluate(self) -> dict[str, float]:
         """The averaged parameters on the run's own set of fresh balls."""

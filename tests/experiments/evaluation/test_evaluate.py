@@ -19,6 +19,7 @@ from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
 from experiments.stats import wilson
 from mjx_tt.env import rewards
+from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import RolloutResult, Simulator
 from mjx_tt.env.task import HIT, MISSED, OUT_OF_REACH, RETURNED
@@ -88,14 +89,15 @@ def test_an_evaluation_plays_the_spin_of_its_model():
     topspin = 250.0
     data = {"name": "a", "balls": "narrow", "model": {"ball_spin": {"mean_x": topspin}}, "training": {"pool": 64}}
     experiment = build.experiment(config.parse(data, "a"), "a")
-    evaluator = evaluate.Evaluator(Simulator(experiment.task), experiment, 32, jax.random.key(0))
+    simulator = Simulator(experiment.task)
+    balls = evaluate.draw_balls(experiment, simulator, 32, jax.random.key(0))
+    evaluator = Evaluator(simulator, balls, experiment.model.model, experiment.model.randomise)
     eleven = np.ones(N_OBSERVATION, np.float32)
     played = evaluator.play(Policy(np.zeros(n_parameters(), np.float32), 0.0 * eleven, eleven), jax.random.key(1))
-    order = np.argsort(np.asarray(evaluator.balls.arrival))
-    missed = played.outcome.ravel() == MISSED
+    missed = played.outcome == MISSED
     assert missed.sum() > 16
-    for i, steps in zip(order[missed], played.steps.ravel()[missed]):
-        ball = jax.tree.map(lambda x: np.asarray(x, float)[:, i], evaluator.balls.state)
+    for i, steps in zip(evaluator.order[missed], played.steps[missed]):
+        ball = jax.tree.map(lambda x: np.asarray(x, float)[:, i], balls.state)
         start = ball_flight.Touch(0.0, ball.position, ball.velocity, np.array([topspin, 0.0, 0.0]))
         end, _ = ball_flight.fly(
             ball_flight.on_table(start), lambda p: min(p[1] - OUT_OF_REACH[0], p[2] - OUT_OF_REACH[1])

@@ -1,0 +1,75 @@
+"""A policy on many balls, each played once, whatever their number with one compiled program."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ballmodel.sampling import BallPool
+from ballmodel.state import BallState
+from mjx_tt.env.policy import Policy
+from mjx_tt.env.rollout import RESULT_SPECS, RolloutResult, Simulator
+from mjx_tt.sim.model import Range, SimModel
+
+ROWS, COLUMNS = 8, 256  # episodes of one call: fewer are padded, more take several calls
+
+
+class Evaluator:
+    """Plays one policy at a time on the balls of a pool, each of them once. Compiles once, whatever their number.
+
+    simulator  its devices share the columns
+    balls      n of them; the result keeps them in the order of their arrival, ``order`` (n,) gives their places in it
+    model, randomise  the world, and what is drawn around it
+
+    Drawing every ball once keeps the episodes independent, which the interval of a rate relies on.
+    """
+
+    def __init__(self, simulator: Simulator, balls: BallPool, model: SimModel, randomise: tuple[Range, ...]) -> None:
+        columns = -(-COLUMNS // simulator.devices) * simulator.devices
+        self.count = balls.arrival.shape[0]
+        # Balls of similar arrival in one row: rows run together until their last episode ends.
+        self.order = np.argsort(np.asarray(balls.arrival))
+        padded = np.resize(self.order, -(-self.count // (ROWS * columns)) * ROWS * columns)
+        padded[self.count :] = self.order[-1]
+        self._calls = [
+            (
+                replace(
+                    balls, state=_take(balls.state, flat), arrival=balls.arrival[flat], landing=balls.landing[:, flat]
+                ),
+                _take(balls.state, flat.reshape(ROWS, columns)),
+            )
+            for flat in padded.reshape(-1, ROWS * columns)
+        ]
+
+        def play(policy: Policy, key: jax.Array, pool: BallPool, thrown: BallState) -> RolloutResult:
+            drawn = simulator.draw(key, pool, model, randomise, ROWS, columns)
+            copies = jnp.repeat(policy.theta[:, None], columns // simulator.devices, axis=1)
+            # Balls of a distribution do not spin: the spin of the drawn ones is the model's.
+            spinning = replace(thrown, spin=thrown.spin + drawn.ball.spin)
+            return simulator.rollout(replace(policy, theta=copies), simulator.local(replace(drawn, ball=spinning)))
+
+        self._spread = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
+        self._replicate = simulator.replicate
+
+    def play(self, policy: Policy, key: jax.Array) -> RolloutResult:
+        """The episodes under the key of latencies and noise, NumPy arrays (..., n); without observation statistics."""
+        found = []
+        for i, call in enumerate(self._calls):
+            # One layout for arrays from training and from files: one compilation.
+            arguments = self._replicate((policy, key if i == 0 else jax.random.fold_in(key, i), *call))
+            found.append(self._spread(*arguments))
+        per_episode = {
+            field.name: np.concatenate(
+                [np.asarray(x).reshape(*x.shape[:-2], -1) for x in (getattr(f, field.name) for f in found)], axis=-1
+            )[..., : self.count]
+            for field in fields(RolloutResult)
+            if not field.name.startswith("observation")
+        }
+        return RolloutResult(**per_episode, observation_sums=None, observation_counts=None)
+
+
+def _take(state: BallState, index: np.ndarray) -> BallState:
+    return jax.tree.map(lambda x: x[:, index], state)
