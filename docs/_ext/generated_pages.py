@@ -52,6 +52,7 @@ def write_all() -> None:
     _write(
         "verdict", schema_page("Verdict", "", json.loads((REFERENCE / "verdict.schema.json").read_text("utf-8")), {})
     )
+    _write("model", model_page())
     _write("robot", dataclass_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", RobotConfig))
     _write("rig", dataclass_page("rig.yaml", "mjx-tt run --robot rig --rig", RigParams))
     _write("command-line", command_line_page())
@@ -174,10 +175,51 @@ def dataclass_page(title: str, command: str, kind: type) -> str:
     return "\n".join(lines) + "\n"
 
 
+def model_page() -> str:
+    """Every parameter of the simulation's model, its nominal value and its comment."""
+    from mjx_tt.sim import model
+
+    sections: dict[str, dict[str, Any]] = {}
+    for path, value in model.paths().items():
+        section, key = path.rsplit(".", 1)
+        sections.setdefault(section, {})[key] = value
+    lines = [
+        "# Model",
+        "",
+        "The YAML of `model` in an experiment, and of `--model`: any of these parameters, nested by",
+    ]
+    lines += ["section, and `randomise` with ranges `[low, high]` by dotted path, drawn uniformly per episode.", ""]
+    lines += [
+        "```yaml",
+        "ball: {table: {restitution: 0.90}}",
+        "randomise: {ball.paddle.restitution: [0.8, 0.95]}",
+        "```",
+    ]
+    joints = [section for section in sections if section.startswith("drives.")]
+    for section, values in sections.items():
+        if section in joints[1:]:
+            continue
+        owner: Any = model.SimModel
+        for name in section.split("."):
+            hint = typing.get_type_hints(owner)[name]
+            owner = next(h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h))
+        summary, notes = _field_notes(owner)
+        title = "drives.JOINT" if section in joints else section
+        lines += ["", f"## {title}", "", _cell(summary), "", "| key | nominal | meaning |", "|---|---|---|"]
+        lines += [f"| `{key}` | {_nominal(value)} | {_cell(notes.get(key, ''))} |" for key, value in values.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _nominal(value: float | str) -> str:
+    return "none" if isinstance(value, float) and value > 100.0 else f"`{value}`"
+
+
 def _field_notes(kind: type) -> tuple[str, dict[str, str]]:
     """First paragraph of a dataclass's docstring, and what docstring and comments say of each field."""
     blocks = (inspect.getdoc(kind) or "").split("\n\n")
-    notes = dict(re.findall(r"^    (\w+): .*?  # (.+)$", inspect.getsource(kind), re.MULTILINE))
+    source = inspect.getsource(kind)
+    notes = {name: text for text, name in re.findall(r"^    # (.+)\n    (\w+): ", source, re.MULTILINE)}
+    notes |= dict(re.findall(r"^    (\w+): .*?  # (.+)$", source, re.MULTILINE))
     for block in blocks[1:]:
         for names, text in _entries(block.splitlines()).items():
             for field in dataclasses.fields(kind):

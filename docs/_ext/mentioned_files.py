@@ -81,9 +81,7 @@ def _inside_module(parts: list[str]) -> bool:
     """True for a module, and for a name that the deepest module among the parts has."""
     for n in range(len(parts), 0, -1):
         path = ROOT.joinpath(*parts[:n])
-        source = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-        if path.is_dir() or source.exists():
-            return n == len(parts) or (
-                source.exists() and re.search(rf"\b{parts[n]}\b", source.read_text("utf-8")) is not None
-            )
+        sources = [*path.glob("__init__.py*"), *path.parent.glob(f"{path.name}.py")]
+        if path.is_dir() or sources:
+            return n == len(parts) or any(re.search(rf"\b{parts[n]}\b", s.read_text("utf-8")) for s in sources)
     return False
