@@ -70,11 +70,17 @@ REPLAY = Replay(environments=16, capacity=20_000, random_steps=2_000, gradient_s
             120,
             0.4,
         ),
-        (OffPolicyLearner(REPLAY, Aim(), SacAgent(Sac(kind="sac", learning_rate=1e-3, layers=[64, 64]))), 40, 0.4),
-        (
+        pytest.param(
+            OffPolicyLearner(REPLAY, Aim(), SacAgent(Sac(kind="sac", learning_rate=1e-3, layers=[64, 64]))),
+            40,
+            0.4,
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
             OffPolicyLearner(REPLAY, Aim(), QtOptAgent(QtOpt(kind="qt_opt", learning_rate=1e-3, layers=[64, 64]))),
             40,
             0.6,
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["PPO", "SAC", "QT-Opt"],
@@ -195,6 +201,7 @@ def write(folder, data):
     return path
 
 
+@pytest.mark.slow
 def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
     path, console = write(tmp_path, SMALL), Console()
     folder = compare.compare(*baselines.load(path), str(path), tmp_path, console)

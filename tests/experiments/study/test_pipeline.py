@@ -415,6 +415,7 @@ def loop(what: study_config.Study, folder: Path) -> None:
     run_all(is2r.Loop(what, folder, quiet()).steps_of_play(), Journal(folder / "steps.jsonl"), quiet())
 
 
+@pytest.mark.slow
 def test_a_study_leaves_what_it_says(finished):
     player = finished / "seed0" / "player3"
     for key in schedule.MODELS:
@@ -474,6 +475,7 @@ def test_worlds_side_by_side_are_those_that_were_drawn():
     assert together["ball.table.restitution"][4] == np.float32(0.93)
 
 
+@pytest.mark.slow
 def test_an_effect_is_left_out_for_the_policy_it_says(finished):
     """One world's rallies played again with every lane in that world."""
     what, lanes = study(), 10
@@ -507,6 +509,7 @@ def test_an_effect_is_left_out_for_the_policy_it_says(finished):
     assert len({r.length for r in rows}) > 2  # worlds differ
 
 
+@pytest.mark.slow
 def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
     """Compilations counted by JAX itself."""
     compiled = []
@@ -523,6 +526,7 @@ def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
     assert np.abs(one - two).max() > 1e-3  # another seed and other balls
 
 
+@pytest.mark.slow
 def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tmp_path):
     """Its steps done by two processes, stopped as a batch system does, gone on with, killed, and ended by this one."""
     folder = tmp_path / "tiny"
@@ -564,6 +568,7 @@ def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tm
                 assert path.read_bytes() == mine.read_bytes(), path
 
 
+@pytest.mark.slow
 def test_a_folder_belongs_to_one_study(finished):
     with pytest.raises(RunError, match="first_balls: the study has 60, now 61"):
         session._open(study(first_balls=61), finished)
@@ -572,6 +577,7 @@ def test_a_folder_belongs_to_one_study(finished):
 # On a robot
 
 
+@pytest.mark.slow
 def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
     """The emulated robot in lock-step; then the scoring sheet, by hand."""
     tuning = {"pairs": 1, "repeats": 1, "evaluation_balls": 2}
@@ -596,6 +602,7 @@ def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
     assert np.isfinite(theta).all()
 
 
+@pytest.mark.slow
 def test_people_play_under_code_names_and_the_key_opens_when_the_sheet_is_full(finished, tmp_path):
     folder, player = tmp_path / "blind", finished / "seed0" / "player3"
     runs_of = {key: (lambda key=key: player / key) for key in ("is2r-ft35", "is2r-ft65")}
