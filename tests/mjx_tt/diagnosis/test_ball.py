@@ -230,6 +230,7 @@ def test_the_size_of_a_filter_is_no_more_off_than_its_interval_says():
     assert abs(found.estimate - 0.008) < 1.5 * (found.high - found.estimate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("session", "spins"), [("mn5008_topspin", True), ("no_spin_robot_simple", False)])
 def test_a_launchers_topspin_is_named_and_its_straight_balls_are_not(session, spins):
     path = DATA / "aimy_launcher" / f"{session}.hdf5"
