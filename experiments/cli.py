@@ -5,11 +5,12 @@ from __future__ import annotations
 import sys
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NoReturn
 
 from cyclopts import App, CycloptsError, Parameter
 from rich.console import Console
 
+from experiments import stages
 from experiments.commands import (
     blind,
     compare,
@@ -122,7 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"mjx-tt: error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interruption:
-        print(interruption or "interrupted", file=sys.stderr)
+        print(str(interruption) or "interrupted", file=sys.stderr)
         return 130
     except Exception as error:
         if not explained(error):
@@ -131,5 +132,10 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
 
+def program() -> NoReturn:
+    """What the shell runs."""
+    stages.leave(main())
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

@@ -38,7 +38,9 @@ def compare(
     writable(out)
     start_jax(1)
     from experiments.baselines import compare as comparing
+    from experiments.stages import interruptible
 
     screen = console()
-    folder = comparing.compare(loaded, experiment, str(path), Path(out), screen)
+    with interruptible():
+        folder = comparing.compare(loaded, experiment, str(path), Path(out), screen)
     screen.print(f"{folder}/comparison.md, with its pictures beside it", highlight=False, soft_wrap=True)

@@ -67,20 +67,25 @@ def evaluate(
     start_jax(devices)
     from experiments.evaluation import evaluate as evaluation
     from experiments.runs import load_policy
+    from experiments.stages import interruptible, printed
     from experiments.training import finalize
 
     screen = console()
     trained = load_policy.load(policy)
     experiment = experiment_of(trained, balls, model)
     settings = experiment.config.evaluation
-    played = evaluation.evaluate(
-        experiment,
-        trained,
-        episodes or settings.episodes,
-        settings.seed if seed is None else seed,
-        None if no_reachable else settings.reachable_balls,
-    )
-    finalize.save_evaluation(folder, played, experiment.task.reward_weights)
+    stage = printed(screen, str(trained.source))
+    with interruptible():
+        played = evaluation.evaluate(
+            experiment,
+            trained,
+            episodes or settings.episodes,
+            settings.seed if seed is None else seed,
+            None if no_reachable else settings.reachable_balls,
+            stage,
+        )
+        with stage("drawing pictures"):
+            finalize.save_evaluation(folder, played, experiment.task.reward_weights)
     finalize.print_report(screen, played.report, str(trained.source))
     screen.print(f"  {folder}/evaluation.json, pictures in {folder}/plots", highlight=False, soft_wrap=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -66,10 +67,12 @@ def is2r(
     writable(out)
     own = loaded.simulation.devices
     start_jax(devices or (None if own == "auto" else own))
+    from experiments.stages import interruptible
     from experiments.study import session, workers
 
     side_by_side = workers.choose(loaded, processes, devices)
-    return 0 if session.run(loaded, Path(out) / loaded.name, console(), side_by_side) else 130
+    with interruptible() if loaded.robot is None else nullcontext():
+        return 0 if session.run(loaded, Path(out) / loaded.name, console(), side_by_side) else 130
 
 
 @report_app.default

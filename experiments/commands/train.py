@@ -77,14 +77,16 @@ def train(
     # As many as the experiment with the most needs; where all leave it open, as many as there are cores.
     most = max((c.training.devices for _, c in configs if c.training.devices != "auto"), default=None)
     start_jax(devices or most)
+    from experiments.stages import interruptible
     from experiments.training import sweep
 
     screen = console()
     planned = sweep.plan(configs, seeds, Path(out))
-    ok = sweep.run_all(planned, screen)
-    if select and ok:
-        for name in dict.fromkeys(job.config.name for job in planned):
-            sweep.select(Path(out) / name, [job for job in planned if job.config.name == name], screen)
+    with interruptible():
+        ok = sweep.run_all(planned, screen)
+        if select and ok:
+            for name in dict.fromkeys(job.config.name for job in planned):
+                sweep.select(Path(out) / name, [job for job in planned if job.config.name == name], screen)
     return 0 if ok else 1
 
 

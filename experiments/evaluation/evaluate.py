@@ -12,6 +12,7 @@ from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.runs.load_policy import TrainedPolicy
+from experiments.stages import Stage, silent
 from experiments.stats import wilson
 from mjx_tt.env import reachability, rewards
 from mjx_tt.env.evaluator import COLUMNS, Evaluator
@@ -52,19 +53,28 @@ class Played:
 
 
 def evaluate(
-    experiment: Experiment, trained: TrainedPolicy, episodes: int, seed: int, reachable_balls: int | None = None
+    experiment: Experiment,
+    trained: TrainedPolicy,
+    episodes: int,
+    seed: int,
+    reachable_balls: int | None = None,
+    stage: Stage = silent,
 ) -> Played:
     """Plays the policy on at least ``episodes`` balls that training has not seen.
 
-    reachable_balls: on how many of the balls to seek a lower bound of the return rate in reach; None: no bound.
+    reachable_balls: on how many of the balls to seek a lower bound of the return rate in reach; None: no bound. stage:
+    shows what is being done.
     """
     config = experiment.config
     task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
     simulator = Simulator(task, len(jax.devices()))
-    balls = draw_balls(experiment, simulator, episodes, build.key(seed, build.EVALUATION_BALLS))
-    evaluator = Evaluator(simulator, balls, experiment.model.model, experiment.model.randomise)
     key = build.key(seed, build.EVALUATION_EPISODES)
-    result, incoming = evaluator.play(trained.policy, key), np.asarray(balls.landing)[:, evaluator.order]
+    with stage("compiling the evaluation"):
+        balls = draw_balls(experiment, simulator, episodes, build.key(seed, build.EVALUATION_BALLS))
+        evaluator = Evaluator(simulator, balls, experiment.model.model, experiment.model.randomise)
+        evaluator.compile(trained.policy, key)
+    with stage(f"evaluating on {episodes:,} fresh balls"):
+        result, incoming = evaluator.play(trained.policy, key), np.asarray(balls.landing)[:, evaluator.order]
     conditions = {
         "balls": experiment.distribution.to_dict(),
         "acceptance": float(balls.acceptance),
@@ -78,7 +88,8 @@ def evaluate(
     }
     reachable = None
     if reachable_balls is not None:
-        reachable = _reachable(experiment, simulator, balls, key, reachable_balls, trained.policy)
+        with stage(f"finding what is in reach of {reachable_balls} of them"):
+            reachable = _reachable(experiment, simulator, balls, key, reachable_balls, trained.policy)
     return Played(summary(result) | {"reachable": reachable} | conditions, result, incoming)
 
 

@@ -14,6 +14,7 @@ from experiments.evaluation.evaluate import Played
 from experiments.runs import load_policy, metrics, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
+from experiments.stages import Stage, printed
 from robot_io import contract
 from robot_io.policy import export
 
@@ -26,13 +27,17 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
     Returns the report. Raises ArtefactError when the policy's exported forms disagree, OSError when the disk refuses.
     """
     trained, evaluation = load_policy.load(run.folder), experiment.config.evaluation
-    console.print(f"{run.folder}: evaluating on {evaluation.episodes:,} fresh balls ...", highlight=False)
-    played = evaluate.evaluate(experiment, trained, evaluation.episodes, evaluation.seed, evaluation.reachable_balls)
-    pictures = figures.draw_evaluation(run.plots, played, experiment.task.reward_weights)
-    title = f"{experiment.config.name}: training on {experiment.distribution.name}"
-    pictures.append(figures.draw_training(run.plots / "training.png", metrics.read(run.metrics), title))
-    shown = show_episodes(experiment, trained, [run.folder / "episode.png", run.folder / "episode.mp4"], console)
-    exported = export_policy(run.artefact, trained, experiment, played.report, console)
+    stage = printed(console, str(run.folder))
+    played = evaluate.evaluate(
+        experiment, trained, evaluation.episodes, evaluation.seed, evaluation.reachable_balls, stage
+    )
+    with stage("drawing pictures"):
+        pictures = figures.draw_evaluation(run.plots, played, experiment.task.reward_weights)
+        title = f"{experiment.config.name}: training on {experiment.distribution.name}"
+        pictures.append(figures.draw_training(run.plots / "training.png", metrics.read(run.metrics), title))
+    shown = show_episodes(experiment, trained, [run.folder / "episode.png", run.folder / "episode.mp4"], console, stage)
+    with stage("exporting and checking the artefact"):
+        exported = export_policy(run.artefact, trained, experiment, played.report, console)
     run_dir.write_json(run.evaluation, played.report)
     print_report(console, played.report, str(run.folder))
     lines = {
@@ -47,15 +52,21 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
     return played.report
 
 
-def show_episodes(experiment: Experiment, trained: TrainedPolicy, paths: list[Path], console: Console) -> list[Path]:
+def show_episodes(
+    experiment: Experiment, trained: TrainedPolicy, paths: list[Path], console: Console, stage: Stage
+) -> list[Path]:
     """Writes the pictures that this machine can draw; says why where it cannot."""
-    played = video.replay(experiment, trained, EPISODES_SHOWN, experiment.config.evaluation.seed)
-    drawn = []
-    for path in paths:
-        try:
-            drawn.append(video.draw(path, played, experiment.task.control_rate))
-        except RuntimeError as error:
-            console.print(f"{path}: not drawn: {error}", highlight=False)
+    with stage("compiling and playing the episodes to be drawn"):
+        played = video.replay(experiment, trained, EPISODES_SHOWN, experiment.config.evaluation.seed)
+    drawn, failed = [], {}
+    with stage(f"drawing {' and '.join(path.name for path in paths)}"):
+        for path in paths:
+            try:
+                drawn.append(video.draw(path, played, experiment.task.control_rate))
+            except RuntimeError as error:
+                failed[path] = error
+    for path, error in failed.items():
+        console.print(f"{path}: not drawn: {error}", highlight=False)
     return drawn
 
 

@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from bgs import normalizer
+from experiments import stages
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.errors import RunError
@@ -74,7 +76,9 @@ class Session:
             with progress, _stop_requests() as stop_wanted:
                 if self.update:
                     progress.note(f"continues after update {self.update}")
+                began = time.monotonic()
                 compiled = _compiled(self._config, self._trainer, self.state)
+                progress.note(f"compiled in {time.monotonic() - began:.1f} s")
                 while (reason := self._ended()) is None and not stop_wanted():
                     self._advance(compiled, log, progress, stop_wanted)
                 self._save(log)
@@ -178,8 +182,13 @@ def _stop_requests() -> Iterator[Callable[[], bool]]:
     """Whether Ctrl-C or SIGTERM has come: the first asks for a stop, a second one acts at once."""
     received = []
 
-    def note(number, _frame) -> None:
+    def note(number: int, _frame: FrameType | None) -> None:
+        stages.acted_on()
         received.append(number)
+        if number == signal.SIGINT:
+            stages.say(
+                "Ctrl-C: saves a checkpoint and stops after this update or compilation; Ctrl-C again ends at once"
+            )
         signal.signal(number, previous[number])
 
     previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 
 import jax
@@ -51,8 +52,13 @@ class Evaluator:
             spinning = replace(thrown, spin=thrown.spin + drawn.ball.spin)
             return simulator.rollout(replace(policy, theta=copies), simulator.local(replace(drawn, ball=spinning)))
 
-        self._spread = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
+        self._traced = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
+        self._spread: Callable[..., RolloutResult] = self._traced
         self._replicate = simulator.replicate
+
+    def compile(self, policy: Policy, key: jax.Array) -> None:
+        """Compiles ``play`` for policies like this one; otherwise its first call does."""
+        self._spread = self._traced.lower(*self._replicate((policy, key, *self._calls[0]))).compile()
 
     def play(self, policy: Policy, key: jax.Array) -> RolloutResult:
         """The episodes under the key of latencies and noise, NumPy arrays (..., n); without observation statistics."""

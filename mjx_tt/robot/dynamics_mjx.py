@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import io
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an optional engine, is not installed
+    from mujoco import mjx
 
 
 class MjxEngine:

@@ -1,0 +1,61 @@
+"""Lines about stages, and a Ctrl-C while a library computes and Python's own handlers wait."""
+
+from __future__ import annotations
+
+import io
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from rich.console import Console
+
+from experiments import stages
+from tests.support.paths import ROOT
+
+DEAF = """
+import hashlib, sys
+from experiments.stages import interruptible
+with interruptible():
+    print("ready", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 60_000_000)  # C code that never looks for signals
+"""
+
+
+def test_a_stage_says_what_and_how_long():
+    text = io.StringIO()
+    stage = stages.printed(Console(file=text), "run")
+    with stage("compiling"):
+        assert text.getvalue() == "run: compiling ..."
+    with pytest.raises(ZeroDivisionError), stage("failing"):
+        raise ZeroDivisionError
+    assert re.fullmatch(r"run: compiling \.\.\. \d+\.\d s\nrun: failing \.\.\.\n", text.getvalue())
+
+
+def test_ctrl_c_is_answered_where_python_does_not_run_and_the_second_one_ends():
+    process = subprocess.Popen(
+        [sys.executable, "-c", DEAF], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        assert process.stderr.readline() == "\n"
+        assert "Ctrl-C again ends at once" in process.stderr.readline()
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        began = time.monotonic()
+        assert process.wait(10) == 130 and time.monotonic() - began < 5.0
+        assert "the same command continues" in process.stderr.read()
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_ctrl_c_where_python_runs_is_an_interruption_as_ever():
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), stages.interruptible():
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(5.0)
+    assert signal.getsignal(signal.SIGINT) is before
