@@ -25,3 +25,12 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     except BaseException:
         os.unlink(temporary)
         raise
+
+
+def sync_folder(folder: str | os.PathLike) -> None:
+    """Make the names of new and renamed files in a folder survive a power cut. Raises OSError."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -60,7 +60,7 @@ def finetune(
     folder = out or f"{Path(policy).resolve().name}-finetuned"
     writable(folder)
     start_jax(1)
-    from experiments.deploy import session
+    from experiments.finetuning import session
     from experiments.runs.run_dir import Run
 
     report = session.finetune(policy, chosen, Run(folder), robot, distribution, rig, backend, seed, console())

@@ -95,6 +95,6 @@ def rig(
     """Returns the exit status."""
     existing(rig, key="--rig")
     start_jax(1)
-    from experiments.deploy import session
+    from experiments.deploy import rig as emulated
 
-    return session.rig(distribution, rig, seed, ports, Path(out), console())
+    return emulated.rig(distribution, rig, seed, ports, Path(out), console())

@@ -7,22 +7,36 @@ import select
 import sys
 import termios
 import tty
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from robot_io.control import messages
+
 COLOURS = {"disarmed": "white", "ready": "green", "active": "bold green", "stopping": "yellow", "fault": "bold red"}
+QUIT, PAUSE = "q", "h"
+
+
+@dataclass(frozen=True)
+class Key:
+    """What a key does, in words, and the request that it sends; None where the program decides."""
+
+    text: str
+    request: messages.Request | None = None
+
+
 KEYS = {
-    "p": ("prepare", "switch on and home the linear axes"),
-    "a": ("arm", "arm: the robot goes to its home pose"),
-    " ": ("stop", "stop"),
-    "r": ("reset", "reset a fault"),
-    "d": ("discard", "discard this ball"),
-    "h": ("pause", "hold: take no new balls, or go on"),
-    "q": ("quit", "stop and end"),
+    "p": Key("switch on and home the linear axes", messages.Prepare()),
+    "a": Key("arm: the robot goes to its home pose", messages.Arm()),
+    " ": Key("stop", messages.Stop()),
+    "r": Key("reset a fault", messages.Reset()),
+    "d": Key("discard this ball", messages.Discard()),
+    PAUSE: Key("pause: take no new balls, or resume"),
+    QUIT: Key("stop and end"),
 }
 
 
@@ -50,7 +64,7 @@ class Keyboard:
 class View:
     """The status of the control process, redrawn in place; on a terminal only."""
 
-    def __init__(self, console: Console, title: str, keys: dict = KEYS) -> None:
+    def __init__(self, console: Console, title: str, keys: Mapping[str, Key] = KEYS) -> None:
         self._title, self._keys = title, keys
         self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
         self._last = ""
@@ -68,37 +82,40 @@ class View:
         """The last line of the view: what was refused, what was asked for."""
         self._last = text
 
-    def show(self, status: dict[str, Any]) -> None:
-        if self._live:
-            self._live.update(self._draw(status), refresh=True)
+    def take(self, message: messages.Message) -> None:
+        """Draw a status anew; put a refusal into the last line."""
+        if isinstance(message, messages.Status) and self._live:
+            self._live.update(self._draw(message), refresh=True)
+        elif isinstance(message, messages.Refused):
+            self.say(message.sentence)
 
-    def _draw(self, s: dict[str, Any]) -> Group:
+    def _draw(self, s: messages.Status) -> Group:
         head = Text.assemble(
             (f"{self._title}  ", "bold"),
-            (s["state"].upper(), COLOURS[s["state"]]),
-            "  holding" if s["paused"] else "",
-            "  at home" if s["at_home"] else "",
+            (s.state.upper(), COLOURS[s.state]),
+            "  holding" if s.paused else "",
+            "  at home" if s.at_home else "",
         )
         lines = [head]
-        lines += [Text(f"FAULT {f['cause']}: {f['text']}", "red") for f in s["faults"]]
-        if not s["faults"]:
-            lines += [Text(f"waiting: {text}", "yellow") for text in s["present"].values()]
-        outcomes = ", ".join(f"{n} {name}" for name, n in s["outcomes"].items()) or "none yet"
+        lines += [Text(f"FAULT {f.cause}: {f.text}", "red") for f in s.faults]
+        if not s.faults:
+            lines += [Text(f"waiting: {text}", "yellow") for text in s.present.values()]
+        outcomes = ", ".join(f"{n} {name}" for name, n in s.outcomes.items()) or "none yet"
         lines.append(Text(f"balls {s['balls']}: {outcomes}; in a row {s['rally']}, longest {s['longest_rally']}"))
         joints = Table(box=None, pad_edge=False)
         for name in ("joint", "position", "command"):
             joints.add_column(name, justify="left" if name == "joint" else "right")
-        for name, position, velocity in s["joints"]:
+        for name, position, velocity in s.joints:
             unit = "m" if name.startswith("gantry") else "rad"
             joints.add_row(name, f"{position:+.3f} {unit}", f"{velocity:+.2f} {unit}/s")
         timing = Table(box=None, pad_edge=False)
         for name in ("", "p50", "p99", "max [ms]"):
             timing.add_column(name, justify="left" if not name else "right")
-        for name, t in s["timings"].items():
+        for name, t in s.timings.items():
             if isinstance(t, dict):
                 timing.add_row(name, f"{t['p50_ms']:.3f}", f"{t['p99_ms']:.3f}", f"{t['max_ms']:.3f}")
-        missed = s["timings"].get("missed_ticks", 0)
-        egm, frames = s["egm"], s["tracker_counts"]
+        missed = s.timings.get("missed_ticks", 0)
+        egm, frames = s.egm, s.tracker_counts
         wire = Text(
             f"EGM {egm['accepted']:,} taken, {sum(egm['rejected'].values()):,} refused, {egm['lost']:,} lost; "
             f"tracker {frames.get('accepted', 0):,} taken, {frames.get('lost', 0):,} lost; "
@@ -106,5 +123,5 @@ class View:
         )
         grid = Table.grid(padding=(0, 4))
         grid.add_row(joints, timing)
-        keys = "   ".join(f"[{'space' if k == ' ' else k}] {text}" for k, (_, text) in self._keys.items())
+        keys = "   ".join(f"[{'space' if k == ' ' else k}] {key.text}" for k, key in self._keys.items())
         return Group(*lines, grid, wire, Text(keys, "dim"), Text(self._last, "yellow"))

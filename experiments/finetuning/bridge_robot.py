@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from experiments.deploy.operator_console import KEYS, Keyboard, View
+from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, Keyboard, View
 from experiments.deploy.session import RECOVERIES, Session
 from experiments.finetuning.robot import PlayedBall
+from robot_io.control.messages import Discard, Pause, Played, PolicySet, Refused, SetPolicy, Stop
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
 from robot_io.policy.policy import Policy
@@ -15,7 +16,8 @@ from robot_io.policy.policy import Policy
 class BridgeRobot:
     """A robot behind a control process, and its operator: both protocols of ``experiments.finetuning.robot``.
 
-    It takes balls only while an episode is asked for. rig: None for a real robot, whose operator recovers from faults.
+    It takes balls only while an episode is asked for, and credits only those that the policy of that episode played.
+    rig: None for a real robot, whose operator recovers from faults.
     """
 
     repeatable = False
@@ -23,54 +25,66 @@ class BridgeRobot:
     def __init__(self, session: Session, rig: Rig | None, keyboard: Keyboard, view: View, name: str) -> None:
         self._session, self._rig, self._keyboard, self._view, self._name = session, rig, keyboard, view, name
         self._paused = self._stopped = self._discarded = False
-        session.ask("pause", True)
+        self._version = 0
+        session.send(Pause(True))
 
     def describe(self) -> dict[str, Any]:
         return {"robot": self._name}
 
     def play(self, policy: Policy, episode_number: int) -> PlayedBall:
-        """Waits for the person's next ball. Raises RefusedError when the robot cannot be brought back after faults."""
+        """Wait for the person's next ball. Raises RefusedError when the robot cannot be brought back after faults.
+
+        The policy is exchanged while no new ball is taken; refused, because the ball before is still played, it is
+        handed over again. A ball that another version played counts for nobody.
+        """
         self._discarded = False
+        self._version += 1
+        exchange = SetPolicy(policy, self._version)
         session, failures = self._session, 0
-        session.ask("policy", policy)  # the robot may still be on its way home from the last ball
-        session.ask("pause", False)
+        session.send(exchange)
         while True:
+            refused = False
             for message in session.messages(0.1):
-                if message[0] == "episode":
-                    session.ask("pause", True)
-                    summary, track = message[1:]
-                    if summary.fault and self._rig is not None:
-                        self._session.recover(self._rig)
-                    return PlayedBall(summary, track)
-                if message[0] == "status":
-                    self._view.show(message[1])
-                elif message[0] == "refused":
-                    self._view.say(message[1])
+                self._view.take(message)
+                if isinstance(message, PolicySet) and message.version == self._version:
+                    session.send(Pause(False))
+                elif isinstance(message, Refused) and isinstance(message.request, SetPolicy):
+                    refused = True
+                elif isinstance(message, Played):
+                    if message.summary.policy_version != self._version:
+                        self._view.say(f"ball {message.summary.ball} was played by an earlier policy: not counted")
+                        continue
+                    session.send(Pause(True))
+                    if message.summary.fault and self._rig is not None:
+                        session.recover(self._rig)
+                    return PlayedBall(message.summary, message.ball)
+            if refused:
+                session.send(exchange)
             self._keys()
             if self._rig is not None:
                 self._rig.check()
-                if session.status and session.status["faults"]:
+                if session.status and session.status.faults:
                     failures += 1
                     if failures > RECOVERIES:
-                        raise RefusedError(f"the rig does not recover: {session.status['faults'][0]['text']}")
-                    self._session.recover(self._rig)
-                    session.ask("pause", False)
+                        raise RefusedError(f"the rig does not recover: {session.status.faults[0].text}")
+                    session.recover(self._rig)
+                    session.send(exchange)
 
     def _keys(self) -> None:
         key = self._keyboard.pressed()
         if key not in KEYS:
             return
-        request = KEYS[key][0]
-        self._view.say(request)
-        if request == "quit":
+        self._view.say(KEYS[key].text)
+        request = KEYS[key].request
+        if key == QUIT:
             self._stopped = True
-            self._session.ask("stop")  # ends the episode in play, which is then played again
-        elif request == "pause":
+            self._session.send(Stop())  # ends the episode in play, which is then played again
+        elif key == PAUSE:
             self._paused = not self._paused
-        elif request == "discard":
+        elif isinstance(request, Discard):
             self._discarded = True
-        else:
-            self._session.ask(request)
+        elif request is not None:
+            self._session.send(request)
 
     # The operator, asked between episodes
 
@@ -78,10 +92,9 @@ class BridgeRobot:
         return self._discarded
 
     def paused(self) -> bool:
-        """Also keeps the view alive while it waits."""
+        """Also keep the view alive while it waits."""
         for message in self._session.messages(0.0):
-            if message[0] == "status":
-                self._view.show(message[1])
+            self._view.take(message)
         self._keys()
         return self._paused and not self._stopped
 

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ballmodel.io.atomic_files import sync_folder
 from experiments.errors import RunError
 from robot_io.control.episode import EpisodeSummary
-from robot_io.files import sync_folder
 
 BEFORE, TRAINING, AFTER = "before", "training", "after"
 PHASES = (BEFORE, TRAINING, AFTER)

@@ -15,9 +15,8 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from ballmodel.io.atomic_files import replacing
+from ballmodel.io.atomic_files import replacing, sync_folder
 from experiments.errors import CheckpointError
-from robot_io.files import sync_folder
 
 NOTES = "notes"
 KEPT = 2

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from ballmodel.io.atomic_files import sync_folder
 from experiments.errors import ExperimentError, RunError
-from robot_io.files import sync_folder
 
 JOURNAL = "steps.jsonl"
 

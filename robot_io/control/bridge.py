@@ -48,8 +48,7 @@ from robot_io.log.messages import (
 from robot_io.log.recorder import NullRecorder, SessionRecorder
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.faults import Cause
-from robot_io.safety.gate import SafetyGate
-from robot_io.safety.gate import State as GateState
+from robot_io.safety.gate import GateState, SafetyGate
 
 MAX_STEPS = 200  # control ticks of an episode, as in training
 AT_HOME = 0.02  # [m], [rad] of every joint
@@ -57,7 +56,7 @@ LONGEST_STOP = 2.0  # [s] after which a stop ends although the measurement does 
 BLADE = "col_blade_axis"  # the capsule whose middle is the blade's centre
 
 
-class State(Enum):
+class BridgeState(Enum):
     DISARMED = "disarmed"
     READY = "ready"
     ACTIVE = "active"
@@ -139,11 +138,12 @@ class Bridge:
         self.counts = Counts()
         self.episode: Episode | None = None
         self._policy = policy
+        self.policy_version = 0
         self._on_episode = on_episode
         self._geometry: RobotGeometry = gate.geometry
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
         self._feedback = Feedback(ball=tracker.track, axes=History(), arm=History())
-        self._state = State.DISARMED
+        self._state = BridgeState.DISARMED
         self._arm_session_id = 0
         self._arm_sequence, self._arm_restarted = -1, False  # packets of the arm's; anew since it was armed
         self._axes_received = -math.inf
@@ -169,8 +169,8 @@ class Bridge:
     # The operator
 
     @property
-    def state(self) -> State:
-        return State.FAULT if self.gate.state is GateState.FAULT else self._state
+    def state(self) -> BridgeState:
+        return BridgeState.FAULT if self.gate.state is GateState.FAULT else self._state
 
     @property
     def at_home(self) -> bool:
@@ -179,15 +179,15 @@ class Bridge:
         near = np.abs(measured - self._home) < 2 * AT_HOME
         return bool(near.all() and (np.abs(self.gate.reference - self._home) < AT_HOME).all() and self.gate.at_rest)
 
-    def set_policy(self, policy: Policy) -> None:
-        """Exchanges the policy. Raises RefusedError while it is playing."""
-        if self.state is State.ACTIVE:
+    def set_policy(self, policy: Policy, version: int = 0) -> None:
+        """Exchange the policy; ``version`` is in the summaries of its balls. Raises RefusedError while it is playing."""
+        if self.state is BridgeState.ACTIVE:
             raise RefusedError("the policy is playing: exchange it between balls")
-        self._policy = policy
+        self._policy, self.policy_version = policy, version
 
     def arm(self, now: float) -> None:
         """DISARMED to READY: the robot will move to its home pose. Raises RefusedError with the reason."""
-        if self.state is not State.DISARMED:
+        if self.state is not BridgeState.DISARMED:
             raise RefusedError(f"not armed: the state is {self.state.value}, only a disarmed robot can be armed")
         if self._policy is None:
             raise RefusedError("not armed: no policy is loaded")
@@ -201,24 +201,24 @@ class Bridge:
         self._arm_session_id = self.arm_session.session_id
         self._arm_restarted = False
         self._start = measured
-        self._change(State.READY, now, "armed by the operator")
+        self._change(BridgeState.READY, now, "armed by the operator")
 
     def stop(self, now: float) -> None:
         """The operator's stop: slows down, holds, and ends DISARMED."""
-        if self.state in (State.READY, State.ACTIVE):
+        if self.state in (BridgeState.READY, BridgeState.ACTIVE):
             self.gate.brake(now)
             self._stopping_since = now
             self._abort_episodes("stopped", now)
-            self._change(State.STOPPING, now, "stopped by the operator")
+            self._change(BridgeState.STOPPING, now, "stopped by the operator")
         self.event(now, Level.INFO, "operator", "stop")
 
     def reset(self, now: float) -> None:
         """FAULT to DISARMED. Raises RefusedError without a fault, while a cause is present or the robot still moves."""
-        if self.state is not State.FAULT:
+        if self.state is not BridgeState.FAULT:
             raise RefusedError(f"nothing to reset: the state is {self.state.value}, without a fault")
         self.gate.reset(now)
         self._logged_faults = 0
-        self._change(State.DISARMED, now, "fault reset by the operator")
+        self._change(BridgeState.DISARMED, now, "fault reset by the operator")
 
     def estop(self, pressed: bool, now: float) -> None:
         """Tells the state of the emergency stop."""
@@ -344,12 +344,12 @@ class Bridge:
         self._settle_episodes(now)
         if self.paused:
             self._last_ball = self.tracker.ball  # a ball that came while it held is not taken in mid-flight
-        if self.state is State.READY and not self.paused and self.at_home and in_play(self.tracker, now):
+        if self.state is BridgeState.READY and not self.paused and self.at_home and in_play(self.tracker, now):
             if self.tracker.ball != self._last_ball:
                 self._begin(now)
-        if self.state is State.ACTIVE:
+        if self.state is BridgeState.ACTIVE:
             return self._play(now)
-        return self._homeward() if self.state is State.READY else np.zeros(N_JOINTS)
+        return self._homeward() if self.state is BridgeState.READY else np.zeros(N_JOINTS)
 
     def _ages(self, now: float) -> dict[str, float]:
         arm, seen = self.arm_session.feedback, self.tracker.received
@@ -364,12 +364,12 @@ class Bridge:
         ages = self._ages(now)
         since_tick = 0.0 if self._last_tick == -math.inf else now - self._last_tick
         self._last_tick = now
-        playing = self.state is State.ACTIVE
+        playing = self.state is BridgeState.ACTIVE
         self.gate.check(now, ages["arm"], ages["axes"], ages["ball"], playing, since_tick)
         arm, axes = self.arm_session.problem(now), self.axes.problem(now)
         self.gate.condition(Cause.ARM_NOT_READY, arm is not None, arm or "", now)
         self.gate.condition(Cause.AXIS_LOST, axes is not None, axes or "", now)
-        armed = self._state in (State.READY, State.ACTIVE)
+        armed = self._state in (BridgeState.READY, BridgeState.ACTIVE)
         if armed and self.arm_session.session_id != self._arm_session_id:
             self._arm_session_id = self.arm_session.session_id
             self.gate.fault(Cause.ARM_NOT_READY, "the arm's EGM session started anew: its reference is lost", now)
@@ -380,11 +380,11 @@ class Bridge:
     def _begin(self, now: float) -> None:
         self.counts.balls += 1
         self._last_ball = self.tracker.ball
-        self.episode = Episode(self.counts.balls, self.tracker.ball, now)
+        self.episode = Episode(self.counts.balls, self.tracker.ball, now, self.policy_version)
         self._tracks[self.counts.balls] = [(t, *x) for t, x in self.tracker.track.samples()]
         self._policy.reset()
         self._log(episode_start(now, self.episode.number, ball=self.episode.ball))
-        self._change(State.ACTIVE, now, f"ball {self.episode.ball}")
+        self._change(BridgeState.ACTIVE, now, f"ball {self.episode.ball}")
 
     def _play(self, now: float) -> np.ndarray:
         """The policy's request (8,)."""
@@ -424,8 +424,8 @@ class Bridge:
             if self.episode.over:
                 self._waiting.append(self.episode)
                 self.episode = None
-                if self._state is State.ACTIVE:
-                    self._change(State.READY, now, "ball over")
+                if self._state is BridgeState.ACTIVE:
+                    self._change(BridgeState.READY, now, "ball over")
         while self._waiting:
             episode = self._waiting[0]
             episode.check(now, MAX_STEPS)
@@ -463,16 +463,16 @@ class Bridge:
                 first, self._logged_faults = self._logged_faults == 0, len(faults)
                 if first:
                     self._abort_episodes(faults[0].cause.value, now)
-                    self._change(State.DISARMED, now, f"fault: {faults[0].sentence}")
+                    self._change(BridgeState.DISARMED, now, f"fault: {faults[0].sentence}")
             if self.gate.at_rest:
                 self.axes.stop()
-        elif self._state is State.STOPPING and self.gate.at_rest:
+        elif self._state is BridgeState.STOPPING and self.gate.at_rest:
             self.axes.stop()
             if self.gate.settled or now - self._stopping_since > LONGEST_STOP:
                 self.gate.disarm(now)
-                self._change(State.DISARMED, now, "at rest")
+                self._change(BridgeState.DISARMED, now, "at rest")
 
-    def _change(self, state: State, now: float, why: str) -> None:
+    def _change(self, state: BridgeState, now: float, why: str) -> None:
         self.event(now, Level.INFO, "state", json_text({"from": self._state.value, "to": state.value, "why": why}))
         self._state = state
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ballmodel.constants import GRAVITY, TABLE_LENGTH, TABLE_WIDTH
 from robot_io.devices.tracker import BallSample, Tracker
 
 COMING = -1.0  # [m/s] along y: a ball that comes towards the robot at least this fast is in play
@@ -25,8 +26,7 @@ EDGE = 0.02  # [m] by which a bounce may seem to miss the table
 NET_REACH, NET_TOP = 0.15, 0.25  # [m] from the net's plane and above the table, where a deflection is the net's
 UNSEEN = 0.25  # [s] without a sight of the ball after which it is out of play
 LONGEST_RETURN = 2.5  # [s] after the hit by which the outcome is decided
-GRAVITY, BALL_RADIUS = 9.81, 0.020
-HALF_WIDTH, HALF_LENGTH = 0.7625, 1.37  # [m] of the table
+HALF_WIDTH, HALF_LENGTH = TABLE_WIDTH / 2, TABLE_LENGTH / 2  # [m]
 FARTHEST = 3.0  # [m] of ball and blade, also where the blade's place is not known
 SIDE = 3  # samples before and after a moment in which a change of velocity is looked for
 LONGEST_WINDOW = 0.12  # [s] of these samples together
@@ -48,6 +48,7 @@ class EpisodeSummary:
     landing     (2,) [m] where the outgoing ball came down to the table's height
     fault       cause of the fault that ended it, or None
     discarded   thrown away by the operator
+    policy_version  of the policy that played it, as its owner counts
     """
 
     number: int
@@ -62,6 +63,7 @@ class EpisodeSummary:
     landing: tuple[float, float]
     fault: str | None = None
     discarded: bool = False
+    policy_version: int = 0
 
 
 def in_play(tracker: Tracker, now: float) -> bool:
@@ -102,6 +104,7 @@ class Episode:
     number: int
     ball: int
     started: float
+    policy_version: int = 0
     steps: int = 0
     bounced: bool = False
     hit: bool = False
@@ -231,6 +234,7 @@ class Episode:
             self.landing,
             self.fault,
             self.discarded,
+            self.policy_version,
         )
 
 

@@ -1,10 +1,6 @@
 """The control process: one thread around select() for the arm, the tracker, the operator and the 75 Hz tick.
 
-Started by ``start``; it talks with its owner over a pipe:
-    to it    ("prepare",) ("arm",) ("stop",) ("reset",) ("discard",) ("pause", bool)
-             ("policy", Policy) ("quit",)
-    from it  ("ready", report) ("status", dict) ("episode", EpisodeSummary, ball (n, 4)) ("refused", sentence)
-             ("failed", sentence) ("ended", statistics)
+Started by ``start``; requests and reports travel over a pipe: ``robot_io.control.messages``.
 When the owner goes away, the robot is stopped and the process ends. An exception ends it too, once the robot stands.
 """
 
@@ -19,14 +15,15 @@ from collections import deque
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
 from robot_io import log
-from robot_io.control import realtime
-from robot_io.control.bridge import Bridge, BridgeConfig, State
+from robot_io.control import messages, realtime
+from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState
 from robot_io.control.config import RobotConfig, linear_axes
+from robot_io.control.episode import EpisodeSummary
 from robot_io.control.timings import Timings
 from robot_io.devices.egm.session import EgmConfig, EgmSession, EgmSocket
 from robot_io.devices.festo import AxesThread
@@ -80,7 +77,7 @@ def _main(config: RobotConfig, options: ControlOptions, pipe: Connection) -> Non
     try:
         control = Control(config, options, pipe)
     except Exception as error:
-        pipe.send(("failed", f"{error}" or type(error).__name__))
+        pipe.send(messages.Failed(f"{error}" or type(error).__name__))
         return
     signal.signal(signal.SIGTERM, lambda *_: control.quit())
     with control:
@@ -119,7 +116,7 @@ class Control:
             self._close()
             raise
         self._quit = False
-        self._unsent: deque = deque()
+        self._unsent: deque[messages.Message] = deque()
         self._status_at = 0.0
         self._period = 1.0 / config.rate
 
@@ -156,15 +153,15 @@ class Control:
         """Until told to quit."""
         report = realtime.prepare(self._config.realtime.priority, self._config.realtime.lock_memory)
         self._axes.start()  # afterwards: a thread inherits the scheduling of the one that starts it
-        self._pipe.send(("ready", report))
+        self._pipe.send(messages.Ready(report))
         try:
             self._loop()
         except BaseException as error:  # nothing leaves the loop before the robot stands
             self._bring_to_rest(error)
-            self._send(("failed", f"{type(error).__name__}: {error}"))
+            self._send(messages.Failed(f"{type(error).__name__}: {error}"))
             raise
         finally:
-            self._send(("ended", self.timings.summary()))
+            self._send(messages.Ended(self.timings.summary()))
             while self._unsent and self._flush():
                 pass
 
@@ -253,7 +250,7 @@ class Control:
         if now >= self._status_at:
             self._status_at = now + STATUS_PERIOD
             if not self._unsent:
-                self._unsent.append(("status", self.status(now)))
+                self._unsent.append(self.status(now))
         if self._unsent:
             self._flush()
 
@@ -267,39 +264,45 @@ class Control:
         except (EOFError, OSError):
             self._quit = True
 
-    def _obey(self, message: tuple) -> None:
+    def _obey(self, request: messages.Request) -> None:
         now = time.monotonic()
-        kind, *arguments = message
         try:
-            if kind == "arm":
-                self.bridge.arm(now)
-            elif kind == "prepare":  # the linear axes
-                self._axes.acknowledge() if self._axes.axes.fault else None
-                self._axes.enable()
-                self._axes.home()
-            elif kind == "stop":
-                self.bridge.stop(now)
-            elif kind == "reset":
-                self.bridge.reset(now)
-            elif kind == "discard":
-                self.bridge.discard(now)
-            elif kind == "pause":
-                self.bridge.paused = bool(arguments[0])
-            elif kind == "policy":
-                self.bridge.set_policy(make_policy(self._options.backend, arguments[0]))
-            elif kind == "quit":
-                self._quit = True
-            else:
-                raise RefusedError(f"unknown request {kind!r}")
+            match request:
+                case messages.Arm():
+                    self.bridge.arm(now)
+                case messages.Prepare():
+                    self._prepare_axes()
+                case messages.Stop():
+                    self.bridge.stop(now)
+                case messages.Reset():
+                    self.bridge.reset(now)
+                case messages.Discard():
+                    self.bridge.discard(now)
+                case messages.Pause(on):
+                    self.bridge.paused = on
+                case messages.SetPolicy(policy, version):
+                    self.bridge.set_policy(make_policy(self._options.backend, policy), version)
+                    self._send(messages.PolicySet(version))
+                case messages.Quit():
+                    self._quit = True
+                case _:
+                    raise RefusedError(f"unknown request {request!r}")
         except RefusedError as error:
-            self._send(("refused", str(error)))
+            self._send(messages.Refused(request, str(error)))
         except Exception as error:  # a request that cannot be carried out must not end the play
-            self._send(("refused", f"{kind}: {type(error).__name__}: {error}"))
+            name = type(request).__name__
+            self._send(messages.Refused(request, f"{name}: {type(error).__name__}: {error}"))
 
-    def _episode(self, summary) -> None:
-        self._send(("episode", summary, self.bridge.ball_track(summary)))
+    def _prepare_axes(self) -> None:
+        if self._axes.axes.fault:
+            self._axes.acknowledge()
+        self._axes.enable()
+        self._axes.home()
 
-    def _send(self, message: tuple) -> None:
+    def _episode(self, summary: EpisodeSummary) -> None:
+        self._send(messages.Played(summary, self.bridge.ball_track(summary)))
+
+    def _send(self, message: messages.Message) -> None:
         self._unsent.append(message)
 
     def _flush(self) -> bool:
@@ -312,44 +315,49 @@ class Control:
             self._unsent.clear()
             return False
 
-    def status(self, now: float) -> dict[str, Any]:
-        """For the operator's view."""
-        bridge, counts = self.bridge, self.bridge.counts
-        return {
-            "time": now,
-            "state": bridge.state.value,
-            "paused": bridge.paused,
-            "at_home": bridge.state in (State.READY, State.ACTIVE) and bridge.at_home,
-            "faults": [{"cause": f.cause.value, "text": f.sentence} for f in bridge.gate.faults],
-            "present": {cause.value: text for cause, text in bridge.gate.present.items()},
-            "arm": self._session.problem(now),
-            "axes": self._axes.problem(now),
-            "tracker": None if self._tracker.received and now - self._tracker.received < 0.5 else "silent",
-            "joints": bridge.joint_table(),
-            "balls": counts.balls,
-            "outcomes": dict(counts.outcomes),
-            "rally": counts.rally,
-            "longest_rally": counts.longest_rally,
-            "egm": asdict(self._session.statistics),
-            "tracker_counts": dict(self._tracker.counts),
-            "axes_cycles": self._axes.cycles,
-            "axes_late": self._axes.late,
-            "log_dropped": self._recorder.dropped,
-            "timings": self.timings.summary(),
-        }
+    def status(self, now: float) -> messages.Status:
+        """State of everything at ``now``."""
+        bridge, counts, heard = self.bridge, self.bridge.counts, self._tracker.received
+        return messages.Status(
+            time=now,
+            state=bridge.state.value,
+            paused=bridge.paused,
+            at_home=bridge.state in (BridgeState.READY, BridgeState.ACTIVE) and bridge.at_home,
+            faults=tuple(messages.FaultReport(f.cause.value, f.sentence) for f in bridge.gate.faults),
+            present={cause.value: text for cause, text in bridge.gate.present.items()},
+            arm=self._session.problem(now),
+            axes=self._axes.problem(now),
+            tracker="silent" if heard is None or now - heard >= 0.5 else None,
+            joints=bridge.joint_table(),
+            policy_version=bridge.policy_version,
+            balls=counts.balls,
+            outcomes=dict(counts.outcomes),
+            rally=counts.rally,
+            longest_rally=counts.longest_rally,
+            egm=asdict(self._session.statistics),
+            tracker_counts=dict(self._tracker.counts),
+            axes_cycles=self._axes.cycles,
+            axes_late=self._axes.late,
+            log_dropped=self._recorder.dropped,
+            timings=self.timings.summary(),
+        )
 
 
-def wait_for(pipe: Connection, kind: str, seconds: float) -> tuple:
-    """The next message of that kind; others are dropped. Raises RefusedError for "failed", TimeoutError."""
+Wanted = TypeVar("Wanted", messages.Ready, messages.Ended)
+
+
+def wait_for(pipe: Connection, kind: type[Wanted], seconds: float) -> Wanted:
+    """The next message of that kind; others are dropped. Raises RefusedError for ``Failed``, TimeoutError."""
     end = time.monotonic() + seconds
     while pipe.poll(max(end - time.monotonic(), 0.0)):
         message = pipe.recv()
-        if message[0] == kind:
+        if isinstance(message, kind):
             return message
-        if message[0] == "failed":
-            raise RefusedError(message[1])
-    raise TimeoutError(f"the control process did not say {kind!r} within {seconds:g} s")
+        if isinstance(message, messages.Failed):
+            raise RefusedError(message.sentence)
+    raise TimeoutError(f"the control process sent no {kind.__name__} within {seconds:g} s")
 
 
 def log_path(options: ControlOptions) -> Path | None:
+    """The log of a session with these options, where it is finished."""
     return None if options.log_folder is None else Path(options.log_folder) / f"{options.log_name}.mcap"

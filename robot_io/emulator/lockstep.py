@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_JOINTS
-from robot_io.control.bridge import Bridge, BridgeConfig, Policy, State
+from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState, Policy
 from robot_io.control.config import PROFILES, axis_range
 from robot_io.control.episode import EpisodeSummary
 from robot_io.devices.egm.session import EgmConfig, EgmSession
@@ -176,7 +176,9 @@ class LockStep:
         found: list[EpisodeSummary] = []
         self.throwing = True
         for _ in range(balls):
-            self.run(longest, lambda: bool(self.summaries) or self.bridge.state in (State.FAULT, State.DISARMED))
+            self.run(
+                longest, lambda: bool(self.summaries) or self.bridge.state in (BridgeState.FAULT, BridgeState.DISARMED)
+            )
             if not self.summaries:
                 break
             found.append(self.summaries.popleft())

@@ -15,15 +15,24 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from ballmodel.constants import (
+    BALL_MASS,
+    BALL_RADIUS,
+    PADDLE_RADIUS,
+    PADDLE_THICKNESS,
+    RUBBER_TANGENTIAL_GAIN,
+    SHELL_INERTIA_FACTOR,
+    TABLE_FRICTION,
+    TABLE_RESTITUTION,
+)
 from robot_io.contract import JOINT_NAMES
 
-BALL_RADIUS, BALL_MASS = 0.020, 0.0027  # [m], [kg], ITTF
-SHELL_INERTIA = 2.0 / 3.0 * BALL_MASS * BALL_RADIUS**2
+SHELL_INERTIA = SHELL_INERTIA_FACTOR * BALL_MASS * BALL_RADIUS**2
 SOLIMP = [0.95, 0.95, 0.001, 0.5, 2.0]  # the same impedance at any depth: a linear spring
 CONTACT_TIME = 0.002  # [s] half a period of the contact's spring; measured ones last 1 ms and need smaller steps
 STIFFNESS = (math.pi / CONTACT_TIME) ** 2
 PARKED = (0.0, 6.0, -0.5)  # [m] where the ball waits, out of everybody's sight
-PADDLE_RADIUS, PADDLE_HALF_THICKNESS = 0.076, 0.006
+PADDLE_HALF_THICKNESS = PADDLE_THICKNESS / 2
 FLOOR = -0.74  # [m] height of the ball's centre on the floor
 STICKING = 2.0 / 5.0  # share of the slip that brings the contact point of a thin shell to rest
 NET = (0.1, 0.3)  # restitution and friction
@@ -48,10 +57,10 @@ class WorldParams:
     timestep: float = 0.001
     drag: float = 0.141
     magnus: float = 0.0
-    table_restitution: float = 0.93
-    table_friction: float = 0.25
+    table_restitution: float = TABLE_RESTITUTION
+    table_friction: float = TABLE_FRICTION
     paddle_restitution: float = 0.81
-    rubber_gain: float = 0.68
+    rubber_gain: float = RUBBER_TANGENTIAL_GAIN
 
 
 class World:

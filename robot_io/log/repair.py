@@ -8,7 +8,7 @@ from pathlib import Path
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from robot_io.files import replacing
+from ballmodel.io.atomic_files import replacing
 from robot_io.log.messages import LogError
 from robot_io.log.scan import Overview, Scan, check
 from robot_io.log.writer import CHUNK_SIZE, SUFFIX, UNFINISHED, checksum

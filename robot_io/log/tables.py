@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ballmodel.io.atomic_files import replacing
 from robot_io.contract import JOINT_NAMES
-from robot_io.files import replacing
 from robot_io.log.reader import BallSeries, SessionLog
 
 GAP = 0.25  # [s] without a sample, after which a ball of the same number is another trajectory

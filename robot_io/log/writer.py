@@ -17,8 +17,8 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
+from ballmodel.io.atomic_files import sync_folder
 from robot_io import contract
-from robot_io.files import sync_folder
 from robot_io.log import schema
 from robot_io.log.messages import End, LogError, Metadata, as_strings, unpack
 

@@ -33,7 +33,7 @@ ROUNDING = 1e-9  # of each limit, allowed in the check of our own results
 LONGEST_LEAD = 3.0  # control periods that commands may come ahead of the clock
 
 
-class State(Enum):
+class GateState(Enum):
     DISARMED = "disarmed"  # nothing moves; the reference is the measured position
     ARMED = "armed"  # requests pass as far as they are safe
     STOPPING = "stopping"  # slowing down to rest, then holding
@@ -54,7 +54,7 @@ class Sent:
     velocity: np.ndarray
     position: np.ndarray
     changed: tuple[str, ...]
-    state: State
+    state: GateState
 
 
 class SafetyGate:
@@ -99,7 +99,7 @@ class SafetyGate:
         self._monitor = FeedbackMonitor(limits, self.geometry, config)
         self._stop = StopReference(limits, config)
         self._latch = FaultLatch()
-        self._mode = State.DISARMED  # apart from faults
+        self._mode = GateState.DISARMED  # apart from faults
         self._engaged = False  # whether the reference is ours, not the measured position
         self._velocity, self._acceleration = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
         self._reference = np.full(N_JOINTS, np.nan)
@@ -112,8 +112,8 @@ class SafetyGate:
         self._armed_at = 0.0
 
     @property
-    def state(self) -> State:
-        return State.FAULT if self._latch else self._mode
+    def state(self) -> GateState:
+        return GateState.FAULT if self._latch else self._mode
 
     @property
     def at_rest(self) -> bool:
@@ -169,7 +169,7 @@ class SafetyGate:
         if self._latch.present:
             listed = "; ".join(f"{cause.name}: {sentence}" for cause, sentence in self._latch.present.items())
             raise RefusedError(f"not armed: {listed}")
-        if self._mode is State.ARMED or not self.at_rest:
+        if self._mode is GateState.ARMED or not self.at_rest:
             raise RefusedError("not armed: it is armed or still stopping")
         if not math.isfinite(now):
             raise RefusedError(f"not armed: the time is {now}")
@@ -193,7 +193,7 @@ class SafetyGate:
             raise RefusedError(f"not armed: {problem}")
         if (np.abs(velocity) > self._still).any():
             raise RefusedError(f"not armed: {worst(velocity, self._still, '/s')}, it must be at rest")
-        self._mode, self._engaged, self._armed_at = State.ARMED, True, now
+        self._mode, self._engaged, self._armed_at = GateState.ARMED, True, now
         self._velocity, self._acceleration = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
         self._reference = self._start = position
         self._inside = np.ones(self._margin.shape, bool)
@@ -203,27 +203,27 @@ class SafetyGate:
 
     def brake(self, now: float) -> None:
         """Slows down to rest from the next command on and holds; no fault. Armed again by ``arm``."""
-        if self._mode is State.ARMED:
-            self._mode = State.STOPPING
+        if self._mode is GateState.ARMED:
+            self._mode = GateState.STOPPING
 
     def disarm(self, now: float) -> None:
         """Gives the reference up. Raises RefusedError while the robot is commanded to move: brake first."""
         if not self.at_rest:
             raise RefusedError("not disarmed: it still moves; brake first")
-        self._mode, self._engaged = State.DISARMED, False
+        self._mode, self._engaged = GateState.DISARMED, False
 
     def fault(self, cause: Cause, sentence: str, now: float) -> None:
         """Latches something that has happened, and brakes."""
         self._latch.event(cause, sentence, now)
-        if self._mode is State.ARMED:
-            self._mode = State.STOPPING
+        if self._mode is GateState.ARMED:
+            self._mode = GateState.STOPPING
 
     def condition(self, cause: Cause, present: bool, sentence: str, now: float) -> None:
         """Says whether something lasts that must not be: brakes and latches it, and neither ``reset`` nor ``arm`` works
         until it is said to be over. While disarmed it is only noted, but for the emergency stop."""
         self._latch.condition(cause, present, sentence, now, latch=self._engaged or cause is Cause.ESTOP)
-        if present and self._mode is State.ARMED:
-            self._mode = State.STOPPING
+        if present and self._mode is GateState.ARMED:
+            self._mode = GateState.STOPPING
 
     def estop(self, pressed: bool, now: float) -> None:
         """Tells the state of the emergency stop."""
@@ -239,7 +239,7 @@ class SafetyGate:
         if not self.at_rest:
             raise RefusedError("cannot reset: it still moves")
         self._latch.reset()
-        self._mode, self._engaged = State.DISARMED, False
+        self._mode, self._engaged = GateState.DISARMED, False
 
     def check(
         self, now: float, arm_age: float, axes_age: float, tracker_age: float, ball_in_play: bool, policy_age: float
@@ -249,7 +249,7 @@ class SafetyGate:
         The policy's age matters only while armed and is counted from arming at the earliest.
         """
         c = self.config
-        if self._mode is State.ARMED and not self._latch:
+        if self._mode is GateState.ARMED and not self._latch:
             policy_age = min(policy_age, now - self._armed_at) if policy_age == policy_age else math.nan
         else:
             policy_age = 0.0
@@ -273,12 +273,12 @@ class SafetyGate:
         if not self._engaged:
             self._start = self._reference
             return Sent(np.zeros(N_JOINTS), self._reference.copy(), (self.state.value,), self.state)
-        if self.state is not State.ARMED:
+        if self.state is not GateState.ARMED:
             self._follow_the_arm(now)
         left = np.abs(self._velocity) - self._step
         braked = np.where(left > ROUNDING * self._step, np.copysign(left, self._velocity), 0.0)
         velocity, changed = braked, (self.state.value,)
-        if self.state is State.ARMED:
+        if self.state is GateState.ARMED:
             try:
                 velocity, changed = self._allowed(wanted, braked)
                 broken = self._broken(velocity)

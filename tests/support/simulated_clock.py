@@ -63,7 +63,7 @@ class Constant:
 class Simulation:
     """1 ms steps; the arm sends every 4 ms, the tracker every 8 ms, the bridge ticks at 75 Hz.
 
-    ball     position (3,) or None by time [s]; it has the number 1 while there is one
+    ball     position (3,) or None by time [s]; ``number`` is its number
     blocked  joints (6,) of the arm that cannot move now
     stalled  whether the control process stands still now, by time
     """
@@ -86,6 +86,7 @@ class Simulation:
             policy or Constant(),
             **options,
         )
+        self.number = 1
         self.packets: list[bytes] = []
         self.frames: deque[tuple[float, bytes]] = deque()
         self._steps = 0
@@ -104,7 +105,7 @@ class Simulation:
         self.arm = np.where(self.blocked, self.arm, self.arm + 0.001 * speed)
         if self._steps % 8 == 0:
             place = self.ball(now)
-            sample = BallSample(self._steps // 8, 0 if place is None else 1, now, place)
+            sample = BallSample(self._steps // 8, 0 if place is None else self.number, now, place)
             self.frames.append((now + 0.015, encode(sample)))
         if self._steps % 4 == 0:
             self.packets.append(encode_robot(self._steps // 4, self._steps, self.arm, self.arm, True, True, True))

@@ -22,8 +22,10 @@ from experiments.config import build
 from experiments.config import robot as robots
 from experiments.config.study import Study
 from experiments.deploy import session
+from experiments.deploy.rig import RIG
 from experiments.errors import ConfigError, checked
 from experiments.finetuning import loop
+from experiments.finetuning import session as tuning
 from experiments.finetuning.robot import LockStepRobot
 from experiments.runs import load_policy
 from experiments.runs.load_policy import TrainedPolicy
@@ -36,7 +38,7 @@ from experiments.training import finalize
 
 def look_up(study: Study) -> None:
     """Raises ConfigError where the robot's YAML or a recording is missing or cannot be read."""
-    if study.robot not in (session.RIG, session.LOCK_STEP):
+    if study.robot not in (RIG, tuning.LOCK_STEP):
         try:
             robots.load_robot(study.robot)
         except ConfigError as error:
@@ -79,7 +81,7 @@ class RobotWorld:
             highlight=False,
             soft_wrap=True,
         )
-        found = session.finetune(
+        found = tuning.finetune(
             str(source), settings, Run(folder), study.robot, None, None, "numpy", _seed(name), self._console
         )
         if found is None:
@@ -97,7 +99,7 @@ class RobotWorld:
     def _score(self, player: str, name: str, trained: TrainedPolicy) -> float:
         balls, robot = self._study.simulation.selection_episodes, self._study.robot
         experiment = loop.experiment_of(trained.source)
-        if robot == session.LOCK_STEP:
+        if robot == tuning.LOCK_STEP:
             emulated = loop.lock_step_robot(experiment, seed=_seed(name))
             return float(np.mean([_lock_step(emulated, trained, n) for n in range(balls)]))
         artefact = exported(trained, self._console)
@@ -165,7 +167,7 @@ def blind_steps(
         left = [f"{p.code} has {p.counted} of {scoring.KEEP}" for p in protocol.progress(folder) if not p.complete]
         if left:
             # A copy under a code name does not say on which balls it was trained, and the rig throws those.
-            thrown = f" --distribution {evaluator}/M0" if robot == session.RIG else ""
+            thrown = f" --distribution {evaluator}/M0" if robot == RIG else ""
             raise Waiting(
                 f"{name}: {evaluator} plays rallies with "
                 f"`mjx-tt run {folder / protocol.POLICIES}/CODE --robot {robot}{thrown}` and "

@@ -15,6 +15,7 @@ from mcap.reader import make_reader
 from rich.console import Console
 
 from experiments.config import build, robot
+from experiments.deploy import rig as deploy_rig
 from experiments.deploy import session as play
 from experiments.errors import ConfigError, explained
 from mjx_tt.sim.model import SimModel
@@ -42,7 +43,7 @@ def run(policy, log_folder, balls=None) -> tuple[int, str]:
     """Exit status and everything printed, as the command line gives them."""
     console = Console(record=True, width=200)
     try:
-        status = play.run(policy, play.RIG, balls, None, "numpy", log_folder, None, 0, None, console)
+        status = play.run(policy, deploy_rig.RIG, balls, None, "numpy", log_folder, None, 0, None, console)
     except Exception as error:
         if not explained(error):
             raise
@@ -155,7 +156,7 @@ def test_missing_devices_are_named_and_arming_is_refused(policy, monkeypatch):
 def playing(policy, tmp_path):
     """A rig whose robot is armed, and its session."""
     artefact_ = artefact.load(policy)
-    with play.rig_for(artefact_, None, None, 0) as rig:
+    with deploy_rig.rig_for(artefact_, None, None, 0) as rig:
         options = process.ControlOptions(str(policy), log_folder=str(tmp_path), log_name="session")
         with play.Session(rig.robot, options, Console()) as session:
             session.prepare(rig)
@@ -207,17 +208,14 @@ def test_emergency_stop_of_the_arm_is_a_latched_fault(playing):
     rig, session, _ = playing
     rig.motors_off()
     end = time.monotonic() + 5
-    while time.monotonic() < end and not (session.status or {}).get("faults"):
+    while time.monotonic() < end and not (session.status and session.status.faults):
         list(session.messages(0.1))
-    assert session.status["state"] == "fault"
-    assert (
-        "motors are off" in session.status["faults"][0]["text"]
-        or session.status["faults"][0]["cause"] == "arm_not_ready"
-    )
+    assert session.status.state == "fault"
+    assert "motors are off" in session.status.faults[0].text or session.status.faults[0].cause == "arm_not_ready"
     with pytest.raises(RefusedError, match="cannot reset"):
         session.reset()
     session.recover(rig)
-    assert session.status["state"] in ("ready", "active") and not session.status["faults"]
+    assert session.status.state in ("ready", "active") and not session.status.faults
 
 
 @pytest.mark.realtime
@@ -225,14 +223,14 @@ def test_pulled_cable_of_an_axis_is_a_latched_fault_and_can_be_mended(playing):
     rig, session, _ = playing
     rig.connect_axis(0, False)
     end = time.monotonic() + 5
-    while time.monotonic() < end and not (session.status or {}).get("faults"):
+    while time.monotonic() < end and not (session.status and session.status.faults):
         list(session.messages(0.1))
-    assert session.status["faults"][0]["cause"] == "axis_lost"
+    assert session.status.faults[0].cause == "axis_lost"
     with pytest.raises(RefusedError, match="cannot reset"):
         session.reset()
     rig.connect_axis(0, True)
     session.recover(rig)
-    assert session.status["state"] in ("ready", "active") and not session.status["faults"]
+    assert session.status.state in ("ready", "active") and not session.status.faults
 
 
 def test_rig_that_cannot_start_says_why():
@@ -242,4 +240,4 @@ def test_rig_that_cannot_start_says_why():
         other.bind(("127.0.0.1", ports.axes[0]))
         other.listen()
         with pytest.raises(DeviceError, match=f"port {ports.axes[0]}"):
-            Rig(play.scene(), throws, RigParams(), ports)
+            Rig(deploy_rig.scene(), throws, RigParams(), ports)

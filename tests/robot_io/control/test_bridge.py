@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robot_io.contract import LIMITS, N_JOINTS
-from robot_io.control.bridge import State
+from robot_io.control.bridge import BridgeState
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.network import NetworkFaults
 from robot_io.errors import RefusedError
@@ -37,7 +37,7 @@ def test_nothing_moves_before_the_bridge_is_armed():
     rig.throwing = True
     start = rig.world.qpos
     rig.run(1.0)
-    assert rig.thrower.thrown == 1 and rig.bridge.state is State.DISARMED and rig.bridge.episode is None
+    assert rig.thrower.thrown == 1 and rig.bridge.state is BridgeState.DISARMED and rig.bridge.episode is None
     np.testing.assert_allclose(rig.world.qpos, start, rtol=0, atol=1e-5)
     np.testing.assert_allclose(start, rig.world.home, rtol=0, atol=1e-4)  # drives without a position controller
 
@@ -46,7 +46,7 @@ def test_arming_is_refused_with_the_reason():
     def refused(rig, match):
         with pytest.raises(RefusedError, match=match):
             rig.bridge.arm(rig.now)
-        assert rig.bridge.state is State.DISARMED
+        assert rig.bridge.state is BridgeState.DISARMED
 
     rig = lockstep()
     power_on(rig, arm=False)
@@ -81,7 +81,7 @@ def test_arming_is_refused_with_the_reason():
     rig.bridge.estop(False, rig.now)
     rig.bridge.reset(rig.now)
     rig.bridge.arm(rig.now)
-    assert rig.bridge.state is State.READY
+    assert rig.bridge.state is BridgeState.READY
 
 
 def watch(rig, seconds=0.5):
@@ -159,7 +159,7 @@ def test_every_fault_stops_the_robot_is_latched_and_can_be_mended(name):
     rig = playing(Swing(0.3))
     rig.run(0.35)
     bridge = rig.bridge
-    assert bridge.state is State.ACTIVE and np.abs(rig.world.qvel[2:]).max() > 1.0
+    assert bridge.state is BridgeState.ACTIVE and np.abs(rig.world.qvel[2:]).max() > 1.0
     braking = (np.abs(rig.world.qvel[2:]) / LIMITS.acceleration[2:]).max()
     event(rig)
     begin = rig.now
@@ -176,7 +176,7 @@ def test_every_fault_stops_the_robot_is_latched_and_can_be_mended(name):
     if cause is None:  # the arm's own communication timeout and the drives' node guard
         assert "no message" in rig.arm.cause
         return
-    assert bridge.state is State.FAULT and bridge.gate.faults[0].cause is cause, bridge.gate.faults
+    assert bridge.state is BridgeState.FAULT and bridge.gate.faults[0].cause is cause, bridge.gate.faults
     place = rig.world.qpos
     rig.run(0.2)
     np.testing.assert_allclose(rig.world.qpos, place, rtol=0, atol=0.02)  # it holds
@@ -185,12 +185,12 @@ def test_every_fault_stops_the_robot_is_latched_and_can_be_mended(name):
     if name != "silent tracker":  # which is only missed while a ball is in play
         with pytest.raises(RefusedError, match="cannot reset while a cause is present"):
             bridge.reset(rig.now)
-    assert bridge.state is State.FAULT
+    assert bridge.state is BridgeState.FAULT
     mend(rig)
     rig.run(0.1)
     assert np.abs(rig.world.qpos - place)[2:].max() < 0.02  # also when the arm's controller is started again
     bridge.reset(rig.now)
-    assert bridge.state is State.DISARMED
+    assert bridge.state is BridgeState.DISARMED
     bridge.arm(rig.now)
     assert rig.run(5.0, lambda: bridge.at_home)
     faulty = rig.summaries.popleft()
@@ -205,7 +205,7 @@ def test_states_and_the_operators_commands_in_each():
     bridge = rig.bridge
     bridge.stop(rig.now)
     bridge.discard(rig.now)
-    assert bridge.state is State.DISARMED
+    assert bridge.state is BridgeState.DISARMED
     with pytest.raises(RefusedError, match="nothing to reset: the state is disarmed"):
         bridge.reset(rig.now)
     bridge.arm(rig.now)
@@ -215,18 +215,18 @@ def test_states_and_the_operators_commands_in_each():
     bridge.set_policy(Swing(0.2))
     assert rig.run(5.0, lambda: bridge.at_home)
     rig.throwing = True
-    assert rig.run(3.0, lambda: bridge.state is State.ACTIVE)
+    assert rig.run(3.0, lambda: bridge.state is BridgeState.ACTIVE)
     rig.run(0.2)
     for command in (bridge.arm, bridge.reset, bridge.set_policy):
         with pytest.raises(RefusedError):
             command(rig.now)
     bridge.discard(rig.now)
     bridge.stop(rig.now)
-    assert bridge.state is State.STOPPING
+    assert bridge.state is BridgeState.STOPPING
     for command in (bridge.arm, bridge.reset):
         with pytest.raises(RefusedError, match="the state is stopping"):
             command(rig.now)
-    assert rig.run(0.5, lambda: bridge.state is State.DISARMED)
+    assert rig.run(0.5, lambda: bridge.state is BridgeState.DISARMED)
     rig.throwing = False
     rig.run(0.5)
     assert np.abs(rig.world.qvel).max() < REST
@@ -236,7 +236,7 @@ def test_states_and_the_operators_commands_in_each():
     assert rig.run(5.0, lambda: bridge.at_home)
     bridge.paused = True
     rig.throwing = True
-    assert not rig.run(1.0, lambda: bridge.state is State.ACTIVE)
+    assert not rig.run(1.0, lambda: bridge.state is BridgeState.ACTIVE)
 
 
 class Broken(Hold):
@@ -263,12 +263,12 @@ def test_a_broken_policy_is_a_fault(answer, cause):
     rig = lockstep(Broken(answer))
     rig.start()
     rig.throwing = True
-    assert rig.run(3.0, lambda: rig.bridge.state is State.FAULT)
+    assert rig.run(3.0, lambda: rig.bridge.state is BridgeState.FAULT)
     rig.throwing = False
     assert rig.bridge.gate.faults[0].cause is cause
     rig.run(0.2)
     rig.bridge.reset(rig.now)
-    assert rig.bridge.state is State.DISARMED and np.abs(rig.world.qvel).max() < REST
+    assert rig.bridge.state is BridgeState.DISARMED and np.abs(rig.world.qvel).max() < REST
 
 
 def test_a_ball_out_of_sight_is_over_and_no_fault():
@@ -277,7 +277,7 @@ def test_a_ball_out_of_sight_is_over_and_no_fault():
     rig.world.park()  # the cameras go on, but see nothing
     rig.throwing = False
     rig.run(0.4)
-    assert rig.bridge.state is State.READY and [s.outcome for s in rig.summaries] == ["missed"]
+    assert rig.bridge.state is BridgeState.READY and [s.outcome for s in rig.summaries] == ["missed"]
 
 
 def test_a_bad_network_neither_stops_play_for_good_nor_breaks_a_limit():
@@ -301,11 +301,11 @@ def test_a_bad_network_neither_stops_play_for_good_nor_breaks_a_limit():
             assert ((reference >= lower) & (reference <= upper)).all()
         assert ((rig.world.qpos >= lower - tolerance) & (rig.world.qpos <= upper + tolerance)).all()
         found += [rig.summaries.popleft() for _ in range(len(rig.summaries))]
-        if rig.bridge.state is State.FAULT:
+        if rig.bridge.state is BridgeState.FAULT:
             break
     statistics, counts = rig.bridge.arm_session.statistics, rig.bridge.tracker.counts
     assert statistics.rejected["out_of_order"] > 10 and counts["out of order"] + counts["duplicate"] > 10
-    if rig.bridge.state is State.FAULT:
+    if rig.bridge.state is BridgeState.FAULT:
         watch(rig)
         assert np.abs(rig.world.qvel).max() < REST
     else:

@@ -12,7 +12,7 @@ import pytest
 
 from mjx_tt.sim.model import LATENCIES
 from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_JOINTS, N_OBSERVATION
-from robot_io.control.bridge import Bridge, BridgeConfig, State
+from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState
 from robot_io.control.observation import Feedback, ObservationDelays, joints, observe
 from robot_io.devices.egm.messages import encode_robot
 from robot_io.devices.egm.session import EgmConfig, EgmSession
@@ -113,7 +113,7 @@ def to_bridge(motion, delays, unit=FINEST):
             bridge.arm(now)
         if i % SUBSTEPS == 0:
             bridge.tick(now, now)
-            if first is None and bridge.state is State.ACTIVE:
+            if first is None and bridge.state is BridgeState.ACTIVE:
                 first = i // SUBSTEPS
     return first, np.array(policy.seen), bridge
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robot_io import contract
-from robot_io.control import process, realtime
+from robot_io.control import messages, process, realtime
 from robot_io.control.config import RealTimeConfig, RobotConfig
 from robot_io.control.process import Control, ControlOptions
 from robot_io.policy import export
@@ -118,12 +118,12 @@ def test_an_exception_leaves_the_loop_after_the_robot_stands(simulated, part, er
 
     def move():
         control.bridge._home = control.bridge._home + [0.3, 0.1, 0.8, 0, 0, 1.0, 0, 1.0]
-        simulated.pipe.send(("arm",))
+        simulated.pipe.send(messages.Arm())
 
     def spoil():
         setattr(owner, name, escape)
         if part == "_obey":
-            simulated.pipe.send(("discard",))
+            simulated.pipe.send(messages.Discard())
 
     simulated.script = [(10.5, move), (10.8, spoil)]
     with pytest.raises(error, match="made up"), control:
@@ -135,7 +135,7 @@ def test_an_exception_leaves_the_loop_after_the_robot_stands(simulated, part, er
     np.testing.assert_allclose(position, simulation.arm, rtol=0, atol=1e-3)
     assert not velocity.any() and simulation.axes.stops and simulation.axes.closed
     words = simulated.words()
-    assert ("failed", f"{error.__name__}: made up") in words and words[-1][0] == "ended"
+    assert messages.Failed(f"{error.__name__}: made up") in words and isinstance(words[-1], messages.Ended)
     rest = simulation.arm.copy()
     for _ in range(300):
         simulation.advance()
@@ -154,18 +154,18 @@ def test_what_fails_for_ever_does_not_keep_the_process(simulated):
 
 def test_a_request_that_fails_is_refused_and_play_goes_on(simulated):
     pipe, control = simulated.pipe, simulated.control
-    wrong = ("policy", Policy(np.zeros(7), np.zeros(11), np.ones(11)))
+    wrong = messages.SetPolicy(Policy(np.zeros(7), np.zeros(11), np.ones(11)), 1)
     simulated.script = [
         (10.2, lambda: pipe.send(wrong)),
         (10.4, lambda: pipe.send(("nonsense",))),
-        (11.0, lambda: pipe.send(("quit",))),
+        (11.0, lambda: pipe.send(messages.Quit())),
     ]
     with control:
         control.run()
     words = simulated.words()
-    refused = [message[1] for message in words if message[0] == "refused"]
+    refused = [message.sentence for message in words if isinstance(message, messages.Refused)]
     assert "theta has 7 parameters" in refused[0] and "nonsense" in refused[1]
-    assert words[-1][0] == "ended" and simulated.simulation.now >= 11.0
+    assert isinstance(words[-1], messages.Ended) and simulated.simulation.now >= 11.0
 
 
 def test_the_robot_stands_before_the_process_quits(simulated):
@@ -173,7 +173,7 @@ def test_the_robot_stands_before_the_process_quits(simulated):
 
     def move():
         control.bridge._home = control.bridge._home + [0, 0, 0.8, 0, 0, 1.0, 0, 1.0]
-        simulated.pipe.send(("arm",))
+        simulated.pipe.send(messages.Arm())
 
     simulated.script = [(10.5, move), (10.8, control.quit)]  # as a signal does
     with control:

@@ -17,7 +17,7 @@ from robot_io.limits import limit_velocity
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.config import SLACK
 from robot_io.safety.faults import Cause, FaultLatch
-from robot_io.safety.gate import SafetyConfig, SafetyGate, State
+from robot_io.safety.gate import GateState, SafetyConfig, SafetyGate
 
 T = 1 / 75
 LOWER, UPPER, V_MAX, A_MAX, MARGIN = (
@@ -178,7 +178,7 @@ def attacked():
         for _ in range(300):
             ideal.tick(request)
             request = player.send(ideal.position)
-        assert ideal.gate.state is State.ARMED
+        assert ideal.gate.state is GateState.ARMED
         robots.append(ideal)
     return robots
 
@@ -275,7 +275,7 @@ def test_nothing_moves_before_arming():
     for _ in range(200):
         measured = HOME + rng.uniform(-0.1, 0.1, 8)
         sent = ideal.tick(rng.uniform(-2, 2, 8) * V_MAX, measured)
-        assert not sent.velocity.any() and sent.state is State.DISARMED and sent.changed == ("disarmed",)
+        assert not sent.velocity.any() and sent.state is GateState.DISARMED and sent.changed == ("disarmed",)
         np.testing.assert_array_equal(sent.position, measured)
     sent = ideal.tick(V_MAX, np.full(8, np.nan))
     np.testing.assert_array_equal(sent.position, measured)  # the last that was known
@@ -305,7 +305,7 @@ def test_arming_is_refused(position, velocity, message):
     ideal = Ideal(arm=False)
     with pytest.raises(RefusedError, match=message):
         ideal.gate.arm(position, 0.0, velocity)
-    assert ideal.gate.state is State.DISARMED and not ideal.tick(V_MAX).velocity.any()
+    assert ideal.gate.state is GateState.DISARMED and not ideal.tick(V_MAX).velocity.any()
 
 
 def test_arming_is_refused_while_armed_moving_faulty_or_pressed():
@@ -349,7 +349,7 @@ def test_braking_holds_and_can_be_armed_again():
     ideal.gate.brake(ideal.now)
     for _ in range(REST):
         sent = ideal.tick(V_MAX)
-        assert sent.state is State.STOPPING and sent.changed == ("stopping",)
+        assert sent.state is GateState.STOPPING and sent.changed == ("stopping",)
     assert ideal.gate.at_rest and not sent.velocity.any()
     keeps_limits(ideal.velocities, ideal.positions)
     held = sent.position
@@ -434,14 +434,14 @@ def test_a_thousand_random_fault_sequences():
         request = rng.uniform(-1, 1, 8) * V_MAX * rng.choice([0.2, 1.0])
         for _ in range(rng.integers(1, 8)):
             ideal.tick(request)
-        assert ideal.gate.state is State.ARMED
+        assert ideal.gate.state is GateState.ARMED
         sequence = [causes[i] for i in rng.permutation(len(causes))[: rng.integers(1, 4)]]
         speed = np.abs(ideal.gate.velocity)
         sent_before = len(ideal.sent)
         started = ideal.now
         for cause in sequence:
             EVENTS[cause](ideal)
-            assert ideal.gate.state is State.FAULT
+            assert ideal.gate.state is GateState.FAULT
             if rng.random() < 0.5:
                 ideal.tick(request)
         while len(ideal.sent) - sent_before < math.ceil((speed / STEP).max()):
@@ -461,7 +461,7 @@ def test_a_thousand_random_fault_sequences():
         for cause in lasting:
             ENDS[cause](ideal)
         ideal.gate.reset(ideal.now)
-        assert ideal.gate.state is State.DISARMED and not ideal.gate.faults
+        assert ideal.gate.state is GateState.DISARMED and not ideal.gate.faults
         assert not ideal.tick(V_MAX).velocity.any()
         ideal.gate.arm(ideal.position, ideal.now)
 
@@ -488,7 +488,7 @@ def test_a_request_that_is_no_velocity_brakes(request_, cause, message):
     before = ideal.gate.velocity
     sent = ideal.tick(request_)
     np.testing.assert_allclose(np.abs(sent.velocity), np.maximum(np.abs(before) - STEP, 0.0))
-    assert sent.state is State.FAULT and sent.changed == ("fault",)
+    assert sent.state is GateState.FAULT and sent.changed == ("fault",)
     (fault,) = ideal.gate.faults
     assert fault.cause is cause and fault.time == pytest.approx(ideal.now - T)
     assert re.search(message, fault.sentence)
@@ -505,7 +505,7 @@ def test_integers_and_single_precision_are_velocities():
     ideal = Ideal()
     ideal.tick([0] * 8)
     ideal.tick(np.full(8, 0.01, np.float32))
-    assert ideal.gate.state is State.ARMED and ideal.sent[-1].velocity.dtype == np.float64
+    assert ideal.gate.state is GateState.ARMED and ideal.sent[-1].velocity.dtype == np.float64
 
 
 class Delayed(Ideal):
@@ -528,14 +528,14 @@ def test_the_known_delay_is_no_following_error():
         ideal = Delayed(delay)
         for tick in range(200):
             ideal.tick(V_MAX * [0.5, 0.5, 1, 0.1, 0.1, 1, 0.5, 1] * np.sign(np.sin(tick / 7)))
-        assert ideal.gate.state is State.ARMED
+        assert ideal.gate.state is GateState.ARMED
 
 
 @pytest.mark.parametrize("joint", [0, 2, 7])
 def test_a_joint_that_does_not_follow_is_a_fault(joint):
     ideal = Delayed(7, stuck=(JOINT_NAMES[joint],))
     request = 0.5 * V_MAX * np.eye(8)[joint]
-    while ideal.gate.state is State.ARMED and len(ideal.sent) < 60:
+    while ideal.gate.state is GateState.ARMED and len(ideal.sent) < 60:
         ideal.tick(request)
     (fault,) = ideal.gate.faults
     assert fault.cause is Cause.FOLLOWING_ERROR and JOINT_NAMES[joint] in fault.sentence
@@ -572,7 +572,7 @@ def test_silence_is_a_fault(age, cause, allowed):
         ideal = Ideal()
         ideal.now += 10.0  # armed long ago
         ideal.gate.check(ideal.now, **(FRESH | {age: 0.99 * allowed}))
-        assert ideal.gate.state is State.ARMED
+        assert ideal.gate.state is GateState.ARMED
         ideal.gate.check(ideal.now, **(FRESH | {age: value}))
         assert [f.cause for f in ideal.gate.faults] == [cause]
         assert f"allowed is {allowed} s" in ideal.gate.faults[0].sentence
@@ -582,7 +582,7 @@ def test_a_silent_tracker_without_a_ball_and_a_policy_before_arming_are_none():
     ideal = Ideal()
     ideal.gate.check(ideal.now, **(FRESH | dict(tracker_age=math.inf, ball_in_play=False)))
     ideal.gate.check(ideal.now + 0.04, **(FRESH | dict(policy_age=5.0)))  # armed 0.04 s ago
-    assert ideal.gate.state is State.ARMED
+    assert ideal.gate.state is GateState.ARMED
     ideal.gate.check(ideal.now + 0.06, **(FRESH | dict(policy_age=5.0)))
     assert ideal.gate.faults[0].cause is Cause.STALE_POLICY
     ideal.gate.check(ideal.now + 0.07, **(FRESH | dict(policy_age=5.0)))
@@ -592,11 +592,11 @@ def test_a_silent_tracker_without_a_ball_and_a_policy_before_arming_are_none():
 def test_devices_that_are_not_there_yet_are_no_fault_but_nothing_is_armed():
     ideal = Ideal(arm=False)
     ideal.gate.check(ideal.now, **(FRESH | dict(arm_age=math.inf)))
-    assert ideal.gate.state is State.DISARMED
+    assert ideal.gate.state is GateState.DISARMED
     with pytest.raises(RefusedError, match="STALE_ARM: nothing heard from the arm's controller for inf s"):
         ideal.gate.arm(HOME, ideal.now, ZERO)
     ideal.gate.estop(True, ideal.now)  # the one condition that latches at all times
-    assert ideal.gate.state is State.FAULT
+    assert ideal.gate.state is GateState.FAULT
 
 
 @pytest.mark.parametrize(
@@ -611,7 +611,7 @@ def test_devices_that_are_not_there_yet_are_no_fault_but_nothing_is_armed():
 def test_commands_out_of_time_are_a_fault(times, message):
     ideal = Ideal()
     for time in times:
-        assert ideal.gate.state is State.ARMED
+        assert ideal.gate.state is GateState.ARMED
         ideal.gate.command(0.1 * STEP, ideal.gate.reference, ZERO, 100.0 + time)
     assert ideal.gate.faults[0].cause is Cause.TIMING and message in ideal.gate.faults[0].sentence
 
@@ -621,7 +621,7 @@ def test_late_ticks_that_catch_up_are_none():
     for i in range(300):
         late = rng.choice([0.0, 0.004, 0.013])
         ideal.gate.command(ZERO, HOME, ZERO, 100.0 + i * T + late)
-    assert ideal.gate.state is State.ARMED
+    assert ideal.gate.state is GateState.ARMED
 
 
 # --- the rest

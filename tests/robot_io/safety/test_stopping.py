@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from robot_io.contract import LIMITS
-from robot_io.control.bridge import State
+from robot_io.control.bridge import BridgeState
 from robot_io.log.messages import Event, json_text
 from robot_io.log.recorder import NullRecorder
 from robot_io.safety.faults import Cause
@@ -139,7 +139,7 @@ def test_an_exception_anywhere_brakes_the_robot_and_is_a_fault(part):
     """And the arm gets an answer to every packet, at last one that holds it where it is."""
     simulation = armed(Constant([0, 0, 0.3, 0, 0, 0, 0, 0]))
     simulation.run(0.7)
-    assert simulation.bridge.state is State.ACTIVE
+    assert simulation.bridge.state is BridgeState.ACTIVE
     *path, name = part.split(".")
     owner = simulation.bridge
     for step in path:
@@ -150,7 +150,7 @@ def test_an_exception_anywhere_brakes_the_robot_and_is_a_fault(part):
     answered = len(simulation.replies)
     simulation.run(1.0)
     gate = simulation.bridge.gate
-    assert simulation.bridge.state is State.FAULT and gate.at_rest
+    assert simulation.bridge.state is BridgeState.FAULT and gate.at_rest
     assert Cause.INTERNAL in [fault.cause for fault in gate.faults]
     assert "Own: made up" in [fault.sentence for fault in gate.faults]
     assert len(simulation.replies) - answered == 250
@@ -167,10 +167,10 @@ def blocked(joint, speed, seconds=0.25):
     action = np.zeros(8)
     action[2 + joint] = speed
     simulation = armed(Constant(action))
-    assert simulation.run(3.0, lambda: simulation.bridge.state is State.ACTIVE)
+    assert simulation.run(3.0, lambda: simulation.bridge.state is BridgeState.ACTIVE)
     simulation.run(seconds)
     simulation.blocked[joint] = True
-    assert simulation.run(2.0, lambda: simulation.bridge.state is State.FAULT)
+    assert simulation.run(2.0, lambda: simulation.bridge.state is BridgeState.FAULT)
     return simulation
 
 
@@ -205,7 +205,7 @@ def test_when_the_obstacle_goes_the_arm_stays():
 @pytest.mark.parametrize("stop", ["stop", "estop"])
 def test_a_joint_that_is_blocked_while_it_brakes_is_not_pushed_either(stop):
     simulation = armed(Constant([0, 0, 0.5, 0, 0, 0, 0, 0]))
-    assert simulation.run(3.0, lambda: simulation.bridge.state is State.ACTIVE)
+    assert simulation.run(3.0, lambda: simulation.bridge.state is BridgeState.ACTIVE)
     simulation.run(0.25)
     simulation.blocked[0] = True
     simulation.bridge.stop(simulation.now) if stop == "stop" else simulation.bridge.estop(True, simulation.now)
@@ -217,7 +217,7 @@ def test_a_joint_that_is_blocked_while_it_brakes_is_not_pushed_either(stop):
 
 def test_an_arm_that_follows_brakes_along_the_way_that_was_proven():
     simulation = armed(Constant([0.2, 0, 0.5, 0, 0, 0.3, 0, 0.5]))
-    assert simulation.run(3.0, lambda: simulation.bridge.state is State.ACTIVE)
+    assert simulation.run(3.0, lambda: simulation.bridge.state is BridgeState.ACTIVE)
     simulation.run(0.2)
     gate = simulation.bridge.gate
     left = gate.velocity - np.sign(gate.velocity) * np.minimum(
@@ -234,7 +234,7 @@ def test_an_arm_that_follows_brakes_along_the_way_that_was_proven():
 
 def test_one_false_measurement_does_not_move_the_reference():
     simulation = armed(Constant([0, 0, 0.3, 0, 0, 0, 0, 0]))
-    assert simulation.run(3.0, lambda: simulation.bridge.state is State.ACTIVE)
+    assert simulation.run(3.0, lambda: simulation.bridge.state is BridgeState.ACTIVE)
     simulation.run(0.2)
     gate = simulation.bridge.gate
     measured = gate.reference

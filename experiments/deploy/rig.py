@@ -1,0 +1,85 @@
+"""The emulated robot: for ``mjx-tt run --robot rig``, and alone as ``mjx-tt rig``."""
+
+from __future__ import annotations
+
+import time
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from experiments.config import build
+from experiments.config import robot as robots
+from experiments.deploy.operator_console import Keyboard
+from experiments.errors import ConfigError
+from mjx_tt.sim.model import SimModel
+from robot_io.emulator.processes import Ports, Rig
+from robot_io.policy import artefact as artefacts
+
+RIG = "rig"
+THROWS = 4096  # balls that the rig can throw before it begins anew
+
+
+def scene() -> str:
+    """Path of the robot's MJCF."""
+    return str(resources.files("mjx_tt") / "assets" / "scene.xml")
+
+
+def rig_for(artefact: artefacts.Artefact, balls: str | None, params_path: str | None, seed: int) -> Rig:
+    """A rig that throws balls of a distribution: the named one, or that of the policy's training."""
+    chosen = balls or _trained_on(artefact)
+    distribution = build.distribution(chosen, "--distribution")
+    throws = robots.throws_of(distribution, SimModel(), THROWS, seed)
+    return Rig(scene(), throws, robots.load_rig(params_path))
+
+
+def _trained_on(artefact: artefacts.Artefact) -> str | dict[str, Any]:
+    config = (artefact.manifest.get("provenance") or {}).get("config") or {}
+    if "balls" not in config:
+        raise ConfigError(
+            f"{artefact.folder}: does not say on which balls it was trained; name some with --distribution"
+        )
+    return config["balls"]
+
+
+def rig(balls: str, rig_params: str | None, seed: int, ports: tuple[int, ...], out: Path, console: Console) -> int:
+    """The rig alone, for a bridge that runs elsewhere; until the operator quits."""
+    throws = robots.throws_of(build.distribution(balls, "--distribution"), SimModel(), THROWS, seed)
+    chosen = Ports(ports[0], ports[1], (ports[2], ports[3]))
+    keys: dict[str, tuple[str, str]] = {
+        "o": ("switch_on", "switch the arm on"),
+        "b": ("throw", "throw balls, or stop"),
+        "e": ("motors_off", "emergency stop"),
+        "f": ("fault", "drive fault"),
+        "c": ("cable", "pull or plug an axis's cable"),
+        "t": ("drop_out", "tracker silent for 1 s"),
+        "q": ("quit", "end"),
+    }
+    with Rig(scene(), throws, robots.load_rig(rig_params), chosen) as running, Keyboard() as keyboard:
+        out.write_text(robots.to_yaml(running.robot), encoding="utf-8")
+        console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}", highlight=False)
+        console.print("   ".join(f"\\[{k}] {text}" for k, (_, text) in keys.items()), highlight=False)
+        throwing, connected = False, True
+        while True:
+            time.sleep(0.1)
+            running.check()
+            request = keys.get(keyboard.pressed() or "", ("",))[0]
+            if request == "quit":
+                return 0
+            if request == "throw":
+                throwing = not throwing
+                running.throw(throwing)
+            elif request == "fault":
+                running.drive_fault(0, 0x31)
+            elif request == "cable":
+                connected = not connected
+                running.connect_axis(0, connected)
+            elif request == "drop_out":
+                running.drop_out(1.0)
+            elif request:
+                getattr(running, request)()
+            if request:
+                qpos, _ = running.state()
+                console.print(f"{request}; {running.thrown} balls thrown; joints {np.round(qpos, 3)}", highlight=False)

@@ -1,0 +1,102 @@
+"""Fine-tuning through the bridge: each ball is credited to the policy that played it, and to no other."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import pytest
+
+from experiments.finetuning.bridge_robot import BridgeRobot
+from robot_io.control import messages
+from robot_io.errors import RefusedError
+from robot_io.policy.policy import Policy
+from tests.support.simulated_clock import Constant, Simulation
+
+PIPE = 0.005  # [s] from one end to the other
+
+
+class Session:
+    """The control process behind a pipe that takes its time, on the simulated clock."""
+
+    status = None
+
+    def __init__(self, balls):
+        self.simulation = Simulation(Constant(), self._ball, on_episode=self._played)
+        self._balls, self._requests, self._reports = balls, deque(), deque()
+        self.simulation.run(0.5)
+        self.simulation.bridge.arm(self.simulation.now)
+
+    def _ball(self, now):
+        for number, start in enumerate(self._balls, 1):
+            if 0 <= now - start < 0.72:
+                s, self.simulation.number = now - start, number
+                return np.array([0.0, 1.5 - 4.2 * s, max(0.03, 0.35 - 0.5 * s)])
+        return None
+
+    def _played(self, summary):
+        self._report(messages.Played(summary, np.zeros((0, 4))))
+
+    def _report(self, message):
+        self._reports.append((self.simulation.now + PIPE, message))
+
+    def send(self, request):
+        self._requests.append((self.simulation.now + PIPE, request))
+
+    def messages(self, seconds):
+        end = self.simulation.now + seconds
+        assert end < 40.0, "no more balls"
+        while self.simulation.now < end:
+            self.simulation.step()
+            while self._requests and self._requests[0][0] <= self.simulation.now:
+                self._obey(self._requests.popleft()[1])
+            while self._reports and self._reports[0][0] <= self.simulation.now:
+                yield self._reports.popleft()[1]
+
+    def _obey(self, request):
+        bridge = self.simulation.bridge
+        try:
+            if isinstance(request, messages.SetPolicy):
+                bridge.set_policy(Constant(1e-4 * np.ones(8) * float(request.policy.theta[0])), request.version)
+                self._report(messages.PolicySet(request.version))
+            elif isinstance(request, messages.Pause):
+                bridge.paused = request.on
+        except RefusedError as error:
+            self._report(messages.Refused(request, str(error)))
+
+
+class Nobody:
+    def pressed(self):
+        return None
+
+    def take(self, message):
+        pass
+
+    def say(self, text):
+        pass
+
+
+@pytest.mark.parametrize("gap", [0.62, 0.75, 0.9, 1.2, 2.5])
+def test_a_ball_is_credited_to_the_policy_that_played_it(gap):
+    """Balls in quick succession, also while the outcome of the one before is open."""
+    session = Session([12.0 + gap * i for i in range(20)])
+    robot = BridgeRobot(session, None, Nobody(), Nobody(), "made up")
+    bridge, played = session.simulation.bridge, {}
+    step = Constant.step
+
+    def watched(policy, observation):
+        played.setdefault(bridge.episode.number, set()).add(round(1e4 * float(policy.action[0])))
+        return step(policy, observation)
+
+    Constant.step = watched
+    try:
+        credited = {}
+        for member in range(1, 5):
+            theta = np.full(976, float(member))
+            found = robot.play(Policy(theta, np.zeros(11), np.ones(11)), 0)
+            credited[found.summary.number] = member
+    finally:
+        Constant.step = step
+    assert len(credited) == 4
+    for number, member in credited.items():
+        assert played[number] == {member}, (credited, played)
