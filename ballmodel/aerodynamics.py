@@ -14,9 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import jax
+from jaxtyping import Float
 
 from ballmodel import constants as c
-from ballmodel.vec import Vec, cross, norm
+from ballmodel.vec import Scalars, Vec, Vector, cross, norm
 
 
 @jax.tree_util.register_dataclass
@@ -24,37 +25,39 @@ from ballmodel.vec import Vec, cross, norm
 class FlightParams:
     """Parameters of free flight; every field is a scalar or has the batch shape of the balls."""
 
-    drag_coefficient: jax.Array | float = c.DRAG_COEFFICIENT  # C_d
-    magnus_coefficient: jax.Array | float = 0.0  # k in C_L = k r |omega| / |u|
-    spin_decay: jax.Array | float = 0.0  # [1/s]
-    air_density: jax.Array | float = c.AIR_DENSITY  # [kg/m^3]
-    mass: jax.Array | float = c.BALL_MASS  # [kg]
-    radius: jax.Array | float = c.BALL_RADIUS  # [m]
-    area: jax.Array | float = c.BALL_AREA  # [m^2] cross-section
-    buoyancy: jax.Array | float = 0.0  # fraction of gravity taken away; 0.0149 for a ball in air at 20 degC
-    gravity_x: jax.Array | float = 0.0  # [m/s^2]
-    gravity_y: jax.Array | float = 0.0  # [m/s^2]
-    gravity_z: jax.Array | float = -c.GRAVITY  # [m/s^2]
-    wind_x: jax.Array | float = 0.0  # [m/s]
-    wind_y: jax.Array | float = 0.0  # [m/s]
-    wind_z: jax.Array | float = 0.0  # [m/s]
+    drag_coefficient: Float[jax.Array, "*#batch"] | float = c.DRAG_COEFFICIENT  # C_d
+    magnus_coefficient: Float[jax.Array, "*#batch"] | float = 0.0  # k in C_L = k r |omega| / |u|
+    spin_decay: Float[jax.Array, "*#batch"] | float = 0.0  # [1/s]
+    air_density: Float[jax.Array, "*#batch"] | float = c.AIR_DENSITY  # [kg/m^3]
+    mass: Float[jax.Array, "*#batch"] | float = c.BALL_MASS  # [kg]
+    radius: Float[jax.Array, "*#batch"] | float = c.BALL_RADIUS  # [m]
+    area: Float[jax.Array, "*#batch"] | float = c.BALL_AREA  # [m^2] cross-section
+    buoyancy: Float[jax.Array, "*#batch"] | float = (
+        0.0  # fraction of gravity taken away; 0.0149 for a ball in air at 20 degC
+    )
+    gravity_x: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s^2]
+    gravity_y: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s^2]
+    gravity_z: Float[jax.Array, "*#batch"] | float = -c.GRAVITY  # [m/s^2]
+    wind_x: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s]
+    wind_y: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s]
+    wind_z: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s]
     integrator: str = field(default="paper", metadata={"static": True})  # one of INTEGRATORS
 
 
 INTEGRATORS = ("paper", "midpoint")  # acceleration of a step taken at its start (the paper's), or at its middle
 
 
-def drag_factor(params: FlightParams):
+def drag_factor(params: FlightParams) -> Scalars:
     """K_d [1/m]."""
     return params.drag_coefficient * params.air_density * params.area / (2.0 * params.mass)
 
 
-def magnus_factor(params: FlightParams):
+def magnus_factor(params: FlightParams) -> Scalars:
     """K_m [dimensionless]: acceleration is K_m (omega x u)."""
     return params.magnus_coefficient * params.air_density * params.area * params.radius / (2.0 * params.mass)
 
 
-def acceleration(params: FlightParams, velocity, spin) -> Vec:
+def acceleration(params: FlightParams, velocity: Vector, spin: Vector) -> Vec:
     """Acceleration [m/s^2] of a ball with velocity [m/s] and spin [rad/s], each a Vec or a (3, ...) array."""
     air = (params.wind_x, params.wind_y, params.wind_z)
     u = Vec(*(velocity[i] - air[i] for i in range(3)))

@@ -19,7 +19,8 @@ BALL_RADIUS = 0.020  # [m]
 BALL_DIAMETER = 2 * BALL_RADIUS
 BALL_MASS = 0.0027  # [kg]
 
-# The paper's drag-only ball (same appendix). Its area is pi r^2 cut to four digits; its density is that of air at 0 degC.
+# The paper's drag-only ball (same appendix). Its area is pi r^2 cut to four digits; its density is that of air at 0
+# degC.
 DRAG_COEFFICIENT = 0.47
 AIR_DENSITY = 1.29  # [kg/m^3]
 BALL_AREA = 1.256e-3  # [m^2]

@@ -11,15 +11,17 @@ Normal part: v_n' = -e v_n, e = restitution - slope |v_n| kept within [0, 1].
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from ballmodel import constants as c
 from ballmodel.partial_params import optional, value_or
-from ballmodel.vec import TINY, Vec, components, cross, dot, norm
+from ballmodel.vec import TINY, Scalars, Vec, Vector, components, cross, dot, norm
 
 STICKING = 2.0 / 5.0  # alpha that brings the contact point of a thin shell to rest
 
@@ -29,12 +31,14 @@ STICKING = 2.0 / 5.0  # alpha that brings the contact point of a thin shell to r
 class SurfaceParams:
     """Impact on table or net; scalars or of the balls' batch shape."""
 
-    restitution: jax.Array | float  # e at zero speed
-    restitution_slope: jax.Array | float  # [s/m], loss of e per normal speed
-    friction: jax.Array | float  # mu
-    height: jax.Array | float  # [m], shift of the surface along z from its nominal place
-    tilt_x: jax.Array | float | None = optional(0.0)  # slope dz/dx of the surface, about the table's centre
-    tilt_y: jax.Array | float | None = optional(0.0)  # slope dz/dy
+    restitution: Float[jax.Array, "*#batch"] | float  # e at zero speed
+    restitution_slope: Float[jax.Array, "*#batch"] | float  # [s/m], loss of e per normal speed
+    friction: Float[jax.Array, "*#batch"] | float  # mu
+    height: Float[jax.Array, "*#batch"] | float  # [m], shift of the surface along z from its nominal place
+    tilt_x: Float[jax.Array, "*#batch"] | float | None = optional(
+        0.0
+    )  # slope dz/dx of the surface, about the table's centre
+    tilt_y: Float[jax.Array, "*#batch"] | float | None = optional(0.0)  # slope dz/dy
 
 
 @jax.tree_util.register_dataclass
@@ -42,14 +46,16 @@ class SurfaceParams:
 class PaddleParams:
     """Impact on the paddle's rubber and the blade's size; scalars or of the balls' batch shape."""
 
-    restitution: jax.Array | float = c.RUBBER_RESTITUTION  # a in e = a - b |v_n|
-    restitution_slope: jax.Array | float = c.RUBBER_RESTITUTION_SLOPE  # b [s/m]
-    tangential_gain: jax.Array | float = c.RUBBER_TANGENTIAL_GAIN  # k_v
-    radius: jax.Array | float = c.PADDLE_RADIUS  # [m]
-    thickness: jax.Array | float = c.PADDLE_THICKNESS  # [m]
+    restitution: Float[jax.Array, "*#batch"] | float = c.RUBBER_RESTITUTION  # a in e = a - b |v_n|
+    restitution_slope: Float[jax.Array, "*#batch"] | float = c.RUBBER_RESTITUTION_SLOPE  # b [s/m]
+    tangential_gain: Float[jax.Array, "*#batch"] | float = c.RUBBER_TANGENTIAL_GAIN  # k_v
+    radius: Float[jax.Array, "*#batch"] | float = c.PADDLE_RADIUS  # [m]
+    thickness: Float[jax.Array, "*#batch"] | float = c.PADDLE_THICKNESS  # [m]
     # [rad], turns the blade's normal about the blade's horizontal in-plane axis; positive turns it downwards (closes)
-    tilt: jax.Array | float | None = optional(0.0)
-    offset: jax.Array | float | None = optional(0.0)  # [m], shift of the blade along its (turned) normal
+    tilt: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
+    offset: Float[jax.Array, "*#batch"] | float | None = optional(
+        0.0
+    )  # [m], shift of the blade along its (turned) normal
 
 
 def table_params() -> SurfaceParams:
@@ -62,13 +68,21 @@ def net_params() -> SurfaceParams:
     return SurfaceParams(0.1, 0.0, 0.3, 0.0)
 
 
-def restitution_at(params, normal_speed):
+def restitution_at(params: SurfaceParams | PaddleParams, normal_speed: Scalars) -> jax.Array:
     """Coefficient of restitution at a normal speed [m/s], (...)."""
     return jnp.clip(params.restitution - params.restitution_slope * jnp.abs(normal_speed), 0.0, 1.0)
 
 
-def _apply(velocity, spin, normal, surface_velocity, radius, restitution, alpha_of) -> tuple[Vec, Vec]:
-    velocity, spin, normal = components((velocity, spin, normal))
+def _apply(
+    velocity: Vector,
+    spin: Vector,
+    normal: Vector,
+    surface_velocity: Vector,
+    radius: Scalars,
+    restitution: Callable[[Scalars], Scalars],
+    alpha_of: Callable[[Scalars, Scalars, Scalars], Scalars],
+) -> tuple[Vec, Vec]:
+    velocity, spin, normal = components(velocity), components(spin), components(normal)
     relative = velocity - surface_velocity
     normal_speed = dot(relative, normal)
     contact_arm = normal * -radius
@@ -81,19 +95,23 @@ def _apply(velocity, spin, normal, surface_velocity, radius, restitution, alpha_
     return new_velocity, new_spin
 
 
-def surface_impact(params: SurfaceParams, velocity, spin, normal, radius) -> tuple[Vec, Vec]:
+def surface_impact(
+    params: SurfaceParams, velocity: Vector, spin: Vector, normal: Vector, radius: Scalars
+) -> tuple[Vec, Vec]:
     """Velocity and spin after an impact on a resting surface.
 
     velocity [m/s], spin [rad/s] and the unit normal pointing to the ball are Vecs or (3, ...) arrays; radius [m].
     """
 
-    def alpha_of(e, normal_speed, slip_speed):
+    def alpha_of(e: Scalars, normal_speed: Scalars, slip_speed: Scalars) -> jax.Array:
         return jnp.minimum(params.friction * (1.0 + e) * jnp.abs(normal_speed) / (slip_speed + TINY), STICKING)
 
     return _apply(velocity, spin, normal, (0.0, 0.0, 0.0), radius, lambda s: restitution_at(params, s), alpha_of)
 
 
-def paddle_impact(params: PaddleParams, velocity, spin, normal, paddle_velocity, radius) -> tuple[Vec, Vec]:
+def paddle_impact(
+    params: PaddleParams, velocity: Vector, spin: Vector, normal: Vector, paddle_velocity: Vector, radius: Scalars
+) -> tuple[Vec, Vec]:
     """Velocity and spin after an impact on the moving paddle.
 
     velocity, paddle_velocity (of the contact point) [m/s], spin [rad/s] and the unit normal pointing to the ball are
@@ -130,14 +148,14 @@ class Frame(NamedTuple):
     y: Vec
     z: Vec  # the surface's normal
 
-    def to_surface(self, v) -> Vec:
+    def to_surface(self, v: Vector) -> Vec:
         """A world vector (a Vec or a (3, ...) array) in the surface's axes."""
         return Vec(dot(self.x, v), dot(self.y, v), dot(self.z, v))
 
-    def to_world(self, v) -> Vec:
+    def to_world(self, v: Vector) -> Vec:
         return self.x * v[0] + self.y * v[1] + self.z * v[2]
 
-    def place(self, surface: SurfaceParams, position) -> Vec:
+    def place(self, surface: SurfaceParams, position: Vector) -> Vec:
         """A world position as the surface's own axes have it, its height taken off."""
         return self.to_surface((position[0], position[1], position[2] - surface.height))
 
@@ -157,7 +175,7 @@ def surface_frame(surface: SurfaceParams) -> Frame | None:
     return Frame(Vec(1.0 - nx * nx * s, -nx * ny * s, -nx), Vec(-nx * ny * s, 1.0 - ny * ny * s, -ny), Vec(nx, ny, nz))
 
 
-def elevation(surface: SurfaceParams, position):
+def elevation(surface: SurfaceParams, position: Vector) -> Scalars:
     """Height [m] of a position (a Vec or a (3, ...) array) over the surface, straight up: (...)."""
     z = position[2] - surface.height
     for slope, along in ((surface.tilt_x, position[0]), (surface.tilt_y, position[1])):
@@ -165,7 +183,7 @@ def elevation(surface: SurfaceParams, position):
     return z
 
 
-def box_gap(box: Box, height, position) -> tuple[Vec, jax.Array]:
+def box_gap(box: Box, height: Scalars, position: Vector) -> tuple[Vec, jax.Array]:
     """Vector from the nearest point of the box to ``position`` (a Vec or a (3, ...) array) and its length [m], (...).
 
     ``height`` shifts the box along z. The vector is zero for a point inside the box. A tilted box takes and returns
@@ -178,7 +196,7 @@ def box_gap(box: Box, height, position) -> tuple[Vec, jax.Array]:
     return gap, norm(gap)
 
 
-def surface_gap(box: Box, surface: SurfaceParams, position) -> tuple[Vec, jax.Array]:
+def surface_gap(box: Box, surface: SurfaceParams, position: Vector) -> tuple[Vec, jax.Array]:
     """``box_gap`` of a box with its surface's height and tilt, in world axes."""
     frame = surface_frame(surface)
     if frame is None:

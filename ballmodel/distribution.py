@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import difflib
 import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
+from jaxtyping import Bool, Float
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.yaml import read as read_yaml
@@ -45,7 +48,7 @@ class BallDistribution:
             low, high = (tuple(float(v) for v in getattr(self, f"{part}_{end}")) for end in ("min", "max"))
             if not len(low) == len(high) == len(axes):
                 raise ValueError(f"{self.name}: {part} needs {len(axes)} numbers at each end, got {low} and {high}")
-            for axis, a, b in zip(axes, low, high):
+            for axis, a, b in zip(axes, low, high, strict=True):
                 if not (np.isfinite(a) and np.isfinite(b) and a <= b):
                     raise ValueError(
                         f"{self.name}: {part}.{axis} is [{a}, {b}]; finite numbers with min <= max are allowed"
@@ -58,14 +61,16 @@ class BallDistribution:
         intervals = {
             part: {
                 axis: [low, high]
-                for axis, low, high in zip(axes, getattr(self, f"{part}_min"), getattr(self, f"{part}_max"))
+                for axis, low, high in zip(
+                    axes, getattr(self, f"{part}_min"), getattr(self, f"{part}_max"), strict=True
+                )
             }
             for part, axes in AXES.items()
         }
         return {"name": self.name, "source": self.source, **intervals}
 
 
-def check_keys(data, allowed, where: str) -> None:
+def check_keys(data: Any, allowed: Iterable[str], where: str) -> None:
     """Raises ValueError where ``data`` is no mapping of exactly the keys ``allowed``; notes (NOTES) may be absent."""
     if not isinstance(data, dict):
         raise ValueError(f"{where}: a mapping with the keys {', '.join(allowed)} is wanted, got {data!r}")
@@ -78,7 +83,7 @@ def check_keys(data, allowed, where: str) -> None:
         raise ValueError(f"{where}: missing key {', '.join(missing)}; wanted: {', '.join(allowed)}")
 
 
-def parse_distribution(data, where: str, name: str = "", source: str = "") -> BallDistribution:
+def parse_distribution(data: Any, where: str, name: str = "", source: str = "") -> BallDistribution:
     """Builds a distribution from its YAML form; ``where`` (file and key) opens every message. Raises ValueError."""
     check_keys(data, (*NOTES, *AXES), where)
     ends = {}
@@ -113,14 +118,14 @@ class DistributionReport:
     """What ``fit_distribution`` did with its balls."""
 
     n: int  # balls given
-    outlier: np.ndarray  # (n,) bool, taken away by DBSCAN
+    outlier: Bool[np.ndarray, " n"]  # taken away by DBSCAN
     eps: float  # DBSCAN radius in robust standard deviations
     min_samples: int
 
 
 def fit_distribution(
     states: BallState,
-    landing,
+    landing: Float[np.ndarray, "2 n"],
     eps: float | None = None,
     min_samples: int = 5,
     name: str = "",

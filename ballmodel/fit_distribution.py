@@ -67,7 +67,7 @@ def fit_human(
     outcome = np.asarray(thrown.outcome)
     good = (outcome == KEPT) | (outcome == SECOND_BOUNCE)
     counts = np.bincount(outcome, minlength=len(OUTCOMES))
-    outcomes = {text: int(count) for text, count in zip(OUTCOMES, counts)}
+    outcomes = {text: int(count) for text, count in zip(OUTCOMES, counts, strict=True)}
     if not good.any():
         raise ValueError(f"{measured.source}: none of {towards.size} balls lands on the robot's side: {outcomes}")
     landed, landing = jax.tree.map(lambda a: a[:, good], state), np.asarray(thrown.landing)[:, good]

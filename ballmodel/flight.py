@@ -11,16 +11,18 @@ steadily within the step, come within touching distance. After the impact the re
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float
 
 from ballmodel import contact
 from ballmodel.aerodynamics import INTEGRATORS, FlightParams, acceleration
 from ballmodel.contact import NET, TABLE, Box, PaddleParams, SurfaceParams, box_gap, surface_frame, surface_gap
 from ballmodel.partial_params import value_or
 from ballmodel.state import BallState
-from ballmodel.vec import TINY, Vec, components, cross, dot, select, stack, stored
+from ballmodel.vec import TINY, Scalars, Vec, components, cross, dot, select, stack, stored
 
 
 @jax.tree_util.register_dataclass
@@ -44,10 +46,10 @@ def ball_params() -> BallParams:
 class PaddlePose:
     """Pose and motion of the blade's centre; the normal is the blade's axis, both faces are rubber."""
 
-    position: jax.Array  # (3, ...) [m]
-    normal: jax.Array  # (3, ...) unit vector
-    velocity: jax.Array  # (3, ...) [m/s]
-    angular_velocity: jax.Array  # (3, ...) [rad/s]
+    position: Float[jax.Array, "3 *batch"]  # [m]
+    normal: Float[jax.Array, "3 *batch"]  # unit vector
+    velocity: Float[jax.Array, "3 *batch"]  # [m/s]
+    angular_velocity: Float[jax.Array, "3 *batch"]  # [rad/s]
 
 
 @jax.tree_util.register_dataclass
@@ -55,27 +57,53 @@ class PaddlePose:
 class Events:
     """What a ball touched within one step; at most the first impact of the step is solved, a second one in the next."""
 
-    table: jax.Array  # (...) bool
-    net: jax.Array  # (...) bool
-    paddle: jax.Array  # (...) bool
-    time: jax.Array  # (...) [s] from the step's start; the whole step when nothing was touched
-    position: jax.Array  # (3, ...) [m] of the ball's centre at ``time``
+    table: Bool[jax.Array, "*batch"]
+    net: Bool[jax.Array, "*batch"]
+    paddle: Bool[jax.Array, "*batch"]
+    time: Float[jax.Array, "*batch"]  # [s] from the step's start; the whole step when nothing was touched
+    position: Float[jax.Array, "3 *batch"]  # [m] of the ball's centre at ``time``
 
 
-def free_step(params: FlightParams, state: BallState, dt) -> BallState:
+class _Ball(NamedTuple):
+    """A BallState taken apart."""
+
+    position: Vec
+    velocity: Vec
+    spin: Vec
+
+
+class _Blade(NamedTuple):
+    """A PaddlePose taken apart."""
+
+    position: Vec
+    normal: Vec
+    velocity: Vec
+    angular_velocity: Vec
+
+
+def _ball(state: BallState) -> _Ball:
+    return _Ball(components(state.position), components(state.velocity), components(state.spin))
+
+
+def _blade(pose: PaddlePose) -> _Blade:
+    vectors = (pose.position, pose.normal, pose.velocity, pose.angular_velocity)
+    return _Blade(*(components(vector) for vector in vectors))
+
+
+def free_step(params: FlightParams, state: BallState, dt: Scalars) -> BallState:
     """One step of free flight over ``dt`` [s], a scalar or of the batch shape."""
-    return _stacked(_free_step(params, components(state), dt))
+    return _stacked(_free_step(params, _ball(state), dt))
 
 
-def _stacked(state: BallState) -> BallState:
+def _stacked(state: _Ball) -> BallState:
     return BallState(stack(state.position), stack(state.velocity), stack(state.spin))
 
 
-def _free_step(params, state, dt):
+def _free_step(params: FlightParams, state: _Ball, dt: Scalars) -> _Ball:
     return _move(state, _step_acceleration(params, state, dt), params, dt)
 
 
-def _step_acceleration(params, state, dt):
+def _step_acceleration(params: FlightParams, state: _Ball, dt: Scalars) -> Vec:
     a = acceleration(params, state.velocity, state.spin)
     if params.integrator == "midpoint":
         spin = state.spin * jnp.exp(-0.5 * dt * params.spin_decay)
@@ -85,23 +113,25 @@ def _step_acceleration(params, state, dt):
     return a
 
 
-def _position_at(state, a, t):
+def _position_at(state: _Ball, a: Vec, t: Scalars) -> Vec:
     return state.position + (state.velocity + a * (0.5 * t)) * t
 
 
-def _move(state, a, params, dt):
-    return BallState(
+def _move(state: _Ball, a: Vec, params: FlightParams, dt: Scalars) -> _Ball:
+    return _Ball(
         position=_position_at(state, a, dt),
         velocity=state.velocity + a * dt,
         spin=state.spin * jnp.exp(-params.spin_decay * dt),
     )
 
 
-def _box_time(box: Box, surface: SurfaceParams, state, a, end_position, radius, dt):
+def _box_time(
+    box: Box, surface: SurfaceParams, state: _Ball, a: Vec, end_position: Vec, radius: Scalars, dt: Scalars
+) -> jax.Array:
     """Time of touching the box within the step, ``dt`` + 1 where it does not."""
     frame = surface_frame(surface)
     if frame is not None:  # the same question in the surface's own axes, where the box is aligned
-        start = BallState(frame.place(surface, state.position), frame.to_surface(state.velocity), state.spin)
+        start = _Ball(frame.place(surface, state.position), frame.to_surface(state.velocity), state.spin)
         end_position = frame.place(surface, end_position)
         state, a, end_position = stored((start, frame.to_surface(a), end_position))
         surface = replace(surface, height=0.0, tilt_x=None, tilt_y=None)
@@ -133,11 +163,11 @@ def _box_time(box: Box, surface: SurfaceParams, state, a, end_position, radius, 
     return jnp.where(touches, t, jnp.where(overlapping, 0.0, dt + 1.0))
 
 
-def _mix(start, end, w):
+def _mix(start: Vec, end: Vec, w: Scalars) -> Vec:
     return start * (1.0 - w) + end * w
 
 
-def _mounted(params: PaddleParams, pose: PaddlePose) -> PaddlePose:
+def _mounted(params: PaddleParams, pose: _Blade) -> _Blade:
     """The pose of the blade as it is mounted: turned and shifted from where the kinematics has it.
 
     The axis of the turn is horizontal and in the blade, z x n / |z x n|; a blade that lies flat has no such axis and is
@@ -154,11 +184,14 @@ def _mounted(params: PaddleParams, pose: PaddlePose) -> PaddlePose:
     normal = Vec(*(n[i] * cos + down[i] * sin for i in range(3)))
     shift = normal * value_or(params.offset, 0.0)
     velocity = pose.velocity + cross(pose.angular_velocity, shift)
-    return stored(PaddlePose(pose.position + shift, normal, velocity, pose.angular_velocity))
+    return stored(_Blade(pose.position + shift, normal, velocity, pose.angular_velocity))
 
 
-def _paddle_time(params: PaddleParams, radius, state, end_position, start: PaddlePose, end: PaddlePose, dt):
-    """Time of touching the blade within the step (``dt`` + 1 where it does not), and the face: +1 or -1 of the normal."""
+def _paddle_time(
+    params: PaddleParams, radius: Scalars, state: _Ball, end_position: Vec, start: _Blade, end: _Blade, dt: Scalars
+) -> tuple[jax.Array, jax.Array]:
+    """Time of touching the blade within the step (``dt`` + 1 where it does not), and the face: +1 or -1 of the
+    normal."""
     s0 = dot(start.normal, state.position - start.position)
     s1 = dot(end.normal, end_position - end.position)
     side = jnp.where(s0 >= 0.0, 1.0, -1.0)
@@ -173,25 +206,27 @@ def _paddle_time(params: PaddleParams, radius, state, end_position, start: Paddl
     return jnp.where(touches, t, dt + 1.0), side
 
 
-def step(params: BallParams, state: BallState, dt: float, paddle=None) -> tuple[BallState, Events]:
+def step(
+    params: BallParams, state: BallState, dt: Scalars, paddle: tuple[PaddlePose, PaddlePose] | None = None
+) -> tuple[BallState, Events]:
     """Advances the ball by ``dt`` [s] with at most one impact, on table, net or paddle.
 
     ``paddle`` is None or a pair (pose at the step's start, pose at its end). Batch axes last throughout.
     """
     flight, radius = params.flight, params.flight.radius
-    state, paddle = components((state, paddle))
-    a = _step_acceleration(flight, state, dt)
-    free = _move(state, a, flight, dt)
-    t_table = _box_time(TABLE, params.table, state, a, free.position, radius, dt)
-    t_net = _box_time(NET, params.net, state, a, free.position, radius, dt)
+    ball = _ball(state)
+    a = _step_acceleration(flight, ball, dt)
+    free = _move(ball, a, flight, dt)
+    t_table = _box_time(TABLE, params.table, ball, a, free.position, radius, dt)
+    t_net = _box_time(NET, params.net, ball, a, free.position, radius, dt)
     t_first = jnp.minimum(t_table, t_net)
     if paddle is not None:
-        start, end = (_mounted(params.paddle, pose) for pose in paddle)
-        t_paddle, side = _paddle_time(params.paddle, radius, state, free.position, start, end, dt)
+        start, end = (_mounted(params.paddle, _blade(pose)) for pose in paddle)
+        t_paddle, side = _paddle_time(params.paddle, radius, ball, free.position, start, end, dt)
         t_first = jnp.minimum(t_first, t_paddle)
     hit_any = t_first <= dt
     t = jnp.where(hit_any, t_first, dt)
-    at = _move(state, a, flight, t)
+    at = _move(ball, a, flight, t)
     at, t, t_first, hit_any = stored((at, t, t_first, hit_any))
 
     hit_paddle = jnp.zeros_like(hit_any) if paddle is None else hit_any & (t_paddle == t_first)
@@ -221,7 +256,7 @@ def step(params: BallParams, state: BallState, dt: float, paddle=None) -> tuple[
         velocity = select(hit_paddle, v_paddle, velocity)
         spin = select(hit_paddle, w_paddle, spin)
     velocity, spin = stored((velocity, spin))
-    after = _free_step(flight, BallState(at.position, velocity, spin), dt - t)
+    after = _free_step(flight, _Ball(at.position, velocity, spin), dt - t)
     events = Events(hit_table, hit_net, hit_paddle, t, stack(at.position))
     new = jax.tree.map(lambda x, y: jnp.where(hit_any, x, y), after, free)
     return _stacked(new), events

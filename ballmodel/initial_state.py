@@ -18,6 +18,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
 from scipy.optimize import minimize
 
 from ballmodel.aerodynamics import FlightParams
@@ -38,17 +41,19 @@ class FitResult:
     """Fitted initial states, as float64 NumPy arrays."""
 
     state: BallState  # (3, n) at each trajectory's first sample
-    rms: np.ndarray  # (n,) [m] root mean square distance of the samples from the fitted flight
-    covariance: np.ndarray  # (6, 6, n) of position [m] and velocity [m/s], from the residuals' own spread
-    converged: np.ndarray  # (n,) bool
+    rms: Float[np.ndarray, " n"]  # [m] root mean square distance of the samples from the fitted flight
+    covariance: Float[np.ndarray, "6 6 n"]  # of position [m] and velocity [m/s], from the residuals' own spread
+    converged: Bool[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
 class _Padded:
-    steps: np.ndarray  # (T - 1, S, n) [s] lengths of the steps between samples; zero where there are fewer
-    time: np.ndarray  # (T, n) [s] since the first sample
-    position: np.ndarray  # (3, T, n) [m]
-    mask: np.ndarray  # (T, n) 1 for a sample, 0 for padding
+    steps: Float[
+        np.ndarray, "gaps S n"
+    ]  # (T - 1, S, n) [s] lengths of the steps between samples; zero where there are fewer
+    time: Float[np.ndarray, "T n"]  # [s] since the first sample
+    position: Float[np.ndarray, "3 T n"]  # [m]
+    mask: Float[np.ndarray, "T n"]  # 1 for a sample, 0 for padding
 
 
 def _check(trajectories: Sequence[Trajectory]) -> None:
@@ -79,12 +84,17 @@ def _pad(trajectories: Sequence[Trajectory]) -> _Padded:
     return _Padded(steps, time.T, np.moveaxis(position, 0, -1), mask.T)
 
 
-def _shape(flight: FlightParams, velocity, spin, steps):
+def _shape(
+    flight: FlightParams,
+    velocity: Float[Array, "3 n"],
+    spin: Float[Array, "3 n"],
+    steps: Float[Array, "gaps S n"],
+) -> Float[Array, "3 T n"]:
     """Positions (3, T, n) of a flight that starts at the origin."""
 
-    def advance(state, dts):
+    def advance(state: BallState, dts: Array) -> tuple[BallState, Array]:
         state, _ = jax.lax.scan(lambda s, dt: (free_step(flight, s, dt), None), state, dts)
-        return state, state.position
+        return state, jnp.asarray(state.position)
 
     start = BallState(jnp.zeros_like(velocity), velocity, spin)
     _, positions = jax.lax.scan(advance, start, steps)
@@ -100,21 +110,30 @@ def _initial_guess(padded: _Padded) -> tuple[np.ndarray, np.ndarray]:
     return coefficients[:, 0].T, coefficients[:, 1].T
 
 
-def _weights(distance, mask, huber):
+def _weights(distance: Array, mask: Array, huber: float | None) -> Array:
     return mask if huber is None else mask * jnp.minimum(1.0, huber / jnp.maximum(distance, 1e-12))
 
 
-def _cost(distance, mask, huber):
+def _cost(distance: Array, mask: Array, huber: float | None) -> Array:
     square = distance * distance
     if huber is not None:
         square = jnp.where(distance <= huber, square, 2.0 * huber * distance - huber * huber)
     return jnp.sum(mask * square, axis=0)
 
 
-def _linearise(flight, x0, v0, spin, steps, measured, mask, huber):
+def _linearise(
+    flight: FlightParams,
+    x0: Float[Array, "3 n"],
+    v0: Float[Array, "3 n"],
+    spin: Float[Array, "3 n"],
+    steps: Float[Array, "gaps S n"],
+    measured: Float[Array, "3 T n"],
+    mask: Float[Array, "T n"],
+    huber: float | None,
+) -> tuple[Float[Array, " n"], Float[Array, "n 6 6"], Float[Array, "n 6"]]:
     """Cost (n,), normal matrix (n, 6, 6) and right-hand side (n, 6) of the weighted least squares at a state."""
 
-    def shape(velocity):
+    def shape(velocity: Array) -> Array:
         return _shape(flight, velocity, spin, steps)
 
     directions = jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, *v0.shape))
@@ -125,32 +144,43 @@ def _linearise(flight, x0, v0, spin, steps, measured, mask, huber):
     total = jnp.sum(weight, axis=0)
     zero = jnp.zeros_like(total)
     position_velocity = [[jnp.sum(weight * slopes[k, i], axis=0) for k in range(3)] for i in range(3)]
-    velocity_velocity = [[jnp.sum(weight * slopes[k] * slopes[m], axis=(0, 1)) for m in range(3)] for k in range(3)]
+    velocity_velocity = [
+        [jnp.sum(weight[None] * slopes[k] * slopes[m], axis=(0, 1)) for m in range(3)] for k in range(3)
+    ]
     rows = [[total if i == j else zero for j in range(3)] + position_velocity[i] for i in range(3)]
     rows += [[position_velocity[i][k] for i in range(3)] + velocity_velocity[k] for k in range(3)]
     normal = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
     right = [jnp.sum(weight * residual[i], axis=0) for i in range(3)]
-    right += [jnp.sum(weight * slopes[k] * residual, axis=(0, 1)) for k in range(3)]
+    right += [jnp.sum(weight[None] * slopes[k] * residual, axis=(0, 1)) for k in range(3)]
     return _cost(distance, mask, huber), normal, jnp.stack(right, axis=-1)
 
 
 @partial(jax.jit, static_argnames="huber")
-def _levenberg_marquardt(flight, x0, v0, spin, steps, measured, mask, huber):
+def _levenberg_marquardt(
+    flight: FlightParams,
+    x0: Float[Array, "3 n"],
+    v0: Float[Array, "3 n"],
+    spin: Float[Array, "3 n"],
+    steps: Float[Array, "gaps S n"],
+    measured: Float[Array, "3 T n"],
+    mask: Float[Array, "T n"],
+    huber: float | None,
+) -> tuple[Array, Array, Array, Array, Array]:
     linearise = partial(_linearise, flight, spin=spin, steps=steps, measured=measured, mask=mask, huber=huber)
 
-    def unfinished(carry):
+    def unfinished(carry: dict[str, Array]) -> Array:
         return (carry["iteration"] < MAX_ITERATIONS) & ~jnp.all(carry["converged"])
 
-    def iterate(carry):
+    def iterate(carry: dict[str, Array]) -> dict[str, Array]:
         diagonal = jnp.diagonal(carry["normal"], axis1=1, axis2=2)
-        damped = carry["normal"] + carry["damping"][:, None, None] * diagonal[:, :, None] * jnp.eye(6)
+        damped = carry["normal"] + carry["damping"][:, None, None] * diagonal[:, :, None] * jnp.eye(6)[None]
         change = jnp.linalg.solve(damped, carry["right"][..., None])[..., 0]
         x_new, v_new = carry["x0"] + change[:, :3].T, carry["v0"] + change[:, 3:].T
         cost, normal, right = linearise(x_new, v_new)
         better = (cost <= carry["cost"]) & ~carry["converged"]
         small = jnp.max(jnp.abs(change), axis=1) < STEP_TOLERANCE
 
-        def pick(new, old):
+        def pick(new: Array, old: Array) -> Array:
             return jnp.where(better.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
 
         return {
@@ -182,12 +212,15 @@ def _levenberg_marquardt(flight, x0, v0, spin, steps, measured, mask, huber):
     samples = jnp.sum(mask, axis=0)
     rms = jnp.sqrt(jnp.sum(mask * square, axis=0) / samples)
     spread = jnp.sum(_weights(jnp.sqrt(square), mask, huber) * square, axis=0) / (3.0 * samples - 6.0)
-    covariance = jnp.moveaxis(jnp.linalg.inv(carry["normal"]), 0, -1) * spread
+    covariance = jnp.moveaxis(jnp.linalg.inv(carry["normal"]), 0, -1) * spread[None, None]
     return x0, v0, rms, covariance, carry["converged"]
 
 
 def fit_gauss_newton(
-    trajectories: Sequence[Trajectory], flight: FlightParams, spin=None, huber: float | None = None
+    trajectories: Sequence[Trajectory],
+    flight: FlightParams,
+    spin: ArrayLike | None = None,
+    huber: float | None = None,
 ) -> FitResult:
     """Fits all free flights at once by damped Gauss-Newton (Levenberg-Marquardt).
 
@@ -213,13 +246,22 @@ def fit_gauss_newton(
 
 
 @jax.jit
-def _rms_distance(unknowns, flight, spin, steps, measured, mask):
+def _rms_distance(
+    unknowns: Float[Array, "6"],
+    flight: FlightParams,
+    spin: Float[Array, "3 1"],
+    steps: Float[Array, "gaps S 1"],
+    measured: Float[Array, "3 T 1"],
+    mask: Float[Array, "T 1"],
+) -> Float[Array, ""]:
     flown = unknowns[:3, None, None] + _shape(flight, unknowns[3:, None], spin, steps)
     square = jnp.sum((measured - flown) ** 2, axis=0)
     return jnp.sqrt(jnp.sum(mask * square) / jnp.sum(mask))
 
 
-def fit_nelder_mead(trajectory: Trajectory, flight: FlightParams, spin=None) -> tuple[BallState, float]:
+def fit_nelder_mead(
+    trajectory: Trajectory, flight: FlightParams, spin: ArrayLike | None = None
+) -> tuple[BallState, float]:
     """The paper's fit of one free flight: state, (3,), at the first sample and root mean square distance [m].
 
     spin: (3,) [rad/s], zero without it. Raises ValueError when there are fewer than MIN_SAMPLES samples.

@@ -8,7 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import field
-from typing import Any
+from typing import Any, TypeVar
+
+from ballmodel.vec import Scalars
+
+T = TypeVar("T")
 
 
 def optional(nominal: float) -> Any:
@@ -16,14 +20,14 @@ def optional(nominal: float) -> Any:
     return field(default=nominal, metadata={"optional": True})
 
 
-def without_nominal(params):
+def without_nominal(params: T) -> T:
     """The same dataclass with every ``optional`` field None that is a plain number equal to its nominal value.
 
     Arrays stay, zero or not: a traced value may become anything.
     """
-    if params is None:
-        return None
-    changed = {}
+    if not dataclasses.is_dataclass(params) or isinstance(params, type):
+        return params
+    changed: dict[str, Any] = {}
     for f in dataclasses.fields(params):
         value = getattr(params, f.name)
         if dataclasses.is_dataclass(value):
@@ -33,6 +37,6 @@ def without_nominal(params):
     return dataclasses.replace(params, **changed)
 
 
-def value_or(value, nominal: float):
+def value_or(value: Scalars | None, nominal: float) -> Scalars:
     """``value``, or ``nominal`` where it was left out."""
     return nominal if value is None else value

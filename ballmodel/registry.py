@@ -7,9 +7,12 @@ import os
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 from ballmodel.distribution import NOTES, BallDistribution, check_keys, load_distribution, parse_distribution
 from ballmodel.io.yaml import read as read_yaml
+
+T = TypeVar("T")
 
 FOLDER = Path(__file__).parent / "data"
 
@@ -46,7 +49,7 @@ def _catalogue() -> tuple[dict[str, BallDistribution], dict[str, Skill]]:
     return distributions, skills
 
 
-def _find(table: dict, name: str, what: str):
+def _find(table: dict[str, T], name: str, what: str) -> T:
     if name in table:
         return table[name]
     near = difflib.get_close_matches(name.lower(), table, n=1, cutoff=0.0)

@@ -15,10 +15,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int, Key
 
 from ballmodel import constants as c
 from ballmodel.contact import NET, TABLE, elevation, surface_gap
@@ -26,6 +29,7 @@ from ballmodel.distribution import BallDistribution
 from ballmodel.flight import BallParams, free_step, step
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, ball_state
+from ballmodel.vec import Scalars, Vector
 
 DT = 1.0 / 300.0  # [s] simulation step
 MAX_FLIGHT = 4.0  # [s] after which a ball counts as lost
@@ -49,14 +53,18 @@ KEPT, BAD_START, HITS_NET, OWN_SIDE, MISSES, OUTSIDE_BOX, SECOND_BOUNCE = range(
 UNDECIDED = -1
 
 
+# x, y [m] of a corner of the landing box
+Corner: TypeAlias = Float[Array, "2"] | tuple[Float[Array, ""] | float, Float[Array, ""] | float]
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Throw:
     """What became of thrown balls."""
 
-    outcome: jax.Array  # (n,) index into OUTCOMES
-    landing: jax.Array  # (2, n) [m] x, y of the first bounce; zero where there was none
-    arrival: jax.Array  # (n,) [s] from the start to the robot's end line (or the floor); zero unless kept
+    outcome: Int[Array, " n"]  # index into OUTCOMES
+    landing: Float[Array, "2 n"]  # [m] x, y of the first bounce; zero where there was none
+    arrival: Float[Array, " n"]  # [s] from the start to the robot's end line (or the floor); zero unless kept
 
 
 @jax.tree_util.register_dataclass
@@ -65,13 +73,13 @@ class BallPool:
     """Balls of one distribution, ready to be thrown."""
 
     state: BallState  # (3, n) at the start
-    arrival: jax.Array  # (n,) [s] from the start until the ball crosses the robot's end line y = -1.37 m
-    landing: jax.Array  # (2, n) [m] x, y of the bounce
-    acceptance: jax.Array  # () fraction of proposals kept
-    rejected: jax.Array  # (len(OUTCOMES),) fraction of proposals by outcome; the kept ones first
+    arrival: Float[Array, " n"]  # [s] from the start until the ball crosses the robot's end line y = -1.37 m
+    landing: Float[Array, "2 n"]  # [m] x, y of the bounce
+    acceptance: Float[Array, ""]  # fraction of proposals kept
+    rejected: Float[Array, " outcomes"]  # by OUTCOMES: fraction of proposals by outcome; the kept ones first
 
 
-def _bad_start(position, params: BallParams):
+def _bad_start(position: Vector, params: BallParams) -> Bool[Array, " n"]:
     radius = params.flight.radius
     inside = (surface_gap(TABLE, params.table, position)[1] <= radius) | (
         surface_gap(NET, params.net, position)[1] <= radius
@@ -81,19 +89,25 @@ def _bad_start(position, params: BallParams):
 
 
 @jax.jit
-def throw(params: BallParams, state: BallState, landing_min, landing_max, dt: float = DT) -> Throw:
+def throw(
+    params: BallParams,
+    state: BallState,
+    landing_min: Corner,
+    landing_max: Corner,
+    dt: Scalars = DT,
+) -> Throw:
     """Follows balls, (3, n), through the full simulation until each is kept or has failed a constraint.
 
     landing_min, landing_max: (2,) [m] corners of the landing box; dt [s].
     """
     end, floor = -c.TABLE_LENGTH / 2, params.flight.radius - c.TABLE_HEIGHT
 
-    def flying(carry):
+    def flying(carry: tuple) -> Array:
         time, _, outcome, *_ = carry
         return jnp.any(outcome == UNDECIDED) & (time < MAX_FLIGHT)
 
     # Reads the carried state and only events of the new one: what reads the new state computes all of the step again.
-    def advance(carry):
+    def advance(carry: tuple) -> tuple:
         time, state, outcome, bounced, x, y, arrival, y_before = carry
         y_now = state.position[1]
         gone = (outcome == UNDECIDED) & ((y_now <= end) | (state.position[2] <= floor))
@@ -104,7 +118,7 @@ def throw(params: BallParams, state: BallState, landing_min, landing_max, dt: fl
         new, events = step(params, state, dt)
         active = outcome == UNDECIDED
         first = active & events.table & ~bounced
-        x, y = (jnp.where(first, now, before) for now, before in zip(events.position, (x, y)))
+        x, y = (jnp.where(first, now, before) for now, before in zip(events.position, (x, y), strict=False))
         in_box = (x >= landing_min[0]) & (x <= landing_max[0]) & (y >= landing_min[1]) & (y <= landing_max[1])
         outcome = jnp.where(active & events.net, HITS_NET, outcome)
         outcome = jnp.where(active & events.table & bounced, SECOND_BOUNCE, outcome)
@@ -121,7 +135,7 @@ def throw(params: BallParams, state: BallState, landing_min, landing_max, dt: fl
     return Throw(outcome, jnp.stack([x, y]), arrival)
 
 
-def coarse_outcome(params: BallParams, state: BallState, landing_min, landing_max):
+def coarse_outcome(params: BallParams, state: BallState, landing_min: Corner, landing_max: Corner) -> Int[Array, " n"]:
     """Outcome, (n,), of those balls that clearly fail on the way to their first bounce; UNDECIDED for all others.
 
     Flies COARSE_STEPS second-order steps over a little more than each ball's fall time without air.
@@ -137,7 +151,7 @@ def coarse_outcome(params: BallParams, state: BallState, landing_min, landing_ma
     net_x = NET.half[0] - NET_MARGIN
     net_z = c.NET_HEIGHT + params.net.height - NET_MARGIN
 
-    def advance(carry, _):
+    def advance(carry: tuple[BallState, Array], _: None) -> tuple[tuple[BallState, Array], None]:
         state, outcome = carry
         new = free_step(flight, state, dt)
         # An unfinished ball that comes down to the table lands; the step's parabola says when.
@@ -169,7 +183,9 @@ def coarse_outcome(params: BallParams, state: BallState, landing_min, landing_ma
 
 
 @partial(jax.jit, static_argnames="n")
-def _propose(key, params: BallParams, box: dict[str, jax.Array], n: int):
+def _propose(
+    key: Key[Array, ""], params: BallParams, box: dict[str, Array], n: int
+) -> tuple[Float[Array, "3 n"], Float[Array, "3 n"], Int[Array, " n"]]:
     key_position, key_velocity = jax.random.split(key)
     shape = (3, n)
     position = jax.random.uniform(key_position, shape, minval=box["position_min"], maxval=box["position_max"])
@@ -179,7 +195,12 @@ def _propose(key, params: BallParams, box: dict[str, jax.Array], n: int):
 
 
 def sample_pool(
-    key, distribution: BallDistribution, params: BallParams, n: int, dt: float = DT, min_acceptance: float = 1e-5
+    key: Key[Array, ""],
+    distribution: BallDistribution,
+    params: BallParams,
+    n: int,
+    dt: float = DT,
+    min_acceptance: float = 1e-5,
 ) -> BallPool:
     """Draws ``n`` balls; the same key gives the same balls, and a larger n the same first ones.
 
@@ -201,7 +222,7 @@ def sample_pool(
     full_counts = np.zeros(len(OUTCOMES))
     proposals = passed = calls = 0
 
-    def shares():
+    def shares() -> np.ndarray:
         """Fractions of all proposals by outcome; the waiting ones are taken to fare like the simulated ones."""
         return coarse_counts / max(proposals, 1) + passed / max(proposals, 1) * full_counts / max(full_counts.sum(), 1)
 
@@ -233,7 +254,9 @@ def sample_pool(
     return BallPool(state, table[6], table[7:9], jnp.asarray(share[KEPT]), jnp.asarray(share))
 
 
-def _complaint(distribution, proposals, shares):
-    reasons = sorted(((share, text) for share, text in zip(shares[1:], OUTCOMES[1:]) if share > 0), reverse=True)
+def _complaint(distribution: BallDistribution, proposals: int, shares: np.ndarray) -> str:
+    reasons = sorted(
+        ((share, text) for share, text in zip(shares[1:], OUTCOMES[1:], strict=True) if share > 0), reverse=True
+    )
     listed = ", ".join(f"{share:.4%} {text}" for share, text in reasons)
     return f"distribution {distribution.name!r} keeps {shares[KEPT]:.2g} of {proposals:,} proposals: {listed}"

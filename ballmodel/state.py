@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
 
 
 @jax.tree_util.register_dataclass
@@ -13,12 +16,12 @@ import jax.numpy as jnp
 class BallState:
     """Position, velocity and spin of one or many balls; component axis first, batch axes last."""
 
-    position: jax.Array  # (3, ...) [m], ball centre
-    velocity: jax.Array  # (3, ...) [m/s]
-    spin: jax.Array  # (3, ...) [rad/s], angular velocity
+    position: Float[jax.Array | np.ndarray, "3 *batch"]  # [m], ball centre
+    velocity: Float[jax.Array | np.ndarray, "3 *batch"]  # [m/s]
+    spin: Float[jax.Array | np.ndarray, "3 *batch"]  # [rad/s], angular velocity
 
 
-def ball_state(position, velocity, spin=None) -> BallState:
+def ball_state(position: ArrayLike, velocity: ArrayLike, spin: ArrayLike | None = None) -> BallState:
     """Builds a BallState; without ``spin`` the ball does not rotate. Raises ValueError on shapes that do not match."""
     position, velocity = jnp.asarray(position), jnp.asarray(velocity)
     spin = jnp.zeros_like(velocity) if spin is None else jnp.asarray(spin)
@@ -30,6 +33,6 @@ def ball_state(position, velocity, spin=None) -> BallState:
     return BallState(position, velocity, spin)
 
 
-def where(condition, a: BallState, b: BallState) -> BallState:
+def where(condition: Bool[jax.Array, "*batch"], a: BallState, b: BallState) -> BallState:
     """Element-wise choice between two states; ``condition`` has the batch shape."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)

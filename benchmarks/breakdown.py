@@ -30,8 +30,8 @@ RUNS = 5  # of each part, of which the fastest counts: the others were disturbed
 def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], list[dict]]:
     """Compiles the parts for a block of rows x columns episodes; the function returned measures them.
 
-    Each line: part, calls per control step, ns per episode and control step, share of the whole. "rest" is the whole less
-    the parts, and can be negative where a part alone costs more than in its place.
+    Each line: part, calls per control step, ns per episode and control step, share of the whole. "rest" is the whole
+    less the parts, and can be negative where a part alone costs more than in its place.
     """
     parts = _parts(TaskConfig(), rows, columns)
     loops = {name: (calls, *_compiled(step, start, ticks)) for name, (calls, step, start) in parts.items()}

@@ -60,7 +60,7 @@ class PyBulletRobot:
         self._mode = pybullet.VELOCITY_CONTROL
 
     def reset(self) -> None:
-        for joint, position in zip(self.joints, self._home):
+        for joint, position in zip(self.joints, self._home, strict=True):
             self.client.resetJointState(self.body, joint, position)
 
     def run(self, velocities: np.ndarray, steps: int) -> None:

@@ -64,7 +64,7 @@ def main(arguments=None) -> int:
         f"{played / seconds:.0f} x real time; the first call, with its compilation, took {compiled:.0f} s"
     )
     print(f"length {length.mean():.1f} on average, {length.max()} at most; ended by:")
-    for row, count in zip(*np.unique(end, return_counts=True)):
+    for row, count in zip(*np.unique(end, return_counts=True), strict=True):
         print(f"  {count / end.size:6.1%}  {End(row).name.lower().replace('_', ' ')}")
     return 0
 

@@ -3,8 +3,8 @@
     python -m benchmarks.side_by_side
 
 One process with a device per core, against one process with one device on each core, both doing updates of
-``study_night.yaml``'s size, in turns. What an update costs beside its episodes, and the wait for the slower half, is what
-the first loses; the second loses what the cores' shared memory costs, as the first does.
+``study_night.yaml``'s size, in turns. What an update costs beside its episodes, and the wait for the slower half, is
+what the first loses; the second loses what the cores' shared memory costs, as the first does.
 """
 
 from __future__ import annotations

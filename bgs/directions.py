@@ -40,14 +40,14 @@ def sample(
     key_basis, key_norm = jax.random.split(key)
     widths = [min(d, pairs - start) for start in range(0, pairs, d)]
     block_keys = jax.random.split(key_basis, len(widths))
-    basis = jnp.concatenate([_haar(k, d, width, dtype) for k, width in zip(block_keys, widths)], axis=1)
+    basis = jnp.concatenate([_haar(k, d, width, dtype) for k, width in zip(block_keys, widths, strict=True)], axis=1)
     if scale == "sqrt_d":
         return math.sqrt(d) * basis
-    return jnp.sqrt(jax.random.chisquare(key_norm, d, (pairs,), dtype)) * basis
+    return jnp.sqrt(jax.random.chisquare(key_norm, d, (pairs,), dtype))[None] * basis
 
 
 def _haar(key: jax.Array, d: int, width: int, dtype: jnp.dtype) -> jax.Array:
     """``width`` orthonormal columns of a Haar-distributed orthogonal matrix, shape (d, width)."""
     q, r = jnp.linalg.qr(jax.random.normal(key, (d, width), dtype))
     # LAPACK's sign convention is not uniform; a positive diagonal of R makes Q exactly Haar (Mezzadri 2007, section 5).
-    return q * jnp.where(jnp.diagonal(r) < 0, -1, 1).astype(dtype)
+    return q * jnp.where(jnp.diagonal(r) < 0, -1, 1).astype(dtype)[None]

@@ -7,17 +7,19 @@ share one compilation.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
+from itertools import pairwise
 
+import jax
 import optax
 
-Schedule = Callable[[int], float]
+Schedule = Callable[[jax.Array], jax.Array | float]  # of the number of updates so far
 
 KINDS = ("sgd", "adam")
 PAPER_LEARNING_RATE = 0.00375  # Abeyruwan et al. 2022, appendix, table of BGS hyper-parameters: step size alpha
 
 
-@lru_cache(maxsize=None)
+@cache
 def make(
     kind: str = "sgd",
     learning_rate: float | Schedule = PAPER_LEARNING_RATE,
@@ -49,7 +51,7 @@ def make(
     return optax.chain(direction, *decay, optax.scale_by_learning_rate(learning_rate))
 
 
-@lru_cache(maxsize=None)
+@cache
 def cosine(value: float, final: float, updates: int, hold: float = 0.5) -> Schedule:
     """Stays at ``value`` for the first ``hold`` fraction of ``updates``, then falls to ``final`` along half a cosine.
 
@@ -66,14 +68,14 @@ def cosine(value: float, final: float, updates: int, hold: float = 0.5) -> Sched
     return optax.join_schedules([optax.constant_schedule(value), fall], [held])
 
 
-@lru_cache(maxsize=None)
+@cache
 def piecewise(value: float, changes: tuple[tuple[int, float], ...]) -> Schedule:
     """``value`` until the first change; each change (update, new value) holds from that update on.
 
     Raises ValueError for a rate that is not positive or for updates that do not increase from at least 1.
     """
     starts, values = [0, *(start for start, _ in changes)], [value, *(new for _, new in changes)]
-    if any(later <= earlier for earlier, later in zip(starts, starts[1:])):
+    if any(later <= earlier for earlier, later in pairwise(starts)):
         raise ValueError(f"step.piecewise: changes at updates {starts[1:]}, allowed are increasing ones from 1 on")
     for given in values:
         _positive("piecewise", "value", given)

@@ -113,4 +113,5 @@ def _centered_ranks(plus: jax.Array, minus: jax.Array, finite: jax.Array) -> tup
     mean_rank = (below + not_above - 1).astype(plus.dtype) / 2
     last_rank = jnp.maximum(2 * jnp.sum(finite) - 1, 1).astype(plus.dtype)
     centered = mean_rank / last_rank - 0.5
-    return tuple(jnp.where(finite, half, 0) for half in jnp.split(centered, 2))
+    first, second = (jnp.where(finite, half, 0) for half in jnp.split(centered, 2))
+    return first, second

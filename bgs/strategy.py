@@ -148,7 +148,8 @@ def _sample(key: jax.Array, state: BGSState, config: BGSConfig) -> jax.Array:
 
 def perturb(state: BGSState, directions: jax.Array, config: BGSConfig) -> Population:
     """The members along given directions (d, N): ``ask`` without its sampling."""
-    sigma = config.sigma(state.updates) if callable(config.sigma) else config.sigma
+    with jax.numpy_dtype_promotion("standard"):  # optax's schedules divide integers by floats
+        sigma = config.sigma(state.updates) if callable(config.sigma) else config.sigma
     theta, offsets = state.theta[:, None], jnp.asarray(sigma, state.theta.dtype) * directions
     return Population(jnp.concatenate([theta + offsets, theta - offsets], axis=1), directions)
 
@@ -170,7 +171,8 @@ def tell(state: BGSState, population: Population, returns: jax.Array, config: BG
     # Accelerators would otherwise multiply float32 in a shorter format.
     gradient = jnp.matmul(directions, shaped.weights, precision=jax.lax.Precision.HIGHEST)
     # optax descends, returns are to rise.
-    change, opt_state = config.step.update(-gradient, state.opt_state, state.theta)
+    with jax.numpy_dtype_promotion("standard"):  # optax raises floats to an integer count
+        change, opt_state = config.step.update(-gradient, state.opt_state, state.theta)
     theta = optax.apply_updates(state.theta, change)
     average = config.average * state.average + (1 - config.average) * theta
 

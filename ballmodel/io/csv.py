@@ -10,6 +10,7 @@ import csv
 import difflib
 import math
 import os
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def read_csv(path: str | os.PathLike) -> Dataset:
         reader = csv.reader(file)
         try:
             header = _header(path, next(reader, None))
-            samples = _samples(path, reader, header)
+            samples = _samples(path, ((reader.line_num, row) for row in reader), header)
         except (csv.Error, UnicodeDecodeError) as error:
             raise ValueError(f"{path}: row {reader.line_num + 1}: not readable as CSV in UTF-8: {error}") from None
     if not samples:
@@ -40,7 +41,7 @@ def read_csv(path: str | os.PathLike) -> Dataset:
     return Dataset(tuple(trajectories), str(path))
 
 
-def _header(path, row) -> list[str]:
+def _header(path: str | os.PathLike, row: list[str] | None) -> list[str]:
     names = [name.strip() for name in row or []]
     for name in names:
         if name not in COLUMNS:
@@ -56,15 +57,17 @@ def _header(path, row) -> list[str]:
     return names
 
 
-def _samples(path, reader, header) -> dict[tuple[str, str], list[list[float]]]:
+def _samples(
+    path: str | os.PathLike, rows: Iterable[tuple[int, list[str]]], header: list[str]
+) -> dict[tuple[str, str], list[list[float]]]:
     samples: dict[tuple[str, str], list[list[float]]] = {}
-    for row in reader:
+    for number, row in rows:
         if not row:
             continue
-        place = f"{path}: row {reader.line_num}"
+        place = f"{path}: row {number}"
         if len(row) != len(header):
             raise ValueError(f"{place}: {len(row)} fields, the header has {len(header)} ({','.join(header)})")
-        fields = dict(zip(header, row))
+        fields = dict(zip(header, row, strict=True))
         values = [_number(place, column, fields[column]) for column in NUMBERS]
         known = samples.setdefault((fields.get("session", ""), fields["trajectory"]), [])
         if known and values[0] <= known[-1][0]:
@@ -76,7 +79,7 @@ def _samples(path, reader, header) -> dict[tuple[str, str], list[list[float]]]:
     return samples
 
 
-def _number(place, column, text) -> float:
+def _number(place: str, column: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:

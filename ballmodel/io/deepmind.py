@@ -10,8 +10,10 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from ballmodel.state import BallState
 
@@ -23,7 +25,7 @@ FIELDS = tuple(f"{prefix}_{axis}" for prefix in VECTORS.values() for axis in "xy
 class MeasuredStates:
     """Single ball states without a time series."""
 
-    id: np.ndarray  # (n,) int
+    id: Int[np.ndarray, " n"]
     state: BallState  # (3, n) float64 NumPy arrays
     source: str
 
@@ -45,8 +47,8 @@ def read_deepmind(path: str | os.PathLike) -> MeasuredStates:
     return MeasuredStates(ids, BallState(position, velocity, spin), str(path))
 
 
-def _number(path, index, entry, field) -> float:
+def _number(path: str | os.PathLike, index: int, entry: Any, field: str) -> float:
     value = entry.get(field) if isinstance(entry, dict) else None
-    if type(value) not in (int, float) or not np.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise ValueError(f"{path}: entry {index}, field {field!r}: a finite number is wanted, got {value!r}")
     return value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from ballmodel.io.aimy import read_aimy
@@ -11,7 +12,12 @@ from ballmodel.io.deepmind import MeasuredStates, read_deepmind
 from ballmodel.io.mcap import read_mcap
 from ballmodel.trajectory import Dataset
 
-FORMATS = {"csv": read_csv, "mcap": read_mcap, "deepmind": read_deepmind, "aimy": read_aimy}
+FORMATS: dict[str, Callable[[Path], Dataset | MeasuredStates]] = {
+    "csv": read_csv,
+    "mcap": read_mcap,
+    "deepmind": read_deepmind,
+    "aimy": read_aimy,
+}
 SUFFIXES = {".csv": "csv", ".mcap": "mcap", ".json": "deepmind", ".hdf5": "aimy", ".h5": "aimy"}
 
 

@@ -53,7 +53,7 @@ def write_mcap(path: str | os.PathLike, dataset: Dataset) -> None:
                 raise ValueError(
                     f"{trajectory.label}: starts at t={trajectory.time[0]}; MCAP holds no time before zero"
                 )
-            for i, (t, (x, y, z)) in enumerate(zip(trajectory.time, trajectory.position.T)):
+            for i, (t, (x, y, z)) in enumerate(zip(trajectory.time, trajectory.position.T, strict=True)):
                 stamp = round(float(t) * NANO)
                 message = {
                     "timestamp": {"sec": stamp // NANO, "nsec": stamp % NANO},
@@ -110,7 +110,7 @@ def read_mcap(path: str | os.PathLike, salvage: bool = False) -> Dataset:
     return Dataset(tuple(trajectories), str(path))
 
 
-def _sample(path, index, data):
+def _sample(path: str | os.PathLike, index: int, data: bytes) -> tuple[str, str, tuple[float, float, float, float]]:
     try:
         message = json.loads(data)
         stamp, point = message["timestamp"], message["point"]

@@ -1,13 +1,13 @@
 """The task as a brax environment: one control step per step, for learners that look inside an episode.
 
-Batches are native: the keys given to ``reset`` decide the batch axes (B,), which stand last inside and first in what brax
-sees. A finished episode is followed at once by another one with a fresh ball, so no wrapper of brax is needed; those that
-repeat the first episode would train on one ball per place.
+Batches are native: the keys given to ``reset`` decide the batch axes (B,), which stand last inside and first in what
+brax sees. A finished episode is followed at once by another one with a fresh ball, so no wrapper of brax is needed;
+those that repeat the first episode would train on one ball per place.
 
 Rewards. R(t) is the task's weighted return of an episode that stopped after control step t, the ball not yet flown out;
 the reward of a step is R(t) - R(t - 1), and at the last step R holds what became of the ball. An episode's rewards
-therefore add up to the return that ``rollout.Simulator`` computes, whatever its terms: counts such as collisions are paid
-when they happen, nearing the ball as it is neared, means over the steps as they move.
+therefore add up to the return that ``rollout.Simulator`` computes, whatever its terms: counts such as collisions are
+paid when they happen, nearing the ball as it is neared, means over the steps as they move.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ import numpy as np
 from brax.envs.base import Env, State
 
 from ballmodel.sampling import BallPool
+from mjx_tt.env.observation import observe
+from mjx_tt.env.outgoing_ball import fly_out
+from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import Episodes, EpisodeState, Return
 from mjx_tt.sim.model import Range, SimModel
@@ -62,8 +65,8 @@ class TableTennis(Env):
 
     Observation (..., 88): the last eight observations of the contract, oldest first, not normalised. Action (..., 8) in
     [-1, 1]. ``done`` is 1 at the step that decided the episode; the state is then already that of the next one.
-    ``metrics`` at such a step, 0 at others: "hit" and "returned", 1 where the ball was, and "episode_return". Nothing is
-    ever truncated: an episode that reaches ``max_steps`` is over, as in the simulator.
+    ``metrics`` at such a step, 0 at others: "hit" and "returned", 1 where the ball was, and "episode_return". Nothing
+    is ever truncated: an episode that reaches ``max_steps`` is over, as in the simulator.
     """
 
     def __init__(
@@ -100,7 +103,7 @@ class TableTennis(Env):
     def begin(self, episodes: Episodes, key) -> State:
         """The state before the first step of given episodes (...); ``key`` is for those that follow."""
         state, tick = self._start(episodes), jnp.int32(0)
-        seen = self._task.observe(tick, state, episodes, self._task.prepare(episodes))
+        seen = observe(tick, state, episodes, self._task.prepare(episodes))
         history = jnp.broadcast_to(seen, (HISTORY, *seen.shape))
         zero = jnp.zeros(episodes.seed.shape)
         playing = Playing(tick, key, episodes, state, history, zero)
@@ -115,7 +118,7 @@ class TableTennis(Env):
         after = task.control_step(playing.tick, before, episodes, task.prepare(episodes), controller)
         done = ~after.live | (after.sums.steps >= task.config.max_steps)
         back = self._fly_out(after, done & after.hit & after.finite, episodes)
-        terms = task.reward_terms(after, back)
+        terms = reward_terms(after, back)
         earned = sum(w * terms[i] for i, w in enumerate(task.config.reward_weights))
         finite = after.finite & jnp.isfinite(earned)
         reward = jnp.where(finite, earned - playing.earned, 0.0)
@@ -130,7 +133,7 @@ class TableTennis(Env):
         episodes = _where(done, fresh, episodes)
         started = _where(done, self._start(episodes), after)
         tick = playing.tick + 1
-        seen = task.observe(tick, started, episodes, task.prepare(episodes))
+        seen = observe(tick, started, episodes, task.prepare(episodes))
         history = jnp.where(done, seen, jnp.concatenate([playing.history[1:], seen[None]]))
         playing = Playing(tick, key, episodes, started, history, jnp.where(done, 0.0, earned))
         return state.replace(
@@ -152,13 +155,13 @@ class TableTennis(Env):
         task, ball, batch = self._task, state.ball, hit.shape
         width = max(FEWEST_FLOWN, batch[0] // 16) if len(batch) == 1 else 0
         if width == 0 or width >= batch[0]:
-            return task.fly_out(ball, hit, episodes.model)
+            return fly_out(task.config, ball, hit, episodes.model)
 
         def fly_some(carry):
             left, back = carry
             index = jnp.nonzero(left, size=width, fill_value=batch[0])[0]
             some, model = jax.tree.map(lambda x: x[..., index] if x.ndim else x, (ball, episodes.model))
-            part = task.fly_out(some, index < batch[0], model)
+            part = fly_out(task.config, some, index < batch[0], model)
             back = jax.tree.map(lambda x, new: x.at[..., index].set(new, mode="drop"), back, part)
             return left.at[index].set(False, mode="drop"), back
 

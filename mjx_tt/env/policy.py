@@ -1,10 +1,12 @@
 """The gated dilated CNN of 976 parameters in JAX, in streaming form (in full: ``robot_io.policy.policy.forward``).
 
 Architecture and parameter order: ``robot_io.contract``. Streaming keeps one past input, two past outputs of layer 1 and
-four of layer 2, which is all that the dilations 1, 2, 4 reach back to: 928 multiply-adds a control step instead of 4,576.
+four of layer 2, which is all that the dilations 1, 2, 4 reach back to: 928 multiply-adds a control step instead of
+4,576.
 
 Parameters may differ along a last axis of P perturbations: kernels are (2, in, out, P) and the batch of activations
-(channels, B) is R repeats of them, B = R x P with P the faster index. Sums over channels are written out so that each layer is one vector loop over the batch.
+(channels, B) is R repeats of them, B = R x P with P the faster index. Sums over channels are written out so that each
+layer is one vector loop over the batch.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ def initial_theta(key, scale: float = 0.1):
 
 def _sizes():
     inputs = N_OBSERVATION
-    for filters, gated in zip(FILTERS, GATED):
+    for filters, gated in zip(FILTERS, GATED, strict=True):
         outputs = filters * (2 if gated else 1)
         yield 2 * inputs * outputs + outputs
         inputs = filters
@@ -52,7 +54,11 @@ def _layer(kernel, bias, older, newer, gated: bool):
 
     z = spread(bias)
     for c in range(older.shape[0]):
-        z = z + spread(kernel[0, c]) * older[c].reshape(shape) + spread(kernel[1, c]) * newer[c].reshape(shape)
+        z = (
+            z
+            + spread(kernel[0, c]) * older[c].reshape(shape)[None]
+            + spread(kernel[1, c]) * newer[c].reshape(shape)[None]
+        )
     z = materialise(z).reshape(-1, *newer.shape[1:])
     if not gated:
         return jnp.tanh(z)

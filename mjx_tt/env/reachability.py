@@ -2,9 +2,9 @@
 
 For every ball the cross-entropy method (Rubinstein 1999) searches an open-loop motion, joint velocities at a few knots
 with straight lines between them, through the same episodes as training: actuation limits and delays included, but
-without observation noise and with the whole future known. What a policy at hand returns under the same conditions needs no
-search. A ball that is returned either way can be returned; one that is missed may still be returned by a better motion,
-so the rate is a lower bound on the best, and no policy is promised to reach it.
+without observation noise and with the whole future known. What a policy at hand returns under the same conditions
+needs no search. A ball that is returned either way can be returned; one that is missed may still be returned by a
+better motion, so the rate is a lower bound on the best, and no policy is promised to reach it.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ballmodel.sampling import BallPool
 from mjx_tt.env.policy import Policy
@@ -45,8 +46,8 @@ class MotionController:
         return ()
 
     def act(self, tick, state, observation):
-        place = jnp.clip(tick * self.period / self.duration, 0.0, 1.0) * (KNOTS - 1)
-        action = sum(jnp.maximum(1.0 - jnp.abs(place - i), 0.0) * self.knots[i] for i in range(KNOTS))
+        place = jnp.clip(tick.astype(self.duration.dtype) * self.period / self.duration, 0.0, 1.0) * (KNOTS - 1)
+        action = sum(jnp.maximum(1.0 - jnp.abs(place - i), 0.0)[None] * self.knots[i] for i in range(KNOTS))
         return jnp.clip(action, -1.0, 1.0), state
 
 
@@ -84,9 +85,13 @@ def reachable(
     batch = -(-BATCH // simulator.devices) * simulator.devices  # one size, one compilation
     for start in range(0, missed.size, batch):
         chosen = np.resize(missed[start : start + batch], batch)
-        some = jax.tree.map(lambda x: x[..., chosen] if x.ndim >= 2 else x, episodes)
+        some = jax.tree.map(partial(_taken, chosen), episodes)
         found[chosen] = np.asarray(search(*simulator.replicate((jax.random.fold_in(search_key, start), some))))
     return Reachable(int(found.sum()), balls, by_policy)
+
+
+def _taken(index: np.ndarray, x: Array) -> Array:
+    return x[..., index] if x.ndim >= 2 else x
 
 
 def _played(simulator: Simulator, policy: Policy, episodes: Episodes) -> np.ndarray:

@@ -20,8 +20,8 @@ TERMS = (
     "paddle_height",
     "style",
 )
-SIM_WEIGHTS = dict(zip(TERMS, (1.0, 1.0, 0.1, 0.0, 0.3, 0.3, 0.4, 1.0, 1.0, 0.5, 1.0)))
-REAL_WEIGHTS = dict(zip(TERMS, (1.0, 1.0, 0.1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)))
+SIM_WEIGHTS = dict(zip(TERMS, (1.0, 1.0, 0.1, 0.0, 0.3, 0.3, 0.4, 1.0, 1.0, 0.5, 1.0), strict=True))
+REAL_WEIGHTS = dict(zip(TERMS, (1.0, 1.0, 0.1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), strict=True))
 
 TARGET = (0.0, 0.685)  # [m] x, y: centre of the human's half
 TARGET_RANGE = 0.7  # [m] e-folding distance of the bonus around the target
@@ -42,7 +42,7 @@ def state_transition(closest, hit, crossed, returned, landing):
     """
     distance = jnp.hypot(landing[0] - TARGET[0], landing[1] - TARGET[1])
     near = jnp.exp(-distance / TARGET_RANGE)
-    after_hit = 3.0 + jnp.where(returned, 1.0 + near, 0.5 * crossed + 0.5 * near)
+    after_hit = 3.0 + jnp.where(returned, 1.0 + near, 0.5 * crossed.astype(near.dtype) + 0.5 * near)
     return jnp.where(hit, after_hit, 3.0 * jnp.exp(-closest / APPROACH_RANGE))
 
 

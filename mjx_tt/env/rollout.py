@@ -1,8 +1,8 @@
 """Perturbations x episodes in one compiled call, over one or several devices.
 
-Arrays are (component, repeat R, perturbation P). Repeats are sorted by the ball's time of arrival and run in blocks, each
-until its last live episode: blocks keep the working set in the cache and let fast balls end early. The perturbation
-axis can be split over devices (jax.sharding): every device runs its share, with no communication.
+Arrays are (component, repeat R, perturbation P). Repeats are sorted by the ball's time of arrival and run in blocks,
+each until its last live episode: blocks keep the working set in the cache and let fast balls end early. The
+perturbation axis can be split over devices (jax.sharding): every device runs its share, with no communication.
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import BallPool
 from ballmodel.state import BallState, where
+from mjx_tt.env.outgoing_ball import fly_out, fly_out_step
 from mjx_tt.env.policy import PolicyController
+from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, Task, TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Range, SimModel
@@ -107,8 +109,8 @@ class Simulator:
     def on_devices(self, function, **specs):
         """``function`` run on every device at once, on the same arguments; inside it ``local`` picks a device's share.
 
-        specs: ``out_specs`` of jax.shard_map. What a function combines over devices it should combine in one collective:
-        several at a time starve the few threads that host devices share, and hang.
+        specs: ``out_specs`` of jax.shard_map. What a function combines over devices it should combine in one
+        collective: several at a time starve the few threads that host devices share, and hang.
         """
         return jax.shard_map(function, mesh=self._mesh, in_specs=PartitionSpec(), check_vma=False, **specs)
 
@@ -117,7 +119,8 @@ class Simulator:
         return jax.device_put(tree, NamedSharding(self._mesh, PartitionSpec()))
 
     def local(self, tree):
-        """This device's share of arrays (..., P) along the last axis; only inside ``on_devices``. Scalars are shared."""
+        """This device's share of arrays (..., P) along the last axis; only inside ``on_devices``. Scalars are
+        shared."""
         return jax.tree.map(lambda x: self._share(x) if x.ndim else x, tree)
 
     def _share(self, x):
@@ -180,8 +183,8 @@ class Simulator:
 
         state = task.reset(episodes, controller)
         _, state = jax.lax.while_loop(running, advance, (jnp.int32(0), state))
-        back = task.fly_out(state.ball, state.hit & state.finite, episodes.model)
-        terms = task.reward_terms(state, back)
+        back = fly_out(config, state.ball, state.hit & state.finite, episodes.model)
+        terms = reward_terms(state, back)
         weights = np.asarray(config.reward_weights, terms.dtype)
         returns = sum(w * terms[i] for i, w in enumerate(weights))
         finite = state.finite & jnp.isfinite(returns)
@@ -203,15 +206,15 @@ class Simulator:
     def replay(self, policy: Policy, episodes: Episodes):
         """Plays single episodes for the camera: one policy, episodes (R, 1).
 
-        Returns joint positions (max_steps, 8, R), ball positions (max_steps, 3, R) at the control ticks and the number of
-        ticks (R,) until the ball came down.
+        Returns joint positions (max_steps, 8, R), ball positions (max_steps, 3, R) at the control ticks and the number
+        of ticks (R,) until the ball came down.
         """
         task = self.task
         controller = PolicyController.of(replace(policy, theta=policy.theta[:, None]))
         prepared = task.prepare(episodes)
         state = task.reset(episodes, controller)
         grounded = jnp.zeros_like(state.live)
-        outcome = task.fly_out(state.ball, grounded, episodes.model)
+        outcome = fly_out(self.config, state.ball, grounded, episodes.model)
         flight = replace(episodes.model.ball.flight, integrator="midpoint")
         params = replace(episodes.model.ball, flight=flight)
 
@@ -219,7 +222,7 @@ class Simulator:
             state, ball, flying, outcome, length = carry
             shown = (state.qpos[..., 0], ball.position[..., 0])
             new = task.control_step(tick, state, episodes, prepared, controller)
-            out, outcome, still = task.fly_out_step(params, ball, flying, outcome)
+            out, outcome, still = fly_out_step(self.config, params, ball, flying, outcome)
             ball = where(state.hit, out, new.ball)
             flying = still | (new.hit & ~state.hit)
             return (new, ball, flying, outcome, jnp.where(new.live | flying, tick + 2, length)), shown

@@ -15,7 +15,7 @@ from ballmodel import constants as c
 from ballmodel import flight
 from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
-from mjx_tt.env.task import FLOOR
+from mjx_tt.env.outgoing_ball import FLOOR
 from mjx_tt.rally.human_player import OVER_TABLE, Incoming
 from robot_io.contract import LIMITS
 
@@ -115,7 +115,7 @@ def meeting(params: BallParams, ball: BallState, returned, plane, height, period
 def homeward(home, qpos, seconds):
     """Joint positions (8, L) ``seconds`` (L,) after the hit, on the way home (8,) as the bridge drives it."""
     speed, braking = HOME_SPEED * column(LIMITS.policy_velocity), HOME_BRAKING * column(LIMITS.acceleration)
-    error, driven = column(home) - qpos, jnp.maximum(seconds - HOME_DELAY, 0.0)
+    error, driven = column(home) - qpos, jnp.maximum(seconds - HOME_DELAY, 0.0)[None]
     distance = jnp.abs(error)
     # At full speed until the braking distance, then along the parabola b / 2 (T - t)^2 that is left.
     stop = jnp.minimum(speed**2 / (2.0 * braking), distance)

@@ -3,8 +3,8 @@
 A player lobs first balls; answers a return with a stroke that depends on it; errs the more, the harder the ball is to
 play; tires; gets used to the robot. The shape of the behaviour is ours (the paper measured balls and rally lengths,
 not behaviour); its numbers, one YAML per player in ``assets/virtual_players``, are calibrated so that balls and rallies
-come near the paper's tables (docs/results/virtual-players.md, ``study/player_calibration.py``). Instructions to the players:
-appendix "Instructions for Human Players" of Abeyruwan et al. 2022: lobs from the left-hand quadrant of the human's half
+come near the paper's tables (docs/results/virtual-players.md, ``study/player_calibration.py``). Instructions to the
+players: appendix "Instructions for Human Players" of Abeyruwan et al. 2022: lobs from the left-hand quadrant of the human's half
 (x > 0 for the human, who looks along -y) to the robot's right-hand quadrant (x > 0), returns to there as well.
 
 Component axis first, batch axes last; a player's leaves are scalars or of the batch shape. SI units.
@@ -67,7 +67,8 @@ class Spread:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FirstBalls:
-    """How a player starts a rally. The way to the landing point and the speed ask for a climb; the bounds come after."""
+    """How a player starts a rally. The way to the landing point and the speed ask for a climb; the bounds come
+    after."""
 
     x: Spread  # [m] where the ball is hit
     y: Spread
@@ -287,7 +288,7 @@ def difficulty(player: Player, state: PlayerState, incoming: Incoming):
     fast = 0.5 * jnp.maximum(speed - ability.easy_speed, 0.0)
     spin = 0.3 * jnp.sqrt(jnp.sum(ball.spin**2, axis=0)) / SPIN_UNIT
     met = (incoming.landing[0], incoming.landing[1], speed)
-    away = sum(((m - e) / unit) ** 2 for m, e, unit in zip(met, state.expected, SURPRISE))
+    away = sum(((m - e) / unit) ** 2 for m, e, unit in zip(met, state.expected, SURPRISE, strict=True))
     strange = 1.0 - 0.7 * state.familiarity
     return (
         stretch(ability, incoming)
@@ -337,7 +338,8 @@ def load(name: str) -> Player:
 
 
 def read(path) -> Player:
-    """A player from a YAML file: the tree of field names, a spread as [low, usual, high]. Raises ValueError naming file and key."""
+    """A player from a YAML file: the tree of field names, a spread as [low, usual, high]. Raises ValueError naming
+    file and key."""
     data = yaml.read(path)
     if not isinstance(data, dict):
         raise ValueError(f"{path}: a mapping of {', '.join(f.name for f in dataclasses.fields(Player))} is wanted")

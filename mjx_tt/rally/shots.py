@@ -44,25 +44,26 @@ def aimed(flight: FlightParams, start, target, seconds, spin):
     """
     flight = replace(flight, integrator="midpoint")
     gravity = jnp.reshape(jnp.array([0.0, 0.0, -c.GRAVITY]), (3,) + (1,) * (start.ndim - 1))
-    velocity = (target - start) / seconds - 0.5 * gravity * seconds
+    velocity = (target - start) / seconds[None] - 0.5 * gravity * seconds[None]
     for _ in range(SOLVER_ROUNDS):
         state = BallState(start, velocity, spin)
         state = jax.lax.fori_loop(0, SOLVER_STEPS, lambda _, s: free_step(flight, s, seconds / SOLVER_STEPS), state)
-        velocity = velocity + (target - state.position) / seconds
+        velocity = velocity + (target - state.position) / seconds[None]
     return velocity
 
 
 def erring(key, velocity, direction, elevation, pace, lift=0.0):
-    """The velocity (3, ...) with Gaussian errors, cut at three deviations: direction and elevation [rad], pace as a share.
+    """The velocity (3, ...) with Gaussian errors, cut at three deviations: direction and elevation [rad], pace as a
+    share.
 
     lift: constant error of the elevation [rad].
     """
     direction, elevation, pace = (
         size * jax.random.truncated_normal(k, -3.0, 3.0, velocity.shape[1:])
-        for k, size in zip(jax.random.split(key, 3), (direction, elevation, pace))
+        for k, size in zip(jax.random.split(key, 3), (direction, elevation, pace), strict=True)
     )
     speed = jnp.sqrt(jnp.sum(velocity**2, axis=0)) * (1.0 + jnp.maximum(pace, -0.5))
     level = jnp.hypot(velocity[0], velocity[1])
     azimuth = jnp.arctan2(velocity[1], velocity[0]) + direction
     rise = jnp.arctan2(velocity[2], level) + elevation + lift
-    return speed * jnp.stack([jnp.cos(rise) * jnp.cos(azimuth), jnp.cos(rise) * jnp.sin(azimuth), jnp.sin(rise)])
+    return speed[None] * jnp.stack([jnp.cos(rise) * jnp.cos(azimuth), jnp.cos(rise) * jnp.sin(azimuth), jnp.sin(rise)])

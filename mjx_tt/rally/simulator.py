@@ -21,7 +21,9 @@ from ballmodel.distribution import BallDistribution
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, where
 from mjx_tt.env import rewards
+from mjx_tt.env.outgoing_ball import fly_out
 from mjx_tt.env.policy import Policy, PolicyController
+from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Episodes, Task, TaskConfig
 from mjx_tt.rally import ball_flights, human_player
 from mjx_tt.rally.ball_flights import column, homeward
@@ -164,8 +166,8 @@ class RallySimulator:
         """``rallies`` rallies of every lane, one after the other, in one compiled call.
 
         policy: theta (976, L), normaliser (11, L) or (11,); player and model: leaves scalar or (L,). box: what is out
-        of distribution, None: nothing is. A rally is broken off (End.NONE) at max_touches. capacity: human hits per lane
-        that the log keeps.
+        of distribution, None: nothing is. A rally is broken off (End.NONE) at max_touches. capacity: human hits per
+        lane that the log keeps.
         """
         box = Box.of(box) if isinstance(box, BallDistribution) else box
         return self._play(
@@ -208,9 +210,9 @@ class RallySimulator:
         fault = ((robot.sums.collision > 0.0) | ~finite) & ~blind
         hit = robot.hit & finite & ~fault & ~blind
         played = replace(robot, hit=hit)
-        back = self.task.fly_out(robot.ball, hit, model)
+        back = fly_out(self.config, robot.ball, hit, model)
         returned = hit & back.returned
-        terms = self.task.reward_terms(played, back)
+        terms = reward_terms(played, back)
         terms = terms.at[rewards.TERMS.index("fault")].set(jnp.where(fault, FAULT, 0.0))
         outcome = jnp.where(returned, RETURNED, jnp.where(hit, HIT, MISSED)).astype(jnp.int32)
 
@@ -250,7 +252,7 @@ class RallySimulator:
             robot_peak=robot.sums.peak_velocity,
             seconds=steps + jnp.where(returned, met.incoming.seconds, 0.0),
         )
-        return after, result, state.touches + hit
+        return after, result, state.touches + hit.astype(jnp.int32)
 
     def _robot(self, key, policy: Policy, model: SimModel, ball: BallState, start):
         """The robot's part of one episode: its last state."""
@@ -305,7 +307,9 @@ class RallySimulator:
             dummy, playing = state.dummy, done < rallies
             by_hand = jax.random.uniform(key_dummy, dummy.shape) < BY_HAND
             over = playing & (dummy | (after.touches == 1))
-            why = jnp.where(dummy, jnp.where(by_hand, End.DUMMY_BY_HAND, End.DUMMY_WITH_PADDLE), shot.end)
+            why = jnp.where(
+                dummy, jnp.where(by_hand, End.DUMMY_BY_HAND, End.DUMMY_WITH_PADDLE), shot.end.astype(jnp.int32)
+            )
             touches = jnp.where(dummy, jnp.where(by_hand, 0, 1), touches)
             seconds = seconds + jnp.where(dummy, 0.0, shot.seconds)
             row = jnp.where(over, done, rallies)  # a row past the end: nothing is written
@@ -314,7 +318,14 @@ class RallySimulator:
             spent = spent.at[row, lane].set(seconds, mode="drop")
             log = _logged(log, done, shot, playing & ~dummy, lane)
             state = replace(jax.tree.map(partial(jnp.where, dummy), state, after), dummy=after.dummy & ~dummy)
-            return turn + 1, state, done + over, jnp.where(over, 0.0, seconds), (length, end, spent), log
+            return (
+                turn + 1,
+                state,
+                done + over.astype(jnp.int32),
+                jnp.where(over, 0.0, seconds),
+                (length, end, spent),
+                log,
+            )
 
         carry = (jnp.int32(0), state, jnp.zeros(lanes, jnp.int32), jnp.zeros(lanes), table, log)
         _, state, _, _, (length, end, spent), log = jax.lax.while_loop(unfinished, advance, carry)
@@ -338,5 +349,5 @@ def _logged(log: BallLog, rally, shot: ShotResult, keep, lane) -> BallLog:
         hit=put(log.hit, shot.outcome != MISSED),
         returned=put(log.returned, shot.outcome == RETURNED),
         return_landing=put(log.return_landing, shot.return_landing),
-        count=log.count + keep,
+        count=log.count + keep.astype(jnp.int32),
     )

@@ -100,7 +100,7 @@ def chain_from_model(model: mujoco.MjModel) -> Chain:
             at_zero = _axis_rotation(axis, -ref)
             pos, rot = pos + rot @ (anchor - at_zero @ anchor), rot @ at_zero
         mass, com, inertia, gravcomp = inertias[joint]
-        dof = int(model.jnt_dofadr[joint])
+        dof, actuator = int(model.jnt_dofadr[joint]), actuator_of.get(joint)
         links.append(
             Link(
                 name=object_name(model, mujoco.mjtObj.mjOBJ_JOINT, joint),
@@ -108,14 +108,15 @@ def chain_from_model(model: mujoco.MjModel) -> Chain:
                 axis=_floats(axis),
                 anchor=_floats(anchor),
                 pos=_floats(pos),
-                rot=tuple(map(_floats, rot)),
+                rot=_rows(rot),
                 mass=mass,
                 com=_floats(com),
-                inertia=tuple(map(_floats, inertia)),
+                inertia=_rows(inertia),
                 armature=float(model.dof_armature[dof]),
                 damping=float(model.dof_damping[dof]),
                 gravcomp=gravcomp,
-                **_actuation(model, actuator_of.get(joint)),
+                ctrl_index=-1 if actuator is None else actuator,
+                **_actuation(model, actuator),
             )
         )
     return Chain(tuple(links), int(model.nu), _floats(model.opt.gravity), float(model.opt.timestep))
@@ -172,14 +173,13 @@ def _merged_inertias(model: mujoco.MjModel, frames: list[Frame]) -> list[tuple[f
     return merged
 
 
-def _actuation(model: mujoco.MjModel, actuator: int | None) -> dict[str, float | int]:
+def _actuation(model: mujoco.MjModel, actuator: int | None) -> dict[str, float]:
     if actuator is None:
-        return dict(ctrl_index=-1, gain=0.0, bias0=0.0, bias_qpos=0.0, bias_qvel=0.0)
+        return dict(gain=0.0, bias0=0.0, bias_qpos=0.0, bias_qvel=0.0)
     gear = float(model.actuator_gear[actuator, 0])
     affine = model.actuator_biastype[actuator] == _AFFINE_BIAS
     bias = [float(b) for b in model.actuator_biasprm[actuator, :3]] if affine else [0.0, 0.0, 0.0]
     return dict(
-        ctrl_index=actuator,
         gain=gear * float(model.actuator_gainprm[actuator, 0]),
         bias0=gear * bias[0],
         bias_qpos=gear**2 * bias[1],
@@ -187,12 +187,18 @@ def _actuation(model: mujoco.MjModel, actuator: int | None) -> dict[str, float |
     )
 
 
-def _floats(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(v) for v in values)
+def _floats(values: np.ndarray) -> Vector:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def _rows(values: np.ndarray) -> Matrix:
+    x, y, z = (_floats(row) for row in values)
+    return x, y, z
 
 
 def _snap(matrix: np.ndarray) -> np.ndarray:
-    """Rounds the last bit off -1, 0 and 1, so that engines can leave out multiplications by them."""
+    """Rounds the last bit off -1, 0 and 1, so that engines can omit multiplications by them."""
     nearest = np.round(matrix)
     return np.where(np.abs(matrix - nearest) < 1e-15, nearest + 0.0, matrix)
 

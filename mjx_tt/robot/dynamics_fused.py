@@ -15,7 +15,7 @@ import numpy as np
 
 from mjx_tt.robot import scalar_algebra as f
 from mjx_tt.robot.chain import Chain, Link
-from mjx_tt.robot.kinematics import centred_on_anchors, joint_transforms, stack
+from mjx_tt.robot.kinematics import Joints, centred_on_anchors, joint_transforms, stack
 
 
 class FusedEngine:
@@ -29,7 +29,7 @@ class FusedEngine:
         gravcomp = {link.gravcomp for link in chain.links if link.mass > 0.0}
         self._uniform_gravcomp = gravcomp.pop() if len(gravcomp) == 1 else None
 
-    def step(self, qpos, qvel, ctrl):
+    def step(self, qpos: Joints, qvel: Joints, ctrl: Joints) -> tuple[Joints, Joints]:
         """One step. qpos [m]/[rad], qvel [m/s]/[rad/s], ctrl in the actuators' units: each (n, ...)."""
         h = self.timestep
         acceleration = _articulated_body(self._chain, h, self._uniform_gravcomp, qpos, qvel, ctrl)
@@ -37,28 +37,54 @@ class FusedEngine:
         return qpos + h * qvel, qvel
 
 
-def _spatial_inertia(link: Link):
+def _spatial_inertia(link: Link) -> tuple[f.Matrix, f.Matrix, f.Matrix]:
     """Rotational part about the link's origin, coupling m [c]x, mass: blocks of the 6 x 6 inertia as constants."""
     c = np.array(f.skew(link.com), float)
     about_origin = np.array(link.inertia) + link.mass * c @ c.T
-    return f.constants(about_origin), f.constants(link.mass * c), f.constants(link.mass * np.eye(3))
+    return f.matrix(about_origin), f.matrix(link.mass * c), f.matrix(link.mass * np.eye(3))
 
 
-def _joint_force(link: Link, i: int, qpos, qvel, ctrl):
+def _joint_force(link: Link, i: int, qpos: Joints, qvel: Joints, ctrl: Joints) -> f.Scalar:
     force = f.mul(link.bias_qvel - link.damping, qvel[i])
     if link.ctrl_index >= 0:
         force = f.add(force, f.mul(link.gain, ctrl[link.ctrl_index]))
     return f.add(f.add(force, f.mul(link.bias_qpos, qpos[i])), link.bias0)
 
 
-def _articulated_body(chain: Chain, h: float, uniform_gravcomp: float | None, qpos, qvel, ctrl):
+# Symmetric matrices, each entry computed once.
+
+
+def _less_outer(m: f.Matrix, a: f.Vector, b: f.Vector) -> f.Matrix:
+    """m - a b^T where that is symmetric."""
+    return f.mirror(lambda r, c: f.sub(m[r][c], f.mul(a[r], b[c])))
+
+
+def _sum(a: f.Matrix, b: f.Matrix) -> f.Matrix:
+    return f.mirror(lambda r, c: f.add(a[r][c], b[r][c]))
+
+
+def _shifted(A: f.Matrix, PBt: f.Matrix, PC: f.Matrix, P: f.Matrix) -> f.Matrix:
+    """A + P B^T + (P B^T)^T + P C P^T."""
+    return f.mirror(lambda r, c: f.add(A[r][c], f.add(f.add(PBt[r][c], PBt[c][r]), f.dot(PC[r], P[c]))))
+
+
+def _articulated_body(
+    chain: Chain, h: float, uniform_gravcomp: float | None, qpos: Joints, qvel: Joints, ctrl: Joints
+) -> list[f.Scalar]:
     links, n = chain.links, len(chain.links)
-    A, B, C = [None] * n, [None] * n, [None] * n  # articulated inertia: rotational, coupling, translational blocks
-    pw, pv = [None] * n, [None] * n  # bias force: moment, force
-    cw, cv = [None] * n, [None] * n  # velocity-product acceleration
-    rot, pos = zip(*joint_transforms(chain, qpos))
-    w_parent, v_parent = f.ZERO3, f.ZERO3
-    gravity = chain.gravity
+    # By joint: articulated inertia (rotational, coupling and translational blocks), bias force (moment, force),
+    # velocity-product acceleration.
+    A: dict[int, f.Matrix] = {}
+    B: dict[int, f.Matrix] = {}
+    C: dict[int, f.Matrix] = {}
+    pw: dict[int, f.Vector] = {}
+    pv: dict[int, f.Vector] = {}
+    cw: dict[int, f.Vector] = {}
+    cv: dict[int, f.Vector] = {}
+    rot, pos = zip(*joint_transforms(chain, qpos), strict=True)
+    w_parent: f.Vector = f.ZERO3
+    v_parent: f.Vector = f.ZERO3
+    gravity: f.Vector = chain.gravity
 
     for i, link in enumerate(links):
         to_link = f.transpose(rot[i])
@@ -85,7 +111,9 @@ def _articulated_body(chain: Chain, h: float, uniform_gravcomp: float | None, qp
         w, v, gravity = f.materialise((w, v, gravity))
         w_parent, v_parent = w, v
 
-    U, inverse_d, u = [None] * n, [None] * n, [None] * n
+    U: dict[int, tuple[f.Vector, f.Vector]] = {}
+    inverse_d: dict[int, f.Scalar] = {}
+    u: dict[int, f.Scalar] = {}
     for i in reversed(range(n)):
         link = links[i]
         if link.slide:
@@ -100,9 +128,9 @@ def _articulated_body(chain: Chain, h: float, uniform_gravcomp: float | None, qp
         if i == 0:
             break
         Uwd, Uvd = f.vscale(Uw, inverse_d[i]), f.vscale(Uv, inverse_d[i])
-        Aa = f.mirror(lambda r, c: f.sub(A[i][r][c], f.mul(Uwd[r], Uw[c])))
+        Aa = _less_outer(A[i], Uwd, Uw)
         Ba = f.msub(B[i], f.outer(Uwd, Uv))
-        Ca = f.mirror(lambda r, c: f.sub(C[i][r][c], f.mul(Uvd[r], Uv[c])))
+        Ca = _less_outer(C[i], Uvd, Uv)
         force_w = f.vadd(pw[i], f.vadd(f.vadd(f.matvec(Aa, cw[i]), f.matvec(Ba, cv[i])), f.vscale(Uwd, u[i])))
         force_v = f.vadd(
             pv[i], f.vadd(f.vadd(f.matvec(f.transpose(Ba), cw[i]), f.matvec(Ca, cv[i])), f.vscale(Uvd, u[i]))
@@ -113,10 +141,10 @@ def _articulated_body(chain: Chain, h: float, uniform_gravcomp: float | None, qp
         A2, C2 = f.congruence(R, Aa), f.congruence(R, Ca)
         B2 = f.matmul(f.matmul(R, Ba), f.transpose(R))
         PC, PBt = f.matmul(P, C2), f.matmul(P, f.transpose(B2))
-        shifted = f.mirror(lambda r, c: f.add(A2[r][c], f.add(f.add(PBt[r][c], PBt[c][r]), f.dot(PC[r], P[c]))))
-        A[i - 1] = f.mirror(lambda r, c: f.add(A[i - 1][r][c], shifted[r][c]))
+        shifted = _shifted(A2, PBt, PC, P)
+        A[i - 1] = _sum(A[i - 1], shifted)
         B[i - 1] = f.madd(B[i - 1], f.madd(B2, PC))
-        C[i - 1] = f.mirror(lambda r, c: f.add(C[i - 1][r][c], C2[r][c]))
+        C[i - 1] = _sum(C[i - 1], C2)
         moved = f.matvec(R, force_v)
         pw[i - 1] = f.vadd(pw[i - 1], f.vadd(f.matvec(R, force_w), f.cross(pos[i], moved)))
         pv[i - 1] = f.vadd(pv[i - 1], moved)
@@ -124,9 +152,9 @@ def _articulated_body(chain: Chain, h: float, uniform_gravcomp: float | None, qp
             (A[i - 1], B[i - 1], C[i - 1], pw[i - 1], pv[i - 1])
         )
 
-    aw = f.ZERO3
-    av = f.ZERO3 if uniform_gravcomp is None else f.vscale(gravity, -(1.0 - uniform_gravcomp))
-    qacc = []
+    aw: f.Vector = f.ZERO3
+    av: f.Vector = f.ZERO3 if uniform_gravcomp is None else f.vscale(gravity, -(1.0 - uniform_gravcomp))
+    qacc: list[f.Scalar] = []
     for i, link in enumerate(links):
         to_link = f.transpose(rot[i])
         a_w = f.vadd(f.matvec(to_link, aw), cw[i])

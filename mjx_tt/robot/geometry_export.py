@@ -15,6 +15,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ballmodel.contact import TABLE
 from mjx_tt.robot import model as robot
@@ -104,7 +105,7 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _numbers(values) -> list:
+def _numbers(values: ArrayLike) -> list:
     """Nested lists, without rounding errors of rotations around 0."""
     return (np.round(np.asarray(values, float), 12) + 0.0).tolist()
 

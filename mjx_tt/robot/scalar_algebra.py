@@ -2,24 +2,36 @@
 
 A scalar is a Python float (a constant of the robot) or an array over the batch. Products with 0 and 1 and sums with 0
 never reach the compiler, which leaves a serial chain's equations of motion with a third of their operations.
-Vectors are 3-tuples of scalars, matrices 3-tuples of rows; ``Sym`` stores the six entries of a symmetric matrix.
+Vectors are 3-tuples of scalars, matrices 3-tuples of rows.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeAlias, TypeVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
-ZERO3 = (0.0, 0.0, 0.0)
-EYE3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+Scalar: TypeAlias = float | jax.Array
+Vector: TypeAlias = tuple[Scalar, Scalar, Scalar]
+Matrix: TypeAlias = tuple[Vector, Vector, Vector]
+Constant: TypeAlias = tuple[float, float, float]
+ConstantMatrix: TypeAlias = tuple[Constant, Constant, Constant]
+T = TypeVar("T")
+
+ZERO3: Constant = (0.0, 0.0, 0.0)
+EYE3: ConstantMatrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def is_const(a, value: float) -> bool:
+def is_const(a: Scalar, value: float) -> bool:
     return isinstance(a, float) and a == value
 
 
-def add(a, b):
+def add(a: Scalar, b: Scalar) -> Scalar:
     if is_const(a, 0.0):
         return b
     if is_const(b, 0.0):
@@ -27,11 +39,11 @@ def add(a, b):
     return a + b
 
 
-def neg(a):
+def neg(a: Scalar) -> Scalar:
     return 0.0 if is_const(a, 0.0) else -a
 
 
-def sub(a, b):
+def sub(a: Scalar, b: Scalar) -> Scalar:
     if is_const(b, 0.0):
         return a
     if is_const(a, 0.0):
@@ -39,7 +51,7 @@ def sub(a, b):
     return a - b
 
 
-def mul(a, b):
+def mul(a: Scalar, b: Scalar) -> Scalar:
     if is_const(a, 0.0) or is_const(b, 0.0):
         return 0.0
     for x, y in ((a, b), (b, a)):
@@ -50,23 +62,23 @@ def mul(a, b):
     return a * b
 
 
-def vadd(a, b):
-    return tuple(add(x, y) for x, y in zip(a, b))
+def vadd(a: Vector, b: Vector) -> Vector:
+    return add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2])
 
 
-def vsub(a, b):
-    return tuple(sub(x, y) for x, y in zip(a, b))
+def vsub(a: Vector, b: Vector) -> Vector:
+    return sub(a[0], b[0]), sub(a[1], b[1]), sub(a[2], b[2])
 
 
-def vscale(a, s):
-    return tuple(mul(x, s) for x in a)
+def vscale(a: Vector, s: Scalar) -> Vector:
+    return mul(a[0], s), mul(a[1], s), mul(a[2], s)
 
 
-def dot(a, b):
+def dot(a: Vector, b: Vector) -> Scalar:
     return add(add(mul(a[0], b[0]), mul(a[1], b[1])), mul(a[2], b[2]))
 
 
-def cross(a, b):
+def cross(a: Vector, b: Vector) -> Vector:
     return (
         sub(mul(a[1], b[2]), mul(a[2], b[1])),
         sub(mul(a[2], b[0]), mul(a[0], b[2])),
@@ -74,73 +86,81 @@ def cross(a, b):
     )
 
 
-def matvec(m, v):
-    return tuple(dot(row, v) for row in m)
+def matvec(m: Matrix, v: Vector) -> Vector:
+    return dot(m[0], v), dot(m[1], v), dot(m[2], v)
 
 
-def transpose(m):
-    return tuple(zip(*m))
+def transpose(m: Matrix) -> Matrix:
+    x, y, z = zip(*m, strict=True)
+    return x, y, z
 
 
-def matmul(a, b):
-    columns = transpose(b)
-    return tuple(tuple(dot(row, column) for column in columns) for row in a)
+def matmul(a: Matrix, b: Matrix) -> Matrix:
+    x, y, z = transpose(b)
+
+    def times(row: Vector) -> Vector:
+        return dot(row, x), dot(row, y), dot(row, z)
+
+    return times(a[0]), times(a[1]), times(a[2])
 
 
-def madd(a, b):
-    return tuple(vadd(x, y) for x, y in zip(a, b))
+def madd(a: Matrix, b: Matrix) -> Matrix:
+    return vadd(a[0], b[0]), vadd(a[1], b[1]), vadd(a[2], b[2])
 
 
-def msub(a, b):
-    return tuple(vsub(x, y) for x, y in zip(a, b))
+def msub(a: Matrix, b: Matrix) -> Matrix:
+    return vsub(a[0], b[0]), vsub(a[1], b[1]), vsub(a[2], b[2])
 
 
-def outer(a, b):
-    return tuple(vscale(b, x) for x in a)
+def outer(a: Vector, b: Vector) -> Matrix:
+    return vscale(b, a[0]), vscale(b, a[1]), vscale(b, a[2])
 
 
-def skew(p):
+def skew(p: Vector) -> Matrix:
     """The matrix of p x (.)."""
     return ((0.0, neg(p[2]), p[1]), (p[2], 0.0, neg(p[0])), (neg(p[1]), p[0], 0.0))
 
 
-def mirror(upper) -> tuple:
+def mirror(upper: Callable[[int, int], Scalar]) -> Matrix:
     """Full symmetric matrix from a function (i, j) -> entry that is called for i <= j only."""
     entries = {(i, j): upper(i, j) for i in range(3) for j in range(i, 3)}
-    return tuple(tuple(entries[min(i, j), max(i, j)] for j in range(3)) for i in range(3))
+    e = entries
+    return (e[0, 0], e[0, 1], e[0, 2]), (e[0, 1], e[1, 1], e[1, 2]), (e[0, 2], e[1, 2], e[2, 2])
 
 
-def congruence(r, a):
+def congruence(r: Matrix, a: Matrix) -> Matrix:
     """R A R^T of a symmetric A, each entry computed once."""
     ra = matmul(r, a)
     return mirror(lambda i, j: dot(ra[i], r[j]))
 
 
-def axis_rotation(axis, cos, sin):
+def axis_rotation(axis: Constant, cos: Scalar, sin: Scalar) -> Matrix:
     """Rotation about a constant unit axis: Rodrigues' formula, exact zeros for the coordinate axes."""
     versine = 1.0 - cos
     k = skew(axis)
     kk = np.array(k) @ np.array(k)
     kk = np.where(np.abs(kk) < 1e-15, 0.0, kk)
 
-    def entry(i, j):
+    def entry(i: int, j: int) -> Scalar:
         constant = 1.0 if i == j else 0.0
         # For a coordinate axis 1 + (1 - c)(-1) is c itself: no rounding, no work.
         even = cos if constant and kk[i, j] == -1.0 else add(constant, mul(float(kk[i, j]), versine))
         return add(even, mul(k[i][j], sin))
 
-    return tuple(tuple(entry(i, j) for j in range(3)) for i in range(3))
+    x, y, z = ((entry(i, 0), entry(i, 1), entry(i, 2)) for i in range(3))
+    return x, y, z
 
 
-def are_signs(*nested) -> bool:
-    """Whether nothing but -1, 0 and 1 stands in nested floats: products with them cost nothing."""
+def are_signs(*nested: Vector | Matrix) -> bool:
+    """True for nested floats that are all -1, 0 or 1: products with them cost nothing."""
     return all(entry in (-1.0, 0.0, 1.0) for entry in jax.tree.leaves(nested))
 
 
-def sin_cos(angle):
+def sin_cos(angle: Float[jax.Array, "*batch"]) -> tuple[Float[jax.Array, "*batch"], Float[jax.Array, "*batch"]]:
     """Sine and cosine of angles [rad], |angle| < 8192, to rounding.
 
-    In float32 both together by Cephes' polynomials (Moshier, sinf.c), four times as fast as XLA's two general functions.
+    In float32 both together by Cephes' polynomials (Moshier, sinf.c), four times as fast as XLA's two general
+    functions.
     """
     if angle.dtype != jnp.float32:
         return jnp.sin(angle), jnp.cos(angle)
@@ -157,13 +177,19 @@ def sin_cos(angle):
     return jnp.where((turn & 2) == 2, -sin, sin), jnp.where(((turn + 1) & 2) == 2, -cos, cos)
 
 
-def constants(values):
-    """Nested floats of a NumPy array."""
-    values = np.asarray(values, float)
-    return tuple(constants(v) for v in values) if values.ndim else float(values)
+def vector(values: ArrayLike) -> Constant:
+    """Three numbers as floats."""
+    x, y, z = np.asarray(values, float)
+    return float(x), float(y), float(z)
 
 
-def materialise(tree):
+def matrix(values: ArrayLike) -> ConstantMatrix:
+    """3 x 3 numbers as nested floats."""
+    x, y, z = np.asarray(values, float)
+    return vector(x), vector(y), vector(z)
+
+
+def materialise(tree: T) -> T:
     """The same nested scalars, with every array of it computed once and stored.
 
     Left alone, the compiler fuses a whole recursion into each of its results and computes shared terms again for every
@@ -172,6 +198,6 @@ def materialise(tree):
     leaves, structure = jax.tree.flatten(tree)
     arrays = [i for i, leaf in enumerate(leaves) if not isinstance(leaf, float)]
     if arrays:
-        for i, stored in zip(arrays, jax.lax.optimization_barrier([leaves[i] for i in arrays])):
+        for i, stored in zip(arrays, jax.lax.optimization_barrier([leaves[i] for i in arrays]), strict=True):
             leaves[i] = stored
     return jax.tree.unflatten(structure, leaves)

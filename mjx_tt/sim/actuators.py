@@ -1,4 +1,6 @@
-"""What a joint's drive makes of its velocity command u before the simulated servo follows it, and of its position then.
+"""Actuator model of a joint: delay, dead band, friction, gain, saturation, first-order lag, backlash.
+
+The velocity command u passes steps 1 to 7 before the simulated servo follows it; 9 and 10 act on the position:
 
     1. u is held for a control period and arrives ``action_delay`` later than the joint's drawn latency says
     2. dead band: 0 where |u| < deadband
@@ -22,6 +24,8 @@ from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
 
 from ballmodel.partial_params import optional, value_or
 from robot_io.contract import JOINT_NAMES, LIMITS
@@ -40,16 +44,22 @@ class JointDrive:
     Units are those of the joint: [m] for the gantry's axes, [rad] for the arm's joints.
     """
 
-    action_delay: jax.Array | float | None = optional(0.0)  # [s] more than latency.abb_action or festo_action draws
-    observation_delay: jax.Array | float | None = optional(0.0)  # [s] more than latency.*_observation draws
-    lag: jax.Array | float | None = optional(0.0)  # [s]
-    velocity_gain: jax.Array | float | None = optional(1.0)  # reached over commanded, beside actuation.velocity_gain
-    joint_offset: jax.Array | float | None = optional(0.0)  # [m], [rad] measured less true position
-    velocity_limit: jax.Array | float | None = optional(NO_VELOCITY_LIMIT)  # [m/s], [rad/s]
-    acceleration_limit: jax.Array | float | None = optional(NO_ACCELERATION_LIMIT)  # [m/s^2], [rad/s^2]
-    backlash: jax.Array | float | None = optional(0.0)  # [m], [rad] width of the play
-    coulomb_friction: jax.Array | float | None = optional(0.0)  # [m/s], [rad/s] that friction costs
-    deadband: jax.Array | float | None = optional(0.0)  # [m/s], [rad/s]
+    action_delay: Float[Array, "*#batch"] | float | None = optional(
+        0.0
+    )  # [s] more than latency.abb_action or festo_action draws
+    observation_delay: Float[Array, "*#batch"] | float | None = optional(
+        0.0
+    )  # [s] more than latency.*_observation draws
+    lag: Float[Array, "*#batch"] | float | None = optional(0.0)  # [s]
+    velocity_gain: Float[Array, "*#batch"] | float | None = optional(
+        1.0
+    )  # reached over commanded, beside actuation.velocity_gain
+    joint_offset: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m], [rad] measured less true position
+    velocity_limit: Float[Array, "*#batch"] | float | None = optional(NO_VELOCITY_LIMIT)  # [m/s], [rad/s]
+    acceleration_limit: Float[Array, "*#batch"] | float | None = optional(NO_ACCELERATION_LIMIT)  # [m/s^2], [rad/s^2]
+    backlash: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m], [rad] width of the play
+    coulomb_friction: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m/s], [rad/s] that friction costs
+    deadband: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m/s], [rad/s]
 
 
 EFFECTS = tuple(f.name for f in dataclasses.fields(JointDrive))
@@ -75,37 +85,37 @@ class DriveParams:
 class Drives:
     """The same by effect, each (8, ...), None where no joint has it: ready for the loop."""
 
-    action_delay: jax.Array | None
-    observation_delay: jax.Array | None
-    lag: jax.Array | None
-    velocity_gain: jax.Array | None
-    joint_offset: jax.Array | None
-    velocity_limit: jax.Array | None
-    acceleration_limit: jax.Array | None
-    backlash: jax.Array | None
-    coulomb_friction: jax.Array | None
-    deadband: jax.Array | None
+    action_delay: Float[Array, "8 *batch"] | None
+    observation_delay: Float[Array, "8 *batch"] | None
+    lag: Float[Array, "8 *batch"] | None
+    velocity_gain: Float[Array, "8 *batch"] | None
+    joint_offset: Float[Array, "8 *batch"] | None
+    velocity_limit: Float[Array, "8 *batch"] | None
+    acceleration_limit: Float[Array, "8 *batch"] | None
+    backlash: Float[Array, "8 *batch"] | None
+    coulomb_friction: Float[Array, "8 *batch"] | None
+    deadband: Float[Array, "8 *batch"] | None
 
     @property
     def follows(self) -> bool:
-        """Whether the velocity needs time to follow its command."""
+        """True where the velocity needs time to follow its command."""
         return self.lag is not None or self.acceleration_limit is not None
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DriveState:
-    """What the drives remember; None where nothing has to be."""
+    """State of the drives; None where an effect has none."""
 
-    velocity: jax.Array | None  # (8, ...) [m/s], [rad/s] v of steps 6 and 7
-    output: jax.Array | None  # (8, ...) [m], [rad] position behind the play
+    velocity: Float[Array, "8 *batch"] | None  # [m/s], [rad/s] v of steps 6 and 7
+    output: Float[Array, "8 *batch"] | None  # [m], [rad] position behind the play
 
 
-def by_effect(params: DriveParams | None, shape: tuple[int, ...], dtype) -> Drives:
+def by_effect(params: DriveParams | None, shape: tuple[int, ...], dtype: jnp.dtype) -> Drives:
     """The drives' numbers as arrays (8, *shape)."""
-    nominal = {f.name: f.default for f in dataclasses.fields(JointDrive)}
+    nominal = dataclasses.asdict(JointDrive())
 
-    def column(effect: str):
+    def column(effect: str) -> Array | None:
         values = [getattr(getattr(params, joint), effect) for joint in JOINT_NAMES] if params is not None else [None]
         if all(value is None for value in values):
             return None
@@ -114,12 +124,12 @@ def by_effect(params: DriveParams | None, shape: tuple[int, ...], dtype) -> Driv
     return Drives(**{effect: column(effect) for effect in EFFECTS})
 
 
-def at_rest(drives: Drives, qpos) -> DriveState:
+def at_rest(drives: Drives, qpos: Float[Array, "8 *batch"]) -> DriveState:
     """The drives of a robot that stands at qpos (8, ...), in the middle of every play."""
     return DriveState(jnp.zeros_like(qpos) if drives.follows else None, qpos if drives.backlash is not None else None)
 
 
-def reachable(drives: Drives, command):
+def reachable(drives: Drives, command: Float[Array, "8 *batch"]) -> Float[Array, "8 *batch"]:
     """Steps 2 to 5: the velocity (8, ...) that a delayed command (8, ...) asks of the drive in the end."""
     u = command
     if drives.deadband is not None:
@@ -133,15 +143,17 @@ def reachable(drives: Drives, command):
     return u
 
 
-def follow(drives: Drives, state: DriveState, u, timestep: float) -> tuple[jax.Array, DriveState]:
+def follow(
+    drives: Drives, state: DriveState, u: Float[Array, "8 *batch"], timestep: float
+) -> tuple[Float[Array, "8 *batch"], DriveState]:
     """Steps 6 and 7 over one substep [s] of constant u (8, ...): the mean velocity in it, and the state at its end.
 
     As long as the lag asks for more than the acceleration limit a, v moves at a; that ends at |u - v| = a lag, and from
     there on the difference decays exponentially. The servo gets the mean, with which its way is exact.
     """
-    if not drives.follows:
-        return u, state
     v = state.velocity
+    if v is None:
+        return u, state
     lag = jnp.zeros_like(v) if drives.lag is None else jnp.maximum(drives.lag, 0.0)
     gap = u - v
     if drives.acceleration_limit is None:
@@ -157,12 +169,18 @@ def follow(drives: Drives, state: DriveState, u, timestep: float) -> tuple[jax.A
     return way / timestep, DriveState(u - left * decay, state.output)
 
 
-def carry(drives: Drives, state: DriveState, qpos, qvel, timestep: float):
+def carry(
+    drives: Drives,
+    state: DriveState,
+    qpos: Float[Array, "8 *batch"],
+    qvel: Float[Array, "8 *batch"],
+    timestep: float,
+) -> tuple[Float[Array, "8 *batch"], Float[Array, "8 *batch"], DriveState]:
     """Step 9 over one substep: position and velocity (8, ...) of what the joints carry, and the state.
 
     qpos, qvel: of the joints at the substep's end.
     """
-    if drives.backlash is None:
+    if drives.backlash is None or state.output is None:
         return qpos, qvel, state
     half = 0.5 * drives.backlash
     output = jnp.clip(state.output, qpos - half, qpos + half)

@@ -1,4 +1,5 @@
-"""What a parameter of a model file may be: wide enough for everything measured, too narrow for another unit or a typing slip.
+"""Bounds of the parameters of a model file: wide enough for everything measured, too narrow for another unit or a
+typing slip.
 
 Nothing else is limited: programs may set what they like.
 """

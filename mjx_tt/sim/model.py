@@ -15,21 +15,24 @@ import dataclasses
 import difflib
 import math
 import os
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import yaml
+from jax import Array
+from jaxtyping import Float, Key
 
-from ballmodel import constants as c
 from ballmodel.aerodynamics import INTEGRATORS
 from ballmodel.flight import BallParams, ball_params
 from ballmodel.io import yaml as yaml_file
 from ballmodel.io.atomic_files import replacing
-from ballmodel.partial_params import optional
 from mjx_tt.sim import bounds
 from mjx_tt.sim.actuators import DriveParams
+from mjx_tt.sim.sensors import SensingParams as SensingParams
 
 
 @jax.tree_util.register_dataclass
@@ -41,16 +44,16 @@ class LatencyParams:
     meant: a variance would have unit ms^2.
     """
 
-    ball_observation: jax.Array | float = 0.040
-    ball_observation_std: jax.Array | float = 0.0082
-    abb_observation: jax.Array | float = 0.029
-    abb_observation_std: jax.Array | float = 0.0082
-    festo_observation: jax.Array | float = 0.033
-    festo_observation_std: jax.Array | float = 0.009
-    abb_action: jax.Array | float = 0.071
-    abb_action_std: jax.Array | float = 0.0057
-    festo_action: jax.Array | float = 0.0645
-    festo_action_std: jax.Array | float = 0.0115
+    ball_observation: Float[Array, "*#batch"] | float = 0.040
+    ball_observation_std: Float[Array, "*#batch"] | float = 0.0082
+    abb_observation: Float[Array, "*#batch"] | float = 0.029
+    abb_observation_std: Float[Array, "*#batch"] | float = 0.0082
+    festo_observation: Float[Array, "*#batch"] | float = 0.033
+    festo_observation_std: Float[Array, "*#batch"] | float = 0.009
+    abb_action: Float[Array, "*#batch"] | float = 0.071
+    abb_action_std: Float[Array, "*#batch"] | float = 0.0057
+    festo_action: Float[Array, "*#batch"] | float = 0.0645
+    festo_action_std: Float[Array, "*#batch"] | float = 0.0115
 
 
 LATENCIES = ("ball_observation", "abb_observation", "festo_observation", "abb_action", "festo_action")
@@ -58,37 +61,10 @@ LATENCIES = ("ball_observation", "abb_observation", "festo_observation", "abb_ac
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class SensingParams:
-    """What the ball tracker makes of the truth.
-
-    measured = camera_scale R (1 + camera_distortion |p|^2) p + offset + noise,   R = Rz Ry Rx
-    with p the ball's position, delayed by ``latency.ball_observation`` times ``clock_rate`` and, with ``smoothing``,
-    filtered: df/dt = (p - f) / smoothing. (Filter and camera commute but for the distortion's change along the flight;
-    the noise is added behind both.)
-    """
-
-    # Half width of the uniform noise on each coordinate, per control step [m]: "2 x the diameter" is its whole width.
-    ball_noise: jax.Array | float = c.BALL_DIAMETER
-    ball_offset_x: jax.Array | float = 0.0  # [m], calibration bias
-    ball_offset_y: jax.Array | float = 0.0
-    ball_offset_z: jax.Array | float = 0.0
-    camera_scale: jax.Array | float | None = optional(1.0)
-    camera_rotation_x: jax.Array | float | None = optional(0.0)  # [rad] about the table frame's axes
-    camera_rotation_y: jax.Array | float | None = optional(0.0)
-    camera_rotation_z: jax.Array | float | None = optional(0.0)
-    camera_distortion: jax.Array | float | None = optional(0.0)  # [1/m^2]
-    # Measured over true time. A policy reads no clock: all that this can do to it is to stretch the tracker's latency.
-    clock_rate: jax.Array | float | None = optional(1.0)
-    smoothing: jax.Array | float | None = optional(0.0)  # [s] time constant of the tracker's filter
-    jitter: jax.Array | float | None = optional(0.0)  # [s] deviation of the moment of each measurement, Gaussian
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
 class ActuationParams:
-    """What the drives make of a velocity command before the servo of the MJCF follows it."""
+    """All drives alike: gain of the velocity command before the servo of the MJCF follows it."""
 
-    velocity_gain: jax.Array | float = 1.0  # reached over commanded velocity
+    velocity_gain: Float[Array, "*#batch"] | float = 1.0  # reached over commanded velocity
 
 
 @jax.tree_util.register_dataclass
@@ -99,16 +75,16 @@ class BallSpinParams:
     The pool of balls is chosen without spin: those that spin much need not land where their distribution says.
     """
 
-    mean_x: jax.Array | float = 0.0
-    mean_y: jax.Array | float = 0.0
-    mean_z: jax.Array | float = 0.0
-    std_x: jax.Array | float = 0.0
-    std_y: jax.Array | float = 0.0
-    std_z: jax.Array | float = 0.0
+    mean_x: Float[Array, "*#batch"] | float = 0.0
+    mean_y: Float[Array, "*#batch"] | float = 0.0
+    mean_z: Float[Array, "*#batch"] | float = 0.0
+    std_x: Float[Array, "*#batch"] | float = 0.0
+    std_y: Float[Array, "*#batch"] | float = 0.0
+    std_z: Float[Array, "*#batch"] | float = 0.0
 
 
 def _ball() -> BallParams:
-    # The paper's first-order step at 300 Hz moves landing points by up to 1.5 mm when it is halved; this one by 0.01 mm.
+    # The paper's first-order step at 300 Hz moves landing points by up to 1.5 mm when halved; this one by 0.01 mm.
     ball = ball_params()
     return dataclasses.replace(ball, flight=dataclasses.replace(ball.flight, integrator="midpoint"))
 
@@ -140,19 +116,19 @@ class Range:
 
 @dataclass(frozen=True)
 class ModelFile:
-    """What a model YAML holds."""
+    """Content of a model YAML."""
 
     model: SimModel
     randomise: tuple[Range, ...] = ()
     provenance: dict = field(default_factory=dict)
 
 
-def paths(node=None, prefix: str = "") -> dict[str, float | str]:
+def paths(node: Any = None, prefix: str = "") -> dict[str, Any]:
     """Every leaf of a SimModel by its dotted path; of the nominal model by default. Absent drives are nominal ones."""
     node = SimModel() if node is None else node
     if isinstance(node, SimModel) and node.drives is None:
         node = dataclasses.replace(node, drives=DriveParams())
-    leaves: dict[str, float | str] = {}
+    leaves: dict[str, Any] = {}
     for f in dataclasses.fields(node):
         value = getattr(node, f.name)
         if dataclasses.is_dataclass(value):
@@ -162,7 +138,7 @@ def paths(node=None, prefix: str = "") -> dict[str, float | str]:
     return leaves
 
 
-def with_values(model: SimModel, values: dict) -> SimModel:
+def with_values(model: SimModel, values: Mapping[str, Any]) -> SimModel:
     """The model with the leaves at the given dotted paths replaced; a path of the drives gives it drives.
 
     Raises ValueError for a path that does not exist.
@@ -176,7 +152,7 @@ def with_values(model: SimModel, values: dict) -> SimModel:
     return _with_values(model, values)
 
 
-def _with_values(node, values: dict):
+def _with_values(node: Any, values: Mapping[str, Any]) -> Any:
     changed = {}
     for f in dataclasses.fields(node):
         inner = {k.removeprefix(f.name + "."): v for k, v in values.items() if k.startswith(f.name + ".")}
@@ -187,21 +163,25 @@ def _with_values(node, values: dict):
     return dataclasses.replace(node, **changed)
 
 
-def draw(key, model: SimModel, randomise: tuple[Range, ...], shape: tuple[int, ...]) -> SimModel:
+def draw(key: Key[Array, ""], model: SimModel, randomise: tuple[Range, ...], shape: tuple[int, ...]) -> SimModel:
     """The model with every range drawn uniformly for a batch of ``shape`` episodes."""
     keys = jax.random.split(key, max(len(randomise), 1))
-    drawn = {r.path: jax.random.uniform(k, shape, minval=r.low, maxval=r.high) for r, k in zip(randomise, keys)}
+    drawn = {
+        r.path: jax.random.uniform(k, shape, minval=r.low, maxval=r.high) for r, k in zip(randomise, keys, strict=False)
+    }
     return with_values(model, drawn)
 
 
-def draw_latencies(key, latency: LatencyParams, shape: tuple[int, ...], longest: float):
+def draw_latencies(
+    key: Key[Array, ""], latency: LatencyParams, shape: tuple[int, ...], longest: Float[Array, "5 *#batch"] | float
+) -> Float[Array, "5 *batch"]:
     """Delays (5, *shape) [s] in the order of ``LATENCIES``, kept within [0, longest]."""
     mean = jnp.stack([jnp.broadcast_to(getattr(latency, n), shape) for n in LATENCIES])
     std = jnp.stack([jnp.broadcast_to(getattr(latency, f"{n}_std"), shape) for n in LATENCIES])
     return jnp.clip(mean + std * jax.random.normal(key, mean.shape), 0.0, longest)
 
 
-def draw_spin(key, spin: BallSpinParams, shape: tuple[int, ...]):
+def draw_spin(key: Key[Array, ""], spin: BallSpinParams, shape: tuple[int, ...]) -> Float[Array, "3 *batch"] | None:
     """Spin (3, *shape) [rad/s] of incoming balls; None where no ball spins, so that nothing is added."""
     values = dataclasses.astuple(spin)
     if all(isinstance(value, int | float) and value == 0.0 for value in values):
@@ -210,7 +190,7 @@ def draw_spin(key, spin: BallSpinParams, shape: tuple[int, ...]):
     return mean + std * jax.random.normal(key, mean.shape)
 
 
-def nearest(name: str, known) -> str:
+def nearest(name: str, known: Collection[str]) -> str:
     """', did you mean ...?' or the list of valid names."""
     close = difflib.get_close_matches(name, list(known), 1)
     return f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}"
@@ -222,7 +202,7 @@ def load(path: str | os.PathLike) -> ModelFile:
     return from_dict(data or {}, str(path))
 
 
-def from_dict(data, where: str) -> ModelFile:
+def from_dict(data: Any, where: str) -> ModelFile:
     """A ModelFile from parsed YAML; ``where`` names its origin in errors."""
     if not isinstance(data, dict):
         raise ValueError(f"{where}: a model is a mapping of parameter groups, got {type(data).__name__}")
@@ -270,7 +250,7 @@ def save(path: str | os.PathLike, file: ModelFile) -> None:
         temporary.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
 
 
-def _flatten(data: dict, where: str, known, prefix: str = ""):
+def _flatten(data: dict, where: str, known: Collection[str], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in data.items():
         path = f"{prefix}{key}"
         if isinstance(value, dict):
@@ -285,13 +265,13 @@ def _flatten(data: dict, where: str, known, prefix: str = ""):
             raise ValueError(f"{where}: unknown parameter {path!r}{hint}")
 
 
-def _mapping(value, where: str) -> dict:
+def _mapping(value: Any, where: str) -> dict:
     if value is not None and not isinstance(value, dict):
         raise ValueError(f"{where} = {value!r}, a mapping is needed")
     return value or {}
 
 
-def _number(value, where: str, path: str) -> float:
+def _number(value: Any, where: str, path: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError(f"{where} = {value!r}, a finite number is needed")
     low, high = bounds.of(path)

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int, UInt32
 
 
-def _hash(x):
+def _hash(x: Array) -> Array:
     x = x ^ (x >> 16)
     x = x * jnp.uint32(0x7FEB352D)
     x = x ^ (x >> 15)
@@ -18,7 +20,7 @@ def _hash(x):
     return x ^ (x >> 16)
 
 
-def symmetric_uniform(seed, counter, n: int):
+def symmetric_uniform(seed: UInt32[Array, "*batch"], counter: Int[Array, ""] | int, n: int) -> Float[Array, "n *batch"]:
     """Uniform numbers in (-1, 1), shape (n, ...), from per-episode seeds (...) uint32 and a step counter."""
     base = _hash(seed ^ (jnp.asarray(counter, jnp.uint32) * jnp.uint32(0x9E3779B9)))
     bits = [_hash(base + jnp.uint32((i + 1) * 0x85EBCA6B & 0xFFFFFFFF)) for i in range(n)]
@@ -26,7 +28,7 @@ def symmetric_uniform(seed, counter, n: int):
     return jnp.stack([((b >> 8).astype(jnp.float32) + 0.5) * (2.0**-23) - 1.0 for b in bits])
 
 
-def normal(seed, counter, skip: int):
+def normal(seed: UInt32[Array, "*batch"], counter: Int[Array, ""] | int, skip: int) -> Float[Array, "*batch"]:
     """A standard normal number per episode (...): the normal quantile of the uniform number after ``skip`` others."""
     u = symmetric_uniform(seed, counter, skip + 1)[skip]
     largest = 1.0 - 2.0**-24  # rounding may make it 1, whose normal number is infinite

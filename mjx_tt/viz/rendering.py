@@ -225,7 +225,7 @@ def _checked_path(path: str | os.PathLike, suffixes: tuple[str, ...]) -> Path:
 def _checked_array(name: str, values: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
     """values as float64; ValueError unless it has this shape, None standing for any length."""
     values = np.asarray(values, float)
-    if values.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, values.shape)):
+    if values.ndim != len(shape) or any(want not in (None, got) for want, got in zip(shape, values.shape, strict=True)):
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise ValueError(f"{name} needs the shape ({wanted}), got {values.shape}")
     return values

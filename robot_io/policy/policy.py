@@ -77,10 +77,10 @@ class Policy:
 def forward(policy: Policy, history: Any, xp: ModuleType = np) -> Any:
     """Actions (8, B) for raw histories (8, 11, B), oldest first, by NumPy or JAX (``xp``), in the inputs' precision."""
     parameters = policy.parameters
-    x = (history - policy.mean[:, None]) * policy.inv_std[:, None]
+    x = (history - policy.mean[None, :, None]) * policy.inv_std[None, :, None]
     for i, (dilation, gated) in enumerate(zip(contract.DILATIONS, contract.GATED, strict=True), start=1):
         older, newer = parameters[f"conv{i}/kernel"]
-        z = older.T @ x[:-dilation] + newer.T @ x[dilation:] + parameters[f"conv{i}/bias"][:, None]
+        z = older.T @ x[:-dilation] + newer.T @ x[dilation:] + parameters[f"conv{i}/bias"][None, :, None]
         x = gate(z, axis=1, xp=xp) if gated else xp.tanh(z)
     return x[0]  # valid padding has shortened the history to length 1
 

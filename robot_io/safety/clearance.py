@@ -17,11 +17,14 @@ import math
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from robot_io.contract import JOINT_NAMES, N_JOINTS
+
+Array = TypeVar("Array", bound=Any)  # of NumPy or JAX
 
 FORMAT = 1
 SHIPPED = "robot_geometry.json"
@@ -54,6 +57,9 @@ class Box:
     def distance(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Distance [m], (n, B), of segments p-q, ends (3, n, B); 0 where they meet. Exact.
 
+        The simulation's ``mjx_tt.robot.clearance.segment_box_distance`` bisects instead, in a form without sorting and
+        indexing that the compiler turns into vector loops; a test compares the two.
+
         Along a segment the squared distance is convex and its derivative linear between the points where a coordinate
         enters or leaves its slab: interpolating between the two such points around the zero finds the minimum.
         """
@@ -80,8 +86,8 @@ class Box:
         return point - np.minimum(np.maximum(point, low), high)
 
 
-def segment_distance(p1, q1, p2, q2) -> np.ndarray:
-    """Distance [m], (n, B), of segments p1-q1 and p2-q2, each end (3, n, B).
+def segment_distance(p1: Array, q1: Array, p2: Array, q2: Array, xp: ModuleType = np) -> Array:
+    """Distance [m], (...), of segments p1-q1 and p2-q2, each end (3, ...); ``xp``: numpy, or jax.numpy as the simulation's.
 
     Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
     """
@@ -89,15 +95,15 @@ def segment_distance(p1, q1, p2, q2) -> np.ndarray:
     a, e, b = _dot(d1, d1), _dot(d2, d2), _dot(d1, d2)
     f, c = _dot(d2, r), _dot(d1, r)
     denominator = a * e - b * b
-    s = np.where(denominator > _TINY, (b * f - c * e) / np.maximum(denominator, _TINY), 0.0)
-    t = np.clip((b * np.clip(s, 0.0, 1.0) + f) / np.maximum(e, _TINY), 0.0, 1.0)
-    s = np.clip((b * t - c) / np.maximum(a, _TINY), 0.0, 1.0)
-    gap = r + s * d1 - t * d2
-    return np.sqrt(_dot(gap, gap))
+    s = xp.where(denominator > _TINY, (b * f - c * e) / xp.maximum(denominator, _TINY), 0.0)
+    t = xp.clip((b * xp.clip(s, 0.0, 1.0) + f) / xp.maximum(e, _TINY), 0.0, 1.0)
+    s = xp.clip((b * t - c) / xp.maximum(a, _TINY), 0.0, 1.0)
+    gap = r + s[None] * d1 - t[None] * d2
+    return xp.sqrt(_dot(gap, gap))
 
 
-def _dot(a, b):
-    return np.einsum("xnb,xnb->nb", a, b)
+def _dot(a: Array, b: Array) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 class RobotGeometry:

@@ -52,7 +52,7 @@ def test_tables_are_symmetric_in_vx_and_fly_towards_the_robot(name):
 
 
 def test_skill_of_a_player():
-    assert registry.skill("player2") == registry.catalogue.Skill("intermediate", 2, 4.0, 16.8, 27.1, 15.0, 190)
+    assert registry.skill("player2") == registry.Skill("intermediate", 2, 4.0, 16.8, 27.1, 15.0, 190)
 
 
 def test_unknown_name_lists_the_valid_ones_and_the_nearest():

@@ -176,7 +176,7 @@ def test_a_bounce_does_not_depend_on_where_in_the_step_it_falls():
     end, touched = run(params, state, 1 / 300, 60)
     assert bool(touched[0].all())
     back = -shift
-    position = end.position + end.velocity * back + 0.5 * g * back**2
+    position = end.position + end.velocity * back[None] + 0.5 * g * back[None] ** 2
     np.testing.assert_allclose(position, position[:, :1] + np.zeros((3, n)), atol=1e-11)
 
 

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ballmodel.state import ball_state
+from mjx_tt.env.outgoing_ball import fly_out
+from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.task import Episodes, EpisodeState, Return, Task, TaskConfig
 from mjx_tt.sim.model import LATENCIES, SimModel
 from robot_io.contract import N_JOINTS, N_OBSERVATION
@@ -93,8 +95,8 @@ def _player(task: Task, ticks: int):
 
         state = task.reset(episodes, controller)
         last, kept = jax.lax.scan(advance, state, jnp.arange(ticks, dtype=jnp.int32))
-        back = task.fly_out(last.ball, last.hit, episodes.model)
-        return *kept, last, back, task.reward_terms(last, back)
+        back = fly_out(task.config, last.ball, last.hit, episodes.model)
+        return *kept, last, back, reward_terms(last, back)
 
     return jax.jit(play)
 

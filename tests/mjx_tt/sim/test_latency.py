@@ -49,7 +49,7 @@ def test_observation_is_the_interpolated_past(x64):
             return latency.ring_write(ring, n, captured[None]), read
 
         start = jnp.full((depth, 1, delays.shape[0]), path[0])
-        return jax.lax.scan(period, start, jnp.arange(TICKS))[1]
+        return jax.lax.scan(period, start, jnp.arange(TICKS, dtype=jnp.int32))[1]
 
     read = run(jnp.asarray(DELAYS), jnp.asarray(path))
     moments = np.arange(TICKS)[:, None] * T - DELAYS
@@ -87,7 +87,7 @@ def test_command_keeps_its_impulse_and_its_substep(x64):
             return ring, jnp.stack([new + a * (old - new) for a in share])
 
         start = jnp.zeros((depth, 1, delays.shape[0]))
-        return jax.lax.scan(period, start, jnp.arange(TICKS))[1]
+        return jax.lax.scan(period, start, jnp.arange(TICKS, dtype=jnp.int32))[1]
 
     applied = np.asarray(run(jnp.asarray(DELAYS), jnp.asarray(commands)))
     applied = applied.reshape(TICKS * SUBSTEPS, -1)
