@@ -13,20 +13,24 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from experiments.config import experiment as config
 from experiments.config import validation
-from experiments.config.experiment import SHIPPED, Config, Count, Optimiser, Positive, Section
+from experiments.config.experiment import SHIPPED, Config, Count, Optimiser, Positive, Section, Seed
 from experiments.errors import ConfigError
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]  # also that of a folder
 Layers = Annotated[list[Count], Field(min_length=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
-Discount = Annotated[float, Field(gt=0, le=1)]
+Discount = Annotated[float, Field(gt=0, le=1, description="Worth of a reward one control step later.")]
+LearningRate = Annotated[Positive, Field(description="Of Adam, for every network.")]
+RewardScale = Annotated[Positive, Field(description="By which rewards are multiplied before learning.")]
 
 
 class Bgs(Section):
     """An evolution strategy on the paper's network of 976 parameters: BGS, or with other settings ARS."""
 
     kind: Literal["bgs"]
+    """This algorithm."""
     optimiser: Optimiser = Optimiser()
+    """As in an experiment."""
     schedule_updates: Count = 2000
     """Updates over which a cosine schedule of the learning rate falls; it then stays."""
 
@@ -35,22 +39,30 @@ class Ppo(Section):
     """Proximal policy optimisation with brax's networks and loss."""
 
     kind: Literal["ppo"]
+    """This algorithm."""
     environments: Count = 1024
+    """Side by side."""
     unroll: Count = 32
     """Control steps in every environment between two rounds of learning."""
     epochs: Count = 4
     """Passes over the data of a round."""
     minibatches: Count = 16
     """Parts, of whole unrolls, that a pass is cut into; they must divide the environments."""
-    learning_rate: Positive = 3e-4
+    learning_rate: LearningRate = 3e-4
     discount: Discount = 0.99
     gae_lambda: Share = 0.95
+    """Lambda of the generalised advantage estimate."""
     clip: Positive = 0.2
+    """Largest change of an action's probability ratio that counts."""
     entropy_cost: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1e-3
-    reward_scale: Positive = 1.0
+    """Weight of the policy's entropy in the loss."""
+    reward_scale: RewardScale = 1.0
     max_gradient_norm: Positive = 1.0
+    """Longer gradients are cut."""
     policy_layers: Layers = [64, 64]
+    """Hidden units of the policy's layers."""
     value_layers: Layers = [64, 64]
+    """Hidden units of the value function's layers."""
 
     @model_validator(mode="after")
     def _divides(self) -> Ppo:
@@ -63,6 +75,7 @@ class Replay(Section):
     """Experience and its use."""
 
     environments: Count = 64
+    """Side by side."""
     capacity: Count = 300_000
     """Transitions kept."""
     random_steps: Count = 20_000
@@ -70,16 +83,19 @@ class Replay(Section):
     gradient_steps: Count = 1
     """After every step of all environments."""
     batch: Count = 256
+    """Transitions of a gradient step."""
 
 
 class OffPolicy(Section):
     """What learners from kept experience have in common."""
 
     replay: Replay = Replay()
+    """Experience and its use."""
     layers: Layers = [128, 128]
-    learning_rate: Positive = 1e-3
+    """Hidden units of every network's layers."""
+    learning_rate: LearningRate = 1e-3
     discount: Discount = 0.99
-    reward_scale: Positive = 1.0
+    reward_scale: RewardScale = 1.0
     target_rate: Share = 0.005
     """By which the target network moves towards the critic in a gradient step."""
 
@@ -88,13 +104,16 @@ class Sac(OffPolicy):
     """Soft actor-critic with brax's networks and losses."""
 
     kind: Literal["sac"]
+    """This algorithm."""
     first_entropy_weight: Positive = 0.1
+    """Weight of the policy's entropy before it is adapted."""
 
 
 class QtOpt(OffPolicy):
     """QT-Opt in its small form: two critics, the cross-entropy method in place of an actor."""
 
     kind: Literal["qt_opt"]
+    """This algorithm."""
     rounds: Count = 2
     """Of the cross-entropy method."""
     candidates: Count = 32
@@ -122,6 +141,7 @@ class Budget(Section):
     minutes: Positive | None = None
     """Of training, without compilation and evaluations."""
     episodes: Count | None = None
+    """Of training."""
     clock: Literal["wall", "cpu"] = "wall"
     """What the minutes are of: the clock, or processor time of this program, for a machine that is busy otherwise."""
 
@@ -138,12 +158,14 @@ class Curve(Section):
     points: Count = 12
     """Evenly over the budget, besides the one before training."""
     episodes: Count = 512
+    """Balls of an evaluation, the same every time."""
 
 
 class Comparison(Section):
     """One comparison."""
 
     name: Name
+    """Folder of the comparison."""
     experiment: str | dict[str, Any]
     """An experiment's YAML, its path or content: balls, model, task, pool and evaluation hold for every algorithm."""
     reality: str | dict[str, Any]
@@ -151,8 +173,11 @@ class Comparison(Section):
     algorithms: Annotated[dict[Name, Algorithm], Field(min_length=1)]
     """By the name that the report gives them."""
     budget: Budget
-    seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=1)] = [0]
+    """What each algorithm may spend with each seed."""
+    seeds: Annotated[list[Seed], Field(min_length=1)] = [0]
+    """Repetitions of every training."""
     curve: Curve = Curve()
+    """The evaluations during training."""
 
     @field_validator("seeds")
     @classmethod
@@ -167,7 +192,7 @@ class Comparison(Section):
 
 
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comparison, Config]:
-    """Reads a comparison and the experiment that it names; ``overrides`` are "dotted.path=value" with the value in YAML.
+    """Reads a comparison and the experiment that it names; ``overrides`` are "dotted.path=value".
 
     Relative paths in the file are relative to its folder, those of overrides to the current one; an experiment that is
     not there is looked up among the shipped ones. Raises ConfigError.

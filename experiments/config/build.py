@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from ballmodel.io import yaml
 from ballmodel.sampling import BallPool, sample_pool
 from bgs import optimizers
 from bgs.strategy import BGSConfig
-from experiments.config.experiment import Config, Optimiser, Rewards, Task, Training
+from experiments.config.experiment import Config, Optimiser, Rewards, Section, Task, Training
 from experiments.errors import ConfigError, checked
 from mjx_tt.env import rewards
 from mjx_tt.env.task import TaskConfig
@@ -74,13 +74,7 @@ def distribution(balls: str | dict[str, Any], where: str) -> BallDistribution:
 
 def task_config(task: Task) -> TaskConfig:
     """Raises ValueError where the numbers do not fit together."""
-    return TaskConfig(
-        engine=task.engine,
-        control_rate=task.control_rate,
-        sim_rate=task.sim_rate,
-        max_steps=task.max_steps,
-        reward_weights=reward_weights(task.rewards),
-    )
+    return TaskConfig(**_shared(task, TaskConfig), reward_weights=reward_weights(task.rewards))
 
 
 def reward_weights(chosen: str | Rewards) -> tuple[float, ...]:
@@ -108,18 +102,8 @@ def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:
     sigma: float | optimizers.Schedule = optimiser.sigma
     if optimiser.sigma_fall is not None:
         sigma = optimizers.cosine(sigma, optimiser.sigma_fall.final, updates, optimiser.sigma_fall.hold)
-    return BGSConfig(
-        pairs=optimiser.pairs,
-        sigma=sigma,
-        keep=optimiser.keep,
-        rank=optimiser.rank,
-        weighting=optimiser.weighting,
-        normalise=optimiser.normalise,
-        orthogonal=optimiser.orthogonal,
-        scale=optimiser.scale,
-        step=optimizers.make(chosen.kind, rate, chosen.b1, chosen.b2, chosen.weight_decay),
-        average=optimiser.average,
-    )
+    step = optimizers.make(chosen.kind, rate, chosen.b1, chosen.b2, chosen.weight_decay)
+    return BGSConfig(**_shared(optimiser, BGSConfig) | {"sigma": sigma, "step": step})
 
 
 def device_count(config: Config) -> int:
@@ -138,6 +122,11 @@ def key(seed: int, purpose: int) -> jax.Array:
 def pool(experiment: Experiment, key: jax.Array, n: int) -> BallPool:
     """``n`` balls of the experiment's distribution under its nominal ball model. Raises ConfigError."""
     return checked("balls", sample_pool, key, experiment.distribution, experiment.model.model.ball, n)
+
+
+def _shared(section: Section, settings: type) -> dict[str, Any]:
+    """The values of the keys that the settings have too."""
+    return {field.name: getattr(section, field.name) for field in fields(settings) if hasattr(section, field.name)}
 
 
 def _mapping(model: str | dict[str, Any], where: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ refers to are looked up by ``experiments.config.build``.
 from __future__ import annotations
 
 import difflib
+import itertools
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +25,33 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**31)]
+
+# Keys of the optimiser, which training and fine-tuning share; their defaults differ.
+Pairs = Annotated[Count, Field(description="Antithetic pairs of perturbations per update.")]
+Sigma = Annotated[Positive, Field(description="Scale of the perturbations.")]
+Keep = Annotated[float, Field(gt=0, le=1, description="Share of the pairs that become elites.")]
+Rank = Annotated[
+    Literal["abs", "signed", "max"],
+    Field(description="Pairs are ranked by |D|, by D or by their better member, D the difference of their returns."),
+]
+Weighting = Annotated[
+    Literal["returns", "centered_rank"], Field(description="Weights follow the returns or their centred ranks.")
+]
+Normalise = Annotated[
+    Literal["std", "none"], Field(description="Weights are divided by the standard deviation of the elites' returns.")
+]
+Orthogonal = Annotated[bool, Field(description="Orthogonal perturbations; false: independent ones.")]
+Scale = Annotated[
+    Literal["sqrt_d", "chi"],
+    Field(description="Norm of orthogonal perturbations: the root of their dimension, or as of Gaussian vectors."),
+]
+Average = Annotated[
+    Decay,
+    Field(
+        description="Decay per update of the moving average of the parameters, which is evaluated and exported; 0: none."
+    ),
+]
 
 
 class Section(BaseModel):
@@ -38,16 +66,27 @@ class Rewards(Section):
     base: Literal["sim", "real"] = "sim"
     """The paper's weights for simulation or for the real robot."""
     state_transition: Finite | None = None
+    """Weight of nearing the ball, hitting it, and returning it over the net and on the table."""
     net_clearance: Finite | None = None
+    """Weight of the return's height over the net."""
     hit_and_land: Finite | None = None
+    """Weight of a ball that was hit and landed."""
     fault: Finite | None = None
+    """Weight of a fault of the robot."""
     jerk: Finite | None = None
+    """Weight of small jerk."""
     acceleration: Finite | None = None
+    """Weight of small accelerations."""
     velocity: Finite | None = None
+    """Weight of small velocities."""
     joint_angle: Finite | None = None
+    """Weight of joints well inside their ranges."""
     collision: Finite | None = None
+    """Weight of steps in contact with table or robot, which count -1 each."""
     paddle_height: Finite | None = None
+    """Weight of steps with a low paddle, which count -1 each."""
     style: Finite | None = None
+    """Weight of steps with a paddle that faces backwards, which count -1 each."""
 
 
 class Task(Section):
@@ -69,12 +108,14 @@ class Constant(Section):
     """The learning rate never changes."""
 
     kind: Literal["constant"]
+    """This schedule."""
 
 
 class Cosine(Section):
     """The learning rate holds, then falls along half a cosine until the last update."""
 
     kind: Literal["cosine"]
+    """This schedule."""
     final: Positive = 0.0005
     """Learning rate after the last update."""
     hold: Annotated[float, Field(ge=0, lt=1)] = 0.3
@@ -85,19 +126,23 @@ class Change(Section):
     """A new learning rate from an update on."""
 
     update: Count
+    """First update that has the new rate."""
     learning_rate: Positive
+    """From then on."""
 
 
 class Piecewise(Section):
     """The learning rate changes at given updates."""
 
     kind: Literal["piecewise"]
+    """This schedule."""
     changes: Annotated[list[Change], Field(min_length=1)]
+    """In the order of their updates."""
 
     @model_validator(mode="after")
     def _increasing(self) -> Piecewise:
         starts = [change.update for change in self.changes]
-        if any(later <= earlier for earlier, later in zip(starts, starts[1:])):
+        if any(later <= earlier for earlier, later in itertools.pairwise(starts)):
             raise ValueError(f"the updates must increase, got {starts}")
         return self
 
@@ -106,7 +151,9 @@ class Step(Section):
     """From a gradient estimate to a change of the parameters."""
 
     kind: Literal["adam", "sgd"] = "adam"
+    """Adam, or the plain gradient."""
     learning_rate: Positive = 0.01
+    """Before the schedule changes it."""
     b1: Decay = 0.9
     """Adam's decay of the first moment; sgd does not use it."""
     b2: Decay = 0.99
@@ -114,6 +161,7 @@ class Step(Section):
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """Share by which an update shrinks the parameters, over the learning rate."""
     schedule: Annotated[Constant | Cosine | Piecewise, Field(discriminator="kind")] = Cosine(kind="cosine")
+    """How the learning rate changes over the updates."""
 
 
 class SigmaFall(Section):
@@ -128,24 +176,21 @@ class SigmaFall(Section):
 class Optimiser(Section):
     """Blackbox Gradient Sensing. The defaults are the recipe that trains best here; paper.yaml has the paper's."""
 
-    pairs: Count = 100
-    """Antithetic pairs of perturbations per update."""
+    pairs: Pairs = 100
     repeats: Count = 10
     """Episodes per perturbation."""
-    sigma: Positive = 0.025
-    """Scale of the perturbations."""
+    sigma: Sigma = 0.025
     sigma_fall: SigmaFall | None = None
     """Smaller perturbations later on: more returned in this simulation, fewer in another world; null: none."""
-    keep: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Share of the pairs that become elites."""
-    rank: Literal["abs", "signed", "max"] = "abs"
-    weighting: Literal["returns", "centered_rank"] = "returns"
-    normalise: Literal["std", "none"] = "std"
-    orthogonal: bool = True
-    scale: Literal["sqrt_d", "chi"] = "sqrt_d"
+    keep: Keep = 1.0
+    rank: Rank = "abs"
+    weighting: Weighting = "returns"
+    normalise: Normalise = "std"
+    orthogonal: Orthogonal = True
+    scale: Scale = "sqrt_d"
     step: Step = Step()
-    average: Decay = 0.98
-    """Decay per update of the moving average of the parameters, which is what is evaluated and exported; 0: none."""
+    """From the gradient estimate to a change of the parameters."""
+    average: Average = 0.98
     common_random_numbers: bool = True
     """Both members of a pair meet the same balls, latencies and noise."""
     initial_scale: Positive = 0.1
@@ -158,25 +203,30 @@ class LaterRewards(Section):
     after: Annotated[float, Field(ge=0, le=1)]
     """Share of the updates that are trained with the weights of the task."""
     rewards: Literal["sim", "real"] | Rewards
+    """The weights from then on, as those of the task."""
 
 
 class Training(Section):
     """How long to train and what to keep of it."""
 
     updates: Count = 2000
+    """Length of the training; a cosine schedule falls over it."""
     later_rewards: LaterRewards | None = None
     """First learn to hit with the weights of the task, then with these; null: the same weights throughout."""
     max_minutes: Positive | None = None
     """Stop after this much training time, all sessions of the run together; a larger value continues the run."""
     stop_at_return_rate: Annotated[float, Field(gt=0, le=1)] | None = None
     """Stop when an evaluation during training reaches this return rate."""
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    seed: Seed = 0
+    """Of balls, first parameters, perturbations and episodes."""
     pool: Count = 65536
     """Balls drawn from the distribution before training; episodes choose among them."""
     checkpoint_seconds: Positive = 30.0
+    """Least time between checkpoints."""
     evaluate_every: Count | None = 200
     """Updates between evaluations on fresh balls; null: none."""
     evaluate_episodes: Count = 1024
+    """Balls of such an evaluation, the same every time."""
     devices: Count | Literal["auto"] = "auto"
     """Devices that share the perturbations; auto: as many as divide them evenly."""
 
@@ -185,7 +235,9 @@ class Evaluation(Section):
     """The evaluation after training."""
 
     episodes: Count = 2000
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 1000
+    """Balls that are played, each once."""
+    seed: Seed = 1000
+    """Of balls, latencies and noise."""
     sim_rate: Positive | None = None
     """[Hz] of the physics; null: that of the task."""
     reachable_balls: Count | None = 128
@@ -202,9 +254,13 @@ class Config(Section):
     model: str | dict[str, Any] = {}
     """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise."""
     task: Task = Task()
+    """The episode."""
     optimiser: Optimiser = Optimiser()
+    """Blackbox Gradient Sensing."""
     training: Training = Training()
+    """How long to train, and what to keep of it."""
     evaluation: Evaluation = Evaluation()
+    """The evaluation after training."""
     initial_policy: str | None = None
     """A run folder or an exported artefact whose policy training starts from."""
 
@@ -276,10 +332,10 @@ def read_mapping(
     shipped: dict[str, Path],
     absolute: Callable[[dict[str, Any], Path], None],
 ) -> dict[str, Any]:
-    """The keys of ``section`` that the file and the overrides "dotted.path=value" give; not checked. Raises ConfigError.
+    """Keys of ``section`` from the file and the overrides "dotted.path=value", not checked. Raises ConfigError.
 
-    what: "an experiment" or the like and ``shipped``: those that come with the program, for messages. absolute: makes the
-    relative paths in the data absolute, given the folder to which they are relative.
+    what, shipped: "an experiment" or the like, and those that come with the program, for messages
+    absolute: makes relative paths in the data absolute, given the folder to which they are relative
     """
     try:
         text = path.read_text(encoding="utf-8")

@@ -9,14 +9,22 @@ from pydantic import Field, ValidationError
 
 from experiments.config import validation
 from experiments.config.experiment import (
+    Average,
     Constant,
     Count,
-    Decay,
+    Keep,
+    Normalise,
     Optimiser,
-    Positive,
+    Orthogonal,
+    Pairs,
+    Rank,
     Rewards,
+    Scale,
     Section,
+    Seed,
+    Sigma,
     Step,
+    Weighting,
     apply_override,
     read_yaml,
 )
@@ -30,27 +38,24 @@ class FineTuning(Section):
 
     updates: Count = 70
     """The paper's cycles have 60 or 70."""
-    pairs: Count = 5
-    """Antithetic pairs of perturbations per update."""
+    pairs: Pairs = 5
     repeats: Count = 3
     """Episodes, hence balls, per perturbation."""
-    sigma: Positive = 0.025
-    """Scale of the perturbations."""
-    keep: Annotated[float, Field(gt=0, le=1)] = 0.6
-    """Share of the pairs that become elites."""
-    rank: Literal["abs", "signed", "max"] = "abs"
-    weighting: Literal["returns", "centered_rank"] = "returns"
-    normalise: Literal["std", "none"] = "std"
-    orthogonal: bool = True
-    scale: Literal["sqrt_d", "chi"] = "sqrt_d"
+    sigma: Sigma = 0.025
+    keep: Keep = 0.6
+    rank: Rank = "abs"
+    weighting: Weighting = "returns"
+    normalise: Normalise = "std"
+    orthogonal: Orthogonal = True
+    scale: Scale = "sqrt_d"
     step: Step = Step(kind="sgd", learning_rate=0.00375, schedule=Constant(kind="constant"))
-    average: Decay = 0.0
-    """Decay per update of the moving average of the parameters, which is what is evaluated and exported; 0: none."""
+    """From the gradient estimate to a change of the parameters."""
+    average: Average = 0.0
     rewards: Literal["sim", "real"] | Rewards = "real"
     """The paper's weights by name, or a mapping that changes single ones; only terms measured on a robot count."""
     evaluation_balls: Annotated[int, Field(ge=2)] = 50
     """Balls played before the first update and again after the last, unperturbed."""
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    seed: Seed = 0
     """Of the perturbations."""
 
     @property
@@ -59,8 +64,8 @@ class FineTuning(Section):
 
     def optimiser(self) -> Optimiser:
         """The same settings as the optimiser section of an experiment."""
-        names = "pairs repeats sigma keep rank weighting normalise orthogonal scale step average".split()
-        return Optimiser(**{name: getattr(self, name) for name in names}, common_random_numbers=False)
+        shared = {name: getattr(self, name) for name in type(self).model_fields if name in Optimiser.model_fields}
+        return Optimiser(**shared, common_random_numbers=False)
 
 
 def load(path: str | Path | None = None, overrides: tuple[str, ...] = ()) -> FineTuning:

@@ -1,7 +1,7 @@
 """The typed YAML of a study: the iterative loop, its baselines and variants, for several players and seeds.
 
-Needs neither JAX nor NumPy, as ``experiments.config.experiment``. The defaults are the paper's numbers (Abeyruwan et al. 2022,
-appendices "Iterative-Sim-to-Real Procedure", "Training Hyperparameters" and "Evaluation Methodology").
+Needs neither JAX nor NumPy, as ``experiments.config.experiment``. The defaults are the paper's numbers (Abeyruwan et
+al. 2022, appendices "Iterative-Sim-to-Real Procedure", "Training Hyperparameters" and "Evaluation Methodology").
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from experiments.config.experiment import (
     Optimiser,
     Positive,
     Section,
+    Seed,
     Step,
     Task,
     read_mapping,
@@ -31,7 +32,6 @@ from experiments.errors import ConfigError
 PLAYERS = ("player1", "player2", "player3", "player4", "player5")
 EFFECTS = ("rubber", "table", "magnus", "spin", "noise", "latency", "camera", "drives", "encoders")
 FEWEST_RALLIES = 50  # of each model that are reported
-Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class Round(Section):
@@ -51,9 +51,11 @@ class Simulation(Section):
     """Training in simulation: what a training YAML says in its sections task, model, optimiser and training."""
 
     task: Task = Task(sim_rate=150.0)
+    """The episode."""
     model: dict[str, Any] = {}
     """SimModel that training believes in, such as {sensing: {ball_noise: 0.02}}; may hold randomise."""
     optimiser: Optimiser = Optimiser()
+    """Blackbox Gradient Sensing."""
     rounds: Annotated[list[Round], Field(min_length=3, max_length=3)]
     """The paper's three; fine-tuned 35 %, 65 % and 100 % are named after their 60, 70 and 70 real updates."""
     pool: Count = 65536
@@ -63,11 +65,13 @@ class Simulation(Section):
     selection_episodes: Count = 50
     """Balls in reality by which it is chosen."""
     checkpoint_seconds: Positive = 60.0
+    """Least time between checkpoints."""
     devices: Count | Literal["auto"] = "auto"
+    """Devices that share the perturbations; auto: as many as divide them evenly."""
 
 
 class Reality(Section):
-    """The virtual reality: what it has that training does not know, drawn per seed (``experiments.study.target_domain.hidden_effects``)."""
+    """The virtual reality: its effects that training does not know (``target_domain.hidden_effects``), drawn per seed."""
 
     without: list[Literal[EFFECTS]] = []
     """Effects that are left out: there, reality is what training believes."""
@@ -81,7 +85,9 @@ class Ablation(Section):
     """Hand-made ball distributions against the oracle's, zero-shot, for one player."""
 
     player: Literal[PLAYERS] = "player4"
+    """Who plays with the policies."""
     balls: list[str] = ["large", "medium", "narrow"]
+    """The distributions by name."""
 
 
 class Evaluation(Section):
@@ -105,18 +111,23 @@ class Study(Section):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
     """Folder of the study."""
     players: Annotated[list[Literal[PLAYERS]], Field(min_length=1)] = list(PLAYERS)
+    """Virtual players, or people in their places."""
     seeds: Annotated[list[Seed], Field(min_length=1)] = [0]
     """Repetitions of the whole study, each with another reality, other initial policies and other chance."""
     first_balls: Annotated[int, Field(ge=20)] = 200
     """Balls of D0: across the table, without a robot."""
     simulation: Simulation
+    """Training in simulation."""
     fine_tuning: FineTuning = FineTuning()
     """In reality; the number of updates is the round's."""
     reality: Reality = Reality()
+    """What the virtual reality has that training does not know."""
     fresh: bool = True
     """Also the variant whose weights are not carried back from reality to simulation."""
     ablation: Ablation | None = Ablation()
+    """Hand-made ball distributions against the oracle's; null: none."""
     evaluation: Evaluation = Evaluation()
+    """Rallies of every model."""
     robot: str | None = None
     """A robot.yaml, "rig" or "lockstep": reality is that robot and its operator; null: the virtual reality."""
     recordings: dict[Literal[PLAYERS], str] = {}

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import get_args
 
 import jsonschema
 import pytest
 import yaml
 
 from ballmodel import registry
+from bgs import directions, shaping
+from bgs.strategy import BGSConfig
 from experiments.config import build
 from experiments.config import experiment as config
+from experiments.config.baselines import Comparison
+from experiments.config.finetuning import FineTuning
+from experiments.config.study import Study
 from experiments.errors import ConfigError
 from mjx_tt.env import rewards
 from mjx_tt.env.task import TaskConfig
@@ -136,6 +142,27 @@ def test_yaml_traps(tmp_path):
         config.load(file)
     with pytest.raises(ConfigError, match="quickstart.yaml"):
         config.load(tmp_path / "quickstrt.yaml")
+
+
+@pytest.mark.parametrize("section", [config.Config, Study, FineTuning, Comparison])
+def test_every_key_has_a_sentence(section):
+    schema = section.model_json_schema()
+    parts = schema.get("$defs", {}) | {section.__name__: schema}
+    for name, part in parts.items():
+        for key, content in part.get("properties", {}).items():
+            own = content.get("$ref", "").rpartition("/")[2]  # a section that says it itself
+            text = content.get("description") or parts[own]["description"]
+            assert text.endswith("."), f"{name}.{key}"
+
+
+def test_keys_and_choices_are_those_of_the_optimiser_and_the_task():
+    choices = {"rank": shaping.RANKS, "weighting": shaping.WEIGHTINGS, "normalise": shaping.NORMALISATIONS}
+    for section in (config.Optimiser, FineTuning):
+        assert {field.name for field in fields(BGSConfig)} <= section.model_fields.keys()
+        for key, allowed in (choices | {"scale": directions.SCALES}).items():
+            assert get_args(section.model_fields[key].annotation) == allowed
+    limits = {"max_observation_latency", "max_action_latency"}  # of memory, which no experiment sets
+    assert {field.name for field in fields(TaskConfig)} - limits - {"reward_weights"} <= config.Task.model_fields.keys()
 
 
 def test_overrides(tmp_path):
