@@ -1,5 +1,6 @@
 """Blackbox Gradient Sensing: an evolution-strategy optimiser that knows nothing of robots."""
 
+from bgs import optimizers as optimizers
 from bgs.normalizer import ObservationStatistics as ObservationStatistics
 from bgs.strategy import BGSConfig as BGSConfig
 from bgs.strategy import BGSInfo as BGSInfo

@@ -79,7 +79,7 @@ def read_logs(paths: Sequence[str]) -> diagnosis.Logs:
 def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
     """Runs the diagnosis and writes its files. Raises ConfigError for bad logs before anything is written."""
     request.check()
-    nominal = checked("--model", model.load, request.model) if request.model else ModelFile(model.SimModel())
+    nominal = checked("--model", ModelFile.load, request.model) if request.model else ModelFile(model.SimModel())
     logs = checked("", read_logs, request.logs)
     balls, joints = len(logs.balls), len(logs.joints)
     console.print(
@@ -152,7 +152,7 @@ def save(found: diagnosis.Diagnosis, folder: Path) -> Path:
     """Writes verdict.json and extended.yaml; returns the path of the latter."""
     folder.mkdir(parents=True, exist_ok=True)
     found.verdict.save(folder / "verdict.json")
-    model.save(folder / "extended.yaml", found.extended)
+    found.extended.save(folder / "extended.yaml")
     return folder / "extended.yaml"
 
 

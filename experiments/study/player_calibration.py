@@ -117,7 +117,7 @@ class Calibration:
     """The virtual players, played with given policies."""
 
     def __init__(self, first, later, model_path=None) -> None:
-        self.model = models.load(model_path).model if model_path else models.SimModel()
+        self.model = models.ModelFile.load(model_path).model if model_path else models.SimModel()
         self.first = len(first)
         self.policies = [load_policy.load(folder).policy for folder in (*first, *later)]
         self.names = human_player.names()

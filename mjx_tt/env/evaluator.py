@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import fields, replace
 
 import jax
@@ -29,21 +30,7 @@ class Evaluator:
     """
 
     def __init__(self, simulator: Simulator, balls: BallPool, model: SimModel, randomise: tuple[Range, ...]) -> None:
-        columns = -(-COLUMNS // simulator.devices) * simulator.devices
-        self.count = balls.arrival.shape[0]
-        # Balls of similar arrival in one row: rows run together until their last episode ends.
-        self.order = np.argsort(np.asarray(balls.arrival))
-        padded = np.resize(self.order, -(-self.count // (ROWS * columns)) * ROWS * columns)
-        padded[self.count :] = self.order[-1]
-        self._calls = [
-            (
-                replace(
-                    balls, state=_take(balls.state, flat), arrival=balls.arrival[flat], landing=balls.landing[:, flat]
-                ),
-                _take(balls.state, flat.reshape(ROWS, columns)),
-            )
-            for flat in padded.reshape(-1, ROWS * columns)
-        ]
+        columns = self._columns = -(-COLUMNS // simulator.devices) * simulator.devices
 
         def play(policy: Policy, key: jax.Array, pool: BallPool, thrown: BallState) -> RolloutResult:
             drawn = simulator.draw(key, pool, model, randomise, ROWS, columns)
@@ -55,6 +42,29 @@ class Evaluator:
         self._traced = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
         self._spread: Callable[..., RolloutResult] = self._traced
         self._replicate = simulator.replicate
+        self._set(balls)
+
+    def on(self, balls: BallPool) -> Evaluator:
+        """The same on other balls, with this one's compiled program."""
+        other = copy(self)
+        other._set(balls)
+        return other
+
+    def _set(self, balls: BallPool) -> None:
+        self.count = balls.arrival.shape[0]
+        # Balls of similar arrival in one row: rows run together until their last episode ends.
+        self.order = np.argsort(np.asarray(balls.arrival))
+        padded = np.resize(self.order, -(-self.count // (ROWS * self._columns)) * ROWS * self._columns)
+        padded[self.count :] = self.order[-1]
+        self._calls = [
+            (
+                replace(
+                    balls, state=_take(balls.state, flat), arrival=balls.arrival[flat], landing=balls.landing[:, flat]
+                ),
+                _take(balls.state, flat.reshape(ROWS, self._columns)),
+            )
+            for flat in padded.reshape(-1, ROWS * self._columns)
+        ]
 
     def compile(self, policy: Policy, key: jax.Array) -> None:
         """Compiles ``play`` for policies like this one; otherwise its first call does."""

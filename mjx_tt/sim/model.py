@@ -122,6 +122,28 @@ class ModelFile:
     randomise: tuple[Range, ...] = ()
     provenance: dict = field(default_factory=dict)
 
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> ModelFile:
+        """Reads a model YAML. Raises ValueError naming file, key, what was given and what is allowed."""
+        data = yaml_file.read(path)
+        return from_dict(data or {}, str(path))
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Writes every parameter, the ranges and the provenance, whole or not at all. Drives only if the model has them."""
+        tree: dict = {}
+        for name, value in paths(self.model).items():
+            if name.startswith("drives.") and self.model.drives is None:
+                continue
+            *groups, leaf = name.split(".")
+            node = tree
+            for group in groups:
+                node = node.setdefault(group, {})
+            node[leaf] = value if isinstance(value, str) else float(value)
+        tree["randomise"] = {r.path: [r.low, r.high] for r in self.randomise}
+        tree["provenance"] = self.provenance
+        with replacing(Path(path)) as temporary:
+            temporary.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+
 
 def paths(node: Any = None, prefix: str = "") -> dict[str, Any]:
     """Every leaf of a SimModel by its dotted path; of the nominal model by default. Absent drives are nominal ones."""
@@ -196,12 +218,6 @@ def nearest(name: str, known: Collection[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}"
 
 
-def load(path: str | os.PathLike) -> ModelFile:
-    """Reads a model YAML. Raises ValueError naming file, key, what was given and what is allowed."""
-    data = yaml_file.read(path)
-    return from_dict(data or {}, str(path))
-
-
 def from_dict(data: Any, where: str) -> ModelFile:
     """A ModelFile from parsed YAML; ``where`` names its origin in errors."""
     if not isinstance(data, dict):
@@ -228,26 +244,6 @@ def from_dict(data: Any, where: str) -> ModelFile:
             raise ValueError(f"{where}: randomise.{path} = {ends!r}, low must not exceed high")
         parsed.append(Range(path, low, high))
     return ModelFile(with_values(SimModel(), values), tuple(parsed), provenance)
-
-
-def save(path: str | os.PathLike, file: ModelFile) -> None:
-    """Writes every parameter, the ranges and the provenance; to a temporary file first, so nothing is half-written.
-
-    Drives are written if the model has them.
-    """
-    tree: dict = {}
-    for name, value in paths(file.model).items():
-        if name.startswith("drives.") and file.model.drives is None:
-            continue
-        *groups, leaf = name.split(".")
-        node = tree
-        for group in groups:
-            node = node.setdefault(group, {})
-        node[leaf] = value if isinstance(value, str) else float(value)
-    tree["randomise"] = {r.path: [r.low, r.high] for r in file.randomise}
-    tree["provenance"] = file.provenance
-    with replacing(Path(path)) as temporary:
-        temporary.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
 
 
 def _flatten(data: dict, where: str, known: Collection[str], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -187,8 +187,8 @@ def test_the_extended_model_is_one_that_training_loads(tmp_path):
     estimate = found.verdict.causes[0].parameters["ball.table.friction"]
     assert abs(estimate.estimate - 0.19) < 1.2 * (estimate.high - estimate.low) < 0.01  # four standard errors
     assert found.verdict.held_out.low > 0.0
-    model.save(tmp_path / "extended.yaml", found.extended)
-    loaded = model.load(tmp_path / "extended.yaml")
+    found.extended.save(tmp_path / "extended.yaml")
+    loaded = model.ModelFile.load(tmp_path / "extended.yaml")
     assert loaded.model.ball.table.friction == pytest.approx(estimate.estimate)
     assert [r.path for r in loaded.randomise] == ["ball.table.friction"]
     assert loaded.provenance["logs"] == {"log": "0" * 64}

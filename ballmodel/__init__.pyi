@@ -1,0 +1,17 @@
+from .aerodynamics import FlightParams as FlightParams
+from .distribution import BallDistribution as BallDistribution
+from .distribution import fit_distribution as fit_distribution
+from .distribution import load_distribution as load_distribution
+from .distribution import save_distribution as save_distribution
+from .fit_distribution import fit_human as fit_human
+from .flight import BallParams as BallParams
+from .flight import step as step
+from .initial_state import fit_gauss_newton as fit_gauss_newton
+from .initial_state import fit_nelder_mead as fit_nelder_mead
+from .registry import names as names
+from .registry import resolve as resolve
+from .sampling import BallPool as BallPool
+from .sampling import sample_pool as sample_pool
+from .state import BallState as BallState
+from .trajectory import Dataset as Dataset
+from .trajectory import Trajectory as Trajectory

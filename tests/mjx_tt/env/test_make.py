@@ -1,0 +1,138 @@
+"""The short way in: rollouts of any size by one compiled program, environments by name."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import mjx_tt.env.gymnasium as table_tennis
+from mjx_tt.env import make, rewards
+from mjx_tt.env.policy import Policy, initial_theta
+from mjx_tt.env.task import TaskConfig
+from mjx_tt.sim.model import ModelFile, SimModel
+from robot_io.policy import export
+from tests.support.paths import ROOT
+
+QUICK = TaskConfig(sim_rate=75.0)
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return Policy(np.asarray(initial_theta(jax.random.key(0))), np.zeros(11, np.float32), np.ones(11, np.float32))
+
+
+@pytest.fixture(scope="module")
+def play():
+    return make.make_rollout("narrow", task=QUICK, devices=1)
+
+
+@pytest.fixture(scope="module")
+def played(play, policy):
+    return play(policy, 300, seed=3)
+
+
+def test_arrays_have_the_episode_first(played):
+    assert set(played.terms) == set(rewards.TERMS) and all(term.shape == (300,) for term in played.terms.values())
+    shapes = {"landing": (2,), "incoming": (2,), "ball": (6,), "peak_velocity": (8,)}
+    for name in ("returns", "outcome", "seconds", "finite", *shapes):
+        assert getattr(played, name).shape == (300, *shapes.get(name, ())), name
+    assert set(played.outcome) <= {"missed", "hit", "returned"}
+    weighted = sum(w * played.terms[name] for w, name in zip(QUICK.reward_weights, rewards.TERMS, strict=True))
+    np.testing.assert_allclose(played.returns[played.finite], weighted[played.finite], rtol=1e-5, atol=1e-5)
+    # Balls fly from the person (y > 0) to the robot's half, inside the distribution's own box.
+    assert (played.ball[:, 4] < 0).all() and (played.incoming[:, 1] < 0).all()
+
+
+def test_another_number_of_episodes_compiles_nothing(play, policy, played):
+    programs = play._evaluator._traced._cache_size()
+    for episodes in (1, 40, 2049):
+        assert play(policy, episodes, seed=1).returns.shape == (episodes,)
+    assert play._evaluator._traced._cache_size() == programs == 1
+    again = play(policy, 300, seed=3)
+    np.testing.assert_array_equal(again.returns, played.returns)
+    np.testing.assert_array_equal(again.ball, played.ball)
+
+
+def test_padding_changes_no_episode(play, policy):
+    """An episode does not know how many others are played with it: the first balls of a longer stream, at the same
+    places of the same call, give the same returns."""
+    few, many = play(policy, 2047, seed=5), play(policy, 2048, seed=5)
+    same = (few.ball[:, None] == many.ball[None]).all(axis=-1)
+    assert same.any(axis=1).all()  # the pool of the longer one begins with the shorter one's
+    at = same.argmax(axis=1)
+    before = at == np.arange(2047)  # in front of the ball that is only in the longer one
+    assert before.any()
+    np.testing.assert_array_equal(few.returns[before], many.returns[:2047][before])
+
+
+def test_bad_requests_are_refused(play, policy, tmp_path):
+    with pytest.raises(ValueError, match="episodes is 0"):
+        play(policy, 0)
+    with pytest.raises(ValueError, match="no distribution is called 'nobody'"):
+        make.make_rollout("nobody")
+    with pytest.raises(FileNotFoundError, match=r"mine\.yaml"):
+        make.make_rollout(tmp_path / "mine.yaml")
+
+
+def test_a_policy_is_loaded_from_artefact_and_file(policy, tmp_path):
+    export.write(tmp_path / "artefact", policy, {})
+    policy.save(tmp_path / "policy.npz")
+    for place in ("artefact", "policy.npz"):
+        loaded = make.load_policy(tmp_path / place)
+        for name in ("theta", "mean", "inv_std"):
+            np.testing.assert_array_equal(getattr(loaded, name), getattr(policy, name))
+            assert getattr(loaded, name).dtype == np.float32
+    np.savez(tmp_path / "other.npz", theta=policy.theta)
+    with pytest.raises(ValueError, match=r"other\.npz: .*missing are \['inverse_scale', 'mean'\]"):
+        make.load_policy(tmp_path / "other.npz")
+
+
+def test_worlds_are_given_as_models_or_files(tmp_path):
+    ModelFile(SimModel(), (), {"from": "here"}).save(tmp_path / "world.yaml")
+    assert make.make_rollout("narrow", tmp_path / "world.yaml", QUICK, 1).model.provenance == {"from": "here"}
+    assert make.make_rollout("narrow", SimModel(), QUICK, 1).model.model == SimModel()
+
+
+@pytest.mark.slow
+def test_gymnasium_steps_many_balls():
+    envs = gymnasium.make_vec(table_tennis.ID, num_envs=16, balls="narrow", task=QUICK, pool=64)
+    observation, _ = envs.reset(seed=4)
+    assert observation.shape == envs.observation_space.shape == (16, 88)
+    first, ended, earned = observation, 0, 0.0
+    for _ in range(150):
+        observation, reward, terminated, truncated, info = envs.step(np.zeros((16, 8), np.float32))
+        assert envs.observation_space.contains(observation) and not truncated.any()
+        ended += terminated.sum()
+        earned += reward.sum()
+        if terminated.any():
+            assert set(info) == {"hit", "returned", "episode_return", "_episode"}
+    assert ended >= 16 and earned != 0.0
+    np.testing.assert_array_equal(envs.reset(seed=4)[0], first)
+    assert (envs.reset(seed=5)[0] != first).any()
+    with pytest.raises(ValueError, match=r"shape \(3, 8\), wanted is \(16, 8\)"):
+        envs.step(np.zeros((3, 8)))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*Box observation space")
+def test_gymnasium_checks_the_single_environment():
+    check_env(gymnasium.make(table_tennis.ID, balls="narrow", task=QUICK, pool=64).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("package", ["mjx_tt", "ballmodel"])
+def test_public_names_load_when_they_are_used(package):
+    code = f"""
+import sys, {package}
+assert "jax" not in sys.modules, "importing {package} loads JAX"
+names = [name for name in dir({package}) if not name.startswith("_")]
+assert len(names) > 5
+for name in {package}.__all__:
+    getattr({package}, name)
+"""
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
