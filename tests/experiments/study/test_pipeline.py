@@ -292,6 +292,7 @@ def virtual() -> VirtualReality:
     return VirtualReality(study(), 0)
 
 
+@pytest.mark.slow
 def test_an_update_is_the_papers_formula_of_what_the_robot_measures(virtual):
     """The parameters after the first chunk of updates, computed anew in NumPy from the same balls."""
     person, theta = virtual.player("player3"), np.asarray(initial_theta(jax.random.key(0), 0.3))
