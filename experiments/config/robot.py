@@ -1,27 +1,44 @@
-"""YAML of a robot and of the rig: dataclasses of ``robot_io`` filled from mappings, with errors that say what to change."""
+"""YAML of a robot and of the rig: dataclasses of ``robot_io``, read by pydantic."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import types
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 import yaml
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from experiments.config.experiment import read_yaml
-from experiments.config.validation import nearest
+from experiments.config.validation import LONGEST, nearest
 from experiments.errors import ConfigError, checked
 from robot_io.control.config import RobotConfig
 from robot_io.emulator.ball_launcher import Throws
 from robot_io.emulator.config import RigParams
 
+COMMISSIONING = 0.1  # speed_scale of a robot.yaml that sets none: full speed is asked for, not forgotten
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+WORDS = {
+    "int_type": "int",
+    "int_from_float": "int",
+    "float_type": "float",
+    "bool_type": "bool",
+    "string_type": "str",
+    "tuple_type": "a list",
+    "finite_number": "a finite number",
+}
+Config = TypeVar("Config", RobotConfig, RigParams)
+
 
 def load_robot(path: str | Path) -> RobotConfig:
-    """A robot.yaml. Raises ConfigError."""
-    return fill(RobotConfig, _mapping(path), str(path))
+    """A robot.yaml; without ``safety.speed_scale`` the robot is slow: COMMISSIONING. Raises ConfigError."""
+    data = _mapping(path)
+    safety = data.setdefault("safety", {})
+    if isinstance(safety, dict):
+        safety.setdefault("speed_scale", COMMISSIONING)
+    return fill(RobotConfig, data, str(path))
 
 
 def load_rig(path: str | Path | None) -> RigParams:
@@ -29,51 +46,60 @@ def load_rig(path: str | Path | None) -> RigParams:
     return RigParams() if path is None else fill(RigParams, _mapping(path), str(path))
 
 
-def to_yaml(config) -> str:
+def to_yaml(config: RobotConfig | RigParams) -> str:
     """Every key of a robot or rig with its value, ready to be edited."""
     return yaml.safe_dump(json.loads(json.dumps(dataclasses.asdict(config))), sort_keys=False)
 
 
-def fill(kind: type, data: dict[str, Any], where: str):
-    """An instance of a dataclass; keys that are left out keep their defaults. Raises ConfigError."""
-    hints = get_type_hints(kind)
-    names = [f.name for f in dataclasses.fields(kind)]
-    values = {}
-    for key, value in data.items():
-        if key not in names:
-            raise ConfigError(f"{where}: {key}: unknown key; {nearest(str(key), names)}allowed: {', '.join(names)}")
-        values[key] = _value(hints[key], value, f"{where}: {key}")
+def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
+    """An instance of a dataclass; omitted keys keep their defaults. Raises ConfigError with one line per mistake."""
+
+    class Content:  # pydantic takes the strictness of this class into the dataclasses inside
+        __pydantic_config__ = STRICT
+        file: Any
+
+    Content.__annotations__["file"] = kind
+    adapter = TypeAdapter(dataclasses.dataclass(Content))
     try:
-        return kind(**values)
-    except (ValueError, TypeError) as error:
-        raise ConfigError(f"{where}: {error}") from None
+        # By JSON, whose lists are tuples: nothing else is converted.
+        return adapter.validate_json(json.dumps({"file": data}, default=str)).file
+    except ValidationError as error:
+        lines = [_line(mistake, kind) for mistake in error.errors(include_url=False)]
+    raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
 
 
-def _value(hint, value, where: str):
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        inner = [a for a in get_args(hint) if a is not type(None)]
-        return None if value is None and len(inner) < len(get_args(hint)) else _value(inner[0], value, where)
-    if dataclasses.is_dataclass(hint):
-        if not isinstance(value, dict):
-            raise ConfigError(f"{where}: got {value!r}; allowed: a mapping of {', '.join(hint.__dataclass_fields__)}")
-        return fill(hint, value, where)
-    if origin is tuple:
-        items = get_args(hint)
-        if not isinstance(value, list):
-            raise ConfigError(f"{where}: got {value!r}; allowed: a list")
-        if items[-1] is Ellipsis:
-            items = items[:1] * len(value)
-        if len(items) != len(value):
-            raise ConfigError(f"{where}: got {len(value)} entries; allowed: {len(items)}")
-        return tuple(_value(item, v, f"{where}[{i}]") for i, (item, v) in enumerate(zip(items, value)))
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, hint) or isinstance(value, bool) is not (hint is bool):
-        raise ConfigError(f"{where}: got {value!r}; allowed: {hint.__name__}")
-    if hint is float and not np.isfinite(value):
-        raise ConfigError(f"{where}: got {value!r}; allowed: a finite number")
-    return value
+def _line(mistake: Any, kind: type) -> str:
+    """One mistake: dotted path, what was given, what is allowed."""
+    *parents, last = mistake["loc"][1:] or ("",)
+    owner: Any = kind
+    for part in parents:
+        owner = _member(owner, part)
+    path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in mistake["loc"][1:])[1:]
+    given, reason = mistake["input"], mistake["type"]
+    shown = repr(given) if len(repr(given)) <= LONGEST else f"{repr(given)[:LONGEST]} ..."
+    if reason == "unexpected_keyword_argument":
+        names = [f.name for f in dataclasses.fields(owner)]
+        return f"{path}: unknown key; {nearest(str(last), names)}allowed: {', '.join(names)}"
+    if reason == "value_error":
+        return f"{path and path + ': '}{mistake['ctx']['error']}"
+    if reason in ("too_long", "missing"):
+        tuple_of = owner if reason == "missing" else _member(owner, last)
+        at = path.rpartition("[")[0] if reason == "missing" else path
+        return f"{at}: got {len(given)} entries; allowed: {len(get_args(tuple_of))}"
+    allowed = WORDS.get(reason, mistake["msg"].removeprefix("Input should be "))
+    if reason in ("dataclass_type", "dataclass_exact_type"):
+        allowed = f"a mapping of {', '.join(f.name for f in dataclasses.fields(_member(owner, last)))}"
+    return f"{path}: got {shown}; allowed: {allowed}"
+
+
+def _member(owner: Any, part: str | int) -> Any:
+    """Type of a field, or of an entry of a tuple; the first of a union."""
+    if isinstance(part, int):
+        return get_args(owner)[0]
+    if not part:
+        return owner
+    hint = get_type_hints(owner)[part]
+    return hint if get_origin(hint) is tuple else next(iter(get_args(hint)), hint)
 
 
 def _mapping(path: str | Path) -> dict[str, Any]:

@@ -2,17 +2,66 @@
 
 from __future__ import annotations
 
+import ipaddress
 from dataclasses import dataclass, field
 
 from robot_io.contract import CONTROL_RATE, FESTO_JOINTS, LIMITS
 from robot_io.control.observation import ObservationDelays
 from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
+from robot_io.ranges import check_ranges
 from robot_io.safety.config import SafetyConfig
 
 PROFILES = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
 ANSWER_TIME = 0.035  # [s] for an axis to answer: less than the age at which its state counts as stale
 AXIS_NAMES = ("gantry_x", "gantry_y")
+
+PORT = (1, 65535)
+# What a robot.yaml may set. Watchdogs, margins and time-outs end where they would no longer protect: docs/concepts/safety.md.
+RANGES = {
+    "arm.port": PORT,
+    "arm.timeout": (0.01, 0.1),
+    "axes.port": PORT,
+    "axes.device_id": (0, 255),
+    "axes.zero": (-5.0, 5.0),
+    "axes.direction": (-1, 1),
+    "axes_motion.speed": (0.01, 2.0),
+    "axes_motion.acceleration": (0.1, 15.0),
+    "axes_motion.latency": (0.001, 0.3),
+    "axes_motion.gain": (0.001, 20.0),
+    "axes_motion.max_correction": (0.001, 0.5),
+    "axes_motion.lead": (0.001, 0.1),
+    "axes_motion.hold_speed": (0.001, 0.5),
+    "axes_motion.max_error": (0.005, 0.15),
+    "axes_motion.node_guard": (0.02, 0.2),
+    "axes_motion.command_timeout": (0.02, 0.1),
+    "axes_motion.state_timeout": (0.02, 0.1),
+    "axes_motion.acknowledge_timeout": (0.1, 10.0),
+    "axes_motion.enable_timeout": (0.1, 30.0),
+    "axes_motion.homing_timeout": (0.1, 120.0),
+    "tracker.port": PORT,
+    "tracker.source_port": PORT,
+    "tracker.oldest": (0.01, 0.2),
+    "tracker.ahead": (0.0, 0.02),
+    "tracker.clock_offset": (-1e10, 1e10),
+    "safety.speed_scale": (0.001, 1.0),
+    "safety.table_margin": (0.01, 0.5),
+    "safety.self_margin": (0.01, 0.5),
+    "safety.floor_margin": (0.15, 0.7),
+    "safety.escape_speed": (0.001, 0.1),
+    "safety.still": (0.001, 0.1),
+    "safety.overspeed": (1.05, 2.0),
+    "safety.following_error": (0.005, 0.4),
+    "safety.delay": (0.0, 0.3),
+    "safety.following_ticks": (1, 6),
+    "safety.late": (0.02, 0.1),
+    "safety.stale_arm": (0.01, 0.1),
+    "safety.stale_axes": (0.01, 0.1),
+    "safety.stale_tracker": (0.01, 0.05),
+    "safety.stale_policy": (0.02, 0.1),
+    "realtime.priority": (1, 99),
+    "realtime.spin": (0.0, 0.005),
+}
 
 
 @dataclass(frozen=True)
@@ -67,6 +116,22 @@ class RobotConfig:
             raise ValueError(f"axis_profile {self.axis_profile!r} does not exist, allowed: {', '.join(PROFILES)}")
         if len(self.axes) != len(FESTO_JOINTS):
             raise ValueError(f"{len(self.axes)} axes given, the robot has {len(FESTO_JOINTS)}: {', '.join(AXIS_NAMES)}")
+        check_ranges(self, RANGES)
+        for i, axis in enumerate(self.axes):
+            if axis.direction not in (-1, 1):
+                raise ValueError(f"axes[{i}].direction is {axis.direction}, allowed are 1 and -1")
+        for i in FESTO_JOINTS:
+            if self.safety.following_error[i] > 0.1:
+                raise ValueError(
+                    f"safety.following_error[{i}] is {self.safety.following_error[i]} m, allowed is 0.005 to 0.1"
+                )
+        for path in ("arm.host", "arm.controller", "tracker.host", "tracker.source"):
+            device, name = path.split(".")
+            value = getattr(getattr(self, device), name)
+            try:
+                ipaddress.IPv4Address(value)
+            except ValueError:
+                raise ValueError(f"{path} is {value!r}, allowed is an IPv4 address such as 192.168.125.1") from None
 
 
 def axis_range(i: int) -> tuple[float, float]:

@@ -84,6 +84,7 @@ class TrackerConfig:
 
     host, port       address that the bridge listens on
     source           IP address of the tracker; datagrams from elsewhere are ignored
+    source_port      port that it sends from; None takes that of the first valid frame, and again after 1 s of silence
     oldest           [s] age at which a frame is too old to be used
     ahead            [s] by which a capture time may lie in the future: clocks that differ by more are refused
     clock_offset     [s] added to capture times: bridge's monotonic clock minus the tracker's clock
@@ -95,6 +96,7 @@ class TrackerConfig:
     oldest: float = 0.15
     ahead: float = 0.005
     clock_offset: float = 0.0
+    source_port: int | None = None
 
 
 class Tracker:

@@ -10,10 +10,50 @@ from robot_io.emulator.axis_drive import DriveParams
 from robot_io.emulator.network import NetworkFaults
 from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.world import WorldParams
+from robot_io.ranges import check_ranges
 
 # The latency that training knows and the lag of the carriage's servo behind it.
 AXES_CONFIG = AxesConfig(latency=0.0645 + 0.033 + 0.035, gain=2.0)
 AXIS_FEEDBACK_DELAY = 0.033  # [s], paper: latency of the linear axes' observation
+
+RANGES = {
+    "world.timestep": (1e-4, 0.002),
+    "world.drag": (0.0, 10.0),
+    "world.magnus": (-1.0, 1.0),
+    "world.table_restitution": (0.01, 1.0),
+    "world.table_friction": (0.0, 10.0),
+    "world.paddle_restitution": (0.01, 1.0),
+    "world.rubber_gain": (0.0, 2.0),
+    "arm.cycle": (0.001, 0.02),
+    "arm.feedback_delay": (0.0, 1.0),
+    "arm.dead_time": (0.0, 1.0),
+    "arm.low_pass": (0.1, 1000.0),
+    "arm.pos_corr_gain": (0.0, 100.0),
+    "arm.comm_timeout": (0.004, 10.0),
+    "arm.stop_deceleration": (0.1, 1000.0),
+    "arm.lower": (-10.0, 10.0),
+    "arm.upper": (-10.0, 10.0),
+    "arm.max_speed": (0.01, 100.0),
+    "arm.position_tolerance": (0.0, 1.0),
+    "arm.overspeed": (1.0, 10.0),
+    "arm.queue_length": (1, 10_000),
+    "axis_dead_time": (0.0, 1.0),
+    "drive.speed": (0.01, 10.0),
+    "drive.acceleration": (0.1, 100.0),
+    "drive.smoothing": (0.0, 1.0),
+    "drive.position_gain": (0.1, 1000.0),
+    "drive.following_error": (0.001, 10.0),
+    "drive.switch_on_time": (0.0, 60.0),
+    "drive.homing_time": (0.0, 60.0),
+    "node_guard": (0.01, 10.0),
+    "tracker.rate": (10.0, 1000.0),
+    "tracker.latency": (0.0, 1.0),
+    "tracker.noise": (0.0, 1.0),
+    "tracker.offset": (-1.0, 1.0),
+    "action_delay": (0.0, 1.0),
+    "pause": (0.0, 600.0),
+    "seed": (0, 2**31),
+}
 
 
 @dataclass(frozen=True)
@@ -33,3 +73,6 @@ class RigParams:
     tracker_network: NetworkFaults = NetworkFaults()
     pause: float = 0.6  # [s] of the thrower
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_ranges(self, RANGES)
