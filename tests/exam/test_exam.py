@@ -28,6 +28,8 @@ from tests.exam.generator.world import World, camera, fly, seen
 from tests.exam.generator.write import write
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.optimised
+
 
 def test_the_generator_imports_nothing_that_it_tests():
     sources = sorted((ROOT / "tests" / "exam" / "generator").glob("*.py"))

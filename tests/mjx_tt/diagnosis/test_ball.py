@@ -21,6 +21,8 @@ from mjx_tt.sim.model import SimModel
 from tests.exam.generator.world import World, camera, fly, seen
 from tests.support.paths import DATA
 
+pytestmark = pytest.mark.optimised
+
 FITTED = tuple(e for e in EFFECTS if e.fit and e.group != AT_THE_PADDLE)
 CHANGED = {
     "ball.flight.drag_coefficient": ("drag_coefficient", 0.55),

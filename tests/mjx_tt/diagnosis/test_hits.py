@@ -18,6 +18,8 @@ from mjx_tt.robot import model
 from mjx_tt.sim.model import SimModel, with_values
 from robot_io.contract import JOINT_NAMES
 
+pytestmark = pytest.mark.optimised
+
 # These balls meet nothing but the paddle: the table is out of their way.
 MODEL = with_values(SimModel(), {"ball.table.height": -3.0})
 HITS, RATE, RADIUS, THICKNESS = 48, 125.0, 0.020, 0.012

@@ -10,6 +10,8 @@ from experiments.commands import diagnose
 from experiments.deploy import session_logs
 from mjx_tt import diagnosis as gap
 
+pytestmark = pytest.mark.optimised
+
 RATE, SAMPLES = 125.0, 60
 
 

@@ -30,6 +30,8 @@ from mjx_tt.diagnosis.verdict import Cause, Estimate, Unexplained
 from mjx_tt.sim import model
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.optimised
+
 PLAY = {
     "nominal": {"rate": 0.93, "low": 0.91, "high": 0.95},
     "extended": {"rate": 0.71, "low": 0.68, "high": 0.74},
