@@ -13,20 +13,25 @@ paid when they happen, nearing the ball as it is neared, means over the steps as
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
+from jax import Array
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from ballmodel.sampling import BallPool
 from mjx_tt.env.observation import observe
 from mjx_tt.env.outgoing_ball import fly_out
 from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import Episodes, EpisodeState, Return
+from mjx_tt.env.task import Episodes, EpisodeState, Return, Tick
 from mjx_tt.sim.model import Range, SimModel
 from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION
+
+T = TypeVar("T")
 
 OBSERVATION_SIZE = HISTORY * N_OBSERVATION
 FEWEST_FLOWN = 16  # balls flown out together, at least
@@ -35,29 +40,29 @@ FEWEST_FLOWN = 16  # balls flown out together, at least
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Given:
-    """The controller whose action (8, ...) has been decided outside."""
+    """Controller with an action decided outside."""
 
-    action: jax.Array
-    mean: jax.Array  # (11,)
+    action: Float[Array, "8 *batch"]
+    mean: Float[Array, "11"]
 
-    def start(self, observation):
+    def start(self, observation: Array) -> tuple[()]:
         return ()
 
-    def act(self, tick, state, observation):
+    def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Float[Array, "8 *batch"], tuple[()]]:
         return self.action, ()
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Playing:
-    """What an environment remembers between steps; batch axes last."""
+    """State of an environment between steps; batch axes last."""
 
-    tick: jax.Array  # () int32, common to the batch: where its rings stand
-    key: jax.Array  # of the episodes to come
+    tick: Int[Array, ""]  # common to the batch: where its rings stand
+    key: PRNGKeyArray  # of the episodes to come
     episodes: Episodes
     state: EpisodeState
-    history: jax.Array  # (8, 11, ...) observations, oldest first
-    earned: jax.Array  # (...) R so far
+    history: Float[Array, "8 11 *batch"]  # observations, oldest first
+    earned: Float[Array, "*batch"]  # R so far
 
 
 class TableTennis(Env):
@@ -95,12 +100,12 @@ class TableTennis(Env):
         draw_key, key = jax.random.split(first)
         return self.begin(self.draw(draw_key, batch), key)
 
-    def draw(self, key, batch: tuple[int, ...]) -> Episodes:
+    def draw(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Episodes:
         """Fresh episodes of the batch shape."""
         drawn = self._simulator.draw(key, self._pool, self._model, self._randomise, 1, int(np.prod(batch)))
         return jax.tree.map(lambda x: x.reshape(*x.shape[:-2], *batch) if x.ndim >= 2 else x, drawn)
 
-    def begin(self, episodes: Episodes, key) -> State:
+    def begin(self, episodes: Episodes, key: PRNGKeyArray) -> State:
         """The state before the first step of given episodes (...); ``key`` is for those that follow."""
         state, tick = self._start(episodes), jnp.int32(0)
         seen = observe(tick, state, episodes, self._task.prepare(episodes))
@@ -147,8 +152,8 @@ class TableTennis(Env):
     def _start(self, episodes: Episodes) -> EpisodeState:
         return self._task.reset(episodes, Given(jnp.zeros(N_JOINTS), jnp.zeros(N_OBSERVATION)))
 
-    def _fly_out(self, state: EpisodeState, hit, episodes: Episodes) -> Return:
-        """What becomes of the balls that were hit in this step.
+    def _fly_out(self, state: EpisodeState, hit: Bool[Array, "*batch"], episodes: Episodes) -> Return:
+        """Outcome of the balls that were hit in this step.
 
         Few of a batch are at any one step: they are gathered, some at a time, until none is left.
         """
@@ -157,7 +162,7 @@ class TableTennis(Env):
         if width == 0 or width >= batch[0]:
             return fly_out(task.config, ball, hit, episodes.model)
 
-        def fly_some(carry):
+        def fly_some(carry: tuple[Array, Return]) -> tuple[Array, Return]:
             left, back = carry
             index = jnp.nonzero(left, size=width, fill_value=batch[0])[0]
             some, model = jax.tree.map(lambda x: x[..., index] if x.ndim else x, (ball, episodes.model))
@@ -166,15 +171,15 @@ class TableTennis(Env):
             return left.at[index].set(False, mode="drop"), back
 
         zero = jnp.zeros_like(ball.position[0])
-        back = Return(zero > 1.0, zero, zero > 1.0, ball.position[:2])
+        back = Return(zero > 1.0, zero, zero > 1.0, jnp.asarray(ball.position[:2]))
         return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), fly_some, (hit, back))[1]
 
 
-def flatten(history):
-    """What a network sees (..., 88) of a history (8, 11, ...)."""
+def flatten(history: Float[Array, "8 11 *batch"]) -> Float[Array, "*batch 88"]:
+    """A network's input: the history as one axis, last."""
     return jnp.moveaxis(history.reshape(OBSERVATION_SIZE, *history.shape[2:]), 0, -1)
 
 
-def _where(done, fresh, old):
+def _where(done: Array, fresh: T, old: T) -> T:
     """Of each leaf (..., B) the fresh entry where an episode is done; scalars of a batch are shared by its episodes."""
     return jax.tree.map(lambda x, y: jnp.where(done, x, y) if x.ndim >= done.ndim else y, fresh, old)

@@ -160,4 +160,4 @@ class Return:
     crossed: Bool[Array, "*batch"]  # over the net plane
     net_height: Float[Array, "*batch"]  # [m] of the ball's centre there
     returned: Bool[Array, "*batch"]
-    landing: Float[Array | np.ndarray, "2 *batch"]  # [m] where it came down to the table's height
+    landing: Float[Array, "2 *batch"]  # [m] where it came down to the table's height

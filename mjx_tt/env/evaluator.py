@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import fields, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -77,14 +78,14 @@ class Evaluator:
             # One layout for arrays from training and from files: one compilation.
             arguments = self._replicate((policy, key if i == 0 else jax.random.fold_in(key, i), *call))
             found.append(self._spread(*arguments))
-        per_episode = {
+        per_episode: dict[str, Any] = {
             field.name: np.concatenate(
                 [np.asarray(x).reshape(*x.shape[:-2], -1) for x in (getattr(f, field.name) for f in found)], axis=-1
             )[..., : self.count]
             for field in fields(RolloutResult)
             if not field.name.startswith("observation")
         }
-        return RolloutResult(**per_episode, observation_sums=None, observation_counts=None)
+        return RolloutResult(**per_episode | {"observation_sums": None, "observation_counts": None})
 
 
 def _take(state: BallState, index: np.ndarray) -> BallState:

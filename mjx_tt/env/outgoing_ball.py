@@ -27,7 +27,7 @@ def fly_out(config: TaskConfig, ball: BallState, hit: Bool[Array, "*batch"], mod
     """
     params = replace(model.ball, flight=replace(model.ball.flight, integrator="midpoint"))
     zero = jnp.zeros_like(ball.position[0])
-    outcome = Return(zero > 1.0, zero, zero > 1.0, ball.position[:2])
+    outcome = Return(zero > 1.0, zero, zero > 1.0, jnp.asarray(ball.position[:2]))
 
     def flying(carry: tuple) -> Array:
         tick, _, live, _ = carry

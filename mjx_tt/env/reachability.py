@@ -16,11 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from ballmodel.sampling import BallPool
 from mjx_tt.env.policy import Policy
-from mjx_tt.env.rollout import AXIS, RESULT_SPECS, Simulator
-from mjx_tt.env.task import RETURNED, Episodes
+from mjx_tt.env.rollout import AXIS, RESULT_SPECS, RolloutResult, Simulator
+from mjx_tt.env.task import RETURNED, Episodes, Tick
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import N_JOINTS, N_OBSERVATION
 
@@ -37,17 +38,21 @@ FIRST_STD = 0.5  # of an action
 class MotionController:
     """Open-loop motions: knots (KNOTS, 8, P) of actions, evenly spaced over ``duration`` (P,) seconds."""
 
-    knots: jax.Array
-    duration: jax.Array
-    period: float
-    mean: jax.Array
+    knots: Float[Array, "knots 8 P"]
+    duration: Float[Array, " P"]  # [s]
+    period: float  # [s]
+    mean: Float[Array, "11"]
 
-    def start(self, observation):
+    def start(self, observation: Array) -> tuple[()]:
         return ()
 
-    def act(self, tick, state, observation):
-        place = jnp.clip(tick.astype(self.duration.dtype) * self.period / self.duration, 0.0, 1.0) * (KNOTS - 1)
-        action = sum(jnp.maximum(1.0 - jnp.abs(place - i), 0.0)[None] * self.knots[i] for i in range(KNOTS))
+    def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Float[Array, "8 P"], tuple[()]]:
+        place = jnp.clip(jnp.asarray(tick).astype(self.duration.dtype) * self.period / self.duration, 0.0, 1.0) * (
+            KNOTS - 1
+        )
+        action = jnp.zeros_like(self.knots[0])
+        for i in range(KNOTS):
+            action = action + jnp.maximum(1.0 - jnp.abs(place - i), 0.0)[None] * self.knots[i]
         return jnp.clip(action, -1.0, 1.0), state
 
 
@@ -65,7 +70,12 @@ class Reachable:
 
 
 def reachable(
-    simulator: Simulator, pool: BallPool, model: SimModel, key, balls: int = 128, policy: Policy | None = None
+    simulator: Simulator,
+    pool: BallPool,
+    model: SimModel,
+    key: PRNGKeyArray,
+    balls: int = 128,
+    policy: Policy | None = None,
 ) -> Reachable:
     """A lower bound of the return rate on balls of the pool: optimises a motion for each that the policy misses.
 
@@ -95,9 +105,9 @@ def _taken(index: np.ndarray, x: Array) -> Array:
 
 
 def _played(simulator: Simulator, policy: Policy, episodes: Episodes) -> np.ndarray:
-    """Which episodes (1, P) the policy returns: (P,) bool."""
+    """True for those of the episodes (1, P) that the policy returns: (P,)."""
 
-    def play(policy, episodes):
+    def play(policy: Policy, episodes: Episodes) -> RolloutResult:
         mine = simulator.local(episodes)
         copies = jnp.repeat(policy.theta[:, None], mine.seed.shape[-1], axis=1)
         return simulator.rollout(replace(policy, theta=copies), mine)
@@ -106,13 +116,13 @@ def _played(simulator: Simulator, policy: Policy, episodes: Episodes) -> np.ndar
     return np.array(spread(*simulator.replicate((policy, episodes))).outcome[0] == RETURNED)
 
 
-def _search(simulator: Simulator, key, episodes: Episodes):
-    """Which of this device's share of episodes (1, P) an optimised motion returns: bool."""
+def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Bool[Array, " P"]:
+    """True for those of this device's share of episodes (1, P) that an optimised motion returns."""
     episodes = simulator.local(episodes)
     mine = episodes.seed.shape[-1]
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
 
-    def spread(x):  # (..., 1, balls) -> (..., 1, CANDIDATES x balls)
+    def spread(x: Array) -> Array:  # (..., 1, balls) -> (..., 1, CANDIDATES x balls)
         return jnp.tile(x, CANDIDATES) if x.ndim >= 2 else x
 
     many = jax.tree.map(spread, episodes)
@@ -120,11 +130,11 @@ def _search(simulator: Simulator, key, episodes: Episodes):
     flight_time = 1.4 * (episodes.ball.position[1] + 1.8) / -episodes.ball.velocity[1]
     duration = jnp.minimum(flight_time[0] + 0.1, LONGEST)
 
-    def searching(carry):
+    def searching(carry: tuple[Array, Array, Array, Array]) -> Array:
         iteration, _, _, solved = carry
         return (iteration < ITERATIONS) & ~jnp.all(solved)
 
-    def iterate(carry):
+    def iterate(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         iteration, mean, std, solved = carry
         noise = jax.random.normal(jax.random.fold_in(key, iteration), (KNOTS, N_JOINTS, CANDIDATES, mine))
         knots = mean[:, :, None] + std[:, :, None] * noise

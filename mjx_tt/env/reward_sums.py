@@ -5,7 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from ballmodel.flight import PaddlePose
@@ -34,9 +33,9 @@ def accumulate(
     sums, alive = s.sums, s.live.astype(command.dtype)
 
     # Mean over the joints of |value| / limit, at most 1 each.
-    def relative(values: Array, limit: ArrayLike) -> Array:
+    def relative(values: Array, limit: np.ndarray | tuple[float, ...]) -> Array:
         parts = [jnp.minimum(jnp.abs(values[i]) / limit[i], 1.0) for i in range(N_JOINTS)]
-        return sum(parts) / N_JOINTS
+        return jnp.asarray(sum(parts)) / N_JOINTS
 
     jerk = (command_acceleration - s.command_acceleration) / period
     lower, upper = np.asarray(LIMITS.lower), np.asarray(LIMITS.upper)

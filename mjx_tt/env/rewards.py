@@ -6,6 +6,8 @@ The paper gives names, ranges and weights; what each term measures in detail is 
 from __future__ import annotations
 
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
 
 TERMS = (
     "state_transition",
@@ -33,11 +35,16 @@ FACING = 0.3  # smallest y component of the blade's normal in good style (72 deg
 SOFT_RANGE = 0.05  # share of a joint's range at each end that the joint-angle term counts as unsafe
 
 
-def state_transition(closest, hit, crossed, returned, landing):
+def state_transition(
+    closest: Float[Array, "*batch"],
+    hit: Bool[Array, "*batch"],
+    crossed: Bool[Array, "*batch"],
+    returned: Bool[Array, "*batch"],
+    landing: Float[Array, "2 *batch"],
+) -> Float[Array, "*batch"]:
     """Term 1, in [0, 5]: nearing the ball up to 3, hit 3, over the net 3.5, on the human's half 4, plus up to 1 more.
 
-    closest (...) [m] least distance of ball and blade centre; hit, crossed, returned (...) bool; landing (2, ...) [m]
-    where the outgoing ball came down to the table's height (anywhere). After a hit, coming down near the target is
+    closest [m]: least distance of ball and blade centre; landing [m]: where the outgoing ball came down to the table's height (anywhere). After a hit, coming down near the target is
     worth up to 0.5, and up to 1 once the ball lands on the human's half.
     """
     distance = jnp.hypot(landing[0] - TARGET[0], landing[1] - TARGET[1])
@@ -46,7 +53,9 @@ def state_transition(closest, hit, crossed, returned, landing):
     return jnp.where(hit, after_hit, 3.0 * jnp.exp(-closest / APPROACH_RANGE))
 
 
-def net_clearance(hit, crossed, net_height):
+def net_clearance(
+    hit: Bool[Array, "*batch"], crossed: Bool[Array, "*batch"], net_height: Float[Array, "*batch"]
+) -> Float[Array, "*batch"]:
     """Term 2, in [0, 1]: the outgoing ball's height over the net plane [m] against a target height."""
     bonus = jnp.exp(-(((net_height - NET_TARGET) / NET_RANGE) ** 2))
     return jnp.where(hit & crossed, bonus, 0.0)

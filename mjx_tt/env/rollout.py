@@ -7,13 +7,17 @@ perturbation axis can be split over devices (jax.sharding): every device runs it
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import BallPool
@@ -21,10 +25,12 @@ from ballmodel.state import BallState, where
 from mjx_tt.env.outgoing_ball import fly_out, fly_out_step
 from mjx_tt.env.policy import PolicyController
 from mjx_tt.env.reward_sums import reward_terms
-from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, Task, TaskConfig
+from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, EpisodeState, Task, TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Range, SimModel
 from robot_io.policy.policy import Policy
+
+T = TypeVar("T")
 
 AXIS = "perturbation"
 CPU_BLOCK = 768  # episodes per block that keep the state inside a core's cache
@@ -33,35 +39,33 @@ CPU_BLOCK = 768  # episodes per block that keep the state inside a core's cache
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class RolloutResult:
-    """What a batch of episodes gave, each (..., R, P)."""
+    """Results of a batch of episodes."""
 
-    terms: jax.Array  # (11, R, P) unweighted, order of rewards.TERMS
-    returns: jax.Array  # (R, P) weighted sum; NaN where the episode was not finite
-    outcome: jax.Array  # (R, P) int32: task.MISSED, HIT, RETURNED
-    landing: jax.Array  # (2, R, P) [m] where the outgoing ball came down to the table's height
-    finite: jax.Array  # (R, P) bool
-    steps: jax.Array  # (R, P) int32 control steps under the policy
-    peak_velocity: jax.Array  # (8, R, P) [m/s], [rad/s]
-    observation_sums: jax.Array  # (2, 11, P) sums of (x - mean) and of (x - mean)^2 over the finite episodes
-    observation_counts: jax.Array  # (P,) int32
-
-
-def _by_perturbation(rank: int) -> PartitionSpec:
-    return PartitionSpec(*[None] * (rank - 1), AXIS)
+    terms: Float[Array, "11 R P"]  # unweighted, order of rewards.TERMS
+    returns: Float[Array, "R P"]  # weighted sum; NaN where the episode was not finite
+    outcome: Int[Array, "R P"]  # task.MISSED, HIT, RETURNED
+    landing: Float[Array, "2 R P"]  # [m] where the outgoing ball came down to the table's height
+    finite: Bool[Array, "R P"]
+    steps: Int[Array, "R P"]  # control steps under the policy
+    peak_velocity: Float[Array, "8 R P"]  # [m/s], [rad/s]
+    observation_sums: Float[Array, "2 11 P"]  # sums of (x - mean) and of (x - mean)^2 over the finite episodes
+    observation_counts: Int[Array, " P"]
 
 
-# How a result that is left on the devices is laid out: split along P.
-RESULT_SPECS = RolloutResult(
-    terms=_by_perturbation(3),
-    returns=_by_perturbation(2),
-    outcome=_by_perturbation(2),
-    landing=_by_perturbation(3),
-    finite=_by_perturbation(2),
-    steps=_by_perturbation(2),
-    peak_velocity=_by_perturbation(3),
-    observation_sums=_by_perturbation(3),
-    observation_counts=_by_perturbation(1),
-)
+# Axes of each field. Where a result stays on the devices it is split along the last one, P.
+_RANKS: dict[str, Any] = {
+    "terms": 3,
+    "returns": 2,
+    "outcome": 2,
+    "landing": 3,
+    "finite": 2,
+    "steps": 2,
+    "peak_velocity": 3,
+    "observation_sums": 3,
+    "observation_counts": 1,
+}
+# The layout of such a result for jax.shard_map: the same pytree of PartitionSpecs.
+RESULT_SPECS = jax.tree.map(lambda rank: PartitionSpec(*[None] * (rank - 1), AXIS), RolloutResult(**_RANKS))
 
 
 class Simulator:
@@ -81,7 +85,13 @@ class Simulator:
         self._cpu = available[0].platform == "cpu"
 
     def draw(
-        self, key, pool: BallPool, model: SimModel, randomise: tuple[Range, ...], repeats: int, columns: int
+        self,
+        key: PRNGKeyArray,
+        pool: BallPool,
+        model: SimModel,
+        randomise: tuple[Range, ...],
+        repeats: int,
+        columns: int,
     ) -> Episodes:
         """Balls, latencies, noise seeds and randomised parameters of repeats x columns episodes.
 
@@ -106,7 +116,7 @@ class Simulator:
             model=jax.tree.map(jnp.asarray, without_nominal(drawn)),
         )
 
-    def on_devices(self, function, **specs):
+    def on_devices(self, function: Callable, **specs: Any) -> Callable:
         """``function`` run on every device at once, on the same arguments; inside it ``local`` picks a device's share.
 
         specs: ``out_specs`` of jax.shard_map. What a function combines over devices it should combine in one
@@ -114,16 +124,16 @@ class Simulator:
         """
         return jax.shard_map(function, mesh=self._mesh, in_specs=PartitionSpec(), check_vma=False, **specs)
 
-    def replicate(self, tree):
+    def replicate(self, tree: T) -> T:
         """The arrays of ``tree`` on every device: the layout that ``on_devices`` takes and returns."""
         return jax.device_put(tree, NamedSharding(self._mesh, PartitionSpec()))
 
-    def local(self, tree):
+    def local(self, tree: T) -> T:
         """This device's share of arrays (..., P) along the last axis; only inside ``on_devices``. Scalars are
         shared."""
         return jax.tree.map(lambda x: self._share(x) if x.ndim else x, tree)
 
-    def _share(self, x):
+    def _share(self, x: Array) -> Array:
         width = x.shape[-1] // self.devices
         if width * self.devices != x.shape[-1]:
             raise ValueError(f"{x.shape[-1]} perturbations cannot be split evenly over {self.devices} devices")
@@ -146,12 +156,12 @@ class Simulator:
         blocks = repeats // rows
 
         # Inside a block rows and columns are one axis: one long loop per operation instead of many short ones.
-        def cut(x):  # (..., R, P) -> (blocks, ..., rows x P); scalars are shared
+        def cut(x: Array) -> Array:  # (..., R, P) -> (blocks, ..., rows x P); scalars are shared
             if x.ndim < 2:
                 return jnp.broadcast_to(x, (blocks, *x.shape))
             return jnp.moveaxis(x.reshape(*x.shape[:-2], blocks, rows * columns), -2, 0)
 
-        def join(x):  # (blocks, ..., rows x P) -> (..., R, P)
+        def join(x: Array) -> Array:  # (blocks, ..., rows x P) -> (..., R, P)
             return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], repeats, columns)
 
         run = partial(self._block, controller=controller)
@@ -169,15 +179,15 @@ class Simulator:
         wanted = max(1, CPU_BLOCK // columns)
         return max(d for d in range(1, repeats + 1) if repeats % d == 0 and d <= wanted)
 
-    def _block(self, episodes: Episodes, controller: Controller):
+    def _block(self, episodes: Episodes, controller: Controller) -> tuple[dict[str, Array], Array, Array]:
         task, config = self.task, self.config
         prepared = task.prepare(episodes)
 
-        def running(carry):
+        def running(carry: tuple[Array, EpisodeState]) -> Array:
             tick, state = carry
             return (tick < config.max_steps) & jnp.any(state.live)
 
-        def advance(carry):
+        def advance(carry: tuple[Array, EpisodeState]) -> tuple[Array, EpisodeState]:
             tick, state = carry
             return tick + 1, task.control_step(tick, state, episodes, prepared, controller)
 
@@ -192,18 +202,20 @@ class Simulator:
         outcome = jnp.where(returned, RETURNED, jnp.where(state.hit & finite, HIT, MISSED)).astype(jnp.int32)
         observed = jnp.where(finite, jnp.stack([state.sums.observation, state.sums.observation_sq]), 0.0)
         steps = state.sums.steps.astype(jnp.int32)
-        result = dict(
+        result: dict[str, Array] = dict(
             terms=terms,
             returns=jnp.where(finite, returns, jnp.nan),
             outcome=outcome,
-            landing=back.landing,
+            landing=jnp.asarray(back.landing),
             finite=finite,
             steps=steps,
             peak_velocity=state.sums.peak_velocity,
         )
         return result, observed, jnp.where(finite, steps, 0)
 
-    def replay(self, policy: Policy, episodes: Episodes):
+    def replay(
+        self, policy: Policy, episodes: Episodes
+    ) -> tuple[Float[Array, "ticks 8 R"], Float[Array, "ticks 3 R"], Int[Array, " R"]]:
         """Plays single episodes for the camera: one policy, episodes (R, 1).
 
         Returns joint positions (max_steps, 8, R), ball positions (max_steps, 3, R) at the control ticks and the number
@@ -218,7 +230,7 @@ class Simulator:
         flight = replace(episodes.model.ball.flight, integrator="midpoint")
         params = replace(episodes.model.ball, flight=flight)
 
-        def advance(carry, tick):
+        def advance(carry: tuple, tick: Array) -> tuple[tuple, tuple[Array, Array]]:
             state, ball, flying, outcome, length = carry
             shown = (state.qpos[..., 0], ball.position[..., 0])
             new = task.control_step(tick, state, episodes, prepared, controller)

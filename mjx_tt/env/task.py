@@ -131,7 +131,20 @@ class Task:
             hit=false,
             live=~false,
             finite=~false,
-            sums=Sums(full(3.0), *[zero] * 8, zeros, full(0.0, N_OBSERVATION), full(0.0, N_OBSERVATION)),
+            sums=Sums(
+                closest=full(3.0),
+                jerk=zero,
+                acceleration=zero,
+                velocity=zero,
+                safe_angle=zero,
+                collision=zero,
+                low_paddle=zero,
+                bad_style=zero,
+                steps=zero,
+                peak_velocity=zeros,
+                observation=full(0.0, N_OBSERVATION),
+                observation_sq=full(0.0, N_OBSERVATION),
+            ),
         )
 
     def control_step(
@@ -199,14 +212,14 @@ class Task:
             (qpos, qvel, pose, drive, filtered, ball, (bounced, hit, live), closest), captured = carry
             share = latency.old_command_share(prepared.action, i, timestep)
             velocity, drive = drives.follow(drive_params, drive, new + share * (old - new), timestep)
-            control = materialise(row(gain) * velocity)
+            control = jnp.asarray(materialise(row(gain) * velocity))
             qpos, qvel = self.engine.step(qpos, qvel, control)
             carried, carried_velocity, drive = drives.carry(drive_params, drive, qpos, qvel, timestep)
             after = materialise(self.kinematics.pose(carried, carried_velocity))
             moved, events = flight.step(params, ball, timestep, (pose, after))
             moved, events = materialise((moved, events))
             before, ball = ball, where(live, moved, ball)
-            if filtered is not None:
+            if filtered is not None and tracker.smoothing is not None:
                 filtered = sensors.smoothed(tracker.smoothing, filtered, before.position, ball.position, timestep)
             own_side = events.table & (events.position[1] < 0.0)
             over = (events.table & (bounced | ~own_side)) | events.net | events.paddle

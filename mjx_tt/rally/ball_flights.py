@@ -10,6 +10,9 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from ballmodel import constants as c
 from ballmodel import flight
@@ -28,12 +31,12 @@ READY = 0.06  # [s] between the bounce and the earliest contact (estimate)
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Sent:
-    """What becomes of the players' balls if nobody plays them."""
+    """Outcome of the players' balls if nobody plays them."""
 
-    net: jax.Array  # bool: touches it
-    own_side: jax.Array  # bool: bounces on the human's half
-    valid: jax.Array  # bool: comes down on the robot's half, from above and without a bounce before
-    landing: jax.Array  # (2, L) [m] there
+    net: Bool[Array, " L"]  # touches it
+    own_side: Bool[Array, " L"]  # bounces on the human's half
+    valid: Bool[Array, " L"]  # comes down on the robot's half, from above and without a bounce before
+    landing: Float[Array, "2 L"]  # [m] there
 
 
 @jax.tree_util.register_dataclass
@@ -42,8 +45,8 @@ class Meeting:
     """How the robot's returns come to the players."""
 
     incoming: Incoming
-    reached: jax.Array  # bool: could be hit before it bounced again or fell to the floor
-    net: jax.Array  # bool: touched it on the way
+    reached: Bool[Array, " L"]  # could be hit before it bounced again or fell to the floor
+    net: Bool[Array, " L"]  # touched it on the way
 
 
 def _alone(params: BallParams) -> BallParams:
@@ -56,11 +59,11 @@ def sent(params: BallParams, ball: BallState, period: float) -> Sent:
     params, false = _alone(params), jnp.zeros(ball.position.shape[1:], bool)
     start = Sent(false, false, false, jnp.zeros((2, *false.shape)))
 
-    def flying(carry):
+    def flying(carry: tuple) -> Array:
         tick, _, live, _ = carry
         return (tick < LONGEST / period) & jnp.any(live)
 
-    def advance(carry):
+    def advance(carry: tuple) -> tuple:
         tick, ball, live, found = carry
         new, events = flight.step(params, ball, period)
         own = live & events.table & (events.position[1] > 0.0)
@@ -77,7 +80,14 @@ def sent(params: BallParams, ball: BallState, period: float) -> Sent:
     return jax.lax.while_loop(flying, advance, (0, ball, ~false, start))[3]
 
 
-def meeting(params: BallParams, ball: BallState, returned, plane, height, period: float) -> Meeting:
+def meeting(
+    params: BallParams,
+    ball: BallState,
+    returned: Bool[Array, " L"],
+    plane: Float[Array, " L"],
+    height: Float[Array, " L"],
+    period: float,
+) -> Meeting:
     """Flies the robot's returns (3, L) to the player: to the wished plane y or height z [m], whichever comes first.
 
     returned: which balls to fly. The contact is looked for once per ``period`` [s].
@@ -85,11 +95,11 @@ def meeting(params: BallParams, ball: BallState, returned, plane, height, period
     params, zero = _alone(params), jnp.zeros_like(ball.position[0])
     start = Meeting(Incoming(ball, jnp.zeros_like(ball.position[:2]), zero), zero > 1.0, zero > 1.0)
 
-    def flying(carry):
+    def flying(carry: tuple) -> Array:
         tick, _, live, _, _ = carry
         return (tick < LONGEST / period) & jnp.any(live)
 
-    def advance(carry):
+    def advance(carry: tuple) -> tuple:
         tick, ball, live, since, met = carry
         new, events = flight.step(params, ball, period)
         net = met.net | (live & events.net)
@@ -112,7 +122,7 @@ def meeting(params: BallParams, ball: BallState, returned, plane, height, period
     return jax.lax.while_loop(flying, advance, (0, ball, returned, zero, start))[4]
 
 
-def homeward(home, qpos, seconds):
+def homeward(home: ArrayLike, qpos: Float[Array, "8 L"], seconds: Float[Array, " L"]) -> Float[Array, "8 L"]:
     """Joint positions (8, L) ``seconds`` (L,) after the hit, on the way home (8,) as the bridge drives it."""
     speed, braking = HOME_SPEED * column(LIMITS.policy_velocity), HOME_BRAKING * column(LIMITS.acceleration)
     error, driven = column(home) - qpos, jnp.maximum(seconds - HOME_DELAY, 0.0)[None]
@@ -125,6 +135,6 @@ def homeward(home, qpos, seconds):
     return qpos + jnp.sign(error) * jnp.clip(moved, 0.0, distance)
 
 
-def column(values):
+def column(values: ArrayLike) -> Float[Array, "8 1"]:
     """Numbers of the joints as (8, 1)."""
     return jnp.asarray(np.asarray(values, np.float32))[:, None]

@@ -1,10 +1,13 @@
-"""Why a rally ended: the paper's table end_of_rally_attribution, row by row, and how a simulated rally finds its row."""
+"""Reasons why a rally ended: the rows of the paper's table end_of_rally_attribution, and which one a simulated rally
+belongs to."""
 
 from __future__ import annotations
 
 from enum import IntEnum
 
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Int
 
 from ballmodel import constants as c
 from mjx_tt.env.task import HIT, MISSED, RETURNED
@@ -15,7 +18,7 @@ CORNER = 0.25  # [m] from a side line and from the end line within which a landi
 
 
 class End(IntEnum):
-    """Why a rally ended: the rows of the paper's table end_of_rally_attribution in their order, and what it lacks."""
+    """Reason why a rally ended: the rows of the paper's table end_of_rally_attribution in their order, and what it lacks."""
 
     FIRST_NET = 0
     FIRST_OVER_TABLE = 1
@@ -69,8 +72,8 @@ ROWS = (
     ),
     (
         End.DUMMY_BY_HAND,
-        "Robot is in ABB home pose, not the episode start state. You throw a dummy ball by hand so that the robot moves "
-        "to episode start state.",
+        "Robot is in ABB home pose, not the episode start state. You throw a dummy ball by hand so that the robot "
+        "moves to episode start state.",
         None,
         True,
     ),
@@ -86,11 +89,16 @@ ROWS = (
 )
 
 
-def ending(first, sent: Sent, outcome, answered, met: Meeting, idle, inside):
-    """The row of the table (L,) that tells why a rally ended; NONE where the player answered.
-
-    first, answered, idle, inside (L,) bool; outcome (L,) of the task.
-    """
+def ending(
+    first: Bool[Array, " L"],
+    sent: Sent,
+    outcome: Int[Array, " L"],
+    answered: Bool[Array, " L"],
+    met: Meeting,
+    idle: Bool[Array, " L"],
+    inside: Bool[Array, " L"],
+) -> Int[Array, " L"]:
+    """The table's row with the reason why a rally ended; NONE where the player answered. outcome: of the task."""
     to_net = sent.net & ~sent.valid
     graze = sent.net & sent.valid
     edge = jnp.minimum(c.TABLE_WIDTH / 2 - jnp.abs(sent.landing[0]), sent.landing[1] + c.TABLE_LENGTH / 2) < EDGE

@@ -4,8 +4,8 @@ A player lobs first balls; answers a return with a stroke that depends on it; er
 play; tires; gets used to the robot. The shape of the behaviour is ours (the paper measured balls and rally lengths,
 not behaviour); its numbers, one YAML per player in ``assets/virtual_players``, are calibrated so that balls and rallies
 come near the paper's tables (docs/results/virtual-players.md, ``study/player_calibration.py``). Instructions to the
-players: appendix "Instructions for Human Players" of Abeyruwan et al. 2022: lobs from the left-hand quadrant of the human's half
-(x > 0 for the human, who looks along -y) to the robot's right-hand quadrant (x > 0), returns to there as well.
+players: appendix "Instructions for Human Players" of Abeyruwan et al. 2022: lobs from the left-hand quadrant of the
+human's half (x > 0 for the human, who looks along -y) to the robot's right-hand quadrant (x > 0), returns to there as well.
 
 Component axis first, batch axes last; a player's leaves are scalars or of the batch shape. SI units.
 """
@@ -15,20 +15,27 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import os
 import types
 import typing
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from ballmodel import constants as c
 from ballmodel.aerodynamics import FlightParams
 from ballmodel.io import yaml
 from ballmodel.state import BallState
+from ballmodel.vec import Scalars
 from mjx_tt.rally.shots import aimed, erring, fall_seconds, stroke_seconds
+
+T = TypeVar("T")
 
 FOLDER = Path(__file__).parents[1] / "assets" / "virtual_players"
 NOTES = ("name", "level", "source")
@@ -53,7 +60,9 @@ class Spread:
     usual: jax.Array | float
     high: jax.Array | float
 
-    def draw(self, key, shape: tuple[int, ...], steadiness, cut: float):
+    def draw(
+        self, key: PRNGKeyArray, shape: tuple[int, ...], steadiness: Scalars, cut: float
+    ) -> Float[Array, "*batch"]:
         """Values (*shape), whose ends are ``cut`` standard deviations away.
 
         steadiness: power to which the share of the way to an end is raised; above 1 most balls are near the usual value
@@ -154,21 +163,21 @@ class Player:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PlayerState:
-    """What a player carries from ball to ball; all (...) unless noted."""
+    """State of a player from ball to ball."""
 
-    tiredness: jax.Array  # 0 fresh to 1
-    familiarity: jax.Array  # 0 never met this robot to 1
-    expected: jax.Array  # (3, ...) [m], [m], [m/s] landing x, y and speed of the robot's returns so far
+    tiredness: Float[Array, "*batch"]  # 0 fresh to 1
+    familiarity: Float[Array, "*batch"]  # 0 never met this robot to 1
+    expected: Float[Array, "3 *batch"]  # [m], [m], [m/s] landing x, y and speed of the robot's returns so far
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Incoming:
-    """A robot's return as the player meets it; (...) unless noted."""
+    """A robot's return as the player meets it."""
 
     ball: BallState  # (3, ...) at the moment of contact
-    landing: jax.Array  # (2, ...) [m] of the bounce on the human's half
-    seconds: jax.Array  # from the robot's hit to the contact
+    landing: Float[Array, "2 *batch"]  # [m] of the bounce on the human's half
+    seconds: Float[Array, "*batch"]  # from the robot's hit to the contact
 
 
 @jax.tree_util.register_dataclass
@@ -177,8 +186,8 @@ class Answer:
     """A player's stroke."""
 
     ball: BallState  # (3, ...) as it leaves the paddle, or as it came where it was missed
-    hit: jax.Array  # (...) bool
-    difficulty: jax.Array  # (...)
+    hit: Bool[Array, "*batch"]
+    difficulty: Float[Array, "*batch"]
     state: PlayerState
 
 
@@ -198,7 +207,7 @@ def rested(player: Player, state: PlayerState) -> PlayerState:
     return replace(state, tiredness=state.tiredness * (1.0 - player.person.rest))
 
 
-def first_ball(player: Player, state: PlayerState, key, shape: tuple[int, ...]) -> BallState:
+def first_ball(player: Player, state: PlayerState, key: PRNGKeyArray, shape: tuple[int, ...]) -> BallState:
     """Balls (3, *shape) that start a rally, as they leave the paddle; aimed as if their little spin did nothing."""
     first = player.first
     keys = iter(jax.random.split(key, 12))
@@ -224,8 +233,10 @@ def first_ball(player: Player, state: PlayerState, key, shape: tuple[int, ...]) 
     return BallState(start, velocity, LOB_SPIN * _spin(player.spin, next(keys), velocity))
 
 
-def wish(player: Player, key, shape: tuple[int, ...]):
-    """Plane y and height z [m] at which the players mean to take the next return; (...) each."""
+def wish(
+    player: Player, key: PRNGKeyArray, shape: tuple[int, ...]
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """Plane y and height z [m] at which the players mean to take the next return."""
     plane, height = jax.random.split(key)
     strokes = player.strokes
     return (
@@ -234,7 +245,7 @@ def wish(player: Player, key, shape: tuple[int, ...]):
     )
 
 
-def answer(player: Player, state: PlayerState, key, incoming: Incoming, flight: FlightParams) -> Answer:
+def answer(player: Player, state: PlayerState, key: PRNGKeyArray, incoming: Incoming, flight: FlightParams) -> Answer:
     """The player's stroke at a return. flight: of the world in which the player has learnt to aim."""
     ability, strokes, ball = player.ability, player.strokes, incoming.ball
     shape = ball.position.shape[1:]
@@ -278,8 +289,8 @@ def answer(player: Player, state: PlayerState, key, incoming: Incoming, flight: 
     return Answer(left, hit, hard, after)
 
 
-def difficulty(player: Player, state: PlayerState, incoming: Incoming):
-    """How hard a return is to play, (...): sums of units of stretch, lean, height, speed, spin and surprise."""
+def difficulty(player: Player, state: PlayerState, incoming: Incoming) -> Float[Array, "*batch"]:
+    """Difficulty of a return: the sum of units of stretch, lean, height, speed, spin and surprise."""
     ability, ball = player.ability, incoming.ball
     _, y, z = ball.position
     speed = jnp.sqrt(jnp.sum(ball.velocity**2, axis=0))
@@ -299,14 +310,14 @@ def difficulty(player: Player, state: PlayerState, incoming: Incoming):
     )
 
 
-def stretch(ability: Ability, incoming: Incoming):
-    """Way to the side that the player has to go, as a share of what the time allows, (...); 1: just reached."""
+def stretch(ability: Ability, incoming: Incoming) -> Float[Array, "*batch"]:
+    """Way to the side that the player has to go, as a share of what the time allows; 1: just reached."""
     way = jnp.maximum(jnp.abs(incoming.ball.position[0] - ability.stand) - ability.reach, 0.0)
     return way / (ability.feet * jnp.maximum(incoming.seconds - REACTION, 0.1))
 
 
-def _spin(spin: Spin, key, way):
-    """Spin (3, ...) [rad/s] of a stroke along ``way`` (3, ...): topspin about z x direction, sidespin about z."""
+def _spin(spin: Spin, key: PRNGKeyArray, way: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
+    """Spin [rad/s] of a stroke along ``way``: topspin about z x direction, sidespin about z."""
     top_key, side_key = jax.random.split(key)
     shape = way.shape[1:]
     length = jnp.hypot(way[0], way[1]) + 1e-6
@@ -315,10 +326,11 @@ def _spin(spin: Spin, key, way):
     return jnp.stack([-top * way[1] / length, top * way[0] / length, side])
 
 
-def _errors(player: Player, state: PlayerState, scale):
+def _errors(player: Player, state: PlayerState, scale: Scalars) -> tuple[Scalars, Scalars, Scalars]:
     """Deviations of direction, elevation and pace, ``scale`` times those of an easy ball to a rested player."""
     scale = scale * (1.0 + player.person.weariness * state.tiredness)
-    return [scale * size for size in (player.ability.direction, player.ability.elevation, player.ability.pace)]
+    ability = player.ability
+    return scale * ability.direction, scale * ability.elevation, scale * ability.pace
 
 
 @cache
@@ -337,7 +349,7 @@ def load(name: str) -> Player:
     return read(FOLDER / f"{name}.yaml")
 
 
-def read(path) -> Player:
+def read(path: str | os.PathLike) -> Player:
     """A player from a YAML file: the tree of field names, a spread as [low, usual, high]. Raises ValueError naming
     file and key."""
     data = yaml.read(path)
@@ -346,12 +358,16 @@ def read(path) -> Player:
     return _parse(Player, {k: v for k, v in data.items() if k not in NOTES}, str(path), "")
 
 
-def to_dict(player) -> dict:
+def to_dict(player: Player) -> dict[str, Any]:
     """The YAML form of a player with scalar leaves."""
+    return {f.name: _plain(getattr(player, f.name)) for f in dataclasses.fields(player)}
+
+
+def _plain(player: Any) -> dict[str, Any] | list[float] | float:
     if isinstance(player, Spread):
         return [round(float(value), 4) for value in (player.low, player.usual, player.high)]
     if dataclasses.is_dataclass(player):
-        return {f.name: to_dict(getattr(player, f.name)) for f in dataclasses.fields(player)}
+        return {f.name: _plain(getattr(player, f.name)) for f in dataclasses.fields(player)}
     return round(float(player), 4)
 
 
@@ -360,7 +376,7 @@ def stack(players: list[Player]) -> Player:
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, jnp.float32) for leaf in leaves]), *players)
 
 
-def _parse(kind, data, where: str, prefix: str):
+def _parse(kind: type[T], data: Any, where: str, prefix: str) -> T:
     hints = typing.get_type_hints(kind)
     if not isinstance(data, dict):
         raise ValueError(f"{where}: {prefix.rstrip('.')} = {data!r}, a mapping of {', '.join(hints)} is wanted")
@@ -368,7 +384,7 @@ def _parse(kind, data, where: str, prefix: str):
         if key not in hints:
             near = difflib.get_close_matches(str(key), hints, n=1, cutoff=0.0)
             raise ValueError(f"{where}: unknown key {prefix}{key}; did you mean {prefix}{near[0]}?")
-    values = {}
+    values: dict[str, Any] = {}
     for name, hint in hints.items():
         path = f"{prefix}{name}"
         if name not in data:
@@ -389,5 +405,5 @@ def _parse(kind, data, where: str, prefix: str):
     return kind(**values)
 
 
-def _is_number(value) -> bool:
+def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -9,16 +9,22 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, PRNGKeyArray
 
 from ballmodel import constants as c
 from ballmodel.aerodynamics import FlightParams
 from ballmodel.flight import free_step
 from ballmodel.state import BallState
+from ballmodel.vec import Scalars
 
 SOLVER_STEPS, SOLVER_ROUNDS = 16, 4  # of the flight that aims a stroke: within a few millimetres
 
 
-def stroke_seconds(start, target, speed, clearance):
+def stroke_seconds(
+    start: Float[Array | np.ndarray, "3 *batch"], target: Float[Array, "3 *batch"], speed: Scalars, clearance: Scalars
+) -> Float[Array, "*batch"]:
     """Time of flight [s] (...) from start to target (3, ...) [m] at a horizontal speed [m/s], or longer: over the net.
 
     Without air the height over the net plane at the share a of the way is z0 + a (z1 - z0) + g T^2 / 2 a (1 - a).
@@ -31,13 +37,19 @@ def stroke_seconds(start, target, speed, clearance):
     return jnp.maximum(jnp.hypot(across, along) / speed, over_net)
 
 
-def fall_seconds(climb, height):
+def fall_seconds(climb: Scalars, height: Scalars) -> Float[Array, "*batch"]:
     """Time [s] (...) without air until a ball that leaves at a height [m] with a climb [m/s] meets the table."""
     square = climb**2 + 2.0 * c.GRAVITY * (height - c.BALL_RADIUS)
-    return (climb + jnp.sqrt(jnp.maximum(square, 0.0))) / c.GRAVITY
+    return jnp.asarray(climb + jnp.sqrt(jnp.maximum(square, 0.0))) / c.GRAVITY
 
 
-def aimed(flight: FlightParams, start, target, seconds, spin):
+def aimed(
+    flight: FlightParams,
+    start: Float[Array | np.ndarray, "3 *batch"],
+    target: Float[Array, "3 *batch"],
+    seconds: Float[Array, "*batch"],
+    spin: Float[Array, "3 *batch"],
+) -> Float[Array, "3 *batch"]:
     """Velocity (3, ...) [m/s] with which a ball of that spin flies from start to target (3, ...) [m] in ``seconds``.
 
     By shooting: the flight without air first, then each time the miss over the time is taken off.
@@ -52,7 +64,14 @@ def aimed(flight: FlightParams, start, target, seconds, spin):
     return velocity
 
 
-def erring(key, velocity, direction, elevation, pace, lift=0.0):
+def erring(
+    key: PRNGKeyArray,
+    velocity: Float[Array, "3 *batch"],
+    direction: Scalars,
+    elevation: Scalars,
+    pace: Scalars,
+    lift: Scalars = 0.0,
+) -> Float[Array, "3 *batch"]:
     """The velocity (3, ...) with Gaussian errors, cut at three deviations: direction and elevation [rad], pace as a
     share.
 

@@ -16,6 +16,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from ballmodel.distribution import BallDistribution
 from ballmodel.partial_params import without_nominal
@@ -24,7 +27,7 @@ from mjx_tt.env import rewards
 from mjx_tt.env.outgoing_ball import fly_out
 from mjx_tt.env.policy import Policy, PolicyController
 from mjx_tt.env.reward_sums import reward_terms
-from mjx_tt.env.task import HIT, MISSED, RETURNED, Episodes, Task, TaskConfig
+from mjx_tt.env.task import HIT, MISSED, RETURNED, Episodes, EpisodeState, Task, TaskConfig
 from mjx_tt.rally import ball_flights, human_player
 from mjx_tt.rally.ball_flights import column, homeward
 from mjx_tt.rally.end_reasons import End, ending
@@ -45,8 +48,8 @@ BY_HAND = 0.5  # share of the dummy balls that are thrown by hand
 class Box:
     """Bounds of a ball distribution: position (3), velocity (3), landing (2); (8,) or (8, L)."""
 
-    low: jax.Array
-    high: jax.Array
+    low: Float[Array, "8 *#lanes"]
+    high: Float[Array, "8 *#lanes"]
 
     @staticmethod
     def of(distribution: BallDistribution) -> Box:
@@ -56,8 +59,8 @@ class Box:
             jnp.array([*d.position_max, *d.velocity_max, *d.landing_max]),
         )
 
-    def holds(self, ball: BallState, landing):
-        """Whether balls (3, ...) with landing (2, ...) lie inside, (...)."""
+    def holds(self, ball: BallState, landing: Float[Array, "2 *batch"]) -> Bool[Array, "*batch"]:
+        """True for balls that lie inside with their landing points."""
         values = jnp.concatenate([ball.position, ball.velocity, landing])
         low, high = (x.reshape(x.shape + (1,) * (values.ndim - x.ndim)) for x in (self.low, self.high))
         return jnp.all((values >= low) & (values <= high), axis=0)
@@ -66,64 +69,64 @@ class Box:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class RallyState:
-    """Lanes between two turns; the next ball is about to leave the player's paddle. All (L,) unless noted."""
+    """Lanes between two turns; the next ball is about to leave the player's paddle."""
 
     player: PlayerState
     ball: BallState  # (3, L)
-    touches: jax.Array  # int32 paddle touches of this rally so far, the coming ball's included
-    start: jax.Array  # (8, L) joint positions of the robot
-    dummy: jax.Array  # bool: the robot stands in the arm's own home pose
+    touches: Int[Array, " L"]  # paddle touches of this rally so far, the coming ball's included
+    start: Float[Array, "8 L"]  # joint positions of the robot
+    dummy: Bool[Array, " L"]  # the robot stands in the arm's own home pose
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ShotResult:
-    """One turn of every lane; (L,) unless noted."""
+    """One turn of every lane."""
 
     ball: BallState  # (3, L) the player's ball as it left the paddle
-    first: jax.Array  # bool: it started a rally
-    touch: jax.Array  # int32 its number in the rally, 1 for the first
-    landing: jax.Array  # (2, L) [m] where it bounced on the robot's side, NaN where it did not
-    terms: jax.Array  # (11, L) unweighted reward terms, the fault among them
-    finite: jax.Array  # bool
-    outcome: jax.Array  # int32: task.MISSED, HIT, RETURNED
-    fault: jax.Array  # bool: the robot stopped itself
-    end: jax.Array  # int8 End; NONE where the rally goes on
-    return_landing: jax.Array  # (2, L) [m] where the robot's ball came down, NaN where it hit none
-    robot_peak: jax.Array  # (8, L) [m/s], [rad/s]
-    seconds: jax.Array  # [s] until the player's next contact, or until the ball was over
+    first: Bool[Array, " L"]  # it started a rally
+    touch: Int[Array, " L"]  # its number in the rally, 1 for the first
+    landing: Float[Array, "2 L"]  # [m] where it bounced on the robot's side, NaN where it did not
+    terms: Float[Array, "11 L"]  # unweighted reward terms, the fault among them
+    finite: Bool[Array, " L"]
+    outcome: Int[Array, " L"]  # task.MISSED, HIT, RETURNED
+    fault: Bool[Array, " L"]  # the robot stopped itself
+    end: Int[Array, " L"]  # End; NONE where the rally goes on
+    return_landing: Float[Array, "2 L"]  # [m] where the robot's ball came down, NaN where it hit none
+    robot_peak: Float[Array, "8 L"]  # [m/s], [rad/s]
+    seconds: Float[Array, " L"]  # [s] until the player's next contact, or until the ball was over
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class BallLog:
-    """Human hits, up to a capacity per lane: (capacity, L), components first; slots past ``count`` are zero."""
+    """Human hits, up to a capacity per lane; slots past ``count`` are zero."""
 
-    rally: jax.Array  # int32 index of the rally in its lane
-    touch: jax.Array  # int32
-    position: jax.Array  # (3, capacity, L) [m] at the human's contact
-    velocity: jax.Array  # (3, capacity, L) [m/s]
-    spin: jax.Array  # (3, capacity, L) [rad/s]
-    landing: jax.Array  # (2, capacity, L) [m] on the robot's side, NaN where there was none
-    hit: jax.Array  # bool: by the robot
-    returned: jax.Array  # bool
-    return_landing: jax.Array  # (2, capacity, L) [m], NaN where the robot hit none
-    count: jax.Array  # (L,) int32 hits, those that found no room included
+    rally: Int[Array, "capacity L"]  # index of the rally in its lane
+    touch: Int[Array, "capacity L"]
+    position: Float[Array, "3 capacity L"]  # [m] at the human's contact
+    velocity: Float[Array, "3 capacity L"]  # [m/s]
+    spin: Float[Array, "3 capacity L"]  # [rad/s]
+    landing: Float[Array, "2 capacity L"]  # [m] on the robot's side, NaN where there was none
+    hit: Bool[Array, "capacity L"]  # by the robot
+    returned: Bool[Array, "capacity L"]
+    return_landing: Float[Array, "2 capacity L"]  # [m], NaN where the robot hit none
+    count: Int[Array, " L"]  # hits, those that found no room included
 
     @property
-    def first(self):
-        """(capacity, L) bool: balls that started a rally."""
+    def first(self) -> Bool[Array, "capacity L"]:
+        """True for balls that started a rally."""
         return self.touch == 1
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class RallyResult:
-    """Rallies of all lanes, (rallies, L) each."""
+    """Rallies of all lanes."""
 
-    length: jax.Array  # int32 paddle touches of human and robot
-    end: jax.Array  # int8 End
-    seconds: jax.Array  # [s] of play
+    length: Int[Array, "rallies L"]  # paddle touches of human and robot
+    end: Int[Array, "rallies L"]  # End
+    seconds: Float[Array, "rallies L"]  # [s] of play
     balls: BallLog
     player: PlayerState  # (L,) as the session left them
 
@@ -138,11 +141,19 @@ class RallySimulator:
         self._shots = jax.jit(self._turn)
         self._start = jax.jit(self._start_lanes, static_argnames="lanes")
 
-    def start(self, player: Player, model: SimModel, key, lanes: int) -> RallyState:
+    def start(self, player: Player, model: SimModel, key: PRNGKeyArray, lanes: int) -> RallyState:
         """Fresh players about to hit a first ball, the robot at home."""
         return self._start(player, without_nominal(model), key, lanes=lanes)
 
-    def shots(self, policy: Policy, player: Player, model: SimModel, state: RallyState, key, box=None):
+    def shots(
+        self,
+        policy: Policy,
+        player: Player,
+        model: SimModel,
+        state: RallyState,
+        key: PRNGKeyArray,
+        box: Box | None = None,
+    ) -> tuple[RallyState, ShotResult]:
         """Every lane plays one ball: the player's answer where the rally goes on, else a new first ball.
 
         policy: theta (976, L), normaliser (11, L) or (11,); player and model with leaves scalar or (L,); box: None, or
@@ -157,7 +168,7 @@ class RallySimulator:
         policy: Policy,
         player: Player,
         model: SimModel,
-        key,
+        key: PRNGKeyArray,
         rallies: int,
         box: Box | BallDistribution | None = None,
         max_touches: int = 400,
@@ -183,7 +194,7 @@ class RallySimulator:
 
     # -- turns ---------------------------------------------------------------------------------------------------------
 
-    def _start_lanes(self, player, model, key, lanes: int) -> RallyState:
+    def _start_lanes(self, player: Player, model: SimModel, key: PRNGKeyArray, lanes: int) -> RallyState:
         fresh = human_player.fresh((lanes,))
         ball = human_player.first_ball(player, fresh, key, (lanes,))
         home = jnp.broadcast_to(jnp.asarray(self.task.home, jnp.float32)[:, None], (N_JOINTS, lanes))
@@ -195,10 +206,10 @@ class RallySimulator:
         player: Player,
         model: SimModel,
         state: RallyState,
-        key,
-        box,
+        key: PRNGKeyArray,
+        box: Box | None,
         max_touches: int = ENDLESS,
-    ):
+    ) -> tuple[RallyState, ShotResult, Int[Array, " L"]]:
         """One ball of every lane. Returns the next state, the result and the paddle touches of each rally so far."""
         lanes = state.touches.shape[0]
         keys = iter(jax.random.split(key, 8))
@@ -254,7 +265,9 @@ class RallySimulator:
         )
         return after, result, state.touches + hit.astype(jnp.int32)
 
-    def _robot(self, key, policy: Policy, model: SimModel, ball: BallState, start):
+    def _robot(
+        self, key: PRNGKeyArray, policy: Policy, model: SimModel, ball: BallState, start: Float[Array, "8 L"]
+    ) -> EpisodeState:
         """The robot's part of one episode: its last state."""
         latency_key, seed_key = jax.random.split(key)
         lanes = ball.position.shape[1:]
@@ -269,11 +282,11 @@ class RallySimulator:
         task, controller = self.task, PolicyController.of(policy)
         prepared = task.prepare(episodes)
 
-        def running(carry):
+        def running(carry: tuple[Array, EpisodeState]) -> Array:
             tick, state = carry
             return (tick < self.config.max_steps) & jnp.any(state.live)
 
-        def advance(carry):
+        def advance(carry: tuple[Array, EpisodeState]) -> tuple[Array, EpisodeState]:
             tick, state = carry
             return tick + 1, task.control_step(tick, state, episodes, prepared, controller)
 
@@ -281,7 +294,18 @@ class RallySimulator:
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 
-    def _play_all(self, policy: Policy, player, model, key, box, *, rallies, max_touches, capacity):
+    def _play_all(
+        self,
+        policy: Policy,
+        player: Player,
+        model: SimModel,
+        key: PRNGKeyArray,
+        box: Box | None,
+        *,
+        rallies: int,
+        max_touches: int,
+        capacity: int,
+    ) -> RallyResult:
         lanes = policy.theta.shape[-1]
         start_key, key = jax.random.split(key)
         lane = jnp.arange(lanes)
@@ -295,11 +319,11 @@ class RallySimulator:
         three, two = (jnp.zeros((n, capacity, lanes)) for n in (3, 2))
         log = BallLog(whole, whole, three, three, three, two, some, some, two, jnp.zeros(lanes, jnp.int32))
 
-        def unfinished(carry):
+        def unfinished(carry: tuple) -> Array:
             turn, _, done, *_ = carry
             return jnp.any(done < rallies) & (turn < rallies * (max_touches + 2))
 
-        def advance(carry):
+        def advance(carry: tuple) -> tuple:
             turn, state, done, seconds, (length, end, spent), log = carry
             key_turn, key_dummy = jax.random.split(jax.random.fold_in(key, turn))
             after, shot, touches = self._turn(policy, player, model, state, key_turn, box, max_touches)
@@ -332,11 +356,13 @@ class RallySimulator:
         return RallyResult(length, end, spent, log, state.player)
 
 
-def _logged(log: BallLog, rally, shot: ShotResult, keep, lane) -> BallLog:
+def _logged(
+    log: BallLog, rally: Int[Array, " L"], shot: ShotResult, keep: Bool[Array, " L"], lane: Int[Array, " L"]
+) -> BallLog:
     capacity = log.touch.shape[0]
     slot = jnp.where(keep, log.count, capacity)
 
-    def put(buffer, value):
+    def put(buffer: Array, value: Array | np.ndarray) -> Array:
         return buffer.at[..., slot, lane].set(value, mode="drop")
 
     return BallLog(

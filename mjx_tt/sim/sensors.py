@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 
@@ -80,8 +81,8 @@ def camera(params: SensingParams) -> Camera | None:
 def smoothed(
     time_constant: Scalars,
     filtered: Float[Array, "3 *batch"],
-    before: Float[Array, "3 *batch"],
-    after: Float[Array, "3 *batch"],
+    before: Float[Array | np.ndarray, "3 *batch"],
+    after: Float[Array | np.ndarray, "3 *batch"],
     timestep: float,
 ) -> Float[Array, "3 *batch"]:
     """The filtered position (3, ...) [m] at a substep's end: df/dt = (p - f) / time_constant, solved exactly for a ball
