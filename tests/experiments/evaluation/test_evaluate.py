@@ -85,9 +85,10 @@ def test_summary_of_nothing_finite_is_still_json():
 
 
 def test_an_evaluation_plays_the_spin_of_its_model():
-    """Past a robot that stands still, balls go out of reach when ``hand_ball`` says: a spinning one leaves the table fast."""
+    """Past a robot that stands still, balls go out of reach when SciPy says: a spinning one leaves the table fast."""
     topspin = 250.0
     data = {"name": "a", "balls": "narrow", "model": {"ball_spin": {"mean_x": topspin}}, "training": {"pool": 64}}
+    data["task"] = {"sim_rate": 150.0}
     experiment = build.experiment(config.parse(data, "a"), "a")
     simulator = Simulator(experiment.task)
     balls = evaluate.draw_balls(experiment, simulator, 32, jax.random.key(0))
@@ -96,9 +97,9 @@ def test_an_evaluation_plays_the_spin_of_its_model():
     played = evaluator.play(Policy(np.zeros(n_parameters(), np.float32), 0.0 * eleven, eleven), jax.random.key(1))
     missed = played.outcome == MISSED
     assert missed.sum() > 16
-    for i, steps in zip(evaluator.order[missed], played.steps[missed]):
-        ball = jax.tree.map(lambda x: np.asarray(x, float)[:, i], balls.state)
-        start = ball_flight.Touch(0.0, ball.position, ball.velocity, np.array([topspin, 0.0, 0.0]))
+    position, velocity = (np.asarray(x, float).T for x in (balls.state.position, balls.state.velocity))
+    for i, steps in zip(evaluator.order[missed], played.steps[missed], strict=True):
+        start = ball_flight.Touch(0.0, position[i], velocity[i], np.array([topspin, 0.0, 0.0]))
         end, _ = ball_flight.fly(
             ball_flight.on_table(start), lambda p: min(p[1] - OUT_OF_REACH[0], p[2] - OUT_OF_REACH[1])
         )

@@ -68,7 +68,7 @@ def source(tmp_path_factory) -> Path:
 
 
 class Toy:
-    """A "robot" that nears the ball the better, the nearer three parameters are to their optimum; remembers what it plays."""
+    """A "robot" that is the better, the nearer three parameters are to their optimum; keeps what it plays."""
 
     repeatable = True
 
@@ -130,7 +130,7 @@ def test_the_defaults_are_the_papers_real_settings():
     )
     assert chosen.step.kind == "sgd" and chosen.step.schedule.kind == "constant" and chosen.orthogonal
     assert chosen.updates in (60, 70) and chosen.episodes_per_update == 30
-    weights = dict(zip(loop.rewards.TERMS, build.reward_weights(chosen.rewards)))
+    weights = dict(zip(loop.rewards.TERMS, build.reward_weights(chosen.rewards), strict=True))
     assert {name: weight for name, weight in weights.items() if weight} == {
         "state_transition": 1.0,
         "net_clearance": 1.0,

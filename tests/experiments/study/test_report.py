@@ -237,7 +237,10 @@ def test_measured_means_are_the_known_ones(whole):
     assert m.robot_ends().value == pytest.approx(robot + (1.0 - robot) / 3, abs=0.03)
     made = [study_data.load(whole).log(seed, "player1", "player1", "is2r-ft100") for seed in (0, 1)]
     far = sum(
-        int(h and y > 1.37) for log in made for h, r, y in zip(log.hit, log.returned, log.return_landing[1]) if not r
+        int(h and y > 1.37)
+        for log in made
+        for h, r, y in zip(log.hit, log.returned, log.return_landing[1], strict=True)
+        if not r
     )
     assert m.over().value == pytest.approx(far / sum(int(np.sum(~log.returned)) for log in made))
 
