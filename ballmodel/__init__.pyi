@@ -1,6 +1,5 @@
 from .aerodynamics import FlightParams as FlightParams
 from .distribution import BallDistribution as BallDistribution
-from .distribution import fit_distribution as fit_distribution
 from .distribution import load_distribution as load_distribution
 from .distribution import save_distribution as save_distribution
 from .fit_distribution import fit_human as fit_human
