@@ -42,6 +42,7 @@ def write_all() -> None:
     """Write every generated page."""
     from experiments.config import baselines, experiment, study
     from experiments.config.finetuning import FineTuning
+    from experiments.config.robot import COMMISSIONING
     from robot_io.control.config import RobotConfig
     from robot_io.emulator.config import RigParams
 
@@ -55,7 +56,8 @@ def write_all() -> None:
         "verdict", schema_page("Verdict", "", json.loads((REFERENCE / "verdict.schema.json").read_text("utf-8")), {})
     )
     _write("model", model_page())
-    _write("robot", dataclass_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", RobotConfig))
+    slow = f"Without `safety.speed_scale` a robot moves at {COMMISSIONING:.0%} of its speed."
+    _write("robot", dataclass_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", RobotConfig, slow))
     _write("rig", dataclass_page("rig.yaml", "mjx-tt run --robot rig --rig", RigParams))
     _write("command-line", command_line_page())
     for package in PACKAGES:
@@ -149,9 +151,9 @@ def _type(key: dict[str, Any], definitions: dict[str, Any], anchors: dict[str, s
     return {"string": "text", "boolean": "true, false", "null": "`null`"}.get(kind, kind)
 
 
-def dataclass_page(title: str, command: str, kind: type) -> str:
+def dataclass_page(title: str, command: str, kind: type, remark: str = "") -> str:
     """Page with one table per dataclass that a YAML fills."""
-    lines = [f"# {title}", "", f"The YAML of `{command}`. Every key has a default."]
+    lines = [f"# {title}", "", f"The YAML of `{command}`. Every key has a default. {remark}"]
     waiting, done = [("", kind)], []
     while waiting:
         path, kind = waiting.pop(0)
@@ -321,7 +323,12 @@ def api_page(package: str) -> str:
 
 
 def _readable(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
+    told = {name for block in "\n".join(lines).split("\n\n") for name in _entries(block.splitlines())}
     lines[:] = _as_rest(lines)
+    if what == "class" and dataclasses.is_dataclass(value):
+        for field, note in _field_notes(value)[1].items():
+            if field not in told and not any(field in names.split(", ") for names in told):
+                lines += [f"``{field}``", f"   {_escaped(note)}", ""]
 
 
 def _short(app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str, returns: str) -> Any:
