@@ -151,6 +151,32 @@ def test_the_robots_side_loads_without_jax():
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
 
 
+def test_the_robots_face_needs_numpy_only():
+    """Its import nothing heavy at all; its names neither JAX, MuJoCo, nor what the devices need."""
+    others = "jax", "mujoco", "pymodbus", "google", "mcap", "pydantic", "scipy"
+    light = (
+        "load_artefact",
+        "SafetyGate",
+        "GateState",
+        "SafetyConfig",
+        "Policy",
+        "StreamingPolicy",
+        "LIMITS",
+        "RefusedError",
+    )
+    code = f"""
+import sys, robot_io
+assert 'numpy' not in sys.modules
+{"; ".join(f"robot_io.{name}" for name in light)}
+loaded = [m for m in {others} if m in sys.modules]
+assert not loaded, loaded
+[getattr(robot_io, name) for name in robot_io.__all__]
+assert 'jax' not in sys.modules and 'mujoco' not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def room(path: Path) -> str | None:
     """The room of a module in the table of its package; None for the ``__init__`` of a folder with folders in it."""
     package, *parts = path.relative_to(ROOT).with_suffix("").parts

@@ -121,6 +121,9 @@ def load(folder: str | Path) -> Artefact:
     return artefact
 
 
+load_artefact = load  # its name in ``robot_io``
+
+
 def sha256(content: bytes) -> str:
     """SHA-256 in lower-case hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()
