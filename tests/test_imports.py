@@ -72,6 +72,7 @@ LONG = {
     "mjx_tt/diagnosis/diagnose.py": "",
     "mjx_tt/diagnosis/report/figures.py": "",
     "mjx_tt/diagnosis/report/page.py": "",
+    "mjx_tt/rally/human_player.py": "",
     "robot_io/control/bridge.py": "",
     "robot_io/safety/gate.py": "",
 }
