@@ -9,7 +9,7 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.joint.records import SHORTEST, JointRecord
+from mjx_tt.diagnosis.joint.log import SHORTEST, JointRecord
 from robot_io.contract import JOINT_NAMES
 from robot_io.log import read
 

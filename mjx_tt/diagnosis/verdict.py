@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from ballmodel.io.atomic_files import replacing
+from mjx_tt.sim.model import Range
 
 
 @dataclass(frozen=True)
@@ -28,14 +31,14 @@ class Cause:
     name: str
     group: tuple[str, ...]  # the name first, then its equals
     confidence: float  # share of bootstrap draws in which this group is chosen
-    parameters: dict[str, Estimate]  # by dotted path of SimModel
-    effect_mm: float  # median shift of a flight's last sample
+    parameters: dict[str, Estimate]  # by dotted path of SimModel, of a joint by joint.parameter
+    effect_mm: float  # median shift of a flight's last sample; rms movement of a joint [mrad], a gantry axis [mm]
     separating_measurement: str
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What no entry of the catalogue explains."""
+    """The largest pattern that no entry of the catalogue explains."""
 
     block: str
     where: str
@@ -45,7 +48,7 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Prediction of what was not used."""
+    """Prediction of data that the fit did not use."""
 
     metric: str
     before: float
@@ -77,9 +80,9 @@ class Verdict:
     runners_up: tuple[dict, ...] = field(default=())
     warnings: tuple[str, ...] = field(default=())
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> dict[str, object]:
         """Plain data; a number that is not finite (a limit that was never reached) is null."""
-        return _plain(asdict(self))
+        return {name: _plain(value) for name, value in asdict(self).items()}
 
     def save(self, path: Path) -> None:
         """Writes the JSON; to a temporary file first."""
@@ -87,9 +90,73 @@ class Verdict:
             temporary.write_text(json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _plain(value):
+def _plain(value: object) -> object:
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@dataclass(frozen=True)
+class Expressed:
+    """A named cause, and the parameters of the extended model that express it."""
+
+    cause: Cause
+    values: dict[str, float]  # by dotted path of SimModel
+    ranges: tuple[Range, ...] = ()
+
+
+@dataclass(frozen=True)
+class Part:
+    """Contribution of one plant, ball or robot, to the verdict."""
+
+    named: tuple[Expressed, ...] = ()
+    beside: dict[str, float] = field(default_factory=dict)  # values fitted beside the named causes
+    undetermined: bool = False  # another set of causes explains as much
+    unexplained: Unexplained | None = None
+    held_out: HeldOut | None = None
+    not_identifiable: tuple[str, ...] = ()
+    not_excited: tuple[str, ...] = ()
+    next_experiment: tuple[Experiment, ...] = ()
+    runners_up: tuple[dict, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict, dict[str, float], tuple[Range, ...]]:
+    """Verdict of all parts, and values and ranges of the extended model.
+
+    Of what one part alone can say, the unexplained and the held-out error, the first part's counts. Names that are not to
+    be relied on change the model only if they predict better. notes: warnings that stand before the parts' own.
+    """
+
+    def every(name: str) -> tuple:
+        return tuple(chain.from_iterable(getattr(part, name) for part in parts))
+
+    named: tuple[Expressed, ...] = every("named")
+    unexplained = next((p.unexplained for p in parts if p.unexplained is not None), None)
+    held_out = next((p.held_out for p in parts if p.held_out is not None), None)
+    worse = bool(named) and held_out is not None and held_out.high < 0.0
+    if unexplained is not None:
+        kind = "unexplained"
+    elif worse or any(p.undetermined for p in parts):
+        # What makes the prediction of unseen balls worse is no cause to act on.
+        kind = "undetermined"
+    else:
+        kind = "named" if named else "none"
+    verdict = Verdict(
+        kind,
+        tuple(n.cause for n in named),
+        unexplained,
+        held_out,
+        every("not_identifiable"),
+        every("not_excited"),
+        every("next_experiment"),
+        every("runners_up"),
+        (*notes, *every("warnings")),
+    )
+    if kind in ("unexplained", "undetermined") and not (held_out and held_out.low > 0.0):
+        return verdict, {}, ()
+    values = {path: value for p in parts for path, value in p.beside.items()}
+    values |= {path: value for n in named for path, value in n.values.items()}
+    return verdict, values, tuple(r for n in named for r in n.ranges)

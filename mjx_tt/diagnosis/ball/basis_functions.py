@@ -55,7 +55,7 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
 
     def family(name, where, basis, labels, respond: Callable, along=(0, 1, 2)):
         columns, names, directions = [], [], []
-        for phi, label in zip(basis, labels):
+        for phi, label in zip(basis, labels, strict=True):
             for d in along:
                 columns.append(respond(phi, d))
                 names.append(label)

@@ -1,4 +1,4 @@
-"""The gain on data that was not used: each ball predicted by a model fitted on others.
+"""Gain on data that was not used: each ball predicted by a model fitted on others.
 
 A ball's state is fitted to the first 30 % of its samples, the rest is predicted: by the nominal model, and by the model
 extended with causes whose size the other folds gave. The interval is a paired bootstrap over the balls.
@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjx_tt.diagnosis.ball import scores as evidence
+from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
-from mjx_tt.diagnosis.ball.linearization import SPIN, fit_starts
+from mjx_tt.diagnosis.ball.fit import fit_starts
+from mjx_tt.diagnosis.ball.linearization import SPIN
 from mjx_tt.diagnosis.verdict import HeldOut
 
 FIRST_PART = 0.3
@@ -40,23 +41,21 @@ def predictions(found: BallFindings, seed: int = 0) -> Prediction:
     fold = _folds(found, seed)
     theta = np.zeros((k, g.n))
     mean = np.zeros((3, g.n))
-    scores = (
-        evidence.with_spin(found.projected, choice.prior.std) if choice.spin else evidence.without_spin(found.projected)
-    )
-    chosen = [*choice.effects, *scores.always]
+    rated = found.scores()
+    chosen = [*choice.effects, *rated.always]
     for f in range(FOLDS):
         rest = fold != f
-        part = evidence.Scores(
-            scores.ball_gram[rest].sum(axis=0),
-            scores.ball_right[rest].sum(axis=0),
-            scores.ball_gram[rest],
-            scores.ball_right[rest],
+        part = scores.Scores(
+            rated.ball_gram[rest].sum(axis=0),
+            rated.ball_right[rest].sum(axis=0),
+            rated.ball_gram[rest],
+            rated.ball_right[rest],
             0.0,
-            scores.always,
+            rated.always,
         )
-        values = evidence.solve(part, chosen) if chosen else np.zeros(0)
+        values = scores.solve(part, chosen) if chosen else np.zeros(0)
         mine = np.flatnonzero(~rest)
-        for j, value in zip(chosen, values):
+        for j, value in zip(chosen, values, strict=True):
             if j < k:
                 theta[j, mine] = value
             else:
@@ -73,7 +72,7 @@ def predictions(found: BallFindings, seed: int = 0) -> Prediction:
         return Prediction(error0, error0.copy())
     start = found.situation.start.copy()
     prior = None
-    if choice.spin:
+    if choice.prior is not None:
         start[SPIN] = mean
         prior = (choice.prior.mean, np.maximum(choice.prior.std, 1.0))
     after = fit_starts(problem, theta, start, g, found.noise, prior, rounds=4, keep=keep)

@@ -1,174 +1,453 @@
-"""What can be wrong with the simulated ball and its measurement: one small declarative entry for each effect.
+"""Catalogue of what can be wrong with the simulated ball and its measurement: one declarative entry for each effect.
 
-An effect is one number, its change from the nominal model, and says which parameters of SimModel express it. A new one
-is one line here, if the parameter exists. Twins are parameters that ball data can never tell from the effect itself:
+An effect is one number, its change from the nominal model, with the parameters of SimModel that express it. A new one
+is one entry here, if the parameter exists. Twins are parameters that ball data can never tell from the effect itself:
 they move the same products; each comes with the reading that would.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from mjx_tt.diagnosis.description import Description
+
 AT_THE_PADDLE = "paddle"  # group of the effects that only a hit shows, with the joints' log beside the ball's
+Numbers = float | np.ndarray
 Values = Mapping[str, float]  # of SimModel's leaves by dotted path
+Express = Callable[[Values, Numbers], dict[str, Numbers]]
 FLIGHT, TABLE, PADDLE, SENSING = "ball.flight.", "ball.table.", "ball.paddle.", "sensing."
 
 
-@dataclass(frozen=True)
-class Twin:
+@dataclass(frozen=True, kw_only=True)
+class Twin(Description):
     """A parameter whose change looks exactly like the effect's."""
 
-    name: str
     path: str
     of: Callable[[float, float], float]  # (nominal of the twin, effect's value over its nominal) -> twin's value
-    unit: str
-    reading: str
 
 
-@dataclass(frozen=True)
-class Effect:
-    """One way in which the model may be wrong.
+@dataclass(frozen=True, kw_only=True)
+class Effect(Description):
+    """One way in which the model may be wrong."""
 
-    ``scale`` is a change that would surprise nobody, in ``unit``; ``step`` what a finite difference moves it by (a
-    fraction of the scale, unless the effect starts with a threshold). ``express`` maps nominal values and the change
-    to the values of the parameters that carry it; by default the change is added to ``path``.
-    """
-
-    name: str
     group: str
-    path: str
-    scale: float
-    unit: str
-    reading: str  # the measurement that would settle it
-    express: Callable[[Values, float], dict] | None = None
+    path: str  # parameter of SimModel, to which the change is added unless ``express`` is given
+    scale: float  # change that would surprise nobody, in ``unit``
+    express: Express | None = None  # (nominal values, change) -> values of the parameters that carry it
+    path_unit: str = ""  # unit of the parameter, where it is not that of the change
     twins: tuple[Twin, ...] = ()
-    step: float | None = None
+    step: float | None = (
+        None  # of a finite difference: a fraction of the scale, unless the effect starts with a threshold
+    )
     low: float = -np.inf  # smallest change that makes sense
     needs_spin: bool = False  # shows only on balls that spin
     fit: bool = True  # False: not a shift of the path, found by other means
+    invisible: str = ""  # reason for which no log of the ball's positions shows it
 
-    def gone(self, without) -> bool:
-        """Whether nothing is left of the entry when these names are left out: neither its own nor a twin's."""
+    def gone(self, without: Container[str]) -> bool:
+        """True if nothing is left of the entry without these names: neither its own nor a twin's."""
         return all(name in without for name in (self.name, *(t.name for t in self.twins)))
 
-    def values(self, nominal: Values, change) -> dict:
+    def values(self, nominal: Values, change: Numbers) -> dict[str, Numbers]:
         """Values of the leaves that express a change (a number or an array)."""
         if self.express is not None:
             return self.express(nominal, change)
         return {self.path: nominal[self.path] + change}
 
 
-def _times(path: str):
+def _times(path: str) -> Express:
     return lambda nominal, change: {path: nominal[path] * (1.0 + change)}
 
 
-def _tilt(axis: str):
+def _tilt(axis: str) -> Express:
     return lambda nominal, change: {FLIGHT + f"gravity_{axis}": nominal[FLIGHT + f"gravity_{axis}"] + 9.81 * change}
-
-
-def _same(nominal, ratio):
-    return nominal * ratio
-
-
-def _inverse(nominal, ratio):
-    return nominal / ratio
 
 
 EFFECTS: tuple[Effect, ...] = (
     Effect(
-        "drag_coefficient",
-        "ball",
-        FLIGHT + "drag_coefficient",
-        0.05,
-        "1",
-        "a barometer, a thermometer and scales",
+        name="drag_coefficient",
+        meaning="drag of the ball",
+        claim="The air brakes the ball {way} than the model says, coefficient {instead}",
+        more="more",
+        less="less",
+        group="ball",
+        path=FLIGHT + "drag_coefficient",
+        scale=0.05,
+        unit="1",
+        reading="a barometer, a thermometer and scales",
         twins=(
-            Twin("air_density", FLIGHT + "air_density", _same, "kg/m^3", "a barometer and a thermometer"),
-            Twin("ball_mass", FLIGHT + "mass", _inverse, "kg", "scales"),
-            Twin("ball_radius", FLIGHT + "radius", lambda r, ratio: r * np.sqrt(ratio), "m", "a calliper"),
+            Twin(
+                name="air_density",
+                meaning="thinner or denser air",
+                path=FLIGHT + "air_density",
+                of=lambda nominal, ratio: nominal * ratio,
+                unit="kg/m^3",
+                reading="a barometer and a thermometer",
+            ),
+            Twin(
+                name="ball_mass",
+                meaning="another mass of the ball",
+                path=FLIGHT + "mass",
+                of=lambda nominal, ratio: nominal / ratio,
+                unit="kg",
+                reading="scales",
+            ),
+            Twin(
+                name="ball_radius",
+                meaning="another radius of the ball",
+                path=FLIGHT + "radius",
+                of=lambda r, ratio: r * np.sqrt(ratio),
+                unit="m",
+                reading="a calliper",
+            ),
         ),
     ),
-    Effect("magnus", "ball", "ball_spin", 30.0, "rad/s", "a marked ball filmed from the side", fit=False),
+    Effect(  # worded by report/text: its parameters are a distribution
+        name="magnus",
+        meaning="spin of the ball",
+        group="ball",
+        path="ball_spin",
+        scale=30.0,
+        unit="rad/s",
+        reading="a marked ball filmed from the side",
+        fit=False,
+    ),
     Effect(
-        "magnus_coefficient",
-        "ball",
-        FLIGHT + "magnus_coefficient",
-        0.2,
-        "1",
-        "a marked ball filmed from the side",
+        name="magnus_coefficient",
+        meaning="curve of a spinning ball",
+        claim="Spinning balls curve {way} than the model says, coefficient {instead}",
+        more="more",
+        less="less",
+        group="ball",
+        path=FLIGHT + "magnus_coefficient",
+        scale=0.2,
+        unit="1",
+        reading="a marked ball filmed from the side",
         needs_spin=True,
     ),
     Effect(
-        "spin_decay", "ball", FLIGHT + "spin_decay", 0.3, "1/s", "a marked ball over a long flight", needs_spin=True
+        name="spin_decay",
+        meaning="loss of spin in flight",
+        claim="The ball loses its spin {way} in flight, {instead}",
+        more="faster",
+        less="more slowly",
+        group="ball",
+        path=FLIGHT + "spin_decay",
+        scale=0.3,
+        unit="1/s",
+        reading="a marked ball over a long flight",
+        needs_spin=True,
     ),
-    Effect("wind_x", "ball", FLIGHT + "wind_x", 0.3, "m/s", "an anemometer across the table"),
-    Effect("wind_y", "ball", FLIGHT + "wind_y", 0.3, "m/s", "an anemometer along the table, or balls both ways"),
-    Effect("wind_z", "ball", FLIGHT + "wind_z", 0.3, "m/s", "an anemometer above the table"),
     Effect(
-        "gravity_tilt_x", "ball", FLIGHT + "gravity_x", 0.01, "rad", "a spirit level on the camera's frame", _tilt("x")
+        name="wind_x",
+        meaning="air that moves across the table",
+        claim="The air moves sideways, towards {way}, at {size}",
+        more="+x",
+        less="-x",
+        group="ball",
+        path=FLIGHT + "wind_x",
+        scale=0.3,
+        unit="m/s",
+        reading="an anemometer across the table",
     ),
     Effect(
-        "gravity_tilt_y", "ball", FLIGHT + "gravity_y", 0.01, "rad", "a spirit level on the camera's frame", _tilt("y")
+        name="wind_y",
+        meaning="air that moves along the table",
+        claim="The air moves along the table, towards the {way}, at {size}",
+        more="human (+y)",
+        less="robot (-y)",
+        group="ball",
+        path=FLIGHT + "wind_y",
+        scale=0.3,
+        unit="m/s",
+        reading="an anemometer along the table, or balls both ways",
     ),
     Effect(
-        "gravity_scale",
-        "ball",
-        FLIGHT + "gravity_z",
-        0.02,
-        "1",
-        "a ball dropped beside a ruler, timed by another clock",
-        _times(FLIGHT + "gravity_z"),
+        name="wind_z",
+        meaning="air that rises or sinks",
+        claim="The air {way} at {size}",
+        more="rises",
+        less="sinks",
+        group="ball",
+        path=FLIGHT + "wind_z",
+        scale=0.3,
+        unit="m/s",
+        reading="an anemometer above the table",
+    ),
+    Effect(
+        name="gravity_tilt_x",
+        meaning="a measuring frame that leans across the table",
+        claim="Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned across the table",
+        more="+x",
+        less="-x",
+        group="ball",
+        path=FLIGHT + "gravity_x",
+        scale=0.01,
+        unit="rad",
+        path_unit="m/s^2",
+        reading="a spirit level on the camera's frame",
+        express=_tilt("x"),
+    ),
+    Effect(
+        name="gravity_tilt_y",
+        meaning="a measuring frame that leans along the table",
+        claim="Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned along the table",
+        more="+y",
+        less="-y",
+        group="ball",
+        path=FLIGHT + "gravity_y",
+        scale=0.01,
+        unit="rad",
+        path_unit="m/s^2",
+        reading="a spirit level on the camera's frame",
+        express=_tilt("y"),
+    ),
+    Effect(
+        name="gravity_scale",
+        meaning="strength of gravity",
+        claim="Balls fall {way} than the model says, acceleration {instead}",
+        more="more slowly",
+        less="faster",
+        group="ball",
+        path=FLIGHT + "gravity_z",
+        scale=0.02,
+        unit="1",
+        path_unit="m/s^2",
+        reading="a ball dropped beside a ruler, timed by another clock",
+        express=_times(FLIGHT + "gravity_z"),
         twins=(
             Twin(
-                "buoyancy", FLIGHT + "buoyancy", lambda b, ratio: 1.0 - (1.0 - b) * ratio, "1", "scales and a calliper"
+                name="buoyancy",
+                meaning="lift of the air on the ball",
+                path=FLIGHT + "buoyancy",
+                of=lambda b, ratio: 1.0 - (1.0 - b) * ratio,
+                unit="1",
+                reading="scales and a calliper",
             ),
-            Twin("clock_rate", SENSING + "clock_rate", lambda c, ratio: c / np.sqrt(ratio), "1", "a hardware clock"),
+            Twin(
+                name="clock_rate",
+                meaning="a clock that runs fast or slow",
+                path=SENSING + "clock_rate",
+                of=lambda c, ratio: c / np.sqrt(ratio),
+                unit="1",
+                reading="a hardware clock",
+            ),
         ),
     ),
-    Effect("table_restitution", "bounce", TABLE + "restitution", 0.03, "1", "a ball dropped on the table from 30 cm"),
     Effect(
-        "table_restitution_speed", "bounce", TABLE + "restitution_slope", 0.01, "s/m", "drops from 10 cm and from 2 m"
-    ),
-    Effect("table_friction", "bounce", TABLE + "friction", 0.06, "1", "flat and fast balls, or a sled on the table"),
-    Effect("table_height", "bounce", TABLE + "height", 0.005, "m", "a ruler, or a ball laid on the table"),
-    Effect("table_tilt_x", "bounce", TABLE + "tilt_x", 0.01, "rad", "a spirit level on the table"),
-    Effect("table_tilt_y", "bounce", TABLE + "tilt_y", 0.01, "rad", "a spirit level on the table"),
-    Effect("camera_scale", "sensing", SENSING + "camera_scale", 0.02, "1", "the table's corners, 2.74 m apart"),
-    Effect("camera_rotation_x", "sensing", SENSING + "camera_rotation_x", 0.01, "rad", "the table's corners"),
-    Effect("camera_rotation_y", "sensing", SENSING + "camera_rotation_y", 0.01, "rad", "the table's corners"),
-    Effect("camera_rotation_z", "sensing", SENSING + "camera_rotation_z", 0.01, "rad", "the table's edges", fit=False),
-    Effect(
-        "camera_distortion", "sensing", SENSING + "camera_distortion", 0.005, "1/m^2", "balls laid on the table's lines"
-    ),
-    Effect("paddle_restitution", "paddle", PADDLE + "restitution", 0.05, "1", "balls dropped on the clamped paddle"),
-    Effect(
-        "paddle_friction",
-        "paddle",
-        PADDLE + "tangential_gain",
-        0.1,
-        "1",
-        "spinning balls dropped on the clamped paddle",
-    ),
-    Effect("paddle_tilt", "paddle", PADDLE + "tilt", 0.02, "rad", "a protractor on the blade in the home pose"),
-    Effect("paddle_offset", "paddle", PADDLE + "offset", 0.005, "m", "a ruler from the flange to the blade"),
-    Effect(
-        "ball_latency",
-        "paddle",
-        "latency.ball_observation",
-        0.01,
-        "s",
-        "a light that the camera and a joint's log both see",
+        name="table_restitution",
+        meaning="speed that the table gives back",
+        claim="The table returns {way} speed than the model says, restitution {instead}",
+        more="more",
+        less="less",
+        group="bounce",
+        path=TABLE + "restitution",
+        scale=0.03,
+        unit="1",
+        reading="a ball dropped on the table from 30 cm",
     ),
     Effect(
-        "tracker_smoothing", "sensing", SENSING + "smoothing", 0.008, "s", "a ball stopped by hand", step=0.006, low=0.0
+        name="table_restitution_speed",
+        meaning="restitution that changes with speed",
+        claim="The table's restitution {way} with the ball's speed, {instead}",
+        more="rises",
+        less="falls",
+        group="bounce",
+        path=TABLE + "restitution_slope",
+        scale=0.01,
+        unit="s/m",
+        reading="drops from 10 cm and from 2 m",
+    ),
+    Effect(
+        name="table_friction",
+        meaning="friction of the table",
+        claim="The table is {way} than the model says, friction {instead}",
+        more="rougher",
+        less="smoother",
+        group="bounce",
+        path=TABLE + "friction",
+        scale=0.06,
+        unit="1",
+        reading="flat and fast balls, or a sled on the table",
+    ),
+    Effect(
+        name="table_height",
+        meaning="height of the table",
+        claim="The table's surface lies {size} {way} than the model says",
+        more="higher",
+        less="lower",
+        group="bounce",
+        path=TABLE + "height",
+        scale=0.005,
+        unit="m",
+        reading="a ruler, or a ball laid on the table",
+    ),
+    Effect(
+        name="table_tilt_x",
+        meaning="a table that leans across",
+        claim="The table's surface rises towards {way} by {size}",
+        more="+x",
+        less="-x",
+        group="bounce",
+        path=TABLE + "tilt_x",
+        scale=0.01,
+        unit="rad",
+        reading="a spirit level on the table",
+    ),
+    Effect(
+        name="table_tilt_y",
+        meaning="a table that leans along its length",
+        claim="The table's surface rises towards {way} by {size}",
+        more="+y",
+        less="-y",
+        group="bounce",
+        path=TABLE + "tilt_y",
+        scale=0.01,
+        unit="rad",
+        reading="a spirit level on the table",
+    ),
+    Effect(
+        name="camera_scale",
+        meaning="scale of the camera's calibration",
+        claim="The camera measures lengths too {way}, scale {instead}",
+        more="long",
+        less="short",
+        group="sensing",
+        path=SENSING + "camera_scale",
+        scale=0.02,
+        unit="1",
+        reading="the table's corners, 2.74 m apart",
+    ),
+    Effect(
+        name="camera_rotation_x",
+        meaning="camera frame turned about x",
+        claim="The camera's frame is turned about x by {value}",
+        group="sensing",
+        path=SENSING + "camera_rotation_x",
+        scale=0.01,
+        unit="rad",
+        reading="the table's corners",
+    ),
+    Effect(
+        name="camera_rotation_y",
+        meaning="camera frame turned about y",
+        claim="The camera's frame is turned about y by {value}",
+        group="sensing",
+        path=SENSING + "camera_rotation_y",
+        scale=0.01,
+        unit="rad",
+        reading="the table's corners",
+    ),
+    Effect(
+        name="camera_rotation_z",
+        meaning="camera frame turned about the vertical",
+        claim="The camera's frame is turned about the vertical by {value}",
+        group="sensing",
+        path=SENSING + "camera_rotation_z",
+        scale=0.01,
+        unit="rad",
+        reading="the table's edges",
+        fit=False,
+        invisible="a turn about the vertical changes no flight; the table's edges show it",
+    ),
+    Effect(
+        name="camera_distortion",
+        meaning="distortion of the camera",
+        claim="The camera distorts the picture, {instead}",
+        group="sensing",
+        path=SENSING + "camera_distortion",
+        scale=0.005,
+        unit="1/m^2",
+        reading="balls laid on the table's lines",
+    ),
+    Effect(
+        name="paddle_restitution",
+        meaning="speed that the paddle gives back",
+        claim="The paddle gives back {way} of the ball's speed than the model says, {instead}",
+        more="more",
+        less="less",
+        group=AT_THE_PADDLE,
+        path=PADDLE + "restitution",
+        scale=0.05,
+        unit="1",
+        reading="balls dropped on the clamped paddle",
+    ),
+    Effect(
+        name="paddle_friction",
+        meaning="grip of the paddle",
+        claim="The rubber grips {way} than the model says, tangential gain {instead}",
+        more="more",
+        less="less",
+        group=AT_THE_PADDLE,
+        path=PADDLE + "tangential_gain",
+        scale=0.1,
+        unit="1",
+        reading="spinning balls dropped on the clamped paddle",
+    ),
+    Effect(
+        name="paddle_tilt",
+        meaning="tilt of the paddle",
+        claim="The blade looks {way} by {value}",
+        more="downwards",
+        less="upwards",
+        group=AT_THE_PADDLE,
+        path=PADDLE + "tilt",
+        scale=0.02,
+        unit="rad",
+        reading="a protractor on the blade in the home pose",
+    ),
+    Effect(
+        name="paddle_offset",
+        meaning="place of the paddle",
+        claim="The blade lies {way} where the model has it, by {size}",
+        more="ahead of",
+        less="behind",
+        group=AT_THE_PADDLE,
+        path=PADDLE + "offset",
+        scale=0.005,
+        unit="m",
+        reading="a ruler from the flange to the blade",
+    ),
+    Effect(
+        name="ball_latency",
+        meaning="delay of the ball's measurement",
+        claim="The ball is measured {way} against the joints than the model says, {instead}",
+        more="later",
+        less="sooner",
+        group=AT_THE_PADDLE,
+        path="latency.ball_observation",
+        scale=0.01,
+        unit="s",
+        reading="a light that the camera and a joint's log both see",
+        invisible="every flight looks the same later; the joint log at a paddle contact shows it",
+    ),
+    Effect(
+        name="tracker_smoothing",
+        meaning="a tracker that smooths",
+        claim="The tracker smooths the ball's positions, time constant {instead}",
+        group="sensing",
+        path=SENSING + "smoothing",
+        scale=0.008,
+        unit="s",
+        reading="a ball stopped by hand",
+        step=0.006,
+        low=0.0,
+    ),
+    Effect(  # found by time_jitter
+        name="latency_jitter",
+        meaning="time stamps that scatter",
+        claim="The time stamps of the ball's positions scatter by {value}",
+        group="sensing",
+        path=SENSING + "jitter",
+        scale=0.005,
+        unit="s",
+        reading="a hardware trigger",
+        fit=False,
     ),
 )
 BY_NAME = {effect.name: effect for effect in EFFECTS}
-# What no log of the ball's positions shows, with why; the last one only without the joints' log.
-INVISIBLE = {
-    "camera_rotation_z": "a turn about the vertical changes no flight; the table's edges show it",
-    "ball_latency": "every flight looks the same later; the joint log at a paddle contact shows it",
-}
+INVISIBLE = {effect.name: effect.invisible for effect in EFFECTS if effect.invisible}
+DESCRIPTIONS: dict[str, Description] = BY_NAME | {twin.name: twin for effect in EFFECTS for twin in effect.twins}

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball import scores as evidence
+from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.ball.forward_model import grid
 from mjx_tt.diagnosis.ball.linearization import BallProblem, Situation, project
@@ -94,5 +94,5 @@ def _gram(found: BallFindings, throw: Throw) -> np.ndarray:
         found.noise.interval,
     )
     p = project(linear, at, noise, np.ones((BALLS, SAMPLES)), g, problem.coefficient)
-    scores = evidence.with_spin(p, found.choice.prior.std) if found.choice.spin else evidence.without_spin(p)
-    return scores.gram[: len(problem.effects), : len(problem.effects)]
+    rated = scores.under(p, found.choice.prior)
+    return rated.gram[: len(problem.effects), : len(problem.effects)]

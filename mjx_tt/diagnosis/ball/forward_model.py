@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from ballmodel import flight
 from ballmodel.flight import PaddlePose
@@ -40,7 +41,13 @@ class Grid:
 
     @property
     def n(self) -> int:
+        """Number of balls."""
         return self.mask.shape[1]
+
+    @property
+    def last(self) -> Int[np.ndarray, " n"]:
+        """Index of each ball's last sample."""
+        return len(self.mask) - 1 - np.argmax(self.mask[::-1], axis=0)
 
 
 def grid(trajectories: Sequence[Trajectory]) -> Grid:
@@ -50,7 +57,7 @@ def grid(trajectories: Sequence[Trajectory]) -> Grid:
     length = -(-max(int(c.sum()) for c in counts) // PAD) * PAD
     steps, index, time = np.zeros((length, n)), np.zeros((samples, n), int), np.zeros((samples, n))
     measured, mask = np.zeros((3, samples, n)), np.zeros((samples, n), bool)
-    for i, (t, count) in enumerate(zip(trajectories, counts)):
+    for i, (t, count) in enumerate(zip(trajectories, counts, strict=True)):
         k, m = len(t), int(count.sum())
         steps[:m, i] = np.repeat(np.diff(t.time) / count, count)
         index[1:k, i] = np.cumsum(count)
@@ -119,7 +126,7 @@ def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray
             )
             keep = min(WIDTH, v * n - first)
             parts.append([np.asarray(x)[..., :keep] for x in flown])
-    joined = (np.concatenate(x, axis=-1) for x in zip(*parts))
+    joined = (np.concatenate(x, axis=-1) for x in zip(*parts, strict=True))
     return Flown(*(x.reshape(*x.shape[:-1], v, n) for x in joined))
 
 

@@ -8,13 +8,13 @@ again are compared on the same footing as those that keep it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mjx_tt.diagnosis.ball.effects import FLIGHT, Effect
 from mjx_tt.diagnosis.ball.forward_model import Flown, Grid, heading_axes, leaves, predict
-from mjx_tt.diagnosis.ball.noise import Noise, nominal_noise, robust_weights, whiten
+from mjx_tt.diagnosis.ball.noise import Noise, whiten
 from mjx_tt.sim.model import SimModel
 
 SPIN = slice(6, 9)
@@ -58,7 +58,7 @@ class BallProblem:
         """Leaves for changes theta (K, ...), which add up where effects share a parameter."""
         base, shape = self.nominal, theta.shape[1:]
         out: dict[str, np.ndarray] = {}
-        for effect, change in zip(self.effects, theta):
+        for effect, change in zip(self.effects, theta, strict=True):
             for path, value in effect.values(base, change).items():
                 out[path] = out.get(path, np.full(shape, base[path])) + (value - base[path])
         out.setdefault(MAGNUS, np.full(shape, base[MAGNUS]))
@@ -179,66 +179,3 @@ class StartsOut:
 def remove(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Columns (n, m, k) without their part in the orthonormal basis (n, m, q)."""
     return columns - basis @ (basis.swapaxes(1, 2) @ columns)
-
-
-def fit_starts(
-    problem: BallProblem,
-    theta: np.ndarray,
-    start: np.ndarray,
-    g: Grid,
-    noise: Noise | None = None,
-    prior: tuple[np.ndarray, np.ndarray] | None = None,
-    rounds: int = 4,
-    keep: np.ndarray | None = None,
-) -> np.ndarray:
-    """Starts (9, n) of all balls for given changes theta, (K,) or (K, n), by damped Gauss-Newton with robust weights.
-
-    prior: mean and standard deviation (3,) of the spin; without it the balls do not spin (or keep the spin given).
-    keep: (T, n) samples that count, all by default.
-    """
-    noise = nominal_noise(g) if noise is None else noise
-    mask = g.mask if keep is None else g.mask & keep
-    g = replace(g, mask=mask)
-    size = 6 if prior is None else 9
-    damping = np.full(g.n, 1e-9)
-    theta_v = np.repeat(theta[:, None], 1 + size, axis=1) if theta.ndim == 1 else theta[:, None]
-    if theta.ndim == 1:
-        theta_v = theta_v[:, :, None]
-    best_cost, best = np.full(g.n, np.inf), start
-    for _ in range(rounds + 1):
-        variants = np.repeat(start[:, None], 1 + size, axis=1)
-        for i in range(size):
-            variants[i, 1 + i] += START_STEPS[i]
-        flown = predict(
-            problem.model,
-            problem.values(np.broadcast_to(theta_v, (len(theta_v), 1 + size, g.n))),
-            variants,
-            g,
-            problem.axes,
-        )
-        base = flown.measured[:, :, 0]
-        columns = np.moveaxis(flown.measured[:, :, 1:] - base[:, :, None], 2, 0) / START_STEPS[:size, None, None, None]
-        residual = np.where(mask, g.measured - base, 0.0)
-        weight = robust_weights(residual, noise, g)
-        white = rows(residual[None], noise, weight, g)[..., 0]
-        cost = (white**2).sum(axis=1)
-        if prior is not None:
-            pull = (start[SPIN] - prior[0][:, None]) / prior[1][:, None]
-            cost = cost + (pull**2).sum(axis=0)
-        worse = ~(cost <= best_cost * (1.0 + 1e-9))
-        start = np.where(worse, best, start)
-        damping = np.where(worse, damping * 100.0 + 1e-6, damping * 0.1)
-        best_cost, best = np.where(worse, best_cost, cost), start
-        j = rows(columns, noise, weight, g)
-        normal, right = j.swapaxes(1, 2) @ j, (j.swapaxes(1, 2) @ white[..., None])[..., 0]
-        if prior is not None:
-            precision = 1.0 / prior[1] ** 2
-            normal[:, SPIN, SPIN] += np.diag(precision)
-            right[:, SPIN] -= (precision[:, None] * (start[SPIN] - prior[0][:, None])).T
-        scale = np.sqrt(np.diagonal(normal, axis1=1, axis2=2)) + 1e-12
-        damped = normal / scale[:, :, None] / scale[:, None, :] + damping[:, None, None] * np.eye(size)
-        change = np.linalg.solve(damped + 1e-12 * np.eye(size), (right / scale)[..., None])[..., 0] / scale
-        # A ball that was just set back waits: its derivatives belong to the rejected place.
-        start = start.copy()
-        start[:size] += np.where(worse[:, None], 0.0, change).T
-    return best

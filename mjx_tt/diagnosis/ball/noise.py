@@ -1,4 +1,4 @@
-"""The measurement noise as the residuals show it: its scale, its memory, its outliers.
+"""Measurement noise as the residuals show it: its scale, its memory, its outliers, and shaking time stamps.
 
 An honest noise model decides whether "something is wrong" means anything: trackers filter, so their noise remembers
 itself; it grows with distance; some samples are plain wrong. Scale and memory are estimated from the residuals, outliers
@@ -12,8 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjx_tt.diagnosis.ball.forward_model import Grid
+from mjx_tt.diagnosis.robust import GAUSSIAN, huber_weights
 
 HUBER = 3.0  # whitened distance beyond which a sample counts linearly; a Gaussian's is beyond it in 3 % of cases
+JITTER_Z = 4.5  # standard errors of a jitter of the time stamps
+OUTLIER = 30.0  # times the median square beyond which a sample counts no more: a Gaussian's never is
+LEAST_SHARE = 0.7  # of the noise along the flight beyond that across it which must grow with the speed's square
 NOMINAL_SCALE = 0.003  # [m] before anything is known
 LARGEST_MEMORY = 0.97
 
@@ -58,7 +62,7 @@ def estimate(residual: np.ndarray, frame: np.ndarray, g: Grid, unknowns: int = 6
     freedom = np.sqrt(3.0 * samples / np.maximum(3.0 * samples - unknowns, 1.0))
     masked = np.where(g.mask, residual, np.nan)
     with np.errstate(all="ignore"):
-        own = 1.4826 * np.nanmedian(np.abs(masked), axis=1) * freedom  # (3, n)
+        own = GAUSSIAN * np.nanmedian(np.abs(masked), axis=1) * freedom  # (3, n)
     shared = np.nanmedian(own, axis=1, keepdims=True)
     # A ball's own scale, shrunk to the others': it carries about as much information as half its samples.
     share = (samples / (samples + 20.0))[None]
@@ -97,4 +101,43 @@ def whiten(x: np.ndarray, noise: Noise, g: Grid) -> np.ndarray:
 def robust_weights(residual: np.ndarray, noise: Noise, g: Grid) -> np.ndarray:
     """Square roots (n, T) of Huber's weights of the samples."""
     distance = np.sqrt((whiten(residual, noise, g) ** 2).sum(axis=0))
-    return np.sqrt(np.minimum(1.0, HUBER / np.maximum(distance, 1e-9))).T
+    return np.sqrt(huber_weights(distance, HUBER)).T
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """Deviation of the time stamps."""
+
+    seconds: float
+    low: float
+    high: float
+    shift: float  # [m] rms along the flight
+
+
+def time_jitter(left: np.ndarray, velocity: np.ndarray, g: Grid) -> Jitter | None:
+    """Jitter in residuals [m] of the best model; None where nothing grows with the speed.
+
+    A moment's error dt shifts a sample by v dt; noise that is merely larger along the flight does not grow with speed.
+    Neighbouring samples are subtracted from each other: what is smooth along the flight is a misfit, not a shaking clock.
+    """
+    near = g.mask[1:] & g.mask[:-1] & (np.diff(g.time, axis=0) < 1.5 * np.median(np.diff(g.time, axis=0)[g.mask[1:]]))
+    step, mean = np.diff(left, axis=1) / np.sqrt(2.0), 0.5 * (velocity[:, 1:] + velocity[:, :-1])
+    square = (mean**2).sum(axis=0)
+    along = (step * mean).sum(axis=0) / np.sqrt(np.maximum(square, 1e-9))
+    across = 0.5 * ((step**2).sum(axis=0) - along**2)
+    cap = OUTLIER * np.median((step**2).sum(axis=0)[near])
+    excess = np.where(near, np.minimum(along**2, cap) - np.minimum(across, cap), 0.0)
+    count = near.sum(axis=0)
+    design = np.stack([count, np.where(near, square, 0.0).sum(axis=0)])
+    gram = np.array([[count.sum(), design[1].sum()], [design[1].sum(), np.where(near, square**2, 0.0).sum()]])
+    right = np.array([excess.sum(), (excess * square).sum()])
+    constant, slope = np.linalg.solve(gram, right)
+    rest = np.where(near, excess - constant - slope * square, 0.0)
+    scores = np.stack([rest.sum(axis=0), (rest * square).sum(axis=0)])
+    inverse = np.linalg.inv(gram)
+    error = float(np.sqrt((inverse @ scores @ scores.T @ inverse)[1, 1]))
+    typical = float(np.median(square[near]))
+    if slope < JITTER_Z * error or slope * typical < LEAST_SHARE * max(constant + slope * typical, 1e-12):
+        return None
+    low, high = (np.sqrt(max(slope + s * 1.645 * error, 0.0)) for s in (-1, 1))
+    return Jitter(float(np.sqrt(slope)), float(low), float(high), float(np.sqrt(slope * typical)))

@@ -1,4 +1,4 @@
-"""Which causes the data ask for: every subset of effects is scored from one Gram matrix.
+"""Scores of sets of causes: every subset of effects is scored from one Gram matrix.
 
 Gains are reductions of the whitened squared error (about twice the log likelihood ratio) of the linearised model.
 Per-ball spin is a random effect: it is judged by its marginal likelihood, spins integrated out, never by fitting each
@@ -7,35 +7,38 @@ ball as it likes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_tt.diagnosis.ball.linearization import Projected
 
 LARGEST_SUBSET = 3
 SPIN_ROUNDS = 25
+Subset = tuple[int, ...]  # columns of a Gram matrix, of effects or of all
 
 
 @dataclass(frozen=True)
 class SpinPrior:
-    """Distribution of the balls' spins, (3,) each [rad/s]."""
+    """Gaussian distribution of the balls' spins [rad/s]."""
 
-    mean: np.ndarray
-    std: np.ndarray
+    mean: Float[np.ndarray, 3]
+    std: Float[np.ndarray, 3]
 
 
 @dataclass(frozen=True)
 class Scores:
     """Sums over the balls for one treatment of spin; with spin the last three columns are its mean."""
 
-    gram: np.ndarray  # (K, K)
-    right: np.ndarray  # (K,)
-    ball_gram: np.ndarray  # (n, K, K)
-    ball_right: np.ndarray  # (n, K)
+    gram: Float[np.ndarray, "K K"]
+    right: Float[np.ndarray, " K"]
+    ball_gram: Float[np.ndarray, "n K K"]
+    ball_right: Float[np.ndarray, "n K"]
     base: float  # gain of the random spread alone
-    always: tuple[int, ...]  # columns that every subset holds: the mean spin, and the Magnus coefficient
+    always: Subset  # columns that every subset holds: the mean spin, and the Magnus coefficient
 
 
 def without_spin(p: Projected) -> Scores:
@@ -69,7 +72,12 @@ def with_spin(p: Projected, std: np.ndarray) -> Scores:
     )
 
 
-def fit_spin(p: Projected, effects: tuple[int, ...], std: np.ndarray | None = None) -> SpinPrior:
+def under(p: Projected, prior: SpinPrior | None) -> Scores:
+    """Scores of balls with spins of this distribution; of balls that do not spin where there is none."""
+    return without_spin(p) if prior is None else with_spin(p, prior.std)
+
+
+def fit_spin(p: Projected, effects: Subset, std: np.ndarray | None = None) -> SpinPrior:
     """Maximum likelihood mean and spread of the spins beside the given effects, by expectation-maximisation."""
     effects = tuple(e for e in effects if e != p.coefficient)
     std = np.full(3, 30.0) if std is None else np.maximum(std, 1.0)
@@ -86,29 +94,26 @@ def fit_spin(p: Projected, effects: tuple[int, ...], std: np.ndarray | None = No
     return SpinPrior(mean, std)
 
 
-def _sub(scores: Scores, chosen) -> tuple[np.ndarray, np.ndarray]:
-    chosen = list(chosen)
-    return scores.gram[np.ix_(chosen, chosen)], scores.right[chosen]
+def _sub(scores: Scores, chosen: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    return scores.gram[np.ix_(chosen, chosen)], scores.right[list(chosen)]
 
 
-def solve(scores: Scores, chosen) -> np.ndarray:
+def solve(scores: Scores, chosen: Sequence[int]) -> Float[np.ndarray, " c"]:
     """Estimates of the chosen columns."""
     gram, right = _sub(scores, chosen)
     scale = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
     return np.linalg.lstsq(gram / scale[:, None] / scale, right / scale, rcond=1e-10)[0] / scale
 
 
-def gain(scores: Scores, subset) -> float:
+def gain(scores: Scores, subset: Sequence[int]) -> float:
     """Reduction of the squared error by a subset of effects."""
     chosen = (*subset, *scores.always)
     return scores.base + (float(_sub(scores, chosen)[1] @ solve(scores, chosen)) if chosen else 0.0)
 
 
-def all_gains(
-    scores: Scores, candidates: tuple[int, ...], largest: int = LARGEST_SUBSET
-) -> dict[tuple[int, ...], float]:
+def all_gains(scores: Scores, candidates: Subset, largest: int = LARGEST_SUBSET) -> dict[Subset, float]:
     """Gains of all subsets of the candidates up to a size."""
-    out = {(): gain(scores, ())}
+    out: dict[Subset, float] = {(): gain(scores, ())}
     for size in range(1, min(largest, len(candidates)) + 1):
         subsets = list(combinations(candidates, size))
         index = np.array([(*s, *scores.always) for s in subsets])
@@ -117,11 +122,11 @@ def all_gains(
         scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-300))
         unit = gram / scale[:, :, None] / scale[:, None, :] + 1e-9 * np.eye(index.shape[1])
         x = np.linalg.solve(unit, (right / scale)[..., None])[..., 0]
-        out.update(zip(subsets, scores.base + (x * right / scale).sum(axis=1)))
+        out.update(zip(subsets, (scores.base + (x * right / scale).sum(axis=1)).tolist(), strict=True))
     return out
 
 
-def sandwich(scores: Scores, chosen) -> np.ndarray:
+def sandwich(scores: Scores, chosen: Sequence[int]) -> Float[np.ndarray, "c c"]:
     """Covariance of the estimates of the chosen columns, from the spread between balls."""
     chosen = list(chosen)
     theta = solve(scores, chosen)
@@ -131,7 +136,9 @@ def sandwich(scores: Scores, chosen) -> np.ndarray:
     return inverse @ (left.T @ left) @ inverse * (n / max(n - len(chosen), 1))
 
 
-def unexplained_scores(scores: Scores, chosen, extra) -> tuple[np.ndarray, np.ndarray]:
+def unexplained_scores(
+    scores: Scores, chosen: Sequence[int], extra: Sequence[int]
+) -> tuple[Float[np.ndarray, "n E"], Float[np.ndarray, "E E"]]:
     """Ball-by-ball scores (n, E) of extra columns beside the chosen ones, and their Gram matrix (E, E)."""
     chosen, extra = list(chosen), list(extra)
     if not chosen:
@@ -145,7 +152,12 @@ def unexplained_scores(scores: Scores, chosen, extra) -> tuple[np.ndarray, np.nd
 
 
 def flip_threshold(
-    scores: Scores, chosen, extra, rng: np.random.Generator, draws: int = 400, level: float = 0.995
+    scores: Scores,
+    chosen: Sequence[int],
+    extra: Sequence[int],
+    rng: np.random.Generator,
+    draws: int = 400,
+    level: float = 0.995,
 ) -> float:
     """Gain that the best single extra effect reaches by chance: scores of whole balls with random signs."""
     own, gram = unexplained_scores(scores, chosen, extra)

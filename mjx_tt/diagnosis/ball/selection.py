@@ -1,23 +1,32 @@
-"""From scores to causes: the smallest set of effects that explains the data, and what cannot be told from it."""
+"""Selection of the causes: the smallest set of effects that explains the data, and what cannot be told from it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-from mjx_tt.diagnosis.ball import scores as evidence
+from mjx_tt.diagnosis.ball import noise, scores
 from mjx_tt.diagnosis.ball.effects import Effect
-from mjx_tt.diagnosis.ball.linearization import Projected
-from mjx_tt.diagnosis.ball.scores import LARGEST_SUBSET, Scores, SpinPrior
+from mjx_tt.diagnosis.ball.fit import fit_starts
+from mjx_tt.diagnosis.ball.forward_model import Grid
+from mjx_tt.diagnosis.ball.linearization import SPIN, BallProblem, Linear, Projected, Situation, project, rows
+from mjx_tt.diagnosis.ball.noise import Noise
+from mjx_tt.diagnosis.ball.scores import LARGEST_SUBSET, Scores, SpinPrior, Subset
 
 FLOOR = 0.003  # [m] shift of the last sample below which an effect is of no practical interest
 LEAST_GAIN = 14.0  # evidence that one more effect must bring at least
 SPIN_GAIN = 30.0  # and a spread of spins, which has six numbers
 MAGNUS_RANGE = (0.2, 2.0)  # of the coefficient k that any source reports, with a margin (0.3 to 1.5)
 LEAST_SHARE = 0.01  # of the whole gain that a member must bring: linearisation errors of a large effect are no cause
+ROUNDS = 4  # of choosing and linearising again
+SETTLED = 0.2  # of an estimate's error by which it may still have moved in the last round
+MAGNUS_KEPT = (0.2, 1.5)  # of the coefficient k about which derivatives are taken
+CORNER = 5e-4  # [s] about the bounce of a spinning ball in which no sample counts
+SPIN_COST = 3.0  # squared error by which three more numbers of a ball must pay at least
 WIDEST = 10.0  # scales of an effect beyond which it is no explanation: beside others it may be all but invisible
 LEAST_Z = 3.5  # estimate over its ball-to-ball standard error
 ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
@@ -29,20 +38,24 @@ class Choice:
     """A set of causes and how it was chosen."""
 
     effects: tuple[int, ...]
-    spin: bool  # per-ball spin is part of the model
     theta: np.ndarray  # (len(effects),)
     error: np.ndarray  # (len(effects),) standard errors, ball to ball
     gain: float
-    prior: SpinPrior | None
+    prior: SpinPrior | None  # of the balls' spins, where spin is part of the model
     magnus: float | None  # change of the Magnus coefficient that came along with spin
     threshold: float
     groups: tuple[tuple[int, ...], ...]  # for each chosen effect: what can stand in for it, itself first
     runners_up: tuple[tuple[tuple[int, ...], bool, float], ...]  # other sets with their gains
 
+    @property
+    def spin(self) -> bool:
+        """True if per-ball spin is part of the model."""
+        return self.prior is not None
+
 
 def named(choice: Choice, trial: Trial) -> tuple[bool, ...]:
-    """For each chosen effect whether it passes the second gate too: a size that matters."""
-    return tuple(bool(abs(t) * trial.shift[j] >= FLOOR) for t, j in zip(choice.theta, choice.effects))
+    """For each chosen effect: True if it passes the second gate too, a size that matters."""
+    return tuple(bool(abs(t) * trial.shift[j] >= FLOOR) for t, j in zip(choice.theta, choice.effects, strict=True))
 
 
 @dataclass(frozen=True)
@@ -58,79 +71,82 @@ class Trial:
     spinning: bool = False  # linearised about spinning balls: effects that need spin mean nothing without it
 
 
-def visible(p: Projected, trial: Trial, spin: bool, std: np.ndarray | None) -> np.ndarray:
-    """(K,) True where the data could show the effect: twice FLOOR would bring LEAST_GAIN."""
-    scores = evidence.with_spin(p, std) if spin else evidence.without_spin(p)
+def visible(rated: Scores, trial: Trial) -> Bool[np.ndarray, " K"]:
+    """True where the data could show the effect: twice FLOOR would bring LEAST_GAIN."""
     k = len(trial.effects)
-    gram = np.diagonal(scores.gram)[:k].copy()
-    if scores.always:
-        a = list(scores.always)
-        cross = scores.gram[np.ix_(range(k), a)]
-        gram -= np.einsum("ka,ab,kb->k", cross, np.linalg.pinv(scores.gram[np.ix_(a, a)]), cross)
+    gram = np.diagonal(rated.gram)[:k].copy()
+    if rated.always:
+        a = list(rated.always)
+        cross = rated.gram[np.ix_(range(k), a)]
+        gram -= np.einsum("ka,ab,kb->k", cross, np.linalg.pinv(rated.gram[np.ix_(a, a)]), cross)
     size = np.where(trial.shift > 1e-9, 2.0 * FLOOR / np.maximum(trial.shift, 1e-9), 0.0)
     return gram * size**2 > LEAST_GAIN
 
 
+@dataclass(frozen=True)
+class _Treatment:
+    """One treatment of spin, with the gains of all sets under it."""
+
+    rated: Scores
+    prior: SpinPrior | None  # of the spins, None where nothing spins
+    candidates: Subset
+    gains: dict[Subset, float]
+    threshold: float
+
+
+def _treated(p: Projected, trial: Trial, prior: SpinPrior | None, rng: np.random.Generator) -> _Treatment:
+    rated = scores.under(p, prior)
+    candidates = _candidates(rated, p, trial, prior is not None)
+    gains = scores.all_gains(rated, candidates)
+    # What chance reaches beside the best set: with a cause omitted, its own signal would count as noise.
+    best = max(gains, key=lambda s: gains[s] - LEAST_GAIN * len(s))
+    rest = [c for c in candidates if c not in best]
+    threshold = LEAST_GAIN
+    if rest:
+        threshold = max(threshold, scores.flip_threshold(rated, (*best, *rated.always), rest, rng))
+    return _Treatment(rated, prior, candidates, gains, threshold)
+
+
 def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
-    """The smallest set that explains what can be explained."""
+    """The smallest set that explains what can be explained. hint: distribution of the spins, fitted without it."""
     rng = np.random.default_rng(trial.seed)
-    prior = None
-    sets: list[tuple[bool, Scores]] = []
+    treatments: dict[bool, _Treatment] = {}
     if trial.spin != "free":
-        sets.append((False, evidence.without_spin(p)))
+        treatments[False] = _treated(p, trial, None, rng)
     if trial.spin != "never":
-        prior = hint
-        if prior is None:
-            plain = evidence.without_spin(p)
-            first = max(evidence.all_gains(plain, _candidates(p, trial, False, None), 1).items(), key=lambda x: x[1])[0]
-            prior = evidence.fit_spin(p, first)
-        sets.append((True, evidence.with_spin(p, prior.std)))
-    found, all_plain, thresholds = [], {}, {}
-    for spin, scores in sets:
-        candidates = _candidates(p, trial, spin, None if prior is None else prior.std)
-        gains = evidence.all_gains(scores, candidates)
-        # What chance reaches beside the best set: with a cause left out, its own signal would count as noise.
-        best = max(gains, key=lambda s: gains[s] - LEAST_GAIN * len(s))
-        rest = [c for c in candidates if c not in best]
-        threshold = LEAST_GAIN
-        if rest:
-            threshold = max(threshold, evidence.flip_threshold(scores, (*best, *scores.always), rest, rng))
-        thresholds[spin] = threshold
+        if hint is None:
+            plain = scores.without_spin(p)
+            single = scores.all_gains(plain, _candidates(plain, p, trial, False), 1)
+            hint = scores.fit_spin(p, max(single, key=lambda s: single[s]))
+        treatments[True] = _treated(p, trial, hint, rng)
+    found = []
+    for spin, t in treatments.items():
         cost = SPIN_GAIN if spin and trial.spin == "none" else 0.0
-        if not spin:
-            all_plain = gains
-        found += [(gain - cost - threshold * len(s), s, spin, gain) for s, gain in gains.items()]
+        found += [(gain - cost - t.threshold * len(s), s, spin, gain) for s, gain in t.gains.items()]
     found.sort(key=lambda f: (-f[0], len(f[1])))
-    by_spin = dict(sets)
-    top = found[0][3]
-    for value, subset, spin, gain in found:
-        plain = all_plain.get(tuple(sorted({*subset, p.coefficient} - {None}))[:LARGEST_SUBSET], -np.inf)
-        if _holds(by_spin[spin], subset, gain, trial, thresholds[spin], spin, prior, top, plain):
-            break
-    scores = by_spin[spin]
-    theta = evidence.solve(scores, (*subset, *scores.always))
-    error = np.sqrt(np.diagonal(evidence.sandwich(scores, (*subset, *scores.always))))
-    magnus = None
-    if spin:
-        prior = SpinPrior(theta[len(subset) : len(subset) + 3], prior.std)
+    without = treatments[False].gains if False in treatments else {}
+    bent = () if p.coefficient is None else (p.coefficient,)
+
+    def holds(subset: Subset, spin: bool, gain: float) -> bool:
+        plain = without.get(tuple(sorted({*subset, *bent}))[:LARGEST_SUBSET], -np.inf)
+        return _holds(treatments[spin], subset, gain, trial, found[0][3], plain)
+
+    _, subset, spin, gain = next((f for f in found if holds(*f[1:])), found[-1])
+    t = treatments[spin]
+    theta, error = _estimated(t.rated, subset)
+    count, prior, magnus = len(subset), None, None
+    if t.prior is not None:
+        prior = SpinPrior(theta[count : count + 3], t.prior.std)
         magnus = None if p.coefficient is None else float(theta[-1])
-    groups = tuple(
-        _group(scores, subset, i, gain, trial, _candidates(p, trial, spin, None if prior is None else prior.std))
-        for i in range(len(subset))
-    )
-    others = tuple((s, sp, g) for v, s, sp, g in found[:200] if (s, sp) != (subset, spin))[:8]
-    return Choice(
-        subset,
-        spin,
-        theta[: len(subset)],
-        error[: len(subset)],
-        gain,
-        prior if spin else None,
-        magnus,
-        thresholds[spin],
-        groups,
-        others,
-    )
+    groups = tuple(_group(t, subset, i, gain, trial) for i in range(count))
+    others = tuple((s, sp, g) for _, s, sp, g in found[:200] if (s, sp) != (subset, spin))[:8]
+    return Choice(subset, theta[:count], error[:count], gain, prior, magnus, t.threshold, groups, others)
+
+
+def _estimated(rated: Scores, subset: Subset) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+    """Estimates and standard errors of a subset and of the columns that every one holds."""
+    chosen = (*subset, *rated.always)
+    return scores.solve(rated, chosen), np.sqrt(np.diagonal(scores.sandwich(rated, chosen)))
 
 
 def refined(choice: Choice, p: Projected) -> Choice:
@@ -140,63 +156,56 @@ def refined(choice: Choice, p: Projected) -> Choice:
     """
     if choice.spin or not choice.effects:
         return choice
-    scores = evidence.without_spin(p)
-    error = np.sqrt(np.diagonal(evidence.sandwich(scores, choice.effects)))
-    return replace(choice, theta=evidence.solve(scores, choice.effects), error=error)
+    theta, error = _estimated(scores.without_spin(p), choice.effects)
+    return replace(choice, theta=theta, error=error)
 
 
-def _candidates(p, trial: Trial, spin: bool, std) -> tuple[int, ...]:
-    ok = visible(p, trial, spin, np.full(3, 30.0) if spin and std is None else std)
+def _candidates(rated: Scores, p: Projected, trial: Trial, spin: bool) -> Subset:
     out = set(trial.left_out)
     bent = {p.coefficient} if spin else {i for i, e in enumerate(trial.effects) if e.needs_spin and trial.spinning}
-    return tuple(int(i) for i in np.flatnonzero(ok) if i not in bent and i not in out)
+    return tuple(int(i) for i in np.flatnonzero(visible(rated, trial)) if i not in bent and i not in out)
 
 
-def _holds(
-    scores: Scores, subset, gain: float, trial: Trial, threshold: float, spin: bool, prior, top: float, plain: float
-) -> bool:
-    """Every member passes the gate of evidence. (Members too small to matter stay in the model without being named.)"""
-    if spin and trial.spin == "none":
-        rms = float(np.sqrt(np.mean(prior.std**2 + prior.mean**2))) * np.sqrt(3.0)
+def _holds(t: _Treatment, subset: Subset, gain: float, trial: Trial, top: float, plain: float) -> bool:
+    """True if every member passes the gate of evidence. (Those too small to matter stay without being named.)
+
+    top: gain of the first set; plain: that of this one without spin.
+    """
+    as_cause = t.prior is not None and trial.spin == "none"
+    if t.prior is not None and as_cause:
+        rms = float(np.sqrt(np.mean(t.prior.std**2 + t.prior.mean**2))) * np.sqrt(3.0)
         if rms * trial.spin_shift < FLOOR or gain - plain < SPIN_GAIN:
             return False
+    theta, error = _estimated(t.rated, subset)
+    if as_cause and len(t.rated.always) > 3:
         # Spin that bends flights without what the bounce does to spinning balls is another force under its name.
-        if len(scores.always) > 3:
-            k = evidence.solve(scores, (*subset, *scores.always))[-1]
-            error = np.sqrt(evidence.sandwich(scores, (*subset, *scores.always))[-1, -1])
-            if k + 2.0 * error < MAGNUS_RANGE[0] or k - 2.0 * error > MAGNUS_RANGE[1]:
-                return False
-    if not subset:
-        return True
-    theta = evidence.solve(scores, (*subset, *scores.always))
-    error = np.sqrt(np.diagonal(evidence.sandwich(scores, (*subset, *scores.always))))
+        k, wide = theta[-1], 2.0 * error[-1]
+        if k + wide < MAGNUS_RANGE[0] or k - wide > MAGNUS_RANGE[1]:
+            return False
     for i, j in enumerate(subset):
-        rest = subset[:i] + subset[i + 1 :]
-        brought = gain - evidence.gain(scores, rest)
+        brought = gain - scores.gain(t.rated, subset[:i] + subset[i + 1 :])
         if abs(theta[i]) < LEAST_Z * error[i]:
             return False
-        if brought < max(threshold, LEAST_SHARE * top):
+        if brought < max(t.threshold, LEAST_SHARE * top):
             return False
         if theta[i] < trial.effects[j].low or abs(theta[i]) > WIDEST * trial.effects[j].scale:
             return False
     return True
 
 
-def _group(scores: Scores, subset, i: int, gain: float, trial: Trial, candidates) -> tuple[int, ...]:
+def _group(t: _Treatment, subset: Subset, i: int, gain: float, trial: Trial) -> Subset:
     """Effects that explain the data as well in place of member i, the member first."""
-    rest = subset[:i] + subset[i + 1 :]
-    fixed = [*rest, *scores.always]
-    member = subset[i]
-    others = [c for c in candidates if c not in subset]
+    rated, rest, member = t.rated, subset[:i] + subset[i + 1 :], subset[i]
+    others = [c for c in t.candidates if c not in subset]
     if not others:
         return (member,)
-    _, gram = evidence.unexplained_scores(scores, fixed, [member, *others])
+    _, gram = scores.unexplained_scores(rated, [*rest, *rated.always], [member, *others])
     cosine = np.abs(gram[0, 1:]) / np.sqrt(np.maximum(gram[0, 0] * np.diagonal(gram)[1:], 1e-300))
     alike = []
-    for c, cos in zip(others, cosine):
+    for c, cos in zip(others, cosine, strict=True):
         substitute = tuple(sorted((*rest, c)))
-        if (cos > ALIKE or gain - evidence.gain(scores, substitute) < TIE) and cos > 0.5:
-            theta = evidence.solve(scores, (*substitute, *scores.always))[substitute.index(c)]
+        if (cos > ALIKE or gain - scores.gain(rated, substitute) < TIE) and cos > 0.5:
+            theta = scores.solve(rated, (*substitute, *rated.always))[substitute.index(c)]
             if theta >= trial.effects[c].low:
                 alike.append((-cos, c))
     return (member, *(c for _, c in sorted(alike)))
@@ -210,12 +219,170 @@ def imitated(p: Projected, trial: Trial, choice: Choice) -> tuple[str, ...]:
     """
     if not trial.left_out or len(choice.effects) < 2:
         return ()
-    scores = evidence.with_spin(p, choice.prior.std) if choice.spin else evidence.without_spin(p)
-    whole = evidence.gain(scores, choice.effects)
+    rated = scores.under(p, choice.prior)
+    whole = scores.gain(rated, choice.effects)
     names = []
     for r in trial.left_out:
         for i, j in combinations(choice.effects, 2):
             rest = tuple(e for e in choice.effects if e not in (i, j))
-            if whole - evidence.gain(scores, tuple(sorted((*rest, r)))) < TIE + choice.threshold:  # one number less
+            if whole - scores.gain(rated, tuple(sorted((*rest, r)))) < TIE + choice.threshold:  # one number less
                 names.append(trial.effects[r].name)
     return tuple(dict.fromkeys(names))
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A choice of causes and the situation about which it was made."""
+
+    at: Situation
+    linear: Linear
+    choice: Choice
+    noise: Noise
+    projected: Projected
+    trial: Trial
+
+
+def search(
+    problem: BallProblem,
+    trial: Trial,
+    at: Situation,
+    prior: SpinPrior | None,
+    say: Callable[[str], None],
+    linear: Linear | None = None,
+) -> Settled:
+    """Chooses causes and linearises about them until the choice settles.
+
+    prior: of the spins at the situation to start from, None where nothing spins. linear: the derivatives there.
+    """
+    g, own_noise, chosen_before, frame, bounces = problem.grid, None, None, None, None
+    for round_ in range(ROUNDS):
+        say(f"round {round_ + 1}: derivatives")
+        linear = problem.linearise(at) if linear is None else linear
+        spins = bool(np.any(at.start[SPIN]))
+        if frame is None:
+            frame = noise.flight_frame(linear.base.velocity[:, :, 0])
+            if spins:  # effects that show on spinning balls alone have a size there
+                shift, spin_shift = shifts(linear, g)
+                trial = replace(trial, shift=shift, spin_shift=spin_shift)
+        say(f"round {round_ + 1}: choosing")
+        for _ in range(2 if own_noise is not None else 3):
+            noise_now = own_noise or noise.estimate(linear.residual, frame, g)
+            p = project(linear, at, noise_now, _weights(linear, noise_now, g, bounces), g, problem.coefficient)
+            choice = choose(p, replace(trial, spinning=spins), prior)
+            left, moved = left_over(linear, at, p, choice, g)
+            own_noise = noise.estimate(left, frame, g, 9 if choice.spin else 6)
+        theta = np.zeros(len(problem.effects))
+        theta[list(choice.effects)] = choice.theta
+        if choice.magnus is not None:
+            # In flight only k omega shows: a coefficient out of reason is kept within it, the spins take up the rest.
+            theta[problem.coefficient] = np.clip(choice.magnus, *MAGNUS_KEPT)
+        settled = chosen_before == (choice.effects, choice.spin) and _close(theta, at.theta, choice)
+        chosen_before, prior = (choice.effects, choice.spin), choice.prior
+        (at, bounces), linear = _move(problem, moved, theta, choice, own_noise, g), None
+        if settled:
+            break
+    linear = problem.linearise(at)
+    p = project(linear, at, own_noise, _weights(linear, own_noise, g, bounces), g, problem.coefficient)
+    return Settled(at, linear, refined(choice, p), own_noise, p, trial)
+
+
+def _close(theta: np.ndarray, before: np.ndarray, choice: Choice) -> bool:
+    """True if the chosen effects moved by little of their errors."""
+    chosen = list(choice.effects)
+    return bool(np.all(np.abs(theta - before)[chosen] <= SETTLED * choice.error))
+
+
+def shifts(linear: Linear, g: Grid) -> tuple[np.ndarray, float]:
+    """Median shift [m] of the last sample of the balls concerned, per unit of each effect and per rad/s of spin.
+
+    Against a nominal flight from the same measured start: what the effect does to the first samples is carried along.
+    """
+    last = g.last
+    balls = np.arange(g.n)
+    dt = np.maximum(g.time[2] - g.time[0], 1e-9)
+    early = np.concatenate([linear.effects[:, :, 0], (linear.effects[:, :, 2] - linear.effects[:, :, 0]) / dt], axis=1)
+    carried = np.einsum("kjn,jcn->kcn", early, linear.starts[:6][:, :, last, balls])
+    end = linear.effects[:, :, last, balls] - carried
+    spin = linear.starts[SPIN][:, :, last, balls]
+    size = np.linalg.norm(end, axis=1)
+    concerned = [s[s > 1e-3 * s.max()] for s in size]
+    return np.array([np.median(s) if s.size else 0.0 for s in concerned]), float(
+        np.median(np.linalg.norm(spin, axis=1))
+    )
+
+
+def _theta(p: Projected, choice: Choice, size: int) -> np.ndarray:
+    """(K,) changes of all effects under a choice."""
+    theta = np.zeros(size)
+    theta[list(choice.effects)] = choice.theta
+    if choice.magnus is not None:
+        theta[p.coefficient] = choice.magnus
+    return theta
+
+
+def left_over(linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Residual (3, T, n) [m] of the linear model with the chosen effects and the best starts, and these, (9, n)."""
+    theta = _theta(p, choice, len(at.theta))
+    left = linear.residual - np.tensordot(theta - at.theta, linear.effects, 1)
+    start = at.start.copy()
+    start[SPIN] = 0.0
+    if choice.spin:
+        full = p.spin_right - p.spin_effect @ theta - p.spin_gram @ choice.prior.mean
+        inner = p.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
+        start[SPIN] = choice.prior.mean[:, None] + np.linalg.solve(inner, full[..., None])[..., 0].T
+    left = left - (linear.starts[SPIN] * (start[SPIN] - at.start[SPIN])[:, None, None]).sum(axis=0)
+    white = rows(linear.starts[:6], p.noise, p.weight, g)
+    target = rows(left[None], p.noise, p.weight, g)
+    nu = np.linalg.solve(white.swapaxes(1, 2) @ white + 1e-9 * np.eye(6), white.swapaxes(1, 2) @ target)[..., 0]
+    start[:6] += nu.T
+    return np.where(g.mask, left - (linear.starts[:6] * nu.T[:, None, None]).sum(axis=0), 0.0), start
+
+
+def _move(
+    problem: BallProblem, start: np.ndarray, theta: np.ndarray, choice: Choice, noise_now: Noise, g: Grid
+) -> tuple[Situation, np.ndarray | None]:
+    """The situation at the chosen causes, starts fitted again; and where balls spin, when each bounces (n,) by its own."""
+    if not choice.spin:
+        return Situation(theta, fit_starts(problem, theta, start, g, noise_now, rounds=3)), None
+    prior = (choice.prior.mean, np.maximum(choice.prior.std, 1.0))
+    start = fit_starts(problem, theta, start, g, noise_now, prior, rounds=3)
+    bounces = problem.fly(theta, start).bounce_time[0]
+    # About the mean spin, not about each ball's own: that is fitted to its noise, and derivatives taken there would
+    # remember it (the first-order method of mixed models against its conditional form).
+    start[SPIN] = choice.prior.mean[:, None]
+    return Situation(theta, start), bounces
+
+
+def _weights(linear: Linear, noise_now: Noise, g: Grid, bounces: np.ndarray | None) -> np.ndarray:
+    """Square roots (n, T) of the samples' weights; none between the bounce of the mean spin and that of a ball's own.
+
+    There a straight line in the spin leads astray: the flight has a corner, and it has moved past the sample.
+    """
+    weight = noise.robust_weights(linear.residual, noise_now, g)
+    if bounces is None:
+        return weight
+    ends = np.sort([linear.base.bounce_time[0], bounces], axis=0)
+    with np.errstate(invalid="ignore"):
+        astray = (g.time > ends[0] - CORNER) & (g.time < ends[1] + CORNER)
+    return np.where(astray, 0.0, weight.T).T
+
+
+def misfit(settled: Settled, g: Grid) -> float:
+    """Twice the negative log likelihood of what a choice leaves under the noise that it leaves, and its price.
+
+    Each sample's whitened error is bounded: mis-tracked ones decide nothing.
+    """
+    n, p, choice = settled.noise, settled.projected, settled.choice
+    left = left_over(settled.linear, settled.at, p, choice, g)[0]
+    counts = g.mask & (p.weight.T > 0.0)
+    error = np.minimum((noise.whiten(left, n, g) ** 2).sum(axis=0), 3.0 * noise.HUBER**2)
+    spread = 2.0 * np.log(n.scale * np.sqrt(1.0 - n.memory[:, None] ** 2)).sum(axis=0)
+    own = SPIN_COST * g.n if choice.spin else 0.0
+    # As if the samples left out were as usual: to leave out must not pay.
+    share = g.mask.sum() / counts.sum()
+    return float(share * np.where(counts, error + spread, 0.0).sum() + own + choice.threshold * len(choice.effects))
+
+
+def bent_too_far(choice: Choice) -> bool:
+    """True if spin was chosen with a Magnus coefficient that no ball has: a line bent too far."""
+    return choice.magnus is not None and not MAGNUS_KEPT[0] <= choice.magnus <= MAGNUS_KEPT[1]

@@ -1,4 +1,4 @@
-"""What no entry of the catalogue explains: anonymous blocks that stay significant beside the chosen causes."""
+"""Patterns that no entry of the catalogue explains: blocks that stay significant beside the chosen causes."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float, Int
 from scipy.special import chdtri, fdtrc
 
-from mjx_tt.diagnosis.ball import basis_functions, selection
-from mjx_tt.diagnosis.ball import scores as evidence
+from mjx_tt.diagnosis.ball import basis_functions, scores, selection
 from mjx_tt.diagnosis.ball.forward_model import Grid
-from mjx_tt.diagnosis.ball.linearization import Linear, Projected, Situation, StartsOut
-from mjx_tt.diagnosis.ball.selection import Choice, Trial
+from mjx_tt.diagnosis.ball.linearization import Linear, Projected, StartsOut
+from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial
 
 BLOCK_LEVEL = 2e-5  # chance of one block's false alarm
 BLOCK_FLOOR = 0.0025  # [m] shift that a block must cause on the balls it concerns
@@ -32,48 +32,44 @@ class Finding:
     gain: float  # squared error that it explains
 
 
-def unexplained(
-    linear: Linear,
-    at: Situation,
-    p: Projected,
-    choice: Choice,
-    trial: Trial,
-    g: Grid,
-    sessions: np.ndarray,
-    age: np.ndarray,
-    called: Sequence[str],
+def find(
+    settled: Settled, g: Grid, sessions: Int[np.ndarray, " n"], age: Float[np.ndarray, " n"], called: Sequence[str]
 ) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
-    """Blocks that stay significant beside the chosen causes, the most important first; names that hold beside it."""
+    """Blocks that stay significant beside the chosen causes, the most important first; names that hold beside it.
+
+    sessions: number of each ball's session; age: 0 to 1, its place in its session; called: the sessions' names.
+    """
+    linear, p, choice, trial = settled.linear, settled.projected, settled.choice, settled.trial
     out, holding = [], []
     chosen = list(choice.effects)
-    if choice.magnus is not None:
+    if choice.magnus is not None and p.coefficient is not None:
         chosen.append(p.coefficient)
     effects = linear.effects[chosen]
     # The chosen effects' own values are in the situation: what is left is scored at it (spins are kept absolute).
-    flights = StartsOut(linear, linear.residual, at.start, p.noise, p.weight, g)
+    flights = StartsOut(linear, linear.residual, settled.at.start, p.noise, p.weight, g)
     for block in basis_functions.build(linear, g, sessions, age, called):
         columns = np.concatenate([effects, block.columns])
         both = flights.project(columns)
-        scores = evidence.with_spin(both, choice.prior.std) if choice.spin else evidence.without_spin(both)
+        rated = scores.under(both, choice.prior)
         extra = list(range(len(chosen), len(columns)))
-        base = [*range(len(chosen)), *scores.always]
-        own, gram = evidence.unexplained_scores(scores, base, extra)
+        base = [*range(len(chosen)), *rated.always]
+        own, gram = scores.unexplained_scores(rated, base, extra)
         p_value, beta = _joint_test(own, gram)
         if p_value > BLOCK_LEVEL:
             continue
         pattern = np.tensordot(beta, block.columns, 1)
         worst = np.linalg.norm(np.where(g.mask, pattern, 0.0), axis=0).max(axis=0)
         size = float(np.percentile(worst, 90))
-        if size < BLOCK_FLOOR or _visible(scores.ball_gram[:, extra][:, :, extra], beta, p, g) < VISIBLE_FLOOR:
+        if size < BLOCK_FLOOR or _visible(rated.ball_gram[:, extra][:, :, extra], beta, p, g) < VISIBLE_FLOOR:
             continue
         axis = int(
             np.argmax([np.percentile(np.abs(np.where(g.mask, pattern[a], 0.0)).max(axis=0), 90) for a in range(3)])
         )
         importance = np.abs(beta) * np.sqrt(np.maximum(np.diagonal(gram), 0.0))
         best = int(np.argmax(importance))
-        change = evidence.solve(scores, (*base, *extra))
-        error = np.sqrt(np.maximum(np.diagonal(evidence.sandwich(scores, (*base, *extra))), 0.0))[: len(chosen)]
-        mean = change[len(chosen) : len(chosen) + len(scores.always)]
+        change = scores.solve(rated, (*base, *extra))
+        error = np.sqrt(np.maximum(np.diagonal(scores.sandwich(rated, (*base, *extra))), 0.0))[: len(chosen)]
+        mean = change[len(chosen) : len(chosen) + len(rated.always)]
         holding.append(_holding(choice, trial, change[: len(chosen)], error) | _spin_holding(choice, trial, mean, size))
         out.append(
             Finding(
@@ -97,7 +93,7 @@ def unexplained(
 def _holding(choice: Choice, trial: Trial, change: np.ndarray, error: np.ndarray) -> set[str]:
     """Chosen effects that keep at least half of their size, and significance, when a block may take over from them."""
     names = set()
-    for j, before, moved, e in zip(choice.effects, choice.theta, change, error):
+    for j, before, moved, e in zip(choice.effects, choice.theta, change, error, strict=True):
         now = before + moved
         if abs(now) > selection.LEAST_Z * e and 0.5 < now / before < 2.0:
             names.add(trial.effects[j].name)
@@ -109,7 +105,7 @@ def _spin_holding(choice: Choice, trial: Trial, mean: np.ndarray, size: float) -
 
     A spin that bends the flights less than the block, of size [m], does not stand beside it: it may be part of the block.
     """
-    if not choice.spin:
+    if choice.prior is None:
         return set()
     spread = float((choice.prior.std**2).sum())
     before, now = (np.sqrt(float((m**2).sum()) + spread) for m in (choice.prior.mean, mean))
@@ -167,7 +163,7 @@ def _odd_balls(linear: Linear, flights: StartsOut, choice: Choice, g: Grid) -> F
             columns.append(column)
     both = flights.project(np.stack(columns))
     gram, right = both.gram, both.right
-    if choice.spin:
+    if choice.prior is not None:
         inner = both.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
         left = both.spin_right - both.spin_gram @ choice.prior.mean
         gram = gram - both.spin_effect.swapaxes(1, 2) @ np.linalg.solve(inner, both.spin_effect)

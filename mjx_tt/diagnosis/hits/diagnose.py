@@ -1,4 +1,4 @@
-"""What the robot's hits say: the return as it was measured against the one that the model plays from the same ball.
+"""Diagnosis of the robot's hits: the measured return against the one that the model plays from the same ball.
 
 A hit scatters: where on the rubber, an encoder's tick, a millisecond. So hits are judged in a second step, with the ball's own
 causes settled: each gives one difference of place and one of velocity behind the paddle, and the spread from hit to hit
@@ -7,20 +7,25 @@ is the noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import stdtr
 
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball import scores as evidence
-from mjx_tt.diagnosis.ball import selection
-from mjx_tt.diagnosis.ball.diagnose import BallFindings, first_fit, flights, heading
-from mjx_tt.diagnosis.ball.effects import AT_THE_PADDLE, EFFECTS, Effect
+from mjx_tt.diagnosis.ball import scores, selection
+from mjx_tt.diagnosis.ball.causes import estimates, names, quantile, ranges, readings
+from mjx_tt.diagnosis.ball.diagnose import BallFindings, flights
+from mjx_tt.diagnosis.ball.effects import AT_THE_PADDLE, EFFECTS, INVISIBLE, Effect
+from mjx_tt.diagnosis.ball.fit import first_fit, heading
 from mjx_tt.diagnosis.ball.forward_model import grid, predict
 from mjx_tt.diagnosis.ball.linearization import BallProblem
-from mjx_tt.diagnosis.ball.scores import Scores
+from mjx_tt.diagnosis.ball.scores import Scores, Subset
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses, watched
+from mjx_tt.diagnosis.robust import deviation, huber_weights
+from mjx_tt.diagnosis.verdict import Cause, Expressed, Part
 
 FEWEST_HITS = 12
 RETURN = 0.25  # [s] of each return that are used
@@ -45,13 +50,13 @@ class HitCause:
 
 @dataclass(frozen=True)
 class HitFindings:
-    """What the hits say."""
+    """Findings at the paddle."""
 
     causes: tuple[HitCause, ...]
     hits: int
     quiet: tuple[str, ...]  # effects that these hits could not show
-    before: np.ndarray  # (6, n) place [m] and velocity [m/s] behind the paddle, measured - nominal
-    after: np.ndarray  # (6, n) with the causes
+    before: Float[np.ndarray, "6 n"]  # place [m] and velocity [m/s] behind the paddle, measured - nominal
+    after: Float[np.ndarray, "6 n"]  # with the causes
 
 
 def diagnose_hits(
@@ -77,27 +82,26 @@ def diagnose_hits(
     incoming = np.arange(len(g.time))[:, None] < n0[None]
     problem = BallProblem(g, found.problem.model, (*found.problem.effects, *effects), heading(g))
     theta = np.concatenate([found.situation.theta, np.zeros(len(effects))])
-    start = first_fit(problem, theta, found.choice.prior.mean if found.choice.spin else None, incoming)
+    start = first_fit(problem, theta, found.choice.prior and found.choice.prior.mean, incoming)
     change = np.zeros(len(effects))
-    first = usable = None
-    for _ in range(ROUNDS):
-        now = theta.copy()
-        now[-len(effects) :] = change
-        y, jacobian, hit = _compare(problem, now, start, incoming)
-        if first is None:
-            first = y
-            usable = np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)
-            if usable.sum() < FEWEST_HITS:
-                return None
+    y, jacobian, hit = _compare(problem, theta, start, incoming)
+    first, usable = y, np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)
+    if usable.sum() < FEWEST_HITS:
+        return None
+    for round_ in range(ROUNDS):
+        if round_:
+            now = theta.copy()
+            now[-len(effects) :] = change
+            y, jacobian, _ = _compare(problem, now, start, incoming)
         target = y + np.einsum("kcn,k->cn", jacobian, change)
-        chosen, values, errors, scores = _choose(target[:, usable], jacobian[:, :, usable], effects)
+        chosen, values, errors, rated = _choose(target[:, usable], jacobian[:, :, usable], effects)
         change = np.zeros(len(effects))
         change[list(chosen)] = values
     shift = np.median(np.linalg.norm(jacobian[:, :3] + RETURN * jacobian[:, 3:], axis=1)[:, usable], axis=1)
     causes = []
-    for i, value, error in zip(chosen, values, errors):
+    for i, value, error in zip(chosen, values, errors, strict=True):
         if abs(value) * shift[i] >= LEAST_SHIFT:
-            rivals = _rivals(scores, chosen, i, range(len(effects)))
+            rivals = _rivals(rated, chosen, i)
             causes.append(
                 HitCause(
                     effects[i],
@@ -107,16 +111,34 @@ def diagnose_hits(
                     float(abs(value) * shift[i]),
                 )
             )
-    could = np.diagonal(scores.gram) * (2.0 * LEAST_SHIFT / np.maximum(shift, 1e-9)) ** 2 > GAIN
+    could = np.diagonal(rated.gram) * (2.0 * LEAST_SHIFT / np.maximum(shift, 1e-9)) ** 2 > GAIN
     named = {c.effect.name for c in causes}
-    quiet = tuple(e.name for e, ok in zip(effects, could) if not ok and e.name not in named)
+    quiet = tuple(e.name for e, ok in zip(effects, could, strict=True) if not ok and e.name not in named)
     now = theta.copy()
-    now[-len(effects) :] = [c if e.name in named else 0.0 for c, e in zip(change, effects)]
+    now[-len(effects) :] = [c if e.name in named else 0.0 for c, e in zip(change, effects, strict=True)]
     after, _, _ = _compare(problem, now, start, incoming)
     return HitFindings(tuple(causes), int(usable.sum()), quiet, first[:, usable], after[:, usable])
 
 
-def _compare(problem: BallProblem, theta: np.ndarray, start: np.ndarray, incoming: np.ndarray):
+def part(found: BallFindings, hits: HitFindings | None, without: Container[str]) -> Part:
+    """The hits' part of the verdict; without hits, the effects at the paddle are not excited."""
+    if hits is None:
+        paddle = (e.name for e in EFFECTS if e.group == AT_THE_PADDLE and e.name not in INVISIBLE)
+        return Part(not_excited=tuple(name for name in paddle if name not in without))
+    nominal, freedom, named = found.problem.nominal, hits.hits - 6, []
+    for c in hits.causes:
+        wide = quantile(freedom) * c.error
+        parameters = estimates(c.effect, nominal, c.change, c.change - wide, c.change + wide)
+        sure = float(1.0 - 2.0 * stdtr(max(freedom, 5), -abs(c.change) / c.error))
+        group = names((c.effect, *c.rivals))
+        cause = Cause(c.effect.name, group, sure, parameters, 1e3 * c.shift, readings(c.effect, c.rivals))
+        named.append(Expressed(cause, {path: e.estimate for path, e in parameters.items()}, ranges(parameters)))
+    return Part(tuple(named), not_excited=hits.quiet)
+
+
+def _compare(
+    problem: BallProblem, theta: np.ndarray, start: np.ndarray, incoming: Bool[np.ndarray, "T n"]
+) -> tuple[Float[np.ndarray, "6 n"], Float[np.ndarray, "K 6 n"], Float[np.ndarray, " n"]]:
     """Differences (6, n) behind the paddle, their derivatives (K, 6, n) by the paddle's effects, and hit times (n,)."""
     g = problem.grid
     paddle = [i for i, e in enumerate(problem.effects) if e.group == AT_THE_PADDLE]
@@ -144,24 +166,26 @@ def _compare(problem: BallProblem, theta: np.ndarray, start: np.ndarray, incomin
     return y, behind(np.where(out, change, 0.0)) / moves[:, None, None], flown.hit_time[0]
 
 
-def _choose(y: np.ndarray, jacobian: np.ndarray, effects: tuple[Effect, ...]):
+def _choose(
+    y: Float[np.ndarray, "6 n"], jacobian: Float[np.ndarray, "K 6 n"], effects: tuple[Effect, ...]
+) -> tuple[Subset, np.ndarray, np.ndarray, Scores]:
     """The best subset by penalised gain; hits are the clusters, their spread the noise."""
-    left, chosen = y - np.median(y, axis=1, keepdims=True), ()
+    left = y - np.median(y, axis=1, keepdims=True)
+    chosen: Subset = ()
     for _ in range(ROUNDS):
         root, weight = _spread(left)
         j = np.einsum("cd,kdn->kcn", root, jacobian) * np.sqrt(weight)
         t = root @ y * np.sqrt(weight)
         gram = np.einsum("kcn,lcn->nkl", j, j)
         right = np.einsum("kcn,cn->nk", j, t)
-        scores = Scores(gram.sum(axis=0), right.sum(axis=0), gram, right, 0.0, ())
-        gains = evidence.all_gains(scores, tuple(range(len(effects))))
+        rated = Scores(gram.sum(axis=0), right.sum(axis=0), gram, right, 0.0, ())
+        gains = scores.all_gains(rated, tuple(range(len(effects))))
         chosen, values, errors = (), np.zeros(0), np.zeros(0)
         for subset in sorted(gains, key=lambda s: GAIN * len(s) - gains[s]):
-            values = evidence.solve(scores, subset) if subset else np.zeros(0)
-            errors = np.sqrt(np.diagonal(evidence.sandwich(scores, subset))) if subset else np.zeros(0)
-            if np.all(np.abs(values) >= LEAST_Z * errors) and all(
-                abs(v) < selection.WIDEST * effects[i].scale for v, i in zip(values, subset)
-            ):
+            values = scores.solve(rated, subset) if subset else np.zeros(0)
+            errors = np.sqrt(np.diagonal(scores.sandwich(rated, subset))) if subset else np.zeros(0)
+            within = (abs(v) < selection.WIDEST * effects[i].scale for v, i in zip(values, subset, strict=True))
+            if np.all(np.abs(values) >= LEAST_Z * errors) and all(within):
                 chosen = subset
                 break
         left = (
@@ -169,7 +193,7 @@ def _choose(y: np.ndarray, jacobian: np.ndarray, effects: tuple[Effect, ...]):
             if chosen
             else y - np.median(y, axis=1, keepdims=True)
         )
-    return chosen, values, errors, scores
+    return chosen, values, errors, rated
 
 
 def _spread(left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -177,23 +201,23 @@ def _spread(left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Place and velocity behind the paddle err together: a hit that is early by a millisecond is both ahead and faster.
     """
-    scale = 1.4826 * np.median(np.abs(left), axis=1) + 1e-6
+    scale = deviation(left, axis=1) + 1e-6
     unit = left / scale[:, None]
     root = np.eye(len(left))
     for _ in range(5):
         distance = np.sqrt(((root @ unit) ** 2).sum(axis=0))
-        weight = np.minimum(1.0, HUBER / np.maximum(distance, 1e-9))
+        weight = huber_weights(distance, HUBER)
         covariance = (unit * weight) @ unit.T / weight.sum() + 0.05 * np.eye(len(left))
         root = np.linalg.inv(np.linalg.cholesky(covariance))
     return root / scale, weight
 
 
-def _rivals(scores: Scores, chosen: tuple[int, ...], member: int, candidates) -> tuple[int, ...]:
+def _rivals(rated: Scores, chosen: Subset, member: int) -> Subset:
     """Effects that explain the hits as well in place of a member."""
     rest = tuple(c for c in chosen if c != member)
-    best = evidence.gain(scores, chosen)
+    best = scores.gain(rated, chosen)
     return tuple(
         c
-        for c in candidates
-        if c not in chosen and best - evidence.gain(scores, tuple(sorted((*rest, c)))) < selection.TIE
+        for c in range(len(rated.gram))
+        if c not in chosen and best - scores.gain(rated, tuple(sorted((*rest, c)))) < selection.TIE
     )

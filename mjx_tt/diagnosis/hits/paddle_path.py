@@ -1,4 +1,4 @@
-"""The paddle in a log: its pose over time, from the measured joints, for balls on the same clock."""
+"""Pose of the paddle over time from the measured joints of a log, for balls on the same clock."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from ballmodel.flight import PaddlePose
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.joint.nominal import nominal_response
-from mjx_tt.diagnosis.joint.records import JointRecord
+from mjx_tt.diagnosis.joint.forward_model import nominal_response
+from mjx_tt.diagnosis.joint.log import JointRecord
 from mjx_tt.robot import model as robot
 from mjx_tt.robot.kinematics import PaddleKinematics
 from mjx_tt.sim.model import SimModel
@@ -31,12 +31,12 @@ class JointPath:
     position: tuple[np.ndarray, ...]  # eight of (m,)
 
     def covers(self, start: float, end: float) -> bool:
-        """Whether every joint was measured over this time."""
+        """True if every joint was measured over this time."""
         return all(t[0] <= start and t[-1] >= end for t in self.time)
 
     def at(self, time: np.ndarray) -> np.ndarray:
         """(8, ...) positions."""
-        return np.stack([np.interp(time, t, q) for t, q in zip(self.time, self.position)])
+        return np.stack([np.interp(time, t, q) for t, q in zip(self.time, self.position, strict=True)])
 
 
 def joint_path(records: Sequence[JointRecord], model: SimModel) -> JointPath | None:
@@ -53,7 +53,7 @@ def joint_path(records: Sequence[JointRecord], model: SimModel) -> JointPath | N
 
 
 def watched(trajectory: Trajectory, path: JointPath | None) -> bool:
-    """Whether the joints were measured all along a trajectory."""
+    """True if the joints were measured all along a trajectory."""
     return path is not None and path.covers(trajectory.time[0] - HALF_WINDOW, trajectory.time[-1] + HALF_WINDOW)
 
 

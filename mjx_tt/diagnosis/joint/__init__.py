@@ -1,4 +1,4 @@
-"""What a joint does with its velocity commands: which drive effects the nominal model gets wrong, and how sure.
+"""Diagnosis of the joints: drive effects that the nominal model gets wrong about a joint's answer to its commands.
 
 One joint at a time. A candidate model is the nominal response with a few effects changed; its parameters are fitted
 with a free offset in every window of the log, so that neither the unknown start nor a slow drift of the integrated
@@ -12,19 +12,19 @@ The constants were set on logs of another simulator, 60 s a joint; tests/mjx_tt/
 
 from __future__ import annotations
 
-from mjx_tt.diagnosis.joint.diagnose import diagnose_robot
-from mjx_tt.diagnosis.joint.findings import JointResidual, RobotCause, RobotFindings, RobotGain, Undecided
+from mjx_tt.diagnosis.joint.diagnose import diagnose_joints
+from mjx_tt.diagnosis.joint.findings import JointFinding, JointFindings, JointGain, JointResidual, Undecided
 from mjx_tt.diagnosis.joint.forward_model import JointResponse
-from mjx_tt.diagnosis.joint.records import JointRecord, read_robot_csv
+from mjx_tt.diagnosis.joint.log import JointRecord, read_robot_csv
 
 __all__ = [
+    "JointFinding",
+    "JointFindings",
+    "JointGain",
     "JointRecord",
     "JointResidual",
     "JointResponse",
-    "RobotCause",
-    "RobotFindings",
-    "RobotGain",
     "Undecided",
-    "diagnose_robot",
+    "diagnose_joints",
     "read_robot_csv",
 ]

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_tt.diagnosis.joint.fit import Fit
 from mjx_tt.diagnosis.joint.log import JointLog
-from mjx_tt.diagnosis.joint.robust import scale, weights
+from mjx_tt.diagnosis.joint.scores import scale, weights
 
 STEP = 0.005  # [s] of the grid on which the predicted motion is looked at
 DECAYS = np.array([0.03, 0.1, 0.3, 1.0, math.inf])  # [s] after a reversal

@@ -1,4 +1,4 @@
-"""How well the named effects predict positions, on windows that the fit did not see and over the whole log."""
+"""Prediction of positions by the named effects, on windows that the fit did not see and over the whole log."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from mjx_tt.diagnosis.joint.findings import JointResidual, RobotGain
+from mjx_tt.diagnosis.joint.findings import JointGain, JointResidual
 from mjx_tt.diagnosis.joint.fit import Fitter
 from mjx_tt.diagnosis.joint.log import JointLog
 
 DRAWS = 400  # of the windows, for an interval
 
 
-def held_out(fitter: Fitter, values: Mapping[str, float], sigma: float, rng: np.random.Generator) -> RobotGain:
+def held_out(fitter: Fitter, values: Mapping[str, float], sigma: float, rng: np.random.Generator) -> JointGain:
     """Error in every second window of effects fitted to the others, from ``values``."""
     log = fitter.log
     odd = log.window % 2 == 1
@@ -27,7 +27,7 @@ def held_out(fitter: Fitter, values: Mapping[str, float], sigma: float, rng: np.
     spread = np.sqrt(squares[:, draws].sum(axis=-1) / counts[draws].sum(axis=-1))
     low, high = np.quantile(spread[0] - spread[1], (0.05, 0.95))
     total = np.sqrt(squares.sum(axis=-1) / counts.sum())
-    return RobotGain(log.record.joint, float(total[0]), float(total[1]), float(low), float(high))
+    return JointGain(log.record.joint, float(total[0]), float(total[1]), float(low), float(high))
 
 
 def residuals(log: JointLog, values: Mapping[str, float]) -> JointResidual:

@@ -1,4 +1,4 @@
-"""Joint by joint: effects that are named, what they leave over, and what the log says nothing about."""
+"""Diagnosis joint by joint: effects that are named, what they do not explain, and what the log cannot show."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from mjx_tt.diagnosis.joint import cross_validation, estimates
-from mjx_tt.diagnosis.joint.effects import CATALOGUE, NAMES, members
+from mjx_tt.diagnosis.joint import cross_validation, selection
+from mjx_tt.diagnosis.joint.effects import EFFECTS, NAMES, members
 from mjx_tt.diagnosis.joint.encoder_home import offset_at
 from mjx_tt.diagnosis.joint.experiment_design import separating, unseen
-from mjx_tt.diagnosis.joint.findings import RobotCause, RobotFindings, merge
-from mjx_tt.diagnosis.joint.fit import Fitter
+from mjx_tt.diagnosis.joint.findings import JointFinding, JointFindings, merge
+from mjx_tt.diagnosis.joint.fit import Fitter, estimates, intervals
 from mjx_tt.diagnosis.joint.forward_model import JointResponse
-from mjx_tt.diagnosis.joint.log import JointLog
-from mjx_tt.diagnosis.joint.naming import Verdict, examine
-from mjx_tt.diagnosis.joint.records import JointRecord
+from mjx_tt.diagnosis.joint.log import JointLog, JointRecord
+from mjx_tt.diagnosis.joint.selection import Choice
+from mjx_tt.diagnosis.verdict import Cause, Experiment, Expressed, HeldOut, Part, Unexplained
 from robot_io.contract import JOINT_NAMES
 
 
-def diagnose_robot(
+def diagnose_joints(
     records: Sequence[JointRecord],
     nominal: Mapping[str, JointResponse],
     seed: int = 0,
     progress: Callable[[str, int, int], None] | None = None,
     without: Sequence[str] = (),
     home: Mapping[str, float] | None = None,
-) -> RobotFindings:
+) -> JointFindings:
     """Names what the nominal responses of the joints get wrong.
 
     records: one for each joint.
@@ -45,7 +45,7 @@ def diagnose_robot(
     _check([record.joint for record in records], nominal, without, home)
     streams = np.random.default_rng(seed).spawn(len(records))
     found = []
-    for i, (record, rng) in enumerate(zip(records, streams)):
+    for i, (record, rng) in enumerate(zip(records, streams, strict=True)):
         joint = record.joint
         gone = {effect for at, _, effect in (name.rpartition(".") for name in without) if at in ("", joint)}
         found.append(_of_joint(JointLog(record, nominal[joint]), gone, home.get(joint), rng))
@@ -74,56 +74,87 @@ def _check(joints: Sequence[str], nominal: Mapping, without: Sequence[str], home
             raise ValueError(f"home position of {name}, which has no record; there are {', '.join(joints)}")
 
 
-def _of_joint(log: JointLog, gone: set[str], home: float | None, rng: np.random.Generator) -> RobotFindings:
+def _of_joint(log: JointLog, gone: set[str], home: float | None, rng: np.random.Generator) -> JointFindings:
     """Findings of one joint without the effects that are gone."""
-    allowed = [e.name for e in CATALOGUE if not gone.intersection(members(e.name))]
+    joint, allowed = log.record.joint, [e.name for e in EFFECTS if not gone.intersection(members(e.name))]
     fitter = Fitter(log)
-    verdict = examine(fitter, allowed)
+    choice = selection.choose(fitter, allowed)
     found = merge(
         [
-            _causes(fitter, verdict),
-            offset_at(home, log, verdict, "joint_offset" not in gone),
-            unseen(log, verdict, allowed),
-            _unexplained(log, verdict),
-            _predictions(fitter, verdict, rng),
+            _causes(fitter, choice),
+            offset_at(home, log, choice, "joint_offset" not in gone),
+            unseen(log, choice, allowed),
+            _unexplained(log, choice),
+            _predictions(fitter, choice, rng),
         ]
     )
-    changes = {name: values[1] for cause in found.causes for name, values in cause.parameters.items()}
-    return dataclasses.replace(found, responses={log.record.joint: dataclasses.replace(log.nominal, **changes)})
+    changes = {p.removeprefix(f"{joint}."): e.estimate for cause in found.causes for p, e in cause.parameters.items()}
+    return dataclasses.replace(found, responses={joint: dataclasses.replace(log.nominal, **changes)})
 
 
-def _causes(fitter: Fitter, verdict: Verdict) -> RobotFindings:
+def _causes(fitter: Fitter, choice: Choice) -> JointFindings:
     log, joint = fitter.log, fitter.log.record.joint
-    intervals = estimates.intervals(fitter, verdict.fit, verdict.judge) if verdict.named else {}
+    ends = intervals(fitter, choice.fit, choice.judge) if choice.named else {}
     causes = []
-    for effect, named in verdict.named.items():
+    for effect, named in choice.named.items():
         group = itertools.chain.from_iterable(map(members, (effect, *named.rivals)))
+        fitted = estimates(log, effect, choice.fit.values[effect], ends[effect])
         causes.append(
-            RobotCause(
+            Cause(
                 name=f"{joint}.{effect}",
                 group=tuple(f"{joint}.{name}" for name in group),
                 confidence=named.confidence,
-                parameters=estimates.parameters(log, effect, verdict.fit.values[effect], intervals[effect]),
-                effect=1e3 * named.movement,
+                parameters={f"{joint}.{name}": estimate for name, estimate in fitted.items()},
+                effect_mm=1e3 * named.movement,
                 separating_measurement=separating(log, effect, named.rivals),
             )
         )
-    experiments = (separating(log, effect, n.rivals) for effect, n in verdict.named.items() if n.rivals)
-    return RobotFindings(causes=tuple(causes), next_experiment=tuple(experiments))
+    experiments = (separating(log, effect, n.rivals) for effect, n in choice.named.items() if n.rivals)
+    return JointFindings(causes=tuple(causes), next_experiment=tuple(experiments))
 
 
-def _unexplained(log: JointLog, verdict: Verdict) -> RobotFindings:
-    joint, left = log.record.joint, verdict.leftover
+def _unexplained(log: JointLog, choice: Choice) -> JointFindings:
+    joint, left = log.record.joint, choice.unexplained
     if left is None:
-        return RobotFindings()
-    about = {"joint": joint, "block": f"{joint}: {left.block.name}", "where": left.where, "direction": left.direction}
-    return RobotFindings(unexplained_by_joint=({**about, "size": 1e3 * left.size},))
+        return JointFindings()
+    block = f"{joint}: {left.block.name}"
+    return JointFindings(
+        unexplained_by_joint=(JointFinding(joint, block, left.where, left.direction, 1e3 * left.size),)
+    )
 
 
-def _predictions(fitter: Fitter, verdict: Verdict, rng: np.random.Generator) -> RobotFindings:
-    """Of the named effects alone: without those of the fit that are not, they are fitted anew."""
-    sigma, values = verdict.judge.sigma, {effect: verdict.fit.values[effect] for effect in verdict.named}
-    if values and len(values) < len(verdict.fit.values):
+def _predictions(fitter: Fitter, choice: Choice, rng: np.random.Generator) -> JointFindings:
+    """Predictions by the named effects alone: beside others that the fit holds, they are fitted anew."""
+    sigma, values = choice.judge.sigma, {effect: choice.fit.values[effect] for effect in choice.named}
+    if values and len(values) < len(choice.fit.values):
         values = fitter.fit(values, sigma).values
     gain = cross_validation.held_out(fitter, values, sigma, rng)
-    return RobotFindings(held_out=(gain,), residuals=(cross_validation.residuals(fitter.log, values),))
+    return JointFindings(held_out=(gain,), residuals=(cross_validation.residuals(fitter.log, values),))
+
+
+def part(found: JointFindings) -> Part:
+    """The joints' part of the verdict."""
+    unexplained = held_out = None
+    if found.unexplained is not None:
+        u = found.unexplained
+        unexplained = Unexplained(f"{u.joint}: {u.block}", u.where, u.direction, f"{u.size:.2f} mrad or mm")
+    if found.held_out:
+        means = (1e3 * np.mean([getattr(g, n) for g in found.held_out]) for n in ("before", "after", "low", "high"))
+        metric = "rms of joint positions on windows not used, mean over joints [mrad], [mm]"
+        held_out = HeldOut(metric, *map(float, means))
+    return Part(
+        tuple(Expressed(cause, _drive_values(cause)) for cause in found.causes),
+        unexplained=unexplained,
+        held_out=held_out,
+        not_identifiable=tuple(f"{u.name}: {u.why}" for u in found.not_identifiable),
+        not_excited=tuple(f"{u.name}: {u.why}" for u in found.not_excited),
+        next_experiment=tuple(Experiment(text, (), 0.0) for text in found.next_experiment),
+    )
+
+
+def _drive_values(cause: Cause) -> dict[str, float]:
+    """Parameters of SimModel's drives; their delays are extra to the drawn latency."""
+    return {
+        f"drives.{path}": e.estimate - e.nominal if path.endswith("_delay") else e.estimate
+        for path, e in cause.parameters.items()
+    }

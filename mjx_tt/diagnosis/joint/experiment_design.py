@@ -4,45 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mjx_tt.diagnosis.joint.effects import EFFECTS, members
-from mjx_tt.diagnosis.joint.findings import RobotFindings, Undecided
+from mjx_tt.diagnosis.joint.effects import BY_NAME, OBSERVATION_DELAY, members
+from mjx_tt.diagnosis.joint.findings import JointFindings, Undecided
 from mjx_tt.diagnosis.joint.log import JointLog
-from mjx_tt.diagnosis.joint.naming import Verdict
+from mjx_tt.diagnosis.joint.selection import Choice
 
 
-def unseen(log: JointLog, verdict: Verdict, allowed: Sequence[str]) -> RobotFindings:
-    """What of the allowed effects this log says nothing about."""
+def unseen(log: JointLog, choice: Choice, allowed: Sequence[str]) -> JointFindings:
+    """The allowed effects about which this log holds no evidence."""
     joint = log.record.joint
     why = "only the sum of action_delay and observation_delay shows in a log"
-    delays = (Undecided(f"{joint}.observation_delay", why),) if "action_delay" in verdict.named else ()
-    quiet = [e for e in allowed if e not in verdict.named and not _excited(log, verdict, e)]
-    return RobotFindings(
+    delays = (Undecided(f"{joint}.observation_delay", why),) if "action_delay" in choice.named else ()
+    quiet = [e for e in allowed if e not in choice.named and not _excited(log, choice, e)]
+    return JointFindings(
         not_identifiable=delays,
         not_excited=tuple(Undecided(f"{joint}.{m}", _why(log, e)) for e in quiet for m in members(e)),
-        next_experiment=tuple(EFFECTS[e].experiment_for(log) for e in quiet),
+        next_experiment=tuple(BY_NAME[e].reading_of(log) for e in quiet),
     )
 
 
-def _excited(log: JointLog, verdict: Verdict, name: str) -> bool:
-    """Whether the effect at the smallest size of interest would have been seen."""
+def _excited(log: JointLog, choice: Choice, name: str) -> bool:
+    """True if the effect at the smallest size of interest would have been seen."""
     if log.fastest == 0.0:
         return False
-    value = EFFECTS[name].interest(log, log.base[name])
-    change = log.simulate({**verdict.fit.values, name: value}) - log.simulate(verdict.fit.values)
-    return verdict.judge.visible(log.centred(change))
+    value = BY_NAME[name].interest(log, log.base[name])
+    change = log.simulate({**choice.fit.values, name: value}) - log.simulate(choice.fit.values)
+    return choice.judge.visible(log.centred(change))
 
 
 def _why(log: JointLog, name: str) -> str:
     if log.fastest == 0.0:
         return "the joint never moves"
-    value, unit = EFFECTS[name].interest(log, log.base[name]), EFFECTS[name].unit_of(log)
+    value, unit = BY_NAME[name].interest(log, log.base[name]), BY_NAME[name].unit_of(log)
     unit = "" if unit == "1" else f" {unit}"
     return f"{value:.3g}{unit} instead of {log.base[name]:.3g} would move the joint by too little to be seen"
 
 
 def separating(log: JointLog, name: str, rivals: Sequence[str]) -> str:
     """Measurements that would tell an effect from its rivals, and one delay from the other."""
-    texts = [EFFECTS[n].experiment_for(log) for n in (name, *rivals)] if rivals else []
-    if name == "action_delay":
-        texts.append("stamp a command's arrival at the drive and a state's departure with one clock")
-    return "; ".join(texts)
+    texts = [BY_NAME[n].reading_of(log) for n in (name, *rivals)] if rivals else []
+    return "; ".join([*texts, OBSERVATION_DELAY.reading] if name == "action_delay" else texts)

@@ -1,4 +1,4 @@
-"""What the logs say about the joints' responses."""
+"""Findings about the joints' responses, joint by joint and merged."""
 
 from __future__ import annotations
 
@@ -7,32 +7,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_tt.diagnosis.joint.forward_model import JointResponse
-
-
-@dataclass(frozen=True)
-class RobotCause:
-    """One named effect of one joint."""
-
-    name: str  # "joint_2.lag"
-    group: tuple[str, ...]  # names that this log cannot tell from it, itself among them
-    confidence: float  # that the cause is in the group
-    parameters: dict[str, tuple[float, float, float, float, str]]  # nominal, estimate, low, high (90 %), unit
-    effect: float  # rms movement that it explains [mrad], a gantry axis [mm]
-    separating_measurement: str  # what would tell the members of the group apart; empty for a group of one
+from mjx_tt.diagnosis.verdict import Cause
 
 
 @dataclass(frozen=True)
 class Undecided:
-    """An effect that this log says nothing about."""
+    """An effect about which the log holds no evidence."""
 
     name: str
     why: str
 
 
 @dataclass(frozen=True)
-class RobotGain:
+class JointFinding:
+    """A pattern of one joint that no effect of the catalogue explains."""
+
+    joint: str
+    block: str
+    where: str
+    direction: str
+    size: float  # [mrad], a gantry axis [mm]
+
+
+@dataclass(frozen=True)
+class JointGain:
     """Prediction error of positions on windows that the fit did not see; [rad], a gantry axis [m]."""
 
     joint: str
@@ -44,45 +45,45 @@ class RobotGain:
 
 @dataclass(frozen=True)
 class JointResidual:
-    """What was measured and predicted, (m,) each, [s] and [rad] or [m]; predictions have each window's offset."""
+    """Measured and predicted positions, [s] and [rad] or [m]; predictions have each window's offset."""
 
     joint: str
-    time: np.ndarray
-    measured: np.ndarray
-    nominal: np.ndarray
-    extended: np.ndarray
+    time: Float[np.ndarray, " m"]
+    measured: Float[np.ndarray, " m"]
+    nominal: Float[np.ndarray, " m"]
+    extended: Float[np.ndarray, " m"]
 
 
 @dataclass(frozen=True)
-class RobotFindings:
-    """What the logs say about the joints' responses."""
+class JointFindings:
+    """All that the logs hold about the joints' responses."""
 
-    causes: tuple[RobotCause, ...] = ()  # largest effect first
+    causes: tuple[Cause, ...] = ()  # largest effect first; effects are rms movements [mrad], a gantry axis [mm]
     not_excited: tuple[Undecided, ...] = ()
     not_identifiable: tuple[Undecided, ...] = ()
-    unexplained_by_joint: tuple[dict, ...] = ()  # joint, block, where, direction, size [mrad], [mm]; largest first
-    held_out: tuple[RobotGain, ...] = ()
+    unexplained_by_joint: tuple[JointFinding, ...] = ()  # largest first
+    held_out: tuple[JointGain, ...] = ()
     next_experiment: tuple[str, ...] = ()
     residuals: tuple[JointResidual, ...] = ()
     responses: dict[str, JointResponse] = field(default_factory=dict)  # nominal, extended by the named causes
 
     @property
-    def unexplained(self) -> dict | None:
+    def unexplained(self) -> JointFinding | None:
         """The largest residual that no effect of the catalogue explains."""
         return self.unexplained_by_joint[0] if self.unexplained_by_joint else None
 
 
-def merge(parts: Sequence[RobotFindings]) -> RobotFindings:
+def merge(parts: Sequence[JointFindings]) -> JointFindings:
     """All of the parts' findings."""
 
     def every(name: str) -> tuple:
         return tuple(itertools.chain.from_iterable(getattr(part, name) for part in parts))
 
-    return RobotFindings(
-        causes=tuple(sorted(every("causes"), key=lambda c: -c.effect)),
+    return JointFindings(
+        causes=tuple(sorted(every("causes"), key=lambda c: -c.effect_mm)),
         not_excited=every("not_excited"),
         not_identifiable=every("not_identifiable"),
-        unexplained_by_joint=tuple(sorted(every("unexplained_by_joint"), key=lambda u: -u["size"])),
+        unexplained_by_joint=tuple(sorted(every("unexplained_by_joint"), key=lambda u: -u.size)),
         held_out=every("held_out"),
         next_experiment=every("next_experiment"),
         residuals=every("residuals"),

@@ -8,9 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjx_tt.diagnosis.joint.effects import EFFECTS
+from mjx_tt.diagnosis.joint.effects import BY_NAME
 from mjx_tt.diagnosis.joint.log import JointLog
-from mjx_tt.diagnosis.joint.robust import loss, weights
+from mjx_tt.diagnosis.joint.scores import Judge, loss, weights
+from mjx_tt.diagnosis.verdict import Estimate
+
+INTERVAL = 1.645  # deviations of a 90 % interval
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class Fitter:
         here = self.log.simulate(values)
         columns = []
         for name, value in values.items():
-            effect = EFFECTS[name]
+            effect = BY_NAME[name]
             step = effect.step(self.log, value)
             if value + step > effect.bounds(self.log)[1]:
                 step = -step
@@ -61,7 +64,7 @@ class Fitter:
             return Fit({}, self.residual({}, sigma))
         if "deadband" in values:
             values = self._place(values, sigma)
-        limits = np.array([(bounds or {}).get(n, EFFECTS[n].bounds(self.log)) for n in names])
+        limits = np.array([(bounds or {}).get(n, BY_NAME[n].bounds(self.log)) for n in names])
         mask = 1.0 if mask is None else mask
         r = self.residual(values, sigma)
         least, damping = np.sum(mask * loss(r, sigma)), 1e-3
@@ -74,7 +77,7 @@ class Fitter:
             for _ in range(4):
                 change = np.linalg.solve(normal + np.diag(damping * scale), right)
                 moved = np.clip(x + change, limits[:, 0], limits[:, 1])
-                trial = dict(zip(names, moved.tolist()))
+                trial = dict(zip(names, moved.tolist(), strict=True))
                 r_trial = self.residual(trial, sigma)
                 reached = np.sum(mask * loss(r_trial, sigma))
                 if reached < least:
@@ -106,7 +109,7 @@ class Fitter:
         weight = weights(fit.residual, sigma)
         best, begin = -math.inf, {}
         here = self.log.simulate(fit.values)
-        for value in EFFECTS[name].starts(self.log, self.log.base[name]):
+        for value in BY_NAME[name].starts(self.log, self.log.base[name]):
             column = self.log.simulate({**fit.values, name: value}) - here
             columns = self.log.centred(np.column_stack([slopes, column]), weight)
             normal = columns.T @ (columns * weight[:, None])
@@ -121,12 +124,14 @@ class Fitter:
                 solution = np.linalg.lstsq(normal, right, rcond=1e-10)[0]
                 gain = right @ solution * (1.0 if 0.2 < solution[-1] < 5.0 else 0.7 if solution[-1] > 0.0 else 0.1)
             if gain > best:
-                shifted = {n: self._bounded(n, v + s) for (n, v), s in zip(fit.values.items(), solution)}
+                shifted = {
+                    n: self._bounded(n, v + s) for (n, v), s in zip(fit.values.items(), solution[:-1], strict=True)
+                }
                 best, begin = gain, {**shifted, name: value}
         return best / sigma**2, begin
 
     def _bounded(self, name: str, value: float) -> float:
-        low, high = EFFECTS[name].bounds(self.log)
+        low, high = BY_NAME[name].bounds(self.log)
         return min(max(value, low), high)
 
     def add(self, fit: Fit, name: str, begin: Mapping[str, float], sigma: float) -> Fit | None:
@@ -138,3 +143,40 @@ class Fitter:
             if old is None or new.loss(sigma) < old.loss(sigma):
                 self.found[names] = old = new
         return old
+
+
+def intervals(fitter: Fitter, fit: Fit, judge: Judge) -> dict[str, tuple[float, float]]:
+    """90 % intervals of the fitted parameters from window-clustered errors, or from the noise where it says more."""
+    log, weight = fitter.log, weights(fit.residual, judge.sigma)
+    slopes = log.centred(fitter.jacobian(fit.values), weight)
+    scores = np.add.reduceat(slopes * (weight * fit.residual)[:, None], log.starts, axis=0)
+    bread = np.linalg.pinv(slopes.T @ (slopes * weight[:, None]))
+    count = len(scores)
+    spread = bread @ (scores.T @ scores) @ bread * count / max(count - 1, 1)
+    noise = bread * judge.sigma**2 * judge.inflation
+    result = {}
+    for i, (name, value) in enumerate(fit.values.items()):
+        if not slopes[:, i].any():  # any larger limit would do as well
+            result[name] = (value, math.inf)
+            continue
+        half = INTERVAL * math.sqrt(max(spread[i, i], noise[i, i], 0.0))
+        low, high = value - half, value + half
+        if name == "deadband":  # the log cannot place a threshold closer than the sizes of its commands
+            below, above = log.sizes[log.sizes < value], log.sizes[log.sizes >= value]
+            low, high = min(low, below.max(initial=0.0)), max(high, above.min(initial=log.fastest))
+        result[name] = (float(max(low, BY_NAME[name].bounds(log)[0])), float(high))
+    return result
+
+
+def estimates(log: JointLog, name: str, value: float, interval: tuple[float, float]) -> dict[str, Estimate]:
+    """Estimates of the parameters of JointResponse that an effect changes, by name."""
+    unit = BY_NAME[name].unit_of(log)
+    if name != "action_delay":
+        return {name: Estimate(log.base[name], value, *interval, unit)}
+    # The sum is known; the change goes to the action delay, and what would make it negative to the observation delay.
+    action, observation = log.nominal.action_delay, log.nominal.observation_delay
+    parts = {name: Estimate(action, *(max(v - observation, 0.0) for v in (value, *interval)), unit)}
+    if value < observation:
+        low, high = (min(v, observation) for v in interval)
+        parts["observation_delay"] = Estimate(observation, value, low, high, unit)
+    return parts

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
+
+from mjx_tt.sim.model import SimModel
+from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class JointResponse:
     deadband: float = 0.0  # [rad/s], [m/s]
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
+        for field in fields(self):
             value = getattr(self, field.name)
             if math.isnan(value) or (value < 0.0 and field.name not in ("joint_offset", "velocity_gain")):
                 raise ValueError(f"JointResponse.{field.name} must not be negative or NaN, got {value}")
@@ -74,12 +76,12 @@ class JointResponse:
         v, velocities = 0.0, [0.0]
         append = velocities.append
         if math.isinf(limit):
-            for w, decay in zip(target[:-1].tolist(), np.exp(-hold / tau).tolist()):
+            for w, decay in zip(target[:-1].tolist(), np.exp(-hold / tau).tolist(), strict=True):
                 v = w + (v - w) * decay
                 append(v)
         else:
             exp, linear = math.exp, limit * tau  # beyond ``linear`` from its target the velocity ramps
-            for w, dt in zip(target[:-1].tolist(), hold.tolist()):
+            for w, dt in zip(target[:-1].tolist(), hold.tolist(), strict=True):
                 d = w - v
                 away = abs(d)
                 if away - linear >= limit * dt:
@@ -128,7 +130,7 @@ class JointResponse:
         begin, up = moves[first], rising[first]
         half = 0.5 * self.backlash
         out, outputs = path[0], []
-        for turn, rises in zip(np.append(path[begin[1:]], path[-1]).tolist(), up.tolist()):
+        for turn, rises in zip(np.append(path[begin[1:]], path[-1]).tolist(), up.tolist(), strict=True):
             outputs.append(out)
             out = max(out, turn - half) if rises else min(out, turn + half)
         run = np.searchsorted(times[begin], query, side="right") - 1
@@ -148,3 +150,24 @@ class JointResponse:
         ramp = np.maximum((away - linear) / limit, 0.0)
         soft = ramp + self.lag * np.log(np.maximum(np.minimum(away, linear) / np.abs(w), 1.0))
         return np.where(np.abs(v) <= limit * ramp, np.abs(v) / limit, soft)
+
+
+def nominal_response(model: SimModel, joint: str) -> JointResponse:
+    """Response of a joint in the model: its mean latencies, and its drive where the model has one."""
+    axis = "festo" if JOINT_NAMES.index(joint) in FESTO_JOINTS else "abb"
+    values = {
+        "action_delay": float(getattr(model.latency, f"{axis}_action")),
+        "observation_delay": float(getattr(model.latency, f"{axis}_observation")),
+        "velocity_gain": float(model.actuation.velocity_gain),
+    }
+    if model.drives is not None:
+        drive = getattr(model.drives, joint)
+        for field in fields(JointResponse):
+            value = float(getattr(drive, field.name))
+            if field.name.endswith("_delay"):
+                values[field.name] += value
+            elif field.name == "velocity_gain":
+                values[field.name] *= value
+            else:
+                values[field.name] = value
+    return JointResponse(**values)

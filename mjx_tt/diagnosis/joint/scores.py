@@ -1,17 +1,40 @@
-"""When one fit is better than another by more than the noise, as correlated as it is, could explain."""
+"""Robust loss of a joint's residual, and when one fit beats another by more than its noise could explain."""
 
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_tt.diagnosis.joint.log import JointLog
-from mjx_tt.diagnosis.joint.robust import loss, rms, scale, weights
+from mjx_tt.diagnosis.robust import deviation, huber_loss, huber_weights
 
+HUBER = 2.5  # noise deviations beyond which a sample counts linearly
+SMALLEST_NOISE = 5e-5  # [rad], [m]: no log is believed more exactly
 EVIDENCE = 30.0  # least gain of the loss in units of the noise, for an effect or a further one
 ONE_WINDOW = 12.0  # the same without the window that gains most: one glitch names nothing
 FLOOR = 5e-4  # [rad], [m] rms movement below which nothing is named
 UNIQUE = 3.5e-4  # [rad], [m] rms of it that no other effect takes over
 CORRELATED = 0.3  # [s] over which noise may remember itself
+
+
+def weights(r: Float[np.ndarray, " n"], sigma: float) -> Float[np.ndarray, " n"]:
+    """Weight of each residual in least squares."""
+    return huber_weights(np.abs(r), HUBER * sigma)
+
+
+def loss(r: Float[np.ndarray, " n"], sigma: float) -> Float[np.ndarray, " n"]:
+    """Huber's loss of each residual in squared noise deviations."""
+    return huber_loss(np.abs(r) / sigma, HUBER)
+
+
+def scale(r: Float[np.ndarray, " n"]) -> float:
+    """Standard deviation of the noise, from the median."""
+    return max(float(deviation(r)), SMALLEST_NOISE)
+
+
+def rms(x: Float[np.ndarray, ...]) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(x * x)))
 
 
 class Judge:

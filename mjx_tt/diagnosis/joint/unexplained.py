@@ -1,4 +1,4 @@
-"""What a fit's residual still holds that is not noise, whatever its name."""
+"""Patterns of a fit's residual that are not noise and that no effect of the catalogue explains."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import numpy as np
 from mjx_tt.diagnosis.joint.basis_functions import Block, blocks
 from mjx_tt.diagnosis.joint.fit import Fit, Fitter
 from mjx_tt.diagnosis.joint.log import JointLog
-from mjx_tt.diagnosis.joint.robust import SMALLEST_NOISE, weights
-from mjx_tt.diagnosis.joint.scores import FLOOR, Judge
+from mjx_tt.diagnosis.joint.scores import FLOOR, SMALLEST_NOISE, Judge, weights
 
 
 @dataclass(frozen=True)
-class Leftover:
+class Finding:
     """The block that explains most of a residual."""
 
     block: Block
@@ -24,7 +23,7 @@ class Leftover:
     direction: str
 
 
-def find(fitter: Fitter, fit: Fit, sigma: float) -> Leftover | None:
+def find(fitter: Fitter, fit: Fit, sigma: float) -> Finding | None:
     """The block that explains most of a fit's residual, None where none explains anything worth a word."""
     log, r = fitter.log, fit.residual
     weight = weights(r, sigma)
@@ -42,7 +41,7 @@ def find(fitter: Fitter, fit: Fit, sigma: float) -> Leftover | None:
     judge = Judge(log, y - together @ _ridge(together, y))
     even = log.window % 2 == 0
     best, highest = None, 0.0
-    for block, columns in zip(nameless, prepared):
+    for block, columns in zip(nameless, prepared, strict=True):
         coefficients = _ridge(columns, y)
         explained = y @ (columns @ coefficients) / judge.sigma**2 / judge.inflation
         count = columns.shape[1]
@@ -50,11 +49,11 @@ def find(fitter: Fitter, fit: Fit, sigma: float) -> Leftover | None:
         predicted = np.where(even, columns @ _ridge(columns[~even], y[~even]), columns @ _ridge(columns[even], y[even]))
         size = math.sqrt(max(np.mean(y * y) - np.mean((y - predicted) ** 2), 0.0))
         if score > highest and size > FLOOR:
-            best, highest = Leftover(block, size, *block.where(coefficients)), score
+            best, highest = Finding(block, size, *block.where(coefficients)), score
     return best or _moments(log, r)
 
 
-def _moments(log: JointLog, r: np.ndarray) -> Leftover | None:
+def _moments(log: JointLog, r: np.ndarray) -> Finding | None:
     """Windows in which the joint was somewhere else for a while, which no function of its motion explains."""
     from scipy.ndimage import median_filter  # half a second to import, which logs without joints need not
 
@@ -70,7 +69,7 @@ def _moments(log: JointLog, r: np.ndarray) -> Leftover | None:
     columns = log.centred(smooth * odd[log.window])[:, None]
     begin = log.time[log.starts[worst]] - log.time[0]
     where = f"{int(odd.sum())} of {odd.size} windows of {log.width:.2g} s, most at {begin:.1f} s in the log"
-    return Leftover(Block("moments", columns, lambda c: (where, "both")), size, where, "both")
+    return Finding(Block("moments", columns, lambda c: (where, "both")), size, where, "both")
 
 
 def _ridge(columns: np.ndarray, y: np.ndarray) -> np.ndarray:

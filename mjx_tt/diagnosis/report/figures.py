@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from scipy.special import bdtr
 
 from mjx_tt.diagnosis.ball.cross_validation import Prediction
-from mjx_tt.diagnosis.ball.diagnose import BallFindings, left_over
+from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.hits.diagnose import HitFindings
-from mjx_tt.diagnosis.joint import JointResidual, RobotFindings
+from mjx_tt.diagnosis.joint import JointFindings, JointResidual
 from mjx_tt.diagnosis.verdict import Cause
 from mjx_tt.viz.html import FAINT, INK, STYLE
 
@@ -78,7 +78,7 @@ def flight_time(found: BallFindings) -> tuple[np.ndarray, str]:
 
 def residuals(found: BallFindings) -> tuple[np.ndarray, np.ndarray]:
     """(3, T, n) [mm] measured minus predicted under the nominal and under the extended model."""
-    return 1e3 * found.residual0, 1e3 * left_over(found)
+    return 1e3 * found.residual0, 1e3 * found.residual()
 
 
 def spins(found: BallFindings) -> np.ndarray:
@@ -99,7 +99,7 @@ def flight_residuals(found: BallFindings) -> tuple[Figure, str]:
     time, origin = flight_time(found)
     both = residuals(found)
     curves = [[curve(time, r[a], mask, 30) for a in range(3)] for r in both]
-    words = "; ".join(_largest(name, row, origin) for name, row in zip(("before", "after"), curves))
+    words = "; ".join(_largest(name, row, origin) for name, row in zip(("before", "after"), curves, strict=True))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 8.2), layout="constrained")
         axes = figure.subplots(3, 2, sharex=True, sharey="row")
@@ -153,9 +153,9 @@ def quantity_residuals(found: BallFindings) -> Figure:
         axes = figure.subplots(3, len(columns), sharex="col", sharey="row")
         for a, name in enumerate(AXES):
             curves = [[curve(q, r[a], grid.mask, 14, least) for r in both] for q, _, least in columns]
-            for ax, (_, label, _), pair in zip(axes[a], columns, curves):
+            for ax, (_, label, _), pair in zip(axes[a], columns, curves, strict=True):
                 _zero(ax)
-                for c, colour in zip(pair, (BEFORE, AFTER)):
+                for c, colour in zip(pair, (BEFORE, AFTER), strict=True):
                     _bands(ax, c, colour, light=True)
                 if a == 2:
                     ax.set_xlabel(label)
@@ -201,7 +201,7 @@ def bounce_map(found: BallFindings) -> Figure:
         figure = Figure(figsize=(10.0, 6.6), layout="constrained")
         axes = figure.subplots(1, 2, sharex=True, sharey=True)
         for ax, height, title, colour in zip(
-            axes, heights, ("before: nominal model", "after: extended model"), (BEFORE, AFTER)
+            axes, heights, ("before: nominal model", "after: extended model"), (BEFORE, AFTER), strict=True
         ):
             dots = ax.scatter(
                 *place, c=height, s=16, cmap="PuOr_r", vmin=-limit, vmax=limit, edgecolor=INK, linewidth=0.2
@@ -215,13 +215,13 @@ def bounce_map(found: BallFindings) -> Figure:
     return figure
 
 
-def joint_residuals(robot: RobotFindings) -> Figure:
+def joint_residuals(robot: JointFindings) -> Figure:
     """Measured minus predicted positions of each joint over time and against its velocity, before and after."""
     rows = robot.residuals
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 0.8 + 1.55 * len(rows)), layout="constrained")
         axes = figure.subplots(len(rows), 2, squeeze=False, width_ratios=(2.0, 1.0), sharey="row")
-        for r, (left, right) in zip(rows, axes):
+        for r, (left, right) in zip(rows, axes, strict=True):
             unit = "mm" if r.joint.startswith("gantry") else "mrad"
             _joint(left, right, r)
             left.set_ylabel(f"{r.joint}\n[{unit}]")
@@ -266,7 +266,11 @@ def hits(found: HitFindings) -> Figure:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 3.6 if same else 4.6), layout="constrained")
         for ax, first, factor, what in zip(
-            figure.subplots(1, 2), (0, 3), (1e3, 1.0), ("place at the hit [mm]", "velocity behind the paddle [m/s]")
+            figure.subplots(1, 2),
+            (0, 3),
+            (1e3, 1.0),
+            ("place at the hit [mm]", "velocity behind the paddle [m/s]"),
+            strict=True,
         ):
             both = factor * np.concatenate([values[first : first + 3] for values, _ in kinds], axis=1)
             # A few wild hits stay on the edge and do not flatten the rest.
@@ -314,7 +318,7 @@ def runners(names: Sequence[str], behind: Sequence[float], chosen: str) -> Figur
         at = np.arange(len(labels))
         ax.barh(at, values, color=colours, height=0.62)
         span = max(max(values), 1.0)
-        for k, value in zip(at, values):
+        for k, value in zip(at, values, strict=True):
             text = "chosen" if k == 0 else f"{value:,.0f}" if value > 0.0 else "ruled out, see below"
             ax.annotate(text, (value, k), (5, 0), textcoords="offset points", va="center", fontsize=9.5)
         ax.set_yticks(at, labels)
@@ -370,7 +374,7 @@ def forest(rows: Sequence[Row]) -> Figure:
         at = np.arange(len(rows))
         ax.axvline(0.0, color=INK, linewidth=0.9)
         ax.grid(axis="x", color="#e6e9ed", linewidth=0.7)
-        for k, r in zip(at, rows):
+        for k, r in zip(at, rows, strict=True):
             ax.plot([r.low, r.high], [k, k], color=AFTER, linewidth=5.0, alpha=0.35, solid_capstyle="butt")
             ax.plot([r.estimate], [k], "o", color=AFTER, markersize=7)
         ax.set_yticks(at, [r.label for r in rows])
@@ -419,7 +423,7 @@ def _gains(ax: Axes, gain: np.ndarray) -> None:
     ax.set_ylabel("balls")
 
 
-def joint_gains(robot: RobotFindings) -> Figure:
+def joint_gains(robot: JointFindings) -> Figure:
     """Prediction errors of joint positions on windows that were not used."""
     rows = robot.held_out
     with matplotlib.rc_context(STYLE):
@@ -450,7 +454,7 @@ def play(rates: Sequence[tuple[str, float, float, float]]) -> Figure:
         figure = Figure(figsize=(10.0, 0.9 + 0.5 * len(rates)), layout="constrained")
         ax = figure.subplots()
         at = np.arange(len(rates))
-        for k, (_, rate, low, high) in zip(at, rates):
+        for k, (_, rate, low, high) in zip(at, rates, strict=True):
             colour = BEFORE if k == 0 else AFTER
             ax.plot([100 * low, 100 * high], [k, k], color=colour, linewidth=5.0, alpha=0.35, solid_capstyle="butt")
             ax.plot([100 * rate], [k], "o", color=colour, markersize=7)

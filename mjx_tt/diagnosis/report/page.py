@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mjx_tt.diagnosis.ball import scores as evidence
-from mjx_tt.diagnosis.ball import selection
+from mjx_tt.diagnosis.ball import scores, selection
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE
 from mjx_tt.diagnosis.diagnose import Diagnosis
@@ -177,7 +176,7 @@ def _verdict(d: Diagnosis, page: Page) -> str:
             table(
                 ("joint", "kind", "where", "direction", "size [mm], [mrad]"),
                 [
-                    tuple(escape(str(u[k])) for k in ("joint", "block", "where", "direction")) + (f"{u['size']:.2f}",)
+                    tuple(escape(getattr(u, k)) for k in ("joint", "block", "where", "direction")) + (f"{u.size:.2f}",)
                     for u in d.robot.unexplained_by_joint
                 ],
                 right=(4,),
@@ -200,7 +199,7 @@ def _detectable(d: Diagnosis) -> str:
     sizes = sorted(words.detectable(d.balls).items(), key=lambda x: x[1])
     floor = 1e3 * selection.FLOOR
     rows = [
-        (_code(name), escape(words.MEANING.get(name, "")))
+        (_code(name), escape(words.description(name).meaning))
         + ((f"{size:.2f}", f"{max(size, floor):.1f}") if math.isfinite(size) else ("not excited", "-"))
         for name, size in sizes
         if name not in INVISIBLE
@@ -261,7 +260,7 @@ def _hits(d: Diagnosis, page: Page) -> str:
             f" {2e3 * diagnose.LEAST_SHIFT:.0f} mm, {diagnose.RETURN:g} s after the hit, would have stayed in the scatter. More"
             " hits would show it, at other speeds and angles of the blade.</p>"
         )
-        lines = [(_code(e.name), escape(words.MEANING[e.name]), escape(e.reading)) for e in quiet]
+        lines = [(_code(e.name), escape(e.meaning), escape(e.reading)) for e in quiet]
         out.append(table(("effect", "meaning", "reading that would tell"), lines))
     return "\n".join(out)
 
@@ -349,12 +348,12 @@ def _rivals(found: BallFindings) -> list[tuple[tuple[int, ...], bool, float]]:
     Beside the chosen effects only those enter that the data could show, as in ``select``.
     """
     choice, p = found.choice, found.projected
-    scores = evidence.with_spin(p, choice.prior.std) if choice.spin else evidence.without_spin(p)
-    useful = [i for i in np.flatnonzero(found.seen).tolist() if i not in scores.always]
+    rated = found.scores()
+    useful = [i for i in np.flatnonzero(found.seen).tolist() if i not in rated.always]
     out = []
 
-    def best(scores, candidates, spun) -> None:
-        gains = evidence.all_gains(scores, tuple(candidates))
+    def best(rated, candidates, spun) -> None:
+        gains = scores.all_gains(rated, tuple(candidates))
         subset = max(gains, key=lambda s: gains[s] - choice.threshold * len(s))
         out.append((subset, spun, float(gains[subset])))
 
@@ -362,10 +361,10 @@ def _rivals(found: BallFindings) -> list[tuple[tuple[int, ...], bool, float]]:
         rest = choice.effects[:i] + choice.effects[i + 1 :]
         for other in group[1:]:
             subset = tuple(sorted((*rest, other)))
-            out.append((subset, choice.spin, float(evidence.gain(scores, subset))))
-        best(scores, [k for k in useful if k not in group], choice.spin)
+            out.append((subset, choice.spin, float(scores.gain(rated, subset))))
+        best(rated, [k for k in useful if k not in group], choice.spin)
     if choice.spin and found.trial.spin == "none":
-        best(evidence.without_spin(p), [k for k in useful if not found.trial.effects[k].needs_spin], False)
+        best(scores.without_spin(p), [k for k in useful if not found.trial.effects[k].needs_spin], False)
     return out
 
 
@@ -429,7 +428,9 @@ def _lines(lines: Sequence[str]) -> str:
             if len(whys) == 1
             else f"for instance {members[0][0]}: {whys[0]}"
             if whys
-            else words.MEANING.get(effect, "")
+            else words.description(effect).meaning
+            if effect in BY_NAME
+            else ""
         )
         rows.append((_code(effect), escape(joints), escape(why)))
     if any(r[1] for r in rows):

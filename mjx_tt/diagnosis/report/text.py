@@ -1,4 +1,4 @@
-"""The words of a diagnosis: what the names of the catalogue mean, and a verdict as sentences with numbers and units."""
+"""Sentences of a diagnosis: a verdict, a cause and a block without a name in plain words, with numbers and units."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjx_tt.diagnosis.ball import scores as evidence
-from mjx_tt.diagnosis.ball import selection
+from mjx_tt.diagnosis.ball import effects as ball_effects
+from mjx_tt.diagnosis.ball import scores, selection
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
+from mjx_tt.diagnosis.description import Description
 from mjx_tt.diagnosis.diagnose import Diagnosis
+from mjx_tt.diagnosis.joint import effects as joint_effects
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Unexplained
 
 SUBSET = "a subset of the balls"  # block of balls of their own kind
@@ -22,52 +24,11 @@ DISPLAY = {
     "kg": (1e3, "g", 0.1),
 }
 
-# What a name of the catalogue means, for readers who do not know it.
-MEANING = {
-    "drag_coefficient": "drag of the ball",
-    "air_density": "thinner or denser air",
-    "ball_mass": "another mass of the ball",
-    "ball_radius": "another radius of the ball",
-    "magnus": "spin of the ball",
-    "magnus_coefficient": "curve of a spinning ball",
-    "spin_decay": "loss of spin in flight",
-    "wind_x": "air that moves across the table",
-    "wind_y": "air that moves along the table",
-    "wind_z": "air that rises or sinks",
-    "gravity_tilt_x": "a measuring frame that leans across the table",
-    "gravity_tilt_y": "a measuring frame that leans along the table",
-    "gravity_scale": "strength of gravity",
-    "buoyancy": "lift of the air on the ball",
-    "clock_rate": "a clock that runs fast or slow",
-    "table_restitution": "speed that the table gives back",
-    "table_restitution_speed": "restitution that changes with speed",
-    "table_friction": "friction of the table",
-    "table_height": "height of the table",
-    "table_tilt_x": "a table that leans across",
-    "table_tilt_y": "a table that leans along its length",
-    "paddle_restitution": "speed that the paddle gives back",
-    "paddle_friction": "grip of the paddle",
-    "paddle_tilt": "tilt of the paddle",
-    "paddle_offset": "place of the paddle",
-    "camera_scale": "scale of the camera's calibration",
-    "camera_rotation_x": "camera frame turned about x",
-    "camera_rotation_y": "camera frame turned about y",
-    "camera_rotation_z": "camera frame turned about the vertical",
-    "camera_distortion": "distortion of the camera",
-    "ball_latency": "delay of the ball's measurement",
-    "latency_jitter": "time stamps that scatter",
-    "tracker_smoothing": "a tracker that smooths",
-    "action_delay": "delay from command to motion",
-    "observation_delay": "delay of the joint's measurement",
-    "lag": "slow answer of the drive",
-    "velocity_gain": "wrong speed of the drive",
-    "joint_offset": "zero of the encoder",
-    "velocity_limit": "a limit of the velocity",
-    "acceleration_limit": "a limit of the acceleration",
-    "backlash": "play of the gear",
-    "coulomb_friction": "dry friction",
-    "deadband": "small commands without motion",
-}
+
+def description(name: str) -> Description:
+    """Description of an effect of the ball, or of a joint by joint.effect."""
+    _, dot, effect = name.rpartition(".")
+    return (joint_effects.DESCRIPTIONS if dot else ball_effects.DESCRIPTIONS)[effect]
 
 
 def sentence(diagnosis: Diagnosis) -> str:
@@ -86,13 +47,20 @@ def sentence(diagnosis: Diagnosis) -> str:
 
 
 def claim(cause: Cause) -> str:
-    """What a cause means, with its size and 90 % interval."""
-    joint, dot, effect = cause.name.rpartition(".")
-    if effect == "magnus":
+    """A cause as a sentence, with its size and 90 % interval."""
+    if cause.name == "magnus":
         return _spin_claim(cause)
-    e = next(iter(cause.parameters.values()))
-    words = (ROBOT_CLAIMS if dot else CLAIMS).get(effect, ("", "", f"{MEANING.get(effect, effect)}: {{instead}}"))
-    return f"{joint} {_say(words, e)}" if dot else _say(words, e)
+    words, e = description(cause.name), next(iter(cause.parameters.values()))
+    sentence = words.claim.format(
+        meaning=words.meaning,
+        way=words.more if e.estimate > e.nominal else words.less,
+        value=_value(e),
+        size=_size(e),
+        instead=_instead(e),
+        nominal=nominal(e),
+    )
+    joint, dot, _ = cause.name.rpartition(".")
+    return f"{joint} {sentence}" if dot else sentence
 
 
 def detectable(found: BallFindings) -> dict[str, float]:
@@ -101,15 +69,12 @@ def detectable(found: BallFindings) -> dict[str, float]:
     The gates of ``select`` but the practical floor: evidence and standard errors, beside what was named; infinite where
     the logs do not excite the effect.
     """
-    choice, trial = found.choice, found.trial
-    scores = (
-        evidence.with_spin(found.projected, choice.prior.std) if choice.spin else evidence.without_spin(found.projected)
-    )
-    base = [*choice.effects, *scores.always]
+    choice, trial, rated = found.choice, found.trial, found.scores()
+    base = [*choice.effects, *rated.always]
     others = [j for j in range(len(trial.effects)) if j not in base and j not in trial.left_out]
-    own, gram = evidence.unexplained_scores(scores, base, others)
+    own, gram = scores.unexplained_scores(rated, base, others)
     out = {}
-    for j, score, information in zip(others, own.T, np.diagonal(gram)):
+    for j, score, information in zip(others, own.T, np.diagonal(gram), strict=True):
         if not found.seen[j] or information <= 0.0:
             out[trial.effects[j].name] = math.inf
             continue
@@ -123,7 +88,7 @@ def detectable(found: BallFindings) -> dict[str, float]:
 
 
 def span(middle: float, low: float, high: float, unit: str) -> tuple[str, str, str, str]:
-    """The three numbers and the unit as a reader wants them: as many digits as the interval deserves."""
+    """Three numbers and the unit, with as many digits as the interval deserves."""
     factor, name, below = DISPLAY.get(unit, (1.0, unit, math.inf))
     if not max(abs(x) for x in (middle, low, high)) < below:
         factor, name = 1.0, unit
@@ -162,74 +127,13 @@ def _instead(e: Estimate) -> str:
 
 
 def nominal(e: Estimate) -> str:
+    """Nominal value with its unit."""
     if math.isinf(e.nominal):
         return "no limit"
     factor, name, below = DISPLAY.get(e.unit, (1.0, e.unit, math.inf))
     if not max(abs(x) for x in (e.estimate, e.low, e.high)) < below:
         factor, name = 1.0, e.unit
     return _join(f"{e.nominal * factor:.6g}", {"1": ""}.get(name, name.replace("^2", "²")))
-
-
-# What a cause says: words for more and for less than nominal, and the sentence that takes them.
-CLAIMS: dict[str, tuple[str, str, str]] = {
-    "drag_coefficient": ("more", "less", "The air brakes the ball {way} than the model says, coefficient {instead}"),
-    "magnus_coefficient": ("more", "less", "Spinning balls curve {way} than the model says, coefficient {instead}"),
-    "spin_decay": ("faster", "more slowly", "The ball loses its spin {way} in flight, {instead}"),
-    "wind_x": ("+x", "-x", "The air moves sideways, towards {way}, at {size}"),
-    "wind_y": ("human (+y)", "robot (-y)", "The air moves along the table, towards the {way}, at {size}"),
-    "wind_z": ("rises", "sinks", "The air {way} at {size}"),
-    "gravity_tilt_x": (
-        "+x",
-        "-x",
-        "Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned across the table",
-    ),
-    "gravity_tilt_y": (
-        "+y",
-        "-y",
-        "Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned along the table",
-    ),
-    "gravity_scale": ("more slowly", "faster", "Balls fall {way} than the model says, acceleration {instead}"),
-    "table_restitution": ("more", "less", "The table returns {way} speed than the model says, restitution {instead}"),
-    "table_restitution_speed": ("rises", "falls", "The table's restitution {way} with the ball's speed, {instead}"),
-    "table_friction": ("rougher", "smoother", "The table is {way} than the model says, friction {instead}"),
-    "table_height": ("higher", "lower", "The table's surface lies {size} {way} than the model says"),
-    "table_tilt_x": ("+x", "-x", "The table's surface rises towards {way} by {size}"),
-    "table_tilt_y": ("+y", "-y", "The table's surface rises towards {way} by {size}"),
-    "camera_scale": ("long", "short", "The camera measures lengths too {way}, scale {instead}"),
-    "camera_rotation_x": ("", "", "The camera's frame is turned about x by {value}"),
-    "camera_rotation_y": ("", "", "The camera's frame is turned about y by {value}"),
-    "camera_rotation_z": ("", "", "The camera's frame is turned about the vertical by {value}"),
-    "camera_distortion": ("", "", "The camera distorts the picture, {instead}"),
-    "latency_jitter": ("", "", "The time stamps of the ball's positions scatter by {value}"),
-    "tracker_smoothing": ("", "", "The tracker smooths the ball's positions, time constant {instead}"),
-    "paddle_restitution": (
-        "more",
-        "less",
-        "The paddle gives back {way} of the ball's speed than the model says, {instead}",
-    ),
-    "paddle_friction": ("more", "less", "The rubber grips {way} than the model says, tangential gain {instead}"),
-    "paddle_tilt": ("downwards", "upwards", "The blade looks {way} by {value}"),
-    "paddle_offset": ("ahead of", "behind", "The blade lies {way} where the model has it, by {size}"),
-    "ball_latency": ("later", "sooner", "The ball is measured {way} against the joints than the model says, {instead}"),
-}
-ROBOT_CLAIMS: dict[str, tuple[str, str, str]] = {
-    "action_delay": ("later", "sooner", "acts {way} on a command than the model says, delay {instead}"),
-    "observation_delay": ("later", "sooner", "is read {way} than the model says, delay {instead}"),
-    "lag": ("", "", "follows its commands with a time constant of {instead}"),
-    "velocity_gain": ("fast", "slowly", "moves too {way}, {value} of what it is told instead of {nominal}"),
-    "joint_offset": ("high", "low", "reads {size} too {way}"),
-    "velocity_limit": ("", "", "gets no faster than {instead}"),
-    "acceleration_limit": ("", "", "gathers speed no faster than {instead}"),
-    "backlash": ("", "", "has a play of {instead}"),
-    "coulomb_friction": ("", "", "loses {instead} of every commanded velocity to dry friction"),
-    "deadband": ("", "", "stands still for commands below {instead}"),
-}
-
-
-def _say(words: tuple[str, str, str], e: Estimate) -> str:
-    up, down, text = words
-    way = up if e.estimate > e.nominal else down
-    return text.format(way=way, value=_value(e), size=_size(e), instead=_instead(e), nominal=nominal(e))
 
 
 def _spin_claim(cause: Cause) -> str:
@@ -246,10 +150,9 @@ def _spin_claim(cause: Cause) -> str:
 
 
 def _alike(cause: Cause) -> str:
-    others = cause.group[1:]
-    if not others:
+    if len(cause.group) < 2:
         return ""
-    names = [f"{name} ({MEANING[name.split('.')[-1]]})" if name.split(".")[-1] in MEANING else name for name in others]
+    names = [f"{name} ({description(name).meaning})" for name in cause.group[1:]]
     return f"; the same log would look alike with {_or(names)}"
 
 
@@ -324,5 +227,7 @@ def _nothing(diagnosis: Diagnosis) -> str:
 def below_floor(found: BallFindings) -> str:
     """Effects that the evidence asks for, but that move a flight's end by less than the practical floor."""
     choice, trial = found.choice, found.trial
-    sizes = {trial.effects[j].name: abs(t) * float(trial.shift[j]) for j, t in zip(choice.effects, choice.theta)}
+    sizes = {
+        trial.effects[j].name: abs(t) * float(trial.shift[j]) for j, t in zip(choice.effects, choice.theta, strict=True)
+    }
     return ", ".join(f"{name} ({1e3 * size:.1f} mm)" for name, size in sizes.items() if size < selection.FLOOR)

@@ -10,10 +10,9 @@ import pytest
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt import diagnosis
-from mjx_tt.diagnosis.ball import basis_functions, noise, time_jitter
-from mjx_tt.diagnosis.ball import scores as evidence
-from mjx_tt.diagnosis.ball.diagnose import first_fit
+from mjx_tt.diagnosis.ball import basis_functions, noise, scores
 from mjx_tt.diagnosis.ball.effects import AT_THE_PADDLE, EFFECTS
+from mjx_tt.diagnosis.ball.fit import first_fit
 from mjx_tt.diagnosis.ball.forward_model import grid, heading_axes, leaves, predict
 from mjx_tt.diagnosis.ball.linearization import BallProblem, Projected, Situation
 from mjx_tt.sim import model
@@ -132,8 +131,8 @@ def test_gains_of_all_subsets_are_those_of_least_squares():
     columns, target = rng.normal(size=(500, 6)), rng.normal(size=500)
     columns[:, 3] = columns[:, 1] + 0.1 * rng.normal(size=500)
     gram, right = columns.T @ columns, columns.T @ target
-    scores = evidence.Scores(gram, right, gram[None], right[None], 0.0, ())
-    gains = evidence.all_gains(scores, tuple(range(6)))
+    rated = scores.Scores(gram, right, gram[None], right[None], 0.0, ())
+    gains = scores.all_gains(rated, tuple(range(6)))
     assert len(gains) == 1 + 6 + 15 + 20
     for size in (1, 2, 3):
         for subset in combinations(range(6), size):
@@ -159,7 +158,7 @@ def test_spins_are_estimated_as_a_distribution():
         np.einsum("nij,ni->nj", design, target),
         None,
     )
-    prior = evidence.fit_spin(p, ())
+    prior = scores.fit_spin(p, ())
     assert prior.mean == pytest.approx(mean, abs=0.4)
     assert prior.std == pytest.approx(std, rel=0.08)
 
@@ -172,7 +171,7 @@ def test_time_stamps_shake_only_if_their_noise_grows_with_speed(grows):
     along = velocity[1] * 0.002 if grows else 0.010
     left = rng.normal(0.0, 0.003, (3, 60, 200))
     left[1] += along * rng.normal(size=(60, 200))
-    found = time_jitter.find(left, velocity, g)
+    found = noise.time_jitter(left, velocity, g)
     assert (found is not None) == grows
     if grows:
         assert found.seconds == pytest.approx(0.002, rel=0.1)

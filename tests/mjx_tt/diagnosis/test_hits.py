@@ -13,7 +13,7 @@ from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball.diagnose import diagnose_balls
 from mjx_tt.diagnosis.hits.diagnose import diagnose_hits
 from mjx_tt.diagnosis.hits.paddle_path import joint_path
-from mjx_tt.diagnosis.joint.records import JointRecord
+from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.robot import model
 from mjx_tt.sim.model import SimModel, with_values
 from robot_io.contract import JOINT_NAMES

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import astuple, replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from mjx_tt.diagnosis.joint import JointRecord, JointResponse, diagnose_robot, read_robot_csv
+from mjx_tt.diagnosis.joint import JointRecord, JointResponse, diagnose_joints, read_robot_csv
 
 DT = 2e-4
 NOMINAL = JointResponse(action_delay=0.071, observation_delay=0.029)
@@ -147,7 +147,7 @@ def single(effect):
 
 
 def diagnose(record, **kinds):
-    return diagnose_robot([record], {record.joint: NOMINAL}, **kinds)
+    return diagnose_joints([record], {record.joint: NOMINAL}, **kinds)
 
 
 def test_simulation_matches_fine_steps():
@@ -158,9 +158,11 @@ def test_simulation_matches_fine_steps():
         {"lag": 0.03, "acceleration_limit": 10.0, "backlash": 0.02, "deadband": 0.2, "velocity_limit": 1.0},
     ]
     rng = np.random.default_rng(0)
-    times, commands = zip(*(command(rng, 8.0, KINDS[i], 2.0) for i in range(4)))
+    times, commands = zip(*(command(rng, 8.0, KINDS[i], 2.0) for i in range(4)), strict=True)
     queries = [np.sort(rng.uniform(0.0, 8.0, 500)) for _ in truths]
-    for t, u, q, truth, path in zip(times, commands, queries, truths, euler(times, commands, queries, truths)):
+    for t, u, q, truth, path in zip(
+        times, commands, queries, truths, euler(times, commands, queries, truths), strict=True
+    ):
         response = JointResponse(action_delay=0.06, observation_delay=0.04, **truth)
         # Euler's own error is about DT / 2 times the speed.
         np.testing.assert_allclose(response.simulate(t, u, q), path, atol=5e-4)
@@ -187,7 +189,7 @@ def test_names_a_single_effect_with_its_size(singles, i):
     assert [cause.name for cause in findings.causes] == [f"joint_2.{name}"]
     cause = findings.causes[0]
     assert findings.unexplained is None and cause.confidence > 0.9
-    estimates = {n: v[1] for n, v in cause.parameters.items()}
+    estimates = {n.removeprefix("joint_2."): e.estimate for n, e in cause.parameters.items()}
     if name == "action_delay":
         assert cause.group == ("joint_2.action_delay", "joint_2.observation_delay")
         total = estimates["action_delay"] + estimates.get("observation_delay", NOMINAL.observation_delay)
@@ -195,7 +197,7 @@ def test_names_a_single_effect_with_its_size(singles, i):
         assert "joint_2.observation_delay" in [u.name for u in findings.not_identifiable]
     else:
         assert estimates[name] == pytest.approx(truth[name], rel=0.08)
-    nominal, estimate, low, high, unit = cause.parameters[name]
+    nominal, estimate, low, high, unit = astuple(cause.parameters[f"joint_2.{name}"])
     assert low <= estimate <= high and nominal == getattr(NOMINAL, name) and unit
     gain = findings.held_out[0]
     assert gain.low > 0.0 and gain.after < 0.7 * gain.before
@@ -227,8 +229,8 @@ def test_calls_an_effect_outside_the_catalogue_unexplained():
     for record in records:
         findings = diagnose(record)
         assert findings.causes == ()
-        assert findings.unexplained["joint"] == "joint_2" and "velocity" in findings.unexplained["block"]
-        assert findings.unexplained["size"] > 1.0  # mrad
+        assert findings.unexplained.joint == "joint_2" and "velocity" in findings.unexplained.block
+        assert findings.unexplained.size > 1.0  # mrad
 
 
 def test_calls_disturbances_now_and_then_unexplained():
@@ -236,8 +238,8 @@ def test_calls_disturbances_now_and_then_unexplained():
     since = record.state_time[:, None] - [3.0, 7.0, 12.0]
     pushed = record.state_position + 0.03 * ((since > 0.0) & (since < 0.3)).any(axis=1)
     findings = diagnose(replace(record, state_position=pushed))
-    assert findings.causes == () and "moments" in findings.unexplained["block"]
-    assert findings.unexplained["size"] > 3.0  # mrad
+    assert findings.causes == () and "moments" in findings.unexplained.block
+    assert findings.unexplained.size > 3.0  # mrad
 
 
 def test_calls_a_cause_left_out_of_the_catalogue_unexplained(singles):
@@ -283,11 +285,11 @@ def test_an_offset_needs_the_home_position():
     findings = diagnose(record)
     assert findings.causes == () and "joint_2.joint_offset" in [u.name for u in findings.not_identifiable]
     (cause,) = diagnose(record, home={"joint_2": 0.0}).causes
-    nominal, estimate, low, high, unit = cause.parameters["joint_offset"]
+    nominal, estimate, low, high, unit = astuple(cause.parameters["joint_2.joint_offset"])
     assert cause.name == "joint_2.joint_offset" and low <= 0.004 <= high and (nominal, unit) == (0.0, "rad")
     assert diagnose(slow(), home={"joint_2": 0.0}).causes == ()
     left_out = diagnose(record, home={"joint_2": 0.0}, without=["joint_offset"])
-    assert left_out.causes == () and "home" in left_out.unexplained["block"]
+    assert left_out.causes == () and "home" in left_out.unexplained.block
 
 
 def test_refuses_what_it_does_not_know():
@@ -300,7 +302,7 @@ def test_refuses_what_it_does_not_know():
         (([record], {"joint_2": NOMINAL}, 0, None, (), {"joint_1": 0.0}), "joint_1"),
     ):
         with pytest.raises(ValueError, match=message):
-            diagnose_robot(*arguments)
+            diagnose_joints(*arguments)
     with pytest.raises(ValueError, match="lag must not be negative"):
         JointResponse(lag=-0.1)
     with pytest.raises(ValueError, match="no joint 'joint_9'; joints are gantry_x"):
@@ -308,7 +310,7 @@ def test_refuses_what_it_does_not_know():
 
 
 def rows(time, values):
-    return [f"{t!r},joint_2,{x!r}" for t, x in zip(time.tolist(), values.tolist())]
+    return [f"{t!r},joint_2,{x!r}" for t, x in zip(time.tolist(), values.tolist(), strict=True)]
 
 
 def write(folder, command_rows, state_rows, header="t,joint,velocity"):

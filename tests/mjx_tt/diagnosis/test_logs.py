@@ -131,7 +131,7 @@ def robot(folder, seconds=8.0, commands=1.0, states=1.0, speed=0.1, joint="joint
         ("command", "velocity", commands, speed * np.cos(time)),
         ("state", "position", states, speed * np.sin(time - 0.05)),
     ):
-        rows = "".join(f"{scale * t:.6f},{joint},{v:.9f}\n" for t, v in zip(time, values))
+        rows = "".join(f"{scale * t:.6f},{joint},{v:.9f}\n" for t, v in zip(time, values, strict=True))
         (folder / f"{name}.csv").write_text(f"t,joint,{column}\n{rows}")
     return folder
 

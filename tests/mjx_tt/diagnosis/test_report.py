@@ -21,6 +21,7 @@ from mjx_tt import diagnosis as gap
 from mjx_tt.diagnosis.ball import effects as catalogue
 from mjx_tt.diagnosis.hits.diagnose import HitCause, HitFindings
 from mjx_tt.diagnosis.joint import JointRecord
+from mjx_tt.diagnosis.joint import effects as joint_effects
 from mjx_tt.diagnosis.joint.effects import NAMES
 from mjx_tt.diagnosis.logs import Logs
 from mjx_tt.diagnosis.report import figures
@@ -335,8 +336,14 @@ def test_cost_in_play(windy_page, joints, tmp_path):
 
 
 def test_spin_in_plain_words():
-    spin = {f"ball_spin.mean_{a}": Estimate(0.0, m, m - 2, m + 2, "rad/s") for a, m in zip("xyz", (60.0, 1.0, -3.0))}
-    spin |= {f"ball_spin.std_{a}": Estimate(0.0, s, s - 1, s + 1, "rad/s") for a, s in zip("xyz", (12.0, 5.0, 5.0))}
+    spin = {
+        f"ball_spin.mean_{a}": Estimate(0.0, m, m - 2, m + 2, "rad/s")
+        for a, m in zip("xyz", (60.0, 1.0, -3.0), strict=True)
+    }
+    spin |= {
+        f"ball_spin.std_{a}": Estimate(0.0, s, s - 1, s + 1, "rad/s")
+        for a, s in zip("xyz", (12.0, 5.0, 5.0), strict=True)
+    }
     text = words.claim(
         Cause(
             "magnus",
@@ -387,10 +394,13 @@ def test_claims_in_plain_words(name, estimate, text):
 
 def test_every_name_of_the_catalogue_has_words():
     effects = {e.name for e in catalogue.EFFECTS}
-    names = effects | {t.name for e in catalogue.EFFECTS for t in e.twins} | {"latency_jitter"}
-    assert names | set(NAMES) == set(words.MEANING)
-    assert set(NAMES) == set(words.ROBOT_CLAIMS)
-    assert effects - {"magnus"} <= set(words.CLAIMS)
+    names = effects | {t.name for e in catalogue.EFFECTS for t in e.twins}
+    assert names == set(catalogue.DESCRIPTIONS) and set(NAMES) == set(joint_effects.DESCRIPTIONS)
+    everything = [*catalogue.DESCRIPTIONS.values(), *joint_effects.DESCRIPTIONS.values()]
+    assert all(e.meaning and e.reading and e.unit for e in everything)
+    default = "{meaning}: {instead}"
+    assert {e.name for e in everything if e.claim == default} == names - effects | {"magnus"}
+    assert all(bool(e.more) == bool(e.less) == ("{way}" in e.claim) for e in everything)
 
 
 def test_a_failed_write_leaves_the_old_report(joints, tmp_path, monkeypatch):

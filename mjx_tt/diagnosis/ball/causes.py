@@ -1,0 +1,251 @@
+"""From the findings of the flights to named causes: sizes with intervals, groups, confidence, and what stays open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterable
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import stdtrit
+
+from mjx_tt.diagnosis.ball import cross_validation, experiment_design, scores, selection
+from mjx_tt.diagnosis.ball.cross_validation import Prediction
+from mjx_tt.diagnosis.ball.diagnose import BallFindings, shaking
+from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
+from mjx_tt.diagnosis.ball.linearization import MAGNUS, REFERENCE_MAGNUS
+from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Part, Unexplained
+from mjx_tt.sim.model import Range
+
+BOOTSTRAP = 100
+LEVEL = 0.90  # of intervals
+
+
+def quantile(freedom: int) -> float:
+    """Standard errors of half an interval, by Student's distribution."""
+    return float(stdtrit(max(freedom, 5), 0.5 + LEVEL / 2))
+
+
+def part(
+    found: BallFindings,
+    prediction: Prediction,
+    without: Container[str],
+    hits: bool,
+    seed: int,
+    say: Callable[[str], None],
+) -> Part:
+    """The flights' part of the verdict. hits: the robot's hits are judged, which show the ball's latency."""
+    say("confidence and intervals")
+    named, beside = _causes(found, without, seed)
+    unexplained = None
+    if found.findings:
+        # A name that does not outlive the block beside it was a stand-in for what has none.
+        named, beside = [n for n in named if n.cause.name in found.survivors], {}
+        top = found.findings[0]
+        unexplained = Unexplained(top.block, top.where, top.direction, f"{1e3 * top.size:.1f} mm")
+    hidden, quiet = _unseen(found, without, hits)
+    names = [e.name for e in found.trial.effects]
+    spin = ["magnus"] if found.trial.spin == "none" else []
+    held_out = cross_validation.held_out(prediction, seed)
+    say("the next experiment")
+    pairs = [(group[0], rival) for group in found.choice.groups for rival in group[1:]]
+    dark = [i for i, name in enumerate(names) if not found.seen[i] and name in quiet]
+    return Part(
+        tuple(_standing_in(n, without) for n in named),
+        beside,
+        _undetermined(found) or bool(found.imitated),
+        unexplained,
+        held_out,
+        tuple(hidden),
+        tuple(quiet),
+        experiment_design.experiments(found, pairs, dark),
+        tuple(
+            {"effects": [names[i] for i in subset] + (spin if spun else []), "gain": float(gain - found.choice.gain)}
+            for subset, spun, gain in found.choice.runners_up
+        ),
+        tuple(
+            f"two of the causes together are just what {name} alone would look like, which was left out"
+            for name in found.imitated
+        ),
+    )
+
+
+def _causes(found: BallFindings, without: Container[str], seed: int) -> tuple[list[Expressed], dict[str, float]]:
+    """Named causes, and the values of what was fitted beside them without being named."""
+    choice, nominal = found.choice, found.problem.nominal
+    confidence, wide = _confidence(found, seed), quantile(found.problem.grid.n - 10)
+    matters = selection.named(choice, found.trial)
+    named, beside = [], {}
+    for i, j in enumerate(choice.effects):
+        if matters[i]:
+            named.append(_effect_cause(found, i, confidence[i], wide, without))
+        elif any(matters):  # too small to be named, but the others' sizes were fitted beside it
+            change = found.trial.effects[j].values(nominal, choice.theta[i])
+            beside |= {path: float(value) for path, value in change.items()}
+    if choice.prior is not None:
+        if found.trial.spin == "none":
+            named.append(_spin_cause(found, confidence[-1], wide))
+        else:
+            for axis, mean, std in zip("xyz", choice.prior.mean, choice.prior.std, strict=True):
+                beside |= {f"ball_spin.mean_{axis}": float(mean), f"ball_spin.std_{axis}": float(std)}
+    shaken = None if "latency_jitter" in without else shaking(found)
+    if shaken is not None and shaken.shift > selection.FLOOR / 2:
+        jitter = BY_NAME["latency_jitter"]
+        estimate = Estimate(nominal[jitter.path], shaken.seconds, shaken.low, shaken.high, jitter.unit)
+        named.append(
+            _expressed(Cause(jitter.name, (jitter.name,), 0.95, {jitter.path: estimate}, 1e3 * shaken.shift, ""))
+        )
+    return named, beside
+
+
+def _effect_cause(found: BallFindings, i: int, confidence: float, wide: float, without: Container[str]) -> Expressed:
+    """The chosen effect number i, with what looks like it. wide: half of the interval in standard errors."""
+    choice, effects, nominal = found.choice, found.trial.effects, found.problem.nominal
+    j, theta, error = choice.effects[i], choice.theta[i], choice.error[i]
+    effect, rivals = effects[j], [effects[k] for k in choice.groups[i][1:]]
+    low, high = theta - wide * error, theta + wide * error
+    twins = [t for t in effect.twins if t.name not in without]
+    alike = [name for r in rivals for name in (r.name, *(t.name for t in r.twins)) if name not in without]
+    parameters = estimates(effect, nominal, theta, low, high)
+    cause = Cause(
+        # The nominal model has no Magnus force at all: that is the cause, whether or not the balls spin at first.
+        "magnus" if j == found.problem.coefficient else effect.name,
+        tuple(
+            dict.fromkeys((*(["magnus"] if j == found.problem.coefficient else []), effect.name, *names(twins), *alike))
+        ),
+        confidence,
+        parameters | {t.path: _twin(effect, t, nominal, theta, low, high) for t in twins},
+        float(1e3 * abs(theta) * found.trial.shift[j]),
+        readings(effect, (*twins, *rivals)),
+    )
+    # Of a pair with the same pattern the extended model needs one.
+    return Expressed(cause, {p: e.estimate for p, e in parameters.items()}, ranges(parameters))
+
+
+def names(effects: Iterable[Effect | Twin]) -> tuple[str, ...]:
+    """Names of effects."""
+    return tuple(e.name for e in effects)
+
+
+def readings(effect: Effect, rivals: Iterable[Effect | Twin]) -> str:
+    """Measurements that would tell an effect from its rivals; empty without rivals."""
+    rivals = tuple(rivals)
+    return "; ".join(f"{e.name}: {e.reading}" for e in (effect, *rivals)) if rivals else ""
+
+
+def estimates(effect: Effect, nominal: Values, theta: float, low: float, high: float) -> dict[str, Estimate]:
+    """Estimates of the parameters that express a change of an effect."""
+    unit, (at_low, at_high) = effect.path_unit or effect.unit, (effect.values(nominal, x) for x in (low, high))
+    return {
+        path: Estimate(nominal[path], float(value), *sorted((float(at_low[path]), float(at_high[path]))), unit)
+        for path, value in effect.values(nominal, theta).items()
+    }
+
+
+def ranges(parameters: dict[str, Estimate]) -> tuple[Range, ...]:
+    """Intervals of parameters, from which training may draw them."""
+    return tuple(Range(path, e.low, e.high) for path, e in parameters.items())
+
+
+def _expressed(cause: Cause) -> Expressed:
+    return Expressed(cause, {path: e.estimate for path, e in cause.parameters.items()}, ranges(cause.parameters))
+
+
+def _twin(effect: Effect, twin: Twin, nominal: Values, theta: float, low: float, high: float) -> Estimate:
+    """The same deviation, expressed by the twin alone."""
+    path = next(iter(effect.values(nominal, theta)))
+
+    def of(change: float) -> float:
+        ratio = float(effect.values(nominal, change)[path]) / nominal[path]
+        return float(twin.of(nominal[twin.path], ratio))
+
+    return Estimate(nominal[twin.path], of(theta), *sorted((of(low), of(high))), twin.unit)
+
+
+def _standing_in(named: Expressed, without: Container[str]) -> Expressed:
+    """The cause under the name of its first twin, where its own is left out: what was fitted is the same."""
+    cause = named.cause
+    effect = BY_NAME[cause.name]
+    twin = next((t for t in effect.twins if t.name not in without), None)
+    if twin is None or cause.name not in without:
+        return named
+    others = [name for name in cause.group if name not in (effect.name, twin.name)]
+    text = cause.separating_measurement.removeprefix(f"{effect.name}: {effect.reading}; ") if others else ""
+    parameters = {path: p for path, p in cause.parameters.items() if path != effect.path}
+    estimate = cause.parameters[twin.path]
+    return Expressed(
+        replace(cause, name=twin.name, group=(twin.name, *others), parameters=parameters, separating_measurement=text),
+        {twin.path: estimate.estimate},
+        ranges({twin.path: estimate}),
+    )
+
+
+def _spin_cause(found: BallFindings, confidence: float, wide: float) -> Expressed:
+    """Balls that spin: the coefficient, and the distribution of the spins that goes with it."""
+    choice, problem = found.choice, found.problem
+    rated, prior = found.scores(), choice.prior
+    if prior is None:
+        raise ValueError("the chosen causes hold no spin")
+    error = np.sqrt(np.diagonal(scores.sandwich(rated, [*choice.effects, *rated.always])))
+    parameters, drawn = {}, ()
+    if problem.coefficient is not None:
+        k, half = float(found.situation.theta[problem.coefficient]), float(error[-1]) * wide
+        low, high = (max(k - half, 0.0), k + half) if half < 0.5 * REFERENCE_MAGNUS else (0.3, 1.5)
+        parameters[MAGNUS] = Estimate(problem.nominal[MAGNUS], k, low, high, "1")
+        drawn = ranges(parameters)
+    own = error[len(choice.effects) : len(choice.effects) + 3]
+    for axis, mean, std, e in zip("xyz", prior.mean, prior.std, own, strict=True):
+        half = wide * std / np.sqrt(2.0 * problem.grid.n)
+        parameters[f"ball_spin.mean_{axis}"] = Estimate(
+            0.0, float(mean), float(mean - wide * e), float(mean + wide * e), "rad/s"
+        )
+        parameters[f"ball_spin.std_{axis}"] = Estimate(
+            0.0, float(std), float(max(std - half, 0.0)), float(std + half), "rad/s"
+        )
+    rms = float(np.sqrt(np.sum(prior.std**2 + prior.mean**2)))
+    text = "in flight only the product of coefficient and spin shows: " + BY_NAME["magnus"].reading
+    cause = Cause("magnus", ("magnus",), confidence, parameters, float(1e3 * rms * found.trial.spin_shift), text)
+    return Expressed(cause, {path: e.estimate for path, e in parameters.items()}, drawn)
+
+
+def _confidence(found: BallFindings, seed: int) -> list[float]:
+    """Share of bootstrap draws of the balls in which each cause (or one of its group) is chosen; spin last."""
+    choice, rng = found.choice, np.random.default_rng(seed)
+    n, rated = found.problem.grid.n, found.scores()
+    useful = [i for i in np.flatnonzero(found.seen).tolist() if not (choice.spin and i == found.problem.coefficient)]
+    hits = np.zeros(len(choice.effects))
+    for _ in range(BOOTSTRAP):
+        count = rng.multinomial(n, np.full(n, 1.0 / n)).astype(float)
+        gains = scores.all_gains(
+            replace(rated, gram=np.tensordot(count, rated.ball_gram, 1), right=count @ rated.ball_right), tuple(useful)
+        )
+        top = max(gains, key=lambda s, gains=gains: gains[s] - choice.threshold * len(s))
+        hits += [bool(set(group) & set(top)) for group in choice.groups]
+    return [*(float(h) / BOOTSTRAP for h in hits), float(choice.spin)]
+
+
+def _unseen(found: BallFindings, without: Container[str], hits: bool) -> tuple[list[str], list[str]]:
+    """Effects that no ball log shows, with the reason, and effects that these balls do not excite."""
+    invisible = {n: why for n, why in INVISIBLE.items() if n not in without and not (hits and n == "ball_latency")}
+    hidden = [f"{name}: {why}" for name, why in invisible.items()]
+    if found.problem.coefficient is not None and found.choice.spin:
+        hidden.append("magnus_coefficient and spin: in flight only their product shows")
+    quiet = [
+        e.name
+        for i, e in enumerate(found.trial.effects)
+        if not found.seen[i] and e.name not in invisible and i not in found.trial.left_out
+    ]
+    if found.trial.spin == "none" and not found.choice.spin:
+        quiet = [name for name in quiet if not BY_NAME[name].needs_spin]
+    return hidden, quiet
+
+
+def _undetermined(found: BallFindings) -> bool:
+    """True if another set of the same size explains as much, and differs by more than members of the groups."""
+    choice = found.choice
+    for subset, spun, gain in choice.runners_up:
+        if len(subset) != len(choice.effects) or spun != choice.spin or choice.gain - gain > selection.TIE:
+            continue
+        strangers = [e for e in subset if not any(e in group for group in choice.groups)]
+        if len(strangers) and len(set(choice.effects) - set(subset)) > 1:
+            return True
+    return False
