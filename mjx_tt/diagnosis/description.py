@@ -9,8 +9,9 @@ from dataclasses import dataclass
 class Description:
     """An effect in words, from which verdict, report and reference page are made.
 
-    claim: sentence of a verdict, by default the meaning with the numbers. Its fields: {way} is ``more`` or ``less``, by the
-    sign of the change; {value} the estimate, {size} its change, {nominal} the nominal value, {instead} both values.
+    claim: sentence of a verdict, by default the meaning with the numbers. Its fields: {way} is ``more`` or ``less``,
+    by the sign of the change; {value} the estimate, {size} its change, {nominal} the nominal value, {instead} both
+    values.
     """
 
     name: str

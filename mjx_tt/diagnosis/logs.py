@@ -1,4 +1,4 @@
-"""Logs of a diagnosis: which balls and joints they hold, and whether they can be what they claim to be.
+"""Logs of a diagnosis: the balls and joints they hold, and checks that they can be what they claim to be.
 
 A log in millimetres, with swapped axes or in another frame would be fitted all the same, and answered with nonsense: so
 its gravity, its bounces and its direction of flight are looked at first.
@@ -27,7 +27,7 @@ ROBOT_FILES = ("command.csv", "state.csv")
 
 @dataclass(frozen=True)
 class Logs:
-    """What was read."""
+    """Logs as they were read."""
 
     balls: tuple[Trajectory, ...]
     joints: tuple[JointRecord, ...]
@@ -36,9 +36,10 @@ class Logs:
 
 
 def hashes(paths: Sequence[str | os.PathLike]) -> dict[Path, str]:
-    """The SHA-256 of every log: of the files given, and of the logs in the folders given.
+    """SHA-256 of every log: of the files given, and of the logs in the folders given.
 
-    Raises ValueError for a folder without logs and for a log that is given twice, FileNotFoundError for what is not there.
+    Raises ValueError for a folder without logs and for a log that is given twice, FileNotFoundError for what is not
+    there.
     """
     found: dict[Path, str] = {}
     seen: dict[str, Path] = {}
@@ -53,8 +54,8 @@ def hashes(paths: Sequence[str | os.PathLike]) -> dict[Path, str]:
 def load(paths: Sequence[str | os.PathLike]) -> Logs:
     """Reads logs: ball trajectories (CSV, MCAP, AIMY) and pairs command.csv, state.csv (or a folder that holds them).
 
-    Of several pairs the longest is used. Raises ValueError naming the file and what is wrong with it, FileNotFoundError when
-    there is none.
+    Of several pairs the longest is used. Raises ValueError naming the file and what is wrong with it,
+    FileNotFoundError when there is none.
     """
     files = hashes(paths)
     if not files:
@@ -68,8 +69,8 @@ def load(paths: Sequence[str | os.PathLike]) -> Logs:
             if file.suffix.lower() != ".mcap":
                 raise
             raise ValueError(
-                f"{error} (a log of balls holds messages on /ball; a session of `mjx-tt run` is read by `mjx-tt diagnose`, "
-                "or by experiments.commands.diagnose.read_logs)"
+                f"{error} (a log of balls holds messages on /ball; a session of `mjx-tt run` is read by "
+                "`mjx-tt diagnose`, or by experiments.commands.diagnose.read_logs)"
             ) from None
         if not hasattr(data, "trajectories"):
             raise ValueError(
@@ -130,7 +131,10 @@ def before_racket(t: Trajectory) -> Trajectory:
 
 
 def check(trajectories: Sequence[Trajectory], source: str) -> None:
-    """Refuses balls that cannot be metres and seconds in the table frame. Raises ValueError that says what they look like."""
+    """Refuses balls that cannot be metres and seconds in the table frame.
+
+    Raises ValueError that describes what they look like.
+    """
     if not trajectories:
         raise ValueError(f"{source}: holds no trajectory")
     long = [cut for t in trajectories if len(cut := before_racket(t)) >= 8] or [t for t in trajectories if len(t) >= 8]
@@ -145,8 +149,8 @@ def check(trajectories: Sequence[Trajectory], source: str) -> None:
         )
     if not GRAVITY_RANGE[0] < np.abs(bend[down]) < GRAVITY_RANGE[1]:
         raise ValueError(
-            f"{source}: balls accelerate by ({', '.join(f'{a:.3g}' for a in bend)}) in x, y, z; a fall of 9.8 m/s^2 along "
-            "-z is wanted (wrong unit of length or time, or no free flights?)"
+            f"{source}: balls accelerate by ({', '.join(f'{a:.3g}' for a in bend)}) in x, y, z; a fall of 9.8 m/s^2 "
+            "along -z is wanted (wrong unit of length or time, or no free flights?)"
         )
     if down != 2:
         raise ValueError(f"{source}: balls fall along {'xyz'[down]}, z must point up (swapped axes?)")

@@ -126,8 +126,8 @@ class Part:
 def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict, dict[str, float], tuple[Range, ...]]:
     """Verdict of all parts, and values and ranges of the extended model.
 
-    Of what one part alone can say, the unexplained and the held-out error, the first part's counts. Names that are not to
-    be relied on change the model only if they predict better. notes: warnings that stand before the parts' own.
+    Of what one part alone can say, the unexplained and the held-out error, the first part's counts. Names that are
+    not to be relied on change the model only if they predict better. notes: warnings that stand before the parts' own.
     """
 
     def every(name: str) -> tuple:

@@ -62,7 +62,7 @@ def environment(*packages: str) -> Environment:
     made = Environment(
         loader=ChoiceLoader(loaders), autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
     )
-    made.globals.update(ink=INK, faint=FAINT, link=LINK, wbr=Markup("<wbr>"))
+    made.globals.update(ink=INK, faint=FAINT, link=LINK)
     return made
 
 

@@ -7,10 +7,11 @@ measured flight follows from the flight's own transition matrix, bounce included
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from mjx_tt.diagnosis.ball.forward_model import Grid
 from mjx_tt.diagnosis.ball.linearization import Linear
@@ -18,21 +19,24 @@ from mjx_tt.diagnosis.ball.linearization import Linear
 DIRECTIONS = ("x", "y", "z", "along the flight")
 FORCES = (0, 3, 2)  # directions of forces: along y and along the flight are nearly one
 KNOTS = 4
+Respond = Callable[[np.ndarray, int], np.ndarray]  # (profile (T, n) or kick (n,), direction) -> column (3, T, n)
 
 
 @dataclass(frozen=True)
 class Block:
-    """A family of unnamed effects: columns (m, 3, T, n) in metres for unit coefficients, and what each stands for."""
+    """A family of unnamed effects: columns in metres for unit coefficients, and what each stands for."""
 
     name: str
     where: str
-    columns: np.ndarray
+    columns: Float[np.ndarray, "m 3 T n"]
     labels: tuple[str, ...]
     directions: tuple[str, ...]
 
 
-def hats(value: np.ndarray, mask: np.ndarray, knots: int = KNOTS) -> tuple[np.ndarray, np.ndarray]:
-    """Linear B-splines (knots, ...) of a quantity between its 2nd and 98th percentile, and the knots."""
+def hats(
+    value: Float[np.ndarray, "*shape"], mask: Bool[np.ndarray, "*shape"], knots: int = KNOTS
+) -> tuple[Float[np.ndarray, "knots ..."], Float[np.ndarray, " k"]]:
+    """Linear B-splines of a quantity between its 2nd and 98th percentile, and the knots."""
     low, high = np.percentile(value[mask], [2, 98])
     if high - low < 1e-9:
         return np.zeros((0, *value.shape)), np.zeros(0)
@@ -41,11 +45,12 @@ def hats(value: np.ndarray, mask: np.ndarray, knots: int = KNOTS) -> tuple[np.nd
     return np.clip(1.0 - np.abs(u[None] - np.arange(knots).reshape((-1,) + (1,) * value.ndim)), 0.0, 1.0), places
 
 
-def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called: Sequence[str]) -> list[Block]:
+def build(
+    linear: Linear, g: Grid, sessions: Int[np.ndarray, " n"], age: Float[np.ndarray, " n"], called: Sequence[str]
+) -> list[Block]:
     """All families.
 
-    sessions: (n,) number of each ball's session; age: (n,) 0 to 1, how far into its session; called: the
-    sessions' names.
+    sessions: number of each ball's session; age: 0 to 1, its place in its session; called: the sessions' names.
     """
     position, velocity = linear.base.position[:, :, 0], linear.base.velocity[:, :, 0]  # (3, T, n)
     speed = np.linalg.norm(velocity, axis=0)
@@ -53,7 +58,14 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
     response, kicked = _propagators(linear, g)
     out = []
 
-    def family(name, where, basis, labels, respond: Callable, along=(0, 1, 2)):
+    def family(
+        name: str,
+        where: str,
+        basis: Iterable[np.ndarray],
+        labels: Sequence[str],
+        respond: Respond,
+        along: Sequence[int] = (0, 1, 2),
+    ) -> None:
         columns, names, directions = [], [], []
         for phi, label in zip(basis, labels, strict=True):
             for d in along:
@@ -63,7 +75,14 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
         if columns:
             out.append(Block(name, where, np.stack(columns), tuple(names), tuple(directions)))
 
-    def spline(name, quantity, unit, respond, knots=KNOTS, along=(0, 1, 2)):
+    def spline(
+        name: str,
+        quantity: np.ndarray,
+        unit: str,
+        respond: Respond,
+        knots: int = KNOTS,
+        along: Sequence[int] = (0, 1, 2),
+    ) -> None:
         basis, places = hats(quantity, g.mask, knots)
         family(
             name,
@@ -93,7 +112,7 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
     ):
         spline(f"force over {name}", quantity, unit, response, along=FORCES)
     for name, quantity, unit in (("x", position[0], "m"), ("y", position[1], "m"), ("z", position[2], "m")):
-        spline(f"measured position over {name}", quantity, unit, lambda phi, d: _shift(phi, d), 5)
+        spline(f"measured position over {name}", quantity, unit, _shift, 5)
     for name, coordinate in (("x", 0), ("y", 1), ("z", 2)):
         steps, labels = _steps(position[coordinate], g.mask)
         family(f"jump of the measured position at {name}", f"at a plane across {name}", steps, labels, _shift)
@@ -104,17 +123,14 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
         vz = -linear.base.bounce_velocity[2, 0]
         bounced = np.isfinite(linear.base.bounce_time[0])
 
-        def kick(phi, d):
-            return kicked(phi, d)
-
-        def over(name, value, unit, knots=4):
-            basis, places = hats(np.where(bounced, value, np.nan_to_num(value[bounced].mean())), bounced, knots)
+        def over(name: str, value: np.ndarray, unit: str) -> None:
+            basis, places = hats(np.where(bounced, value, np.nan_to_num(value[bounced].mean())), bounced)
             family(
                 f"bounce over {name}",
                 f"at the bounce, with {name}",
                 basis,
                 [f"{name} near {p:.2f} {unit}" for p in places],
-                kick,
+                kicked,
             )
 
         over("x", bx, "m")
@@ -123,7 +139,7 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
         over("vertical speed", vz, "m/s")
         over("time in the session", age, "of it")
         cells, labels = _cells(bx, by, bounced)
-        family("bounce over the table", "at the bounce, by place", cells, labels, kick, (2,))
+        family("bounce over the table", "at the bounce, by place", cells, labels, kicked, (2,))
     names = np.unique(sessions)
     if len(names) > 1:
         basis = np.stack([(sessions == s).astype(float) for s in names])
@@ -131,7 +147,7 @@ def build(linear: Linear, g: Grid, sessions: np.ndarray, age: np.ndarray, called
         labels = [f"session {called[s]}" for s in names]
         family("force by session", "by session", wide, labels, response, FORCES)
         if late.any():
-            family("bounce by session", "at the bounce, by session", basis, labels, kick)
+            family("bounce by session", "at the bounce, by session", basis, labels, kicked)
     crossing = _crossing(position[1], g)
     if crossing.any():
         family("force at the net", "over the net", [crossing], ["|y| < 0.15 m"], response, FORCES)
@@ -170,7 +186,7 @@ def _crossing(y: np.ndarray, g: Grid) -> np.ndarray:
     return np.where(g.mask & (np.abs(y) < 0.15), 1.0, 0.0)
 
 
-def _propagators(linear: Linear, g: Grid):
+def _propagators(linear: Linear, g: Grid) -> tuple[Respond, Respond]:
     """Functions that turn an acceleration profile (T, n) or a kick (n,) along an axis into a column (3, T, n)."""
     # Components first, balls last: (6, 6, T, n).
     inverse = np.ascontiguousarray(np.linalg.inv(linear.transition).transpose(2, 3, 1, 0))

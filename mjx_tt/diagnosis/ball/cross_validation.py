@@ -9,11 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.ball.fit import fit_starts
-from mjx_tt.diagnosis.ball.linearization import SPIN
+from mjx_tt.diagnosis.ball.forward_model import Grid
+from mjx_tt.diagnosis.ball.linearization import SPIN, BallProblem
 from mjx_tt.diagnosis.verdict import HeldOut
 
 FIRST_PART = 0.3
@@ -27,8 +29,8 @@ METRIC = "rms of the predicted last 70 % of each flight, state from the first 30
 class Prediction:
     """Errors ball by ball [m]."""
 
-    before: np.ndarray  # (n,) root mean square under the nominal model
-    after: np.ndarray  # (n,) under the extended one
+    before: Float[np.ndarray, " n"]  # root mean square under the nominal model
+    after: Float[np.ndarray, " n"]  # under the extended one
 
 
 def predictions(found: BallFindings, seed: int = 0) -> Prediction:
@@ -99,7 +101,7 @@ def _folds(found: BallFindings, seed: int) -> np.ndarray:
     return rng.permutation(np.arange(len(found.sessions)) % FOLDS)
 
 
-def _error(problem, theta, start, g, rest) -> np.ndarray:
+def _error(problem: BallProblem, theta: np.ndarray, start: np.ndarray, g: Grid, rest: np.ndarray) -> np.ndarray:
     flown = problem.fly(theta, start)
     distance = np.linalg.norm(g.measured - flown.measured[:, :, 0], axis=0)
     distance = np.where(rest, distance, np.nan)

@@ -103,7 +103,10 @@ def _diagnose(
     hidden: Bool[np.ndarray, "T n"] | None = None,
     before: BallFindings | None = None,
 ) -> BallFindings:
-    """Chooses the causes. hidden: samples that do not count. before: findings with them, whose spins the search starts at."""
+    """Chooses the causes.
+
+    hidden: samples that do not count. before: findings with these samples, at whose spins the search starts.
+    """
     say = progress or (lambda text: None)
     kept = flights(trajectories)
     if len(kept) < FEWEST_BALLS:

@@ -14,8 +14,8 @@ from mjx_tt.diagnosis.ball.scores import SpinPrior
 from mjx_tt.diagnosis.robust import GAUSSIAN
 
 WINDOWS = (0.1, 0.2, 0.3, 0.4)  # [s] of a flight that the first fit takes in turn
-# Coefficient k and mean spin [rad/s] (topspin, gyro, side) to start from where balls may spin fast. In flight only their
-# product shows, at the bounce the spin alone.
+# Coefficient k and mean spin [rad/s] (topspin, gyro, side) to start from where balls may spin fast. In flight only
+# their product shows, at the bounce the spin alone.
 FAST_SPINS = tuple(
     (k, tuple(sign * w * (a == axis) for a in range(3)))
     for k, w in ((0.6, 100.0), (0.3, 200.0))
@@ -104,8 +104,8 @@ def first_fit(
     """(9, n) starts: a parabola through the first samples, then ever longer parts of the flight.
 
     A flight that bounces has other minima for a start that is far off; growing windows keep the bounce where it is.
-    theta: (K,) or (K, n) changes of the effects, none by default. spin: (3,) or (3, n) [rad/s] of the balls, in their own
-    axes. part: (T, n) samples that count.
+    theta: (K,) or (K, n) changes of the effects, none by default. spin: (3,) or (3, n) [rad/s] of the balls, in
+    their own axes. part: (T, n) samples that count.
     """
     g = problem.grid if part is None else replace(problem.grid, mask=problem.grid.mask & part)
     theta = np.zeros(len(problem.effects)) if theta is None else theta

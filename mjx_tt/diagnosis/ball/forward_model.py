@@ -1,4 +1,4 @@
-"""What the model says a tracker would have measured: many balls under many variants of the model, in float64.
+"""Positions that a tracker would have measured under the model: many balls under many variants, in float64.
 
 The flights are those of ``ballmodel.flight``, bounces inside the step, so the diagnosis fits what the simulation does.
 Steps end at the samples' times; the camera's geometry and the tracker's filter are applied to what was flown. Variants
@@ -14,14 +14,15 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 from ballmodel import flight
 from ballmodel.flight import PaddlePose
 from ballmodel.partial_params import value_or, without_nominal
 from ballmodel.state import BallState
 from ballmodel.trajectory import Trajectory
-from mjx_tt.sim.model import SimModel, paths, with_values
+from mjx_tt.sim.model import SensingParams, SimModel, paths, with_values
 
 LONGEST_STEP = 0.01  # [s]; second order: 0.05 mm over a flight
 PAD = 16  # numbers of steps are rounded up to it, so that similar logs share one compiled program
@@ -32,11 +33,11 @@ WIDTH = 2048  # columns, balls x variants, of one call: always the same, for the
 class Grid:
     """Measured samples of n balls on the steps that lead to them; padded to one length."""
 
-    steps: np.ndarray  # (L, n) [s] of measured time, zero where there are fewer
-    index: np.ndarray  # (T, n) step after which sample t is taken; 0 is the start
-    time: np.ndarray  # (T, n) [s] since the first sample
-    measured: np.ndarray  # (3, T, n) [m]
-    mask: np.ndarray  # (T, n) True for a sample
+    steps: Float[np.ndarray, "L n"]  # [s] of measured time, zero where there are fewer
+    index: Int[np.ndarray, "T n"]  # step after which sample t is taken; 0 is the start
+    time: Float[np.ndarray, "T n"]  # [s] since the first sample
+    measured: Float[np.ndarray, "3 T n"]  # [m]
+    mask: Bool[np.ndarray, "T n"]  # True for a sample
     paddle: PaddlePose | None = None  # the blade at the steps' ends, each quantity (3, L + 1, n)
 
     @property
@@ -68,27 +69,28 @@ def grid(trajectories: Sequence[Trajectory]) -> Grid:
     return Grid(steps, index, time, measured, mask)
 
 
-def picked(g: Grid, index: np.ndarray) -> Grid:
+def picked(g: Grid, index: Int[np.ndarray, " m"]) -> Grid:
     """The grid of the balls with these indices, which may repeat."""
     paddle = g.paddle and jax.tree.map(lambda x: x[..., index], g.paddle)
-    return Grid(*(x[..., index] for x in (g.steps, g.index, g.time, g.measured, g.mask)), paddle)
+    steps, step, time, measured, mask = (x[..., index] for x in (g.steps, g.index, g.time, g.measured, g.mask))
+    return Grid(steps, step, time, measured, mask, paddle)
 
 
 @dataclass(frozen=True)
 class Flown:
     """Predictions for n balls under v variants."""
 
-    measured: np.ndarray  # (3, T, v, n) [m] what the tracker would report
-    position: np.ndarray  # (3, T, v, n) [m] true
-    velocity: np.ndarray  # (3, T, v, n) [m/s] true
-    bounce_time: np.ndarray  # (v, n) [s] of the first bounce since the first sample; inf without one
-    bounce: np.ndarray  # (3, v, n) [m] where
-    bounce_velocity: np.ndarray  # (3, v, n) [m/s] before it
-    hit_time: np.ndarray  # (v, n) [s] of the paddle's contact since the first sample; inf without one
+    measured: Float[np.ndarray, "3 T v n"]  # [m] report of the tracker
+    position: Float[np.ndarray, "3 T v n"]  # [m] true
+    velocity: Float[np.ndarray, "3 T v n"]  # [m/s] true
+    bounce_time: Float[np.ndarray, "v n"]  # [s] of the first bounce since the first sample; inf without one
+    bounce: Float[np.ndarray, "3 v n"]  # [m] place of the bounce
+    bounce_velocity: Float[np.ndarray, "3 v n"]  # [m/s] before it
+    hit_time: Float[np.ndarray, "v n"]  # [s] of the paddle's contact since the first sample; inf without one
 
 
-def heading_axes(velocity: np.ndarray) -> np.ndarray:
-    """(3, 3, n) axes in which a ball's spin is told, by its first velocity (3, n): topspin, against its way, sidespin.
+def heading_axes(velocity: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 3 n"]:
+    """Axes in which a ball's spin is told, by its first velocity: topspin, against its way, sidespin.
 
     For a ball that flies towards -y they are the table's x, y and z.
     """
@@ -98,11 +100,17 @@ def heading_axes(velocity: np.ndarray) -> np.ndarray:
     return np.stack([np.stack([x, -y, zero]), np.stack([y, x, zero]), np.stack([zero, zero, zero + 1.0])])
 
 
-def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray, g: Grid, axes: np.ndarray) -> Flown:
+def predict(
+    model: SimModel,
+    values: Mapping[str, np.ndarray],
+    start: Float[np.ndarray, "9 v n"],
+    g: Grid,
+    axes: Float[np.ndarray, "3 3 n"],
+) -> Flown:
     """Flies every ball under every variant.
 
-    values: leaves of ``model`` to replace, each broadcastable to (v, n). start: (9, v, n) position, velocity, spin at
-    the first sample, the spin in ``axes`` (3, 3, n): component, axis, ball.
+    values: leaves of ``model`` to replace, each broadcastable to (v, n). start: position, velocity, spin at the
+    first sample, the spin in ``axes``: component, axis, ball.
     """
     start = np.concatenate([start[:6], np.einsum("can,avn->cvn", axes, start[6:])])
     v, n = start.shape[1:]
@@ -115,7 +123,7 @@ def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray
             # The last call is filled up with its last column: one shape, one compiled program.
             mine = np.minimum(np.arange(first, first + WIDTH), v * n - 1)
             some = ball[mine]
-            paddle = g.paddle and jax.tree.map(lambda x: np.moveaxis(x[..., some], 1, 0), g.paddle)
+            paddle = g.paddle and jax.tree.map(lambda x, some=some: np.moveaxis(x[..., some], 1, 0), g.paddle)
             flown = _fly(
                 model,
                 {k: x[mine] for k, x in flat.items()},
@@ -131,7 +139,10 @@ def predict(model: SimModel, values: Mapping[str, np.ndarray], start: np.ndarray
 
 
 @jax.jit
-def _fly(model: SimModel, values: dict, start, steps, index, paddle):
+def _fly(
+    model: SimModel, values: dict[str, Array], start: Array, steps: Array, index: Array, paddle: PaddlePose | None
+) -> tuple[Array, ...]:
+    """Fields of Flown for columns (9, c) of starts; values (c,), steps (L, c), index (T, c), paddle (L + 1, 3, c)."""
     nominal_latency = model.latency.ball_observation
     model = with_values(without_nominal(model), values)
     # What was measured flew on: a trial start that grazes the net must not be stopped by it.
@@ -143,7 +154,7 @@ def _fly(model: SimModel, values: dict, start, steps, index, paddle):
     smoothing = jnp.broadcast_to(jnp.asarray(value_or(sensing.smoothing, 0.0), start.dtype), shape)
     tau = jnp.maximum(smoothing, 1e-9)
 
-    def follow(filtered, before, after, dt):
+    def follow(filtered: Array, before: Array, after: Array, dt: Array) -> Array:
         """The filter's output after a piece of straight motion: exact."""
         slope = (after - before) / jnp.maximum(dt, 1e-9)
         out = after - tau * slope + (filtered - before + tau * slope) * jnp.exp(-dt / tau)
@@ -152,11 +163,11 @@ def _fly(model: SimModel, values: dict, start, steps, index, paddle):
     # A ball that is stamped late meets the paddle of an earlier moment.
     late = jnp.asarray(model.latency.ball_observation, start.dtype) - nominal_latency
 
-    def moved(pose):
+    def moved(pose: PaddlePose) -> PaddlePose:
         turned = jnp.cross(pose.angular_velocity, pose.normal, axis=0)
         return replace(pose, position=pose.position - late * pose.velocity, normal=pose.normal - late * turned)
 
-    def advance(carry, inputs):
+    def advance(carry: tuple, inputs: tuple) -> tuple[tuple, tuple[Array, ...]]:
         state, filtered, elapsed, bounced, at, incoming, struck = carry
         dt, *blade = inputs
         dt = dt / rate
@@ -182,14 +193,11 @@ def _fly(model: SimModel, values: dict, start, steps, index, paddle):
     # In steady motion the filter trails by tau v: it was running before the first sample.
     filtered = start[:3] - smoothing * start[3:6]
     carry = (state, filtered, zero, zero + jnp.inf, start[:3] * 0.0, start[:3] * 0.0, zero + jnp.inf)
-    blades = (
-        ()
-        if paddle is None
-        else tuple(jax.tree.map(lambda x: x[part], paddle) for part in (slice(None, -1), slice(1, None)))
-    )
+    ends = () if paddle is None else (slice(None, -1), slice(1, None))
+    blades = tuple(jax.tree.map(lambda x, part=part: x[part], paddle) for part in ends)
     (_, _, _, bounced, at, incoming, struck), (x, v, y) = jax.lax.scan(advance, carry, (steps, *blades))
 
-    def sampled(first, later):
+    def sampled(first: Array, later: Array) -> Array:
         at_steps = jnp.moveaxis(jnp.concatenate([first[None], later]), 0, 1)  # (3, L + 1, ...)
         return jnp.take_along_axis(at_steps, index[None], axis=1)
 
@@ -198,7 +206,7 @@ def _fly(model: SimModel, values: dict, start, steps, index, paddle):
     return _camera(sensing, seen), position, velocity, bounced, at, incoming, struck
 
 
-def _camera(sensing, p):
+def _camera(sensing: SensingParams, p: Array) -> Array:
     """Positions (3, ...) as the calibrated camera reports them: scale R (1 + k |p|^2) p + offset, R = Rz Ry Rx."""
     bend, turns = value_or(sensing.camera_distortion, 0.0), ("x", "y", "z")
     x, y, z = p * (1.0 + bend * jnp.sum(p * p, axis=0)) * value_or(sensing.camera_scale, 1.0)

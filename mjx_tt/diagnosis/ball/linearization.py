@@ -1,4 +1,4 @@
-"""The model linearised at a set of causes: whitened residuals and columns, ball by ball, with the nuisances projected out.
+"""The model linearised at a set of causes: whitened residuals and columns of each ball, nuisances projected out.
 
 Everything is in absolute coordinates: the linear model is  target = E theta + M omega + N nu + noise, with theta the
 effects' changes from the nominal model, omega the spin of each ball, nu its start. So subsets that leave an effect out
@@ -77,7 +77,8 @@ class BallProblem:
         moves = np.array([e.step if e.step is not None else 1e-3 * e.scale for e in self.effects])
         # A step of its own is for an effect without a derivative at zero; elsewhere it would only blur.
         moves = np.where(at.theta != 0.0, np.minimum(moves, np.maximum(0.1 * np.abs(at.theta), 1e-6)), moves)
-        # Variants: as it is; start moved (6); effects changed (k); and with a ball that air can bend: as it is, spun (3).
+        # Variants: as it is; start moved (6); effects changed (k); and with a ball that air can bend: as it is, spun
+        # (3).
         theta = np.repeat(at.theta[:, None], 11 + k, axis=1)
         theta[np.arange(k), 7 + np.arange(k)] += moves
         start = np.repeat(at.start[:, None], 11 + k, axis=1)

@@ -1,8 +1,8 @@
 """Measurement noise as the residuals show it: its scale, its memory, its outliers, and shaking time stamps.
 
 An honest noise model decides whether "something is wrong" means anything: trackers filter, so their noise remembers
-itself; it grows with distance; some samples are plain wrong. Scale and memory are estimated from the residuals, outliers
-are weighted down by Huber's rule, and every test downstream takes its spread from ball to ball.
+itself; it grows with distance; some samples are plain wrong. Scale and memory are estimated from the residuals,
+outliers are weighted down by Huber's rule, and every test downstream takes its spread from ball to ball.
 """
 
 from __future__ import annotations
@@ -118,7 +118,8 @@ def time_jitter(left: np.ndarray, velocity: np.ndarray, g: Grid) -> Jitter | Non
     """Jitter in residuals [m] of the best model; None where nothing grows with the speed.
 
     A moment's error dt shifts a sample by v dt; noise that is merely larger along the flight does not grow with speed.
-    Neighbouring samples are subtracted from each other: what is smooth along the flight is a misfit, not a shaking clock.
+    Neighbouring samples are subtracted from each other: what is smooth along the flight is a misfit, not a shaking
+    clock.
     """
     near = g.mask[1:] & g.mask[:-1] & (np.diff(g.time, axis=0) < 1.5 * np.median(np.diff(g.time, axis=0)[g.mask[1:]]))
     step, mean = np.diff(left, axis=1) / np.sqrt(2.0), 0.5 * (velocity[:, 1:] + velocity[:, :-1])

@@ -341,7 +341,7 @@ def left_over(linear: Linear, at: Situation, p: Projected, choice: Choice, g: Gr
 def _move(
     problem: BallProblem, start: np.ndarray, theta: np.ndarray, choice: Choice, noise_now: Noise, g: Grid
 ) -> tuple[Situation, np.ndarray | None]:
-    """The situation at the chosen causes, starts fitted again; and where balls spin, when each bounces (n,) by its own."""
+    """Situation at the chosen causes, starts fitted again; and where balls spin, the time of each one's own bounce."""
     if not choice.spin:
         return Situation(theta, fit_starts(problem, theta, start, g, noise_now, rounds=3)), None
     prior = (choice.prior.mean, np.maximum(choice.prior.std, 1.0))

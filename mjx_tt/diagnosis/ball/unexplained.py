@@ -103,7 +103,8 @@ def _holding(choice: Choice, trial: Trial, change: np.ndarray, error: np.ndarray
 def _spin_holding(choice: Choice, trial: Trial, mean: np.ndarray, size: float) -> set[str]:
     """Spin, where the balls keep at least half of theirs, and their way of it, when a block may take over from it.
 
-    A spin that bends the flights less than the block, of size [m], does not stand beside it: it may be part of the block.
+    A spin that bends the flights less than the block, of size [m], does not stand beside it: it may be part of the
+    block.
     """
     if choice.prior is None:
         return set()
@@ -131,7 +132,7 @@ def _joint_test(own: np.ndarray, gram: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _visible(gram: np.ndarray, beta: np.ndarray, p: Projected, g: Grid) -> float:
-    """Size [m], rms over a flight, of a pattern beyond what its ball's start explains: the 95th percentile of the balls."""
+    """Rms over a flight [m] of a pattern beyond what its ball's start explains: the 95th percentile of the balls."""
     energy = np.einsum("i,nij,j->n", beta, gram, beta) / (3.0 * g.mask.sum(axis=0))
     memory = float(p.noise.memory.mean())
     # Slow patterns lose this factor when noise that remembers itself is whitened.

@@ -1,6 +1,7 @@
 """Diagnosis of the robot's hits: the measured return against the one that the model plays from the same ball.
 
-A hit scatters: where on the rubber, an encoder's tick, a millisecond. So hits are judged in a second step, with the ball's own
+A hit scatters: where on the rubber, an encoder's tick, a millisecond. So hits are judged in a second step, with the
+ball's own
 causes settled: each gives one difference of place and one of velocity behind the paddle, and the spread from hit to hit
 is the noise.
 """

@@ -9,6 +9,8 @@ from functools import cache
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
 from ballmodel.flight import PaddlePose
 from ballmodel.trajectory import Trajectory
@@ -27,15 +29,15 @@ FAR = 1e3  # [m] where the blade is parked for a ball that nobody watched the jo
 class JointPath:
     """Positions of all joints over time."""
 
-    time: tuple[np.ndarray, ...]  # eight of (m,) [s]
-    position: tuple[np.ndarray, ...]  # eight of (m,)
+    time: tuple[Float[np.ndarray, " m"], ...]  # [s], of each of the eight joints
+    position: tuple[Float[np.ndarray, " m"], ...]
 
     def covers(self, start: float, end: float) -> bool:
         """True if every joint was measured over this time."""
         return all(t[0] <= start and t[-1] >= end for t in self.time)
 
-    def at(self, time: np.ndarray) -> np.ndarray:
-        """(8, ...) positions."""
+    def at(self, time: Float[np.ndarray, ...]) -> Float[np.ndarray, "8 ..."]:
+        """Positions of all joints."""
         return np.stack([np.interp(time, t, q) for t, q in zip(self.time, self.position, strict=True)])
 
 
@@ -57,13 +59,15 @@ def watched(trajectory: Trajectory, path: JointPath | None) -> bool:
     return path is not None and path.covers(trajectory.time[0] - HALF_WINDOW, trajectory.time[-1] + HALF_WINDOW)
 
 
-def poses(trajectories: Sequence[Trajectory], steps: np.ndarray, path: JointPath | None) -> PaddlePose | None:
+def poses(
+    trajectories: Sequence[Trajectory], steps: Float[np.ndarray, "L n"], path: JointPath | None
+) -> PaddlePose | None:
     """The blade at the ends of all steps, each quantity (3, L + 1, n); None where no ball's joints were watched.
 
-    steps: (L, n) [s] of measured time from each trajectory's first sample on.
+    steps: [s] of measured time from each trajectory's first sample on.
     """
     seen = np.array([watched(t, path) for t in trajectories])
-    if not seen.any():
+    if path is None or not seen.any():
         return None
     begin = np.array([t.time[0] for t in trajectories])
     time = begin + np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
@@ -81,5 +85,5 @@ def _kinematics() -> PaddleKinematics:
 
 
 @jax.jit
-def _pose(q, qd) -> PaddlePose:
+def _pose(q: Array, qd: Array) -> PaddlePose:
     return _kinematics().pose(jnp.asarray(q), jnp.asarray(qd))

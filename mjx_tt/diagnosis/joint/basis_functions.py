@@ -106,7 +106,7 @@ def _waves(log: JointLog, fit: Fit, position: np.ndarray) -> Iterator[Block]:
         best = frequencies[int(np.argmax(power))]
         columns = np.column_stack([np.cos(best * x), np.sin(best * x)])
         place = (f"wave number {best:.3g} {of}", "both")
-        yield Block(name, columns, lambda c, place=place: place, frequencies.size)
+        yield Block(name, columns, _always(*place), frequencies.size)
 
 
 def _hats(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -119,8 +119,12 @@ def _hats(x: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(0.0, 1.0 - np.abs(np.clip(x, low, high)[:, None] - peaks) / width), peaks
 
 
+def _always(place: str, direction: str) -> Where:
+    return lambda coefficients: (place, direction)
+
+
 def _peak(peaks: np.ndarray, what: str, of: str) -> Where:
-    """Says at which of the peaks the coefficients are largest."""
+    """Place of the peak at which the coefficients are largest."""
 
     def where(coefficients: np.ndarray) -> tuple[str, str]:
         shape = coefficients - coefficients.mean() if coefficients.size > 1 else coefficients

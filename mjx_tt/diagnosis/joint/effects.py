@@ -18,7 +18,8 @@ SMALLEST_DELAY = 2e-3  # [s] below which neither a delay nor a lag is named
 
 @dataclass(frozen=True, kw_only=True)
 class Effect(Description):
-    """One entry of the catalogue: a parameter of JointResponse; in its unit "u" stands for that of the joint's position.
+    """One entry of the catalogue: a parameter of JointResponse; in its unit "u" stands for that of the joint's
+    position.
 
     Effects with a threshold have no gradient while they are inactive: every effect starts from a grid. The reading is a
     log that would show the effect, with the fields {joint}, {velocity} (its rated one) and {unit}.

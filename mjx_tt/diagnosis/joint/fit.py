@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_tt.diagnosis.joint.effects import BY_NAME
 from mjx_tt.diagnosis.joint.log import JointLog
@@ -21,7 +22,7 @@ class Fit:
     """Fitted effects; ``values`` holds the parameter of each, the sum of both delays under action_delay."""
 
     values: dict[str, float]
-    residual: np.ndarray  # (n,) measured - predicted, without each window's offset
+    residual: Float[np.ndarray, " n"]  # measured - predicted, without each window's offset
 
     @property
     def names(self) -> frozenset[str]:
@@ -38,15 +39,15 @@ class Fitter:
         self.log = log
         self.found: dict[frozenset[str], Fit] = {}
 
-    def residual(self, values: Mapping[str, float], sigma: float) -> np.ndarray:
-        """Measured - predicted (n,), without each window's robust mean."""
+    def residual(self, values: Mapping[str, float], sigma: float) -> Float[np.ndarray, " n"]:
+        """Measured - predicted, without each window's robust mean."""
         r = self.log.centred(self.log.measured - self.log.simulate(values))
         for _ in range(2):
             r = self.log.centred(r, weights(r, sigma))
         return r
 
-    def jacobian(self, values: Mapping[str, float]) -> np.ndarray:
-        """Derivatives (n, p) of the prediction by the fitted parameters."""
+    def jacobian(self, values: Mapping[str, float]) -> Float[np.ndarray, "n p"]:
+        """Derivatives of the prediction by the fitted parameters."""
         here = self.log.simulate(values)
         columns = []
         for name, value in values.items():
@@ -57,15 +58,20 @@ class Fitter:
             columns.append((self.log.simulate({**values, name: value + step}) - here) / step)
         return np.array(columns).T.reshape(self.log.time.size, len(columns))
 
-    def fit(self, start: Mapping[str, float], sigma: float, bounds: Mapping | None = None, mask=None) -> Fit:
-        """Levenberg-Marquardt from ``start``; mask (n,) of the samples that count, all without it."""
+    def fit(
+        self,
+        start: Mapping[str, float],
+        sigma: float,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        mask: Float[np.ndarray, " n"] | float = 1.0,
+    ) -> Fit:
+        """Levenberg-Marquardt from ``start``; mask: 1 for the samples that count."""
         values, names = dict(start), list(start)
         if not names:
             return Fit({}, self.residual({}, sigma))
         if "deadband" in values:
             values = self._place(values, sigma)
         limits = np.array([(bounds or {}).get(n, BY_NAME[n].bounds(self.log)) for n in names])
-        mask = 1.0 if mask is None else mask
         r = self.residual(values, sigma)
         least, damping = np.sum(mask * loss(r, sigma)), 1e-3
         for _ in range(12):
@@ -91,7 +97,7 @@ class Fitter:
         return Fit(values, r)
 
     def _place(self, values: dict[str, float], sigma: float) -> dict[str, float]:
-        """The best deadband near the given one: the loss is a staircase in it, so that slopes lead nowhere."""
+        """Best deadband near the given one: the loss is a staircase in it, so that slopes lead nowhere."""
         least = float(np.sum(loss(self.residual(values, sigma), sigma)))
         for width in (0.12, 0.04, 0.013, 0.004, 0.0013):
             for factor in (1.0 - 2.0 * width, 1.0 - width, 1.0 + width, 1.0 + 2.0 * width):

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
@@ -41,10 +42,16 @@ class JointResponse:
             if getattr(self, name) == 0.0:
                 raise ValueError(f"JointResponse.{name} must be positive, got 0: the joint could not move")
 
-    def simulate(self, command_time, command_velocity, query_time, start_position: float = 0.0) -> np.ndarray:
-        """Measured positions (m,) at ``query_time`` (m,) of a joint that rests until the first command.
+    def simulate(
+        self,
+        command_time: Float[np.ndarray, " n"],
+        command_velocity: Float[np.ndarray, " n"],
+        query_time: Float[np.ndarray, " m"],
+        start_position: float = 0.0,
+    ) -> Float[np.ndarray, " m"]:
+        """Measured positions at ``query_time`` of a joint that rests until the first command.
 
-        command_time: (n,) [s], increasing; each command holds until the next, the last one for ever.
+        command_time: [s], increasing; each command holds until the next, the last one for ever.
         start_position: true position [rad], [m] at rest, in the middle of the play.
         Exact: between two commands the response is a ramp and an exponential in closed form. Linear in n and m.
         """
@@ -110,7 +117,16 @@ class JointResponse:
             return moved
         return moved + left * tau * np.expm1(-rest / tau)
 
-    def _play(self, t, target, velocity, knots, hold, query, position) -> np.ndarray:
+    def _play(
+        self,
+        t: np.ndarray,
+        target: np.ndarray,
+        velocity: np.ndarray,
+        knots: np.ndarray,
+        hold: np.ndarray,
+        query: np.ndarray,
+        position: np.ndarray,
+    ) -> np.ndarray:
         """Positions after the play: between two turning points it is closed form, so only those are walked."""
         v, w, q = velocity[:-1], target[:-1], knots[:-1]
         turns = np.flatnonzero((v * w < 0.0) & (self.lag > 0.0 or math.isfinite(self.acceleration_limit)))

@@ -33,8 +33,8 @@ class JointRecord:
     """Commands and states of one joint, on one clock.
 
     Raises ValueError, naming the joint, for a joint that is not in JOINT_NAMES, arrays that do not match, numbers that
-    are not finite, time that does not increase, fewer than SHORTEST seconds of states after the first command, times that
-    are not the same seconds, and numbers too large to be SI units.
+    are not finite, time that does not increase, fewer than SHORTEST seconds of states after the first command, times
+    that are not the same seconds, and numbers too large to be SI units.
     """
 
     joint: str
@@ -74,7 +74,8 @@ class JointRecord:
         apart = float(np.median(np.diff(self.state_time)))
         if apart > SPARSEST:
             raise ValueError(
-                f"{self.joint}: states are {apart:g} s apart, at most {SPARSEST:g} s are wanted (are these milliseconds?)"
+                f"{self.joint}: states are {apart:g} s apart, at most {SPARSEST:g} s are wanted "
+                "(are these milliseconds?)"
             )
         within = np.mean((self.command_time >= self.state_time[0]) & (self.command_time <= self.state_time[-1]))
         if within < WITHIN and self.command_time[-1] > self.state_time[-1]:

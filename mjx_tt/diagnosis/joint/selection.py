@@ -1,5 +1,6 @@
-"""Selection of the causes: the smallest set of effects that no larger one beats by more than the noise, what would do as
-well in place of each, and what neither explains.
+"""Selection of the causes: the smallest set of effects that no larger one beats by more than the noise.
+
+Beside it, what would do as well in place of each, and what neither explains.
 """
 
 from __future__ import annotations

@@ -167,6 +167,11 @@ def _odd(u: Unexplained) -> str:
     return f"{block(u.block)}, largest at {u.where}, {along}, {u.size}"
 
 
+def kind(name: str) -> str:
+    """Kind of a finding in words, for a table."""
+    return "balls that fly unlike the others" if name == SUBSET else block(name)
+
+
 def block(name: str) -> str:
     """An anonymous block in words."""
     joint, colon, rest = name.rpartition(": ")

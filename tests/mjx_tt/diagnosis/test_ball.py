@@ -178,7 +178,7 @@ def test_time_stamps_shake_only_if_their_noise_grows_with_speed(grows):
 
 
 def test_the_extended_model_is_one_that_training_loads(tmp_path):
-    """A slippery table comes back within its interval, in a file that the simulator reads, and predicts unseen balls."""
+    """A slippery table comes back within its interval, in a file that the simulator reads, and predicts new balls."""
     start = starts(120, seed=7)
     start[6:] = 0.0
     measured = flown(World(friction=0.19), start) + np.random.default_rng(8).normal(0.0, 0.003, (3, 56, 120))
@@ -197,7 +197,7 @@ def test_the_extended_model_is_one_that_training_loads(tmp_path):
 
 @pytest.mark.parametrize(("spin", "k"), [((200.0, 0.0, 0.0), 0.3), ((-120.0, 0.0, 40.0), 0.6)])
 def test_names_a_spin_far_beyond_a_straight_line(spin, k):
-    """Balls of a launcher that spin fast, by the tests' own physics: out of reach of derivatives about resting balls."""
+    """Balls of a launcher that spin fast, by the tests' own physics: out of reach of derivatives about balls at rest."""
     rng = np.random.default_rng(3)
     n = 30
     start = starts(n)

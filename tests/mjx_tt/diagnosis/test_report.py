@@ -24,7 +24,7 @@ from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.diagnosis.joint import effects as joint_effects
 from mjx_tt.diagnosis.joint.effects import NAMES
 from mjx_tt.diagnosis.logs import Logs
-from mjx_tt.diagnosis.report import figures
+from mjx_tt.diagnosis.report import figures, residuals
 from mjx_tt.diagnosis.report import page as report
 from mjx_tt.diagnosis.report import text as words
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Unexplained
@@ -193,26 +193,26 @@ def test_sentence_names_the_cause_with_its_direction_and_size(windy, windy_page)
 def test_residual_picture_shows_the_wind_before_and_nothing_after(windy):
     """A ball that side wind blows runs ahead of its fitted parabola at both ends."""
     found = windy.balls
-    before, after = figures.residuals(found)
-    time, origin = figures.flight_time(found)
+    before, after = residuals.residuals(found)
+    time, origin = residuals.flight_time(found)
     assert origin == "bounce"
-    x = figures.curve(found.problem.grid.time, before[0], found.problem.grid.mask)
+    x = residuals.curve(found.problem.grid.time, before[0], found.problem.grid.mask)
     assert x.quantiles[2, 0] < -1.0 and x.quantiles[2, -1] < -1.0 and x.quantiles[2].max() > 0.5
-    assert np.abs(figures.curve(time, after[0], found.problem.grid.mask).quantiles[2]).max() < 0.8
+    assert np.abs(residuals.curve(time, after[0], found.problem.grid.mask).quantiles[2]).max() < 0.8
     assert np.all(np.diff(x.quantiles, axis=0) >= 0.0)
 
 
 def test_curve_is_the_plain_quantile_of_each_bin():
     rng = np.random.default_rng(0)
     quantity, residual = rng.uniform(0.0, 1.0, 4000), rng.normal(size=4000)
-    c = figures.curve(quantity, residual + 10.0 * quantity, np.ones(4000, bool), 5)
+    c = residuals.curve(quantity, residual + 10.0 * quantity, np.ones(4000, bool), 5)
     low, high = np.percentile(quantity, (1, 99))
     inside = (quantity >= low) & (quantity < low + (high - low) / 5)
     expected = np.percentile((residual + 10.0 * quantity)[inside], (5, 25, 50, 75, 95))
     np.testing.assert_allclose(c.quantiles[:, 0], expected, rtol=1e-12)
     np.testing.assert_allclose(c.place[0], low + 0.1 * (high - low), rtol=1e-12)
-    assert figures.curve(quantity[:10], residual[:10], np.ones(10, bool)).place.size == 0
-    assert figures.curve(np.ones(100), residual[:100], np.ones(100, bool)).place.size == 0
+    assert residuals.curve(quantity[:10], residual[:10], np.ones(10, bool)).place.size == 0
+    assert residuals.curve(np.ones(100), residual[:100], np.ones(100, bool)).place.size == 0
 
 
 def test_smallest_visible_effect_falls_with_more_balls(windy):
