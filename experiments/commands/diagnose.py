@@ -19,14 +19,15 @@ from experiments.runs import load_policy as policy
 from experiments.runs.run_dir import Run
 from experiments.training import loop
 from mjx_tt import diagnosis
-from mjx_tt.diagnosis.report import page as report
+from mjx_tt.diagnosis import report
+from mjx_tt.diagnosis.report import Play, Rate
 from mjx_tt.sim import model
 from mjx_tt.sim.model import ModelFile
 
 
 @dataclass(frozen=True)
 class Request:
-    """What was asked for on the command line."""
+    """Arguments of the command line."""
 
     logs: Sequence[str]
     out: Path
@@ -39,7 +40,7 @@ class Request:
     retrain: int = 0
 
     def check(self) -> None:
-        """Refuses at once what would fail after the work. Raises ConfigError."""
+        """Refuses at once a request that would fail after the work. Raises ConfigError."""
         if self.seed < 0:
             raise ConfigError(f"--seed {self.seed}: a whole number from 0 on is wanted")
         if self.retrain and self.policy is None:
@@ -56,7 +57,10 @@ class Request:
 
 
 def read_logs(paths: Sequence[str]) -> diagnosis.Logs:
-    """Logs of balls and joints, sessions at the robot among them. Raises ValueError or FileNotFoundError naming the file."""
+    """Logs of balls and joints, sessions at the robot among them.
+
+    Raises ValueError or FileNotFoundError naming the file.
+    """
     files = diagnosis.hashes(paths)
     sessions = [f for f in files if session_logs.is_session(f)]
     others = [f for f in files if f not in sessions]
@@ -112,40 +116,45 @@ def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
     )
 
 
-def play(extended: Path, request: Request, episodes: int, console: Console) -> dict[str, dict | int | None]:
-    """What the defect costs a policy: return rates with 95 % intervals under the nominal and the extended model.
+def play(extended: Path, request: Request, episodes: int, console: Console) -> Play | None:
+    """Cost of the defect to a policy: return rates with 95 % intervals under the nominal and the extended model.
+
+    None without a policy.
 
     extended: the model file that was written, under which the policy is trained on for ``request.retrain`` updates; the
     run of that training is kept beside the model file.
     """
-    folder, retrain = request.policy, request.retrain
+    folder = request.policy
+    if folder is None:
+        return None
     trained = policy.load(folder)
-    nominal = {"model": request.model} if request.model else {}
 
-    def rate(name: str, who: policy.Policy, changes: dict) -> dict[str, float]:
-        experiment = build.experiment(trained.config.model_copy(update=changes | {"initial_policy": None}), folder)
-        report = evaluate.evaluate(experiment, who, episodes, trained.config.evaluation.seed, None).report
+    def rate(name: str, who: policy.Policy, model_path: str | None) -> Rate:
+        changes = {"initial_policy": None} | ({"model": model_path} if model_path else {})
+        experiment = build.experiment(trained.config.model_copy(update=changes), folder)
+        found = evaluate.evaluate(experiment, who, episodes, trained.config.evaluation.seed, None).report
         console.print(
-            f"  {name}: {report['return_rate']:.1%} of {report['episodes']} balls returned "
-            f"({report['low']:.1%} to {report['high']:.1%})",
+            f"  {name}: {found['return_rate']:.1%} of {found['episodes']} balls returned "
+            f"({found['low']:.1%} to {found['high']:.1%})",
             highlight=False,
         )
-        return {"rate": report["return_rate"], "low": report["low"], "high": report["high"]}
+        return {"rate": found["return_rate"], "low": found["low"], "high": found["high"]}
 
-    rates = {
-        "nominal": rate("nominal model", trained, nominal),
-        "extended": rate("extended model", trained, {"model": str(extended)}),
+    rates: Play = {
+        "nominal": rate("nominal model", trained, request.model),
+        "extended": rate("extended model", trained, str(extended)),
         "retrained": None,
+        "balls": episodes,
     }
-    if retrain:
-        training = trained.config.training.model_copy(update={"updates": retrain, "later_rewards": None})
+    if request.retrain:
+        training = trained.config.training.model_copy(update={"updates": request.retrain, "later_rewards": None})
         config = trained.config.model_copy(
             update={"model": str(extended), "initial_policy": folder, "training": training, "name": "retrained"}
         )
         run = Run(extended.parent / "retrained")
         loop.train(build.experiment(config, folder), run, console)
-        rates["retrained"] = rate("retrained", policy.load(run.folder), {"model": str(extended)})
-    return {"balls": episodes, **rates}
+        rates["retrained"] = rate("retrained", policy.load(run.folder), str(extended))
+    return rates
 
 
 def save(found: diagnosis.Diagnosis, folder: Path) -> Path:
@@ -156,15 +165,15 @@ def save(found: diagnosis.Diagnosis, folder: Path) -> Path:
     return folder / "extended.yaml"
 
 
-def draw(found: diagnosis.Diagnosis, folder: Path, title: str, console: Console, cost: dict | None = None) -> None:
-    """Writes report.html and its pictures, and says where everything is."""
+def draw(found: diagnosis.Diagnosis, folder: Path, title: str, console: Console, cost: Play | None = None) -> None:
+    """Writes report.html and its pictures, and prints the paths."""
     report.write(folder, found, title, cost)
     for name in ("report.html", "verdict.json", "extended.yaml"):
         console.print(f"  {folder / name}", highlight=False)
 
 
 def show(found: diagnosis.Diagnosis, console: Console) -> None:
-    """The answer in a few lines."""
+    """Prints the verdict in a few lines."""
     v = found.verdict
     console.print(f"verdict: {v.verdict}", style="bold")
     for warning in v.warnings:
