@@ -9,9 +9,8 @@ from dataclasses import dataclass
 class Description:
     """An effect in words, from which verdict, report and reference page are made.
 
-    claim: sentence of a verdict, by default the meaning with the numbers. Its fields: {way} is ``more`` or ``less``,
-    by the sign of the change; {value} the estimate, {size} its change, {nominal} the nominal value, {instead} both
-    values.
+    claim: sentence of a verdict, by default the meaning with the numbers. Its fields: {way:more|less}, one of two words
+    by the sign of the change; {value} the estimate, {size} its change, {nominal} the nominal value, {instead} both.
     """
 
     name: str
@@ -19,5 +18,13 @@ class Description:
     unit: str
     reading: str  # measurement that would settle it
     claim: str = "{meaning}: {instead}"
-    more: str = ""
-    less: str = ""
+
+
+@dataclass(frozen=True)
+class Way:
+    """Sign of a change, written in a claim as one of two words."""
+
+    up: bool
+
+    def __format__(self, words: str) -> str:
+        return words.split("|")[not self.up]

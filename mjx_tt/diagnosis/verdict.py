@@ -1,4 +1,4 @@
-"""What a diagnosis says: plain data, and its JSON (docs/reference/verdict.schema.json)."""
+"""Verdict of a diagnosis: plain data, its JSON (docs/reference/verdict.schema.json), and the parts it is made of."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import noise, scores, selection
-from mjx_tt.diagnosis.ball.effects import AT_THE_PADDLE, EFFECTS
+from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.fit import fast_spin, first_fit, heading
 from mjx_tt.diagnosis.ball.forward_model import grid
 from mjx_tt.diagnosis.ball.linearization import BallProblem, Linear, Projected, Situation
@@ -117,7 +117,7 @@ def _diagnose(
     gone = set(without)
     if "magnus" in gone and model.ball.flight.magnus_coefficient == 0.0:
         gone |= {"magnus_coefficient", "spin_decay"}  # without the force the nominal model has no use for either
-    fitted = tuple(e for e in EFFECTS if e.fit and e.group != AT_THE_PADDLE and not (e.needs_spin and e.name in gone))
+    fitted = tuple(e for e in EFFECTS if e.fit and not e.at_paddle and not (e.needs_spin and e.name in gone))
     left_out = tuple(i for i, e in enumerate(fitted) if e.gone(gone))
     mode = "never" if spin == "none" and "magnus" in gone else spin
     names, sessions, age = _sessions(kept)

@@ -14,7 +14,6 @@ import numpy as np
 
 from mjx_tt.diagnosis.description import Description
 
-AT_THE_PADDLE = "paddle"  # group of the effects that only a hit shows, with the joints' log beside the ball's
 Numbers = float | np.ndarray
 Values = Mapping[str, float]  # of SimModel's leaves by dotted path
 Express = Callable[[Values, Numbers], dict[str, Numbers]]
@@ -33,7 +32,6 @@ class Twin(Description):
 class Effect(Description):
     """One way in which the model may be wrong."""
 
-    group: str
     path: str  # parameter of SimModel, to which the change is added unless ``express`` is given
     scale: float  # change that would surprise nobody, in ``unit``
     express: Express | None = None  # (nominal values, change) -> values of the parameters that carry it
@@ -43,6 +41,7 @@ class Effect(Description):
         None  # of a finite difference: a fraction of the scale, unless the effect starts with a threshold
     )
     low: float = -np.inf  # smallest change that makes sense
+    at_paddle: bool = False  # only a hit shows it, with the joints' log beside the ball's
     needs_spin: bool = False  # shows only on balls that spin
     fit: bool = True  # False: not a shift of the path, found by other means
     invisible: str = ""  # reason for which no log of the ball's positions shows it
@@ -70,10 +69,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="drag_coefficient",
         meaning="drag of the ball",
-        claim="The air brakes the ball {way} than the model says, coefficient {instead}",
-        more="more",
-        less="less",
-        group="ball",
+        claim="The air brakes the ball {way:more|less} than the model says, coefficient {instead}",
         path=FLIGHT + "drag_coefficient",
         scale=0.05,
         unit="1",
@@ -108,7 +104,6 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(  # worded by report/text: its parameters are a distribution
         name="magnus",
         meaning="spin of the ball",
-        group="ball",
         path="ball_spin",
         scale=30.0,
         unit="rad/s",
@@ -118,10 +113,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="magnus_coefficient",
         meaning="curve of a spinning ball",
-        claim="Spinning balls curve {way} than the model says, coefficient {instead}",
-        more="more",
-        less="less",
-        group="ball",
+        claim="Spinning balls curve {way:more|less} than the model says, coefficient {instead}",
         path=FLIGHT + "magnus_coefficient",
         scale=0.2,
         unit="1",
@@ -131,10 +123,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="spin_decay",
         meaning="loss of spin in flight",
-        claim="The ball loses its spin {way} in flight, {instead}",
-        more="faster",
-        less="more slowly",
-        group="ball",
+        claim="The ball loses its spin {way:faster|more slowly} in flight, {instead}",
         path=FLIGHT + "spin_decay",
         scale=0.3,
         unit="1/s",
@@ -144,10 +133,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="wind_x",
         meaning="air that moves across the table",
-        claim="The air moves sideways, towards {way}, at {size}",
-        more="+x",
-        less="-x",
-        group="ball",
+        claim="The air moves sideways, towards {way:+x|-x}, at {size}",
         path=FLIGHT + "wind_x",
         scale=0.3,
         unit="m/s",
@@ -156,10 +142,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="wind_y",
         meaning="air that moves along the table",
-        claim="The air moves along the table, towards the {way}, at {size}",
-        more="human (+y)",
-        less="robot (-y)",
-        group="ball",
+        claim="The air moves along the table, towards the {way:human (+y)|robot (-y)}, at {size}",
         path=FLIGHT + "wind_y",
         scale=0.3,
         unit="m/s",
@@ -168,10 +151,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="wind_z",
         meaning="air that rises or sinks",
-        claim="The air {way} at {size}",
-        more="rises",
-        less="sinks",
-        group="ball",
+        claim="The air {way:rises|sinks} at {size}",
         path=FLIGHT + "wind_z",
         scale=0.3,
         unit="m/s",
@@ -180,10 +160,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="gravity_tilt_x",
         meaning="a measuring frame that leans across the table",
-        claim="Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned across the table",
-        more="+x",
-        less="-x",
-        group="ball",
+        claim="Gravity also pulls towards {way:+x|-x}, with {size}, as if the measuring frame leaned across the table",
         path=FLIGHT + "gravity_x",
         scale=0.01,
         unit="rad",
@@ -194,10 +171,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="gravity_tilt_y",
         meaning="a measuring frame that leans along the table",
-        claim="Gravity also pulls towards {way}, with {size}, as if the measuring frame leaned along the table",
-        more="+y",
-        less="-y",
-        group="ball",
+        claim="Gravity also pulls towards {way:+y|-y}, with {size}, as if the measuring frame leaned along the table",
         path=FLIGHT + "gravity_y",
         scale=0.01,
         unit="rad",
@@ -208,10 +182,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="gravity_scale",
         meaning="strength of gravity",
-        claim="Balls fall {way} than the model says, acceleration {instead}",
-        more="more slowly",
-        less="faster",
-        group="ball",
+        claim="Balls fall {way:more slowly|faster} than the model says, acceleration {instead}",
         path=FLIGHT + "gravity_z",
         scale=0.02,
         unit="1",
@@ -240,10 +211,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="table_restitution",
         meaning="speed that the table gives back",
-        claim="The table returns {way} speed than the model says, restitution {instead}",
-        more="more",
-        less="less",
-        group="bounce",
+        claim="The table returns {way:more|less} speed than the model says, restitution {instead}",
         path=TABLE + "restitution",
         scale=0.03,
         unit="1",
@@ -252,10 +220,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="table_restitution_speed",
         meaning="restitution that changes with speed",
-        claim="The table's restitution {way} with the ball's speed, {instead}",
-        more="rises",
-        less="falls",
-        group="bounce",
+        claim="The table's restitution {way:rises|falls} with the ball's speed, {instead}",
         path=TABLE + "restitution_slope",
         scale=0.01,
         unit="s/m",
@@ -264,10 +229,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="table_friction",
         meaning="friction of the table",
-        claim="The table is {way} than the model says, friction {instead}",
-        more="rougher",
-        less="smoother",
-        group="bounce",
+        claim="The table is {way:rougher|smoother} than the model says, friction {instead}",
         path=TABLE + "friction",
         scale=0.06,
         unit="1",
@@ -276,10 +238,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="table_height",
         meaning="height of the table",
-        claim="The table's surface lies {size} {way} than the model says",
-        more="higher",
-        less="lower",
-        group="bounce",
+        claim="The table's surface lies {size} {way:higher|lower} than the model says",
         path=TABLE + "height",
         scale=0.005,
         unit="m",
@@ -288,10 +247,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="table_tilt_x",
         meaning="a table that leans across",
-        claim="The table's surface rises towards {way} by {size}",
-        more="+x",
-        less="-x",
-        group="bounce",
+        claim="The table's surface rises towards {way:+x|-x} by {size}",
         path=TABLE + "tilt_x",
         scale=0.01,
         unit="rad",
@@ -300,10 +256,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="table_tilt_y",
         meaning="a table that leans along its length",
-        claim="The table's surface rises towards {way} by {size}",
-        more="+y",
-        less="-y",
-        group="bounce",
+        claim="The table's surface rises towards {way:+y|-y} by {size}",
         path=TABLE + "tilt_y",
         scale=0.01,
         unit="rad",
@@ -312,10 +265,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="camera_scale",
         meaning="scale of the camera's calibration",
-        claim="The camera measures lengths too {way}, scale {instead}",
-        more="long",
-        less="short",
-        group="sensing",
+        claim="The camera measures lengths too {way:long|short}, scale {instead}",
         path=SENSING + "camera_scale",
         scale=0.02,
         unit="1",
@@ -325,7 +275,6 @@ EFFECTS: tuple[Effect, ...] = (
         name="camera_rotation_x",
         meaning="camera frame turned about x",
         claim="The camera's frame is turned about x by {value}",
-        group="sensing",
         path=SENSING + "camera_rotation_x",
         scale=0.01,
         unit="rad",
@@ -335,7 +284,6 @@ EFFECTS: tuple[Effect, ...] = (
         name="camera_rotation_y",
         meaning="camera frame turned about y",
         claim="The camera's frame is turned about y by {value}",
-        group="sensing",
         path=SENSING + "camera_rotation_y",
         scale=0.01,
         unit="rad",
@@ -345,7 +293,6 @@ EFFECTS: tuple[Effect, ...] = (
         name="camera_rotation_z",
         meaning="camera frame turned about the vertical",
         claim="The camera's frame is turned about the vertical by {value}",
-        group="sensing",
         path=SENSING + "camera_rotation_z",
         scale=0.01,
         unit="rad",
@@ -357,7 +304,6 @@ EFFECTS: tuple[Effect, ...] = (
         name="camera_distortion",
         meaning="distortion of the camera",
         claim="The camera distorts the picture, {instead}",
-        group="sensing",
         path=SENSING + "camera_distortion",
         scale=0.005,
         unit="1/m^2",
@@ -366,10 +312,8 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="paddle_restitution",
         meaning="speed that the paddle gives back",
-        claim="The paddle gives back {way} of the ball's speed than the model says, {instead}",
-        more="more",
-        less="less",
-        group=AT_THE_PADDLE,
+        claim="The paddle gives back {way:more|less} of the ball's speed than the model says, {instead}",
+        at_paddle=True,
         path=PADDLE + "restitution",
         scale=0.05,
         unit="1",
@@ -378,10 +322,8 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="paddle_friction",
         meaning="grip of the paddle",
-        claim="The rubber grips {way} than the model says, tangential gain {instead}",
-        more="more",
-        less="less",
-        group=AT_THE_PADDLE,
+        claim="The rubber grips {way:more|less} than the model says, tangential gain {instead}",
+        at_paddle=True,
         path=PADDLE + "tangential_gain",
         scale=0.1,
         unit="1",
@@ -390,10 +332,8 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="paddle_tilt",
         meaning="tilt of the paddle",
-        claim="The blade looks {way} by {value}",
-        more="downwards",
-        less="upwards",
-        group=AT_THE_PADDLE,
+        claim="The blade looks {way:downwards|upwards} by {value}",
+        at_paddle=True,
         path=PADDLE + "tilt",
         scale=0.02,
         unit="rad",
@@ -402,10 +342,8 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="paddle_offset",
         meaning="place of the paddle",
-        claim="The blade lies {way} where the model has it, by {size}",
-        more="ahead of",
-        less="behind",
-        group=AT_THE_PADDLE,
+        claim="The blade lies {way:ahead of|behind} where the model has it, by {size}",
+        at_paddle=True,
         path=PADDLE + "offset",
         scale=0.005,
         unit="m",
@@ -414,10 +352,8 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="ball_latency",
         meaning="delay of the ball's measurement",
-        claim="The ball is measured {way} against the joints than the model says, {instead}",
-        more="later",
-        less="sooner",
-        group=AT_THE_PADDLE,
+        claim="The ball is measured {way:later|sooner} against the joints than the model says, {instead}",
+        at_paddle=True,
         path="latency.ball_observation",
         scale=0.01,
         unit="s",
@@ -428,7 +364,6 @@ EFFECTS: tuple[Effect, ...] = (
         name="tracker_smoothing",
         meaning="a tracker that smooths",
         claim="The tracker smooths the ball's positions, time constant {instead}",
-        group="sensing",
         path=SENSING + "smoothing",
         scale=0.008,
         unit="s",
@@ -440,7 +375,6 @@ EFFECTS: tuple[Effect, ...] = (
         name="latency_jitter",
         meaning="time stamps that scatter",
         claim="The time stamps of the ball's positions scatter by {value}",
-        group="sensing",
         path=SENSING + "jitter",
         scale=0.005,
         unit="s",

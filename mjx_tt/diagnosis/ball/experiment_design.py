@@ -1,4 +1,4 @@
-"""What to measure next: the throws that would tell apart what these flights cannot, by expected evidence.
+"""Design of the next experiment: the throws that would tell apart what these flights cannot, by expected evidence.
 
 A kind of throw is worth the squared error, in units of the noise, by which the rival's best imitation of the chosen
 cause would miss on twenty such balls. Instrument readings come from the catalogue.

@@ -25,7 +25,7 @@ REFERENCE_MAGNUS = 0.6  # k used where the nominal model has none: in flight onl
 
 @dataclass(frozen=True)
 class Situation:
-    """Where the model is linearised."""
+    """Point at which the model is linearised."""
 
     theta: np.ndarray  # (K,) changes of the effects
     start: np.ndarray  # (9, n)

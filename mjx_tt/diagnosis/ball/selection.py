@@ -60,7 +60,7 @@ def named(choice: Choice, trial: Trial) -> tuple[bool, ...]:
 
 @dataclass(frozen=True)
 class Trial:
-    """What may be chosen."""
+    """Effects that may be chosen."""
 
     effects: Sequence[Effect]
     shift: np.ndarray  # (K,) [m] median shift of the last sample per unit of the effect

@@ -19,7 +19,7 @@ from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import scores, selection
 from mjx_tt.diagnosis.ball.causes import estimates, names, quantile, ranges, readings
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, flights
-from mjx_tt.diagnosis.ball.effects import AT_THE_PADDLE, EFFECTS, INVISIBLE, Effect
+from mjx_tt.diagnosis.ball.effects import EFFECTS, INVISIBLE, Effect
 from mjx_tt.diagnosis.ball.fit import first_fit, heading
 from mjx_tt.diagnosis.ball.forward_model import grid, predict
 from mjx_tt.diagnosis.ball.linearization import BallProblem
@@ -75,7 +75,7 @@ def diagnose_hits(
             pairs.append((t.part(0, stop), n0))
     if len(pairs) < FEWEST_HITS:
         return None
-    effects = tuple(e for e in EFFECTS if e.group == AT_THE_PADDLE and e.name not in without)
+    effects = tuple(e for e in EFFECTS if e.at_paddle and e.name not in without)
     whole = [t for t, _ in pairs]
     g = grid(whole)
     g = replace(g, paddle=poses(whole, g.steps, joints))
@@ -124,7 +124,7 @@ def diagnose_hits(
 def part(found: BallFindings, hits: HitFindings | None, without: Container[str]) -> Part:
     """The hits' part of the verdict; without hits, the effects at the paddle are not excited."""
     if hits is None:
-        paddle = (e.name for e in EFFECTS if e.group == AT_THE_PADDLE and e.name not in INVISIBLE)
+        paddle = (e.name for e in EFFECTS if e.at_paddle and e.name not in INVISIBLE)
         return Part(not_excited=tuple(name for name in paddle if name not in without))
     nominal, freedom, named = found.problem.nominal, hits.hits - 6, []
     for c in hits.causes:
@@ -142,7 +142,7 @@ def _compare(
 ) -> tuple[Float[np.ndarray, "6 n"], Float[np.ndarray, "K 6 n"], Float[np.ndarray, " n"]]:
     """Differences (6, n) behind the paddle, their derivatives (K, 6, n) by the paddle's effects, and hit times (n,)."""
     g = problem.grid
-    paddle = [i for i, e in enumerate(problem.effects) if e.group == AT_THE_PADDLE]
+    paddle = [i for i, e in enumerate(problem.effects) if e.at_paddle]
     variants = 1 + len(paddle)
     thetas = np.repeat(theta[:, None], variants, axis=1)
     moves = np.array([0.02 * problem.effects[i].scale for i in paddle])

@@ -57,9 +57,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="action_delay",  # the sum of both delays, which alone shows in a log
         meaning="delay from command to motion",
-        claim="acts {way} on a command than the model says, delay {instead}",
-        more="later",
-        less="sooner",
+        claim="acts {way:later|sooner} on a command than the model says, delay {instead}",
         unit="s",
         reading="reverse {joint} quickly and often",
         starts=lambda log, b: tuple(max(b + d, 0.0) for d in (-0.05, -0.02, 0.01, 0.03, 0.07, 0.12)),
@@ -83,9 +81,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect(
         name="velocity_gain",
         meaning="wrong speed of the drive",
-        claim="moves too {way}, {value} of what it is told instead of {nominal}",
-        more="fast",
-        less="slowly",
+        claim="moves too {way:fast|slowly}, {value} of what it is told instead of {nominal}",
         unit="1",
         reading="sweep {joint} over long ways at two speeds",
         starts=lambda log, b: (0.85 * b, 1.1 * b),
@@ -153,18 +149,14 @@ BY_NAME = {effect.name: effect for effect in EFFECTS}
 OBSERVATION_DELAY = Description(  # named in one group with action_delay
     name="observation_delay",
     meaning="delay of the joint's measurement",
-    claim="is read {way} than the model says, delay {instead}",
-    more="later",
-    less="sooner",
+    claim="is read {way:later|sooner} than the model says, delay {instead}",
     unit="s",
     reading="stamp a command's arrival at the drive and a state's departure with one clock",
 )
 JOINT_OFFSET = Description(  # found by encoder_home
     name="joint_offset",
     meaning="zero of the encoder",
-    claim="reads {size} too {way}",
-    more="high",
-    less="low",
+    claim="reads {size} too {way:high|low}",
     unit="u",
     reading="hold {joint} still at its home position before it moves",
 )

@@ -57,12 +57,12 @@ class Judge:
         return self._in_all(loss(worse, self.sigma) - loss(better, self.sigma))
 
     def convincing(self, worse: np.ndarray, better: np.ndarray) -> bool:
-        """Whether the better residual (n,) speaks for its model."""
+        """True if the better residual (n,) speaks for its model."""
         total, rest = self.gain(worse, better)
         return total > EVIDENCE and rest > ONE_WINDOW and rms(worse - better) > UNIQUE
 
     def visible(self, change: np.ndarray) -> bool:
-        """Whether a change (n,) of the predicted positions would show in this noise."""
+        """True if a change (n,) of the predicted positions would show in this noise."""
         total, rest = self._in_all(change * change / self.sigma**2)
         return rms(change) > FLOOR and total > EVIDENCE and rest > ONE_WINDOW
 

@@ -79,7 +79,7 @@ def hits(found: HitFindings) -> Figure:
 
 
 def runners(names: Sequence[str], behind: Sequence[float], chosen: str) -> Figure:
-    """What other sets of causes would cost: gain less what their size has to pay, against the chosen set's."""
+    """Cost of other sets of causes: gain less what their size has to pay, against the chosen set's."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 1.1 + 0.36 * (len(names) + 1)), layout="constrained")
         ax = figure.subplots()

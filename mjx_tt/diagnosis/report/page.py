@@ -162,7 +162,7 @@ def _effect(c: Cause) -> str:
 
 
 def _hits(d: Diagnosis, page: Page) -> Context:
-    """Where the returns lie off, before and after, and what the hits could not show."""
+    """Offsets of the returns, before and after, and effects that the hits could not show."""
     found = d.hits
     if found is None:
         return None

@@ -10,7 +10,7 @@ import numpy as np
 from mjx_tt.diagnosis.ball import effects as ball_effects
 from mjx_tt.diagnosis.ball import scores, selection
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
-from mjx_tt.diagnosis.description import Description
+from mjx_tt.diagnosis.description import Description, Way
 from mjx_tt.diagnosis.diagnose import Diagnosis
 from mjx_tt.diagnosis.joint import effects as joint_effects
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Unexplained
@@ -53,7 +53,7 @@ def claim(cause: Cause) -> str:
     words, e = description(cause.name), next(iter(cause.parameters.values()))
     sentence = words.claim.format(
         meaning=words.meaning,
-        way=words.more if e.estimate > e.nominal else words.less,
+        way=Way(e.estimate > e.nominal),
         value=_value(e),
         size=_size(e),
         instead=_instead(e),

@@ -11,7 +11,7 @@ import pytest
 from ballmodel.trajectory import Trajectory
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.ball import basis_functions, noise, scores
-from mjx_tt.diagnosis.ball.effects import AT_THE_PADDLE, EFFECTS
+from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.fit import first_fit
 from mjx_tt.diagnosis.ball.forward_model import grid, heading_axes, leaves, predict
 from mjx_tt.diagnosis.ball.linearization import BallProblem, Projected, Situation
@@ -22,7 +22,7 @@ from tests.support.paths import DATA
 
 pytestmark = pytest.mark.optimised
 
-FITTED = tuple(e for e in EFFECTS if e.fit and e.group != AT_THE_PADDLE)
+FITTED = tuple(e for e in EFFECTS if e.fit and not e.at_paddle)
 CHANGED = {
     "ball.flight.drag_coefficient": ("drag_coefficient", 0.55),
     "ball.flight.magnus_coefficient": ("magnus_coefficient", 0.6),
@@ -197,7 +197,7 @@ def test_the_extended_model_is_one_that_training_loads(tmp_path):
 
 @pytest.mark.parametrize(("spin", "k"), [((200.0, 0.0, 0.0), 0.3), ((-120.0, 0.0, 40.0), 0.6)])
 def test_names_a_spin_far_beyond_a_straight_line(spin, k):
-    """Balls of a launcher that spin fast, by the tests' own physics: out of reach of derivatives about balls at rest."""
+    """Balls of a launcher that spin fast, by the tests' own physics: beyond derivatives about balls at rest."""
     rng = np.random.default_rng(3)
     n = 30
     start = starts(n)
