@@ -15,7 +15,7 @@ from experiments.config import build
 from experiments.deploy import session_logs
 from experiments.errors import ConfigError, checked
 from experiments.evaluation import evaluate
-from experiments.runs import load_policy as policy
+from experiments.runs.load_policy import TrainedPolicy, load
 from experiments.runs.run_dir import Run
 from experiments.training import loop
 from mjx_tt import diagnosis
@@ -47,7 +47,7 @@ class Request:
             raise ConfigError("--retrain needs --policy: the run or artefact that is to be trained on")
         if self.retrain < 0:
             raise ConfigError(f"--retrain {self.retrain}: a number of updates is wanted")
-        if self.policy is not None and policy.load(self.policy).config is None:
+        if self.policy is not None and load(self.policy).config is None:
             raise ConfigError(f"{self.policy}: does not say how it was trained; give the run that it came from")
         existing = next(p for p in (self.out, *self.out.absolute().parents) if p.exists())
         if not existing.is_dir():
@@ -127,12 +127,15 @@ def play(extended: Path, request: Request, episodes: int, console: Console) -> P
     folder = request.policy
     if folder is None:
         return None
-    trained = policy.load(folder)
+    trained = load(folder)
+    config = trained.config
+    if config is None:
+        raise ConfigError(f"{folder}: does not record how it was trained; give the run that it came from")
 
-    def rate(name: str, who: policy.Policy, model_path: str | None) -> Rate:
+    def rate(name: str, who: TrainedPolicy, model_path: str | None) -> Rate:
         changes = {"initial_policy": None} | ({"model": model_path} if model_path else {})
-        experiment = build.experiment(trained.config.model_copy(update=changes), folder)
-        found = evaluate.evaluate(experiment, who, episodes, trained.config.evaluation.seed, None).report
+        experiment = build.experiment(config.model_copy(update=changes), folder)
+        found = evaluate.evaluate(experiment, who, episodes, config.evaluation.seed, None).report
         console.print(
             f"  {name}: {found['return_rate']:.1%} of {found['episodes']} balls returned "
             f"({found['low']:.1%} to {found['high']:.1%})",
@@ -147,13 +150,13 @@ def play(extended: Path, request: Request, episodes: int, console: Console) -> P
         "balls": episodes,
     }
     if request.retrain:
-        training = trained.config.training.model_copy(update={"updates": request.retrain, "later_rewards": None})
-        config = trained.config.model_copy(
+        training = config.training.model_copy(update={"updates": request.retrain, "later_rewards": None})
+        later = config.model_copy(
             update={"model": str(extended), "initial_policy": folder, "training": training, "name": "retrained"}
         )
         run = Run(extended.parent / "retrained")
-        loop.train(build.experiment(config, folder), run, console)
-        rates["retrained"] = rate("retrained", policy.load(run.folder), str(extended))
+        loop.train(build.experiment(later, folder), run, console)
+        rates["retrained"] = rate("retrained", load(run.folder), str(extended))
     return rates
 
 
@@ -202,5 +205,6 @@ def show(found: diagnosis.Diagnosis, console: Console) -> None:
         console.print(
             f"  held out: {h.before:.2f} -> {h.after:.2f} mm, gain {h.low:.2f} to {h.high:.2f}", highlight=False
         )
-    for e in v.next_experiment[:2]:
-        console.print(f"  next: {e.what}{' tells ' + ', '.join(e.separates) if e.separates else ''}", highlight=False)
+    for step in v.next_experiment[:2]:
+        tells = f" tells {', '.join(step.separates)}" if step.separates else ""
+        console.print(f"  next: {step.what}{tells}", highlight=False)

@@ -74,7 +74,8 @@ def _causes(found: BallFindings, without: Container[str], seed: int) -> tuple[li
     choice, nominal = found.choice, found.problem.nominal
     confidence, wide = _confidence(found, seed), quantile(found.problem.grid.n - 10)
     matters = selection.named(choice, found.trial)
-    named, beside = [], {}
+    named: list[Expressed] = []
+    beside: dict[str, float] = {}
     for i, j in enumerate(choice.effects):
         if matters[i]:
             named.append(_effect_cause(found, i, confidence[i], wide, without))
@@ -134,11 +135,11 @@ def readings(effect: Effect, rivals: Iterable[Effect | Twin]) -> str:
 
 def estimates(effect: Effect, nominal: Values, theta: float, low: float, high: float) -> dict[str, Estimate]:
     """Estimates of the parameters that express a change of an effect."""
-    unit, (at_low, at_high) = effect.path_unit or effect.unit, (effect.values(nominal, x) for x in (low, high))
-    return {
-        path: Estimate(nominal[path], float(value), *sorted((float(at_low[path]), float(at_high[path]))), unit)
-        for path, value in effect.values(nominal, theta).items()
-    }
+    out = {}
+    for path, value in effect.values(nominal, theta).items():
+        first, last = sorted(float(effect.values(nominal, end)[path]) for end in (low, high))
+        out[path] = Estimate(nominal[path], float(value), first, last, effect.path_unit or effect.unit)
+    return out
 
 
 def ranges(parameters: dict[str, Estimate]) -> tuple[Range, ...]:
@@ -158,7 +159,8 @@ def _twin(effect: Effect, twin: Twin, nominal: Values, theta: float, low: float,
         ratio = float(effect.values(nominal, change)[path]) / nominal[path]
         return float(twin.of(nominal[twin.path], ratio))
 
-    return Estimate(nominal[twin.path], of(theta), *sorted((of(low), of(high))), twin.unit)
+    first, last = sorted((of(low), of(high)))
+    return Estimate(nominal[twin.path], of(theta), first, last, twin.unit)
 
 
 def _standing_in(named: Expressed, without: Container[str]) -> Expressed:
@@ -186,7 +188,8 @@ def _spin_cause(found: BallFindings, confidence: float, wide: float) -> Expresse
     if prior is None:
         raise ValueError("the chosen causes hold no spin")
     error = np.sqrt(np.diagonal(scores.sandwich(rated, [*choice.effects, *rated.always])))
-    parameters, drawn = {}, ()
+    parameters: dict[str, Estimate] = {}
+    drawn: tuple[Range, ...] = ()
     if problem.coefficient is not None:
         k, half = float(found.situation.theta[problem.coefficient]), float(error[-1]) * wide
         low, high = (max(k - half, 0.0), k + half) if half < 0.5 * REFERENCE_MAGNUS else (0.3, 1.5)
@@ -218,7 +221,7 @@ def _confidence(found: BallFindings, seed: int) -> list[float]:
         gains = scores.all_gains(
             replace(rated, gram=np.tensordot(count, rated.ball_gram, 1), right=count @ rated.ball_right), tuple(useful)
         )
-        top = max(gains, key=lambda s, gains=gains: gains[s] - choice.threshold * len(s))
+        top = max(gains.items(), key=lambda x: x[1] - choice.threshold * len(x[0]))[0]
         hits += [bool(set(group) & set(top)) for group in choice.groups]
     return [*(float(h) / BOOTSTRAP for h in hits), float(choice.spin)]
 

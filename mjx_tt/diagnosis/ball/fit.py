@@ -135,16 +135,14 @@ def fast_spin(problem: BallProblem, start: np.ndarray) -> tuple[Situation, SpinP
     count = len(FAST_SPINS)
     many = picked(g, np.tile(few, count))
     tried = BallProblem(many, problem.model, problem.effects, heading(many))
-    theta = np.zeros((len(problem.effects), many.n))
-    theta[problem.coefficient] = np.repeat([k for k, _ in FAST_SPINS], len(few))
-    spin = np.repeat(np.array([w for _, w in FAST_SPINS], float).T, len(few), axis=1)
-    fitted = first_fit(tried, theta, spin)
-    left = many.measured - tried.fly(theta, fitted).measured[:, :, 0]
+    tried_theta = np.zeros((len(problem.effects), many.n))
+    tried_theta[problem.coefficient] = np.repeat([k for k, _ in FAST_SPINS], len(few))
+    fitted = first_fit(tried, tried_theta, np.repeat(np.array([w for _, w in FAST_SPINS], float).T, len(few), axis=1))
+    left = many.measured - tried.fly(tried_theta, fitted).measured[:, :, 0]
     cost = np.sqrt(np.where(many.mask, (left**2).sum(axis=0), 0.0).sum(axis=0) / many.mask.sum(axis=0))
     best = int(np.argmin(np.median(cost.reshape(count, -1), axis=1)))
-    k, mean = FAST_SPINS[best]
-    theta, mean = np.zeros(len(problem.effects)), np.array(mean, float)
-    theta[problem.coefficient] = k
+    theta, mean = np.zeros(len(problem.effects)), np.array(FAST_SPINS[best][1], float)
+    theta[problem.coefficient] = FAST_SPINS[best][0]
     start = first_fit(problem, theta, mean)
     for _ in range(3):
         frame = noise.flight_frame(problem.fly(theta, start).velocity[:, :, 0])

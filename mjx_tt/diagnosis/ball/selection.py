@@ -254,20 +254,22 @@ def search(
 
     prior: of the spins at the situation to start from, None where nothing spins. linear: the derivatives there.
     """
-    g, own_noise, chosen_before, frame, bounces = problem.grid, None, None, None, None
+    g, bounces, chosen_before = problem.grid, None, None
+    say("round 1: derivatives")
+    linear = problem.linearise(at) if linear is None else linear
+    frame = noise.flight_frame(linear.base.velocity[:, :, 0])
+    own_noise = noise.estimate(linear.residual, frame, g)
+    if np.any(at.start[SPIN]):  # effects that show on spinning balls alone have a size there
+        shift, spin_shift = shifts(linear, g)
+        trial = replace(trial, shift=shift, spin_shift=spin_shift)
     for round_ in range(ROUNDS):
-        say(f"round {round_ + 1}: derivatives")
-        linear = problem.linearise(at) if linear is None else linear
+        if round_:
+            say(f"round {round_ + 1}: derivatives")
+            linear = problem.linearise(at)
         spins = bool(np.any(at.start[SPIN]))
-        if frame is None:
-            frame = noise.flight_frame(linear.base.velocity[:, :, 0])
-            if spins:  # effects that show on spinning balls alone have a size there
-                shift, spin_shift = shifts(linear, g)
-                trial = replace(trial, shift=shift, spin_shift=spin_shift)
         say(f"round {round_ + 1}: choosing")
-        for _ in range(2 if own_noise is not None else 3):
-            noise_now = own_noise or noise.estimate(linear.residual, frame, g)
-            p = project(linear, at, noise_now, _weights(linear, noise_now, g, bounces), g, problem.coefficient)
+        for _ in range(2 if round_ else 3):
+            p = project(linear, at, own_noise, _weights(linear, own_noise, g, bounces), g, problem.coefficient)
             choice = choose(p, replace(trial, spinning=spins), prior)
             left, moved = left_over(linear, at, p, choice, g)
             own_noise = noise.estimate(left, frame, g, 9 if choice.spin else 6)
@@ -278,7 +280,7 @@ def search(
             theta[problem.coefficient] = np.clip(choice.magnus, *MAGNUS_KEPT)
         settled = chosen_before == (choice.effects, choice.spin) and _close(theta, at.theta, choice)
         chosen_before, prior = (choice.effects, choice.spin), choice.prior
-        (at, bounces), linear = _move(problem, moved, theta, choice, own_noise, g), None
+        at, bounces = _move(problem, moved, theta, choice, own_noise, g)
         if settled:
             break
     linear = problem.linearise(at)
@@ -311,25 +313,32 @@ def shifts(linear: Linear, g: Grid) -> tuple[np.ndarray, float]:
     )
 
 
-def _theta(p: Projected, choice: Choice, size: int) -> np.ndarray:
-    """(K,) changes of all effects under a choice."""
-    theta = np.zeros(size)
+def _theta(p: Projected, choice: Choice) -> Float[np.ndarray, " K"]:
+    """Changes of all effects under a choice."""
+    theta = np.zeros(p.gram.shape[1])
     theta[list(choice.effects)] = choice.theta
     if choice.magnus is not None:
         theta[p.coefficient] = choice.magnus
     return theta
 
 
-def left_over(linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Residual (3, T, n) [m] of the linear model with the chosen effects and the best starts, and these, (9, n)."""
-    theta = _theta(p, choice, len(at.theta))
-    left = linear.residual - np.tensordot(theta - at.theta, linear.effects, 1)
+def fitted_spins(p: Projected, choice: Choice) -> Float[np.ndarray, "3 n"]:
+    """Spin of each ball [rad/s]: its best linear prediction from the flight and from what the balls share."""
+    prior = choice.prior
+    if prior is None:
+        return np.zeros((3, len(p.gram)))
+    left = p.spin_right - p.spin_effect @ _theta(p, choice) - p.spin_gram @ prior.mean
+    inner = p.spin_gram + np.diag(1.0 / np.maximum(prior.std, 1e-3) ** 2)
+    return prior.mean[:, None] + np.linalg.solve(inner, left[..., None])[..., 0].T
+
+
+def left_over(
+    linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid
+) -> tuple[Float[np.ndarray, "3 T n"], Float[np.ndarray, "9 n"]]:
+    """Residual [m] of the linear model with the chosen effects and the best starts, and these."""
+    left = linear.residual - np.tensordot(_theta(p, choice) - at.theta, linear.effects, 1)
     start = at.start.copy()
-    start[SPIN] = 0.0
-    if choice.spin:
-        full = p.spin_right - p.spin_effect @ theta - p.spin_gram @ choice.prior.mean
-        inner = p.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
-        start[SPIN] = choice.prior.mean[:, None] + np.linalg.solve(inner, full[..., None])[..., 0].T
+    start[SPIN] = fitted_spins(p, choice)
     left = left - (linear.starts[SPIN] * (start[SPIN] - at.start[SPIN])[:, None, None]).sum(axis=0)
     white = rows(linear.starts[:6], p.noise, p.weight, g)
     target = rows(left[None], p.noise, p.weight, g)
@@ -342,7 +351,7 @@ def _move(
     problem: BallProblem, start: np.ndarray, theta: np.ndarray, choice: Choice, noise_now: Noise, g: Grid
 ) -> tuple[Situation, np.ndarray | None]:
     """Situation at the chosen causes, starts fitted again; and where balls spin, the time of each one's own bounce."""
-    if not choice.spin:
+    if choice.prior is None:
         return Situation(theta, fit_starts(problem, theta, start, g, noise_now, rounds=3)), None
     prior = (choice.prior.mean, np.maximum(choice.prior.std, 1.0))
     start = fit_starts(problem, theta, start, g, noise_now, prior, rounds=3)

@@ -66,10 +66,10 @@ def diagnose_hits(
     """Judges the hits of the watched balls; None where there are fewer than FEWEST_HITS."""
     pairs = []
     for t in trajectories:
-        incoming = flights([t])
-        if not incoming or len(incoming[0]) + 6 > len(t) or not watched(t, joints) or incoming[0].position[1, -1] > 0.0:
+        cut = flights([t])
+        if not cut or len(cut[0]) + 6 > len(t) or not watched(t, joints) or cut[0].position[1, -1] > 0.0:
             continue
-        n0 = len(incoming[0])
+        n0 = len(cut[0])
         stop = int(np.searchsorted(t.time, t.time[n0] + RETURN))
         if stop - n0 >= 8:
             pairs.append((t.part(0, stop), n0))
@@ -79,11 +79,11 @@ def diagnose_hits(
     whole = [t for t, _ in pairs]
     g = grid(whole)
     g = replace(g, paddle=poses(whole, g.steps, joints))
-    n0 = np.array([n for _, n in pairs])
-    incoming = np.arange(len(g.time))[:, None] < n0[None]
+    before = np.array([n for _, n in pairs])
+    incoming = np.arange(len(g.time))[:, None] < before[None]
     problem = BallProblem(g, found.problem.model, (*found.problem.effects, *effects), heading(g))
     theta = np.concatenate([found.situation.theta, np.zeros(len(effects))])
-    start = first_fit(problem, theta, found.choice.prior and found.choice.prior.mean, incoming)
+    start = first_fit(problem, theta, None if found.choice.prior is None else found.choice.prior.mean, incoming)
     change = np.zeros(len(effects))
     y, jacobian, hit = _compare(problem, theta, start, incoming)
     first, usable = y, np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)

@@ -181,7 +181,8 @@ def estimates(log: JointLog, name: str, value: float, interval: tuple[float, flo
         return {name: Estimate(log.base[name], value, *interval, unit)}
     # The sum is known; the change goes to the action delay, and what would make it negative to the observation delay.
     action, observation = log.nominal.action_delay, log.nominal.observation_delay
-    parts = {name: Estimate(action, *(max(v - observation, 0.0) for v in (value, *interval)), unit)}
+    left, low, high = (max(v - observation, 0.0) for v in (value, *interval))
+    parts = {name: Estimate(action, left, low, high, unit)}
     if value < observation:
         low, high = (min(v, observation) for v in interval)
         parts["observation_delay"] = Estimate(observation, value, low, high, unit)

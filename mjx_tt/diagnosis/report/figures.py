@@ -184,7 +184,7 @@ def held_out(prediction: Prediction) -> Figure:
 def _gains(ax: Axes, gain: np.ndarray) -> None:
     low, high = np.percentile(gain, (1, 99))
     span = max(-low, high, 0.1)
-    ax.hist(np.clip(gain, -span, span), np.linspace(-span, span, 33), color=FAINT)
+    ax.hist(np.clip(gain, -span, span), np.linspace(-span, span, 33).tolist(), color=FAINT)
     middle = float(np.median(gain))
     ax.axvline(0.0, color=INK, linewidth=0.9)
     ax.axvline(middle, color=AFTER, linewidth=2.0)

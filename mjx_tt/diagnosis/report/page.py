@@ -226,7 +226,7 @@ def _open_questions(d: Diagnosis, page: Page) -> Context:
     return {"settled": settled, "unseen": unseen, "nothing": not (settled or v.not_identifiable or v.not_excited)}
 
 
-def _lines(lines: Sequence[str]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def _lines(lines: Sequence[str]) -> tuple[tuple[str, ...], Sequence[tuple[str, ...]]]:
     """Lines "name: why" as head and rows of a table, the joints of one effect in one row."""
     groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for line in lines:

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
+from mjx_tt.diagnosis.ball.selection import fitted_spins
 from mjx_tt.diagnosis.joint import JointFindings, JointResidual
 from mjx_tt.viz.html import FAINT, INK, STYLE
 
@@ -29,11 +31,11 @@ QUANTILES = (5, 25, 50, 75, 95)
 
 @dataclass(frozen=True)
 class Curve:
-    """Quantiles of a residual in bins of a quantity; bins with few samples are left out."""
+    """Quantiles of a residual in bins of a quantity; bins with few samples are omitted."""
 
-    place: np.ndarray  # (b,) middles of the bins
-    quantiles: np.ndarray  # (5, b) at 5, 25, 50, 75 and 95 %
-    count: np.ndarray  # (b,) samples
+    place: Float[np.ndarray, " b"]  # middles of the bins
+    quantiles: Float[np.ndarray, "5 b"]  # at 5, 25, 50, 75 and 95 %
+    count: Int[np.ndarray, " b"]  # samples
 
     def largest(self) -> tuple[float, float]:
         """Place and value of the median that is farthest from zero."""
@@ -41,9 +43,15 @@ class Curve:
         return float(self.place[k]), float(self.quantiles[2, k])
 
 
-def curve(quantity, residual, mask, bins: int = BINS, fewest: int = FEWEST) -> Curve:
-    """Bins of equal width between the 1st and 99th percentile of ``quantity``; all arrays of one shape."""
-    q, r = np.asarray(quantity)[mask], np.asarray(residual)[mask]
+def curve(
+    quantity: Float[np.ndarray, "*shape"],
+    residual: Float[np.ndarray, "*shape"],
+    mask: Bool[np.ndarray, "*shape"],
+    bins: int = BINS,
+    fewest: int = FEWEST,
+) -> Curve:
+    """Bins of equal width between the 1st and 99th percentile of ``quantity``."""
+    q, r = quantity[mask], residual[mask]
     good = np.isfinite(q) & np.isfinite(r)
     q, r = q[good], r[good]
     empty = Curve(np.zeros(0), np.zeros((5, 0)), np.zeros(0, int))
@@ -63,29 +71,17 @@ def curve(quantity, residual, mask, bins: int = BINS, fewest: int = FEWEST) -> C
     return Curve(0.5 * (edges[:-1] + edges[1:])[full], quantiles, np.array([groups[k].size for k in full]))
 
 
-def flight_time(found: BallFindings) -> tuple[np.ndarray, str]:
-    """(T, n) [s] since the bounce where most balls bounce, since the first sample otherwise; and what it is called."""
+def flight_time(found: BallFindings) -> tuple[Float[np.ndarray, "T n"], str]:
+    """Time [s] since the bounce where most balls bounce, since the first sample otherwise; and what it is called."""
     grid, bounce = found.problem.grid, found.linear.base.bounce_time[0]
     if np.isfinite(bounce).mean() > 0.5:
         return np.where(np.isfinite(bounce), grid.time - np.where(np.isfinite(bounce), bounce, 0.0), np.nan), "bounce"
     return grid.time, "start"
 
 
-def residuals(found: BallFindings) -> tuple[np.ndarray, np.ndarray]:
-    """(3, T, n) [mm] measured minus predicted under the nominal and under the extended model."""
+def residuals(found: BallFindings) -> tuple[Float[np.ndarray, "3 T n"], Float[np.ndarray, "3 T n"]]:
+    """Residuals [mm], measured minus predicted under the nominal and under the extended model."""
     return 1e3 * found.residual0, 1e3 * found.residual()
-
-
-def spins(found: BallFindings) -> np.ndarray:
-    """(3, n) [rad/s] spin of each ball: its best linear prediction from the flight and from what the balls share."""
-    choice, p = found.choice, found.projected
-    theta = np.zeros(p.gram.shape[1])
-    theta[list(choice.effects)] = choice.theta
-    if choice.magnus is not None:
-        theta[p.coefficient] = choice.magnus
-    left = p.spin_right - p.spin_effect @ theta - p.spin_gram @ choice.prior.mean
-    inner = p.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
-    return choice.prior.mean[:, None] + np.linalg.solve(inner, left[..., None])[..., 0].T
 
 
 def flight(found: BallFindings) -> tuple[Figure, str]:
@@ -139,7 +135,7 @@ def quantities(found: BallFindings) -> Figure:
         (np.broadcast_to(found.age, grid.mask.shape), "time in the session\n(0 start, 1 end)", whole),
     ]
     if found.choice.spin:
-        spin = spins(found)
+        spin = fitted_spins(found.projected, found.choice)
         a = int(np.argmax(spin.std(axis=1) + np.abs(spin.mean(axis=1))))
         columns.append((np.broadcast_to(spin[a], grid.mask.shape), f"fitted spin\nabout {AXES[a]} [rad/s]", whole))
     both = residuals(found)

@@ -36,7 +36,7 @@ def sentence(diagnosis: Diagnosis) -> str:
     v = diagnosis.verdict
     if v.verdict == "none":
         return _nothing(diagnosis)
-    if v.verdict == "unexplained":
+    if v.unexplained is not None:
         text = f"Something is wrong that no entry of the catalogue explains: {_odd(v.unexplained)}."
         names = ", ".join(c.name for c in v.causes)
         return text + (f" Beside it, to be taken with caution until it is understood: {names}." if names else "")
@@ -99,7 +99,8 @@ def span(middle: float, low: float, high: float, unit: str) -> tuple[str, str, s
         texts = [f"{round(x * factor, digits) + 0.0:.{digits}f}" for x in (middle, low, high)]
     else:
         texts = [f"{x * factor:.4g}" for x in (middle, low, high)]
-    return *texts, {"1": ""}.get(name, name.replace("^2", "²"))
+    middle_text, low_text, high_text = texts
+    return middle_text, low_text, high_text, {"1": ""}.get(name, name.replace("^2", "²"))
 
 
 def _join(text: str, unit: str) -> str:
@@ -118,8 +119,8 @@ def _value(e: Estimate) -> str:
 
 def _size(e: Estimate) -> str:
     """The size of the change from the nominal value, with its interval."""
-    ends = sorted(math.copysign(1.0, e.estimate - e.nominal) * (x - e.nominal) for x in (e.low, e.high))
-    return _interval(abs(e.estimate - e.nominal), *ends, e.unit)
+    low, high = sorted(math.copysign(1.0, e.estimate - e.nominal) * (x - e.nominal) for x in (e.low, e.high))
+    return _interval(abs(e.estimate - e.nominal), low, high, e.unit)
 
 
 def _instead(e: Estimate) -> str:
