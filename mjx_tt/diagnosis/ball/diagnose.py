@@ -40,7 +40,6 @@ class BallFindings:
     survivors: tuple[str, ...]  # names that hold beside what is unexplained; all of them where nothing is
     start0: Float[np.ndarray, "9 n"]  # under the nominal model
     residual0: Float[np.ndarray, "3 T n"]  # [m] under the nominal model
-    trajectories: tuple[Trajectory, ...]
     sessions: Int[np.ndarray, " n"]
     age: Float[np.ndarray, " n"]
     seen: Bool[np.ndarray, " K"]  # the data could show the effect, and it was not left out
@@ -157,7 +156,6 @@ def _diagnose(
         survivors,
         start,
         linear.residual,
-        tuple(kept),
         sessions,
         age,
         seen,
