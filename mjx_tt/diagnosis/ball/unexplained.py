@@ -47,6 +47,7 @@ def find(
     effects = linear.effects[chosen]
     # The chosen effects' own values are in the situation: what is left is scored at it (spins are kept absolute).
     flights = StartsOut(linear, linear.residual, settled.at.start, p.noise, p.weight, g)
+    named = len(choice.effects)  # the coefficient that comes along with spin is no name of its own
     for block in basis_functions.build(linear, g, sessions, age, called):
         columns = np.concatenate([effects, block.columns])
         both = flights.project(columns)
@@ -68,9 +69,11 @@ def find(
         importance = np.abs(beta) * np.sqrt(np.maximum(np.diagonal(gram), 0.0))
         best = int(np.argmax(importance))
         change = scores.solve(rated, (*base, *extra))
-        error = np.sqrt(np.maximum(np.diagonal(scores.sandwich(rated, (*base, *extra))), 0.0))[: len(chosen)]
+        error = np.sqrt(np.maximum(np.diagonal(scores.sandwich(rated, (*base, *extra))), 0.0))
         mean = change[len(chosen) : len(chosen) + len(rated.always)]
-        holding.append(_holding(choice, trial, change[: len(chosen)], error) | _spin_holding(choice, trial, mean, size))
+        holding.append(
+            _holding(choice, trial, change[:named], error[:named]) | _spin_holding(choice, trial, mean, size)
+        )
         out.append(
             Finding(
                 block.name,
