@@ -115,7 +115,7 @@ def save_distribution(path: str | os.PathLike, distribution: BallDistribution) -
 
 @dataclass(frozen=True)
 class DistributionReport:
-    """What ``fit_distribution`` did with its balls."""
+    """Outliers and settings of ``fit_distribution``."""
 
     n: int  # balls given
     outlier: Bool[np.ndarray, " n"]  # taken away by DBSCAN

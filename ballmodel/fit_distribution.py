@@ -23,7 +23,7 @@ ROBOT_SIDE = ((-c.TABLE_WIDTH / 2, -c.TABLE_LENGTH / 2), (c.TABLE_WIDTH / 2, 0.0
 
 @dataclass(frozen=True)
 class HumanReport:
-    """What became of the measured balls on the way to a distribution."""
+    """Counts of the measured balls on the way to a distribution."""
 
     measured: int
     too_short: int  # fewer than MIN_SAMPLES samples before the first bounce

@@ -55,7 +55,7 @@ class PaddlePose:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Events:
-    """What a ball touched within one step; at most the first impact of the step is solved, a second one in the next."""
+    """Impacts within one step; at most the first one of the step is solved, a second one in the next."""
 
     table: Bool[jax.Array, "*batch"]
     net: Bool[jax.Array, "*batch"]

@@ -60,7 +60,7 @@ Corner: TypeAlias = Float[Array, "2"] | tuple[Float[Array, ""] | float, Float[Ar
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Throw:
-    """What became of thrown balls."""
+    """Outcome of thrown balls."""
 
     outcome: Int[Array, " n"]  # index into OUTCOMES
     landing: Float[Array, "2 n"]  # [m] x, y of the first bounce; zero where there was none

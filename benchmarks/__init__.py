@@ -1,1 +1,1 @@
-"""How fast this machine trains, and against what: ``mjx-tt bench`` or ``python -m benchmarks.bench``."""
+"""Speed of training on this machine, beside other engines: ``mjx-tt bench`` or ``python -m benchmarks.bench``."""

@@ -18,6 +18,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -28,7 +29,7 @@ from benchmarks.worker import Worker, summary, take_turns
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is measured.
+    """Amounts of what is measured.
 
     rounds       runs of each side
     fused, mjx   (lanes, chunks, physics steps): batches of that many robots one after the other on each device
@@ -78,7 +79,7 @@ def main(console: Console, json_path: str | None = None, quick: bool = False) ->
 def measure(sizes: Sizes, console: Console) -> dict:
     """All figures as plain data. Raises WorkerError when a side does not start."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    report = {"cpu": processor(), "cores": len(cores), "python": platform.python_version()}
+    report: dict[str, Any] = {"cpu": processor(), "cores": len(cores), "python": platform.python_version()}
     console.print("physics steps per second of the robot alone ...")
     report |= measure_physics(sizes, len(cores))
     console.print(f"one update: {2 * sizes.pairs} perturbations x {sizes.repeats} episodes ...")
@@ -95,7 +96,7 @@ def measure(sizes: Sizes, console: Console) -> dict:
     return report
 
 
-def _run(worker: Worker):
+def _run(worker: Worker) -> Any:
     worker.start()
     return worker.finish()
 
@@ -104,7 +105,7 @@ def measure_physics(sizes: Sizes, cores: int) -> dict:
     """Physics steps per second by engine, on all cores, and the ratios of fused to the others."""
     with ExitStack() as stack:
 
-        def side(name: str, copies: int = 1, **arguments) -> list[Worker]:
+        def side(name: str, copies: int = 1, **arguments: Any) -> list[Worker]:
             return [stack.enter_context(Worker(name, **arguments)) for _ in range(copies)]
 
         lanes, chunks, steps = sizes.fused
@@ -130,7 +131,7 @@ def measure_update(sizes: Sizes, cores: list[int]) -> dict:
     """Seconds per update at the start of training and under a trained policy, by number of devices; peak memory."""
     scale = [f"optimiser.pairs={sizes.pairs}", f"optimiser.repeats={sizes.repeats}"]
     n, common = len(cores), "optimiser.common_random_numbers=true"
-    asked = {
+    asked: dict[str, tuple[set[int] | None, dict[str, Any]]] = {
         "all_devices": (None, dict(changes=scale, devices=n)),
         "common_random_numbers": (None, dict(changes=[*scale, common], devices=n)),
         "one_device_all_cores": (None, dict(changes=scale, devices=1)),

@@ -1,4 +1,4 @@
-"""Where the time of a control step goes: its parts one by one, on one core, at the size of a block of episodes.
+"""Cost of a control step: its parts one by one, on one core, at the size of a block of episodes.
 
 Each part runs in a loop of its own whose state depends on its results, so that nothing is hoisted or dropped.
 """
@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from ballmodel import flight, registry
-from ballmodel.flight import ball_params
+from ballmodel.flight import PaddlePose, ball_params
 from ballmodel.sampling import sample_pool
+from ballmodel.state import BallState
 from mjx_tt.env.policy import PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import TaskConfig
+from mjx_tt.env.task import EpisodeState, TaskConfig
 from mjx_tt.robot.scalar_algebra import materialise
 from mjx_tt.sim import latency, noise
 from mjx_tt.sim.model import SimModel
@@ -42,7 +45,9 @@ def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], list[dict]]:
             fastest = min(_seconds(run, start) for _ in range(RUNS))
             nanoseconds[name] = calls * fastest / ticks / (rows * columns) * 1e9
         whole = nanoseconds.pop(WHOLE)
-        table = [{"part": name, "calls": loops[name][0], "ns": ns} for name, ns in nanoseconds.items()]
+        table: list[dict[str, Any]] = [
+            {"part": name, "calls": loops[name][0], "ns": ns} for name, ns in nanoseconds.items()
+        ]
         table.append({"part": "rest", "calls": 1, "ns": whole - sum(nanoseconds.values())})
         table.append({"part": WHOLE, "calls": 1, "ns": whole})
         return [row | {"share": row["ns"] / whole} for row in table]
@@ -50,8 +55,8 @@ def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], list[dict]]:
     return measure
 
 
-def _compiled(step, start, ticks: int):
-    def loop(state):
+def _compiled(step: Callable, start: Any, ticks: int) -> tuple[Callable, Any]:
+    def loop(state: Any) -> Any:
         return jax.lax.fori_loop(0, ticks, lambda tick, s: materialise(step(tick, s)), state)
 
     start = jax.block_until_ready(jax.tree.map(jnp.asarray, start))
@@ -60,7 +65,7 @@ def _compiled(step, start, ticks: int):
     return run, start
 
 
-def _seconds(run, start) -> float:
+def _seconds(run: Callable, start: Any) -> float:
     began = time.perf_counter()
     jax.block_until_ready(run(start))
     return time.perf_counter() - began
@@ -83,25 +88,25 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
     observation = jnp.concatenate([first.ball.position, first.qpos])
     nothing = 1e-9  # couples a result to the next call without moving it
 
-    def kinematics(_, state):
+    def kinematics(_: Array, state: tuple[Array, PaddlePose]) -> tuple[Array, PaddlePose]:
         qpos, last = state
         return qpos + nothing * last.position[0], task.kinematics.pose(qpos, speeds)
 
-    def ball(_, state):
+    def ball(_: Array, state: BallState) -> BallState:
         moved, events = flight.step(episodes.model.ball, state, timestep, (pose, pose))
         events = materialise(events)
         return jax.tree.map(lambda x: x + nothing * events.time, moved)
 
-    def policy(tick, state):
+    def policy(tick: Array, state: tuple[Any, Array]) -> tuple[Any, Array]:
         memory, seen = state
         action, memory = controller.act(tick, memory, seen)
         return memory, seen.at[:N_JOINTS].add(nothing * action)
 
-    def clearance(_, qpos):
+    def clearance(_: Array, qpos: Array) -> Array:
         gaps = task.clearance(materialise(task.kinematics.links(qpos)), qpos[0])
         return qpos + nothing * (gaps.table + gaps.own + gaps.blade)
 
-    def signals(tick, state):
+    def signals(tick: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         """Delayed, noisy observation; limited, delayed command."""
         seen, sent, reference, previous, captured = state
         delayed = jnp.concatenate(
@@ -124,13 +129,13 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
             captured = captured.at[3:].add(weight * control)
         return latency.ring_write(seen, tick, nothing * captured), sent, reference, command, captured
 
-    def whole(tick, state):
+    def whole(tick: Array, state: EpisodeState) -> EpisodeState:
         return task.control_step(tick, state, episodes, prepared, controller)
 
     zeros = jnp.zeros_like(first.qpos)
     n = config.substeps
     return {
-        "arm dynamics": (n, lambda _, state: task.engine.step(*state, speeds), (first.qpos, first.qvel)),
+        "arm dynamics": (n, lambda _, state: task.engine.step(state[0], state[1], speeds), (first.qpos, first.qvel)),
         "paddle kinematics": (n, kinematics, (first.qpos, pose)),
         "ball": (n, ball, first.ball),
         "policy": (1, policy, (first.controller, observation)),

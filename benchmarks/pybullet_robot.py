@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -82,5 +83,5 @@ def _origin(element: ElementTree.Element, position: np.ndarray, quaternion: np.n
     ElementTree.SubElement(element, "origin", xyz=_text(position), rpy=_text(rpy))
 
 
-def _text(values) -> str:
+def _text(values: Iterable[float]) -> str:
     return " ".join(repr(float(v)) for v in values)

@@ -29,7 +29,8 @@ LANES = 200  # side by side; each plays its share one rally after the other
 RUNS = 3  # of which the fastest counts
 
 
-def main(arguments=None) -> int:
+def main(arguments: list[str] | None = None) -> int:
+    """Measures and prints; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--policy", help="run or artefact")
     parser.add_argument("--rallies", type=int, default=1000)
@@ -48,7 +49,7 @@ def main(arguments=None) -> int:
     policy = replace(policy, theta=jnp.repeat(policy.theta[:, None], chosen.lanes, axis=1))
     simulator = RallySimulator(TaskConfig(sim_rate=chosen.sim_rate))
 
-    def play(seed):
+    def play(seed: int) -> tuple[float, np.ndarray, np.ndarray, float]:
         began = time.perf_counter()
         result = simulator.play(policy, people, SimModel(), jax.random.key(seed), each)
         length, end = np.asarray(result.length), np.asarray(result.end)
@@ -59,9 +60,9 @@ def main(arguments=None) -> int:
         (play(seed) for seed in range(1, RUNS + 1)), key=lambda run: run[0] / run[1].sum()
     )
     print(
-        f"{length.size} rallies, {length.sum()} touches, {played:.0f} s of play in one compiled call of {seconds:.2f} s "
-        f"on {jax.devices()[0].platform}: {length.size / seconds:.0f} rallies/s, {length.sum() / seconds:.0f} touches/s, "
-        f"{played / seconds:.0f} x real time; the first call, with its compilation, took {compiled:.0f} s"
+        f"{length.size} rallies, {length.sum()} touches, {played:.0f} s of play in one compiled call of "
+        f"{seconds:.2f} s on {jax.devices()[0].platform}: {length.size / seconds:.0f} rallies/s, "
+        f"{length.sum() / seconds:.0f} touches/s, {played / seconds:.0f} x real time; the first call, with its compilation, took {compiled:.0f} s"
     )
     print(f"length {length.mean():.1f} on average, {length.max()} at most; ended by:")
     for row, count in zip(*np.unique(end, return_counts=True), strict=True):

@@ -1,4 +1,4 @@
-"""What is measured. Each function prepares one side and returns (what it says about itself, its work).
+"""Sides of the comparisons. Each function prepares one and returns (what it says about itself, its work).
 
 The work is a function without arguments that returns how much it did: physics steps, episodes or lines of a table.
 
@@ -9,10 +9,20 @@ velocity commands 75 times per second.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from mjx_tt.env.policy import Policy
+
+if TYPE_CHECKING:  # a side without JAX does not load it
+    from jax import Array
+
+    from experiments.training.update import Trainer, TrainState
+    from mjx_tt.env.rollout import RolloutResult
+    from mjx_tt.env.task import Episodes
+
+    State: TypeAlias = tuple[Array, Array]  # qpos, qvel
 
 Side = tuple[dict, Callable[[], float | list]]
 
@@ -46,16 +56,16 @@ def _jax_engine(name: str, lanes: int, chunks: int, steps: int) -> Side:
     devices = jax.devices()
     home = jnp.broadcast_to(jnp.asarray(task.home, jnp.float32)[:, None], (8, lanes))
 
-    def period(state, control):
-        def step(_, s):
+    def period(state: State, control: Array) -> tuple[State, None]:
+        def step(_: int, s: State) -> State:
             return materialise(task.engine.step(*s, control))
 
         return jax.lax.fori_loop(0, SUBSTEPS, step, state), None
 
-    def chunk(controls):  # (steps / SUBSTEPS, 8, lanes)
+    def chunk(controls: Array) -> State:  # (steps / SUBSTEPS, 8, lanes)
         return jax.lax.scan(period, (home, jnp.zeros_like(home)), controls)[0]
 
-    def device(controls):  # (chunks, steps / SUBSTEPS, 8, lanes)
+    def device(controls: Array) -> State:  # (chunks, steps / SUBSTEPS, 8, lanes)
         return jax.lax.map(chunk, controls)
 
     mesh = Mesh(np.array(devices), ("device",))
@@ -149,7 +159,7 @@ def rollout(changes: list[str], devices: int | None = None) -> Side:
     episodes = simulator.draw(jax.random.key(2), trainer.pool, SimModel(), (), repeats, columns)
     theta = state.bgs.theta[:, None] + 0.025 * jax.random.normal(jax.random.key(3), (state.bgs.theta.shape[0], columns))
 
-    def play(theta, episodes):
+    def play(theta: Array, episodes: Episodes) -> RolloutResult:
         policy = Policy(simulator.local(theta), jnp.zeros(11), jnp.ones(11))
         return simulator.rollout(policy, simulator.local(episodes))
 
@@ -163,7 +173,7 @@ def rollout(changes: list[str], devices: int | None = None) -> Side:
     return about_jax(), work
 
 
-def _paper_trainer(changes: list[str]):
+def _paper_trainer(changes: list[str]) -> tuple[Trainer, TrainState]:
     import jax
 
     from experiments.config import build, experiment

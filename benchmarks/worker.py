@@ -8,6 +8,7 @@ standard input with one run of that work.
 from __future__ import annotations
 
 import json
+import math
 import os
 import resource
 import subprocess
@@ -15,6 +16,7 @@ import sys
 import time
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -30,7 +32,7 @@ class Worker:
     """
 
     def __init__(
-        self, side: str, cpus: set[int] | None = None, environment: dict[str, str] | None = None, **sizes
+        self, side: str, cpus: set[int] | None = None, environment: dict[str, str] | None = None, **sizes: Any
     ) -> None:
         request = json.dumps({"side": side, "cpus": sorted(cpus) if cpus else None, "sizes": sizes})
         path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
@@ -41,32 +43,35 @@ class Worker:
             text=True,
             env=os.environ | {"PYTHONPATH": path} | (environment or {}),
         )
+        if self._process.stdin is None or self._process.stdout is None:
+            raise WorkerError(f"{side}: its process has no pipes")
+        self._orders, self._answers = self._process.stdin, self._process.stdout
         self.side = side
-        self.peak_memory: float | None = None
+        self.peak_memory = math.nan
 
     def wait_ready(self) -> dict:
-        """What the side says about itself, once it is warm. Raises WorkerError."""
+        """The side's description of itself, once it is warm. Raises WorkerError."""
         return self._answer()
 
     def start(self) -> None:
-        self._process.stdin.write("\n")
-        self._process.stdin.flush()
+        self._orders.write("\n")
+        self._orders.flush()
 
     def finish(self) -> float:
         """Amount of work done by the run that ``start`` began. Raises WorkerError."""
         return self._answer()["amount"]
 
     def close(self) -> None:
-        if not self._process.stdin.closed:
-            self._process.stdin.close()  # the process answers with its memory and ends
+        if not self._orders.closed:
+            self._orders.close()  # the process answers with its memory and ends
             self.peak_memory = self._answer()["peak_memory_mb"]
             self._process.wait()
-            self._process.stdout.close()
+            self._answers.close()
 
     def __enter__(self) -> Worker:
         return self
 
-    def __exit__(self, kind, *_) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.close()
         else:
@@ -74,7 +79,7 @@ class Worker:
             self._process.wait()
 
     def _answer(self) -> dict:
-        line = self._process.stdout.readline()
+        line = self._answers.readline()
         if not line:
             raise WorkerError(f"{self.side}: its process ended with status {self._process.wait()}; see above for why")
         return json.loads(line)

@@ -19,7 +19,7 @@ _ZERO_STD = 1e-8
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ShapedPairs:
-    """What the returns of one update say about its directions.
+    """Result of ``shape``: weights of one update's directions, from their returns.
 
     weights       (N,) weight of each direction: the gradient estimate is directions @ weights; 0 outside the elites
     elites        (N,) bool, the pairs that contribute

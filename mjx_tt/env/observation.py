@@ -1,4 +1,4 @@
-"""What the policy sees: delayed, filtered, distorted, noisy positions of ball and joints."""
+"""Observations of the policy: delayed, filtered, distorted, noisy positions of ball and joints."""
 
 from __future__ import annotations
 

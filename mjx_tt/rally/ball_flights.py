@@ -1,4 +1,4 @@
-"""What happens in a rally besides the robot's part of a ball: balls without the robot, and the robot without a ball.
+"""A rally besides the robot's part of a ball: balls without the robot, and the robot without a ball.
 
 Batch axis last; (L,) unless noted.
 """
@@ -42,7 +42,7 @@ class Sent:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Meeting:
-    """How the robot's returns come to the players."""
+    """The robot's returns as they come to the players."""
 
     incoming: Incoming
     reached: Bool[Array, " L"]  # could be hit before it bounced again or fell to the floor

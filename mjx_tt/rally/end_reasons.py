@@ -18,7 +18,7 @@ CORNER = 0.25  # [m] from a side line and from the end line within which a landi
 
 
 class End(IntEnum):
-    """Reason why a rally ended: the rows of the paper's table end_of_rally_attribution in their order, and what it lacks."""
+    """Reason why a rally ended: the rows of the paper's table end_of_rally_attribution in order, and what it lacks."""
 
     FIRST_NET = 0
     FIRST_OVER_TABLE = 1

@@ -5,7 +5,8 @@ play; tires; gets used to the robot. The shape of the behaviour is ours (the pap
 not behaviour); its numbers, one YAML per player in ``assets/virtual_players``, are calibrated so that balls and rallies
 come near the paper's tables (docs/results/virtual-players.md, ``study/player_calibration.py``). Instructions to the
 players: appendix "Instructions for Human Players" of Abeyruwan et al. 2022: lobs from the left-hand quadrant of the
-human's half (x > 0 for the human, who looks along -y) to the robot's right-hand quadrant (x > 0), returns to there as well.
+human's half (x > 0 for the human, who looks along -y) to the robot's right-hand quadrant (x > 0), returns to there
+as well.
 
 Component axis first, batch axes last; a player's leaves are scalars or of the batch shape. SI units.
 """
@@ -76,7 +77,7 @@ class Spread:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FirstBalls:
-    """How a player starts a rally. The way to the landing point and the speed ask for a climb; the bounds come
+    """First balls of a player. The way to the landing point and the speed ask for a climb; the bounds come
     after."""
 
     x: Spread  # [m] where the ball is hit
@@ -94,7 +95,7 @@ class FirstBalls:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Strokes:
-    """How a player answers a return."""
+    """Answers of a player to returns."""
 
     plane: Spread  # [m] y at which a ball is taken that has not fallen yet
     height: Spread  # [m] z to which a ball falls at most before it is taken
@@ -111,7 +112,7 @@ class Strokes:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Ability:
-    """What a player can do. Errors are those of an easy ball, as standard deviations."""
+    """Ability of a player. Errors are those of an easy ball, as standard deviations."""
 
     direction: jax.Array | float  # [rad] error of the stroke's direction, to the side
     elevation: jax.Array | float  # [rad] and upwards
@@ -139,7 +140,7 @@ class Spin:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Person:
-    """What changes a player in the course of a session."""
+    """Changes of a player in the course of a session."""
 
     tiring: jax.Array | float  # share of the strength that is left lost per stroke
     rest: jax.Array | float  # share of the tiredness that a pause between rallies takes away

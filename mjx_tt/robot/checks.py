@@ -1,4 +1,4 @@
-"""What a serial chain of hinges and slides cannot represent: the refusals behind ``mjx_tt.robot.chain``.
+"""Elements that a serial chain of hinges and slides cannot represent: the refusals behind ``mjx_tt.robot.chain``.
 
 Everything that changes how MuJoCo C moves the model is either carried by a ``Chain`` or named here.
 """
@@ -135,7 +135,7 @@ def _unsupported_actuators(model: mujoco.MjModel) -> Iterator[str]:
 
 
 def _any(model: mujoco.MjModel, field: str, index: int) -> bool:
-    """Whether the field has a non-zero entry at index; False where this MuJoCo release does not have the field."""
+    """True where the field has a non-zero entry at index; False where this MuJoCo release does not have the field."""
     values = getattr(model, field, None)
     return values is not None and bool(np.any(values[index]))
 

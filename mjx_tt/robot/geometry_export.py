@@ -85,7 +85,7 @@ def text(model: mujoco.MjModel) -> str:
 
 
 def path() -> Path:
-    """Where the file is shipped."""
+    """Path of the shipped file."""
     return Path(str(resources.files("robot_io.safety"))) / "robot_geometry.json"
 
 

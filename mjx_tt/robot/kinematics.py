@@ -1,4 +1,4 @@
-"""Where the links of a chain are and how fast they move, as element-wise operations over the batch."""
+"""Forward kinematics of a chain, as element-wise operations over the batch."""
 
 from __future__ import annotations
 

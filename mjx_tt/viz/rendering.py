@@ -116,8 +116,9 @@ def render_frames(
     with _offscreen(model, size) as context:
         for t in range(0, len(qpos), stride):
             data.qpos[:] = qpos[t]
-            option.geomgroup[_BALL_GROUP] = ball is not None and np.isfinite(ball[t]).all()
-            if option.geomgroup[_BALL_GROUP]:
+            shown = ball is not None and np.isfinite(ball[t]).all()
+            option.geomgroup[_BALL_GROUP] = shown
+            if ball is not None and shown:
                 data.mocap_pos[0] = ball[t]
             mujoco.mj_forward(model, data)
             mujoco.mjv_updateScene(model, data, option, perturb, view, mujoco.mjtCatBit.mjCAT_ALL, scene)
@@ -138,7 +139,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
     count = 0
     with imageio.get_writer(path, fps=fps, codec="libx264", quality=8, macro_block_size=2) as writer:
         for frame in frames:
-            writer.append_data(frame)
+            writer.append_data(frame)  # type: ignore[attr-defined]  # annotated as the base of readers and writers
             count += 1
     return count
 
