@@ -1,12 +1,13 @@
 """Forces on a ball in flight: gravity, buoyancy, quadratic drag, Magnus lift, spin decay, wind.
 
-acceleration = g (1 - buoyancy) - K_d |u| u + K_m (omega x u),   u = v - wind
+acceleration = g (1 - buoyancy) - K_d |u| u + K_m (omega x u) / (1 + c S),   u = v - wind
 K_d = C_d rho A / (2 m)                 (Abeyruwan et al. 2022, appendix "Details on Modeling Human Ball Distributions")
-K_m = k rho A r / (2 m)                 from C_L = k S with the spin ratio S = r |omega| / |u|
+K_m = k rho A r / (2 m)                 from C_L = k S / (1 + c S) with the spin ratio S = r |omega| / |u|
 d omega / dt = -spin_decay omega
 
 The defaults are the paper's drag-only ball. The literature's k runs from 0.3 to 1.5, so it is a parameter to be
-identified, not a constant. MJX cannot do this: it has only the inertia-box fluid model and drops lift silently.
+identified, not a constant; over a wide range of spins it falls, and c says how soon: ``SATURATING_LIFT`` was fitted to
+1,597 shots with measured spin, whose constant k falls from 0.69 (S < 0.3) to 0.23 (S > 1). MJX cannot do this: it has only the inertia-box fluid model and drops lift silently.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import jax
 from jaxtyping import Float
 
 from ballmodel import constants as c
+from ballmodel.partial_params import optional
 from ballmodel.vec import Scalars, Vec, Vector, cross, norm
 
 
@@ -27,6 +29,7 @@ class FlightParams:
 
     drag_coefficient: Float[jax.Array, "*#batch"] | float = c.DRAG_COEFFICIENT  # C_d
     magnus_coefficient: Float[jax.Array, "*#batch"] | float = 0.0  # k in C_L = k r |omega| / |u|
+    lift_saturation: Float[jax.Array, "*#batch"] | float | None = optional(0.0)  # c in C_L = k S / (1 + c S)
     spin_decay: Float[jax.Array, "*#batch"] | float = 0.0  # [1/s]
     air_density: Float[jax.Array, "*#batch"] | float = c.AIR_DENSITY  # [kg/m^3]
     mass: Float[jax.Array, "*#batch"] | float = c.BALL_MASS  # [kg]
@@ -44,6 +47,8 @@ class FlightParams:
     integrator: str = field(default="paper", metadata={"static": True})  # one of INTEGRATORS
 
 
+# C_L = S / (0.55 + 3.55 S), with C_d = 0.33: landing errors of 68 mm in the median where the best constant k has 104.
+SATURATING_LIFT = {"magnus_coefficient": 1 / 0.55, "lift_saturation": 3.55 / 0.55, "drag_coefficient": 0.33}
 INTEGRATORS = ("paper", "midpoint")  # acceleration of a step taken at its start (the paper's), or at its middle
 
 
@@ -63,5 +68,9 @@ def acceleration(params: FlightParams, velocity: Vector, spin: Vector) -> Vec:
     u = Vec(*(velocity[i] - air[i] for i in range(3)))
     drag = -drag_factor(params) * norm(u)
     lift = cross(spin, u) * magnus_factor(params)
+    if params.lift_saturation is not None:
+        speed = norm(u)
+        saturated = speed + params.lift_saturation * params.radius * norm(Vec(*(spin[i] for i in range(3))))
+        lift = lift * (speed / saturated)
     weight = (params.gravity_x, params.gravity_y, params.gravity_z)
     return Vec(*(weight[i] * (1.0 - params.buoyancy) + drag * u[i] + lift[i] for i in range(3)))

@@ -25,6 +25,7 @@ from scipy.optimize import minimize
 
 from ballmodel.aerodynamics import FlightParams
 from ballmodel.flight import free_step
+from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState
 from ballmodel.trajectory import Trajectory
 
@@ -240,7 +241,9 @@ def fit_gauss_newton(
     spins = np.pad(spin, ((0, 0), (0, extra)), mode="edge")
     with jax.enable_x64(True):
         x0, v0 = _initial_guess(padded)
-        result = _levenberg_marquardt(flight, x0, v0, spins, padded.steps, padded.position, padded.mask, huber)
+        result = _levenberg_marquardt(
+            without_nominal(flight), x0, v0, spins, padded.steps, padded.position, padded.mask, huber
+        )
         x0, v0, rms, covariance, converged = (np.asarray(a)[..., :n] for a in result)
     return FitResult(BallState(x0, v0, spin), rms, covariance, converged)
 
@@ -273,7 +276,10 @@ def fit_nelder_mead(
     # The simplex spans the guess's likely error: a centimetre, a tenth of a metre per second.
     simplex = start + np.vstack([np.zeros(6), np.diag([0.01] * 3 + [0.1] * 3)])
     with jax.enable_x64(True):
-        arguments = (flight, *map(jnp.asarray, (spin[:, None], padded.steps, padded.position, padded.mask)))
+        arguments = (
+            without_nominal(flight),
+            *map(jnp.asarray, (spin[:, None], padded.steps, padded.position, padded.mask)),
+        )
         result = minimize(
             lambda unknowns: float(_rms_distance(unknowns, *arguments)),
             start,

@@ -17,6 +17,7 @@ BOUNDS: tuple[tuple[str, tuple[float, float]], ...] = (
     ("ball.flight.air_density", (0.0, 10.0)),  # [kg/m^3]
     ("ball.flight.drag_coefficient", (0.0, 5.0)),
     ("ball.flight.magnus_coefficient", (-10.0, 10.0)),
+    ("ball.flight.lift_saturation", (0.0, 100.0)),
     ("ball.flight.spin_decay", (-10.0, 100.0)),  # [1/s]
     ("ball.flight.buoyancy", (-10.0, 10.0)),
     ("ball.flight.gravity_*", (-100.0, 100.0)),  # [m/s^2]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ballmodel import constants as c
 from ballmodel import registry
-from ballmodel.aerodynamics import FlightParams, drag_factor, magnus_factor
+from ballmodel.aerodynamics import SATURATING_LIFT, FlightParams, acceleration, drag_factor, magnus_factor
 from ballmodel.contact import PaddleParams, SurfaceParams
 from ballmodel.flight import PaddlePose, ball_params, free_step, step
 from ballmodel.partial_params import without_nominal
@@ -104,6 +104,38 @@ def test_magnus_force_alone_turns_the_ball_on_a_circle():
     quarter = fly(params, state, np.pi / 2 / rate / n, n)
     np.testing.assert_allclose(quarter.position, [speed / rate, speed / rate, 0], atol=1e-6 * speed / rate)
     np.testing.assert_allclose(quarter.velocity, [0, speed, 0], atol=1e-6 * speed)
+
+
+def test_saturating_lift_turns_the_ball_on_a_wider_circle():
+    """Spin ratio 0.02 x 100 / 5 = 0.4: C_L = 0.4 / (0.55 + 3.55 x 0.4) = 0.203, not 0.4 / 0.55."""
+    params = FlightParams(**SATURATING_LIFT | {"drag_coefficient": 0.0}, gravity_z=0.0, integrator="midpoint")
+    speed, spin, n = 5.0, 100.0, 20000
+    lift_coefficient = 0.4 / (0.55 + 3.55 * 0.4)
+    rate = 1.29 * 1.256e-3 / (2 * 0.0027) * lift_coefficient * speed  # rho A C_L v / (2 m) turns the velocity
+    state = ball_state(np.zeros(3), np.array([speed, 0, 0]), np.array([0, 0, spin]))
+    quarter = fly(params, state, np.pi / 2 / rate / n, n)
+    np.testing.assert_allclose(quarter.position, [speed / rate, speed / rate, 0], rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(quarter.velocity, [0, speed, 0], atol=1e-2)
+
+
+def test_saturating_lift_falls_as_measured_and_is_the_constant_law_at_no_saturation():
+    """The constant k that gives the same force is 1 / (0.55 + 3.55 S)."""
+    spins = np.array([0.15, 0.45, 0.65, 0.85, 1.3]) * 5.0 / 0.02
+    velocity, spin = np.tile([[0.0], [-5.0], [0.0]], 5), np.stack([spins, 0 * spins, 0 * spins])
+    still = FlightParams(drag_coefficient=0.0, gravity_z=0.0)
+
+    def lift(**changes):
+        return np.asarray(acceleration(replace(still, **changes), velocity, spin)[2])
+
+    saturating = {name: value for name, value in SATURATING_LIFT.items() if name != "drag_coefficient"}
+    constant = lift(**saturating) / lift(magnus_coefficient=1.0)
+    assert (np.diff(constant) < 0).all()
+    np.testing.assert_allclose(constant, 1 / (0.55 + 3.55 * spins * 0.02 / 5.0), rtol=1e-3)
+    np.testing.assert_allclose(
+        lift(magnus_coefficient=0.6, lift_saturation=0.0), lift(magnus_coefficient=0.6), rtol=1e-14
+    )
+    at_rest = acceleration(replace(still, **saturating), np.zeros((3, 1)), np.zeros((3, 1)))
+    np.testing.assert_array_equal(np.stack(list(at_rest)), np.zeros((3, 1)))
 
 
 def test_topspin_pulls_a_ball_towards_the_robot_down():
