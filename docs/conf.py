@@ -29,6 +29,7 @@ nitpicky = True
 nitpick_ignore_regex = [("py:.*", r"(?!(ballmodel|bgs|mjx_tt|robot_io)\.).*")]
 
 myst_enable_extensions = ["deflist", "colon_fence", "dollarmath"]
+highlight_language = "text"
 smartquotes_action = "qe"  # two hyphens begin an option
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
