@@ -189,7 +189,8 @@ def test_sessions_and_other_logs_are_read_together(tmp_path, monkeypatch):
 def test_what_would_fail_later_is_refused_before_the_work(more, words, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "log.csv", flights())
-    assert cli.main(["diagnose", "log.csv", "--out", "out", *more]) == 1
+    out = [] if "--out" in more else ["--out", "out"]
+    assert cli.main(["diagnose", "log.csv", *out, *more]) == 1
     said = capsys.readouterr()
     assert words in said.err and "trajectories" not in said.out
     assert sorted(p.name for p in tmp_path.iterdir()) == ["log.csv"]
