@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 GENERATED = REFERENCE / "generated"
-PACKAGES = ("mjx_tt", "ballmodel", "bgs", "robot_io")
+PACKAGES = ("robot_io", "ballmodel", "bgs", "mjx_tt")  # a name that several show is described with the first
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
@@ -60,8 +60,9 @@ def write_all() -> None:
     _write("robot", dataclass_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", RobotConfig, slow))
     _write("rig", dataclass_page("rig.yaml", "mjx-tt run --robot rig --rig", RigParams))
     _write("command-line", command_line_page())
+    described: dict[int, str] = {}
     for package in PACKAGES:
-        _write(f"api-{package}", api_page(package))
+        _write(f"api-{package}", api_page(package, described))
 
 
 def schema_page(title: str, command: str, schema: dict[str, Any], known: dict[str, str]) -> str:
@@ -300,8 +301,8 @@ def _arguments(command: App) -> list[str]:
     return ["| argument | meaning |", "|---|---|", *rows] if rows else []
 
 
-def api_page(package: str) -> str:
-    """Public names of a package: those that its ``__init__`` shows."""
+def api_page(package: str, described: dict[int, str]) -> str:
+    """Public names of a package: those that its ``__init__`` shows; ``described`` holds objects of earlier pages."""
     module = importlib.import_module(package)
     names = getattr(module, "__all__", None) or [name for name in dir(module) if not name.startswith("_")]
     with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that the optional package warp is absent
@@ -314,9 +315,20 @@ def api_page(package: str) -> str:
     summary = (inspect.getdoc(module) or "").strip()
     rest = [package, "=" * len(package), "", *_as_rest(summary.splitlines()), ""]
     if public:
-        rest += [".. autosummary::", "   :nosignatures:", "", *(f"   {package}.{name}" for name in sorted(public)), ""]
+        rest += [
+            ".. autosummary::",
+            "   :nosignatures:",
+            "",
+            *(f"   {package}.{name}" for name in sorted(public) if id(public[name]) not in described),
+            "",
+        ]
     for name in sorted(public):
         value = public[name]
+        if id(value) in described:
+            rest += [f"``{package}.{name}`` is :class:`{described[id(value)]}`.", ""]
+            continue
+        if inspect.isclass(value):
+            described[id(value)] = f"{package}.{name}"
         kind = "class" if inspect.isclass(value) else "function" if callable(value) else "data"
         rest += [f".. auto{kind}:: {package}.{name}", *(["   :members:"] if kind == "class" else []), ""]
     return "\n".join(rest)
@@ -332,9 +344,9 @@ def _readable(app: Sphinx, what: str, name: str, value: Any, options: Any, lines
 
 
 def _short(app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str, returns: str) -> Any:
-    """Signature without the modules of its types."""
-    if signature is None:
-        return None
+    """Signature of a dataclass that Sphinx cannot parse, without the modules of its types."""
+    if "<factory>" not in (signature or ""):
+        return None  # Sphinx can parse and link it
     return tuple(
         part and re.sub(r"~?(?:[A-Za-z_]\w*\.)+(\w+)", r"\1", part).replace("<factory>", "...")
         for part in (signature, returns)
