@@ -62,7 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
     print(
         f"{length.size} rallies, {length.sum()} touches, {played:.0f} s of play in one compiled call of "
         f"{seconds:.2f} s on {jax.devices()[0].platform}: {length.size / seconds:.0f} rallies/s, "
-        f"{length.sum() / seconds:.0f} touches/s, {played / seconds:.0f} x real time; the first call, with its compilation, took {compiled:.0f} s"
+        f"{length.sum() / seconds:.0f} touches/s, {played / seconds:.0f} x real time; "
+        f"the first call, with its compilation, took {compiled:.0f} s"
     )
     print(f"length {length.mean():.1f} on average, {length.max()} at most; ended by:")
     for row, count in zip(*np.unique(end, return_counts=True), strict=True):

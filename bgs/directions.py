@@ -10,18 +10,21 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float, PRNGKeyArray
 
 SCALES = ("sqrt_d", "chi")
 
 
 def sample(
-    key: jax.Array,
+    key: PRNGKeyArray,
     d: int,
     pairs: int,
     orthogonal: bool = True,
     scale: str = "sqrt_d",
-    dtype: jnp.dtype = jnp.float32,
-) -> jax.Array:
+    dtype: DTypeLike = jnp.float32,
+) -> Float[Array, "d pairs"]:
     """Draws the directions of one update, shape (d, pairs), one direction per column.
 
     orthogonal=True gives blocks of up to ``d`` mutually orthogonal columns, each block Haar-distributed and independent
@@ -46,7 +49,7 @@ def sample(
     return jnp.sqrt(jax.random.chisquare(key_norm, d, (pairs,), dtype))[None] * basis
 
 
-def _haar(key: jax.Array, d: int, width: int, dtype: jnp.dtype) -> jax.Array:
+def _haar(key: PRNGKeyArray, d: int, width: int, dtype: DTypeLike) -> Float[Array, "d width"]:
     """``width`` orthonormal columns of a Haar-distributed orthogonal matrix, shape (d, width)."""
     q, r = jnp.linalg.qr(jax.random.normal(key, (d, width), dtype))
     # LAPACK's sign convention is not uniform; a positive diagonal of R makes Q exactly Haar (Mezzadri 2007, section 5).

@@ -10,6 +10,9 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+from jax import Array
+from jax.typing import DTypeLike
+from jaxtyping import Float, Int, Shaped
 
 # Constants of Iris' MeanStdBuffer: below MINIMUM_STD a component counts as constant and is normalised to 0.
 MINIMUM_STD = 1e-7
@@ -32,18 +35,21 @@ class ObservationStatistics:
     m2     (n,) sum of (x - mean)^2
     """
 
-    count: jax.Array
-    mean: jax.Array
-    m2: jax.Array
+    count: Int[Array, "2"]
+    mean: Float[Array, " n"]
+    m2: Float[Array, " n"]
 
 
-def empty(n: int, dtype: jnp.dtype = jnp.float32) -> ObservationStatistics:
+def empty(n: int, dtype: DTypeLike = jnp.float32) -> ObservationStatistics:
     """Statistics of no observations with ``n`` components: the identity of ``merge``."""
     return ObservationStatistics(jnp.zeros(2, jnp.int32), jnp.zeros(n, dtype), jnp.zeros(n, dtype))
 
 
 def from_sums(
-    count: jax.Array | int, shift: jax.Array, sum_shifted: jax.Array, sum_sq_shifted: jax.Array
+    count: Shaped[Array, ""] | float,
+    shift: Float[Array, " n"],
+    sum_shifted: Float[Array, " n"],
+    sum_sq_shifted: Float[Array, " n"],
 ) -> ObservationStatistics:
     """Statistics of ``count`` observations x from the sums of (x - shift) and of (x - shift)^2, each (n,).
 
@@ -60,7 +66,7 @@ def from_sums(
     return ObservationStatistics(digits, jnp.where(count > 0, shift + offset, 0), m2)
 
 
-def total(statistics: ObservationStatistics) -> jax.Array:
+def total(statistics: ObservationStatistics) -> Float[Array, ""]:
     """Number of observations as a float (): correctly rounded from the exact count, for ratios and for display."""
     dtype = statistics.mean.dtype
     return statistics.count[0].astype(dtype) * _RADIX + statistics.count[1].astype(dtype)
@@ -78,7 +84,7 @@ def merge(a: ObservationStatistics, b: ObservationStatistics) -> ObservationStat
     return ObservationStatistics(count, a.mean + delta * share_b, a.m2 + b.m2 + delta**2 * (n_a * share_b))
 
 
-def normaliser(statistics: ObservationStatistics) -> tuple[jax.Array, jax.Array]:
+def normaliser(statistics: ObservationStatistics) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Mean and inverse scale, each (n,), such that the policy sees (x - mean) * inverse_scale.
 
     inverse_scale is 1 / (std + 1e-8) with the n - 1 standard deviation, and 0 for a component whose std is below 1e-7

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
 
 RANKS = ("abs", "signed", "max")
 WEIGHTINGS = ("returns", "centered_rank")
@@ -29,17 +31,17 @@ class ShapedPairs:
     mean_return   () mean return of all finite pairs; NaN when there are none
     """
 
-    weights: jax.Array
-    elites: jax.Array
-    n_elites: jax.Array
-    failed_pairs: jax.Array
-    elite_std: jax.Array
-    mean_return: jax.Array
+    weights: Float[Array, " N"]
+    elites: Bool[Array, " N"]
+    n_elites: Int[Array, ""]
+    failed_pairs: Int[Array, ""]
+    elite_std: Float[Array, ""]
+    mean_return: Float[Array, ""]
 
 
 def shape(
-    plus: jax.Array,
-    minus: jax.Array,
+    plus: Float[Array, "..."],
+    minus: Float[Array, "..."],
     keep: float = 0.3,
     rank: str = "abs",
     weighting: str = "returns",
@@ -98,13 +100,17 @@ def shape(
     )
 
 
-def _std_of_elites(plus: jax.Array, minus: jax.Array, elites: jax.Array, k: jax.Array) -> jax.Array:
+def _std_of_elites(
+    plus: Float[Array, " N"], minus: Float[Array, " N"], elites: Bool[Array, " N"], k: Float[Array, ""]
+) -> Float[Array, ""]:
     mean = jnp.sum(jnp.where(elites, plus + minus, 0)) / (2 * k)
     squares = jnp.where(elites, (plus - mean) ** 2 + (minus - mean) ** 2, 0)
     return jnp.sqrt(jnp.sum(squares) / (2 * k))
 
 
-def _centered_ranks(plus: jax.Array, minus: jax.Array, finite: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _centered_ranks(
+    plus: Float[Array, " N"], minus: Float[Array, " N"], finite: Bool[Array, " N"]
+) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
     # Dropped members sort to the end as infinities, so they do not move anybody else's rank.
     members = jnp.concatenate([jnp.where(finite, plus, jnp.inf), jnp.where(finite, minus, jnp.inf)])
     ordered = jnp.sort(members)

@@ -19,6 +19,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import optax
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from bgs import directions as direction_sampling
 from bgs import optimizers as steps
@@ -87,10 +90,10 @@ class BGSState:
     updates    () int32, number of ``tell`` calls
     """
 
-    theta: jax.Array
-    average: jax.Array
+    theta: Float[Array, " d"]
+    average: Float[Array, " d"]
     opt_state: optax.OptState
-    updates: jax.Array
+    updates: Int[Array, ""]
 
 
 @jax.tree_util.register_dataclass
@@ -102,8 +105,8 @@ class Population:
     directions  (d, N) delta_i
     """
 
-    members: jax.Array
-    directions: jax.Array
+    members: Float[Array, "d 2*N"]
+    directions: Float[Array, "d N"]
 
 
 @jax.tree_util.register_dataclass
@@ -119,15 +122,15 @@ class BGSInfo:
     mean_return    mean return of the members of all finite pairs; NaN when there are none
     """
 
-    gradient_norm: jax.Array
-    update_norm: jax.Array
-    failed_pairs: jax.Array
-    elites: jax.Array
-    elite_std: jax.Array
-    mean_return: jax.Array
+    gradient_norm: Float[Array, ""]
+    update_norm: Float[Array, ""]
+    failed_pairs: Int[Array, ""]
+    elites: Int[Array, ""]
+    elite_std: Float[Array, ""]
+    mean_return: Float[Array, ""]
 
 
-def init(theta: jax.Array, config: BGSConfig) -> BGSState:
+def init(theta: ArrayLike, config: BGSConfig) -> BGSState:
     """State before the first update from the initial parameters theta (d,), float32 or float64."""
     theta = jnp.asarray(theta)
     if theta.ndim != 1 or not jnp.issubdtype(theta.dtype, jnp.floating):
@@ -135,18 +138,18 @@ def init(theta: jax.Array, config: BGSConfig) -> BGSState:
     return BGSState(theta, theta, config.step.init(theta), jnp.zeros((), jnp.int32))
 
 
-def ask(key: jax.Array, state: BGSState, config: BGSConfig) -> Population:
+def ask(key: PRNGKeyArray, state: BGSState, config: BGSConfig) -> Population:
     """The members to evaluate for the next update, in theta's precision."""
     return perturb(state, _sample(key, state, config), config)
 
 
 @partial(jax.jit, static_argnames="config")
-def _sample(key: jax.Array, state: BGSState, config: BGSConfig) -> jax.Array:
+def _sample(key: PRNGKeyArray, state: BGSState, config: BGSConfig) -> Float[Array, "d N"]:
     d, dtype = state.theta.shape[0], state.theta.dtype
     return direction_sampling.sample(key, d, config.pairs, config.orthogonal, config.scale, dtype)
 
 
-def perturb(state: BGSState, directions: jax.Array, config: BGSConfig) -> Population:
+def perturb(state: BGSState, directions: Float[Array, "d N"], config: BGSConfig) -> Population:
     """The members along given directions (d, N): ``ask`` without its sampling."""
     with jax.numpy_dtype_promotion("standard"):  # optax's schedules divide integers by floats
         sigma = config.sigma(state.updates) if callable(config.sigma) else config.sigma
@@ -155,7 +158,9 @@ def perturb(state: BGSState, directions: jax.Array, config: BGSConfig) -> Popula
 
 
 @partial(jax.jit, static_argnames="config")
-def tell(state: BGSState, population: Population, returns: jax.Array, config: BGSConfig) -> tuple[BGSState, BGSInfo]:
+def tell(
+    state: BGSState, population: Population, returns: Float[Array, "..."], config: BGSConfig
+) -> tuple[BGSState, BGSInfo]:
     """One ascent step from the members' returns (2N,), each averaged over its repeats.
 
     A non-finite return marks a failed evaluation and drops its pair. When every pair failed, theta, the average and the

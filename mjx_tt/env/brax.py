@@ -92,7 +92,7 @@ class TableTennis(Env):
     def backend(self) -> str:
         return self._task.config.engine
 
-    def reset(self, rng: jax.Array) -> State:
+    def reset(self, rng: Array) -> State:
         """``rng``: one key, or keys (B,); raw ones have a last axis of their own."""
         typed = jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
         batch = rng.shape if typed else rng.shape[:-1]
@@ -115,7 +115,7 @@ class TableTennis(Env):
         metrics = {"hit": zero, "returned": zero, "episode_return": zero}
         return State(playing, flatten(history), zero, zero, metrics, {"truncation": zero})
 
-    def step(self, state: State, action: jax.Array) -> State:
+    def step(self, state: State, action: Float[Array, "*batch 8"]) -> State:
         """One control period under ``action`` (..., 8)."""
         task, playing = self._task, state.pipeline_state
         episodes, before = playing.episodes, playing.state

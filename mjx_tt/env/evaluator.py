@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
 from ballmodel.sampling import BallPool
 from ballmodel.state import BallState
@@ -33,7 +34,7 @@ class Evaluator:
     def __init__(self, simulator: Simulator, balls: BallPool, model: SimModel, randomise: tuple[Range, ...]) -> None:
         columns = self._columns = -(-COLUMNS // simulator.devices) * simulator.devices
 
-        def play(policy: Policy, key: jax.Array, pool: BallPool, thrown: BallState) -> RolloutResult:
+        def play(policy: Policy, key: PRNGKeyArray, pool: BallPool, thrown: BallState) -> RolloutResult:
             drawn = simulator.draw(key, pool, model, randomise, ROWS, columns)
             copies = jnp.repeat(policy.theta[:, None], columns // simulator.devices, axis=1)
             # Balls of a distribution do not spin: the spin of the drawn ones is the model's.
@@ -67,11 +68,11 @@ class Evaluator:
             for flat in padded.reshape(-1, ROWS * self._columns)
         ]
 
-    def compile(self, policy: Policy, key: jax.Array) -> None:
+    def compile(self, policy: Policy, key: PRNGKeyArray) -> None:
         """Compiles ``play`` for policies like this one; otherwise its first call does."""
         self._spread = self._traced.lower(*self._replicate((policy, key, *self._calls[0]))).compile()
 
-    def play(self, policy: Policy, key: jax.Array) -> RolloutResult:
+    def play(self, policy: Policy, key: PRNGKeyArray) -> RolloutResult:
         """The episodes under the key of latencies and noise, NumPy arrays (..., n); without observation statistics."""
         found = []
         for i, call in enumerate(self._calls):

@@ -1,4 +1,4 @@
-"""The task for Gymnasium: ``gymnasium.make_vec("mjx_tt/TableTennis-v0", num_envs=64)``, or ``make`` for one ball at a time.
+"""The task for Gymnasium: ``gymnasium.make_vec("mjx_tt/TableTennis-v0", num_envs=64)``, or ``make`` for single balls.
 
 Importing this module registers it; an installed package is registered by its entry point. Keyword arguments are those
 of ``mjx_tt.make``. Needs the extra ``gymnasium``.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import brax.envs
 import jax
@@ -29,7 +30,7 @@ OUTCOMES = {MISSED: "missed", HIT: "hit", RETURNED: "returned"}
 
 @dataclass(frozen=True)
 class PlayedEpisodes:
-    """What n episodes gave: NumPy arrays with the episode as first axis, in the order of the balls' arrival.
+    """Results of n episodes: NumPy arrays with the episode as first axis, in the order of the balls' arrival.
 
     terms          reward term by name, (n,) each, unweighted (``rewards.TERMS``)
     returns        (n,) weighted sum; NaN where the episode was not finite
@@ -74,14 +75,14 @@ class Rollout:
         start = np.concatenate([np.asarray(balls.state.position), np.asarray(balls.state.velocity)])
         return PlayedEpisodes(
             terms=dict(zip(rewards.TERMS, result.terms, strict=True)),
-            returns=result.returns,
+            returns=np.asarray(result.returns),
             outcome=np.array([OUTCOMES[i] for i in sorted(OUTCOMES)])[result.outcome],
-            landing=result.landing.T,
+            landing=np.asarray(result.landing).T,
             incoming=np.asarray(balls.landing).T[order],
             ball=start.T[order],
-            seconds=result.steps * self.simulator.config.period,
-            peak_velocity=result.peak_velocity.T,
-            finite=result.finite,
+            seconds=np.asarray(result.steps) * self.simulator.config.period,
+            peak_velocity=np.asarray(result.peak_velocity).T,
+            finite=np.asarray(result.finite),
         )
 
 
@@ -113,7 +114,7 @@ def load_policy(path: str | os.PathLike) -> Policy:
 
     Raises ArtefactError, OSError or ValueError saying what is wrong with it.
     """
-    return artefact.load(path).policy.astype(np.float32) if os.path.isdir(path) else Policy.load(path)
+    return artefact.load(Path(path)).policy.astype(np.float32) if os.path.isdir(path) else Policy.load(path)
 
 
 def _distribution(balls: Balls) -> BallDistribution:

@@ -45,7 +45,8 @@ def state_transition(
     """Term 1, in [0, 5]: nearing the ball up to 3, hit 3, over the net 3.5, on the human's half 4, plus up to 1 more.
 
     closest [m]: least distance of ball and blade centre; landing [m]: where the outgoing ball came down to the
-    table's height (anywhere). After a hit, coming down near the target is worth up to 0.5, and up to 1 once the ball lands on the human's half.
+    table's height (anywhere). After a hit, coming down near the target is worth up to 0.5, and up to 1 once the ball
+    lands on the human's half.
     """
     distance = jnp.hypot(landing[0] - TARGET[0], landing[1] - TARGET[1])
     near = jnp.exp(-distance / TARGET_RANGE)

@@ -25,6 +25,7 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from ballmodel.partial_params import optional, value_or
@@ -111,7 +112,7 @@ class DriveState:
     output: Float[Array, "8 *batch"] | None  # [m], [rad] position behind the play
 
 
-def by_effect(params: DriveParams | None, shape: tuple[int, ...], dtype: jnp.dtype) -> Drives:
+def by_effect(params: DriveParams | None, shape: tuple[int, ...], dtype: DTypeLike) -> Drives:
     """The drives' numbers as arrays (8, *shape)."""
     nominal = dataclasses.asdict(JointDrive())
 

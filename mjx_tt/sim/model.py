@@ -129,7 +129,7 @@ class ModelFile:
         return from_dict(data or {}, str(path))
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes every parameter, the ranges and the provenance, whole or not at all. Drives only if the model has them."""
+        """Writes parameters, ranges and provenance, whole or not at all. Drives only if the model has them."""
         tree: dict = {}
         for name, value in paths(self.model).items():
             if name.startswith("drives.") and self.model.drives is None:

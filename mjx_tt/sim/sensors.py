@@ -89,4 +89,4 @@ def smoothed(
     that goes straight from ``before`` to ``after`` (3, ...) within the substep."""
     tau = row(jnp.maximum(time_constant, SHORTEST))
     behind = (after - before) * (tau / timestep)  # by which f follows a steady p
-    return after - behind + (filtered - before + behind) * jnp.exp(-timestep / tau)
+    return jnp.asarray(after) - behind + (filtered - before + behind) * jnp.exp(-timestep / tau)
