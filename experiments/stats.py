@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
@@ -26,7 +30,8 @@ def t_interval(values: ArrayLike) -> tuple[float, float, float]:
     mean = float(values.mean())
     if not values.std():
         return mean, mean, mean
-    interval = stats.ttest_1samp(values, 0.0).confidence_interval()
+    with _nearly_equal_values():
+        interval = stats.ttest_1samp(values, 0.0).confidence_interval()
     return mean, float(interval.low), float(interval.high)
 
 
@@ -36,7 +41,8 @@ def welch_interval(a: ArrayLike, b: ArrayLike) -> tuple[float, float, float]:
     difference = float(b.mean() - a.mean())
     if not a.std() and not b.std():
         return difference, difference, difference
-    interval = stats.ttest_ind(b, a, equal_var=False).confidence_interval()
+    with _nearly_equal_values():
+        interval = stats.ttest_ind(b, a, equal_var=False).confidence_interval()
     return difference, float(interval.low), float(interval.high)
 
 
@@ -45,7 +51,8 @@ def welch_p(a: ArrayLike, b: ArrayLike) -> float:
     a, b = np.asarray(a, float), np.asarray(b, float)
     if not a.std() and not b.std():
         return float(a.mean() == b.mean())
-    return float(stats.ttest_ind(a, b, equal_var=False).pvalue)
+    with _nearly_equal_values():
+        return float(stats.ttest_ind(a, b, equal_var=False).pvalue)
 
 
 def sign_flip(differences: ArrayLike, key: int = 0) -> float:
@@ -62,11 +69,19 @@ def sign_flip(differences: ArrayLike, key: int = 0) -> float:
     return float(found.pvalue)
 
 
-def holm(p: ArrayLike) -> list[float]:
+def holm(p: Iterable[float]) -> list[float]:
     """p-values adjusted for their number: one family in twenty has a false one below 0.05 (Holm 1979)."""
-    p = np.asarray(p, float)
+    p = np.asarray(list(p), float)
     order = np.argsort(p)
     adjusted = np.maximum.accumulate((p.size - np.arange(p.size)) * p[order])
     out = np.empty(p.size)
     out[order] = np.minimum(adjusted, 1.0)
     return out.tolist()
+
+
+@contextmanager
+def _nearly_equal_values() -> Iterator[None]:
+    """Without SciPy's warning that their t is imprecise: intervals and p are as good as those of equal values."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Precision loss", RuntimeWarning)
+        yield
