@@ -21,7 +21,8 @@ def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
     if len(parts) == 1:
         return parts[0]
     kinds = ", ".join(
-        f"{path}: {'trajectories' if isinstance(p, Dataset) else 'states'}" for path, p in zip(paths, parts)
+        f"{path}: {'trajectories' if isinstance(p, Dataset) else 'states'}"
+        for path, p in zip(paths, parts, strict=False)
     )
     raise ConfigError(f"several files must all hold trajectories ({kinds}); fit the others one by one")
 
@@ -32,5 +33,5 @@ def write_csv(path: Path, dataset: Dataset) -> None:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for trajectory in dataset:
-            rows = zip(trajectory.time, *trajectory.position)
+            rows = zip(trajectory.time, *trajectory.position, strict=False)
             writer.writerows((trajectory.session, trajectory.name, *(repr(float(v)) for v in row)) for row in rows)

@@ -90,7 +90,7 @@ def say(text: str) -> None:
 
 
 def leave(status: int) -> NoReturn:
-    """Ends the process; after a Ctrl-C in a computation without JAX's own end, which then crashes: its threads go on."""
+    """Ends the process; after a Ctrl-C in a computation without JAX's own end, which would crash in its threads."""
     sys.stdout.flush()
     sys.stderr.flush()
     if _interrupted.is_set():

@@ -36,7 +36,7 @@ def t_interval(values: ArrayLike) -> tuple[float, float, float]:
 
 
 def welch_interval(a: ArrayLike, b: ArrayLike) -> tuple[float, float, float]:
-    """Mean of b minus mean of a with Welch's 95 % interval (Welch 1947), for independent samples of different spread."""
+    """Mean of b minus mean of a with Welch's 95 % interval (1947), for independent samples of different spread."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     difference = float(b.mean() - a.mean())
     if not a.std() and not b.std():

@@ -49,12 +49,12 @@ class Arena:
         """Every ball of ``balls`` (``draw_balls``) once; NumPy arrays (..., R, P)."""
         chunks = _chunks(balls)
         keys = jax.random.split(key, len(chunks))
-        parts = [jax.tree.map(np.asarray, self._play(controller, *given)) for given in zip(chunks, keys)]
+        parts = [jax.tree.map(np.asarray, self._play(controller, *given)) for given in zip(chunks, keys, strict=False)]
         episodes = [replace(part, observation_sums=0.0, observation_counts=0) for part in parts]
         return jax.tree.map(lambda *x: np.concatenate(x, axis=-2) if np.ndim(x[0]) else x[0], *episodes)
 
     def action_change(self, controller: Controller, balls: BallPool, key) -> float:
-        """Mean square of the change of an action, each velocity relative to its limit, from one control step to the next."""
+        """Mean square change of an action between control steps, each velocity relative to its limit."""
         return float(self._restless(controller, _chunks(balls)[0], key))
 
     def _draw(self, balls: BallPool, key) -> Episodes:

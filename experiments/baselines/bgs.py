@@ -1,4 +1,4 @@
-"""Blackbox Gradient Sensing and ARS: the strategies of ``bgs`` on the compiled update of ``experiments.training.update``."""
+"""Blackbox Gradient Sensing and ARS: the strategies of ``bgs`` on the compiled update of training."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def prepare(comparison: Comparison, config: Config, where: str, out: Path, conso
 
 
 def unfinished(common: Common) -> dict[str, list[int]]:
-    """Per algorithm the seeds that lack training or evaluation. Raises RunError for a training under other conditions."""
+    """Per algorithm the seeds without training or evaluation. Raises RunError for a training under other conditions."""
     seeds = common.comparison.seeds
     return {name: [k for k in seeds if not _finished(common, name, k)] for name in common.comparison.algorithms}
 

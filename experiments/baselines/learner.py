@@ -16,7 +16,7 @@ from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis, flatten
 from mjx_tt.env.task import Controller
 from robot_io.contract import HISTORY, N_OBSERVATION
 
-# Sums over the episodes that ended within a call of ``advance``, each a scalar on the device; "steps" counts control steps.
+# Sums over the episodes that ended within a call of ``advance``, scalars on the device; "steps": control steps.
 MEASURED = ("episodes", "steps", "hit", "returned", "episode_return")
 
 

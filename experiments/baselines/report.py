@@ -40,7 +40,7 @@ def write(folder: Path, comparison: Comparison) -> None:
         name: {seed: _run(folder / name / f"seed{seed}") for seed in comparison.seeds} for name in comparison.algorithms
     }
     summary = {name: _summary(seeds) for name, seeds in found.items()}
-    colours = dict(zip(found, COLOURS * (1 + len(found) // len(COLOURS))))
+    colours = dict(zip(found, COLOURS * (1 + len(found) // len(COLOURS)), strict=False))
     run_dir.write_json(folder / "comparison.json", {"name": comparison.name, "algorithms": summary})
     _write_curves(folder / "curves.csv", found)
     with plt.rc_context(STYLE):
@@ -71,7 +71,9 @@ def _summary(seeds: dict[int, dict[str, Any]]) -> dict[str, Any]:
     worlds = {}
     for world in WORLDS:
         parts = [run[world] for run in seeds.values()]
-        balls, returned = (sum(count) for count in zip(*((p["episodes"], p["outcomes"]["returned"]) for p in parts)))
+        balls, returned = (
+            sum(count) for count in zip(*((p["episodes"], p["outcomes"]["returned"]) for p in parts), strict=False)
+        )
         low, high = wilson(returned, balls)
         worlds[world] = {
             "return_rate": returned / balls,
@@ -105,8 +107,8 @@ def _curves(found, colours, clock: str) -> Figure:
     """Rates and mean return against episodes and against training time."""
     figure, grid = plt.subplots(3, 2, figsize=(11, 9), sharex="col", sharey="row")
     measures = {"return_rate": "returned", "hit_rate": "touched", "mean_return": "mean return"}
-    for row, (measure, label) in zip(grid, measures.items()):
-        for axes, x in zip(row, ("episodes", "seconds" if clock == "wall" else "cpu_seconds")):
+    for row, (measure, label) in zip(grid, measures.items(), strict=False):
+        for axes, x in zip(row, ("episodes", "seconds" if clock == "wall" else "cpu_seconds"), strict=False):
             for name, seeds in found.items():
                 for i, run in enumerate(seeds.values()):
                     # A logarithmic axis has no place for the evaluation before any episode.
@@ -147,9 +149,9 @@ def _bars(axes, summary, colours, value: Callable[[dict[str, Any]], float]) -> n
 
 def _transfer(summary, colours) -> Figure:
     figure, row = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True)
-    for axes, (world, title) in zip(row, WORLDS.items()):
-        place = _bars(axes, summary, colours, lambda part: part[world]["return_rate"])
-        for at, part in zip(place, summary.values()):
+    for axes, (world, title) in zip(row, WORLDS.items(), strict=False):
+        place = _bars(axes, summary, colours, lambda part, world=world: part[world]["return_rate"])
+        for at, part in zip(place, summary.values(), strict=False):
             found = part[world]
             rate, below = found["return_rate"], found["return_rate"] - found["low"]
             axes.errorbar(at, rate, [[below], [found["high"] - rate]], color=INK, capsize=4)
@@ -170,8 +172,8 @@ def _transfer(summary, colours) -> Figure:
 
 def _restlessness(summary, colours) -> Figure:
     figure, row = plt.subplots(1, len(RESTLESSNESS), figsize=(3.2 * len(RESTLESSNESS), 3.6))
-    for axes, (key, title) in zip(row, RESTLESSNESS.items()):
-        _bars(axes, summary, colours, lambda part: part["restlessness"][key] or 0.0)
+    for axes, (key, title) in zip(row, RESTLESSNESS.items(), strict=False):
+        _bars(axes, summary, colours, lambda part, key=key: part["restlessness"][key] or 0.0)
         axes.set_title(title, fontsize=9)
         axes.tick_params(axis="x", labelrotation=45)
     row[0].set_yscale("log")  # from one algorithm to another by orders of magnitude
@@ -190,8 +192,8 @@ def _page(comparison: Comparison, summary: dict[str, Any]) -> str:
         f"# {comparison.name}: {', '.join(summary)}",
         "",
         f"Seed{'s' * several} {', '.join(map(str, comparison.seeds))}; each training at most {' or '.join(limits)}.",
-        "Rates with the 95 % interval (Wilson) of the balls of all seeds together. It does not hold the spread between seeds: "
-        + ("their range stands in brackets." if several else "with one seed nothing tells it."),
+        "Rates with the 95 % interval (Wilson) of the balls of all seeds together. It does not hold the spread between "
+        "seeds: " + ("their range stands in brackets." if several else "with one seed nothing tells it."),
         "",
         "| | episodes | seconds | processor s | touched | returned | in reality | mean return |",
         "|---|---|---|---|---|---|---|---|",

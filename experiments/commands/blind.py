@@ -24,7 +24,8 @@ app = command(
   mjx-tt blind sheet anna-evaluates                                how many rallies count so far
   mjx-tt blind open anna-evaluates                                 when all are played: which was which, and the means
 
-The key is sealed in FOLDER/key.sealed; it opens when every code has 50 rallies that count. docs/how-to/evaluate-blind.md.
+The key is sealed in FOLDER/key.sealed; it opens when every code has 50 rallies that count.
+docs/how-to/evaluate-blind.md.
 """,
 )
 

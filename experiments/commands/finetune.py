@@ -19,6 +19,7 @@ from experiments.commands.options import (
     writable,
 )
 from experiments.commands.run import Backend, Distribution
+from experiments.runs.locate import find_policy
 
 app = command(
     "finetune",
@@ -31,7 +32,6 @@ app = command(
 Every ball is on disk before the next begins: the same command continues after an interruption, a crash or a power cut.
 """,
 )
-from experiments.runs.locate import find_policy
 
 
 @app.default

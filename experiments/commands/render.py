@@ -22,6 +22,7 @@ from experiments.commands.options import (
     suffix,
 )
 from experiments.errors import checked
+from experiments.runs.locate import find_policy
 
 app = command(
     "render",
@@ -38,7 +39,6 @@ curves_app = command(
   mjx-tt curves runs/quickstart runs/paper --out curves.png
 """,
 )
-from experiments.runs.locate import find_policy
 
 
 @app.default

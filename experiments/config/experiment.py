@@ -48,9 +48,7 @@ Scale = Annotated[
 ]
 Average = Annotated[
     Decay,
-    Field(
-        description="Decay per update of the moving average of the parameters, which is evaluated and exported; 0: none."
-    ),
+    Field(description="Decay per update of the moving average of the parameters, which is exported; 0: none."),
 ]
 
 

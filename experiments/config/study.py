@@ -71,7 +71,7 @@ class Simulation(Section):
 
 
 class Reality(Section):
-    """The virtual reality: its effects that training does not know (``target_domain.hidden_effects``), drawn per seed."""
+    """The virtual reality: effects that training does not know (``target_domain.hidden_effects``), drawn per seed."""
 
     without: list[Literal[EFFECTS]] = []
     """Effects that are left out: there, reality is what training believes."""

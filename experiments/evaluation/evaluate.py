@@ -137,6 +137,6 @@ def selection_score(result: RolloutResult) -> float:
 
 
 def sparse_reward(outcome, fault) -> float:
-    """The paper's reward for choosing a seed: +1 hit, +1 landed on the human's side, -2 fault; mean over the episodes."""
+    """The paper's reward for choosing a seed: +1 hit, +1 landed on the human's side, -2 fault; mean over episodes."""
     score = (outcome != MISSED).astype(float) + (outcome == RETURNED)
     return float(np.mean(np.where(fault, -2.0, score)))

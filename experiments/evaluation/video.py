@@ -50,6 +50,6 @@ def draw(path: Path, episodes: list[tuple[np.ndarray, np.ndarray]], rate: float,
         return path
     pause = round(PAUSE * rate)
     parts = [tuple(np.concatenate([a, np.repeat(a[-1:], pause, axis=0)]) for a in episode) for episode in episodes]
-    qpos, ball = (np.concatenate(part) for part in zip(*parts))
+    qpos, ball = (np.concatenate(part) for part in zip(*parts, strict=True))
     rendering.render_video(path, qpos, ball, rate, camera, SIZE)
     return path

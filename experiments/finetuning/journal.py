@@ -1,6 +1,6 @@
 """The journal of fine-tuning: one JSON line per episode, on the disk before the next ball is played.
 
-Everything but the order of the lines is in the lines: parameters, curves and the human's balls can be made from them again.
+Everything but their order is in the lines: parameters, curves and the human's balls can be made from them again.
 """
 
 from __future__ import annotations

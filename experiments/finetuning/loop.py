@@ -1,6 +1,6 @@
 """Fine-tuning on a robot: Blackbox Gradient Sensing with one ball at a time, which nothing interrupts for good.
 
-Every episode is on the disk before the next begins (``finetune_journal``), every update ends with a checkpoint. A run that
+Every episode is on the disk before the next begins (``journal``), every update ends with a checkpoint. A run that
 was killed continues with the same perturbations and ends, on a robot that repeats itself, in the same parameters bit
 for bit. The run's folder is a run like those of training: it can be evaluated, exported and trained from.
 """
@@ -103,7 +103,7 @@ def experiment_of(source: str | Path, balls: str | None = None) -> Experiment:
     return build.experiment(trained.config.model_copy(update=changed), str(source))
 
 
-def lock_step_robot(experiment: Experiment, params: RigParams = RigParams(), seed: int = 0) -> LockStepRobot:
+def lock_step_robot(experiment: Experiment, params: RigParams | None = None, seed: int = 0) -> LockStepRobot:
     """The emulated robot with balls of the experiment's distribution; ``seed`` draws them."""
     pool = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), LOCK_STEP_BALLS)
     return LockStepRobot(thrown(pool.state), params)
@@ -135,7 +135,7 @@ class Session:
     ) -> None:
         self._settings, self._run, self._robot, self._operator = settings, run, robot, operator
         self._bgs = build.bgs_config(settings.optimiser(), settings.updates)
-        self._weights = dict(zip(rewards.TERMS, build.reward_weights(settings.rewards)))
+        self._weights = dict(zip(rewards.TERMS, build.reward_weights(settings.rewards), strict=False))
         found = checkpoint.load_latest(run.checkpoints, first)
         self.state, notes = found or (first, {"update": 0, "seconds": 0.0})
         self.update, self._seconds = notes["update"], notes["seconds"]
@@ -281,7 +281,7 @@ def _order(pairs: int) -> list[int]:
 def _open(run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, first: TrainState, source: str) -> None:
     """Records what the run is, or checks that it is the one that is asked for. Raises RunError naming differences.
 
-    Before the first ball there is nothing to protect: a start that failed must not stand in the way of the corrected one.
+    Before the first ball there is nothing to protect: a failed start must not stand in the way of the corrected one.
     """
     path, journal = run.folder / SETTINGS, run.folder / JOURNAL
     wanted = {

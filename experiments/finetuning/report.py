@@ -122,7 +122,7 @@ def print_result(console: Console, result: dict[str, Any], title: str) -> None:
 
 
 def write_human_balls(path: Path, session: str, entries: list[Entry]) -> int:
-    """Writes the measured balls as ``session,trajectory,t,x,y,z`` (docs/reference/measured-balls.md); returns their number."""
+    """Writes the measured balls as CSV (docs/reference/measured-balls.md); returns their number."""
     count = 0
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -181,7 +181,7 @@ def _figure(entries: list[Entry], result: dict[str, Any], title: str) -> Figure:
         ):
             lower.plot(updates, smooth(column[name]), color=colour, label=label, linewidth=1.5)
     ends = (0, result["updates"] + 1)
-    for at, name in zip(ends, (BEFORE, AFTER)):
+    for at, name in zip(ends, (BEFORE, AFTER), strict=False):
         e = result[name]
         bars = [[e["mean_return"] - e["low"]], [e["high"] - e["mean_return"]]]
         label = f"evaluated policy, {e['balls']} balls, 95 %" if name == BEFORE else None

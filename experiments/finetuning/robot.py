@@ -86,9 +86,9 @@ class LockStepRobot:
 
     repeatable = True
 
-    def __init__(self, throws: Throws, params: RigParams = RigParams(), scene: str | Path = SCENE) -> None:
-        self._throws, self._params, self._scene = throws, params, scene
-        self._world = World(scene, params.world)
+    def __init__(self, throws: Throws, params: RigParams | None = None, scene: str | Path = SCENE) -> None:
+        self._throws, self._params, self._scene = throws, params or RigParams(), scene
+        self._world = World(scene, self._params.world)
 
     def play(self, policy: Policy, episode_number: int) -> PlayedBall:
         balls = BallRecorder()

@@ -9,7 +9,7 @@ import platform
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -161,7 +161,7 @@ def digest(config: Config) -> str:
 def provenance() -> dict[str, Any]:
     """When, with which versions and from which commit: plain data."""
     return {
-        "started": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
         "versions": {name: _version(name) for name in _PACKAGES},
@@ -210,7 +210,7 @@ def _changeable(key: str) -> bool:
 def differences(
     found: dict[str, Any], wanted: dict[str, Any], changeable: Callable[[str], bool], owner: str = "run"
 ) -> str:
-    """A line for every key, by dotted path, that may not change and did: what the ``owner`` has and what is wanted now."""
+    """A line for every dotted key that may not change and did: what the ``owner`` has and what is wanted now."""
     theirs, ours = _flat(found), _flat(wanted)
     return "\n".join(
         f"  {key}: the {owner} has {theirs.get(key)!r}, now {ours.get(key)!r}"

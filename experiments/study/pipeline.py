@@ -1,8 +1,8 @@
 """Simulate, play, refine: the iterative loop of the paper with its baselines, as a resumable list of steps.
 
-For every seed and player: balls without a robot, a human model, training in simulation, fine-tuning in reality while the
-player's balls are measured, the next human model, and so on; then rallies of all models, and the report. Reality is a
-virtual one (``experiments.study.target_domain.finetuning``) or a robot with its operator (``experiments.study.target_domain.on_robot``).
+For every seed and player: balls without a robot, a human model, training in simulation, fine-tuning in reality while
+the player's balls are measured, the next human model, and so on; then rallies of all models, and the report. Reality is
+a virtual one (``target_domain.finetuning``) or a robot with its operator (``target_domain.on_robot``).
 """
 
 from __future__ import annotations

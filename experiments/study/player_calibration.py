@@ -1,6 +1,7 @@
 """How near the virtual players come to the paper's people: target against reached, as tables and a picture.
 
-    python -m experiments.study.player_calibration --first runs/player3_m0 --later runs/player3_m2 runs/medium --out calibration
+    python -m experiments.study.player_calibration --first runs/player3_m0 --later runs/player3_m2 runs/medium \\
+        --out calibration
 
 First balls are compared with M0 and rally balls with M1 and M2, each through the path of real data: seen by cameras at
 125 Hz with noise, fitted, cleaned by DBSCAN, minima and maxima taken. The rallies of D1 are those with the policies
@@ -284,7 +285,7 @@ def picture(path: Path, rows: list[dict], lengths: list[dict]) -> None:
     names, coordinates = list(dict.fromkeys(r["player"] for r in rows)), [n.removesuffix(" min") for n in NUMBERS[::2]]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(3, 3, figsize=(12.5, 9.5), layout="constrained")
-        for axis, coordinate in zip(axes.flat, coordinates):
+        for axis, coordinate in zip(axes.flat, coordinates, strict=False):
             for p, name in enumerate(names):
                 for m, model in enumerate(ROUNDS):
                     chosen = [r for r in rows if r["player"] == name and r["model"] == model]

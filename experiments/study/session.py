@@ -1,4 +1,4 @@
-"""One session of a study: looks up what it names, checks that the folder is its own, and does the steps that are left."""
+"""One session of a study: looks up what it names, checks that the folder is its own, does the remaining steps."""
 
 from __future__ import annotations
 

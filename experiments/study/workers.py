@@ -133,7 +133,7 @@ def _sigterm_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-# -- in a worker -----------------------------------------------------------------------------------------------------------
+# -- in a worker ----------------------------------------------------------------------------------------------------
 
 _steps: dict[str, Step] = {}  # of this worker's study, by name
 _stopping = None  # event: no further step is to begin

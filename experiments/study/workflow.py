@@ -1,8 +1,8 @@
 """A study as a list of named steps: what is done is marked, what was killed begins again, what is left is estimated.
 
 A step is done when the journal says so, what it made is there, and the steps whose files it read were done before it.
-Steps write their files whole (or resume by themselves, as trainings do), and each draws its own keys from its name, so a
-study killed at any moment ends as one that was left alone.
+Steps write their files whole (or resume by themselves, as trainings do), and each draws its own keys from its name, so
+a study killed at any moment ends as one that was left alone.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Step:
 
 
 class Journal:
-    """The steps that were done, in the order of their ends: one JSON line each, on the disk before the next step begins.
+    """The finished steps in the order of their ends: one JSON line each, on the disk before the next step begins.
 
     Raises RunError for a line, other than an unfinished last one, that is no entry.
     """

@@ -45,7 +45,8 @@ def train(experiment: Experiment, run: Run, console: Console) -> str:
         except OSError as error:  # of the measurements; checkpoints raise their own
             raise RunError(
                 f"{error.filename or run.metrics}: cannot be written: {error.strerror or error}; "
-                "the last checkpoint is whole. Make room or repair the folder, then run the same command again to continue"
+                "the last checkpoint is whole. Make room or repair the folder, then run the same command again to "
+                "continue"
             ) from error
 
 

@@ -1,7 +1,7 @@
 """One update of Blackbox Gradient Sensing on the simulator, compiled as a whole.
 
-Nothing crosses to the host inside an update: directions, balls, rollouts, the step and the merged observation statistics
-are one compiled call from a ``TrainState`` to the next.
+Nothing crosses to the host inside an update: directions, balls, rollouts, the step and the merged observation
+statistics are one compiled call from a ``TrainState`` to the next.
 """
 
 from __future__ import annotations

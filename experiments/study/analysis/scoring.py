@@ -137,7 +137,7 @@ def write(path: Path, rallies: Rallies) -> None:
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
-        writer.writerows(zip(*columns))
+        writer.writerows(zip(*columns, strict=True))
 
 
 def read(path: Path) -> Rallies:

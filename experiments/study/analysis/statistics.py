@@ -127,7 +127,7 @@ def cells(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
     """The values by seed, trainer, evaluator and model."""
     groups: dict[Cell, list[int]] = {}
     columns = (getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model"))
-    for i, cell in enumerate(zip(*columns)):
+    for i, cell in enumerate(zip(*columns, strict=True)):
         groups.setdefault(cell, []).append(i)
     return {cell: values[index] for cell, index in groups.items()}
 
@@ -152,7 +152,9 @@ def normalised_by_model(rallies: Rallies) -> np.ndarray:
 
 def _standardised(rallies: Rallies, group: Callable[[Cell], tuple], own_only: bool = False) -> np.ndarray:
     length = rallies.length.astype(float)
-    columns = zip(*(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")))
+    columns = zip(
+        *(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")), strict=False
+    )
     names = [group(cell) for cell in columns]
     out, own = np.full(length.size, np.nan), rallies.own
     index: dict[tuple, list[int]] = {}
@@ -202,7 +204,7 @@ def difference(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bo
     if not pairs or min(min(x.size, y.size) for x, y in pairs) < 2:
         return None
     both = boot.pair(a, b, trainers, own)
-    first, second = (np.concatenate(side) for side in zip(*pairs))
+    first, second = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return Difference(
         (both[0] - both[1]).interval,
         Interval(*welch_interval(second, first), first.size + second.size),

@@ -86,12 +86,12 @@ def aggregated(study: Study, m: Measurements) -> Figure | None:
 def _histogram(axes: Axes, m: Measurements) -> None:
     edges = np.array([2, *range(5, LONGEST + 1, 5), LONGEST + 1])
     shown = ("is2r-ft100", "s2r-ft100")
-    for key, offset in zip(shown, (-0.21, 0.21)):
+    for key, offset in zip(shown, (-0.21, 0.21), strict=False):
         values = lengths(m.raw, key, "all")
         if values.size:
             share = np.histogram(np.clip(values, edges[0], LONGEST), edges)[0] / values.size
             axes.bar(np.arange(share.size) + offset, 100 * share, 0.4, color=colour(key), label=SHORT[key])
-    names = [f"{a}-{b - 1}" for a, b in zip(edges[:-2], edges[1:-1])] + [f"{LONGEST}+"]
+    names = [f"{a}-{b - 1}" for a, b in zip(edges[:-2], edges[1:-1], strict=False)] + [f"{LONGEST}+"]
     axes.set_xticks(range(len(names)), names, rotation=60, fontsize=8)
     axes.set_xlabel("rally length")
     axes.set_ylabel("rallies [%]")
@@ -122,7 +122,7 @@ def by_skill(study: Study, m: Measurements) -> Figure | None:
     if not has(m.raw, FINAL):
         return None
     figure = Figure(figsize=(11, 6.8))
-    for column, (upper, lower) in zip(LEVELS, figure.subplots(2, 3).T):
+    for column, (upper, lower) in zip(LEVELS, figure.subplots(2, 3).T, strict=False):
         boxes(upper, [lengths(m.raw, key, column) for key in FINAL], FINAL, "rally length", log=True)
         upper.set_title(level_label(column))
         bars(lower, [mean_of(m.raw, key, column) for key in FINAL], FINAL, "mean rally length, 95 %")
@@ -135,8 +135,8 @@ def checkpoints(study: Study, m: Measurements, normalise: bool = False) -> Figur
     if not has(m.raw, (*TEN, *CURVES[FRESH])):
         return None
     figure = Figure(figsize=(11, 4.2))
-    for axes, name in zip(figure.subplots(1, 3), LEVELS):
-        shift = dict(zip(CURVES, (-0.06, 0.06, 0.0, -0.14)))
+    for axes, name in zip(figure.subplots(1, 3), LEVELS, strict=False):
+        shift = dict(zip(CURVES, (-0.06, 0.06, 0.0, -0.14), strict=False))
         for method, keys in CURVES.items():
             found = [(i, key, mean_of(m.raw, key, name)) for i, key in enumerate(keys) if key is not None]
             found = [(i, key, mean) for i, key, mean in found if mean is not None]
@@ -148,7 +148,7 @@ def checkpoints(study: Study, m: Measurements, normalise: bool = False) -> Figur
             axes.errorbar(
                 x, y, err, color=COLOUR[method], linestyle="--" if dashed else "-", linewidth=1.6, capsize=2.5
             )
-            for at, value, (_, key, _) in zip(x, y, found):
+            for at, value, (_, key, _) in zip(x, y, found, strict=False):
                 full = BY_KEY[key].fine_tuned
                 axes.plot(
                     at,
@@ -225,7 +225,7 @@ def cross_by_player(study: Study, m: Measurements) -> Figure | None:
     trainers = study.players
     figure = Figure(figsize=(10, 2.2 * len(trainers)))
     grid = figure.subplots(len(trainers), 2, squeeze=False)
-    for (left, right), trainer in zip(grid, trainers):
+    for (left, right), trainer in zip(grid, trainers, strict=False):
         evaluators = (trainer, *CROSS[trainer])
         for axes, boot in ((left, m.raw), (right, m.cross_normalised)):
             for i, evaluator in enumerate(evaluators):
@@ -250,7 +250,7 @@ def by_player(study: Study, m: Measurements) -> Figure | None:
         return None
     figure = Figure(figsize=(11, 2.35 * len(study.players)))
     grid = figure.subplots(len(study.players), 2, squeeze=False)
-    for row, ((left, right), player) in enumerate(zip(grid, study.players)):
+    for row, ((left, right), player) in enumerate(zip(grid, study.players, strict=False)):
         last = row == len(study.players) - 1
         bars(left, [evaluated(m.raw, player, player, key) for key in TEN], TEN, "mean, 95 %", last)
         boxes(right, [of_player(m.raw, player, key) for key in TEN], TEN, "rally length", log=True, labelled=last)

@@ -67,8 +67,8 @@ def heatmaps(study: Study, which) -> Figure | None:
     if not rows:
         return None
     figure = Figure(figsize=(9.2, 4.75 * len(rows) + 0.6))
-    for axes_row, player in zip(figure.subplots(len(rows), 2, squeeze=False), rows):
-        for axes, key in zip(axes_row, METHODS):
+    for axes_row, player in zip(figure.subplots(len(rows), 2, squeeze=False), rows, strict=False):
+        for axes, key in zip(axes_row, METHODS, strict=False):
             logs = study.logs(player, key)
             axes.set_axis_off()
             if not logs:
@@ -119,5 +119,5 @@ def _cell(value: np.ndarray, start: float, width: float) -> np.ndarray:
 
 
 def _sum(parts) -> tuple[np.ndarray, np.ndarray]:
-    counts, backs = zip(*parts)
+    counts, backs = zip(*parts, strict=True)
     return np.sum(counts, axis=0), np.sum(backs, axis=0)

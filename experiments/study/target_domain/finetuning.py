@@ -112,14 +112,14 @@ class VirtualReality:
             self.model, jax.tree.map(lambda x: x[:, finite], hits), self._study.reality.camera_noise, camera_key
         )
         rows = [
-            {"update": u + 1, **self._row(jax.tree.map(lambda x: x[u], shots))}
+            {"update": u + 1, **self._row(jax.tree.map(lambda x, u=u: x[u], shots))}
             | {name: float(getattr(info, name)[u]) for name in ("gradient_norm", "update_norm", "elite_std")}
             for u in range(updates)
         ]
         return Cycle(TrainState(state, statistics, ask_key), rows, measured.trajectories(session))
 
     def score(self, player: Player, policy: Policy, balls: int, key) -> float:
-        """The paper's sparse reward by which a seed is chosen, over at least ``balls`` balls of rallies with the player."""
+        """The paper's sparse reward by which a seed is chosen, over at least ``balls`` balls with the player."""
         turns = -(-balls // SELECTION_LANES)
         outcome, fault = self._compared(policy, player, self.known, key, turns=turns)
         return evaluate.sparse_reward(np.asarray(outcome), np.asarray(fault))

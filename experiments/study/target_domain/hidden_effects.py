@@ -1,11 +1,11 @@
-"""A virtual reality: a simulation that differs from the one in which policies are trained, in ways that training does not know.
+"""A virtual reality: a simulation that differs from that of training in ways that training does not know.
 
 Each effect moves a few parameters of ``SimModel`` to values drawn from a range around what a laboratory may have; an
 effect that is left out keeps what training believes. The draw depends on the seed and on the parameter's name only, so
 leaving out one effect changes no other. Balls spin as the player hits them; training believes that none does.
 
-What was drawn is sealed (``experiments.study.blind.protocol``) when a study begins and opened when it is over. The learner gets measured
-balls and rewards.
+What was drawn is sealed (``study.blind.protocol``) when a study begins and opened when it is over. The learner gets
+measured balls and rewards.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _ENCODERS = {
     f"drives.{name}.joint_offset": (-0.006, 0.006) if i in FESTO_JOINTS else (-0.012, 0.012)  # [m], [rad]
     for i, name in enumerate(JOINT_NAMES)
 }
-# Training believes: rubber 0.917 and gain 0.68 of one make, table 0.93 and 0.25, no lift, the paper's latencies, no bias.
+# Training believes: rubber 0.917, gain 0.68 of one make, table 0.93 and 0.25, no lift, the paper's latencies, no bias.
 # The ranges are estimates: other rubbers and their wear, tables within ITTF's rule (a bounce of 23 cm from 30 cm,
 # restitution 0.876), lift coefficients from 0.3 to 1.5 in the literature, calibration within a centimetre or so.
 RANGES: dict[str, dict[str, tuple[float, float]]] = {
@@ -151,7 +151,7 @@ def _fly(params: BallParams, state: BallState, frames: int):
 
 
 def measure(model: SimModel, balls: BallState, noise: float, key) -> Measured:
-    """What the reality's cameras see of balls (3, n) from the player's contact on: its physics, calibration and noise [m]."""
+    """Balls (3, n) as the reality's cameras see them from the player's contact on: physics, calibration, noise [m]."""
     n = balls.position.shape[1]
     padded = jax.tree.map(lambda x: jnp.pad(jnp.asarray(x, jnp.float32), ((0, 0), (0, -n % 256)), mode="edge"), balls)
     positions, length = _fly(model.ball, padded, round(_LONGEST * CAMERA_RATE))

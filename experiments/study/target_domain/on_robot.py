@@ -1,4 +1,4 @@
-"""A study on a robot: the loop waits for its operator, who fine-tunes with ``mjx-tt finetune`` and counts rallies blindly.
+"""A study on a robot: the loop waits for its operator, who fine-tunes by ``mjx-tt finetune``, counts rallies blindly.
 
 A step that people do is started here with the same code as the command of its own, and goes on where it was left. What
 they have not finished ends the program with a sentence that says what to do; the same command then continues the study.
