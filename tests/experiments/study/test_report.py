@@ -312,7 +312,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(whole):
         image = Image.open(io.BytesIO(base64.b64decode(data))).convert("L")
         assert image.width > 600 and np.asarray(image).std() > 5.0  # something is drawn
     for claim in study_paper.CLAIMS:
-        assert claim.text.replace("'", "&#x27;") in html, claim.key
+        assert claim.text.replace("'", "&#39;") in html, claim.key
     assert html.index("What was found") < html.index("Over all players")
     assert "players player5, player4, player2" in html  # what is missing is named
     assert "<td class=n>11 %</td>" in html and "reached" in html  # of the calibration
