@@ -1,4 +1,4 @@
-"""The command line as a person meets it, on a tiny experiment: one process that trains, the rest in this one."""
+"""The command line as a person meets it, on a tiny experiment."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from ballmodel.distribution import load_distribution
 from bgs import normalizer
 from experiments import cli
 from experiments.errors import RunError
+from experiments.evaluation import video
 from experiments.runs import checkpoint, load_policy
 from robot_io.policy import artefact
 from tests.support.paths import ROOT
@@ -47,13 +48,21 @@ def process(*arguments) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_videos():
+    """Without a graphics card the pixels of a video cost more than everything else."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(video, "SIZE", (160, 90))
+        yield
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """(experiment YAML, folder of runs, output) of one whole ``mjx-tt train``."""
     folder = tmp_path_factory.mktemp("cli")
     yaml = folder / "tiny.yaml"
     yaml.write_text(EXPERIMENT)
-    done = process("train", yaml, "--out", folder / "runs", "--devices", 1)
+    done = mjx_tt("train", yaml, "--out", folder / "runs", "--devices", 1)
     assert done.returncode == 0, done.stdout + done.stderr
     return yaml, folder / "runs", done.stdout
 
@@ -153,7 +162,7 @@ def test_train_into_a_folder_that_cannot_be_written(trained, tmp_path):
 
 def test_mistake_in_a_yaml_ends_with_one_line(tmp_path):
     (tmp_path / "a.yaml").write_text("name: a\nballs: narrow\ntrainin: {}\n")
-    refused = mjx_tt("train", tmp_path / "a.yaml")
+    refused = process("train", tmp_path / "a.yaml")
     assert refused.returncode == 1
     assert refused.stderr.startswith(
         f"mjx-tt: error: {tmp_path / 'a.yaml'}: trainin: unknown key; did you mean 'training'?"
