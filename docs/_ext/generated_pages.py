@@ -314,22 +314,20 @@ def api_page(package: str, described: dict[int, str]) -> str:
     }
     summary = (inspect.getdoc(module) or "").strip()
     rest = [package, "=" * len(package), "", *_as_rest(summary.splitlines()), ""]
-    if public:
-        rest += [
-            ".. autosummary::",
-            "   :nosignatures:",
-            "",
-            *(f"   {package}.{name}" for name in sorted(public) if id(public[name]) not in described),
-            "",
-        ]
-    for name in sorted(public):
+    objects = [name for name in sorted(public) if callable(public[name])]
+    own = [name for name in objects if id(public[name]) not in described]
+    if own:
+        rest += [".. autosummary::", "   :nosignatures:", "", *(f"   {package}.{name}" for name in own), ""]
+    for name in sorted(set(public) - set(objects)):
+        rest += [f".. py:data:: {package}.{name}", f"   :value: {textwrap.shorten(repr(public[name]), 160)}", ""]
+    for name in objects:
         value = public[name]
         if id(value) in described:
             rest += [f"``{package}.{name}`` is :class:`{described[id(value)]}`.", ""]
             continue
         if inspect.isclass(value):
             described[id(value)] = f"{package}.{name}"
-        kind = "class" if inspect.isclass(value) else "function" if callable(value) else "data"
+        kind = "class" if inspect.isclass(value) else "function"
         rest += [f".. auto{kind}:: {package}.{name}", *(["   :members:"] if kind == "class" else []), ""]
     return "\n".join(rest)
 
