@@ -18,8 +18,8 @@ from ballmodel.distribution import load_distribution
 from bgs import normalizer
 from experiments import cli
 from experiments.errors import RunError
-from experiments.evaluation import video
 from experiments.runs import checkpoint, load_policy
+from experiments.training import finalize
 from robot_io.policy import artefact
 from tests.support.paths import ROOT
 
@@ -49,10 +49,10 @@ def process(*arguments) -> subprocess.CompletedProcess:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def small_videos():
-    """Without a graphics card the pixels of a video cost more than everything else."""
+def short_videos():
+    """Of one episode: without a graphics card, pictures take longer than everything else."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(video, "SIZE", (160, 90))
+        patch.setattr(finalize, "EPISODES_SHOWN", 1)
         yield
 
 
