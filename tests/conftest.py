@@ -15,11 +15,23 @@ CACHE = Path(__file__).parent.parent / ".cache" / "jax"
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE)
 
 import jax  # noqa: E402 - reads the environment
+from jaxtyping import install_import_hook  # noqa: E402
+
+import tests.support.type_checker  # noqa: E402, F401 - found by its name
+
+# STRICT_ARRAYS=1: annotations of functions are checked, arrays by type and shape, in every call (of compiled functions:
+# when they are traced); numbers change their type and arrays their rank only where the code says so.
+STRICT = os.environ.get("STRICT_ARRAYS", "0") == "1"
+if STRICT:  # the hook works on modules that are imported after it
+    install_import_hook(("ballmodel", "bgs", "mjx_tt"), "tests.support.type_checker.checked")
 
 from mjx_tt import platform  # noqa: E402
 
 # Two host devices, so that splitting over devices is tested everywhere.
 platform.configure(devices=2, cache=CACHE)
+if STRICT:
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -37,7 +37,7 @@ BLADE_CAPSULES = ("col_blade_axis", "col_blade_cross")
 
 
 def segment_box_distance(
-    box: Box, p: Float[jax.Array, "3 *batch"], q: Float[jax.Array, "3 *batch"]
+    box: Box, p: Float[jax.Array | np.ndarray, "3 *batch"], q: Float[jax.Array | np.ndarray, "3 *batch"]
 ) -> Float[jax.Array, "*batch"]:
     """Distance [m] between the segment p-q, ends (3, ...), and a box; 0 where they meet."""
     d = q - p

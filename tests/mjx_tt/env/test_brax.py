@@ -47,7 +47,7 @@ def played(env, theta):
 
     def policy(observation):
         history = jnp.moveaxis(observation.reshape(B, HISTORY, N_OBSERVATION), 0, -1)
-        normalised = (history - MEAN[:, None]) * INVERSE_SCALE[:, None]
+        normalised = (history - MEAN[None, :, None]) * INVERSE_SCALE[None, :, None]
         return forward(Policy(theta, np.zeros(11), np.ones(11)), normalised, xp=jnp).T
 
     @jax.jit
