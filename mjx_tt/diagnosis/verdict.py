@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -105,6 +105,12 @@ class Expressed:
     cause: Cause
     values: dict[str, float]  # by dotted path of SimModel
     ranges: tuple[Range, ...] = ()
+
+    @classmethod
+    def by(cls, cause: Cause, parameters: Mapping[str, Estimate]) -> Expressed:
+        """A cause by estimates of parameters, which training may draw from their intervals."""
+        ranges = tuple(Range(path, e.low, e.high) for path, e in parameters.items())
+        return cls(cause, {path: e.estimate for path, e in parameters.items()}, ranges)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from mjx_tt.diagnosis.ball.diagnose import BallFindings, shaking
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
 from mjx_tt.diagnosis.ball.linearization import MAGNUS, REFERENCE_MAGNUS
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Part, Unexplained
-from mjx_tt.sim.model import Range
 
 BOOTSTRAP = 100
 LEVEL = 0.90  # of intervals
@@ -92,9 +91,8 @@ def _causes(found: BallFindings, without: Container[str], seed: int) -> tuple[li
     if shaken is not None and shaken.shift > selection.FLOOR / 2:
         jitter = BY_NAME["latency_jitter"]
         estimate = Estimate(nominal[jitter.path], shaken.seconds, shaken.low, shaken.high, jitter.unit)
-        named.append(
-            _expressed(Cause(jitter.name, (jitter.name,), 0.95, {jitter.path: estimate}, 1e3 * shaken.shift, ""))
-        )
+        cause = Cause(jitter.name, (jitter.name,), 0.95, {jitter.path: estimate}, 1e3 * shaken.shift, "")
+        named.append(Expressed.by(cause, cause.parameters))
     return named, beside
 
 
@@ -107,24 +105,18 @@ def _effect_cause(found: BallFindings, i: int, confidence: float, wide: float, w
     twins = [t for t in effect.twins if t.name not in without]
     alike = [name for r in rivals for name in (r.name, *(t.name for t in r.twins)) if name not in without]
     parameters = estimates(effect, nominal, theta, low, high)
+    # Where the nominal model has no Magnus force at all, that is the cause, whether or not the balls spin at first.
+    name = "magnus" if j == found.problem.coefficient else effect.name
     cause = Cause(
-        # The nominal model has no Magnus force at all: that is the cause, whether or not the balls spin at first.
-        "magnus" if j == found.problem.coefficient else effect.name,
-        tuple(
-            dict.fromkeys((*(["magnus"] if j == found.problem.coefficient else []), effect.name, *names(twins), *alike))
-        ),
+        name,
+        tuple(dict.fromkeys((name, effect.name, *(t.name for t in twins), *alike))),
         confidence,
         parameters | {t.path: _twin(effect, t, nominal, theta, low, high) for t in twins},
         float(1e3 * abs(theta) * found.trial.shift[j]),
         readings(effect, (*twins, *rivals)),
     )
     # Of a pair with the same pattern the extended model needs one.
-    return Expressed(cause, {p: e.estimate for p, e in parameters.items()}, ranges(parameters))
-
-
-def names(effects: Iterable[Effect | Twin]) -> tuple[str, ...]:
-    """Names of effects."""
-    return tuple(e.name for e in effects)
+    return Expressed.by(cause, parameters)
 
 
 def readings(effect: Effect, rivals: Iterable[Effect | Twin]) -> str:
@@ -140,15 +132,6 @@ def estimates(effect: Effect, nominal: Values, theta: float, low: float, high: f
         first, last = sorted(float(effect.values(nominal, end)[path]) for end in (low, high))
         out[path] = Estimate(nominal[path], float(value), first, last, effect.path_unit or effect.unit)
     return out
-
-
-def ranges(parameters: dict[str, Estimate]) -> tuple[Range, ...]:
-    """Intervals of parameters, from which training may draw them."""
-    return tuple(Range(path, e.low, e.high) for path, e in parameters.items())
-
-
-def _expressed(cause: Cause) -> Expressed:
-    return Expressed(cause, {path: e.estimate for path, e in cause.parameters.items()}, ranges(cause.parameters))
 
 
 def _twin(effect: Effect, twin: Twin, nominal: Values, theta: float, low: float, high: float) -> Estimate:
@@ -173,11 +156,9 @@ def _standing_in(named: Expressed, without: Container[str]) -> Expressed:
     others = [name for name in cause.group if name not in (effect.name, twin.name)]
     text = cause.separating_measurement.removeprefix(f"{effect.name}: {effect.reading}; ") if others else ""
     parameters = {path: p for path, p in cause.parameters.items() if path != effect.path}
-    estimate = cause.parameters[twin.path]
-    return Expressed(
+    return Expressed.by(
         replace(cause, name=twin.name, group=(twin.name, *others), parameters=parameters, separating_measurement=text),
-        {twin.path: estimate.estimate},
-        ranges({twin.path: estimate}),
+        {twin.path: cause.parameters[twin.path]},
     )
 
 
@@ -189,12 +170,10 @@ def _spin_cause(found: BallFindings, confidence: float, wide: float) -> Expresse
         raise ValueError("the chosen causes hold no spin")
     error = np.sqrt(np.diagonal(scores.sandwich(rated, [*choice.effects, *rated.always])))
     parameters: dict[str, Estimate] = {}
-    drawn: tuple[Range, ...] = ()
     if problem.coefficient is not None:
         k, half = float(found.situation.theta[problem.coefficient]), float(error[-1]) * wide
         low, high = (max(k - half, 0.0), k + half) if half < 0.5 * REFERENCE_MAGNUS else (0.3, 1.5)
         parameters[MAGNUS] = Estimate(problem.nominal[MAGNUS], k, low, high, "1")
-        drawn = ranges(parameters)
     own = error[len(choice.effects) : len(choice.effects) + 3]
     for axis, mean, std, e in zip("xyz", prior.mean, prior.std, own, strict=True):
         half = wide * std / np.sqrt(2.0 * problem.grid.n)
@@ -207,7 +186,8 @@ def _spin_cause(found: BallFindings, confidence: float, wide: float) -> Expresse
     rms = float(np.sqrt(np.sum(prior.std**2 + prior.mean**2)))
     text = "in flight only the product of coefficient and spin shows: " + BY_NAME["magnus"].reading
     cause = Cause("magnus", ("magnus",), confidence, parameters, float(1e3 * rms * found.trial.spin_shift), text)
-    return Expressed(cause, {path: e.estimate for path, e in parameters.items()}, drawn)
+    coefficient = {path: e for path, e in parameters.items() if path == MAGNUS}  # the spins are a distribution already
+    return replace(Expressed.by(cause, parameters), ranges=Expressed.by(cause, coefficient).ranges)
 
 
 def _confidence(found: BallFindings, seed: int) -> list[float]:

@@ -197,7 +197,7 @@ def _fly(
     blades = tuple(jax.tree.map(lambda x, part=part: x[part], paddle) for part in ends)
     (_, _, _, bounced, at, incoming, struck), (x, v, y) = jax.lax.scan(advance, carry, (steps, *blades))
 
-    def sampled(first: Array, later: Array) -> Array:
+    def sampled(first: Array | np.ndarray, later: Array) -> Array:
         at_steps = jnp.moveaxis(jnp.concatenate([first[None], later]), 0, 1)  # (3, L + 1, ...)
         return jnp.take_along_axis(at_steps, index[None], axis=1)
 

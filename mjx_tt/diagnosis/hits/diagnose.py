@@ -17,7 +17,7 @@ from scipy.special import stdtr
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import scores, selection
-from mjx_tt.diagnosis.ball.causes import estimates, names, quantile, ranges, readings
+from mjx_tt.diagnosis.ball.causes import estimates, quantile, readings
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, flights
 from mjx_tt.diagnosis.ball.effects import EFFECTS, INVISIBLE, Effect
 from mjx_tt.diagnosis.ball.fit import first_fit, heading
@@ -131,9 +131,9 @@ def part(found: BallFindings, hits: HitFindings | None, without: Container[str])
         wide = quantile(freedom) * c.error
         parameters = estimates(c.effect, nominal, c.change, c.change - wide, c.change + wide)
         sure = float(1.0 - 2.0 * stdtr(max(freedom, 5), -abs(c.change) / c.error))
-        group = names((c.effect, *c.rivals))
+        group = (c.effect.name, *(e.name for e in c.rivals))
         cause = Cause(c.effect.name, group, sure, parameters, 1e3 * c.shift, readings(c.effect, c.rivals))
-        named.append(Expressed(cause, {path: e.estimate for path, e in parameters.items()}, ranges(parameters)))
+        named.append(Expressed.by(cause, parameters))
     return Part(tuple(named), not_excited=hits.quiet)
 
 
