@@ -106,7 +106,7 @@ def parameter_shapes() -> dict[str, tuple[int, ...]]:
     """
     shapes: dict[str, tuple[int, ...]] = {}
     inputs = N_OBSERVATION
-    for i, (filters, gated) in enumerate(zip(FILTERS, GATED), start=1):
+    for i, (filters, gated) in enumerate(zip(FILTERS, GATED, strict=True), start=1):
         outputs = filters * (2 if gated else 1)
         shapes[f"conv{i}/kernel"] = (KERNEL, inputs, outputs)
         shapes[f"conv{i}/bias"] = (outputs,)
@@ -140,10 +140,10 @@ def describe() -> dict:
         "version": CONTRACT_VERSION,
         "control_rate_hz": CONTROL_RATE,
         "history": HISTORY,
-        "observation": [{"name": n, "unit": u} for n, u in zip(OBSERVATION_NAMES, OBSERVATION_UNITS)],
+        "observation": [{"name": n, "unit": u} for n, u in zip(OBSERVATION_NAMES, OBSERVATION_UNITS, strict=True)],
         "action": [
             {"name": n, "unit": f"{u}/s", "scale": v}
-            for n, u, v in zip(JOINT_NAMES, JOINT_UNITS, LIMITS.policy_velocity)
+            for n, u, v in zip(JOINT_NAMES, JOINT_UNITS, LIMITS.policy_velocity, strict=True)
         ],
         "limits": {name: list(values) for name, values in asdict(LIMITS).items()},
         "parameters": {name: list(shape) for name, shape in parameter_shapes().items()},

@@ -36,7 +36,7 @@ class History:
 
     def samples(self) -> list[tuple[float, np.ndarray]]:
         """All that is kept, oldest first."""
-        return list(zip(self._times, self._values))
+        return list(zip(self._times, self._values, strict=True))
 
     def add(self, time: float, value: np.ndarray) -> bool:
         """Takes a sample; False, and nothing is kept, when it is not newer than the newest."""

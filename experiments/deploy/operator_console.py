@@ -50,7 +50,7 @@ class Keyboard:
             tty.setcbreak(sys.stdin)
         return self
 
-    def __exit__(self, *exc_info) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         if self._terminal:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
 
@@ -74,7 +74,7 @@ class View:
             self._live.start()
         return self
 
-    def __exit__(self, *exc_info) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         if self._live:
             self._live.stop()
 
@@ -101,7 +101,7 @@ class View:
         if not s.faults:
             lines += [Text(f"waiting: {text}", "yellow") for text in s.present.values()]
         outcomes = ", ".join(f"{n} {name}" for name, n in s.outcomes.items()) or "none yet"
-        lines.append(Text(f"balls {s['balls']}: {outcomes}; in a row {s['rally']}, longest {s['longest_rally']}"))
+        lines.append(Text(f"balls {s.balls}: {outcomes}; in a row {s.rally}, longest {s.longest_rally}"))
         joints = Table(box=None, pad_edge=False)
         for name in ("joint", "position", "command"):
             joints.add_column(name, justify="left" if name == "joint" else "right")
@@ -119,7 +119,8 @@ class View:
         wire = Text(
             f"EGM {egm['accepted']:,} taken, {sum(egm['rejected'].values()):,} refused, {egm['lost']:,} lost; "
             f"tracker {frames.get('accepted', 0):,} taken, {frames.get('lost', 0):,} lost; "
-            f"axes {s['axes_cycles']:,} cycles, {s['axes_late']:,} late; ticks missed {missed}; log lost {s['log_dropped']}"
+            f"axes {s.axes_cycles:,} cycles, {s.axes_late:,} late; "
+            f"ticks missed {missed}; log lost {s.log_dropped}"
         )
         grid = Table.grid(padding=(0, 4))
         grid.add_row(joints, timing)

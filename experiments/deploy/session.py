@@ -22,7 +22,7 @@ from experiments.stats import wilson
 from robot_io.control import messages, process
 from robot_io.control.config import RobotConfig
 from robot_io.control.episode import EpisodeSummary
-from robot_io.control.messages import FaultReport, Played, Refused, Status
+from robot_io.control.messages import FaultReport, Message, Played, Refused, Request, Status
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
@@ -57,23 +57,23 @@ class Session:
     def __enter__(self) -> Session:
         return self
 
-    def __exit__(self, *exc_info) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()
 
-    def send(self, request: messages.Request) -> None:
+    def send(self, request: Request) -> None:
         """Send a request; refusals come as messages."""
         try:
             self.pipe.send(request)
         except OSError:
             pass  # it has ended: the next message says so
 
-    def messages(self, seconds: float) -> Iterator[messages.Message]:
+    def messages(self, seconds: float) -> Iterator[Message]:
         """Messages that arrive within that time. Raises RefusedError when the control process has ended."""
         while self._episodes:
             yield self._episodes.popleft()
         yield from self._received(seconds)
 
-    def _answers(self, seconds: float) -> Iterator[messages.Message]:
+    def _answers(self, seconds: float) -> Iterator[Message]:
         """``messages`` without the episodes, which are kept for it."""
         for message in self._received(seconds):
             if isinstance(message, Played):
@@ -81,7 +81,7 @@ class Session:
             else:
                 yield message
 
-    def _received(self, seconds: float) -> Iterator[messages.Message]:
+    def _received(self, seconds: float) -> Iterator[Message]:
         end = time.monotonic() + seconds
         while self.pipe.poll(max(end - time.monotonic(), 0.0)):
             try:
@@ -109,11 +109,17 @@ class Session:
         self.send(messages.Prepare())
         if rig is not None:
             rig.switch_on()
-        for status in self._statuses(PREPARE_TIME):
-            if not status.missing:
-                return
+        end, refusal = time.monotonic() + PREPARE_TIME, ""
+        while time.monotonic() < end:
+            for message in self._answers(0.3):
+                if isinstance(message, Status) and not message.missing:
+                    return
+                if isinstance(message, Refused):  # until the arm has sent its position, or an axis has answered
+                    refusal = f"; {message.sentence}"
+                    self.send(messages.Prepare())
+                    time.sleep(0.1)
         missing = "no status" if self.status is None else self.status.missing
-        raise RefusedError(f"the robot does not get ready within {PREPARE_TIME:g} s: {missing}")
+        raise RefusedError(f"the robot does not get ready within {PREPARE_TIME:g} s: {missing}{refusal}")
 
     def reset(self) -> None:
         """Reset a fault and wait until it is gone; without a fault there is nothing to do. Raises RefusedError."""
@@ -246,8 +252,8 @@ def _watch(
                 break
             if key == PAUSE:
                 session.send(messages.Pause(not (session.status and session.status.paused)))
-            elif key in KEYS:
-                session.send(KEYS[key].request)
+            elif key in KEYS and (request := KEYS[key].request) is not None:
+                session.send(request)
             if key in KEYS:
                 view.say(KEYS[key].text)
             if rig is not None:

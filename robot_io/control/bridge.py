@@ -52,6 +52,8 @@ from robot_io.safety.gate import GateState, SafetyGate
 
 MAX_STEPS = 200  # control ticks of an episode, as in training
 AT_HOME = 0.02  # [m], [rad] of every joint
+HOMING_GAP = 0.03  # [m] of everything to everything while the linear axes search their references
+HOMING_PLACES = 21  # along each axis at which that is looked at
 LONGEST_STOP = 2.0  # [s] after which a stop ends although the measurement does not come to rest
 BLADE = "col_blade_axis"  # the capsule whose middle is the blade's centre
 
@@ -220,6 +222,27 @@ class Bridge:
         self._logged_faults = 0
         self._change(BridgeState.DISARMED, now, "fault reset by the operator")
 
+    def check_homing(self) -> None:
+        """Raise RefusedError unless the linear axes may search their references: nobody knows where they are until then.
+
+        The robot must be disarmed, and the arm, where it is measured to be, clear of everything wherever the axes go.
+        """
+        if self.state not in (BridgeState.DISARMED, BridgeState.FAULT) or not self.gate.at_rest:
+            raise RefusedError(f"axes not homed: the state is {self.state.value}; stop the robot first")
+        measured, _ = joints(self._feedback)
+        if not np.isfinite(measured[list(ABB_JOINTS)]).all():
+            raise RefusedError("axes not homed: the arm's position is not known; start its EGM session first")
+        places = np.meshgrid(*(np.linspace(LIMITS.lower[i], LIMITS.upper[i], HOMING_PLACES) for i in FESTO_JOINTS))
+        q = np.repeat(measured[:, None], places[0].size, axis=1)
+        q[list(FESTO_JOINTS)] = [axis.ravel() for axis in places]
+        gaps = self._geometry.gaps(q)
+        if not gaps.min() > HOMING_GAP:
+            row = self._geometry.rows[int(gaps.min(axis=1).argmin())]
+            raise RefusedError(
+                f"axes not homed: somewhere on their way {row} comes as near as {gaps.min():.3f} m, allowed is "
+                f"{HOMING_GAP} m; jog the arm to its home pose first"
+            )
+
     def estop(self, pressed: bool, now: float) -> None:
         """Tells the state of the emergency stop."""
         self.gate.estop(pressed, now)
@@ -277,13 +300,13 @@ class Bridge:
         since = min(max(now - self._tick_time, 0.0), 2.0 * self.gate.period)
         return self._start[rows] + velocity * since, velocity
 
-    def tracker_received(self, datagram: bytes, source: str, now: float) -> None:
-        """Take one datagram of the tracker."""
+    def tracker_received(self, datagram: bytes, source: str, now: float, port: int | None = None) -> None:
+        """Take one datagram from an IP address and port; without a port none is checked."""
         with self._guarded(now):
-            self._follow_ball(datagram, source, now)
+            self._follow_ball(datagram, source, now, port)
 
-    def _follow_ball(self, datagram: bytes, source: str, now: float) -> None:
-        sample = self.tracker.receive(datagram, source, now)
+    def _follow_ball(self, datagram: bytes, source: str, now: float, port: int | None) -> None:
+        sample = self.tracker.receive(datagram, source, now, port)
         if sample is None or sample.position is None:
             return
         self._log(Ball(sample.captured, now, sample.position, sample.ball))
@@ -496,4 +519,4 @@ class Bridge:
     def joint_table(self) -> list[tuple[str, float, float]]:
         """Name, measured position and commanded velocity of every joint, for the view."""
         measured, _ = joints(self._feedback)
-        return list(zip(JOINT_NAMES, measured.tolist(), self.gate.velocity.tolist()))
+        return list(zip(JOINT_NAMES, measured.tolist(), self.gate.velocity.tolist(), strict=True))

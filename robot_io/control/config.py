@@ -21,6 +21,7 @@ PORT = (1, 65535)
 RANGES = {
     "arm.port": PORT,
     "arm.timeout": (0.01, 0.1),
+    "arm.controller_port": PORT,
     "axes.port": PORT,
     "axes.device_id": (0, 255),
     "axes.zero": (-5.0, 5.0),
@@ -66,12 +67,16 @@ RANGES = {
 
 @dataclass(frozen=True)
 class ArmConfig:
-    """EGM. host, port: where the bridge listens; controller: the arm controller's address; timeout [s] of feedback."""
+    """EGM. host, port: where the bridge listens; controller: the arm controller's address; timeout [s] of feedback.
+
+    controller_port: that it sends from; None: learned from the first packet, and two senders at once stop the arm
+    """
 
     host: str = "127.0.0.1"
     port: int = 6510
     controller: str = "127.0.0.1"
     timeout: float = 0.05
+    controller_port: int | None = None
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,9 @@ class Control:
                 )
             self._recorder = self._open(recorder)
             self._axes = self._open(AxesThread(linear_axes(config)))
-            self._session = EgmSession(EgmConfig(config.arm.controller, timeout=config.arm.timeout))
+            self._session = EgmSession(
+                EgmConfig(config.arm.controller, config.arm.controller_port, timeout=config.arm.timeout)
+            )
             self._tracker = Tracker(config.tracker)
             gate = SafetyGate(config=config.safety)
             bridge_config = BridgeConfig(delays=config.delays)
@@ -127,7 +129,7 @@ class Control:
     def __enter__(self) -> Control:
         return self
 
-    def __exit__(self, *exc_info) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self._close()
 
     def _close(self) -> None:
@@ -202,8 +204,8 @@ class Control:
                 self._answer_arm()
             if tracker in ready:
                 now = time.monotonic()
-                for datagram, source in self._tracker_socket.drain():
-                    bridge.tracker_received(datagram, source, now)
+                for datagram, source, port in self._tracker_socket.drain():
+                    bridge.tracker_received(datagram, source, now, port)
             if pipe in ready:
                 self._listen()
             now = time.monotonic()
@@ -294,10 +296,13 @@ class Control:
             self._send(messages.Refused(request, f"{name}: {type(error).__name__}: {error}"))
 
     def _prepare_axes(self) -> None:
+        """Acknowledge faults, switch on, and home what is not homed. Raises RefusedError where homing is not safe."""
         if self._axes.axes.fault:
             self._axes.acknowledge()
         self._axes.enable()
-        self._axes.home()
+        if not self._axes.axes.homed:
+            self.bridge.check_homing()
+            self._axes.home()
 
     def _episode(self, summary: EpisodeSummary) -> None:
         self._send(messages.Played(summary, self.bridge.ball_track(summary)))

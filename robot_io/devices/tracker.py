@@ -18,6 +18,7 @@ import socket
 import struct
 import zlib
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,12 @@ SEQUENCE = 1 << 32
 NANO = 1_000_000_000
 MAX_DRAIN = 1000  # datagrams per call: a flood must not keep the caller from its control tick
 REACH = 10.0  # [m] from the table's centre, beyond which a position is nonsense
+FASTEST = 40.0  # [m/s] of a ball; the fastest strokes that were measured reach 32 m/s
+JUMP = 0.1  # [m] of noise on the distance of two positions
+AGREEING = 3  # frames in a row that the track is taken up again from after what looked like outliers
+LONGEST_GAP = 0.5  # [s] of lost frames between two sequence numbers; one further ahead waits for a neighbour
+FASTEST_RATE = 1000.0  # [Hz] of any tracker
+SILENCE = 1.0  # [s] after which the tracker may have been started anew
 
 
 @dataclass(frozen=True)
@@ -111,10 +118,14 @@ class Tracker:
         self.newest: BallSample | None = None
         self.counts: Counter[str] = Counter()
         self._sequence: int | None = None
+        self._port = config.source_port  # that frames are taken from
+        self._far: int | None = None  # sequence number far ahead of the track's, not confirmed yet
+        self._outliers: list[BallSample] = []  # refused in a row; a track of their own when they agree
 
-    def receive(self, datagram: bytes, source: str, now: float) -> BallSample | None:
-        """Takes one datagram from IP address ``source``; the sample, or None when it was refused and counted."""
-        if source != self.config.source:
+    def receive(self, datagram: bytes, source: str, now: float, port: int | None = None) -> BallSample | None:
+        """Take one datagram from an IP address and port; the sample, or None when it was refused and counted."""
+        silent = self.received is None or now - self.received > SILENCE
+        if source != self.config.source or not (port is None or port == self._port or self._unpinned(silent)):
             self.counts["stranger"] += 1
             return None
         try:
@@ -127,28 +138,67 @@ class Tracker:
         if age < -self.config.ahead or age > self.config.oldest:
             self.counts["future" if age < 0 else "stale"] += 1
             return None
-        if self._sequence is not None:
-            ahead = (sample.sequence - self._sequence) % SEQUENCE
-            restarted = self.received is None or now - self.received > 1.0
-            if not 0 < ahead < SEQUENCE // 2 and not restarted:
-                self.counts["duplicate" if ahead == 0 else "out of order"] += 1
-                return None
-            if not restarted and captured <= self.newest.captured:
-                self.counts["out of order"] += 1
-                return None
-            self.counts["lost"] += 0 if restarted else ahead - 1
-        self._sequence = sample.sequence
-        self.counts["accepted"] += 1
+        if self.newest is not None and not silent and not self._follows(sample.sequence, captured):
+            return None
+        self._sequence, self._far = sample.sequence, None
         self.received = now
+        self._port = port if self._unpinned(silent) else self._port
         sample = BallSample(sample.sequence, sample.ball, captured, sample.position)
         self.newest = sample
-        if sample.position is not None:
-            if sample.ball != self.ball:
-                self.track.clear()
-                self.ball = sample.ball
-            if self.track.add(captured, sample.position):
-                self.seen = captured
+        if sample.position is None:
+            self.counts["accepted"] += 1
+            return sample
+        new_track = sample.ball != self.ball
+        if not new_track and not self._reachable(sample):
+            self.counts["outlier"] += 1
+            self._outliers = [*self._outliers, sample] if self._agrees(sample) else [sample]
+            if len(self._outliers) < AGREEING:
+                return None
+            new_track = True  # it was the track that was wrong
+        self._outliers = []
+        self.counts["accepted"] += 1
+        if new_track:
+            self.track.clear()
+            self.ball = sample.ball
+        if self.track.add(captured, sample.position):
+            self.seen = captured
         return sample
+
+    def _unpinned(self, silent: bool) -> bool:
+        return self.config.source_port is None and silent
+
+    def _follows(self, sequence: int, captured: float) -> bool:
+        """Whether a frame comes after the newest by number and time; counts what was lost, or why it does not."""
+        last = -np.inf if self.newest is None else self.newest.captured
+        ahead = (sequence - (self._sequence or 0)) % SEQUENCE
+        if ahead == 0 or ahead >= SEQUENCE // 2 or captured <= last:
+            self.counts["duplicate" if ahead == 0 else "out of order"] += 1
+            return False
+        if ahead > FASTEST_RATE * max(LONGEST_GAP, captured - last):
+            # One damaged number must not make the true ones look old: only its successor confirms it.
+            confirmed = self._far is not None and 0 < (sequence - self._far) % SEQUENCE <= AGREEING
+            self._far = sequence
+            if not confirmed:
+                self.counts["far ahead"] += 1
+                return False
+            return True
+        self.counts["lost"] += ahead - 1
+        return True
+
+    def _reachable(self, sample: BallSample) -> bool:
+        """Whether a ball can have come here from the track's newest place."""
+        newest = self.track.newest
+        return newest is None or _near(newest[0], newest[1], sample)
+
+    def _agrees(self, sample: BallSample) -> bool:
+        last = self._outliers[-1] if self._outliers else None
+        return last is not None and last.position is not None and _near(last.captured, last.position, sample)
+
+
+def _near(time: float, place: np.ndarray, sample: BallSample) -> bool:
+    if sample.position is None:
+        return False
+    return float(np.linalg.norm(sample.position - place)) <= JUMP + FASTEST * (sample.captured - time)
 
 
 class TrackerSocket:
@@ -169,14 +219,14 @@ class TrackerSocket:
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def drain(self):
-        """The datagrams that wait, as (bytes, IP address)."""
+    def drain(self) -> Iterator[tuple[bytes, str, int]]:
+        """The datagrams that wait, with IP address and port of their senders."""
         for _ in range(MAX_DRAIN):
             try:
                 datagram, address = self._socket.recvfrom(2048)
             except BlockingIOError:
                 return
-            yield datagram, address[0]
+            yield datagram, address[0], address[1]
 
     def close(self) -> None:
         self._socket.close()

@@ -72,7 +72,7 @@ class ArmParams:
                 raise ValueError(f"ArmParams.{name} {getattr(self, name)} must be 0 or positive, and finite")
         if min(self.stop_deceleration) <= 0 or min(self.max_speed) <= 0 or not self.overspeed >= 1:
             raise ValueError("ArmParams: stop_deceleration and max_speed must be positive, overspeed at least 1")
-        if not all(low < high for low, high in zip(self.lower, self.upper)):
+        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError(f"ArmParams: lower {self.lower} must be below upper {self.upper} in every joint")
 
 

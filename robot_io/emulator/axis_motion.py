@@ -79,6 +79,6 @@ class Past:
         for earlier in reversed(samples):
             if earlier[0] <= time:
                 share = (time - earlier[0]) / (later[0] - earlier[0])
-                return tuple(a + share * (b - a) for a, b in zip(earlier[1:], later[1:]))
+                return tuple(a + share * (b - a) for a, b in zip(earlier[1:], later[1:], strict=True))
             later = earlier
         return later[1:]

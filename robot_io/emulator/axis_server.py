@@ -66,7 +66,7 @@ class AxisServer:
     def __enter__(self) -> AxisServer:
         return self
 
-    def __exit__(self, *exc_info) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()
 
     def _run(self) -> None:

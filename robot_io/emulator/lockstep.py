@@ -68,7 +68,7 @@ class LockStep:
         self.axes = FestoAxes(
             [
                 Axis(name, DirectLink(emulator), PROFILES[params.axis_profile](), *axis_range(i))
-                for i, (name, emulator) in enumerate(zip(("gantry_x", "gantry_y"), self.emulators))
+                for i, (name, emulator) in enumerate(zip(("gantry_x", "gantry_y"), self.emulators, strict=True))
             ],
             AXES_CONFIG,
         )
@@ -124,7 +124,7 @@ class LockStep:
         abb = list(ABB_JOINTS)
         speed, datagram = self.arm.step(now, qpos[abb], qvel[abb])
         self._setpoint[abb] = speed
-        for i, emulator in zip(FESTO_JOINTS, self.emulators):
+        for i, emulator in zip(FESTO_JOINTS, self.emulators, strict=True):
             self._setpoint[i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
         if datagram is not None:
             self._to_bridge.send(datagram, now)

@@ -161,7 +161,7 @@ class Rig:
     def __enter__(self) -> Rig:
         return self
 
-    def __exit__(self, *exc_info) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()
 
 
@@ -272,7 +272,7 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
         AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)
         for _ in FESTO_JOINTS
     ]
-    servers = [serve(emulator, HOST, port) for emulator, port in zip(emulators, ports.axes)]
+    servers = [serve(emulator, HOST, port) for emulator, port in zip(emulators, ports.axes, strict=True)]
     try:
         pipe.send("ready")
         for _ in _paced(shared, pipe, 0.004):
@@ -285,7 +285,7 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
                 }[kind](*rest)
             now = time.monotonic()
             qpos, qvel = shared.read("qpos", "qvel")
-            for i, emulator in zip(FESTO_JOINTS, emulators):
+            for i, emulator in zip(FESTO_JOINTS, emulators, strict=True):
                 shared["setpoint"][i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
     finally:
         for server in servers:

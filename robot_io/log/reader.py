@@ -6,7 +6,7 @@ import json
 import os
 from array import array
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +128,7 @@ class SessionLog:
 
     def utc(self, time: float) -> datetime:
         """Date and time of a moment of the control process's clock."""
-        return datetime.fromtimestamp(time + int(self.metadata["session"]["clock_offset_ns"]) / NANO, timezone.utc)
+        return datetime.fromtimestamp(time + int(self.metadata["session"]["clock_offset_ns"]) / NANO, UTC)
 
     @property
     def episodes(self) -> tuple[Episode, ...]:

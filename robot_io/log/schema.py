@@ -182,6 +182,6 @@ def encode(record: Ball | Joints | Command | Observation | Action | Tick | Event
 def _joint_states(velocity: Any, position: Any = None) -> Any:
     message = JointStates()
     positions = [None] * N_JOINTS if position is None else position.tolist()
-    for name, p, v in zip(JOINT_NAMES, positions, velocity.tolist()):
+    for name, p, v in zip(JOINT_NAMES, positions, velocity.tolist(), strict=True):
         message.joints.add(name=name, position=p, velocity=v)
     return message

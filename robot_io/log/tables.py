@@ -41,7 +41,7 @@ def export(log: SessionLog, folder: str | Path) -> list[Path]:
         ),
         "ticks.csv": (
             "tick,t,lateness,policy_seconds,ball_age,gantry_age,arm_age",
-            ((int(tick), *map(_seconds, row)) for tick, *row in zip(ticks.tick, *seconds)),
+            ((int(tick), *map(_seconds, row)) for tick, *row in zip(ticks.tick, *seconds, strict=True)),
         ),
     }
     paths = []
@@ -82,13 +82,13 @@ def trajectories(ball: BallSeries) -> list[tuple[str, np.ndarray]]:
 def _balls(log: SessionLog) -> Iterator[tuple]:
     for name, indices in trajectories(log.ball):
         times = log.ball.capture_time[indices] - log.start_time
-        for t, position in zip(times, log.ball.position[:, indices].T):
+        for t, position in zip(times, log.ball.position[:, indices].T, strict=True):
             yield (log.name, name, _seconds(t), *map(_number, position))
 
 
 def _by_joint(times: np.ndarray, values: np.ndarray) -> Iterator[tuple]:
-    for t, row in zip(times, values.T):
-        yield from ((_seconds(t), joint, _number(value)) for joint, value in zip(JOINT_NAMES, row))
+    for t, row in zip(times, values.T, strict=True):
+        yield from ((_seconds(t), joint, _number(value)) for joint, value in zip(JOINT_NAMES, row, strict=True))
 
 
 def _seconds(value: float) -> str:

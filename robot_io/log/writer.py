@@ -11,7 +11,7 @@ import platform
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +94,7 @@ def session(
         "start_time": start_time,
     }
     if host:
-        started = datetime.fromtimestamp(start_time + clock_offset_ns / schema.NANO, timezone.utc)
+        started = datetime.fromtimestamp(start_time + clock_offset_ns / schema.NANO, UTC)
         own |= {
             "started_utc": started.isoformat(timespec="milliseconds"),
             "host": platform.node(),

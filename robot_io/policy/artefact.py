@@ -161,7 +161,11 @@ def differences(found: Any, expected: Any, path: str) -> list[str]:
                 lines += differences(found[key], expected[key], f"{path}.{key}")
         return lines
     if isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
-        return [line for i, (f, e) in enumerate(zip(found, expected)) for line in differences(f, e, f"{path}[{i}]")]
+        return [
+            line
+            for i, (f, e) in enumerate(zip(found, expected, strict=True))
+            for line in differences(f, e, f"{path}[{i}]")
+        ]
     return [] if found == expected else [f"{path}: found {found!r}, expected {expected!r}"]
 
 

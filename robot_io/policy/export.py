@@ -11,7 +11,7 @@ import json
 import os
 import secrets
 import shutil
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -140,7 +140,7 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
         helper.make_node("Mul", ["centred", "inverse_scale"], ["normalised"]),
         helper.make_node("Transpose", ["normalised"], ["layer0"], perm=[2, 1, 0]),  # Conv wants (B, channels, time)
     ]
-    for i, (dilation, gated) in enumerate(zip(contract.DILATIONS, contract.GATED), start=1):
+    for i, (dilation, gated) in enumerate(zip(contract.DILATIONS, contract.GATED, strict=True), start=1):
         constants[f"kernel{i}"] = np.ascontiguousarray(parameters[f"conv{i}/kernel"].transpose(2, 1, 0))
         constants[f"bias{i}"] = parameters[f"conv{i}/bias"]
         nodes.append(
@@ -209,7 +209,7 @@ def _contents(policy: Policy, provenance: dict[str, Any]) -> dict[str, bytes]:
         "files": {name: artefacts.sha256(content) for name, content in contents.items()},
         "provenance": provenance,
         "written_with": {
-            "utc": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+            "utc": datetime.now(UTC).isoformat(timespec="seconds"),
             "jax": jax.__version__,
             "numpy": np.__version__,
             "onnx": onnx.__version__,

@@ -145,7 +145,7 @@ class RobotGeometry:
             *(f"{n} to the floor" for n in watched),
         )
         self.kinds = np.array(["table"] * len(watched) + ["self"] * len(pairs) + ["floor"] * len(watched))
-        self._levers = _levers(data["joints"], [(int(j), capsules[n]) for j, n in zip(self._joint, order)])
+        self._levers = _levers(data["joints"], [(int(j), capsules[n]) for j, n in zip(self._joint, order, strict=True)])
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> RobotGeometry:

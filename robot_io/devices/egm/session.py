@@ -30,11 +30,13 @@ class EgmConfig:
 
     controller_address  IPv4 address that packets are taken from; None takes that of the first valid packet. The port is
                         learned from the first valid packet, and again after a silence of ``timeout``
+    controller_port     port that packets are taken from; None learns it. Two senders at once are then a problem
     period              the controller's cycle [s]
     timeout             age [s] at which feedback is stale: ``problem`` says so, and the next packet opens a new session
     """
 
     controller_address: str | None = None
+    controller_port: int | None = None
     period: float = 0.004
     timeout: float = 0.05
 
@@ -109,12 +111,16 @@ class EgmSession:
         self._pending = False
         self._reply_sequence = 0
         self._last_refusal = ""
+        self._rival: tuple[int, float] | None = None  # another port that sends valid packets, and when it did last
 
     def receive(self, datagram: bytes, source: tuple[str, int], now: float) -> bool:
         """Takes one datagram; True when it is the trusted controller's newest packet. No content makes it raise."""
         self.statistics.received += 1
         if not self._trusts(source, now):
-            trusted = self.config.controller_address or f"{self.endpoint[0]} port {self.endpoint[1]}"
+            self._note_rival(datagram, source, now)
+            address = self.config.controller_address or (self.endpoint[0] if self.endpoint else "no address")
+            port = self.config.controller_port or (self.endpoint[1] if self.endpoint else None)
+            trusted = address if port is None or source[0] != address else f"{address} port {port}"
             return self._refuse("stranger", f"from {source[0]} port {source[1]}, only {trusted} is trusted")
         try:
             message = decode_robot(datagram)
@@ -176,6 +182,11 @@ class EgmSession:
                 f"{self.config.timeout:.3f} s): check the cable and whether the EGM session has ended there"
                 f"{self._refusals()}."
             )
+        if self._rival is not None and now - self._rival[1] < RECENT:
+            return (
+                f"EGM packets come from ports {self.endpoint[1] if self.endpoint else 0} and {self._rival[0]} of the "
+                "controller's address: end the wrong sender, or name the right port as arm.controller_port."
+            )
         if not feedback.motors_on:
             return "The arm's motors are off: release the emergency stop and switch the motors on at the controller."
         if not feedback.rapid_running:
@@ -184,10 +195,22 @@ class EgmSession:
             return "EGM is not running on the arm's controller: let its RAPID program reach EGMRunJoint."
         return None
 
+    def _note_rival(self, datagram: bytes, source: tuple[str, int], now: float) -> None:
+        """Remember a second sender at the controller's address: which of the two is the arm cannot be known."""
+        if self.config.controller_port is not None or self.endpoint is None or source[0] != self.endpoint[0]:
+            return
+        try:
+            decode_robot(datagram)
+        except EgmError:
+            return
+        self._rival = (source[1], now)
+
     def _trusts(self, source: tuple[str, int], now: float) -> bool:
         address = self.config.controller_address or (self.endpoint and self.endpoint[0])
         if address and source[0] != address:
             return False
+        if self.config.controller_port is not None:
+            return source[1] == self.config.controller_port
         return self.endpoint is None or source[1] == self.endpoint[1] or self._is_stale(now)
 
     def _is_stale(self, now: float) -> bool:
@@ -289,7 +312,7 @@ class EgmSocket:
     def __enter__(self) -> EgmSocket:
         return self
 
-    def __exit__(self, *exc_info) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()
 
 

@@ -70,6 +70,11 @@ class FestoAxes:
         """The newest state, None before both axes have answered."""
         return self._state
 
+    @property
+    def homed(self) -> bool:
+        """Both axes answer and know where they are."""
+        return all(c.status is not None and c.status.homed for c in self._channels)
+
     def command(self, position, velocity, now: float) -> None:
         """The newest target: position (2,) [m] at ``now``, velocity (2,) [m/s] to go on with. ValueError: no number."""
         numbers = []
@@ -232,7 +237,7 @@ class FestoAxes:
             moves = [Move(c.position if c.status else 0.0, 0.0, 0.0) for c in self._channels]
         self.commanded = np.array([m.velocity for m in moves])
         commands = []
-        for channel, wanted in zip(self._channels, moves):
+        for channel, wanted in zip(self._channels, moves, strict=True):
             status, axis = channel.status, channel.axis
             commands.append(
                 AxisCommand(

@@ -30,7 +30,7 @@ class Target:
 
     def at(self, time: float) -> tuple[float, ...]:
         since = time - self.time
-        return tuple(r + v * since for r, v in zip(self.position, self.velocity))
+        return tuple(r + v * since for r, v in zip(self.position, self.velocity, strict=True))
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Reference:
         for earlier in reversed(self._past):
             if earlier[0] <= time:
                 share = (time - earlier[0]) / (later[0] - earlier[0]) if later is not earlier else 0.0
-                return tuple(a + share * (b - a) for a, b in zip(earlier[1], later[1]))
+                return tuple(a + share * (b - a) for a, b in zip(earlier[1], later[1], strict=True))
             later = earlier
         return later[1]
 

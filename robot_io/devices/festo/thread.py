@@ -46,7 +46,7 @@ class AxesThread:
         self.start()
         return self
 
-    def __exit__(self, *exc_info) -> None:
+    def __exit__(self, *exc_info: object) -> None:
         self.close()
 
     def command(self, position, velocity, now: float) -> None:

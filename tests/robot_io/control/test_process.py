@@ -48,7 +48,7 @@ class FrameSocket(ArmSocket):
     def drain(self):
         frames = self._simulation.frames
         while frames and frames[0][0] <= self._simulation.now:
-            yield frames.popleft()[1], "127.0.0.1"
+            yield frames.popleft()[1], "127.0.0.1", 5000
 
 
 class Simulated:

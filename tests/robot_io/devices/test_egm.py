@@ -434,3 +434,22 @@ def test_the_schema_is_that_of_another_library():
     for name, theirs in egm_pb2.DESCRIPTOR.message_types_by_name.items():
         if name != "EgmExternalJoints":  # which no message uses
             assert schema(messages.message_class(name).DESCRIPTOR) == schema(theirs), name
+
+
+def test_two_senders_at_the_controllers_address_are_a_problem_and_a_named_port_settles_it():
+    """Whichever came first: the wrong one may be it."""
+    other = CONTROLLER[0], 6666
+    session = EgmSession(EgmConfig(CONTROLLER[0]))
+    assert session.receive(packet(100), other, 0.0)
+    assert session.problem(0.0) is None
+    assert not session.receive(packet(100), CONTROLLER, 0.001)
+    assert f"ports 6666 and {CONTROLLER[1]}" in session.problem(0.002)
+    assert "arm.controller_port" in session.problem(0.002)
+    for n in range(300):
+        assert session.receive(packet(101 + n), other, 0.004 + 0.004 * n)
+    assert session.problem(1.2) is None  # over, a second after the last
+    assert not session.receive(b"\0", CONTROLLER, 1.2) and session.problem(1.2) is None  # garbage is no sender
+    session = EgmSession(EgmConfig(CONTROLLER[0], CONTROLLER[1]))
+    assert not session.receive(packet(100), other, 0.0)
+    assert session.receive(packet(100), CONTROLLER, 0.001) and session.problem(0.001) is None
+    assert not session.receive(packet(101), other, 1.0)  # not even after a silence

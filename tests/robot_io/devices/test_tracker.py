@@ -131,7 +131,7 @@ def test_the_clocks_difference_is_taken_into_account():
 
 def test_damaged_datagrams_are_never_taken():
     random = np.random.default_rng(0)
-    valid = [frame(i, i * 0.008, i // 200, random.uniform(-2, 2, 3)) for i in range(1000)]
+    valid = [frame(i, i * 0.008, i // 200, random.uniform(-0.1, 0.1, 3)) for i in range(1000)]
     known, taken = set(valid), 0
     tracker = Tracker(TrackerConfig(oldest=1e9, ahead=1e9))
     kinds, places, bits = (
@@ -222,8 +222,65 @@ def test_the_socket_gives_what_has_arrived_and_names_a_busy_port():
     assert list(receiver.drain()) == []
     for data in (golden(), b"", bytes(1000)):
         sender.send(data)
-    assert [(data, source) for data, source in receiver.drain()] == [(golden(), HOME), (b"", HOME), (bytes(1000), HOME)]
+    assert [(data, source) for data, source, _ in receiver.drain()] == [
+        (golden(), HOME),
+        (b"", HOME),
+        (bytes(1000), HOME),
+    ]
     with pytest.raises(DeviceError, match="cannot listen on .* tracker.port"):
         TrackerSocket(TrackerConfig(port=receiver._socket.getsockname()[1]))
     receiver.close()
     sender.close()
+
+
+def flying(i, **changed):
+    """Frame i of a ball at 6 m/s."""
+    position = changed.pop("position", (0.1, 1.5 - 6.0 * 0.008 * i, 0.4))
+    return frame(changed.pop("sequence", i), 1 + i * 0.008, 1, position)
+
+
+def test_an_outlier_is_refused_and_a_track_that_goes_on_elsewhere_is_taken_up():
+    tracker = Tracker(TrackerConfig())
+    for i in range(10):
+        assert tracker.receive(flying(i), HOME, 1 + i * 0.008)
+    assert tracker.receive(flying(10, position=(9.0, -9.0, 9.0)), HOME, 1.08) is None  # 20 m in 8 ms
+    assert tracker.counts["outlier"] == 1 and len(tracker.track) == 10
+    assert tracker.receive(flying(11), HOME, 1.088) is not None and len(tracker.track) == 11
+    for i in range(12, 20):
+        random = np.random.default_rng(i).uniform(-9, 9, 3)
+        assert tracker.receive(flying(i, position=random), HOME, 1 + i * 0.008) is None
+    assert len(tracker.track) == 11 and tracker.received == pytest.approx(1.152)
+    taken = [tracker.receive(flying(i, position=(7.0, 7.0, 0.1)), HOME, 1 + i * 0.008) for i in range(20, 24)]
+    assert [sample is not None for sample in taken] == [False, False, True, True]
+    assert len(tracker.track) == 2
+
+
+def test_the_fastest_ball_and_noise_are_no_outliers():
+    random = np.random.default_rng(0)
+    tracker = Tracker(TrackerConfig())
+    for i in range(100):
+        place = np.array([0.0, 8.0 - 35.0 * 0.008 * (i % 50), 0.4]) + 0.01 * random.normal(size=3)
+        assert tracker.receive(frame(i, 1 + i * 0.008, i // 50, place), HOME, 1 + i * 0.008)
+
+
+def test_one_far_sequence_number_does_not_block_the_true_ones():
+    tracker = Tracker(TrackerConfig())
+    for i in range(5):
+        tracker.receive(flying(i), HOME, 1 + i * 0.008)
+    assert tracker.receive(flying(5, sequence=2**30), HOME, 1.04) is None
+    assert tracker.counts["far ahead"] == 1
+    for i in range(6, 20):
+        assert tracker.receive(flying(i), HOME, 1 + i * 0.008) is not None
+    taken = [tracker.receive(flying(i, sequence=10**6 + i), HOME, 1 + i * 0.008) for i in range(20, 23)]
+    assert [sample is not None for sample in taken] == [False, True, True]  # a tracker that was started anew
+
+
+def test_frames_are_taken_from_one_port():
+    tracker = Tracker(TrackerConfig())
+    assert tracker.receive(flying(0), HOME, 1.0, 5000)
+    assert tracker.receive(flying(1), HOME, 1.008, 6000) is None and tracker.counts["stranger"] == 1
+    assert tracker.receive(flying(1), HOME, 1.008, 5000)
+    assert tracker.receive(flying(200), HOME, 2.6, 6000)  # after a second of silence
+    tracker = Tracker(TrackerConfig(source_port=5000))
+    assert tracker.receive(flying(0), HOME, 1.0, 6000) is None
+    assert tracker.receive(flying(0), HOME, 1.0, 5000)
