@@ -12,6 +12,7 @@ from experiments.commands.options import (
     command,
     console,
     count,
+    existing,
     option,
     start_jax,
     suffix,
@@ -66,6 +67,7 @@ def fit_human(
     suffix(out, ".yaml", ".yml")
     if eps is not None and not 0.0 < eps < float("inf"):
         raise ConfigError(f"--eps {eps:g}: a positive number is wanted")
+    existing(*data)
     start_jax(None)
     from ballmodel.distribution import save_distribution
     from ballmodel.fit_distribution import fit_human as fit
@@ -98,6 +100,8 @@ def import_(
     format: Format = None,
 ) -> None:
     """Raises ConfigError for another suffix or without trajectories."""
+    existing(data)
+    suffix(out, ".csv", ".mcap")
     start_jax(1)
     from ballmodel.io import read, write_mcap
     from ballmodel.trajectory import Dataset
@@ -108,8 +112,6 @@ def import_(
     if not isinstance(measured, Dataset):
         raise ConfigError(f"{data}: holds start states, not trajectories; mjx-tt fit-human takes it as it is")
     writers = {".csv": write_csv, ".mcap": write_mcap}
-    if path.suffix not in writers:
-        raise ConfigError(f"{path}: suffix {path.suffix!r}; allowed: {', '.join(writers)}")
     if path.exists() and path.samefile(data):
         raise ConfigError(f"--out {path}: is the file to be converted")
     path.parent.mkdir(parents=True, exist_ok=True)

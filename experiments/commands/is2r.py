@@ -14,6 +14,7 @@ from experiments.commands.options import (
     command,
     console,
     count,
+    existing,
     option,
     shipped_or_own,
     start_jax,
@@ -78,6 +79,7 @@ def is2r(
 @report_app.default
 def study_report(folder: Annotated[str, Parameter("FOLDER", help="folder of a study")], /) -> None:
     """Prints where it is."""
+    existing(folder)
     start_jax(1)
     from experiments.study.report import page
 

@@ -23,6 +23,7 @@ from experiments.commands.options import (
 )
 from experiments.errors import checked
 from experiments.runs.locate import find_policy
+from experiments.runs.run_dir import Run
 
 app = command(
     "render",
@@ -77,6 +78,8 @@ def curves(
     out: Annotated[str, option("PNG", "the picture (default: curves.png)")] = "curves.png",
 ) -> None:
     """Draws them."""
+    for folder in runs:
+        Run(folder).config()
     from experiments.evaluation import figures
 
     found = [figures.read_curve(folder) for folder in runs]
