@@ -1,6 +1,8 @@
 from .diagnosis.diagnose import Diagnosis as Diagnosis
 from .diagnosis.diagnose import diagnose as diagnose
 from .diagnosis.logs import Logs as Logs
+from .diagnosis.logs import load_logs as load_logs
+from .diagnosis.report.page import write_report as write_report
 from .diagnosis.verdict import Verdict as Verdict
 from .env.brax import TableTennis as TableTennis
 from .env.make import PlayedEpisodes as PlayedEpisodes

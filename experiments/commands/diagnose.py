@@ -65,8 +65,8 @@ def read_logs(paths: Sequence[str]) -> diagnosis.Logs:
     sessions = [f for f in files if session_logs.is_session(f)]
     others = [f for f in files if f not in sessions]
     if not sessions:
-        return diagnosis.load(paths)
-    rest = diagnosis.load(others) if others else diagnosis.Logs((), (), {})
+        return diagnosis.load_logs(paths)
+    rest = diagnosis.load_logs(others) if others else diagnosis.Logs((), (), {})
     balls, records = list(rest.balls), [("the CSV files", rest.joints)] if rest.joints else []
     for file in sessions:
         flights, joints = session_logs.load(file)
@@ -170,7 +170,7 @@ def save(found: diagnosis.Diagnosis, folder: Path) -> Path:
 
 def draw(found: diagnosis.Diagnosis, folder: Path, title: str, console: Console, cost: Play | None = None) -> None:
     """Writes report.html and its pictures, and prints the paths."""
-    report.write(folder, found, title, cost)
+    report.write_report(folder, found, title, cost)
     for name in ("report.html", "verdict.json", "extended.yaml"):
         console.print(f"  {folder / name}", highlight=False)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mjx_tt.diagnosis.diagnose import Diagnosis, diagnose
-from mjx_tt.diagnosis.logs import Logs, check, hashes, load, longest
+from mjx_tt.diagnosis.logs import Logs, check, hashes, load_logs, longest
 from mjx_tt.diagnosis.verdict import Verdict
 
-__all__ = ["Diagnosis", "Logs", "Verdict", "check", "diagnose", "hashes", "load", "longest"]
+__all__ = ["Diagnosis", "Logs", "Verdict", "check", "diagnose", "hashes", "load_logs", "longest"]

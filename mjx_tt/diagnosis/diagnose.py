@@ -1,7 +1,7 @@
 """Diagnosis: logs and a model in; the verdict, the extended model and all that a report draws out.
 
 from mjx_tt import diagnosis
-found = diagnosis.diagnose(diagnosis.load(["session1.csv"]))
+found = diagnosis.diagnose(diagnosis.load_logs(["session1.csv"]))
 found.verdict.causes, found.extended
 """
 

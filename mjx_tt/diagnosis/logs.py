@@ -51,7 +51,7 @@ def hashes(paths: Sequence[str | os.PathLike]) -> dict[Path, str]:
     return found
 
 
-def load(paths: Sequence[str | os.PathLike]) -> Logs:
+def load_logs(paths: Sequence[str | os.PathLike]) -> Logs:
     """Reads logs: ball trajectories (CSV, MCAP, AIMY) and pairs command.csv, state.csv (or a folder that holds them).
 
     Of several pairs the longest is used. Raises ValueError naming the file and what is wrong with it,

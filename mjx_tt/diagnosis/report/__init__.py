@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from mjx_tt.diagnosis.report.page import Play, Rate, write
+from mjx_tt.diagnosis.report.page import Play, Rate, write_report
 
-__all__ = ["Play", "Rate", "write"]
+__all__ = ["Play", "Rate", "write_report"]

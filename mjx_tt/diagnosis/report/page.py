@@ -8,6 +8,7 @@ are those of ``text``; a section is left away where its function gives no contex
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -59,7 +60,7 @@ class Play(TypedDict):
 Context = Mapping[str, object] | None
 
 
-def write(folder: Path, diagnosis: Diagnosis, title: str, play: Play | None = None) -> list[Path]:
+def write_report(folder: str | os.PathLike, diagnosis: Diagnosis, title: str, play: Play | None = None) -> list[Path]:
     """Writes report.html and plots/*.png into a folder and returns their paths, the page first.
 
     play: what the defect costs. Raises OSError when the folder cannot be written; files that were there stay whole.

@@ -237,6 +237,6 @@ def test_a_launchers_topspin_is_named_and_its_straight_balls_are_not(session, sp
     path = DATA / "aimy_launcher" / f"{session}.hdf5"
     if not path.exists():
         pytest.skip(f"{path} is not there: measured balls of a launcher")
-    verdict = diagnosis.diagnose(diagnosis.load([path])).verdict
+    verdict = diagnosis.diagnose(diagnosis.load_logs([path])).verdict
     assert ("magnus" in [c.name for c in verdict.causes]) == spins
     assert verdict.held_out.low > 0.0

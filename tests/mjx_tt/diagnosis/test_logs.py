@@ -89,7 +89,7 @@ WRONG = [
 
 
 def test_a_right_log_is_taken(tmp_path):
-    logs = gap.load([write(tmp_path / "log.csv", flights())])
+    logs = gap.load_logs([write(tmp_path / "log.csv", flights())])
     assert len(logs.balls) == 20 and logs.joints == ()
     assert list(logs.sources) == [str(tmp_path / "log.csv")]
 
@@ -100,7 +100,7 @@ def test_what_cannot_be_is_refused_by_name(change, words, tmp_path):
     change(balls)
     path = write(tmp_path / "log.csv", balls)
     with pytest.raises(ValueError, match=f"(?i){words}") as refused:
-        gap.load([path])
+        gap.load_logs([path])
     assert "log.csv" in str(refused.value)
 
 
@@ -118,9 +118,9 @@ def test_too_little_is_said_and_nothing_written(balls, words, tmp_path, capsys):
 def test_half_a_robot_log_names_the_other_half(tmp_path):
     (tmp_path / "command.csv").write_text("t,joint,velocity\n0,joint_1,0.1\n")
     with pytest.raises(ValueError, match="state.csv is missing"):
-        gap.load([tmp_path])
+        gap.load_logs([tmp_path])
     with pytest.raises(FileNotFoundError, match="nowhere.csv"):
-        gap.load([tmp_path / "nowhere.csv"])
+        gap.load_logs([tmp_path / "nowhere.csv"])
 
 
 def robot(folder, seconds=8.0, commands=1.0, states=1.0, speed=0.1, joint="joint_1"):
@@ -142,18 +142,18 @@ def robot(folder, seconds=8.0, commands=1.0, states=1.0, speed=0.1, joint="joint
 def test_commands_and_states_share_their_seconds(scales, words, tmp_path):
     folder = robot(tmp_path / "robot", 20.0, *scales)
     with pytest.raises(ValueError, match=words) as refused:
-        gap.load([folder])
+        gap.load_logs([folder])
     assert "milliseconds" in str(refused.value) and "state.csv" in str(refused.value)
 
 
 def test_of_several_robot_logs_the_longest_is_used_and_the_others_are_named(tmp_path):
     long, short = robot(tmp_path / "long", 12.0), robot(tmp_path / "short", 8.0, joint="joint_2")
-    logs = gap.load([short, long])
+    logs = gap.load_logs([short, long])
     assert [j.joint for j in logs.joints] == ["joint_1"] and logs.joints[0].state_time.size == 1500
     assert len(logs.sources) == 4
     assert any(str(short) in note and str(long) in note for note in logs.notes)
     with pytest.raises(ValueError, match=r"long.state\.csv: the joints' command\.csv is missing"):
-        gap.load([long / "state.csv", short / "command.csv"])
+        gap.load_logs([long / "state.csv", short / "command.csv"])
 
 
 def test_a_log_counts_once(tmp_path):
@@ -161,7 +161,7 @@ def test_a_log_counts_once(tmp_path):
     (tmp_path / "copy.csv").write_bytes(path.read_bytes())
     for twice_given in ([path, path], [path, tmp_path / "copy.csv"], [tmp_path]):
         with pytest.raises(ValueError, match="is the same log as"):
-            gap.load(twice_given)
+            gap.load_logs(twice_given)
 
 
 def test_sessions_and_other_logs_are_read_together(tmp_path, monkeypatch):
@@ -169,7 +169,7 @@ def test_sessions_and_other_logs_are_read_together(tmp_path, monkeypatch):
     folder = robot(tmp_path / "all", 12.0)
     write(folder / "balls.csv", flights())
     (folder / "session.mcap").write_bytes(b"as if")
-    flown = gap.load([write(tmp_path / "flown.csv", flights(5, seed=1))]).balls
+    flown = gap.load_logs([write(tmp_path / "flown.csv", flights(5, seed=1))]).balls
     monkeypatch.setattr(session_logs, "is_session", lambda path: path.suffix == ".mcap")
     monkeypatch.setattr(session_logs, "load", lambda path: (flown, ()))
     logs = diagnose.read_logs([str(folder)])
@@ -197,6 +197,6 @@ def test_what_would_fail_later_is_refused_before_the_work(more, words, tmp_path,
 
 
 def test_an_unknown_effect_cannot_be_left_out(tmp_path):
-    logs = gap.load([write(tmp_path / "log.csv", flights())])
+    logs = gap.load_logs([write(tmp_path / "log.csv", flights())])
     with pytest.raises(ValueError, match="did you mean 'table_friction'"):
         gap.diagnose(logs, without=["table_fricton"])

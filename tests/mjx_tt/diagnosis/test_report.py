@@ -129,7 +129,7 @@ def windy_page(windy, tmp_path_factory) -> tuple[Page, list[Path]]:
 
 
 def written(folder: Path, diagnosis: gap.Diagnosis, **more) -> tuple[Page, list[Path]]:
-    files = report.write(folder, diagnosis, "one <log> & another.csv", **more)
+    files = report.write_report(folder, diagnosis, "one <log> & another.csv", **more)
     page = Page(files[0].read_text(encoding="utf-8"))
     assert not page.open
     return page, files
@@ -411,7 +411,7 @@ def test_a_failed_write_leaves_the_old_report(joints, tmp_path, monkeypatch):
 
     monkeypatch.setattr("mjx_tt.viz.html.png", broken)
     with pytest.raises(RuntimeError, match="no picture"):
-        report.write(tmp_path, joints, "title")
+        report.write_report(tmp_path, joints, "title")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"] and (tmp_path / "report.html").read_text() == "old"
 
 
