@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
 
 class ExperimentError(Exception):
     """The message names the file or folder, what is wrong, and what to do."""
@@ -30,7 +35,7 @@ def explained(error: Exception) -> bool:
     return isinstance(error, (ExperimentError, ArtefactError, OSError, RefusedError, DeviceError, EgmError, LogError))
 
 
-def checked(where: str, function, *arguments):
+def checked(where: str, function: Callable[..., T], *arguments: Any) -> T:
     """What ``function`` returns; what it says about its arguments as a ConfigError that begins with ``where``."""
     try:
         return function(*arguments)

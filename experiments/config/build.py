@@ -88,7 +88,7 @@ def reward_weights(chosen: str | Rewards) -> tuple[float, ...]:
 def later_weights(training: Training) -> tuple[int, tuple[float, ...]] | None:
     """The number of updates after which the reward weights change, and those weights."""
     later = training.later_rewards
-    return later and (round(later.after * training.updates), reward_weights(later.rewards))
+    return None if later is None else (round(later.after * training.updates), reward_weights(later.rewards))
 
 
 def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:

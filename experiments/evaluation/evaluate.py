@@ -94,7 +94,7 @@ def evaluate(
 
 
 def _reachable(
-    experiment: Experiment, simulator: Simulator, balls: BallPool, key, count: int, policy: Policy
+    experiment: Experiment, simulator: Simulator, balls: BallPool, key: jax.Array, count: int, policy: Policy
 ) -> dict[str, Any]:
     """What the policy or motions optimised ball by ball return, the balls known and without noise."""
     found = reachability.reachable(simulator, balls, experiment.model.model, key, count, policy)
@@ -136,7 +136,7 @@ def selection_score(result: RolloutResult) -> float:
     return sparse_reward(result.outcome, ~result.finite | (collision < 0))
 
 
-def sparse_reward(outcome, fault) -> float:
+def sparse_reward(outcome: np.ndarray, fault: np.ndarray) -> float:
     """The paper's reward for choosing a seed: +1 hit, +1 landed on the human's side, -2 fault; mean over episodes."""
     score = (outcome != MISSED).astype(float) + (outcome == RETURNED)
     return float(np.mean(np.where(fault, -2.0, score)))

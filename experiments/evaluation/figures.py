@@ -12,6 +12,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import RcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -31,19 +32,21 @@ LANDING_FRAME = (-1.5, 1.5), (-1.45, 2.3)  # [m] x and y shown
 FEWEST_BALLS = 5  # in a cell whose rate is shown
 SMOOTHING = 25  # updates
 
-STYLE = {
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "figure.constrained_layout.use": True,
-    "legend.frameon": False,
-    "savefig.dpi": 150,
-}
+STYLE = RcParams(
+    {
+        "font.size": 10,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.edgecolor": INK,
+        "axes.labelcolor": INK,
+        "axes.titlesize": 11,
+        "axes.titleweight": "bold",
+        "axes.titlelocation": "left",
+        "figure.constrained_layout.use": True,
+        "legend.frameon": False,
+        "savefig.dpi": 150,
+    }
+)
 
 
 def draw_evaluation(folder: Path, played: Played, weights: tuple[float, ...]) -> list[Path]:

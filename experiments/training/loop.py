@@ -12,12 +12,15 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.stages import Compiled
+from numpy.typing import ArrayLike
 from rich.console import Console
 
 from bgs import normalizer
 from experiments import stages
 from experiments.config import build
 from experiments.config.build import Experiment
+from experiments.config.experiment import Config
 from experiments.errors import RunError
 from experiments.evaluation.evaluate import draw_balls, return_rate
 from experiments.runs import checkpoint, load_policy, run_dir
@@ -28,7 +31,7 @@ from experiments.training.update import Trainer, TrainState, trainer
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 
-_programs: dict[str, Any] = {}  # compiled updates by what decides them
+_programs: dict[str, Compiled] = {}  # compiled updates by what decides them
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
 
 
@@ -93,7 +96,9 @@ class Session:
     def _ended(self) -> str | None:
         return run_dir.training_ended(self._config, self.update, self.seconds, self.return_rate)
 
-    def _advance(self, compiled, log: MetricsLog, progress: TrainingProgress, stop_wanted: Callable[[], bool]) -> None:
+    def _advance(
+        self, compiled: Compiled, log: MetricsLog, progress: TrainingProgress, stop_wanted: Callable[[], bool]
+    ) -> None:
         """Updates until it is time to look at them; then measurements, evaluation and checkpoint as they are due."""
         training, every = self._config.training, self._config.training.evaluate_every
         first, began, waiting = self.update + 1, time.monotonic(), []
@@ -139,7 +144,7 @@ class Session:
         self.return_rate = rate.value
         return {"evaluation/return_rate": rate.value, "evaluation/low": rate.low, "evaluation/high": rate.high}
 
-    def _notes(self) -> dict:
+    def _notes(self) -> dict[str, Any]:
         return {"update": self.update, "seconds": round(self.seconds, 4), "return_rate": self.return_rate}
 
     def _save(self, log: MetricsLog) -> None:
@@ -149,7 +154,7 @@ class Session:
         self._saved = (self.update, time.monotonic())
 
 
-def _compiled(config, trainer: Trainer, state: TrainState):
+def _compiled(config: Config, trainer: Trainer, state: TrainState) -> Compiled:
     """The update's program: one for all runs of this process that differ in balls, seed and first policy only."""
     sections, training = [config.to_dict()[name] for name in ("task", "model", "optimiser")], config.training
     length = training.updates if config.optimiser.step.schedule.kind == "cosine" else None
@@ -160,21 +165,21 @@ def _compiled(config, trainer: Trainer, state: TrainState):
     return _programs[decides]
 
 
-def _start(config, run: Run, trainer: Trainer) -> tuple[TrainState, dict]:
+def _start(config: Config, run: Run, trainer: Trainer) -> tuple[TrainState, dict[str, Any]]:
     """The last checkpoint's state and notes, or the first ones."""
     theta = statistics = None
     if config.initial_policy is not None:
         theta, statistics = load_policy.load_statistics(config.initial_policy)
     state = trainer.init(build.key(config.training.seed, build.INITIAL_STATE), theta, statistics)
-    notes = {"update": 0, "seconds": 0.0, "return_rate": None}
+    notes: dict[str, Any] = {"update": 0, "seconds": 0.0, "return_rate": None}
     state, notes = checkpoint.load_latest(run.checkpoints, state) or (state, notes)
     # Where the update leaves its results: compiled for this placement, it can be fed what it returns.
     return trainer.simulator.replicate(state), notes
 
 
-def _short(value) -> float | None:
+def _short(value: ArrayLike) -> float | None:
     """Six digits, None where not finite: JSON has no NaN."""
-    number = float(value)
+    number = float(np.asarray(value))
     return float(f"{number:.6g}") if np.isfinite(number) else None
 
 
@@ -190,7 +195,7 @@ def _stop_requests() -> Iterator[Callable[[], bool]]:
             stages.say(
                 "Ctrl-C: saves a checkpoint and stops after this update or compilation; Ctrl-C again ends at once"
             )
-        signal.signal(number, previous[number])
+        signal.signal(number, previous[signal.Signals(number)])
 
     previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

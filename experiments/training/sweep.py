@@ -83,7 +83,7 @@ def select(folder: Path, jobs: list[Job], console: Console) -> None:
         trained = load_policy.load(job.run.folder)
         played = evaluate.evaluate(experiment, trained, SELECTION_EPISODES, job.config.evaluation.seed + 1)
         scores[job.run.folder.name] = evaluate.selection_score(played.result)
-    best = max(scores, key=scores.get)
+    best = max(scores, key=lambda seed: scores[seed])
     selection = {
         "episodes": SELECTION_EPISODES,
         "reward": {"hit": 1, "landed": 1, "fault": -2},

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jax.sharding import PartitionSpec
+from jax.stages import Lowered
+from jax.typing import ArrayLike
 
 from ballmodel.sampling import BallPool
 from bgs import normalizer, strategy
@@ -70,7 +72,12 @@ class Trainer:
     def episodes_per_update(self) -> int:
         return 2 * self.bgs_config.pairs * self._repeats
 
-    def init(self, key, theta=None, statistics=None) -> TrainState:
+    def init(
+        self,
+        key: jax.Array,
+        theta: ArrayLike | None = None,
+        statistics: normalizer.ObservationStatistics | None = None,
+    ) -> TrainState:
         """State before the first update, from random weights or from ``theta`` (976,) and its statistics."""
         theta_key, run_key = jax.random.split(key)
         theta = initial_theta(theta_key, self._initial_scale) if theta is None else jnp.asarray(theta)
@@ -81,11 +88,11 @@ class Trainer:
         """One update and its metrics (scalars on the device; fetch them rarely)."""
         return self._update(state, self.pool)
 
-    def lower(self, state: TrainState):
+    def lower(self, state: TrainState) -> Lowered:
         """The update, lowered for ahead-of-time compilation (``.compile()``)."""
         return self._update.lower(state, self.pool)
 
-    def _update_local(self, state: TrainState, pool: BallPool):
+    def _update_local(self, state: TrainState, pool: BallPool) -> tuple[TrainState, dict[str, jax.Array]]:
         config, pairs = self.bgs_config, self.bgs_config.pairs
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
         population = strategy.ask(direction_key, state.bgs, config)
@@ -121,7 +128,7 @@ class Trainer:
         }
         return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
 
-    def _weighed(self, result: RolloutResult, updates) -> RolloutResult:
+    def _weighed(self, result: RolloutResult, updates: jax.Array) -> RolloutResult:
         """The result with the returns that the weights of this update give."""
         if self._later is None:
             return result
@@ -134,7 +141,7 @@ class Trainer:
 def totals(result: RolloutResult) -> dict:
     """Sums over the finite episodes of a rollout, from which ``means`` makes metrics; sums of parts add up."""
 
-    def total(x):
+    def total(x: jax.Array) -> jax.Array:
         return jnp.where(result.finite, x, 0.0).sum(axis=(-2, -1)).astype(jnp.float32)
 
     return {
