@@ -29,6 +29,7 @@ from mjx_tt import platform  # noqa: E402
 
 # Two host devices, so that splitting over devices is tested everywhere.
 platform.configure(devices=2, cache=CACHE)
+jax.devices()  # from here on no command in this process can change their number
 if STRICT:
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
