@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fnmatch
 import importlib
 import inspect
 import io
 import json
-import re
 import textwrap
 import types
 import typing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from docstrings import as_rest, field_notes
 
 if TYPE_CHECKING:
     from cyclopts import App
@@ -33,8 +33,6 @@ PACKAGES = ("robot_io", "ballmodel", "bgs", "mjx_tt")  # a name that several sho
 def setup(app: Sphinx) -> dict[str, Any]:
     """Entry point of the extension."""
     app.connect("builder-inited", lambda app: write_all())
-    app.connect("autodoc-process-docstring", _readable)
-    app.connect("autodoc-process-signature", _short)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
@@ -47,14 +45,13 @@ def write_all() -> None:
     from robot_io.emulator.config import RigParams
 
     GENERATED.mkdir(parents=True, exist_ok=True)
-    known: dict[str, str] = {}  # name of a section: its anchor; sections shared by several files are described once
+    known: dict[str, Section] = {}  # sections that several files share are described once
     _write("experiment", schema_page("Experiment", "mjx-tt train", experiment.json_schema(), known))
-    _write("study", schema_page("Study", "mjx-tt is2r", study.Study.model_json_schema(), known))
     _write("fine-tuning", schema_page("Fine-tuning", "mjx-tt finetune", FineTuning.model_json_schema(), known))
+    _write("study", schema_page("Study", "mjx-tt is2r", study.Study.model_json_schema(), known))
     _write("comparison", schema_page("Comparison", "mjx-tt compare", baselines.Comparison.model_json_schema(), known))
-    _write(
-        "verdict", schema_page("Verdict", "", json.loads((REFERENCE / "verdict.schema.json").read_text("utf-8")), {})
-    )
+    verdict = json.loads((REFERENCE / "verdict.schema.json").read_text("utf-8"))
+    _write("verdict", schema_page("Verdict", "", verdict, {}))
     _write("model", model_page())
     slow = f"Without `safety.speed_scale` a robot moves at {COMMISSIONING:.0%} of its speed."
     _write("robot", dataclass_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", RobotConfig, slow))
@@ -65,13 +62,22 @@ def write_all() -> None:
         _write(f"api-{package}", api_page(package, described))
 
 
-def schema_page(title: str, command: str, schema: dict[str, Any], known: dict[str, str]) -> str:
-    """Page with one table per section of a JSON schema; ``known`` holds the anchors of sections described before."""
+class Section(NamedTuple):
+    """A section of a schema that a page describes."""
+
+    anchor: str
+    definition: dict[str, Any]
+
+
+def schema_page(title: str, command: str, schema: dict[str, Any], known: dict[str, Section]) -> str:
+    """Page with one table per section of a JSON schema, except those that ``known`` holds; they are added to it."""
     page = title.lower()
     definitions = schema.get("$defs", {})
-    own = [name for name in _in_order(schema, definitions) if name not in known and _has_keys(definitions[name])]
-    anchors = known | {name: f"{page}-{name.lower()}" for name in own}
-    lines = [f"# {title}", ""]
+    own = [name for name in _in_order(schema, definitions) if definitions[name].get("properties")]
+    own = [name for name in own if name not in known or known[name].definition != definitions[name]]
+    known |= {name: Section(f"{page}-{name.lower()}", definitions[name]) for name in own}
+    anchors = {name: section.anchor for name, section in known.items()}
+    lines = [f"({page}-yaml)=", f"# {title}", ""]
     if command:
         lines += [f"The YAML of `{command}`. Keys without a default are required.", ""]
     else:
@@ -81,7 +87,8 @@ def schema_page(title: str, command: str, schema: dict[str, Any], known: dict[st
         section = definitions[name]
         lines += ["", f"({anchors[name]})=", f"## {name}", "", _cell(section.get("description", "")), ""]
         lines += _table(section, definitions, anchors)
-    known |= anchors
+    root = {key: value for key, value in schema.items() if key != "$defs"}
+    known.setdefault(schema.get("title", title), Section(f"{page}-yaml", root))
     return "\n".join(lines) + "\n"
 
 
@@ -104,10 +111,6 @@ def _in_order(schema: dict[str, Any], definitions: dict[str, Any]) -> list[str]:
 
     visit(schema)
     return found
-
-
-def _has_keys(definition: dict[str, Any]) -> bool:
-    return bool(definition.get("properties"))
 
 
 def _table(section: dict[str, Any], definitions: dict[str, Any], anchors: dict[str, str]) -> list[str]:
@@ -162,7 +165,7 @@ def dataclass_page(title: str, command: str, kind: type, remark: str = "") -> st
             continue
         done.append(kind)
         hints = typing.get_type_hints(kind)
-        summary, meanings = _field_notes(kind)
+        summary, meanings = field_notes(kind)
         lines += ["", f"## {path}" if path else "", "", _cell(summary), ""]
         told = bool(meanings) or any(map(dataclasses.is_dataclass, hints.values()))
         lines += ["| key | type | default |" + " meaning |" * told, "|---|---|---|" + "---|" * told]
@@ -172,7 +175,7 @@ def dataclass_page(title: str, command: str, kind: type, remark: str = "") -> st
             below = f"{path}.{field.name}".lstrip(".")
             if inner is not None:
                 waiting.append((below, inner))
-                lines.append(f"| `{field.name}` | mapping | section `{below}` | {_cell(_field_notes(inner)[0])} |")
+                lines.append(f"| `{field.name}` | mapping | section `{below}` | {_cell(field_notes(inner)[0])} |")
             else:
                 text = hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
                 meaning = f" {_cell(meanings.get(field.name, ''))} |" * told
@@ -208,7 +211,7 @@ def model_page() -> str:
         for name in section.split("."):
             hint = typing.get_type_hints(owner)[name]
             owner = next(h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h))
-        summary, notes = _field_notes(owner)
+        summary, notes = field_notes(owner)
         title = "drives.JOINT" if section in joints else section
         lines += ["", f"## {title}", "", _cell(summary), "", "| key | nominal | meaning |", "|---|---|---|"]
         lines += [f"| `{key}` | {_nominal(value)} | {_cell(notes.get(key, ''))} |" for key, value in values.items()]
@@ -217,20 +220,6 @@ def model_page() -> str:
 
 def _nominal(value: float | str) -> str:
     return "none" if isinstance(value, float) and value > 100.0 else f"`{value}`"
-
-
-def _field_notes(kind: type) -> tuple[str, dict[str, str]]:
-    """First paragraph of a dataclass's docstring, and what docstring and comments say of each field."""
-    blocks = (inspect.getdoc(kind) or "").split("\n\n")
-    source = inspect.getsource(kind)
-    notes = {name: text for text, name in re.findall(r"^    # (.+)\n    (\w+): ", source, re.MULTILINE)}
-    notes |= dict(re.findall(r"^    (\w+): .*?  # (.+)$", source, re.MULTILINE))
-    for block in blocks[1:]:
-        for names, text in _entries(block.splitlines()).items():
-            for field in dataclasses.fields(kind):
-                if any(fnmatch.fnmatch(field.name, name) for name in names.split(", ")):
-                    notes[field.name] = text
-    return blocks[0], notes
 
 
 def _plain(field: dataclasses.Field) -> str:
@@ -313,7 +302,7 @@ def api_page(package: str, described: dict[int, str]) -> str:
         if not isinstance(value, types.ModuleType) and name != "annotations"
     }
     summary = (inspect.getdoc(module) or "").strip()
-    rest = [package, "=" * len(package), "", *_as_rest(summary.splitlines()), ""]
+    rest = [package, "=" * len(package), "", *as_rest(summary.splitlines()), ""]
     objects = [name for name in sorted(public) if callable(public[name])]
     own = [name for name in objects if id(public[name]) not in described]
     if own:
@@ -330,81 +319,6 @@ def api_page(package: str, described: dict[int, str]) -> str:
         kind = "class" if inspect.isclass(value) else "function"
         rest += [f".. auto{kind}:: {package}.{name}", *(["   :members:"] if kind == "class" else []), ""]
     return "\n".join(rest)
-
-
-def _readable(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
-    told = {name for block in "\n".join(lines).split("\n\n") for name in _entries(block.splitlines())}
-    lines[:] = _as_rest(lines)
-    if what == "class" and dataclasses.is_dataclass(value):
-        for field, note in _field_notes(value)[1].items():
-            if field not in told and not any(field in names.split(", ") for names in told):
-                lines += [f"``{field}``", f"   {_escaped(note)}", ""]
-
-
-def _short(app: Sphinx, what: str, name: str, value: Any, options: Any, signature: str, returns: str) -> Any:
-    """Signature of a dataclass that Sphinx cannot parse, without the modules of its types."""
-    if "<factory>" not in (signature or ""):
-        return None  # Sphinx can parse and link it
-    return tuple(
-        part and re.sub(r"~?(?:[A-Za-z_]\w*\.)+(\w+)", r"\1", part).replace("<factory>", "...")
-        for part in (signature, returns)
-    )
-
-
-def _as_rest(lines: list[str]) -> list[str]:
-    """Docstring as reStructuredText: lists of names as definitions, indented blocks as literal text, marks escaped."""
-    found: list[str] = []
-    for block in "\n".join(lines).split("\n\n"):
-        rows = [row for row in block.splitlines() if row.strip()]
-        entries = _entries(rows)
-        if entries:
-            for name, text in entries.items():
-                found += [f"``{name}``", f"   {_escaped(text)}"]
-        elif rows and rows[0].startswith(" "):
-            found += [".. code-block:: text", "", *("   " + row for row in rows)]
-        else:
-            found += _paragraph(rows)
-        found.append("")
-    return found
-
-
-def _paragraph(rows: list[str]) -> list[str]:
-    """Plain rows; from the first indented row behind a colon on, and behind rows of code, literal text."""
-    for i, row in enumerate(rows[:-1]):
-        if rows[i + 1].startswith("  ") and row.endswith(":"):
-            literal = [".. code-block:: text", "", *("   " + r for r in rows[i + 1 :])]
-            return [*map(_escaped, rows[: i + 1]), "", *literal]
-    return [
-        _escaped(row) if row.startswith(("- ", "  ")) and rows[0].startswith("- ") else _escaped(row.strip())
-        for row in rows
-    ]
-
-
-def _entries(rows: list[str]) -> dict[str, str]:
-    """Rows "name   description", in columns, continued by indented rows; empty for anything else."""
-    entries: dict[str, str] = {}
-    names = r"[a-z][\w.]*\*?(?:, [a-z][\w.]*\*?)*"
-    rows = textwrap.dedent("\n".join(rows)).splitlines()
-    first = next(filter(None, (re.match(rf"{names} {{2,}}(?=\S)", row) for row in rows)), None)
-    if first is None:
-        return {}
-    for row in rows:
-        head, text = row[: first.end()], row[first.end() :]
-        long = re.match(rf"({names})(?: {{2,}}| (?=[(\[]))(\S.*)$", row)
-        if head.endswith(" ") and re.fullmatch(names, head.strip()):
-            entries[head.strip()] = text
-        elif long:
-            entries[long[1]] = long[2]
-        elif entries and row.startswith("    "):
-            entries[list(entries)[-1]] += " " + row.strip()
-        else:
-            return {}
-    return entries
-
-
-def _escaped(line: str) -> str:
-    parts = re.split(r"(``.*?``)", line)
-    return "".join(p if p.startswith("``") else re.sub(r"([*|`\\]|_(?=\W|$))", r"\\\1", p) for p in parts)
 
 
 def _write(name: str, text: str) -> None:
