@@ -1,0 +1,51 @@
+"""The files for the arm's controller agree with what the bridge and the emulated arm expect."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robot_io.contract import ABB_JOINTS, LIMITS
+from robot_io.devices.egm.session import DEFAULT_PORT, EgmConfig
+from robot_io.emulator.arm import ArmParams
+
+FOLDER = Path(__file__).resolve().parents[3] / "examples" / "abb"
+MODULE, MOTION, PROTOCOL = (
+    (FOLDER / name).read_text("ascii") for name in ("TableTennis.mod", "MOC.cfg", "transmission_protocol.txt")
+)
+
+
+def number(text: str, key: str) -> float:
+    (value,) = set(re.findall(rf"{re.escape(key)} *:?=? *(-?[\d.]+)", text))
+    return float(value)
+
+
+def test_the_module_agrees_with_the_bridge_and_the_emulated_arm():
+    assert number(MODULE, r"\SampleRate") / 1000 == EgmConfig().period == ArmParams().cycle
+    assert number(MODULE, r"\LpFilter") == number(MOTION, "-ext_motion_filter_bandwidth") == ArmParams().low_pass
+    gain = number(MODULE, r"\PosCorrGain") * number(MOTION, "-ext_motion_Kp")
+    assert gain == pytest.approx(ArmParams().pos_corr_gain)
+    assert int(number(PROTOCOL, "Remote Port")) == DEFAULT_PORT
+    assert EgmConfig().timeout < number(MODULE, "communication_timeout") <= 0.1
+
+
+def test_as_delivered_it_is_slow_and_never_moves_by_itself():
+    assert (
+        number(MODULE, "max_speed_deviation") <= 0.05 * np.degrees(max(LIMITS.velocity[i] for i in ABB_JOINTS)) + 1e-9
+    )
+    code = re.sub(r"!.*", "", MODULE)
+    assert "RAMP_DOWN" not in code and "NoWaitCond" not in code
+    assert re.findall(r"Move\w+ \w+", code) == ["MoveAbsJ here"] and "here := CJointT()" in code
+    assert "-do_not_restart_after_motors_off" in MOTION
+
+
+def test_names_and_blocks_of_the_files_match():
+    assert re.findall(r'"(\w+)" \\Joint', MODULE) == ["TT_BRIDGE"] and re.search(r"^Name +TT_BRIDGE$", PROTOCOL, re.M)
+    assert '"table_tennis"' in MODULE and '-name "table_tennis"' in MOTION
+    code = re.sub(r'!.*|"[^"\n]*"', "", MODULE)
+    for block in ("MODULE", "PROC", "TRAP", "WHILE", "IF"):
+        assert len(re.findall(rf"\b{block}\b", code)) == len(re.findall(rf"\bEND{block}\b", code)) > 0
+    assert max(map(len, re.findall(r"[A-Za-z_]\w*", code))) <= 32  # RAPID's longest name
