@@ -165,9 +165,9 @@ def test_a_program_sends_its_ball_to_the_bridge_in_real_time(programs, language)
         try:
             while len(received) < FRAMES and time.monotonic() < began + 20.0:
                 select.select([receiver], [], [], 0.2)
-                for packet, source in receiver.drain():
+                for packet, source, sender in receiver.drain():
                     now = time.monotonic()
-                    sample = tracker.receive(packet, source, now)
+                    sample = tracker.receive(packet, source, now, sender)
                     assert sample is not None, tracker.counts
                     received.append((sample, now))
             lines = client.communicate(timeout=10.0)[0].splitlines()
