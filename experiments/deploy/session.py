@@ -106,18 +106,18 @@ class Session:
 
     def prepare(self, rig: Rig | None) -> None:
         """Switch the axes on and home them, on the rig the arm too, until nothing is missing. Raises RefusedError."""
-        self.send(messages.Prepare())
         if rig is not None:
             rig.switch_on()
-        end, refusal = time.monotonic() + PREPARE_TIME, ""
+        end, refusal, again = time.monotonic() + PREPARE_TIME, "", True
         while time.monotonic() < end:
+            if again:
+                self.send(messages.Prepare())
+            again = False
             for message in self._answers(0.3):
                 if isinstance(message, Status) and not message.missing:
                     return
                 if isinstance(message, Refused):  # until the arm has sent its position, or an axis has answered
-                    refusal = f"; {message.sentence}"
-                    self.send(messages.Prepare())
-                    time.sleep(0.1)
+                    refusal, again = f"; {message.sentence}", True
         missing = "no status" if self.status is None else self.status.missing
         raise RefusedError(f"the robot does not get ready within {PREPARE_TIME:g} s: {missing}{refusal}")
 

@@ -46,7 +46,7 @@ from robot_io.log.messages import (
     json_text,
 )
 from robot_io.log.recorder import NullRecorder, SessionRecorder
-from robot_io.safety.clearance import RobotGeometry
+from robot_io.safety.clearance import BLADE, RobotGeometry
 from robot_io.safety.faults import Cause
 from robot_io.safety.gate import GateState, SafetyGate
 
@@ -55,7 +55,6 @@ AT_HOME = 0.02  # [m], [rad] of every joint
 HOMING_GAP = 0.03  # [m] of everything to everything while the linear axes search their references
 HOMING_PLACES = 21  # along each axis at which that is looked at
 LONGEST_STOP = 2.0  # [s] after which a stop ends although the measurement does not come to rest
-BLADE = "col_blade_axis"  # the capsule whose middle is the blade's centre
 
 
 class BridgeState(Enum):

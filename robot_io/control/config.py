@@ -49,6 +49,7 @@ RANGES = {
     "safety.table_margin": (0.01, 0.5),
     "safety.self_margin": (0.01, 0.5),
     "safety.floor_margin": (0.15, 0.7),
+    "safety.blade_speed": (0.05, 10.0),
     "safety.escape_speed": (0.001, 0.1),
     "safety.still": (0.001, 0.1),
     "safety.overspeed": (1.05, 2.0),

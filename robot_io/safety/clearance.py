@@ -28,6 +28,7 @@ Array = TypeVar("Array", bound=Any)  # of NumPy or JAX
 
 FORMAT = 1
 SHIPPED = "robot_geometry.json"
+BLADE = "col_blade_axis"  # the capsule whose middle is the blade's centre
 LEVELS = 5  # halvings of a stretch before it counts as too close
 
 _KEYS = ("format", "joints", "capsules", "table", "floor", "table_capsules", "blade_capsules", "self_pairs", "home")
@@ -169,6 +170,11 @@ class RobotGeometry:
             np.matmul(world[i - 1], local[i], out=world[i])
         points = np.matmul(world[self._joint, :, :3], self._local)  # (capsules, B, 3, 2)
         return np.ascontiguousarray(points.transpose(3, 2, 0, 1))
+
+    def blade_speed(self, q: np.ndarray, velocity: np.ndarray, duration: float) -> float:
+        """Mean speed [m/s] of the blade's centre from joint positions q (8,) at ``velocity`` (8,) for ``duration`` [s]."""
+        ends = self.ends(np.stack([q, q + velocity * duration], axis=1))[:, :, self._names.index(BLADE)].mean(axis=0)
+        return float(np.linalg.norm(ends[:, 1] - ends[:, 0])) / duration
 
     def middle(self, capsule: str, q: np.ndarray) -> np.ndarray:
         """World position (3,) [m] of the middle of a capsule's axis at joint positions q (8,)."""

@@ -28,6 +28,7 @@ from robot_io.safety.monitor import FeedbackMonitor, eight, worst
 from robot_io.safety.stopping import StopReference
 
 SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
+TOUCH = 0.01  # [m] smallest gap of the way that lies beside the reference by the measured deviation
 INSIDE = 1e-6  # [m] by which a gap must miss its margin to count as inside: more than rounding
 ROUNDING = 1e-9  # of each limit, allowed in the check of our own results
 LONGEST_LEAD = 3.0  # control periods that commands may come ahead of the clock
@@ -47,7 +48,7 @@ class Sent:
     velocity  (8,) for the coming control period [m/s], [rad/s]
     position  (8,) reference at that period's end [m], [rad]; NaN while no finite position was ever measured
     changed   names of the rules that changed the request, in order: speed_scale, escape, velocity, acceleration,
-              position, clearance, or the state's name when it is not armed; empty: sent as requested
+              position, blade_speed or clearance, or the state's name when it is not armed; empty: sent as requested
     state     after this command
     """
 
@@ -94,6 +95,7 @@ class SafetyGate:
         self._low, self._high = np.array(limits.lower) + outside, np.array(limits.upper) - outside
         margins = {"table": config.table_margin, "self": config.self_margin, "floor": config.floor_margin}
         self._margin = np.array([margins[kind] for kind in self.geometry.kinds])
+        self._touch = np.minimum(self._margin, TOUCH)
         self._inside = np.zeros(self._margin.shape, bool)  # gaps that have been below their margin since arming
         self._still = np.array(config.still)
         self._monitor = FeedbackMonitor(limits, self.geometry, config)
@@ -106,6 +108,7 @@ class SafetyGate:
         self._start = self._reference  # where the period in force starts
         self._measured: tuple[np.ndarray, np.ndarray] | None = None  # position and velocity, when credible
         self._unexplained = np.zeros(N_JOINTS)
+        self._deviation = np.zeros(N_JOINTS)  # of the measured position from the way of the reference
         self._measured_velocity: np.ndarray | None = None
         self._last: float | None = None  # time of the command before
         self._lead = 0.0  # [s] that commands are ahead of the clock
@@ -198,6 +201,7 @@ class SafetyGate:
         self._reference = self._start = position
         self._inside = np.ones(self._margin.shape, bool)
         self._stop.restart()
+        self._deviation = np.zeros(N_JOINTS)
         self._lead, self._last = 0.0, None
         self._monitor.restart(position, now)
 
@@ -338,18 +342,26 @@ class SafetyGate:
                 rules.append(name)
         if (velocity == braked).all():  # cleared before, or at rest
             return velocity, tuple(rules)
+        rule = ""
         for share in SHARES:
             # Between two velocities that keep the kinematic limits every one does: they bound each joint by itself.
             tried = velocity if share == 1.0 else braked + share * (velocity - braked)
-            if self._clear(tried):
-                return tried, tuple(rules if share == 1.0 else [*rules, "clearance"])
-        return braked, (*rules, "clearance")
+            if self.geometry.blade_speed(self._reference, tried, self.period) > self.config.blade_speed:
+                rule = "blade_speed"
+            elif self._clear(tried):
+                return tried, tuple(rules if share == 1.0 else [*rules, rule])
+            else:
+                rule = "clearance"
+        return braked, (*rules, rule)
 
     def _clear(self, velocity: np.ndarray) -> bool:
         """Whether this period and braking after it keep the margins, or leave a margin that is missed already."""
         way = self.braking_way(velocity)
         if self.geometry.first_too_close(way, self._margin, SLACK) is not None:
             return False
+        if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
+            if self.geometry.first_too_close(way + self._deviation[:, None], self._touch, SLACK) is not None:
+                return False
         if self._inside.any():
             gaps = self.geometry.gaps(way)[self._inside]
             return bool((gaps[:, -1] > gaps[:, 0]).all())
@@ -432,6 +444,7 @@ class SafetyGate:
         if not self._engaged:
             return
         self._unexplained = self._monitor.unexplained(position, now)
+        self._deviation = self._monitor.deviation(position)
         if not self._latch:
             sentence = self._monitor.following_error(self._unexplained)
             if sentence:

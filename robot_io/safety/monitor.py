@@ -11,6 +11,7 @@ from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.config import SafetyConfig
 from robot_io.safety.faults import Cause
 
+EXACT = 0.002  # [m], [rad] by which a robot may go beside its reference unnoticed
 EARLY = 0.1  # [s] by which a measurement may be looked at before the end of the newest period
 
 
@@ -23,6 +24,7 @@ class FeedbackMonitor:
         self._geometry, self._config = geometry, config
         self._tolerance = np.array(config.following_error)
         self._past: deque[tuple[float, np.ndarray]] = deque()  # times and references at the ends of periods
+        self._low = self._high = np.zeros(N_JOINTS)  # of the references in the window
         self._off = 0  # measurements in a row with a following error
 
     def restart(self, position: np.ndarray, now: float) -> None:
@@ -53,7 +55,13 @@ class FeedbackMonitor:
         shortest, longest = self._config.delay
         self._forget(now - longest)
         seen = [r for i, (_, r) in enumerate(self._past) if i == 0 or self._past[i - 1][0] < now - shortest]
-        return np.maximum(np.min(seen, axis=0) - position, position - np.max(seen, axis=0))
+        self._low, self._high = np.min(seen, axis=0), np.max(seen, axis=0)
+        return np.maximum(self._low - position, position - self._high)
+
+    def deviation(self, position: np.ndarray) -> np.ndarray:
+        """Vector (8,) from the nearest place in the window of ``unexplained`` to the position; zero below EXACT."""
+        found = position - np.clip(position, self._low, self._high)
+        return np.where(np.abs(found) > EXACT, found, 0.0)
 
     def following_error(self, error: np.ndarray) -> str:
         """Following error over the actuation-delay window as a sentence; empty: none. ``error`` (8,): ``unexplained``."""

@@ -683,3 +683,53 @@ def test_latch_keeps_the_first_cause_and_lists_the_others():
 def test_a_wrong_configuration_is_refused(wrong):
     with pytest.raises(ValueError, match=f"SafetyConfig.{next(iter(wrong))} is"):
         replace(SafetyConfig(), **wrong)
+
+
+# --- where the robot is, beside its reference
+
+
+class Offset(Ideal):
+    """A robot that is measured beside its reference, within the following-error limit."""
+
+    def __init__(self, offset, **options) -> None:
+        super().__init__(**options)
+        self.offset = np.zeros(8)
+        self.final = np.asarray(offset, float)
+
+    def tick(self, request=ZERO, measured=None):
+        self.offset += np.clip(self.final - self.offset, -0.002, 0.002)  # as a drift
+        sent = super().tick(request, self.position + self.offset)
+        return sent
+
+
+@pytest.mark.parametrize("offset", [0.03, 0.08, 0.15])
+def test_a_robot_beside_its_reference_does_not_come_into_the_table(offset):
+    """Its joints 2 and 5 lead it down: the margin of the reference alone would let the measured blade through."""
+    deepest = np.inf
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        robot = Offset([0, 0, 0, offset, 0.5 * offset, 0, 0, 0])
+        for _ in range(100):  # it drifts where there is room
+            robot.tick()
+        for _ in range(250):
+            robot.tick(attack(robot.position + robot.offset, rng))
+            deepest = min(deepest, GEOMETRY.gaps((robot.position + robot.offset)[:, None]).min())
+            if robot.gate.state is not GateState.ARMED:
+                break
+    assert deepest > -0.002
+
+
+def test_the_blade_is_no_faster_than_allowed():
+    limit = 3.0
+    fastest = {}
+    for allowed in (limit, 10.0):
+        ideal, fastest[allowed] = Ideal(SafetyConfig(speed_scale=1.0, blade_speed=allowed)), 0.0
+        changed: list[str] = []
+        for tick in range(200):
+            before = ideal.position
+            changed += ideal.tick(V_MAX * [1, 1, 1, 0.1, 0.1, 1, 1, 1] * np.sign(np.sin(tick / 12))).changed
+            way = GEOMETRY.middle("col_blade_axis", ideal.position) - GEOMETRY.middle("col_blade_axis", before)
+            fastest[allowed] = max(fastest[allowed], np.linalg.norm(way) / T)
+        keeps_limits(ideal.velocities, ideal.positions)
+        assert ("blade_speed" in changed) == (allowed == limit)
+    assert fastest[limit] < 1.15 * limit and fastest[10.0] > 4.0
