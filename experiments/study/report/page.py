@@ -57,7 +57,7 @@ class Report:
             f"{name}: {_count(len(study.players), 'player')}, {_count(len(study.seeds), 'seed')}, "
             f"{len(study.rallies):,} rallies, of which {int(study.rallies.selected.sum()):,} are reported"
         )
-        style, _, _ = self._templates.loader.get_source(self._templates, "study.css")
+        style = self._templates.get_template("study.css").render()
         self.page = Page("Simulate, play, refine: the paper's study repeated", subtitle, css=style)
 
     def compose(self) -> None:

@@ -37,7 +37,7 @@ class Table:
     """A table of text; columns ``right`` hold numbers."""
 
     head: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
     right: tuple[int, ...] = ()
 
     def write(self, path: Path) -> None:
