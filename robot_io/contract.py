@@ -10,8 +10,8 @@ Observation at one control tick, in this order (11 numbers, SI units):
 The policy input is the last ``HISTORY`` observations, oldest first: shape (8, 11). At the start of an episode the first
 observation fills the whole history.
 
-Action: eight numbers in [-1, 1], in ``JOINT_NAMES`` order; times ``LIMITS.policy_velocity`` they are the requested joint
-velocities [m/s], [rad/s]. The request passes ``robot_io.limits`` before anything moves.
+Action: eight numbers in [-1, 1], in ``JOINT_NAMES`` order; times ``LIMITS.policy_velocity`` they are the requested
+joint velocities [m/s], [rad/s]. The request passes ``robot_io.limits`` before anything moves.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ class JointLimits:
         for i, joint in enumerate(JOINT_NAMES):
             if not self.upper[i] - self.lower[i] > 2 * self.margin[i] >= 0:
                 raise ValueError(
-                    f"{joint}: range [{self.lower[i]}, {self.upper[i]}] leaves no room inside a margin of {self.margin[i]}"
+                    f"{joint}: range [{self.lower[i]}, {self.upper[i]}] leaves no room inside a margin of "
+                    f"{self.margin[i]}"
                 )
             if not 0 < self.policy_velocity[i] <= self.velocity[i]:
                 raise ValueError(
@@ -79,8 +80,9 @@ def _rad(*degrees: float) -> tuple[float, ...]:
     return tuple(float(np.deg2rad(d)) for d in degrees)
 
 
-# Arm: ABB manual 3HAC035728 (ranges, 120T speeds). Accelerations: the base moments allow about 70 rad/s^2 on a stretched
-# joint 1; wrist joints are lighter. Gantry: estimates (2 m and 1 m stroke, 2 m/s, 15 m/s^2), centred on the stroke.
+# Arm: ABB manual 3HAC035728 (ranges, 120T speeds). Accelerations: the base moments allow about 70 rad/s^2 on a
+# stretched joint 1; wrist joints are lighter. Gantry: estimates (2 m and 1 m stroke, 2 m/s, 15 m/s^2),
+# centred on the stroke.
 LIMITS = JointLimits(
     lower=(-1.0, -0.5, *_rad(-165.0, -110.0, -110.0, -160.0, -120.0, -400.0)),
     upper=(1.0, 0.5, *_rad(165.0, 110.0, 70.0, 160.0, 120.0, 400.0)),
@@ -101,8 +103,9 @@ GATED = (True, True, False)
 def parameter_shapes() -> dict[str, tuple[int, ...]]:
     """Names and shapes of the policy's parameters in the order of the flat vector theta (976,).
 
-    ``conv<i>/kernel`` is (KERNEL, inputs, outputs) with kernel tap 0 the OLDER observation; the outputs of a gated layer
-    are the tanh half first, then the sigmoid half. ``conv<i>/bias`` is (outputs,). Arrays are flattened in C order.
+    ``conv<i>/kernel`` is (KERNEL, inputs, outputs) with kernel tap 0 the OLDER observation; the outputs of a gated
+    layer are the tanh half first, then the sigmoid half. ``conv<i>/bias`` is (outputs,). Arrays are
+    flattened in C order.
     """
     shapes: dict[str, tuple[int, ...]] = {}
     inputs = N_OBSERVATION
@@ -147,5 +150,6 @@ def describe() -> dict:
         ],
         "limits": {name: list(values) for name, values in asdict(LIMITS).items()},
         "parameters": {name: list(shape) for name, shape in parameter_shapes().items()},
-        "frame": "origin at the table's centre on its top surface; x across, y along the table (human y > 0), z up; SI units",
+        "frame": "origin at the table's centre on its top surface; x across, y along the table (human y > 0), z up; "
+        "SI units",
     }

@@ -47,7 +47,7 @@ class History:
         return True
 
     def at(self, time: float) -> np.ndarray | None:
-        """The value (n,) at ``time`` [s]: interpolated, the oldest before all samples, the newest for a short while after.
+        """Value (n,) at ``time`` [s]: interpolated; the oldest before all samples, the newest for a short while after.
 
         None without samples or when the newest is older than ``longest_hold``.
         """
@@ -65,7 +65,7 @@ class History:
         return values[i - 1] + share * (values[i] - values[i - 1])
 
     def slope(self, span: float) -> np.ndarray | None:
-        """Rate of change (n,) per second by least squares over the last ``span`` seconds; None with under three samples."""
+        """Rate of change (n,) per second by least squares over the last ``span`` [s]; None with under three samples."""
         times, values = self._times, self._values
         n, first = 0, times[-1] - span if times else 0.0
         while n < len(times) and times[-1 - n] >= first:

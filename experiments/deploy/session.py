@@ -184,7 +184,7 @@ def run(
     seconds: float | None,
     console: Console,
 ) -> int:
-    """Plays until ``balls`` outcomes are known, ``seconds`` have passed, or the operator quits; 0 when all went well."""
+    """Play until ``balls`` outcomes are known, ``seconds`` have passed, or the operator quits; 0: all went well."""
     loaded = artefacts.load(artefact)
     with ExitStack() as stack:
         rig = None

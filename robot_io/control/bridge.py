@@ -6,8 +6,8 @@ ACTIVE    the policy plays the ball that is coming
 STOPPING  the operator's stop: slows down to rest, then DISARMED
 FAULT     slowed down and held until the operator resets it
 
-Everything that is sent has passed ``robot_io.safety.gate``. An exception in here is a fault: ``tick`` and whatever takes
-what arrives never raise. Times are seconds of one monotonic clock, passed in.
+Everything that is sent has passed ``robot_io.safety.gate``. An exception in here is a fault: ``tick`` and
+whatever takes what arrives never raise. Times are seconds of one monotonic clock, passed in.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import Enum
 from time import perf_counter
 from typing import Protocol
@@ -76,7 +76,7 @@ class Policy(Protocol):
 class Axes(Protocol):
     """``FestoAxes`` or the thread that drives it."""
 
-    def command(self, position, velocity, now: float) -> None: ...
+    def command(self, position: np.ndarray, velocity: np.ndarray, now: float) -> None: ...
 
     def stop(self) -> None: ...
 
@@ -105,12 +105,9 @@ class Counts:
 
     ticks: int = 0
     balls: int = 0
-    outcomes: Counter = None
+    outcomes: Counter[str] = field(default_factory=Counter)
     rally: int = 0  # balls returned in a row
     longest_rally: int = 0
-
-    def __post_init__(self) -> None:
-        self.outcomes = Counter()
 
 
 class Bridge:
@@ -181,7 +178,7 @@ class Bridge:
         return bool(near.all() and (np.abs(self.gate.reference - self._home) < AT_HOME).all() and self.gate.at_rest)
 
     def set_policy(self, policy: Policy, version: int = 0) -> None:
-        """Exchange the policy; ``version`` is in the summaries of its balls. Raises RefusedError while it is playing."""
+        """Exchange the policy; ``version`` is in its balls' summaries. Raises RefusedError while it is playing."""
         if self.state is BridgeState.ACTIVE:
             raise RefusedError("the policy is playing: exchange it between balls")
         self._policy, self.policy_version = policy, version
@@ -222,7 +219,7 @@ class Bridge:
         self._change(BridgeState.DISARMED, now, "fault reset by the operator")
 
     def check_homing(self) -> None:
-        """Raise RefusedError unless the linear axes may search their references: nobody knows where they are until then.
+        """Raise RefusedError unless the linear axes may search their references; where they are is unknown until then.
 
         The robot must be disarmed, and the arm, where it is measured to be, clear of everything wherever the axes go.
         """
@@ -333,7 +330,7 @@ class Bridge:
     # The control tick
 
     def tick(self, deadline: float, now: float) -> np.ndarray:
-        """One control period: observe, decide, pass the gate, hand over to the devices. Returns the sent velocity (8,)."""
+        """One control period: observe, decide, pass the gate, hand over to the devices; the sent velocity (8,)."""
         self.counts.ticks += 1
         self.policy_seconds, request = 0.0, np.zeros(N_JOINTS)
         measured, measured_velocity = np.full(N_JOINTS, np.nan), np.zeros(N_JOINTS)
@@ -512,7 +509,7 @@ class Bridge:
                 self._log_failure = f"the log cannot be written: {error}"
 
     def ball_track(self, summary: EpisodeSummary) -> np.ndarray:
-        """(n, 4) t [s], x, y, z [m] of the incoming ball, from its first sight until it was played; while ``on_episode``."""
+        """(n, 4) t [s], x, y, z [m] of the incoming ball until it was played; in ``on_episode`` only."""
         return np.array(self._tracks.get(summary.number, [])).reshape(-1, 4)
 
     def joint_table(self) -> list[tuple[str, float, float]]:

@@ -17,7 +17,8 @@ ANSWER_TIME = 0.035  # [s] for an axis to answer: less than the age at which its
 AXIS_NAMES = ("gantry_x", "gantry_y")
 
 PORT = (1, 65535)
-# What a robot.yaml may set. Watchdogs, margins and time-outs end where they would no longer protect: docs/concepts/safety.md.
+# Allowed in a robot.yaml: watchdogs, margins and time-outs end where they would no longer protect
+# (docs/concepts/safety.md).
 RANGES = {
     "arm.port": PORT,
     "arm.timeout": (0.01, 0.1),

@@ -165,7 +165,7 @@ class Episode:
             self._decide(now)
 
     def _turns(self, last: _Seen | None, seen: _Seen) -> bool:
-        """Whether the ball leaves the robot: the newest difference sees it at once, the fit confirms that it is no noise."""
+        """True when the ball leaves the robot: the newest difference shows it at once, the fit excludes noise."""
         if last is None or seen.position[1] > 0.2 or len(self._recent) < SIDE:
             return False
         newest = (seen.position[1] - last.position[1]) / (seen.time - last.time)

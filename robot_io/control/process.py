@@ -133,7 +133,7 @@ class Control:
         self._close()
 
     def _close(self) -> None:
-        """Close everything in the opposite order, so that the axes stop before the log ends; then raise the first error."""
+        """Close everything in the opposite order, so that the axes stop before the log ends; raise the first error."""
         errors = []
         while self._opened:
             try:

@@ -1,4 +1,4 @@
-"""How late and how long: percentiles that cost the same after a second and after a day, so that asking delays nothing."""
+"""Percentiles of lateness and durations, at a cost that does not grow with the length of a session."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Timing:
         self._bins[min(i, BINS)] += 1
 
     def percentile(self, share: float) -> float:
-        """Upper edge [s] of the bin that holds the percentile (0 to 100); at most 1.2 % too long. NaN without samples."""
+        """Upper edge [s] of the percentile's bin (0 to 100), at most 1.2 % too long; NaN without samples."""
         if not self.count:
             return math.nan
         i = int(np.searchsorted(np.cumsum(self._bins), share / 100 * self.count))

@@ -1,6 +1,6 @@
 """Emulated register banks: how words written to an axis move its drive, and what it reports.
 
-Written from the registers' side and without the computer's codecs (``robot_io.devices.festo``): only bits' names are shared.
+Written from the registers' side without the computer's codecs (``robot_io.devices.festo``); only names are shared.
 """
 
 from __future__ import annotations

@@ -76,3 +76,6 @@ class RigParams:
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)
+
+
+STANDARD_RIG = RigParams()

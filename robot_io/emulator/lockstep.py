@@ -1,7 +1,7 @@
 """Rig and bridge in one process on a clock of its own: the same code as in real time, as fast as the machine allows.
 
-Bytes on the wire are those of the sockets; only UDP and TCP themselves are left out. Deterministic: equal parameters give
-equal episodes, bit for bit.
+Bytes on the wire are those of the sockets; only UDP and TCP themselves are omitted. Deterministic: equal parameters
+give equal episodes, bit for bit.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.arm import ArmController
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.ball_launcher import Thrower, Throws
-from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, RigParams
+from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams
 from robot_io.emulator.network import Network
 from robot_io.emulator.tracker import TrackerEmulator
 from robot_io.emulator.world import World
@@ -34,6 +34,7 @@ from robot_io.safety.gate import SafetyConfig, SafetyGate
 GRID = 3000  # ticks a second of the clock, so that 75, 125 and 250 Hz are whole numbers of them
 ARM, AXES, TRACK, CONTROL = GRID // 250, GRID // 125, GRID // 125, GRID // 75
 BRIDGE, CONTROLLER = ("127.0.0.1", 6510), ("127.0.0.1", 6511)
+STANDARD_PLAY = BridgeConfig()
 
 
 class LockStep:
@@ -48,8 +49,8 @@ class LockStep:
         scene: str | Path,
         throws: Throws,
         policy: Policy,
-        params: RigParams = RigParams(),
-        config: BridgeConfig = BridgeConfig(),
+        params: RigParams = STANDARD_RIG,
+        config: BridgeConfig = STANDARD_PLAY,
         safety: SafetyConfig | None = None,
         recorder: SessionRecorder | None = None,
         first: int = 0,
@@ -157,7 +158,7 @@ class LockStep:
         return until()
 
     def start(self) -> None:
-        """Switches everything on, homes the axes and arms the bridge. Raises RefusedError when it does not get ready."""
+        """Switch everything on, home the axes, arm the bridge. Raises RefusedError when it does not get ready."""
         self.arm.motors_on()
         self.arm.start_rapid()
         self.arm.start_egm()

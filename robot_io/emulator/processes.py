@@ -21,7 +21,7 @@ from robot_io.emulator.arm import ArmController, ArmStateError
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_server import serve
 from robot_io.emulator.ball_launcher import Thrower, Throws
-from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, RigParams
+from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams
 from robot_io.emulator.network import Network
 from robot_io.emulator.shared_state import Shared
 from robot_io.emulator.tracker import TrackerEmulator
@@ -67,7 +67,9 @@ class Rig:
     Raises DeviceError when one of them does not start.
     """
 
-    def __init__(self, scene: str, throws: Throws, params: RigParams = RigParams(), ports: Ports | None = None) -> None:
+    def __init__(
+        self, scene: str, throws: Throws, params: RigParams = STANDARD_RIG, ports: Ports | None = None
+    ) -> None:
         self.params, self.ports = params, ports or free_ports()
         self._shared = Shared()
         self._shared["silent_until"][0] = -1.0
@@ -184,7 +186,7 @@ def _run(job: Callable, name: str, params: RigParams, ports: Ports, pipe, argume
 
 
 def _paced(shared: Shared, pipe, period: float):
-    """Absolute deadlines [s] until the rig ends; what has been missed is made up for one by one, as a real clock would."""
+    """Absolute deadlines [s] until the rig ends; missed ones are made up for one by one, as a real clock would."""
     parent = multiprocessing.parent_process()
     deadline, count = time.monotonic(), 0
     while not shared.value("finish"):

@@ -1,7 +1,7 @@
 """The state that the rig's processes share: the world writes it, the emulators of arm and axes write set-points.
 
-One block of float64 in shared memory. The world counts a version up before and after it writes, so a reader knows when it
-has read half of two states and reads again.
+One block of float64 in shared memory. The world counts a version up before and after it writes, so a reader that
+has read half of two states knows and reads again.
 """
 
 from __future__ import annotations

@@ -1,14 +1,16 @@
 """The rig's world: one MuJoCo C simulation of robot, table, net and a ball, with contacts.
 
-Another physics than the training's on purpose. The ball is a free body: MuJoCo integrates its flight and its impacts are
-MuJoCo contacts that last about 2 ms. The air's drag and the tangential impulses are applied here: MuJoCo has no drag for
-such a ball and no rubber, and the friction of its soft contacts takes from the bounce when a ball slides. The robot's
+Another physics than the training's on purpose. The ball is a free body: MuJoCo integrates its flight and its impacts
+are MuJoCo contacts that last about 2 ms. The air's drag and the tangential impulses are applied here: MuJoCo has no
+drag for such a ball and no rubber, and the friction of its soft contacts takes from the bounce when a ball
+slides. The robot's
 drives follow velocity set-points, as in the training's model.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +41,8 @@ NET = (0.1, 0.3)  # restitution and friction
 PHASES = 6  # of a contact's beginning within a step, for the calibration
 FINE = 4  # steps instead of one near a surface
 NEAR = 0.06  # [m] from the ball's centre: a ball at 20 m/s moves 0.02 m in a step
+
+Vector = Sequence[float] | np.ndarray  # (3,)
 
 
 @dataclass(frozen=True)
@@ -121,7 +125,7 @@ class World:
     def ball_velocity(self) -> np.ndarray:
         return self.data.qvel[self._ball_v : self._ball_v + 3].copy()
 
-    def throw(self, position, velocity, spin=(0.0, 0.0, 0.0)) -> None:
+    def throw(self, position: Vector, velocity: Vector, spin: Vector = (0.0, 0.0, 0.0)) -> None:
         """Puts a new ball into play."""
         self._place(position, velocity, spin)
         mujoco.mj_kinematics(self.model, self.data)  # the ball's orientation is looked at before the next step
@@ -133,7 +137,7 @@ class World:
         self._place(PARKED, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         self.in_play = False
 
-    def _place(self, position, velocity, spin) -> None:
+    def _place(self, position: Vector, velocity: Vector, spin: Vector) -> None:
         q, v = self._ball_q, self._ball_v
         self.data.qpos[q : q + 7] = [*position, 1.0, 0.0, 0.0, 0.0]
         self.data.qvel[v : v + 6] = [*velocity, *spin]

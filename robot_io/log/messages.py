@@ -339,7 +339,7 @@ def as_strings(entries: Mapping[str, Any]) -> dict[str, str]:
 
 
 def json_text(value: Any) -> str:
-    """JSON of whatever there is to log, without raising: numbers that are not finite become null, unknown types their repr."""
+    """JSON of any value without raising: numbers that are not finite become null, unknown types their repr."""
     try:
         return json.dumps(_finite(value), allow_nan=False, default=repr)
     except (TypeError, ValueError, RecursionError):  # keys of other types, circles

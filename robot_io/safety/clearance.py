@@ -88,7 +88,7 @@ class Box:
 
 
 def segment_distance(p1: Array, q1: Array, p2: Array, q2: Array, xp: ModuleType = np) -> Array:
-    """Distance [m], (...), of segments p1-q1 and p2-q2, each end (3, ...); ``xp``: numpy, or jax.numpy as the simulation's.
+    """Distance [m], (...), of segments p1-q1 and p2-q2, each end (3, ...); ``xp``: numpy or jax.numpy.
 
     Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
     """
@@ -172,7 +172,7 @@ class RobotGeometry:
         return np.ascontiguousarray(points.transpose(3, 2, 0, 1))
 
     def blade_speed(self, q: np.ndarray, velocity: np.ndarray, duration: float) -> float:
-        """Mean speed [m/s] of the blade's centre from joint positions q (8,) at ``velocity`` (8,) for ``duration`` [s]."""
+        """Mean speed [m/s] of the blade's centre from positions q (8,) at ``velocity`` (8,) for ``duration`` [s]."""
         ends = self.ends(np.stack([q, q + velocity * duration], axis=1))[:, :, self._names.index(BLADE)].mean(axis=0)
         return float(np.linalg.norm(ends[:, 1] - ends[:, 0])) / duration
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robot_io.contract import CONTROL_RATE, JOINT_NAMES, JOINT_UNITS, LIMITS, N_JOINTS, JointLimits
 from robot_io.errors import RefusedError
@@ -161,7 +162,7 @@ class SafetyGate:
         """Conditions that keep the gate from being armed or reset at the moment."""
         return self._latch.present
 
-    def arm(self, measured, now: float, measured_velocity=None) -> None:
+    def arm(self, measured: ArrayLike, now: float, measured_velocity: ArrayLike | None = None) -> None:
         """Takes the measured position (8,) as reference and lets requests pass from now on.
 
         measured_velocity (8,): None takes what the last ``command`` was told. Raises RefusedError, and changes nothing,
@@ -266,7 +267,7 @@ class SafetyGate:
             sentence = f"nothing heard from {what} for {age:.3f} s, allowed is {allowed} s"
             self.condition(cause, not age <= allowed, sentence, now)
 
-    def command(self, request, measured, measured_velocity, now: float) -> Sent:
+    def command(self, request: ArrayLike, measured: ArrayLike, measured_velocity: ArrayLike, now: float) -> Sent:
         """One control tick: requested, measured velocity and measured position, each (8,), to what has to be sent.
 
         Never raises: whatever is wrong with the inputs is a fault, and what comes back then is the braked motion.
@@ -409,7 +410,7 @@ class SafetyGate:
             self.fault(Cause.TIMING, f"commands come faster than every {self.period:.5f} s", now)
         return now
 
-    def _request(self, request, now: float) -> np.ndarray:
+    def _request(self, request: ArrayLike, now: float) -> np.ndarray:
         """The requested velocity (8,), zero when it cannot be used."""
         values, problem = eight(request, "requested velocity")
         finite = values is None or bool(np.isfinite(values).all())
@@ -425,7 +426,7 @@ class SafetyGate:
         self.condition(Cause.MALFORMED_COMMAND, bool(problem) and finite, problem, now)
         return np.zeros(N_JOINTS) if problem else values
 
-    def _watch(self, measured, measured_velocity, now: float) -> None:
+    def _watch(self, measured: ArrayLike, measured_velocity: ArrayLike, now: float) -> None:
         """Looks at what was measured."""
         position, problem = eight(measured, "measured position")
         velocity, second = eight(measured_velocity, "measured velocity")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robot_io.contract import JOINT_NAMES, JOINT_UNITS, N_JOINTS, JointLimits
 from robot_io.safety.clearance import RobotGeometry
@@ -64,7 +65,7 @@ class FeedbackMonitor:
         return np.where(np.abs(found) > EXACT, found, 0.0)
 
     def following_error(self, error: np.ndarray) -> str:
-        """Following error over the actuation-delay window as a sentence; empty: none. ``error`` (8,): ``unexplained``."""
+        """Following error over the actuation-delay window as a sentence; empty: none. error (8,): ``unexplained``."""
         self._off = self._off + 1 if (error > self._tolerance).any() else 0
         if self._off < self._config.following_ticks:
             return ""
@@ -85,7 +86,7 @@ class FeedbackMonitor:
         return ""
 
 
-def eight(values, what: str) -> tuple[np.ndarray | None, str]:
+def eight(values: ArrayLike, what: str) -> tuple[np.ndarray | None, str]:
     """Eight finite float64 numbers, and what is wrong with them instead; None where they are not eight numbers."""
     try:
         given = np.asarray(values)

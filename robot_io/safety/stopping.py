@@ -37,7 +37,7 @@ class StopReference:
         self._at_rest_since = math.inf
 
     def credible(self, position: np.ndarray, now: float) -> bool:
-        """Compare a measurement (8,) with the one before: False for a jump that no joint can make. Call once per tick."""
+        """Compare a measurement (8,) with the one before: False for a jump that no joint can make. Once per tick."""
         last, self._last = self._last, (now, position)
         if last is None:
             return True

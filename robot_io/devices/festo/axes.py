@@ -1,7 +1,8 @@
 """Two linear axes that follow a stream of positions and velocities. No socket, no clock, no thread.
 
-The drives position: each cycle they get a target and a highest speed (``robot_io.devices.festo.following``). When the computer
-dies in mid-motion they stop by themselves: at the last target, at most ``lead`` seconds and a braking distance away, or
+The drives position: each cycle they get a target and a highest speed (``robot_io.devices.festo.following``). When the
+computer dies in mid-motion they stop by themselves: at the last target, at most ``lead`` seconds and a braking
+distance away, or
 when their node guards fire.
 """
 
@@ -9,14 +10,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robot_io.devices.festo.config import N_AXES, AxesConfig, AxesFault, AxesState, Axis
 from robot_io.devices.festo.following import Move, Reference, Target, move
 from robot_io.devices.festo.modbus_link import AxisLost
 from robot_io.devices.festo.profile import AxisCommand, AxisStatus
+
+DEFAULTS = AxesConfig()
 
 
 class _Channel:
@@ -47,7 +51,7 @@ class FestoAxes:
     stale_commands  how often a stream of commands broke off
     """
 
-    def __init__(self, axes: Sequence[Axis], config: AxesConfig = AxesConfig()):
+    def __init__(self, axes: Sequence[Axis], config: AxesConfig = DEFAULTS) -> None:
         if len(axes) != N_AXES:
             raise ValueError(f"{len(axes)} axes given, the robot has {N_AXES}")
         self.config = config
@@ -75,7 +79,7 @@ class FestoAxes:
         """Both axes answer and know where they are."""
         return all(c.status is not None and c.status.homed for c in self._channels)
 
-    def command(self, position, velocity, now: float) -> None:
+    def command(self, position: ArrayLike, velocity: ArrayLike, now: float) -> None:
         """The newest target: position (2,) [m] at ``now``, velocity (2,) [m/s] to go on with. ValueError: no number."""
         numbers = []
         for name, values in (("position", position), ("velocity", velocity)):
@@ -344,6 +348,6 @@ class FestoAxes:
     def _fault_words(self, channel: _Channel) -> str:
         return "no answer" if channel.status is None else channel.axis.profile.fault_text(channel.status.fault_code)
 
-    def _names(self, wrong) -> str:
+    def _names(self, wrong: Callable[[AxisStatus], bool]) -> str:
         names = [c.axis.name for c in self._channels if c.status is None or wrong(c.status)]
         return f"{' and '.join(names)} {'is' if len(names) == 1 else 'are'}"

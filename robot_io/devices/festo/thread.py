@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
-from robot_io.devices.festo.axes import AxesState, FestoAxes
+from numpy.typing import ArrayLike
+
+from robot_io.devices.festo.axes import FestoAxes
+from robot_io.devices.festo.config import AxesState
 
 STOPPING = 1.0  # [s] for coming to rest at the end
 
@@ -49,7 +53,7 @@ class AxesThread:
     def __exit__(self, *exc_info: object) -> None:
         self.close()
 
-    def command(self, position, velocity, now: float) -> None:
+    def command(self, position: ArrayLike, velocity: ArrayLike, now: float) -> None:
         """As ``FestoAxes.command``; ``now`` of ``time.monotonic``."""
         self.axes.command(position, velocity, now)
 
@@ -90,7 +94,7 @@ class AxesThread:
         finally:
             self._end()
 
-    def _loop(self, finished) -> None:
+    def _loop(self, finished: Callable[[], bool]) -> None:
         deadline = time.monotonic()
         while not finished():
             began = time.monotonic()

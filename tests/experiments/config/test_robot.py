@@ -116,7 +116,8 @@ def test_mistakes_are_told_all_at_once_with_what_is_allowed(tmp_path):
         robot.load_robot(path)
     assert str(error.value).splitlines() == [
         f"{path}: arm.port: got 'x'; allowed: int",
-        f"{path}: arm.hots: unknown key; did you mean 'host'? allowed: host, port, controller, timeout, controller_port",
+        f"{path}: arm.hots: unknown key; did you mean 'host'? "
+        "allowed: host, port, controller, timeout, controller_port",
         f"{path}: axes[1].port: got 1.5; allowed: int",
         str(error.value).splitlines()[-1],
     ]
