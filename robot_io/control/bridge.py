@@ -367,7 +367,7 @@ class Bridge:
             if self.tracker.ball != self._last_ball:
                 self._begin(now)
         if self.state is BridgeState.ACTIVE:
-            return self._play(now)
+            return self._play(now, self.episode, self._policy)
         return self._homeward() if self.state is BridgeState.READY else np.zeros(N_JOINTS)
 
     def _ages(self, now: float) -> dict[str, float]:
@@ -401,13 +401,16 @@ class Bridge:
         self._last_ball = self.tracker.ball
         self.episode = Episode(self.counts.balls, self.tracker.ball, now, self.policy_version)
         self._tracks[self.counts.balls] = [(t, *x) for t, x in self.tracker.track.samples()]
-        self._policy.reset()
+        if self._policy is not None:  # arming has looked
+            self._policy.reset()
         self._log(episode_start(now, self.episode.number, ball=self.episode.ball))
         self._change(BridgeState.ACTIVE, now, f"ball {self.episode.ball}")
 
-    def _play(self, now: float) -> np.ndarray:
+    def _play(self, now: float, episode: Episode | None, policy: Policy | None) -> np.ndarray:
         """The policy's request (8,)."""
-        episode = self.episode
+        if episode is None or policy is None:
+            self.gate.fault(Cause.INTERNAL, "neither ball nor policy to play", now)
+            return np.zeros(N_JOINTS)
         observation = observe(self._feedback, self.config.delays, now)
         if observation is None:
             if self._feedback.ball.at(now - self.config.delays.ball) is None:
@@ -417,7 +420,7 @@ class Bridge:
             return np.zeros(N_JOINTS)
         began = perf_counter()
         try:
-            action = np.asarray(self._policy.step(observation), float)
+            action = np.asarray(policy.step(observation), float)
             if action.shape != (N_JOINTS,):
                 raise ValueError(f"an action of shape {action.shape}, needed is ({N_JOINTS},)")
         except Exception as error:  # whatever a policy does, the robot is braked

@@ -40,12 +40,9 @@ class Feedback:
 
 def observe(feedback: Feedback, delays: ObservationDelays, now: float) -> np.ndarray | None:
     """The observation (11,) at ``now`` in the order of the contract; None while a device has nothing recent to say."""
-    parts = (
-        feedback.ball.at(now - delays.ball),
-        feedback.axes.at(now - delays.axes),
-        feedback.arm.at(now - delays.arm),
-    )
-    return None if any(part is None for part in parts) else np.concatenate(parts)
+    ball = feedback.ball.at(now - delays.ball)
+    axes, arm = feedback.axes.at(now - delays.axes), feedback.arm.at(now - delays.arm)
+    return None if ball is None or axes is None or arm is None else np.concatenate([ball, axes, arm])
 
 
 def joints(feedback: Feedback) -> tuple[np.ndarray, np.ndarray]:

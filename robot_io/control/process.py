@@ -14,14 +14,16 @@ import time
 from collections import deque
 from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from robot_io import log
 from robot_io.control import messages, realtime
 from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState
+from robot_io.control.bridge import Policy as StepPolicy
 from robot_io.control.config import RobotConfig, linear_axes
 from robot_io.control.episode import EpisodeSummary
 from robot_io.control.timings import Timings
@@ -37,6 +39,14 @@ from robot_io.safety.gate import SafetyGate
 STATUS_PERIOD = 0.2  # [s]
 STOP_TIME = 2.0  # [s] for coming to rest before the process ends
 AFTER_REST = 0.05  # [s] in which the arm is told to hold the place where it stands
+Wanted = TypeVar("Wanted", messages.Ready, messages.Ended)
+
+
+class Closable(Protocol):
+    def close(self) -> object: ...
+
+
+Closing = TypeVar("Closing", bound=Closable)
 
 
 @dataclass(frozen=True)
@@ -51,7 +61,7 @@ class ControlOptions:
     attachments: tuple[tuple[str, str], ...] = ()
 
 
-def make_policy(backend: str, policy: Policy):
+def make_policy(backend: str, policy: Policy) -> StepPolicy:
     """A policy for the loop. Raises ValueError for an unknown backend."""
     if backend == "numpy":
         return StreamingPolicy(policy)
@@ -62,7 +72,7 @@ def make_policy(backend: str, policy: Policy):
     raise ValueError(f"policy backend {backend!r}, allowed: numpy, jit")
 
 
-def start(config: RobotConfig, options: ControlOptions) -> tuple[multiprocessing.Process, Connection]:
+def start(config: RobotConfig, options: ControlOptions) -> tuple[BaseProcess, Connection]:
     """Starts the process; the first message on the pipe is "ready" or "failed"."""
     context = multiprocessing.get_context("spawn")
     mine, theirs = context.Pipe()
@@ -92,11 +102,11 @@ class Control:
         loaded = artefacts.load(options.artefact)
         policy = make_policy(options.backend, loaded.policy)
         self.timings = Timings()
-        self._opened: list = []
+        self._opened: list[Closable] = []
         try:
             self._arm_socket = self._open(EgmSocket(config.arm.host, config.arm.port))
             self._tracker_socket = self._open(TrackerSocket(config.tracker))
-            recorder = log.NullRecorder()
+            recorder: log.SessionRecorder = log.NullRecorder()
             if options.log_folder is not None:
                 metadata = {"artefact": options.artefact, "artefact_sha256": loaded.digest, "robot": config.name}
                 recorder = log.Recorder.start(
@@ -122,7 +132,7 @@ class Control:
         self._status_at = 0.0
         self._period = 1.0 / config.rate
 
-    def _open(self, thing):
+    def _open(self, thing: Closing) -> Closing:
         self._opened.append(thing)
         return thing
 
@@ -144,7 +154,7 @@ class Control:
             raise errors[0]
 
     @staticmethod
-    def _warm_up(policy, gate: SafetyGate) -> None:
+    def _warm_up(policy: StepPolicy, gate: SafetyGate) -> None:
         """First calls import and allocate: not in the loop."""
         for _ in range(20):
             policy.step(np.zeros(11))
@@ -233,8 +243,9 @@ class Control:
         began = time.monotonic()
         if self._arm_socket.drain(self._session, began):
             reply = self.bridge.arm_received(began)
-            if reply is not None:
-                self._arm_socket.send(reply, self._session.endpoint)
+            endpoint = self._session.endpoint
+            if reply is not None and endpoint is not None:
+                self._arm_socket.send(reply, endpoint)
                 self.timings.reply.add(time.monotonic() - began)
 
     def _take_axes(self) -> None:
@@ -346,9 +357,6 @@ class Control:
             log_dropped=self._recorder.dropped,
             timings=self.timings.summary(),
         )
-
-
-Wanted = TypeVar("Wanted", messages.Ready, messages.Ended)
 
 
 def wait_for(pipe: Connection, kind: type[Wanted], seconds: float) -> Wanted:

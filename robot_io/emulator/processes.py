@@ -8,8 +8,9 @@ import signal
 import socket
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
 
 import numpy as np
 
@@ -100,7 +101,7 @@ class Rig:
 
     @property
     def robot(self) -> RobotConfig:
-        axes = tuple(AxisConfig(HOST, port) for port in self.ports.axes)
+        axes = AxisConfig(HOST, self.ports.axes[0]), AxisConfig(HOST, self.ports.axes[1])
         return RobotConfig(
             name="rig",
             arm=ArmConfig(HOST, self.ports.arm, HOST),
@@ -167,7 +168,7 @@ class Rig:
         self.close()
 
 
-def _run(job: Callable, name: str, params: RigParams, ports: Ports, pipe, arguments: tuple) -> None:
+def _run(job: Callable, name: str, params: RigParams, ports: Ports, pipe: Connection, arguments: tuple) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     shared = Shared(name)
     # These stand for hardware, which nothing else on this machine can delay; below the bridge's priority.
@@ -185,7 +186,7 @@ def _run(job: Callable, name: str, params: RigParams, ports: Ports, pipe, argume
         shared.close()
 
 
-def _paced(shared: Shared, pipe, period: float):
+def _paced(shared: Shared, pipe: Connection, period: float) -> Iterator[float]:
     """Absolute deadlines [s] until the rig ends; missed ones are made up for one by one, as a real clock would."""
     parent = multiprocessing.parent_process()
     deadline, count = time.monotonic(), 0
@@ -197,12 +198,12 @@ def _paced(shared: Shared, pipe, period: float):
             time.sleep(wait)
         elif wait < -0.5:
             deadline = time.monotonic()  # the machine was asleep
-        if count % 256 == 0 and not parent.is_alive():
+        if count % 256 == 0 and parent is not None and not parent.is_alive():
             return
         yield deadline
 
 
-def _world(shared: Shared, params: RigParams, ports: Ports, pipe, scene: str, throws: Throws) -> None:
+def _world(shared: Shared, params: RigParams, ports: Ports, pipe: Connection, scene: str, throws: Throws) -> None:
     world = World(scene, params.world)
     thrower = Thrower(throws, params.pause)
 
@@ -223,7 +224,7 @@ def _world(shared: Shared, params: RigParams, ports: Ports, pipe, scene: str, th
         publish(now)
 
 
-def _arm(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
+def _arm(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> None:
     client = (HOST, ports.arm)
     controller = ArmController(client, replace(params.arm, dead_time=params.arm.dead_time + params.action_delay))
     out, back = Network(params.arm_network, params.seed), Network(params.arm_network, params.seed + 1)
@@ -268,7 +269,7 @@ def _operate(controller: ArmController, request: str) -> None:
             pass  # it is so already
 
 
-def _axes(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
+def _axes(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> None:
     dead_time = params.axis_dead_time + params.action_delay
     emulators = [
         AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)
@@ -294,7 +295,7 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
             server.close()
 
 
-def _tracker(shared: Shared, params: RigParams, ports: Ports, pipe) -> None:
+def _tracker(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> None:
     cameras, network = (
         TrackerEmulator(params.tracker, params.seed + 2),
         Network(params.tracker_network, params.seed + 3),

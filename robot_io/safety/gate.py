@@ -178,7 +178,7 @@ class SafetyGate:
         if not math.isfinite(now):
             raise RefusedError(f"not armed: the time is {now}")
         position, problem = eight(measured, "measured position")
-        if problem:
+        if problem or position is None:
             raise RefusedError(f"not armed: {problem}")
         outside = (position < self._low) | (position > self._high)
         if outside.any():
@@ -189,11 +189,11 @@ class SafetyGate:
         touching = self._monitor.contact(position)
         if touching:
             raise RefusedError(f"not armed: {touching}; jog it away")
-        velocity = self._measured_velocity if measured_velocity is None else measured_velocity
-        if velocity is None:
+        given = self._measured_velocity if measured_velocity is None else measured_velocity
+        if given is None:
             raise RefusedError("not armed: no measured velocity yet")
-        velocity, problem = eight(velocity, "measured velocity")
-        if problem:
+        velocity, problem = eight(given, "measured velocity")
+        if problem or velocity is None:
             raise RefusedError(f"not armed: {problem}")
         if (np.abs(velocity) > self._still).any():
             raise RefusedError(f"not armed: {worst(velocity, self._still, '/s')}, it must be at rest")
@@ -282,7 +282,8 @@ class SafetyGate:
             self._follow_the_arm(now)
         left = np.abs(self._velocity) - self._step
         braked = np.where(left > ROUNDING * self._step, np.copysign(left, self._velocity), 0.0)
-        velocity, changed = braked, (self.state.value,)
+        velocity = braked
+        changed: tuple[str, ...] = (self.state.value,)
         if self.state is GateState.ARMED:
             try:
                 velocity, changed = self._allowed(wanted, braked)
@@ -414,7 +415,7 @@ class SafetyGate:
         """The requested velocity (8,), zero when it cannot be used."""
         values, problem = eight(request, "requested velocity")
         finite = values is None or bool(np.isfinite(values).all())
-        if not problem:
+        if not problem and values is not None:
             kind = np.asarray(request).dtype
             tiny = np.finfo(kind if kind.kind == "f" else np.float64).tiny
             # No motion is that slow: bytes that were taken for numbers often look like this.
@@ -424,7 +425,7 @@ class SafetyGate:
                 problem = f"requested velocity: {JOINT_NAMES[i]} is {values[i]}, a subnormal number"
         self.condition(Cause.NON_FINITE_COMMAND, not finite, problem, now)
         self.condition(Cause.MALFORMED_COMMAND, bool(problem) and finite, problem, now)
-        return np.zeros(N_JOINTS) if problem else values
+        return np.zeros(N_JOINTS) if problem or values is None else values
 
     def _watch(self, measured: ArrayLike, measured_velocity: ArrayLike, now: float) -> None:
         """Looks at what was measured."""

@@ -15,6 +15,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robot_io.devices.egm.messages import MAX_DATAGRAM, UINT32, decode_robot, encode_sensor
 from robot_io.devices.egm.messages import EgmError as EgmError
@@ -152,7 +153,7 @@ class EgmSession:
         self.statistics.accepted += 1
         return True
 
-    def reply(self, position, velocity, now: float) -> bytes | None:
+    def reply(self, position: ArrayLike, velocity: ArrayLike, now: float) -> bytes | None:
         """The answer to the newest packet: position (6,) [rad] and velocity (6,) [rad/s] to move at.
 
         To hold, pass the held position and zeros. Returns None when no packet waits for an answer, or when one has
@@ -214,7 +215,7 @@ class EgmSession:
         return self.endpoint is None or source[1] == self.endpoint[1] or self._is_stale(now)
 
     def _is_stale(self, now: float) -> bool:
-        return now - self.feedback.received > self.config.timeout
+        return self.feedback is None or now - self.feedback.received > self.config.timeout
 
     def _refuse(self, reason: str, sentence: str) -> bool:
         self.statistics.rejected[reason] += 1
