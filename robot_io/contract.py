@@ -17,6 +17,7 @@ joint velocities [m/s], [rad/s]. The request passes ``robot_io.limits`` before a
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -122,7 +123,7 @@ def n_parameters() -> int:
     return sum(int(np.prod(shape)) for shape in parameter_shapes().values())
 
 
-def unflatten(theta):
+def unflatten(theta: Any) -> dict[str, Any]:
     """Splits theta (976, ...batch) into a dict of arrays shaped as ``parameter_shapes`` with batch axes last.
 
     Works on NumPy and JAX arrays. Raises ValueError when the first axis is not 976 long.

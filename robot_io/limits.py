@@ -9,12 +9,17 @@ contradict each other. Written with array operators only, so that NumPy and JAX 
 
 from __future__ import annotations
 
+from types import ModuleType
+from typing import Any
+
 import numpy as np
 
 from robot_io.contract import LIMITS, JointLimits
 
 
-def limit_velocity(request, previous, reference, dt: float, limits: JointLimits = LIMITS, xp=np):
+def limit_velocity(
+    request: Any, previous: Any, reference: Any, dt: float, limits: JointLimits = LIMITS, xp: ModuleType = np
+) -> Any:
     """The velocity to command for the next ``dt`` seconds.
 
     request    (8, ...) wanted joint velocity [m/s], [rad/s]; finite
@@ -27,7 +32,7 @@ def limit_velocity(request, previous, reference, dt: float, limits: JointLimits 
     """
     column = (slice(None),) + (None,) * (request.ndim - 1)
 
-    def bound(values):
+    def bound(values: tuple[float, ...]) -> np.ndarray:
         return np.asarray(values, request.dtype)[column]
 
     a, v_max, margin = bound(limits.acceleration), bound(limits.velocity), bound(limits.margin)

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint.log import SHORTEST, JointRecord
 from robot_io.contract import JOINT_NAMES
-from robot_io.log import read
+from robot_io.log import SessionLog, read
 
 LONGEST_GAP = 0.1  # [s] without a sample that ends a flight
 
@@ -34,7 +34,7 @@ def load(path: Path) -> tuple[tuple[Trajectory, ...], tuple[JointRecord, ...]]:
     return _flights(log, path.stem), _joints(log)
 
 
-def _flights(log, session: str) -> tuple[Trajectory, ...]:
+def _flights(log: SessionLog, session: str) -> tuple[Trajectory, ...]:
     out = []
     for ball in np.unique(log.ball.id):
         mine = np.flatnonzero(log.ball.id == ball)
@@ -51,7 +51,7 @@ def _flights(log, session: str) -> tuple[Trajectory, ...]:
     return tuple(out)
 
 
-def _joints(log) -> tuple[JointRecord, ...]:
+def _joints(log: SessionLog) -> tuple[JointRecord, ...]:
     states, commands = log.joints, log.commands
     if states.time.size < 2 or commands.time.size < 2:
         return ()

@@ -22,7 +22,7 @@ from robot_io.devices.egm.messages import N_ARM_JOINTS, EgmError, decode_sensor,
 EVENTS_KEPT = 1000
 
 
-def _arm(values) -> tuple[float, ...]:
+def _arm(values: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(values[i] for i in ABB_JOINTS)
 
 

@@ -18,7 +18,7 @@ from robot_io.emulator.axis_drive import Drive as Drive
 from robot_io.emulator.axis_drive import DriveParams as DriveParams
 from robot_io.emulator.axis_drive import Power as Power
 from robot_io.emulator.axis_motion import Past
-from robot_io.emulator.axis_registers import REGISTERS, AxisUnits
+from robot_io.emulator.axis_registers import REGISTERS, AxisUnits, CmmtRegisters, FhppRegisters
 from robot_io.emulator.axis_server import AxisServer as AxisServer
 from robot_io.emulator.axis_server import serve as serve
 
@@ -58,7 +58,7 @@ class AxisEmulator:
         self.images = 0  # of the output registers taken so far
         self.disconnected = False
         self.guard_tripped = False  # until the server has closed the connection
-        self._bank = REGISTERS[profile](units)
+        self._bank: CmmtRegisters | FhppRegisters = REGISTERS[profile](units)
         self._dead_time, self._delay = dead_time, feedback_delay
         self._lock = threading.Lock()
         self._now = 0.0

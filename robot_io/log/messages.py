@@ -66,7 +66,7 @@ class Ball:
     @classmethod
     def unpack(cls, data: bytes) -> Ball:
         _, capture_time, received, id = _BALL.unpack_from(data)
-        return cls(capture_time, received, *_arrays(data, _BALL.size, 3), id)
+        return cls(capture_time, received, _arrays(data, _BALL.size, 3)[0], id)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -96,7 +96,8 @@ class Joints:
     @classmethod
     def unpack(cls, data: bytes) -> Joints:
         _, time, received = _TWO_TIMES.unpack_from(data)
-        return cls(time, *_arrays(data, _TWO_TIMES.size, N_JOINTS, N_JOINTS), received)
+        position, velocity = _arrays(data, _TWO_TIMES.size, N_JOINTS, N_JOINTS)
+        return cls(time, position, velocity, received)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -305,7 +306,7 @@ _KINDS = {kind.KIND: kind for kind in (Ball, Joints, Command, Observation, Actio
 
 def unpack(data: bytes) -> Record:
     """The record that ``pack`` made. Raises LogError for bytes that are none."""
-    kind = _KINDS.get(data[0] if data else None)
+    kind = _KINDS.get(data[0]) if data else None
     if kind is None:
         raise LogError(f"record of unknown kind {data[:1]!r}, known are {sorted(_KINDS)}")
     try:

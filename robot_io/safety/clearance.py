@@ -80,7 +80,7 @@ class Box:
         gap = self._gap(p + best * d)
         return np.sqrt(np.einsum("xnb,xnb->nb", gap, gap))
 
-    def _gap(self, point):
+    def _gap(self, point: np.ndarray) -> np.ndarray:
         """From the nearest point of the box to ``point`` (3, ..., n, B)."""
         extra = (1,) * (point.ndim - 3)
         low, high = (corner.reshape(3, *extra, 1, 1) for corner in (self.low, self.high))

@@ -45,7 +45,7 @@ class DirectLink:
     bank: anything with ``exchange`` as in ``RegisterLink``, such as ``robot_io.emulator.axes.AxisEmulator``.
     """
 
-    def __init__(self, bank) -> None:
+    def __init__(self, bank: RegisterLink) -> None:
         self._bank = bank
 
     def exchange(self, write_address: int, values: list[int], read_address: int, count: int) -> list[int]:
