@@ -114,7 +114,7 @@ def reward_terms(summary: EpisodeSummary) -> dict[str, float]:
     hit, returned = summary.outcome in (HIT, RETURNED), summary.outcome == RETURNED
     landing = np.array(summary.landing, np.float32)
     closest = np.float32(summary.closest)
-    nearing = rewards.state_transition(closest, hit, summary.crossed, returned, landing)
+    nearing = rewards.state_transition(closest, hit, np.bool_(summary.crossed), returned, landing)
     return {
         "state_transition": float(nearing),
         "net_clearance": float(rewards.net_clearance(np.bool_(hit), np.bool_(summary.crossed), summary.net_height)),
