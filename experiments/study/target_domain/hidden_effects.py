@@ -21,6 +21,7 @@ import numpy as np
 from ballmodel import flight
 from ballmodel.constants import TABLE_LENGTH
 from ballmodel.flight import BallParams
+from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState
 from ballmodel.trajectory import Trajectory
 from mjx_tt.sim import model as models
@@ -154,7 +155,7 @@ def measure(model: SimModel, balls: BallState, noise: float, key) -> Measured:
     """Balls (3, n) as the reality's cameras see them from the player's contact on: physics, calibration, noise [m]."""
     n = balls.position.shape[1]
     padded = jax.tree.map(lambda x: jnp.pad(jnp.asarray(x, jnp.float32), ((0, 0), (0, -n % 256)), mode="edge"), balls)
-    positions, length = _fly(model.ball, padded, round(_LONGEST * CAMERA_RATE))
+    positions, length = _fly(without_nominal(model.ball), padded, round(_LONGEST * CAMERA_RATE))
     seen, camera = jnp.moveaxis(positions, 1, 0), sensors.camera(model.sensing)
     if camera is not None:
         seen = camera.seen(seen)
