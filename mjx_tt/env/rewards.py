@@ -50,7 +50,7 @@ def state_transition(
     """
     distance = jnp.hypot(landing[0] - TARGET[0], landing[1] - TARGET[1])
     near = jnp.exp(-distance / TARGET_RANGE)
-    after_hit = 3.0 + jnp.where(returned, 1.0 + near, 0.5 * crossed.astype(near.dtype) + 0.5 * near)
+    after_hit = 3.0 + jnp.where(returned, 1.0 + near, 0.5 * jnp.asarray(crossed).astype(near.dtype) + 0.5 * near)
     return jnp.where(hit, after_hit, 3.0 * jnp.exp(-closest / APPROACH_RANGE))
 
 
