@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import Array
+from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 TERMS = (
@@ -34,13 +35,17 @@ BLADE_CLEARANCE = 0.05  # [m] between blade and table below which the paddle cou
 FACING = 0.3  # smallest y component of the blade's normal in good style (72 degrees from the table's axis)
 SOFT_RANGE = 0.05  # share of a joint's range at each end that the joint-angle term counts as unsafe
 
+# One episode on the robot has plain numbers, a batch in simulation arrays (...).
+Flag = Bool[ArrayLike, "*batch"] | bool
+Number = Float[ArrayLike, "*batch"] | float
+
 
 def state_transition(
-    closest: Float[Array, "*batch"],
-    hit: Bool[Array, "*batch"],
-    crossed: Bool[Array, "*batch"],
-    returned: Bool[Array, "*batch"],
-    landing: Float[Array, "2 *batch"],
+    closest: Number,
+    hit: Flag,
+    crossed: Flag,
+    returned: Flag,
+    landing: Float[ArrayLike, "2 *batch"],
 ) -> Float[Array, "*batch"]:
     """Term 1, in [0, 5]: nearing the ball up to 3, hit 3, over the net 3.5, on the human's half 4, plus up to 1 more.
 
@@ -54,9 +59,7 @@ def state_transition(
     return jnp.where(hit, after_hit, 3.0 * jnp.exp(-closest / APPROACH_RANGE))
 
 
-def net_clearance(
-    hit: Bool[Array, "*batch"], crossed: Bool[Array, "*batch"], net_height: Float[Array, "*batch"]
-) -> Float[Array, "*batch"]:
+def net_clearance(hit: Flag, crossed: Flag, net_height: Number) -> Float[Array, "*batch"]:
     """Term 2, in [0, 1]: the outgoing ball's height over the net plane [m] against a target height."""
     bonus = jnp.exp(-(((net_height - NET_TARGET) / NET_RANGE) ** 2))
     return jnp.where(hit & crossed, bonus, 0.0)

@@ -33,7 +33,7 @@ from ballmodel import constants as c
 from ballmodel.aerodynamics import FlightParams
 from ballmodel.io import yaml
 from ballmodel.state import BallState
-from ballmodel.vec import Scalars
+from ballmodel.vec import Scalars, row
 from mjx_tt.rally.shots import aimed, erring, fall_seconds, stroke_seconds
 
 T = TypeVar("T")
@@ -284,7 +284,7 @@ def answer(player: Player, state: PlayerState, key: PRNGKeyArray, incoming: Inco
     after = PlayerState(
         tiredness=state.tiredness + person.tiring * (1.0 - state.tiredness),
         familiarity=state.familiarity + person.adapting * strange,
-        expected=state.expected + jnp.maximum(person.adapting, 0.1) * (met - state.expected),
+        expected=state.expected + row(jnp.maximum(person.adapting, 0.1)) * (met - state.expected),
     )
     left = BallState(ball.position, jnp.where(hit, velocity, ball.velocity), jnp.where(hit, spin, ball.spin))
     return Answer(left, hit, hard, after)

@@ -207,7 +207,7 @@ def test_a_randomised_drive_shows_in_the_rollout(simulator, pool, theta, episode
 
 def test_replay_shows_the_same_episode(simulator, theta, episodes, played):
     one = jax.tree.map(lambda x: x[..., :1] if x.ndim >= 2 else x, episodes)
-    qpos, ball, length = jax.jit(simulator.replay)(theta[:, 0], MEAN, INVERSE_SCALE, one)
+    qpos, ball, length = jax.jit(simulator.replay)(Policy(theta[:, 0], MEAN, INVERSE_SCALE), one)
     columns = np.arange(0, R * P, P)
     np.testing.assert_allclose(qpos[1:121], played.qpos[..., columns], atol=1e-4)
     for i, b in enumerate(columns):
