@@ -1,4 +1,4 @@
-"""What a study makes for each player: human models, policies and the order in which they come about.
+"""Items that a study makes for each player: human models, policies and the order in which they come about.
 
 The ten models of the paper (appendix "Evaluation Methodology"), the variant whose weights stay in simulation (its
 "Bringing the Fine-Tuned Model from the Real World Back to Simulation"), and the ablation's hand-made distributions.
@@ -92,7 +92,7 @@ ORACLE = "oracle"  # the oracle's simulated policy under its name in the ablatio
 
 
 def items(study: Study, player: str) -> tuple[Item, ...]:
-    """What is made for a player, in an order in which everything comes after what it needs."""
+    """Items made for a player, in an order in which everything comes after what it needs."""
     chosen = LOOP + (FRESH if study.fresh else ())
     if study.ablation and study.ablation.player == player:
         chosen += tuple(Simulated(balls, balls, None, None) for balls in study.ablation.balls)

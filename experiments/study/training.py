@@ -66,7 +66,7 @@ def simulate(
     step, which decides the seeds. score: what a policy is worth in reality, needed to choose among seeds.
     """
     balls = item.balls if human is None else load_distribution(human).to_dict()
-    scores = {}
+    scores: dict[str, float] = {}
     for k in range(study.simulation.seeds):
         seed = zlib.crc32(f"{name}/{k}".encode()) >> 1  # another one for every player, model and study seed
         config = configuration(study, item, balls, source, seed)
@@ -76,7 +76,7 @@ def simulate(
             train(experiment, run, console)
         if score is not None:
             scores[f"seed{k}"] = score(load_policy.load(run.folder))
-    best = max(scores, key=scores.get) if scores else "seed0"
+    best = max(scores, key=scores.__getitem__) if scores else "seed0"
     chosen = load_policy.load(folder / "training" / best)
     chosen.policy.save(folder / POLICY)
     run_dir.write_json(folder / SELECTION, {"best": f"training/{best}", "scores": scores})

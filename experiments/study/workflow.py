@@ -81,11 +81,11 @@ class Journal:
         self.entries.append(entry)
 
     def place(self, step: Step) -> int | None:
-        """Where the step's last mark stands; None without one."""
+        """Index of the step's last mark; None without one."""
         return max((i for i, entry in enumerate(self.entries) if entry["step"] == step.name), default=None)
 
     def seconds_per_work(self) -> dict[str, float]:
-        """What a unit of work of each kind took so far, all sessions together."""
+        """Seconds that a unit of work of each kind took so far, all sessions together."""
         work: dict[str, list[float]] = {}
         for entry in self.entries:
             sums = work.setdefault(entry["kind"], [0.0, 0.0])

@@ -28,14 +28,17 @@ from functools import cached_property
 import numpy as np
 
 from ballmodel import constants as c
+from ballmodel.distribution import BallDistribution
 from experiments.stats import welch_interval
 from experiments.study.analysis.paper import CLAIMS, FINAL, GROUPS, TEN, WITHOUT, Claim, of_level
+from experiments.study.analysis.scoring import Rallies
 from experiments.study.analysis.statistics import (
     DRAWS,
     Bootstrap,
     Difference,
     Estimate,
     Interval,
+    Models,
     difference,
     normalised_by_model,
     normalised_by_player,
@@ -151,7 +154,13 @@ class Measurements:
         return _finite(rallies, normalised_by_model(rallies), self.over_seeds)
 
     def ratio(
-        self, a, b, group: str, own: bool = True, own_b: bool | None = None, boot: Bootstrap | None = None
+        self,
+        a: Models,
+        b: Models,
+        group: str,
+        own: bool = True,
+        own_b: bool | None = None,
+        boot: Bootstrap | None = None,
     ) -> Estimate | None:
         """Mean of a over mean of b, over the players of a group that have both."""
         pair = (boot or self.raw).pair(a, b, of_level(group), own, own_b)
@@ -160,7 +169,9 @@ class Measurements:
     def minus(self, boot: Bootstrap, a: str, b: str, group: str, own: bool = True) -> Estimate | None:
         """Mean of a minus mean of b, over the players of a group that have both; ``larger`` is of the rally lengths."""
         pair, lengths = (x.pair(a, b, of_level(group), own) for x in (boot, self.raw))
-        return pair and replace(pair[0] - pair[1], larger=max(e.value for e in lengths))
+        if pair is None or lengths is None:
+            return None
+        return replace(pair[0] - pair[1], larger=max(e.value for e in lengths))
 
     def short(self) -> Estimate | None:
         """Share of rallies below SHORT, S2R+FT minus i-S2R."""
@@ -209,7 +220,9 @@ class Measurements:
 
         return self._of_balls(("player3",), chosen)
 
-    def _of_balls(self, trainers: Iterable[str], chosen: Callable) -> Estimate | None:
+    def _of_balls(
+        self, trainers: Iterable[str], chosen: Callable[[BallLog], tuple[np.ndarray, np.ndarray]]
+    ) -> Estimate | None:
         """A share of the balls of i-S2R's own evaluations, all seeds together; whole rallies are drawn anew.
 
         chosen: of a log, which balls are in the share, and which are counted at all, both (n,) bool.
@@ -230,7 +243,7 @@ class Measurements:
     def changes(self) -> dict[tuple[int, str], tuple[float, float]]:
         """Changes M0 to M1 and M1 to M2 by seed and player: mean over the 16 numbers, each in units of its quantity's
         width over the three models."""
-        out = {}
+        out: dict[tuple[int, str], tuple[float, float]] = {}
         for seed in self.study.seeds:
             for player in self.study.players:
                 models = self.study.models_of(seed, player)
@@ -244,7 +257,8 @@ class Measurements:
         if len(ratios) < 2:
             return None
         t = t_mean(np.log(ratios))
-        return Interval(*np.exp([t.value, t.low, t.high]).tolist(), t.n)
+        value, low, high = np.exp([t.value, t.low, t.high]).tolist()
+        return Interval(value, low, high, t.n)
 
     def change_levels(self) -> Interval | None:
         """Second change of beginners over that of intermediate players, geometric means with Welch's interval."""
@@ -268,6 +282,9 @@ class Measurements:
                     if found is not None:
                         out.append((group, scale, a, b, found))
         return out
+
+
+Measure = Callable[[Measurements], Estimate | Interval | None]
 
 
 def paper_changes(player: str) -> tuple[float, float]:
@@ -305,19 +322,19 @@ def _paper(claim: Claim) -> float | None:
     return claim.value
 
 
-def _ratio(a: str, b: str, group: str, own: bool = True) -> Callable:
+def _ratio(a: str, b: str, group: str, own: bool = True) -> Measure:
     return lambda m: m.ratio(a, b, group, own)
 
 
-def _keeps(models, group: str = "all") -> Callable:
+def _keeps(models: Models, group: str = "all") -> Measure:
     return lambda m: m.ratio(models, models, group, False, True)
 
 
-def _normalised(a: str, b: str, group: str) -> Callable:
+def _normalised(a: str, b: str, group: str) -> Measure:
     return lambda m: m.minus(m.normalised, a, b, group)
 
 
-_MEASURES: dict[str, tuple[str, str, Callable]] = {
+_MEASURES: dict[str, tuple[str, str, Measure]] = {
     "all-ratio": ("more", RATIO, _ratio(IS2R, S2R, "all")),
     "all-raw": ("alike", RATIO, _ratio(IS2R, S2R, "all")),
     "all-normalised": ("more", DIFFERENCE, _normalised(IS2R, S2R, "all")),
@@ -358,11 +375,11 @@ _MEASURES: dict[str, tuple[str, str, Callable]] = {
 }
 
 
-def _changes(models) -> tuple[float, float]:
+def _changes(models: dict[str, BallDistribution]) -> tuple[float, float]:
     scale = widths(models)
     return change(models["M0"], models["M1"], scale), change(models["M1"], models["M2"], scale)
 
 
-def _finite(rallies, values: np.ndarray, over_seeds: bool) -> Bootstrap:
+def _finite(rallies: Rallies, values: np.ndarray, over_seeds: bool) -> Bootstrap:
     good = np.isfinite(values)
     return Bootstrap(rallies.take(good), values[good], over_seeds)

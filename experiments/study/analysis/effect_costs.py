@@ -1,4 +1,4 @@
-"""What each hidden effect costs: a study's policies in its reality with one effect left out at a time.
+"""Cost of each hidden effect: a study's policies in its reality with one effect omitted at a time.
 
 Nothing is trained again: a policy from simulation meets a reality that is nearer to what it was trained in, and a
 fine-tuned one a reality that lacks something that it may have adapted to.
@@ -21,7 +21,7 @@ FILE = "effects.csv"
 MODELS = ("is2r-sim1", "is2r-sim3", "oracle-sim", "is2r-ft100", "s2r-ft100", "oracle-ft")
 NOTHING, ALL = "nothing", "all"
 WORLDS = (NOTHING, *EFFECTS, ALL)
-"""What is left out."""
+"""Omitted effects."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def write(path: Path, outcomes: list[Outcome]) -> None:
 
 
 def read(path: Path) -> list[Outcome]:
-    """What ``write`` wrote. Raises ConfigError naming file and line."""
+    """Outcomes from the file of ``write``. Raises ConfigError naming file and line."""
     try:
         with open(path, newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))

@@ -1,4 +1,4 @@
-"""How rallies count: the end-of-rally table, "top 60, then top 50", and the file that keeps every rally.
+"""Scoring of rallies: the end-of-rally table, "top 60, then top 50", and the file that keeps every rally.
 
 Abeyruwan et al. 2022, Details on Rally Score Evaluations: rallies whose end the table marks "Filter" are removed; of
 the others the "top 60" are taken and sorted by length, and the 50 longest of these are reported. Both numbers matter
@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ballmodel.io.atomic_files import replacing
 from experiments.errors import ConfigError
@@ -24,7 +25,7 @@ KEEP = 50
 FILTERED = frozenset(end for end, _, _, filtered in ROWS if filtered)
 ROBOT_ENDED = {end: ended for end, _, ended, _ in ROWS}
 NUMBERS = {str(number): end for number, (end, *_) in enumerate(ROWS, 1)}
-"""What a scoring sheet says: the number of the row in the paper's table."""
+"""End by its number on a scoring sheet, that of the row in the paper's table."""
 UNKNOWN = -1  # whether the robot ended the rally, where the table has no entry
 COLUMNS = (
     "seed",
@@ -56,7 +57,7 @@ def end_of(text: str) -> End:
         raise ValueError(f"{text!r} is no end of a rally; 1 to {len(ROWS)} are allowed, or {names}") from None
 
 
-def select(length, filtered, pool: int = POOL, keep: int = KEEP) -> np.ndarray:
+def select(length: ArrayLike, filtered: ArrayLike, pool: int = POOL, keep: int = KEEP) -> np.ndarray:
     """(n,) bool, the rallies that are reported, of one evaluation's in the order of play.
 
     length: (n,) touches; filtered: (n,) bool. The first ``pool`` that are not filtered, and of these the ``keep``
@@ -91,7 +92,7 @@ class Rallies:
     def __len__(self) -> int:
         return self.length.size
 
-    def take(self, where) -> Rallies:
+    def take(self, where: np.ndarray) -> Rallies:
         """The rallies at a mask or at indices."""
         return Rallies(*(getattr(self, f.name)[where] for f in fields(self)))
 
@@ -101,21 +102,26 @@ class Rallies:
         return self.trainer == self.evaluator
 
 
-def scored(seed: int, trainer: str, evaluator: str, model: str, blind: str, length, end) -> Rallies:
+def scored(
+    seed: int, trainer: str, evaluator: str, model: str, blind: str, length: ArrayLike, end: ArrayLike
+) -> Rallies:
     """One evaluation's rallies, in the order of play. length: (n,) touches; end: (n,) End."""
     length, end = np.asarray(length, int), np.asarray(end, int)
     count = length.size
     filtered = np.isin(end, [int(e) for e in FILTERED])
     ended = [ROBOT_ENDED.get(End(e)) for e in end.tolist()]
     return Rallies(
-        np.full(count, seed),
-        *(np.full(count, name) for name in (trainer, evaluator, model, blind)),
-        np.arange(count),
-        length,
-        end,
-        np.array([UNKNOWN if e is None else int(e) for e in ended], int),
-        filtered,
-        select(length, filtered),
+        seed=np.full(count, seed),
+        trainer=np.full(count, trainer),
+        evaluator=np.full(count, evaluator),
+        model=np.full(count, model),
+        blind=np.full(count, blind),
+        rally=np.arange(count),
+        length=length,
+        end=end,
+        robot_ended=np.array([UNKNOWN if e is None else int(e) for e in ended], int),
+        filtered=filtered,
+        selected=select(length, filtered),
     )
 
 
@@ -145,7 +151,7 @@ def read(path: Path) -> Rallies:
 
     Raises ConfigError naming file, line and column.
     """
-    evaluations: dict[tuple, list[tuple[int, int, End]]] = {}
+    evaluations: dict[tuple[int, str, str, str, str], list[tuple[int, int, End]]] = {}
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
@@ -156,7 +162,9 @@ def read(path: Path) -> Rallies:
                 where = f"{path}: line {reader.line_num}"
                 group = (
                     _whole(row, "seed", where),
-                    *(_name(row, name, where) for name in ("trainer", "evaluator", "model")),
+                    _name(row, "trainer", where),
+                    _name(row, "evaluator", where),
+                    _name(row, "model", where),
                     row["blind"] or "",
                 )
                 try:
@@ -164,25 +172,25 @@ def read(path: Path) -> Rallies:
                 except KeyError:
                     names = ", ".join(e.name.lower() for e in End)
                     raise ConfigError(f"{where}: column end: {row['end'] or ''!r} is none of {names}") from None
-                played = (_whole(row, "rally", where), _whole(row, "length", where), end)
-                evaluations.setdefault(group, []).append(played)
+                rally = (_whole(row, "rally", where), _whole(row, "length", where), end)
+                evaluations.setdefault(group, []).append(rally)
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path}: not readable as CSV in UTF-8: {error}") from None
     parts = []
     for group, played in evaluations.items():
         played.sort(key=lambda p: p[0])
         one = scored(*group, [length for _, length, _ in played], [end for *_, end in played])
-        parts.append(replace(one, rally=np.array([rally for rally, *_ in played])))
+        parts.append(replace(one, rally=np.array([number for number, *_ in played])))
     return join(parts)
 
 
-def _name(row: dict, column: str, where: str) -> str:
+def _name(row: dict[str, str], column: str, where: str) -> str:
     if not row[column]:
         raise ConfigError(f"{where}: column {column}: a name is wanted, got nothing")
     return row[column]
 
 
-def _whole(row: dict, column: str, where: str) -> int:
+def _whole(row: dict[str, str], column: str, where: str) -> int:
     text = (row[column] or "").strip()
     if not re.fullmatch("[0-9]{1,9}", text):
         raise ConfigError(f"{where}: column {column}: a whole number from 0 to 999999999 is wanted, got {text!r}")

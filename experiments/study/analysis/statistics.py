@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from experiments.stats import sign_flip, t_interval, welch_interval, welch_p
 from experiments.study.analysis.scoring import Rallies
@@ -18,6 +19,7 @@ from experiments.study.analysis.scoring import Rallies
 DRAWS = 2000
 PERMUTATIONS = 4000
 Cell = tuple[int, str, str, str]  # seed, trainer, evaluator, model
+Models = str | Iterable[str]  # one or several
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,12 @@ class Bootstrap:
     """
 
     def __init__(
-        self, rallies: Rallies, values=None, over_seeds: bool = True, draws: int = DRAWS, key: int = 0
+        self,
+        rallies: Rallies,
+        values: np.ndarray | None = None,
+        over_seeds: bool = True,
+        draws: int = DRAWS,
+        key: int = 0,
     ) -> None:
         """values: (n,) of each rally, its length by default."""
         values = rallies.length if values is None else values
@@ -78,37 +85,39 @@ class Bootstrap:
         # Which seeds each draw takes, by how many there are: the same for all means, so that their differences pair.
         self._chosen = {s: rng.integers(0, s, (s - 1, draws)) for s in range(2, len(self.seeds) + 1) if over_seeds}
 
-    def mean(self, models: str | Iterable[str], trainers: Iterable[str], own: bool | None = True) -> Estimate | None:
+    def mean(self, models: Models, trainers: Iterable[str], own: bool | None = True) -> Estimate | None:
         """Mean over the models' cells of a trainer, then over trainers, then over seeds; None where there is no cell.
 
         own: evaluated by the trainer (True), by others (False) or by anybody (None).
         """
-        return self._mean(self._find(models, trainers, own))
+        found = self._find(models, trainers, own)
+        return self._mean(found) if found else None
 
     def evaluated(self, model: str, trainer: str, evaluator: str) -> Estimate | None:
         """Mean of one trainer's policy with one evaluator over the seeds; None where it was not evaluated."""
-        return self._mean([cell for cell in self.cells if cell[1:] == (trainer, evaluator, model)])
+        found = [cell for cell in self.cells if cell[1:] == (trainer, evaluator, model)]
+        return self._mean(found) if found else None
 
     def pair(
-        self, a, b, trainers: Iterable[str], own: bool = True, own_b: bool | None = None
+        self, a: Models, b: Models, trainers: Iterable[str], own: bool = True, own_b: bool | None = None
     ) -> tuple[Estimate, Estimate] | None:
         """The means of two (sets of) models over the trainers and seeds that have both; own_b: like own by default."""
         found = self._find(a, trainers, own), self._find(b, trainers, own if own_b is None else own_b)
         both = {cell[:2] for cell in found[0]} & {cell[:2] for cell in found[1]}
         if not both:
             return None
-        return tuple(self._mean([cell for cell in side if cell[:2] in both]) for side in found)
+        first, second = (self._mean([cell for cell in side if cell[:2] in both]) for side in found)
+        return first, second
 
-    def _find(self, models, trainers, own: bool | None) -> list[Cell]:
+    def _find(self, models: Models, trainers: Iterable[str], own: bool | None) -> list[Cell]:
         models, trainers = (models,) if isinstance(models, str) else tuple(models), tuple(trainers)
         return [cell for cell in self.cells if cell[3] in models and cell[1] in trainers and _is(own, cell)]
 
-    def _mean(self, found: list[Cell]) -> Estimate | None:
+    def _mean(self, found: list[Cell]) -> Estimate:
+        """Mean over cells, at least one."""
         groups: dict[int, dict[str, list[Cell]]] = {}
         for cell in found:
             groups.setdefault(cell[0], {}).setdefault(cell[1], []).append(cell)
-        if not groups:
-            return None
         points, draws = (
             np.array(
                 [
@@ -160,15 +169,15 @@ def _standardised(rallies: Rallies, group: Callable[[Cell], tuple], own_only: bo
     index: dict[tuple, list[int]] = {}
     for i, name in enumerate(names):
         index.setdefault(name, []).append(i)
-    for members in index.values():
-        members = np.array(members)
+    for numbers in index.values():
+        members = np.array(numbers)
         base = length[members[own[members]]] if own_only else length[members]
         if base.size > 1 and base.std(ddof=1) > 0.0:
             out[members] = (length[members] - base.mean()) / base.std(ddof=1)
     return out
 
 
-def t_mean(values) -> Interval:
+def t_mean(values: ArrayLike) -> Interval:
     """Mean with Student's t interval; without an interval where there are fewer than two values."""
     values = np.asarray(values, float)
     if values.size < 2:
@@ -201,9 +210,9 @@ def difference(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bo
         for cell in boot.cells
         if cell[3] == a and cell[1] in trainers and _is(own, cell) and (*cell[:3], b) in boot.cells
     ]
-    if not pairs or min(min(x.size, y.size) for x, y in pairs) < 2:
-        return None
     both = boot.pair(a, b, trainers, own)
+    if both is None or not pairs or min(min(x.size, y.size) for x, y in pairs) < 2:
+        return None
     first, second = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return Difference(
         (both[0] - both[1]).interval,

@@ -21,6 +21,7 @@ from experiments.errors import ConfigError
 from experiments.runs.run_dir import CONFIG
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis.paper import BY_KEY, BY_SKILL, CROSS, FINAL, TEN
+from experiments.study.analysis.statistics import Models
 from mjx_tt.rally.human_player import FOLDER as VIRTUAL_PLAYERS
 
 ROUNDS = ("M0", "M1", "M2")
@@ -71,7 +72,7 @@ class BallLog:
 
 @dataclass
 class Study:
-    """What a study's folder holds.
+    """Content of a study's folder.
 
     missing: what a whole study would have besides, in words
     """
@@ -94,7 +95,13 @@ class Study:
         found = {path.name for path in self.folder.glob("seed*/player*")} | set(self.rallies.trainer.tolist())
         return tuple(p for p in BY_SKILL if p in found)
 
-    def pick(self, models=None, trainers=None, own: bool | None = True, selected: bool = True) -> scoring.Rallies:
+    def pick(
+        self,
+        models: Models | None = None,
+        trainers: Models | None = None,
+        own: bool | None = True,
+        selected: bool = True,
+    ) -> scoring.Rallies:
         """Rallies that count. own: by the trainer (True), by others (False), both (None); selected: the top 50 only."""
         r = self.rallies
         where = r.selected if selected else ~r.filtered
@@ -213,7 +220,7 @@ def load(folder: Path) -> Study:
 
 
 def _instead(folder: Path) -> str:
-    """What a folder holds that is no study, and the command for it; nothing where it is neither."""
+    """Clause about a folder that is no study but holds a run, with the command for that; empty where it holds none."""
     runs = [path.parent for path in sorted([*folder.glob(CONFIG), *folder.glob(f"*/{CONFIG}")])]
     if not runs:
         return "" if folder.is_dir() else "; there is no such folder"
@@ -221,7 +228,7 @@ def _instead(folder: Path) -> str:
 
 
 def _missing(study: Study) -> list[str]:
-    """What a whole study would have besides."""
+    """Parts of a whole study that this one lacks, in words."""
     out = []
     absent = [p for p in BY_SKILL if p not in study.players]
     if absent:
@@ -272,7 +279,7 @@ def counted(rallies: scoring.Rallies) -> dict[tuple[int, str, str, str], int]:
 
 
 def _read(path: Path, parse: Callable[[Path], Any]) -> Any:
-    """What ``parse`` makes of a file; what it says about the file as a ConfigError that names it."""
+    """Result of ``parse`` on a file; raises its errors as a ConfigError that names the file."""
     try:
         return parse(path)
     except (ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:

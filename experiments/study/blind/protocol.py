@@ -21,6 +21,7 @@ import secrets
 import shutil
 import string
 import zlib
+from collections.abc import Iterable
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,6 +31,7 @@ import numpy as np
 from ballmodel.io.atomic_files import replacing
 from experiments.errors import ConfigError
 from experiments.study.analysis import scoring
+from mjx_tt.rally.end_reasons import ROWS, End
 
 if TYPE_CHECKING:
     from robot_io.policy.artefact import Artefact
@@ -51,7 +53,7 @@ def codes(count: int) -> tuple[str, ...]:
     return tuple(itertools.islice(itertools.chain.from_iterable(lengths), count))
 
 
-def draw(models, rng: np.random.Generator) -> dict[str, str]:
+def draw(models: Iterable[str], rng: np.random.Generator) -> dict[str, str]:
     """Code name of every model, one to one, in the order in which they are to be tested.
 
     The order is random and a code is only a place in it, so neither tells anything. Raises ValueError for a model that
@@ -78,7 +80,7 @@ def seal(path: Path, content: Any) -> str:
 
 
 def unseal(path: Path) -> Any:
-    """What ``seal`` was given. Raises ConfigError where the content is not what its hash commits to."""
+    """Content that ``seal`` was given. Raises ConfigError where its hash does not commit to it."""
     try:
         sealed = json.loads(Path(path).read_text(encoding="utf-8"))
         plain = zlib.decompress(base64.b64decode(sealed["sealed"], validate=True))
@@ -98,7 +100,7 @@ class Played:
 
     rally: int
     length: int
-    end: scoring.End
+    end: End
 
 
 @dataclass(frozen=True)
@@ -202,13 +204,13 @@ def blank_sheet(path: Path, tested: tuple[str, ...], rallies: int = scoring.POOL
 
 
 def instructions() -> list[str]:
-    """How to fill in a sheet, with the paper's table (Rally score evaluation and end-of-rally attribution)."""
+    """Instructions on a sheet, with the paper's table (Rally score evaluation and end-of-rally attribution)."""
     lines = [
         "One line a rally, in the order of play. length: paddle touches of human and robot together, the human's first",
         "hit is 1; 0 only where a rally is not counted. end: number of the row that says how the rally ended.",
         "Lines with neither length nor end are left out.",
     ]
-    for number, (_, description, ended, filtered) in enumerate(scoring.ROWS, 1):
+    for number, (_, description, ended, filtered) in enumerate(ROWS, 1):
         who = (
             "not counted"
             if filtered
@@ -230,12 +232,14 @@ def read_sheet(path: Path) -> dict[str, list[Played]]:
         lines = content.decode(encoding).splitlines()
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not readable as UTF-8: {error}") from None
-    lines = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith(("#", '"#'))]
-    head = lines[0][1] if lines else ""
+    filled = [
+        (n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith(("#", '"#'))
+    ]
+    head = filled[0][1] if filled else ""
     separator = next((s for s in SEPARATORS if tuple(_cells(head, s)[:4]) == SHEET_COLUMNS), None)
     if separator is None:
         raise ConfigError(f"{path}: the first line must be {','.join(SHEET_COLUMNS)}, got {head.strip()}")
-    for number, line in lines[1:]:
+    for number, line in filled[1:]:
         cells = _cells(line, separator)
         code, rally, length, end = (cells + [""] * 4)[:4]
         where = f"{path}: line {number}"
@@ -262,7 +266,7 @@ def _cells(line: str, separator: str) -> list[str]:
 
 
 def progress(folder: Path) -> list[Progress]:
-    """How far the sheet is, code by code; writes a blank one where there is none."""
+    """Progress of the sheet, code by code; writes a blank one where there is none."""
     folder = Path(folder)
     tested = tuple(unseal(folder / KEY)["codes"].values())
     if not (folder / SHEET).exists():

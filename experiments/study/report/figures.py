@@ -132,14 +132,17 @@ def by_skill(study: Study, m: Measurements) -> Figure | None:
 @styled
 def checkpoints(study: Study, m: Measurements, normalise: bool = False) -> Figure | None:
     """Mean rally length at the key checkpoints by skill level (main_training_curves)."""
-    if not has(m.raw, (*TEN, *CURVES[FRESH])):
+    if not has(m.raw, (*TEN, *filter(None, CURVES[FRESH]))):
         return None
     figure = Figure(figsize=(11, 4.2))
     for axes, name in zip(figure.subplots(1, 3), LEVELS, strict=False):
         shift = dict(zip(CURVES, (-0.06, 0.06, 0.0, -0.14), strict=False))
         for method, keys in CURVES.items():
-            found = [(i, key, mean_of(m.raw, key, name)) for i, key in enumerate(keys) if key is not None]
-            found = [(i, key, mean) for i, key, mean in found if mean is not None]
+            found = [
+                (i, key, mean)
+                for i, key in enumerate(keys)
+                if key is not None and (mean := mean_of(m.raw, key, name)) is not None
+            ]
             if not found or (method == FRESH and not any(key.startswith("fresh") for _, key, _ in found)):
                 continue
             x = np.array([i for i, *_ in found]) + shift[method]
@@ -211,8 +214,11 @@ def cross(study: Study, m: Measurements) -> Figure | None:
     right.set_xticks(range(3), [SHORT[key] for key in FINAL], fontsize=8.5)
     right.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
     right.set_title("Kept with other players")
-    own, others = {"facecolor": "#aaaaaa"}, {"facecolor": "#aaaaaa", "hatch": "///", "edgecolor": "white"}
-    handles = [Patch(**own, label="own trainer"), Patch(**others, label="other players"), PAPER_MARK]
+    handles = [
+        Patch(facecolor="#aaaaaa", label="own trainer"),
+        Patch(facecolor="#aaaaaa", hatch="///", edgecolor="white", label="other players"),
+        PAPER_MARK,
+    ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
 

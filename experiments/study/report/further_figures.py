@@ -116,18 +116,18 @@ def fine_tuning(study: Study, m: Measurements) -> Figure | None:
 
 def _tuned(study: Study, seed: int, player: str, keys: tuple[str, ...]) -> np.ndarray:
     """Return rate over the updates of cycles that follow one another, smoothed within each; NaN between them."""
-    parts = []
+    parts: list[np.ndarray] = []
     for key in keys:
         rate = np.array([row["return_rate"] for row in study.metrics(seed, player, key) if "return_rate" in row])
         if not rate.size:
             return np.zeros(0)
-        parts += [smooth(rate), [np.nan]]
+        parts += [smooth(rate), np.array([np.nan])]
     return np.concatenate(parts)
 
 
 @styled
 def effects_left_out(study: Study) -> Figure | None:
-    """How many times as long the rallies are without an effect, by model."""
+    """Rally length without an effect over that with all, by model."""
     table = {
         (model, world): effect_costs.gain(study.effects, model, world)
         for model in effect_costs.MODELS
@@ -145,15 +145,15 @@ def effects_left_out(study: Study) -> Figure | None:
     axes = figure.subplots()
     limit = max(np.log2(1.5), float(np.nanmax(np.abs(np.log2(ratio)))))
     image = axes.imshow(np.log2(ratio), cmap="RdBu", vmin=-limit, vmax=limit, aspect="auto")
-    for (row, column), value in np.ndenumerate(ratio):
-        if np.isfinite(value):
-            found = table[effect_costs.MODELS[column], effect_costs.WORLDS[1 + row]]
+    for row, column in np.ndindex(ratio.shape):
+        found = table[effect_costs.MODELS[column], effect_costs.WORLDS[1 + row]]
+        if found is not None and np.isfinite(found.value):
             sure = not (np.isnan(found.low) or found.low <= 1.0 <= found.high)
-            dark = abs(np.log2(value)) > 0.6 * limit
+            dark = abs(np.log2(found.value)) > 0.6 * limit
             axes.text(
                 column,
                 row,
-                f"{value:.2f}",
+                f"{found.value:.2f}",
                 ha="center",
                 va="center",
                 fontsize=9,
@@ -202,7 +202,7 @@ def variant(study: Study, m: Measurements) -> Figure | None:
 
 @styled
 def ends(study: Study, m: Measurements) -> Figure | None:
-    """Who ended the rallies, by model, over all counted rallies with the own trainer."""
+    """Ends of the rallies by robot and human, by model, over all counted rallies with the own trainer."""
     keys = [model.key for model in (*MODELS, *VARIANT) if len(study.pick(model.key, selected=False))]
     if not keys:
         return None

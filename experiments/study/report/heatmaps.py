@@ -11,6 +11,8 @@ beside the half counts to the nearest square.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -28,9 +30,10 @@ from mjx_tt.viz.html import FAINT, INK
 CELLS = 3
 METHODS = ("is2r-ft100", "s2r-ft100")
 GAP = 0.35  # between the large cells, in squares
+Grids = tuple[np.ndarray, np.ndarray]  # counts and returned counts, both (3, 3, 3, 3)
 
 
-def grid(landing: np.ndarray, place: np.ndarray, returned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def grid(landing: np.ndarray, place: np.ndarray, returned: np.ndarray) -> Grids:
     """Counts and returned counts, both (3, 3, 3, 3): large cell x, y, small cell x, y; from left to right seen from the
     robot's end, from its end line to the human's.
 
@@ -49,19 +52,19 @@ def grid(landing: np.ndarray, place: np.ndarray, returned: np.ndarray) -> tuple[
     return count, back
 
 
-def incoming(logs: list[BallLog]) -> tuple[np.ndarray, np.ndarray]:
+def incoming(logs: list[BallLog]) -> Grids:
     """Grids by the place from which the human hit."""
     return _sum(grid(log.landing, log.position[:2], log.returned.astype(bool)) for log in logs)
 
 
-def outgoing(logs: list[BallLog]) -> tuple[np.ndarray, np.ndarray]:
+def outgoing(logs: list[BallLog]) -> Grids:
     """Grids by the place where the robot's return came down, of the balls that it touched."""
     touched = ((log, log.hit.astype(bool)) for log in logs)
     return _sum(grid(log.landing[:, h], log.return_landing[:, h], log.returned.astype(bool)[h]) for log, h in touched)
 
 
 @styled
-def heatmaps(study: Study, which) -> Figure | None:
+def heatmaps(study: Study, which: Callable[[list[BallLog]], Grids]) -> Figure | None:
     """One row per player, i-S2R left and S2R+FT right. which: ``incoming`` or ``outgoing``."""
     rows = [p for p in study.players if any(study.logs(p, key) for key in METHODS)]
     if not rows:
@@ -81,7 +84,9 @@ def heatmaps(study: Study, which) -> Figure | None:
     bar.set_in_layout(False)
     mappable = ScalarMappable(Normalize(0.0, 1.0), matplotlib.colormaps["Blues"])
     figure.colorbar(mappable, cax=bar, label="return rate", orientation="horizontal", format=lambda v, _: f"{v:.0%}")
-    figure.get_layout_engine().set(rect=(0.0, 0.75 / figure.get_figheight(), 1.0, 1.0 - 0.75 / figure.get_figheight()))
+    figure.set_layout_engine(
+        "constrained", rect=(0.0, 0.75 / figure.get_figheight(), 1.0, 1.0 - 0.75 / figure.get_figheight())
+    )
     bar.set_position((0.3, 0.45 / figure.get_figheight(), 0.4, 0.12 / figure.get_figheight()))
     return figure
 
@@ -118,6 +123,6 @@ def _cell(value: np.ndarray, start: float, width: float) -> np.ndarray:
         return np.clip(np.nan_to_num((value - start) / width * CELLS), 0, CELLS - 1).astype(int)
 
 
-def _sum(parts) -> tuple[np.ndarray, np.ndarray]:
+def _sum(parts: Iterable[Grids]) -> Grids:
     counts, backs = zip(*parts, strict=True)
     return np.sum(counts, axis=0), np.sum(backs, axis=0)

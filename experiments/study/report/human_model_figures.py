@@ -58,7 +58,7 @@ def evolution(study: Study, m: Measurements) -> Figure | None:
 
 @styled
 def changes(study: Study, m: Measurements) -> Figure | None:
-    """How far the human model moves from M0 to M1 and from M1 to M2, here and in the paper."""
+    """Changes of the human model from M0 to M1 and from M1 to M2, here and in the paper."""
     if not m.changes:
         return None
     figure = Figure(figsize=(10, 3.5))
@@ -74,7 +74,7 @@ def changes(study: Study, m: Measurements) -> Figure | None:
     axes.set_xticks(range(len(shown)), [f"player {p[-1]}" for p in shown])
     axes.set_ylabel("change [share of the width]")
     axes.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
-    handles = [
+    handles: list[Patch | Line2D] = [
         Patch(facecolor=SHADES["M1"], label="M0 to M1"),
         Patch(facecolor=SHADES["M2"], label="M1 to M2"),
         Patch(facecolor="white", edgecolor=INK, label="the paper's"),
@@ -87,7 +87,7 @@ def changes(study: Study, m: Measurements) -> Figure | None:
 
 @styled
 def calibration(content: dict) -> Figure | None:
-    """How near the virtual players come to the paper's: deviations of the 16 numbers, and the rally statistics."""
+    """Virtual players against the paper's: deviations of the 16 numbers, and the rally statistics."""
     numbers_, lengths = content.get("numbers", []), content.get("rallies", [])
     if not numbers_ or not lengths:
         return None

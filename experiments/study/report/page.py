@@ -45,7 +45,7 @@ def write(folder: Path) -> Path:
 
 
 class Report:
-    """What the template calls for: pictures, tables and claims of one study, each by its name."""
+    """Pictures, tables and claims of one study, each by the name that the template calls."""
 
     def __init__(self, study: Study) -> None:
         self.study, self.measured = study, Measurements(study)

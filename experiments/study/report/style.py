@@ -1,4 +1,4 @@
-"""How a study's pictures look: colours, boxes, bars and intervals.
+"""Style of a study's pictures: colours, boxes, bars and intervals.
 
 One colour per method everywhere (Okabe and Ito's, which the colour-blind tell apart): blue i-S2R, vermilion S2R, green
 S2R-Oracle, purple i-S2R without carrying the weights back, orange the ablation. Paler: not fine-tuned. Hollow: the
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import wraps
+from typing import ParamSpec, TypeVar
 
 import matplotlib
 import numpy as np
@@ -19,20 +20,24 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from experiments.study.analysis.paper import ABLATION, BY_KEY, FRESH, IS2R, ORACLE, S2R, SHORT, level, of_level
-from experiments.study.analysis.statistics import Bootstrap, Interval
+from experiments.study.analysis.statistics import Bootstrap, Estimate, Interval
 from mjx_tt.viz.html import FAINT, INK
 from mjx_tt.viz.html import STYLE as PAGE_STYLE
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Shade = str | tuple[float, float, float]  # a colour
 
 COLOUR = {IS2R: "#0072b2", S2R: "#d55e00", ORACLE: "#009e73", FRESH: "#cc79a7", ABLATION: "#e69f00"}
 STYLE = PAGE_STYLE | {"figure.constrained_layout.use": True, "axes.titleweight": "bold", "font.size": 9.5}
 PAPER_MARK = Line2D([], [], color=INK, marker="D", markerfacecolor="white", linestyle="", label="paper")
 
 
-def styled(draw: Callable) -> Callable:
+def styled(draw: Callable[P, T]) -> Callable[P, T]:
     """Draws within STYLE."""
 
     @wraps(draw)
-    def inner(*arguments, **named):
+    def inner(*arguments: P.args, **named: P.kwargs) -> T:
         with matplotlib.rc_context(STYLE):
             return draw(*arguments, **named)
 
@@ -42,9 +47,14 @@ def styled(draw: Callable) -> Callable:
 def colour(key: str) -> tuple[float, float, float]:
     """Of a model: its method's, paler where it is not fine-tuned."""
     model = BY_KEY[key]
-    rgb = np.array(to_rgb(COLOUR[model.method]))
-    pale = not model.fine_tuned and model.method != ABLATION
-    return tuple(rgb + 0.55 * (1.0 - rgb) if pale else rgb)
+    red, green, blue = to_rgb(COLOUR[model.method])
+    if model.fine_tuned or model.method == ABLATION:
+        return red, green, blue
+    return _paler(red), _paler(green), _paler(blue)
+
+
+def _paler(share: float) -> float:
+    return share + 0.55 * (1.0 - share)
 
 
 def level_label(name: str) -> str:
@@ -112,7 +122,7 @@ def bars(
     note_empty(axes, any(i is not None for i in intervals))
 
 
-def bar(axes: Axes, at: float, interval: Interval | None, shade, width: float, hatch=None) -> None:
+def bar(axes: Axes, at: float, interval: Interval | None, shade: Shade, width: float, hatch: str | None = None) -> None:
     """One bar with its interval at ``at`` on the x axis, ``width`` in its units; nothing for None."""
     if interval is None:
         return
@@ -127,7 +137,7 @@ def error_bars(intervals: Sequence[Interval]) -> tuple[np.ndarray, np.ndarray]:
     return table[0], np.where(np.isfinite(table[1:]), table[1:], 0.0)
 
 
-def forest(axes: Axes, intervals: Sequence[Interval | None], labels: Sequence[str], colours) -> None:
+def forest(axes: Axes, intervals: Sequence[Interval | None], labels: Sequence[str], colours: Sequence[Shade]) -> None:
     """Ratios with their intervals on a log scale around 1, from top to bottom."""
     for row, (interval, shade) in enumerate(zip(intervals, colours, strict=False)):
         if interval is None:
@@ -191,10 +201,10 @@ def evaluated(boot: Bootstrap, trainer: str, evaluator: str, key: str) -> Interv
 
 
 def has(boot: Bootstrap, keys: Sequence[str]) -> bool:
-    """Whether a bootstrap holds any of the models."""
+    """True for a bootstrap that holds any of the models."""
     return any(cell[3] in keys for cell in boot.cells)
 
 
-def interval_of(estimate) -> Interval | None:
+def interval_of(estimate: Estimate | None) -> Interval | None:
     """The interval of an estimate, if there is one."""
     return None if estimate is None else estimate.interval

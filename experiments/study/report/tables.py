@@ -12,7 +12,7 @@ import numpy as np
 from ballmodel import registry
 from ballmodel.io.atomic_files import replacing
 from experiments.stats import holm
-from experiments.study.analysis import effect_costs, scoring
+from experiments.study.analysis import effect_costs
 from experiments.study.analysis.claims import Finding, Measurements, paper_changes, show, span
 from experiments.study.analysis.paper import (
     ABLATED,
@@ -29,7 +29,7 @@ from experiments.study.analysis.paper import (
 )
 from experiments.study.analysis.statistics import t_mean
 from experiments.study.analysis.study_folder import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
-from mjx_tt.rally.end_reasons import End
+from mjx_tt.rally.end_reasons import ROWS, End
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def claims(findings: Sequence[Finding]) -> Table:
 
 
 def effects_left_out(study: Study) -> Table:
-    """How many times as long the rallies of each model are in a reality without an effect, with 95 % intervals."""
+    """Rally length of each model in a reality without an effect over that with all, with 95 % intervals."""
     rows = []
     for world in effect_costs.WORLDS[1:]:
         gains = [effect_costs.gain(study.effects, model, world) for model in effect_costs.MODELS]
@@ -79,11 +79,12 @@ def models(study: Study, m: Measurements) -> Table:
     rows = []
     for group in GROUPS:
         for model in (*MODELS, *VARIANT, *ABLATED):
-            chosen = study.pick(model.key, of_level(group))
-            if not len(chosen):
+            by_rallies, by_seeds = (b.raw.mean(model.key, of_level(group)) for b in (fixed, m))
+            if by_rallies is None or by_seeds is None:
                 continue
+            rallies, seeds = by_rallies.interval, by_seeds.interval
+            chosen = study.pick(model.key, of_level(group))
             t, every = t_mean(chosen.length), study.pick(model.key, of_level(group), selected=False)
-            rallies, seeds = (b.raw.mean(model.key, of_level(group)).interval for b in (fixed, m))
             quartiles = (f"{q:.0f}" for q in np.percentile(chosen.length, (25, 50, 75)))
             rows.append(
                 (
@@ -156,7 +157,7 @@ def significance(m: Measurements) -> Table:
 
 def skill(study: Study) -> Table:
     """Rally length by player over the ten models, ours above the paper's (table player_skill)."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for player in study.players:
         length = study.pick(TEN, player).length
         paper = registry.skill(player)
@@ -194,7 +195,7 @@ def distributions(study: Study) -> Table:
 
 
 def deviations(study: Study) -> Table:
-    """How near the human models come to the paper's: medians over the 16 numbers, in units of each quantity's width."""
+    """Median deviation of the human models from the paper's over the 16 numbers, in units of each quantity's width."""
     rows = []
     for player in study.players:
         theirs = paper_models(player)
@@ -208,7 +209,7 @@ def deviations(study: Study) -> Table:
 
 
 def change(study: Study, m: Measurements) -> Table:
-    """How far the human models move, here (mean over seeds) and in the paper."""
+    """Changes of the human models, here (mean over seeds) and in the paper."""
     rows = []
     for player in study.players:
         ours = np.array([v for (_, p), v in m.changes.items() if p == player])
@@ -221,11 +222,11 @@ def change(study: Study, m: Measurements) -> Table:
 
 
 def ends(study: Study) -> Table:
-    """How often each row of the end-of-rally table was met (table end_of_rally_attribution)."""
+    """Counts of each row of the end-of-rally table (table end_of_rally_attribution)."""
     r = study.rallies
     groups = (r.own & np.isin(r.model, TEN), r.own & (r.model == FINAL[0]), r.own & (r.model == FINAL[1]), ~r.own)
     rows = []
-    for number, (end, text, ended, filtered) in enumerate(scoring.ROWS, 1):
+    for number, (end, text, ended, filtered) in enumerate(ROWS, 1):
         counts = [int(np.sum(g & (r.end == end))) for g in groups]
         who = "filter" if filtered else {True: "robot", False: "human", None: "-"}[ended]
         rows.append(
@@ -277,10 +278,11 @@ def quartiles(study: Study, m: Measurements) -> Table:
     for group in ("all", *GROUPS[-1:]):
         for key in FINAL:
             chosen = of_level(group)
-            cells = [v for c, v in m.normalised.cells.items() if c[3] == key and c[1] in chosen]
-            if cells:
+            estimate = m.normalised.mean(key, chosen)
+            if estimate is not None:
+                mean = estimate.interval
+                cells = [v for c, v in m.normalised.cells.items() if c[3] == key and c[1] in chosen]
                 values = np.concatenate(cells)
-                mean = m.normalised.mean(key, chosen).interval
                 rows.append(
                     (
                         group,

@@ -15,38 +15,40 @@ from experiments.study.analysis.claims import (
     Measurements,
 )
 from experiments.study.analysis.paper import LEVELS, SHORT, of_level
+from experiments.study.analysis.statistics import Interval
 
 
 def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:
     """The findings in plain words, only of what was measured."""
     out = []
+    intervals = {key: f.interval for key, f in found.items() if f.interval is not None}
 
     def measured(*keys: str) -> list[str]:
-        return [key for key in keys if found[key].interval is not None]
+        return [key for key in keys if key in intervals]
 
     if measured("all-ratio"):
         means = ((name, m.raw.mean(key, of_level("all"))) for key, name in SHORT.items())
         text = ", ".join(f"{name} {mean.value:.1f}" for name, mean in means if mean is not None)
         out.append(f"Mean rally length in hits: {text}.")
         out.append(
-            f"Over all players, i-S2R's rallies are {compared(found['all-ratio'])} those of S2R+FT; the paper: 9 % "
+            f"Over all players, i-S2R's rallies are {compared(intervals['all-ratio'])} those of S2R+FT; the paper: 9 % "
             "longer."
         )
     paper = {"beginner": "70 % longer", "intermediate": "175 % longer", "advanced": "far shorter"}
     for key in measured(*LEVELS):
         who = {"beginner": "With beginners", "advanced": "With the advanced player"}.get(key, f"With {key} players")
-        out.append(f"{who}, they are {compared(found[key])} those of S2R+FT; the paper: {paper[key]}.")
+        out.append(f"{who}, they are {compared(intervals[key])} those of S2R+FT; the paper: {paper[key]}.")
     for key in measured("oracle-beginner", "oracle-intermediate"):
         out.append(
             f"With {'beginners' if 'beginner' in key else 'intermediate players'}, S2R-Oracle+FT, with 35 % of the "
             "real training, plays rallies that are "
-            f"{compared(found[key])} i-S2R's; the paper: comparable."
+            f"{compared(intervals[key])} i-S2R's; the paper: comparable."
         )
     if measured("keeps-is2r", "keeps-s2r"):
         kept = " and ".join(
-            f"{name} {100 * f.interval.value:.0f} % ({100 * f.interval.low:.0f} to {100 * f.interval.high:.0f} %)"
-            for name, f in (("i-S2R", found["keeps-is2r"]), ("S2R+FT", found["keeps-s2r"]))
-            if f.interval is not None
+            f"{name} {100 * i.value:.0f} % ({100 * i.low:.0f} to {100 * i.high:.0f} %)"
+            for name, i in (("i-S2R", intervals.get("keeps-is2r")), ("S2R+FT", intervals.get("keeps-s2r")))
+            if i is not None
         )
         out.append(
             f"With players who did not train it, a policy keeps of its rally length: {kept}; the paper: 70 % and 30 %."
@@ -58,7 +60,7 @@ def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:
     }
     for key in measured(*steps):
         text = "longer" if key == "fine-tuning" else "shorter"
-        out.append(f"After {steps[key]}, rallies are {compared(found[key])} before; the paper: {text}.")
+        out.append(f"After {steps[key]}, rallies are {compared(intervals[key])} before; the paper: {text}.")
     if m.changes:
         first, second = np.mean(list(m.changes.values()), axis=0)
         out.append(
@@ -66,8 +68,8 @@ def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:
         )
     if measured("carried"):
         out.append(
-            f"With the weights carried back to simulation, rallies are {compared(found['carried'])} without; the paper "
-            "leaves it open."
+            f"With the weights carried back to simulation, rallies are {compared(intervals['carried'])} without; "
+            "the paper leaves it open."
         )
     unselected = m.ratio("is2r-ft100", "s2r-ft100", "all", boot=m.unselected)
     if unselected is not None:
@@ -87,9 +89,9 @@ def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:
     return [*out, f"What differs: {differ}"] if differ else out
 
 
-def compared(f: Finding) -> str:
+def compared(ratio: Interval) -> str:
     """A ratio of rally lengths as what stands before "than": how much longer or shorter, with its interval."""
-    value, low, high = (100.0 * (x - 1.0) for x in (f.interval.value, f.interval.low, f.interval.high))
+    value, low, high = (100.0 * (x - 1.0) for x in (ratio.value, ratio.low, ratio.high))
     if low <= 0.0 <= high:
         return f"not clearly longer or shorter ({value:+.0f} %, {low:+.0f} to {high:+.0f} %) than"
     return f"{abs(value):.0f} % {'longer' if value > 0 else 'shorter'} ({low:+.0f} to {high:+.0f} %) than"

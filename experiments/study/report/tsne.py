@@ -8,6 +8,7 @@ set, and 250 of each evaluation.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,7 +89,7 @@ def trained(study: Study, seed: int, player: str, name: str) -> np.ndarray | Non
 
 @styled
 def training(planes: list[Plane]) -> Figure | None:
-    """How the training balls evolve: D0, D1 = D0 + ΔD1, D2 = D1 + ΔD2 (app:ball-dist-evo-train)."""
+    """Evolution of the training balls: D0, D1 = D0 + ΔD1, D2 = D1 + ΔD2 (app:ball-dist-evo-train)."""
     if not planes:
         return None
     figure, grid = _figure(planes, 3)
@@ -129,28 +130,30 @@ def methods(planes: list[Plane]) -> Figure | None:
     return figure
 
 
-def _figure(planes: list[Plane], columns: int):
+def _figure(planes: list[Plane], columns: int) -> tuple[Figure, np.ndarray]:
     figure = Figure(figsize=(3.5 * columns, 3.1 * len(planes)))
     return figure, figure.subplots(len(planes), columns, squeeze=False)
 
 
-def _scatter(axes: Axes, plane: Plane, sets, key: str | None = None) -> None:
-    everything = np.concatenate(list(plane.points.values()), axis=1)
-    axes.scatter(*everything, s=2, color="#e9ebee", linewidth=0)  # where balls of this player can be at all
+def _scatter(axes: Axes, plane: Plane, sets: Sequence[str], key: str | None = None) -> None:
+    x, y = np.concatenate(list(plane.points.values()), axis=1)
+    axes.scatter(x, y, s=2, color="#e9ebee", linewidth=0)  # where balls of this player can be at all
     for name in sets:
         if name in plane.points:
-            axes.scatter(*plane.points[name], s=5, color=SHADES[name], alpha=0.75, linewidth=0)
+            x, y = plane.points[name]
+            axes.scatter(x, y, s=5, color=SHADES[name], alpha=0.75, linewidth=0)
     if key is not None:
         method = S2R if key.startswith("s2r") else IS2R
         if key in plane.points:
-            axes.scatter(*plane.points[key], s=12, facecolor="none", edgecolor=COLOUR[method], linewidth=0.6)
+            x, y = plane.points[key]
+            axes.scatter(x, y, s=12, facecolor="none", edgecolor=COLOUR[method], linewidth=0.6)
         else:
             axes.text(0.5, 0.5, "not in this study", transform=axes.transAxes, ha="center", color=FAINT)
     axes.set_xticks([])
     axes.set_yticks([])
 
 
-def _legend(figure: Figure, sets, evaluated=()) -> None:
+def _legend(figure: Figure, sets: Sequence[str], evaluated: Sequence[str] = ()) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
