@@ -1,4 +1,4 @@
-"""Train a policy by Blackbox Gradient Sensing, one ask and one tell an update: python examples/train_bgs.py [UPDATES]"""
+"""Train a policy by Blackbox Gradient Sensing, an ask and a tell each update: python examples/train_bgs.py [UPDATES]"""
 
 import sys
 

@@ -12,13 +12,14 @@ paid when they happen, nearing the ball as it is neared, means over the steps as
 
 from __future__ import annotations
 
+import contextlib
+import io
 from dataclasses import dataclass
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
 from jax import Array
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
@@ -30,6 +31,10 @@ from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import Episodes, EpisodeState, Return, Tick
 from mjx_tt.sim.model import Range, SimModel
 from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that Warp, an optional engine, is not installed
+    from brax.envs import register_environment as register_environment
+    from brax.envs.base import Env, State
 
 T = TypeVar("T")
 

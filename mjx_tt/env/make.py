@@ -6,7 +6,6 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-import brax.envs
 import jax
 import numpy as np
 
@@ -14,7 +13,7 @@ from ballmodel import registry
 from ballmodel.distribution import BallDistribution
 from ballmodel.sampling import sample_pool
 from mjx_tt.env import rewards
-from mjx_tt.env.brax import TableTennis
+from mjx_tt.env.brax import TableTennis, register_environment
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
@@ -129,4 +128,4 @@ def _model(model: Model) -> ModelFile:
     return models.ModelFile.load(model)
 
 
-brax.envs.register_environment("table_tennis", make)
+register_environment("table_tennis", make)
