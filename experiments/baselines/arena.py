@@ -1,8 +1,9 @@
-"""Where finished and half-finished policies of every kind are compared: the same balls, frozen, without exploration."""
+"""Comparison of finished and half-finished policies of every kind: the same balls, frozen, without exploration."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +13,11 @@ from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
 from mjx_tt.env.rollout import RolloutResult, Simulator
-from mjx_tt.env.task import Controller, Episodes, TaskConfig
+from mjx_tt.env.task import Controller, Episodes, EpisodeState, TaskConfig, Tick
 from mjx_tt.sim.model import ModelFile
 
 ROWS, COLUMNS = 2, 256  # episodes of one compiled call
+Carry = tuple[EpisodeState, jax.Array, jax.Array]  # of a scan: state, sum of changes, their number
 
 
 @jax.tree_util.register_dataclass
@@ -26,10 +28,12 @@ class Remembered:
     inner: Controller
     mean: jax.Array
 
-    def start(self, observation):
+    def start(self, observation: jax.Array) -> tuple[Any, jax.Array]:
         return self.inner.start(observation), observation[3:]  # of the action's shape, before there is one
 
-    def act(self, tick, state, observation):
+    def act(
+        self, tick: Tick, state: tuple[Any, jax.Array], observation: jax.Array
+    ) -> tuple[jax.Array, tuple[Any, jax.Array]]:
         action, inner = self.inner.act(tick, state[0], observation)
         return action, (inner, action)
 
@@ -45,7 +49,7 @@ class Arena:
         self._play = jax.jit(self._play_chunk)
         self._restless = jax.jit(self._action_change)
 
-    def play(self, controller: Controller, balls: BallPool, key) -> RolloutResult:
+    def play(self, controller: Controller, balls: BallPool, key: jax.Array) -> RolloutResult:
         """Every ball of ``balls`` (``draw_balls``) once; NumPy arrays (..., R, P)."""
         chunks = _chunks(balls)
         keys = jax.random.split(key, len(chunks))
@@ -53,25 +57,25 @@ class Arena:
         episodes = [replace(part, observation_sums=0.0, observation_counts=0) for part in parts]
         return jax.tree.map(lambda *x: np.concatenate(x, axis=-2) if np.ndim(x[0]) else x[0], *episodes)
 
-    def action_change(self, controller: Controller, balls: BallPool, key) -> float:
+    def action_change(self, controller: Controller, balls: BallPool, key: jax.Array) -> float:
         """Mean square change of an action between control steps, each velocity relative to its limit."""
         return float(self._restless(controller, _chunks(balls)[0], key))
 
-    def _draw(self, balls: BallPool, key) -> Episodes:
+    def _draw(self, balls: BallPool, key: jax.Array) -> Episodes:
         """The chunk's balls in their order, with the spin that the world gives them."""
         drawn = self._simulator.draw(key, balls, self._world.model, self._world.randomise, ROWS, COLUMNS)
         thrown = jax.tree.map(lambda x: x.reshape(-1, ROWS, COLUMNS), balls.state)
         return replace(drawn, ball=replace(thrown, spin=thrown.spin + drawn.ball.spin))
 
-    def _play_chunk(self, controller, balls: BallPool, key) -> RolloutResult:
+    def _play_chunk(self, controller: Controller, balls: BallPool, key: jax.Array) -> RolloutResult:
         return self._simulator.play(controller, self._draw(balls, key))
 
-    def _action_change(self, controller, balls: BallPool, key):
+    def _action_change(self, controller: Controller, balls: BallPool, key: jax.Array) -> jax.Array:
         task, episodes = self._simulator.task, self._draw(balls, key)
         episodes = jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1) if x.ndim >= 2 else x, episodes)
         prepared, remembered = task.prepare(episodes), Remembered(controller, controller.mean)
 
-        def advance(carry, tick):
+        def advance(carry: Carry, tick: Tick) -> tuple[Carry, None]:
             state, total, count = carry
             after = task.control_step(tick, state, episodes, prepared, remembered)
             counted = (state.live & (tick > 0)).astype(total.dtype)
@@ -83,7 +87,7 @@ class Arena:
         return total / count
 
 
-def draw_balls(experiment: Experiment, key, episodes: int) -> BallPool:
+def draw_balls(experiment: Experiment, key: jax.Array, episodes: int) -> BallPool:
     """At least ``episodes`` balls, up to whole calls, in the order of their arrival: similar ones play together."""
     size = ROWS * COLUMNS
     balls = build.pool(experiment, key, -(-episodes // size) * size)

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import jax
+
 from bgs import normalizer
-from experiments.baselines.learner import Learner
+from experiments.baselines.learner import Advance, Learner, Measured
 from experiments.training.update import Trainer, TrainState
 from mjx_tt.env.policy import Policy, PolicyController
 
 
-class Evolution(Learner):
+class Evolution(Learner[TrainState]):
     """One call of the compiled function is one update."""
 
     def __init__(self, trainer: Trainer) -> None:
         self._trainer = trainer
 
-    def init(self, key) -> TrainState:
+    def init(self, key: jax.Array) -> TrainState:
         return self._trainer.init(key)
 
-    def compiled(self, state: TrainState):
+    def compiled(self, state: TrainState) -> Advance[TrainState]:
         update, episodes = self._trainer.lower(state).compile(), self._trainer.episodes_per_update
 
-        def advance(state):
+        def advance(state: TrainState) -> tuple[TrainState, Measured]:
             state, metrics = update(state, self._trainer.pool)
             finite = episodes - metrics["non_finite"]
             means = {"hit": "hit_rate", "returned": "return_rate", "episode_return": "mean_return", "steps": "steps"}

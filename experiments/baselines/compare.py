@@ -1,7 +1,7 @@
 """Trains several algorithms on one task, evaluates them alike, also in a world that no training saw.
 
 Folder of a comparison:
-  comparison.yaml                     what was asked for, defaults written out
+  comparison.yaml                     the request, defaults written out
   <algorithm>/seed<K>/training.json   the curve, and under which conditions it came about
   <algorithm>/seed<K>/policy/         the controller's arrays
   <algorithm>/seed<K>/evaluation.json
@@ -27,13 +27,13 @@ from ballmodel.io.atomic_files import replacing
 from experiments.baselines import report
 from experiments.baselines.arena import Arena, draw_balls
 from experiments.baselines.bgs import Evolution
-from experiments.baselines.learner import MEASURED, Learner
+from experiments.baselines.learner import MEASURED, Advance, Learner, S
 from experiments.baselines.off_policy import OffPolicyLearner
 from experiments.baselines.ppo import PpoLearner
 from experiments.baselines.qt_opt import QtOptAgent
 from experiments.baselines.sac import SacAgent
 from experiments.config import build
-from experiments.config.baselines import Algorithm, Bgs, Comparison, Ppo, Sac
+from experiments.config.baselines import Algorithm, Bgs, Budget, Comparison, Ppo, Sac
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
 from experiments.errors import RunError, checked
@@ -42,6 +42,7 @@ from experiments.runs import checkpoint, run_dir
 from experiments.training.update import Trainer
 from mjx_tt.env.brax import TableTennis
 from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import Controller
 from mjx_tt.sim.model import ModelFile
 
 RELATIVE = ("velocity", "acceleration", "jerk")  # reward terms: 1 - mean over joints and steps of |value| / limit
@@ -49,7 +50,7 @@ RELATIVE = ("velocity", "acceleration", "jerk")  # reward terms: 1 - mean over j
 
 @dataclass(frozen=True)
 class Common:
-    """What all algorithms of a comparison share."""
+    """Things that all algorithms of a comparison share."""
 
     comparison: Comparison
     experiment: Experiment
@@ -61,14 +62,14 @@ class Common:
         return self.folder / name / f"seed{seed}"
 
     def conditions(self, name: str) -> dict[str, Any]:
-        """What decides a training, as plain data."""
+        """Settings that decide a training, as plain data."""
         config = self.experiment.config.to_dict()
         shared = {key: config[key] for key in ("balls", "model", "task")} | {"pool": config["training"]["pool"]}
         given = self.comparison.to_dict()
         return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": given["algorithms"][name]}
 
     def evaluation_conditions(self) -> dict[str, Any]:
-        """What decides an evaluation besides the policy."""
+        """Settings that decide an evaluation besides the policy."""
         return {
             "evaluation": self.experiment.config.evaluation.model_dump(mode="json"),
             "reality": self.comparison.reality,
@@ -84,7 +85,7 @@ def compare(comparison: Comparison, config: Config, where: str, out: Path, conso
         temporary.write_text(yaml.safe_dump(common.comparison.to_dict(), sort_keys=False), encoding="utf-8")
     judge = Judge(common) if any(missing.values()) else None
     for name, seeds in missing.items():
-        if seeds:
+        if judge is not None and seeds:
             _run(common, judge, name, seeds)
         else:
             console.print(f"{common.folder / name}: done before, skipped", highlight=False)
@@ -107,7 +108,7 @@ def unfinished(common: Common) -> dict[str, list[int]]:
     return {name: [k for k in seeds if not _finished(common, name, k)] for name in common.comparison.algorithms}
 
 
-def learner(settings: Algorithm, experiment: Experiment) -> Learner:
+def learner(settings: Algorithm, experiment: Experiment) -> Learner[Any]:
     """The algorithm on the experiment's task. Raises ConfigError."""
     config, model = experiment.config, experiment.model
     pool = build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool)
@@ -141,13 +142,13 @@ class Judge:
         self._key = build.key(seed, build.EVALUATION_EPISODES)
         self._balls = draw_balls(experiment, build.key(seed, build.EVALUATION_BALLS), config.evaluation.episodes)
 
-    def progress(self, controller) -> dict[str, Any]:
+    def progress(self, controller: Controller) -> dict[str, Any]:
         result = self._arenas["simulation"].play(controller, self._progress_balls, self._progress_key)
         kept = ("return_rate", "low", "high", "hit_rate", "mean_return")
         summary = evaluate.summary(result)
         return {name: summary[name] for name in kept}
 
-    def final(self, controller) -> dict[str, Any]:
+    def final(self, controller: Controller) -> dict[str, Any]:
         """Per world the summary of ``evaluate``, and how restless the motion is in simulation."""
         found = {
             world: evaluate.summary(arena.play(controller, self._balls, self._key))
@@ -160,7 +161,7 @@ class Judge:
 
 
 def _run(common: Common, judge: Judge, name: str, seeds: list[int]) -> None:
-    """What is missing of training and evaluation of one algorithm."""
+    """Does what is missing of training and evaluation of one algorithm."""
     algorithm = learner(common.comparison.algorithms[name], common.experiment)
     key = build.key(seeds[0], build.INITIAL_STATE)
     compiled = None
@@ -173,15 +174,17 @@ def _run(common: Common, judge: Judge, name: str, seeds: list[int]) -> None:
                 compiled = algorithm.compiled(state)
             _train(common, judge, name, folder, algorithm, compiled, state)
         template = jax.eval_shape(lambda key: algorithm.controller(algorithm.init(key)), key)
-        controller, _ = checkpoint.load_latest(folder / "policy", template)
-        found = judge.final(controller)
+        restored = checkpoint.load_latest(folder / "policy", template)
+        if restored is None:
+            raise RunError(f"{folder / 'policy'}: holds no policy, though training.json is there; remove {folder}")
+        found = judge.final(restored[0])
         run_dir.write_json(folder / "evaluation.json", {"conditions": common.evaluation_conditions()} | found)
         rates = (f"{world} {found[world]['return_rate']:.1%}" for world in ("simulation", "reality"))
         common.console.print(f"{folder}: returned in {', in '.join(rates)}", highlight=False)
 
 
 def _finished(common: Common, name: str, seed: int) -> bool:
-    """Whether training and evaluation are there. Raises RunError for a training under other conditions."""
+    """True where training and evaluation are there. Raises RunError for a training under other conditions."""
     folder = common.run_folder(name, seed)
     if not (folder / "training.json").exists():
         return False
@@ -195,7 +198,9 @@ def _finished(common: Common, name: str, seed: int) -> bool:
     return path.exists() and json.loads(path.read_text())["conditions"] == common.evaluation_conditions()
 
 
-def _train(common: Common, judge: Judge, name: str, folder: Path, algorithm: Learner, advance, state) -> None:
+def _train(
+    common: Common, judge: Judge, name: str, folder: Path, algorithm: Learner[S], advance: Advance[S], state: S
+) -> None:
     """Learns until the budget is spent; the curve has evenly spaced evaluations, the first before any learning."""
     budget, points = common.comparison.budget, common.comparison.curve.points
     spent = {"seconds": 0.0, "cpu_seconds": 0.0} | {name: 0 for name in ("episodes", "steps")}
@@ -204,8 +209,8 @@ def _train(common: Common, judge: Judge, name: str, folder: Path, algorithm: Lea
     since: dict[str, float] = dict.fromkeys(MEASURED, 0.0)
     while (share := _share(budget, spent)) < 1.0:
         started = time.monotonic(), time.process_time()
-        state, measured = advance(state)
-        measured = {key: float(value) for key, value in jax.device_get(measured).items()}
+        state, on_device = advance(state)
+        measured = {key: float(value) for key, value in jax.device_get(on_device).items()}
         spent["seconds"] += time.monotonic() - started[0]
         spent["cpu_seconds"] += time.process_time() - started[1]
         for key in ("episodes", "steps"):
@@ -225,8 +230,8 @@ def _train(common: Common, judge: Judge, name: str, folder: Path, algorithm: Lea
     )
 
 
-def _share(budget, spent: dict[str, float]) -> float:
-    """How much of the budget is spent; at 1 it is."""
+def _share(budget: Budget, spent: dict[str, float]) -> float:
+    """Spent share of the budget; at 1 it is used up."""
     seconds = spent["seconds" if budget.clock == "wall" else "cpu_seconds"]
     by_time = 0.0 if budget.minutes is None else seconds / (60 * budget.minutes)
     by_episodes = 0.0 if budget.episodes is None else spent["episodes"] / budget.episodes

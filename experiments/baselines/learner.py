@@ -1,35 +1,42 @@
-"""What the comparison asks of an algorithm, and what learners with networks have in common."""
+"""The interface of an algorithm to the comparison, and the common parts of learners with networks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import State
 from brax.training.acme import running_statistics, specs
-from brax.training.types import Transition
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.types import Params, Policy, Transition
+from jax.typing import ArrayLike
 
 from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis, flatten
-from mjx_tt.env.task import Controller
+from mjx_tt.env.task import Controller, Tick
 from robot_io.contract import HISTORY, N_OBSERVATION
 
 # Sums over the episodes that ended within a call of ``advance``, scalars on the device; "steps": control steps.
 MEASURED = ("episodes", "steps", "hit", "returned", "episode_return")
+Measured = dict[str, ArrayLike]
+
+S = TypeVar("S")  # everything that learning changes, a pytree
+Advance = Callable[[S], tuple[S, Measured]]  # a piece of learning: from a state, which it may consume, to the next one
+Decide = Callable[[Params, jax.Array], jax.Array]  # (parameters, (..., 88)) -> (..., 8) in [-1, 1]
 
 
-class Learner(Protocol):
+class Learner(Protocol[S]):
     """One algorithm on one task."""
 
-    def init(self, key) -> Any:
+    def init(self, key: jax.Array) -> S:
         """Everything that learning changes, a pytree."""
 
-    def compiled(self, state) -> Callable[[Any], tuple[Any, dict[str, jax.Array]]]:
+    def compiled(self, state: S) -> Advance[S]:
         """A piece of learning, ready to run: from a state, which it may consume, to the next one and ``MEASURED``."""
 
-    def controller(self, state) -> Controller:
+    def controller(self, state: S) -> Controller:
         """The policy learned so far, without exploration."""
 
 
@@ -38,34 +45,36 @@ class Learner(Protocol):
 class NetworkController:
     """A network on the history of observations as a ``task.Controller``."""
 
-    parameters: Any
+    parameters: Params
     mean: jax.Array  # (11,) of the newest observation in the normaliser
-    decide: Callable = field(metadata={"static": True})  # (parameters, (..., 88)) -> (..., 8) in [-1, 1]
+    decide: Decide = field(metadata={"static": True})
 
-    def start(self, observation):
+    def start(self, observation: jax.Array) -> jax.Array:
         return jnp.broadcast_to(observation, (HISTORY, *observation.shape))
 
-    def act(self, tick, history, observation):
+    def act(self, tick: Tick, history: jax.Array, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         history = jnp.concatenate([history[1:], observation[None]])
         return jnp.moveaxis(self.decide(self.parameters, flatten(history)), -1, 0), history
 
 
-def network_controller(parameters, normaliser, decide) -> NetworkController:
+def network_controller(parameters: Params, normaliser: RunningStatisticsState, decide: Decide) -> NetworkController:
     """``normaliser``: brax's running statistics of the histories."""
     return NetworkController(parameters, normaliser.mean[-N_OBSERVATION:], decide)
 
 
-def empty_normaliser():
+def empty_normaliser() -> RunningStatisticsState:
     """Brax's running statistics of histories (88,), before the first."""
     return running_statistics.init_state(specs.Array((OBSERVATION_SIZE,), jnp.dtype("float32")))
 
 
-def compiled(advance, state):
+def compiled(advance: Advance[S], state: S) -> Advance[S]:
     """``advance`` compiled for ``state``, whose memory it takes over."""
     return jax.jit(advance, donate_argnums=0).lower(state).compile()
 
 
-def play(env: TableTennis, state: State, policy, key) -> tuple[State, Transition, dict[str, jax.Array]]:
+def play(
+    env: TableTennis, state: State, policy: Policy, key: jax.Array
+) -> tuple[State, Transition, dict[str, jax.Array]]:
     """One step of all environments; ``policy``: (observation, key) -> (action, extras). Also what it measured."""
     action, extras = policy(state.obs, key)
     after = env.step(state, action)
@@ -82,6 +91,6 @@ def play(env: TableTennis, state: State, policy, key) -> tuple[State, Transition
     return after, transition, measured
 
 
-def summed(measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
+def summed(measured: dict[str, jax.Array]) -> Measured:
     """Measurements stacked along axis 0, added up."""
     return {name: value.sum(axis=0) for name, value in measured.items()}

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from brax.envs.base import State
 from brax.training.acme import running_statistics
-from brax.training.types import Transition
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.types import Params, Transition
 from flax import struct
 
 from experiments.baselines import learner
-from experiments.baselines.learner import Learner, NetworkController
+from experiments.baselines.learner import Advance, Learner, Measured, NetworkController
 from experiments.config.baselines import Replay
 from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis
 from robot_io.contract import N_JOINTS
 
 WIDTH = 2 * OBSERVATION_SIZE + N_JOINTS + 2  # numbers in a transition
 CALL = 64  # steps of the environments in one call of ``compiled``
+
+
+A = TypeVar("A")  # networks and states of their optimisers, a pytree
 
 
 @struct.dataclass
@@ -40,7 +45,7 @@ def insert(buffer: Buffer, t: Transition) -> Buffer:
     return Buffer(jax.lax.dynamic_update_slice_in_dim(buffer.rows, rows, place, 0), buffer.added + rows.shape[0])
 
 
-def sample(buffer: Buffer, key, n: int) -> Transition:
+def sample(buffer: Buffer, key: jax.Array, n: int) -> Transition:
     """n transitions, drawn with replacement from those that the buffer holds."""
     held = jnp.minimum(buffer.added, buffer.rows.shape[0])
     rows = buffer.rows[jax.random.randint(key, (n,), 0, held)]
@@ -50,42 +55,44 @@ def sample(buffer: Buffer, key, n: int) -> Transition:
     return Transition(observation, action, reward[:, 0], discount[:, 0], following, extras)
 
 
-class Agent(Protocol):
-    """What is learned from transitions."""
+class Agent(Protocol[A]):
+    """Learner from transitions."""
 
-    def init(self, key) -> Any: ...
+    def init(self, key: jax.Array) -> A: ...
 
-    def explore(self, agent, normaliser, observation, key):
+    def explore(
+        self, agent: A, normaliser: RunningStatisticsState, observation: jax.Array, key: jax.Array
+    ) -> jax.Array:
         """Actions (B, 8) to learn from."""
 
-    def update(self, agent, normaliser, batch: Transition, key) -> Any:
+    def update(self, agent: A, normaliser: RunningStatisticsState, batch: Transition, key: jax.Array) -> A:
         """The agent after one gradient step."""
 
-    def parameters(self, agent) -> Any:
-        """What ``decide`` needs of the agent."""
+    def parameters(self, agent: A) -> Params:
+        """Part of the agent that ``decide`` needs."""
 
-    def decide(self, parameters, observation):
+    def decide(self, parameters: tuple[RunningStatisticsState, Params], observation: jax.Array) -> jax.Array:
         """Best actions (..., 8); ``parameters``: (normaliser, those of the agent)."""
 
 
 @struct.dataclass
 class OffPolicyState:
-    agent: Any
-    normaliser: Any
+    agent: Any  # of the kind of agent
+    normaliser: RunningStatisticsState
     buffer: Buffer
-    env: Any
+    env: State
     key: jax.Array
 
 
 @dataclass(frozen=True, eq=False)
-class OffPolicyLearner(Learner):
+class OffPolicyLearner(Learner[OffPolicyState]):
     """Random actions first; then ``gradient_steps`` after every step of the environments."""
 
     replay: Replay
     env: TableTennis
-    agent: Agent
+    agent: Agent[Any]
 
-    def init(self, key) -> OffPolicyState:
+    def init(self, key: jax.Array) -> OffPolicyState:
         agent_key, env_key, key = jax.random.split(key, 3)
         places = self.replay.environments
         env = jax.jit(self.env.reset)(jax.random.split(env_key, places))
@@ -93,22 +100,22 @@ class OffPolicyLearner(Learner):
         buffer = Buffer(jnp.zeros((capacity, WIDTH)), jnp.int32(0))
         return OffPolicyState(self.agent.init(agent_key), learner.empty_normaliser(), buffer, env, key)
 
-    def compiled(self, state: OffPolicyState):
+    def compiled(self, state: OffPolicyState) -> Advance[OffPolicyState]:
         return learner.compiled(self._advance, state)
 
     def controller(self, state: OffPolicyState) -> NetworkController:
         parameters = (state.normaliser, self.agent.parameters(state.agent))
         return learner.network_controller(parameters, state.normaliser, self.agent.decide)
 
-    def _advance(self, state: OffPolicyState):
+    def _advance(self, state: OffPolicyState) -> tuple[OffPolicyState, Measured]:
         state, measured = jax.lax.scan(self._step, state, None, length=CALL)
         return state, learner.summed(measured)
 
-    def _step(self, state: OffPolicyState, _):
+    def _step(self, state: OffPolicyState, _: None) -> tuple[OffPolicyState, dict[str, jax.Array]]:
         play_key, learn_key, key = jax.random.split(state.key, 3)
         warm = state.buffer.added >= self.replay.random_steps
 
-        def policy(observation, key):
+        def policy(observation: jax.Array, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
             action_key, random_key = jax.random.split(key)
             random = jax.random.uniform(random_key, (observation.shape[0], N_JOINTS), minval=-1.0, maxval=1.0)
             action = self.agent.explore(state.agent, state.normaliser, observation, action_key)
@@ -118,7 +125,7 @@ class OffPolicyLearner(Learner):
         normaliser = running_statistics.update(state.normaliser, transition.observation)
         buffer = insert(state.buffer, transition)
 
-        def learn(agent, key):
+        def learn(agent: Any, key: jax.Array) -> tuple[Any, None]:
             sample_key, update_key = jax.random.split(key)
             batch = sample(buffer, sample_key, self.replay.batch)
             return self.agent.update(agent, normaliser, batch, update_key), None

@@ -6,32 +6,36 @@ Brax's own training loop is not used: it neither counts episodes nor hands out t
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
+from brax.envs.base import State
 from brax.training import gradients
 from brax.training.acme import running_statistics
+from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.ppo import losses, networks
+from brax.training.types import Params, Transition
 from flax import struct
 
 from experiments.baselines import learner
-from experiments.baselines.learner import Learner, NetworkController
+from experiments.baselines.learner import Advance, Learner, Measured, NetworkController
 from experiments.config.baselines import Ppo
 from mjx_tt.env.brax import TableTennis
+
+Learned = tuple[losses.PPONetworkParams, optax.OptState]  # of a scan
 
 
 @struct.dataclass
 class PpoState:
     parameters: losses.PPONetworkParams
-    optimiser: Any
-    normaliser: Any
-    env: Any
+    optimiser: optax.OptState
+    normaliser: RunningStatisticsState
+    env: State
     key: jax.Array
 
 
-class PpoLearner(Learner):
+class PpoLearner(Learner[PpoState]):
     """One call of ``compiled`` plays ``unroll`` steps in every environment and learns from them ``epochs`` times."""
 
     def __init__(self, settings: Ppo, env: TableTennis) -> None:
@@ -58,7 +62,7 @@ class PpoLearner(Learner):
         )
         self._descend = gradients.gradient_update_fn(loss, self._optimiser, pmap_axis_name=None, has_aux=True)
 
-    def init(self, key) -> PpoState:
+    def init(self, key: jax.Array) -> PpoState:
         policy_key, value_key, env_key, key = jax.random.split(key, 4)
         parameters = losses.PPONetworkParams(
             self._networks.policy_network.init(policy_key), self._networks.value_network.init(value_key)
@@ -66,21 +70,21 @@ class PpoLearner(Learner):
         env = jax.jit(self._env.reset)(jax.random.split(env_key, self._settings.environments))
         return PpoState(parameters, self._optimiser.init(parameters), learner.empty_normaliser(), env, key)
 
-    def compiled(self, state: PpoState):
+    def compiled(self, state: PpoState) -> Advance[PpoState]:
         return learner.compiled(self._advance, state)
 
     def controller(self, state: PpoState) -> NetworkController:
         parameters = (state.normaliser, state.parameters.policy)
         return learner.network_controller(parameters, state.normaliser, self._decide)
 
-    def _decide(self, parameters, observation):
+    def _decide(self, parameters: tuple[RunningStatisticsState, Params], observation: jax.Array) -> jax.Array:
         return self._make_policy(parameters, deterministic=True)(observation, None)[0]
 
-    def _advance(self, state: PpoState):
+    def _advance(self, state: PpoState) -> tuple[PpoState, Measured]:
         play_key, learn_key, key = jax.random.split(state.key, 3)
         policy = self._make_policy((state.normaliser, state.parameters.policy))
 
-        def play(env, key):
+        def play(env: State, key: jax.Array) -> tuple[State, tuple[Transition, dict[str, jax.Array]]]:
             env, transition, measured = learner.play(self._env, env, policy, key)
             return env, (transition, measured)
 
@@ -92,12 +96,14 @@ class PpoLearner(Learner):
         (parameters, optimiser), _ = jax.lax.scan(learn, (state.parameters, state.optimiser), keys)
         return PpoState(parameters, optimiser, normaliser, env, key), learner.summed(measured)
 
-    def _epoch(self, carry, key, normaliser, data):
+    def _epoch(
+        self, carry: Learned, key: jax.Array, normaliser: RunningStatisticsState, data: Transition
+    ) -> tuple[Learned, None]:
         order_key, loss_key = jax.random.split(key)
         parts = self._settings.minibatches
         order = jax.random.permutation(order_key, self._settings.environments).reshape(parts, -1)
 
-        def descend(carry, chosen):
+        def descend(carry: Learned, chosen: tuple[jax.Array, jax.Array]) -> tuple[Learned, None]:
             parameters, optimiser = carry
             index, key = chosen
             batch = jax.tree.map(lambda x: x[index], data)

@@ -7,13 +7,15 @@ stored demonstrations, images, and its second, slower target network.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import optax
 from brax.training.acme import running_statistics
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.types import Params, Transition
 from flax import linen, struct
 
 from experiments.config.baselines import QtOpt
@@ -31,7 +33,7 @@ class Critics(linen.Module):
     layers: Sequence[int]
 
     @linen.compact
-    def __call__(self, observation, action):
+    def __call__(self, observation: jax.Array, action: jax.Array) -> jax.Array:
         values = []
         for _ in range(2):
             first = self.layers[0]
@@ -42,7 +44,7 @@ class Critics(linen.Module):
         return jnp.stack(values, axis=-1)
 
 
-def best_action(value, normals, elites: int):
+def best_action(value: Callable[[jax.Array], jax.Array], normals: jax.Array, elites: int) -> jax.Array:
     """The action (..., 8) that the cross-entropy method finds for ``value``: (..., n, 8) -> (..., n).
 
     normals: (rounds, n, 8) standard normal numbers, or (rounds, ..., n, 8). Each round draws n actions, cut to [-1, 1],
@@ -62,9 +64,9 @@ def best_action(value, normals, elites: int):
 
 @struct.dataclass
 class QtOptState:
-    critic: Any
-    target: Any
-    optimiser: Any
+    critic: Params
+    target: Params
+    optimiser: optax.OptState
 
 
 class QtOptAgent:
@@ -76,11 +78,13 @@ class QtOptAgent:
         # The same numbers at every decision: the policy is a function of what it sees.
         self._normals = self._draw(jax.random.key(0))
 
-    def init(self, key) -> QtOptState:
+    def init(self, key: jax.Array) -> QtOptState:
         critic = self._critics.init(key, jnp.zeros(OBSERVATION_SIZE), jnp.zeros(N_JOINTS))
         return QtOptState(critic, jax.tree.map(jnp.copy, critic), self._optimiser.init(critic))
 
-    def explore(self, agent: QtOptState, normaliser, observation, key):
+    def explore(
+        self, agent: QtOptState, normaliser: RunningStatisticsState, observation: jax.Array, key: jax.Array
+    ) -> jax.Array:
         search_key, noise_key, random_key, which_key = jax.random.split(key, 4)
         batch = observation.shape[:1]
         seen = running_statistics.normalize(observation, normaliser)
@@ -90,32 +94,39 @@ class QtOptAgent:
         at_random = jax.random.uniform(which_key, batch) < self._settings.random_share
         return jnp.where(at_random[:, None], random, jnp.clip(action, -1.0, 1.0))
 
-    def update(self, agent: QtOptState, normaliser, batch, key) -> QtOptState:
+    def update(
+        self, agent: QtOptState, normaliser: RunningStatisticsState, batch: Transition, key: jax.Array
+    ) -> QtOptState:
         settings = self._settings
         following = running_statistics.normalize(batch.next_observation, normaliser)
         action = self._best(agent.target, following, self._draw(key))
-        value = self._critics.apply(agent.target, following, action).min(axis=-1)
+        value = self._values(agent.target, following, action).min(axis=-1)
         wanted = settings.reward_scale * batch.reward + settings.discount * batch.discount * value
         seen = running_statistics.normalize(batch.observation, normaliser)
 
-        def loss(critic):
-            return jnp.mean((self._critics.apply(critic, seen, batch.action) - wanted[:, None]) ** 2)
+        def loss(critic: Params) -> jax.Array:
+            return jnp.mean((self._values(critic, seen, batch.action) - wanted[:, None]) ** 2)
 
         change, optimiser = self._optimiser.update(jax.grad(loss)(agent.critic), agent.optimiser)
         critic = optax.apply_updates(agent.critic, change)
         return QtOptState(critic, optax.incremental_update(critic, agent.target, settings.target_rate), optimiser)
 
-    def parameters(self, agent: QtOptState):
+    def parameters(self, agent: QtOptState) -> Params:
         return agent.critic
 
-    def decide(self, parameters, observation):
+    def decide(self, parameters: tuple[RunningStatisticsState, Params], observation: jax.Array) -> jax.Array:
         normaliser, critic = parameters
         return self._best(critic, running_statistics.normalize(observation, normaliser), self._normals)
 
-    def _best(self, critic, seen, normals):
+    def _best(self, critic: Params, seen: jax.Array, normals: jax.Array) -> jax.Array:
         """``seen``: normalised observations (..., 88)."""
         state = seen[..., None, :]
-        return best_action(lambda a: self._critics.apply(critic, state, a)[..., 0], normals, self._settings.elites)
+        return best_action(lambda a: self._values(critic, state, a)[..., 0], normals, self._settings.elites)
 
-    def _draw(self, key):
+    def _values(self, critic: Params, observation: jax.Array, action: jax.Array) -> jax.Array:
+        """Both networks' values (..., 2) under the parameters ``critic``."""
+        # Of flax's two kinds of result, the one with changed variables comes only when ``mutable`` is given.
+        return cast(jax.Array, self._critics.apply(critic, observation, action))
+
+    def _draw(self, key: jax.Array) -> jax.Array:
         return jax.random.normal(key, (self._settings.rounds, self._settings.candidates, N_JOINTS))

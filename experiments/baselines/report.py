@@ -1,10 +1,10 @@
-"""What a comparison of algorithms came to: tables, pictures and a page, made from the finished runs alone."""
+"""Results of a comparison of algorithms: tables, pictures and a page, made from the finished runs alone."""
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
@@ -32,6 +33,10 @@ RESTLESSNESS = {
     "acceleration": "acceleration over its limit",
     "jerk": "jerk over its limit",
 }
+
+Runs = dict[str, dict[int, dict[str, Any]]]  # by algorithm and seed
+Summary = dict[str, dict[str, Any]]  # by algorithm
+Colours = dict[str, str]
 
 
 def write(folder: Path, comparison: Comparison) -> None:
@@ -88,13 +93,13 @@ def _summary(seeds: dict[int, dict[str, Any]]) -> dict[str, Any]:
     return {"spent": spent, **worlds, "restlessness": restless}
 
 
-def _mean(values) -> float | None:
+def _mean(values: Iterable[float | None]) -> float | None:
     """Over what is known."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
 
-def _write_curves(path: Path, found: dict[str, dict[int, dict[str, Any]]]) -> None:
+def _write_curves(path: Path, found: Runs) -> None:
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(("algorithm", "seed", *CURVE))
@@ -103,7 +108,7 @@ def _write_curves(path: Path, found: dict[str, dict[int, dict[str, Any]]]) -> No
                 writer.writerows((name, seed, *(point[key] for key in CURVE)) for point in run["curve"])
 
 
-def _curves(found, colours, clock: str) -> Figure:
+def _curves(found: Runs, colours: Colours, clock: str) -> Figure:
     """Rates and mean return against episodes and against training time."""
     figure, grid = plt.subplots(3, 2, figsize=(11, 9), sharex="col", sharey="row")
     measures = {"return_rate": "returned", "hit_rate": "touched", "mean_return": "mean return"}
@@ -138,19 +143,19 @@ def _curves(found, colours, clock: str) -> Figure:
     return figure
 
 
-def _bars(axes, summary, colours, value: Callable[[dict[str, Any]], float]) -> np.ndarray:
-    place = np.arange(len(summary))
-    heights = [value(part) for part in summary.values()]
-    axes.bar(place, heights, width=0.62, color=[colours[name] for name in summary])
-    axes.set_xticks(place, list(summary))
+def _bars(axes: Axes, heights: dict[str, float], colours: Colours) -> np.ndarray:
+    """A bar per algorithm; returns their places."""
+    place = np.arange(len(heights))
+    axes.bar(place, list(heights.values()), width=0.62, color=[colours[name] for name in heights])
+    axes.set_xticks(place, list(heights))
     axes.grid(axis="y", alpha=0.25)
     return place
 
 
-def _transfer(summary, colours) -> Figure:
+def _transfer(summary: Summary, colours: Colours) -> Figure:
     figure, row = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True)
     for axes, (world, title) in zip(row, WORLDS.items(), strict=False):
-        place = _bars(axes, summary, colours, lambda part, world=world: part[world]["return_rate"])
+        place = _bars(axes, {name: part[world]["return_rate"] for name, part in summary.items()}, colours)
         for at, part in zip(place, summary.values(), strict=False):
             found = part[world]
             rate, below = found["return_rate"], found["return_rate"] - found["low"]
@@ -170,10 +175,10 @@ def _transfer(summary, colours) -> Figure:
     return figure
 
 
-def _restlessness(summary, colours) -> Figure:
+def _restlessness(summary: Summary, colours: Colours) -> Figure:
     figure, row = plt.subplots(1, len(RESTLESSNESS), figsize=(3.2 * len(RESTLESSNESS), 3.6))
     for axes, (key, title) in zip(row, RESTLESSNESS.items(), strict=False):
-        _bars(axes, summary, colours, lambda part, key=key: part["restlessness"][key] or 0.0)
+        _bars(axes, {name: part["restlessness"][key] or 0.0 for name, part in summary.items()}, colours)
         axes.set_title(title, fontsize=9)
         axes.tick_params(axis="x", labelrotation=45)
     row[0].set_yscale("log")  # from one algorithm to another by orders of magnitude
@@ -181,7 +186,7 @@ def _restlessness(summary, colours) -> Figure:
     return figure
 
 
-def _page(comparison: Comparison, summary: dict[str, Any]) -> str:
+def _page(comparison: Comparison, summary: Summary) -> str:
     budget, several = comparison.budget, len(comparison.seeds) > 1
     limits = []
     if budget.minutes is not None:

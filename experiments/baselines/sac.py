@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import optax
 from brax.training import gradients
 from brax.training.acme import running_statistics
+from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.sac import losses, networks
+from brax.training.types import Params, Transition
 from flax import struct
 
 from experiments.config.baselines import Sac
@@ -19,11 +19,11 @@ from robot_io.contract import N_JOINTS
 
 @struct.dataclass
 class SacState:
-    policy: Any
-    critic: Any
-    target: Any
+    policy: Params
+    critic: Params
+    target: Params
     log_alpha: jax.Array  # () of the entropy's weight
-    optimisers: tuple[Any, Any, Any]
+    optimisers: tuple[optax.OptState, optax.OptState, optax.OptState]  # of policy, critic, log_alpha
 
 
 class SacAgent:
@@ -41,7 +41,7 @@ class SacAgent:
             gradients.gradient_update_fn(loss, self._optimiser, pmap_axis_name=None) for loss in three
         )
 
-    def init(self, key) -> SacState:
+    def init(self, key: jax.Array) -> SacState:
         policy_key, critic_key = jax.random.split(key)
         policy, critic = self._networks.policy_network.init(policy_key), self._networks.q_network.init(critic_key)
         log_alpha = jnp.log(jnp.float32(self._settings.first_entropy_weight))
@@ -49,10 +49,14 @@ class SacAgent:
         # Copies: a state that is given away whole must not hold the same array twice.
         return SacState(policy, critic, jax.tree.map(jnp.copy, critic), log_alpha, optimisers)
 
-    def explore(self, agent: SacState, normaliser, observation, key):
+    def explore(
+        self, agent: SacState, normaliser: RunningStatisticsState, observation: jax.Array, key: jax.Array
+    ) -> jax.Array:
         return self._make_policy((normaliser, agent.policy))(observation, key)[0]
 
-    def update(self, agent: SacState, normaliser, batch, key) -> SacState:
+    def update(
+        self, agent: SacState, normaliser: RunningStatisticsState, batch: Transition, key: jax.Array
+    ) -> SacState:
         alpha_key, critic_key, actor_key = jax.random.split(key, 3)
         for_policy, for_critic, for_alpha = agent.optimisers
         alpha = jnp.exp(agent.log_alpha)
@@ -68,8 +72,8 @@ class SacAgent:
         target = optax.incremental_update(critic, agent.target, self._settings.target_rate)
         return SacState(policy, critic, target, log_alpha, (for_policy, for_critic, for_alpha))
 
-    def parameters(self, agent: SacState):
+    def parameters(self, agent: SacState) -> Params:
         return agent.policy
 
-    def decide(self, parameters, observation):
+    def decide(self, parameters: tuple[RunningStatisticsState, Params], observation: jax.Array) -> jax.Array:
         return self._make_policy(parameters, deterministic=True)(observation, None)[0]

@@ -87,7 +87,7 @@ class Replay(Section):
 
 
 class OffPolicy(Section):
-    """What learners from kept experience have in common."""
+    """Settings of all learners from kept experience."""
 
     replay: Replay = Replay()
     """Experience and its use."""
@@ -136,7 +136,7 @@ Algorithm = Annotated[Bgs | Ppo | Sac | QtOpt, Field(discriminator="kind")]
 
 
 class Budget(Section):
-    """What each algorithm may spend with each seed; whichever is spent first ends its training."""
+    """Limits of each algorithm with each seed; the first that is reached ends its training."""
 
     minutes: Positive | None = None
     """Of training, without compilation and evaluations."""
