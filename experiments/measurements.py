@@ -16,8 +16,9 @@ def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
     """The balls of several files together. Raises ConfigError for files that hold different kinds of measurements."""
     parts = [checked("", read, path, format) for path in paths]
     source = ", ".join(part.source for part in parts)
-    if all(isinstance(part, Dataset) for part in parts):
-        return Dataset(tuple(trajectory for part in parts for trajectory in part), source)
+    datasets = [part for part in parts if isinstance(part, Dataset)]
+    if len(datasets) == len(parts):
+        return Dataset(tuple(trajectory for part in datasets for trajectory in part), source)
     if len(parts) == 1:
         return parts[0]
     kinds = ", ".join(
@@ -25,6 +26,14 @@ def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
         for path, p in zip(paths, parts, strict=False)
     )
     raise ConfigError(f"several files must all hold trajectories ({kinds}); fit the others one by one")
+
+
+def read_trajectories(paths: list[Path]) -> Dataset:
+    """Trajectories of several files together. Raises ConfigError as ``read_all`` does, and for start states."""
+    measured = read_all([str(path) for path in paths], None)
+    if not isinstance(measured, Dataset):
+        raise ConfigError(f"{measured.source}: holds start states; measured trajectories are needed")
+    return measured
 
 
 def write_csv(path: Path, dataset: Dataset) -> None:

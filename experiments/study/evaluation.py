@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
 
 from ballmodel.distribution import BallDistribution
 from ballmodel.io.atomic_files import replacing
@@ -40,7 +43,7 @@ def play(
     """
     lanes, settings = study.evaluation.lanes, study.evaluation
 
-    def spread(arrays):  # one array (n, ...) per pairing -> (n, pairings x lanes)
+    def spread(arrays: Iterable[ArrayLike]) -> Array:  # one array (n, ...) per pairing -> (n, pairings x lanes)
         return jnp.repeat(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1), lanes, axis=-1)
 
     policy = jax.tree.map(lambda *arrays: spread(arrays), *policies)
@@ -86,7 +89,7 @@ def play_without(
     ]
 
     # Lanes: worlds x models x sessions.
-    def per_model(arrays):
+    def per_model(arrays: Iterable[ArrayLike]) -> Array:
         each = jnp.stack([jnp.asarray(a) for a in arrays], axis=-1)
         return jnp.tile(jnp.repeat(each, lanes, axis=-1), len(worlds))
 

@@ -7,8 +7,10 @@ a virtual one (``target_domain.finetuning``) or a robot with its operator (``tar
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -45,12 +47,14 @@ class Loop:
 
     def __init__(self, study: Study, folder: Path, console: Console) -> None:
         self.study, self.folder, self.console = study, folder, console
+        self._virtual: dict[int, VirtualWorld] = {}
         self._world: dict[int, World] = {}
         if study.robot is None:
             shared = VirtualReality(study, study.seeds[0])
-            self._world = {seed: VirtualWorld(study, seed, shared) for seed in study.seeds}
+            self._virtual = {seed: VirtualWorld(study, seed, shared) for seed in study.seeds}
+            self._world.update(self._virtual)
         else:
-            self._world = dict.fromkeys(study.seeds, on_robot.RobotWorld(study, console))
+            self._world = dict.fromkeys(study.seeds, on_robot.RobotWorld(study, study.robot, console))
 
     # -- places --------------------------------------------------------------------------------------------------------
 
@@ -94,7 +98,7 @@ class Loop:
 
     def steps_of_play(self) -> list[Step]:
         """All that makes data."""
-        found = []
+        found: list[Step] = []
         for seed in self.study.seeds:
             if self.study.robot is None:
                 found.append(self._seal(seed))
@@ -103,7 +107,7 @@ class Loop:
                 for item in items(self.study, player):
                     found.append(self._step(seed, player, item))
                 found.append(self._convergence(seed, player))
-            found += [self._evaluate(seed)] if self.study.robot is None else self._blind(seed)
+            found += [self._evaluate(seed)] if self.study.robot is None else self._blind(seed, self.study.robot)
             if self.study.robot is None and self.study.evaluation.effects:
                 found.append(self._effects(seed))
         found.append(self._collect(found))
@@ -120,7 +124,7 @@ class Loop:
 
         return Step(f"seed{seed}/reality", "seal", 1, (), (path,), run)
 
-    def _reality(self, seed: int) -> dict:
+    def _reality(self, seed: int) -> dict[str, Any]:
         without = tuple(self.study.reality.without)
         return realities.content(realities.draw(seed, without), seed, without)
 
@@ -158,8 +162,8 @@ class Loop:
         path, sources = self.human(seed, player, item.name), tuple(self.data(seed, player, name) for name in item.data)
 
         def run() -> str:
-            found = measurements.read_all([str(source) for source in sources], None)
-            measured = Dataset(tuple(found), " + ".join(item.data))  # wherever the study's folder lies
+            found = measurements.read_trajectories(list(sources))
+            measured = Dataset(found.trajectories, " + ".join(item.data))  # wherever the study's folder lies
             title = f"{player}/{item.name}, seed {seed}"
             distribution, report = checked(str(path), fit_human, measured, ball_params(), None, 5, title)
             save_distribution(path, distribution)
@@ -170,7 +174,7 @@ class Loop:
     def _simulated(self, seed: int, player: str, item: Simulated) -> Step:
         folder, name = self.model_folder(seed, player, item.key), f"seed{seed}/{player}/{item.key}"
         human = self.human(seed, player, item.balls) if item.balls.startswith("M") else None
-        inputs = () if human is None else (human,)
+        inputs: tuple[Path, ...] = () if human is None else (human,)
         if item.source is not None:
             inputs += (self.model_folder(seed, player, item.source) / POLICY,)
 
@@ -224,10 +228,10 @@ class Loop:
         logs = self.folder / evaluation.LOGS
 
         def run() -> str:
-            lanes, world = self.study.evaluation.lanes, self._world[seed]
+            lanes, reality = self.study.evaluation.lanes, self._virtual[seed].reality
             policies = [Policy.load(place.parent / training.POLICY) for place in places]
             boxes = [self._box(seed, trainer, model) for trainer, _, model in pairs]
-            result = evaluation.play(self.study, world.reality, seed, pairs, policies, boxes)
+            result = evaluation.play(self.study, reality, seed, pairs, policies, boxes)
             codes = evaluation.code_names(seed, pairs)
             evaluation.save_logs(logs, seed, pairs, result, lanes)
             rallies = evaluation.rallies_of(seed, pairs, codes, result, lanes)
@@ -247,7 +251,7 @@ class Loop:
         def run() -> str:
             policies = [Policy.load(place.parent / training.POLICY) for place in places]
             boxes = [self._box(seed, player, model) for player, model in models]
-            found = evaluation.play_without(self.study, self._world[seed].reality, seed, models, policies, boxes)
+            found = evaluation.play_without(self.study, self._virtual[seed].reality, seed, models, policies, boxes)
             effect_costs.write(path, found)
             return f"{sum(o.rallies for o in found):,} rallies in {len(effect_costs.WORLDS)} worlds"
 
@@ -267,19 +271,19 @@ class Loop:
         human = self.human(seed, trainer, item.balls)
         return load_distribution(human) if item.balls.startswith("M") else build.distribution(item.balls, model)
 
-    def _blind(self, seed: int) -> list[Step]:
+    def _blind(self, seed: int, robot: str) -> list[Step]:
         """The evaluation by people: for every trainer and evaluator a folder with code names and a scoring sheet."""
-        found = []
+        found: list[Step] = []
         pairs = pairings(self.study)
         for trainer, evaluator in dict.fromkeys((t, e) for t, e, _ in pairs):
             models = [m for t, e, m in pairs if (t, e) == (trainer, evaluator)]
             places = {m: self._policy_of(seed, trainer, m) for m in models}
-            runs_of = {m: partial(self.run_of, seed, trainer, place.parent.name) for m, place in places.items()}
+            runs_of: dict[str, Callable[[], Path]] = {
+                m: partial(self.run_of, seed, trainer, place.parent.name) for m, place in places.items()
+            }
             folder = self.seed_folder(seed) / "blind" / f"{trainer}-{evaluator}"
             inputs = tuple(dict.fromkeys(places.values()))
-            found += on_robot.blind_steps(
-                folder, seed, trainer, evaluator, runs_of, inputs, self.study.robot, self.console
-            )
+            found += on_robot.blind_steps(folder, seed, trainer, evaluator, runs_of, inputs, robot, self.console)
         return found
 
     def _collect(self, before: list[Step]) -> Step:

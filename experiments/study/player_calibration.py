@@ -1,4 +1,4 @@
-"""How near the virtual players come to the paper's people: target against reached, as tables and a picture.
+"""Distance of the virtual players from the paper's people: target against reached, as tables and a picture.
 
     python -m experiments.study.player_calibration --first runs/player3_m0 --later runs/player3_m2 runs/medium \\
         --out calibration
@@ -16,6 +16,7 @@ import argparse
 import csv
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,8 +25,10 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import yaml
+from matplotlib.lines import Line2D
 
 from ballmodel import registry as paper
+from ballmodel.distribution import BallDistribution
 from ballmodel.fit_distribution import fit_human
 from ballmodel.io import yaml as yaml_file
 from ballmodel.io.atomic_files import replacing
@@ -53,12 +56,12 @@ LANES, RALLIES, CAPACITY = 8, 30, 400  # per player and policy
 class Reached:
     """One player: fitted numbers by model, and rally lengths."""
 
-    numbers: dict  # model -> (16,) in the order of NUMBERS
-    lengths: object  # (n,) of the rallies that count
-    balls: dict  # model -> number of balls
+    numbers: dict[str, np.ndarray]  # model -> (16,) in the order of NUMBERS
+    lengths: np.ndarray  # (n,) of the rallies that count
+    balls: dict[str, int]  # model -> number of balls
 
 
-def main(arguments=None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="calibrate_players", description=__doc__.splitlines()[0])
     parser.add_argument("--first", nargs="+", required=True, help="runs or artefacts trained on first balls")
     parser.add_argument("--later", nargs="+", required=True, help="runs or artefacts trained on rally balls")
@@ -117,7 +120,7 @@ FARTHEST = 0.4  # [m], [m/s] that an end may be from the number that it follows
 class Calibration:
     """The virtual players, played with given policies."""
 
-    def __init__(self, first, later, model_path=None) -> None:
+    def __init__(self, first: Sequence[str], later: Sequence[str], model_path: str | None = None) -> None:
         self.model = models.ModelFile.load(model_path).model if model_path else models.SimModel()
         self.first = len(first)
         self.policies = [load_policy.load(folder).policy for folder in (*first, *later)]
@@ -129,7 +132,7 @@ class Calibration:
             lambda *arrays: jnp.stack([jnp.asarray(a, jnp.float32) for a in arrays], axis=1), *columns
         )
 
-    def people(self):
+    def people(self) -> human_player.Player:
         """The players of the lanes, read anew."""
         loaded = [human_player.load(name) for name in self.names]
         return human_player.stack([loaded[p] for p, _ in self.lanes])
@@ -249,7 +252,7 @@ def medians_of(rows: list[dict]) -> dict[str, dict[str, float]]:
     return {name: {m: round(float(np.median(d)), 3) for m, d in by.items()} for name, by in found.items()}
 
 
-def sixteen(distribution):
+def sixteen(distribution: BallDistribution) -> np.ndarray:
     """The 16 numbers (16,) of a distribution in the order of NUMBERS."""
     low, high = (
         [v for part in ("position", "velocity", "landing") for v in getattr(distribution, f"{part}_{end}")]
@@ -332,8 +335,10 @@ def picture(path: Path, rows: list[dict], lengths: list[dict]) -> None:
         axis.set_xticks(range(len(names)), [n.removeprefix("player") for n in names])
         axis.set_title("rally length: quartiles and mean", fontsize=10)
         figure.legend(
-            handles=[plt.Line2D([], [], color=TARGET, linewidth=4), plt.Line2D([], [], color=REACHED, linewidth=4)],
-            labels=["the paper's player", "virtual player"],
+            handles=[
+                Line2D([], [], color=TARGET, linewidth=4, label="the paper's player"),
+                Line2D([], [], color=REACHED, linewidth=4, label="virtual player"),
+            ],
             loc="outside lower center",
             ncols=2,
             frameon=False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -66,7 +67,7 @@ def look_up(study: Study) -> None:
         if isinstance(item, Simulated) and item.source is None:
             build.experiment(training.configuration(study, item, "narrow", None, 0), "simulation")
     if study.robot is not None:
-        on_robot.look_up(study)
+        on_robot.look_up(study, study.robot)
 
 
 def _open(study: Study, folder: Path) -> None:
@@ -82,10 +83,11 @@ def _open(study: Study, folder: Path) -> None:
             raise RunError(f"{folder}: is another study:\n{changed}\nRestore these values or choose another --out")
     run_dir.write_yaml(path, study.to_dict())
     sessions = folder / SESSIONS
-    before = []
+    before: list[dict[str, Any]] = []
     if sessions.exists():
         found = read_yaml(checked(str(sessions), sessions.read_text, "utf-8"), str(sessions))
-        before = found.get("sessions") if isinstance(found, dict) else None
-        if not isinstance(before, list):
+        listed = found.get("sessions") if isinstance(found, dict) else None
+        if not isinstance(listed, list):
             raise RunError(f"{sessions}: holds no list of sessions; restore the file or remove it")
+        before = listed
     run_dir.write_json(sessions, {"sessions": [*before, run_dir.provenance()]})

@@ -15,7 +15,10 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import connection, get_context, parent_process
+from multiprocessing.queues import SimpleQueue
+from multiprocessing.synchronize import Event
 from pathlib import Path
+from types import FrameType
 
 import jax
 from rich.console import Console
@@ -27,7 +30,7 @@ from mjx_tt import platform
 
 
 def choose(study: Study, processes: int | None, devices: int | None) -> int:
-    """How many processes do a study's steps: ``processes`` where it is given, else one per core.
+    """Number of processes for a study's steps: ``processes`` where it is given, else one per core.
 
     On a robot, on an accelerator, or where a number of devices is asked for, one does them all. Call it when JAX is
     configured. Raises ConfigError for several processes at a robot.
@@ -57,13 +60,16 @@ def run_side_by_side(
     if not ledger.left:
         return
     context = get_context("spawn")  # a fork of a process in which JAX has run hangs
-    shares, started, stopping = context.SimpleQueue(), context.SimpleQueue(), context.Event()
+    shares: SimpleQueue[list[int]] = context.SimpleQueue()
+    started: SimpleQueue[int] = context.SimpleQueue()
+    stopping = context.Event()
     cores = sorted(os.sched_getaffinity(0))
     for i in range(processes):
         shares.put(cores[i::processes] or cores)
-    cache = jax.config.jax_compilation_cache_dir
+    cache = jax.config.values["jax_compilation_cache_dir"]
     executor = ProcessPoolExecutor(processes, context, _start, (study, folder, cache, shares, started, stopping))
-    waiting, running = list(ledger.left), {}
+    waiting = list(ledger.left)
+    running: dict[Future[tuple[str, float]], Step] = {}
     with _sigterm_interrupts():
         try:
             while waiting or running:
@@ -93,7 +99,7 @@ def _ready(waiting: list[Step], running: list[Step]) -> list[Step]:
     return [step for step in waiting if not coming.intersection(step.inputs)]
 
 
-def _stop(running: dict[Future, Step], started, stopping) -> list[str]:
+def _stop(running: dict[Future[tuple[str, float]], Step], started: SimpleQueue[int], stopping: Event) -> list[str]:
     """Asks the workers to save and stop, and waits for them; what they said. A second Ctrl-C does not wait."""
     stopping.set()  # for those that have not begun
     pids = []
@@ -123,7 +129,7 @@ def _sigterm_interrupts() -> Iterator[None]:
         yield
         return
 
-    def interrupt(_number, _frame) -> None:
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGTERM, interrupt)
@@ -136,10 +142,17 @@ def _sigterm_interrupts() -> Iterator[None]:
 # -- in a worker ----------------------------------------------------------------------------------------------------
 
 _steps: dict[str, Step] = {}  # of this worker's study, by name
-_stopping = None  # event: no further step is to begin
+_stopping: Event  # set: no further step is to begin
 
 
-def _start(study: Study, folder: Path, cache: str | None, shares, started, stopping) -> None:
+def _start(
+    study: Study,
+    folder: Path,
+    cache: str | None,
+    shares: SimpleQueue[list[int]],
+    started: SimpleQueue[int],
+    stopping: Event,
+) -> None:
     """Takes a share of the cores, and makes the steps."""
     global _stopping
     _stopping = stopping
@@ -160,8 +173,10 @@ def _start(study: Study, folder: Path, cache: str | None, shares, started, stopp
 
 def _end_with_parent() -> None:
     """Nobody would mark what an orphan does, and the next start would meet it in the same folder."""
-    connection.wait([parent_process().sentinel])
-    os._exit(1)
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
 
 
 def _perform(name: str) -> tuple[str, float]:

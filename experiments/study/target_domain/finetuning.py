@@ -14,11 +14,15 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import PRNGKeyArray
 
 from ballmodel.partial_params import without_nominal
 from ballmodel.trajectory import Dataset, Trajectory
 from bgs import normalizer, strategy
-from bgs.strategy import BGSConfig, BGSState
+from bgs.normalizer import ObservationStatistics
+from bgs.strategy import BGSConfig, BGSInfo, BGSState
 from experiments.config import build
 from experiments.config.study import Study
 from experiments.evaluation import evaluate
@@ -38,7 +42,7 @@ SELECTION_LANES = 10  # sessions side by side in which policies are compared
 
 @dataclass(frozen=True)
 class Cycle:
-    """What a cycle of fine-tuning gave.
+    """Result of a cycle of fine-tuning.
 
     state  after the last update; the observation statistics are those it began with
     rows   per update: mean return, rates of balls hit and returned and of faults, norms of gradient and step
@@ -82,14 +86,22 @@ class VirtualReality:
         person = human_player.load(name)
         return human_player.without_spin(person) if "spin" in self._study.reality.without else person
 
-    def first_balls(self, player: Player, count: int, key, session: str) -> Dataset:
+    def first_balls(self, player: Player, count: int, key: PRNGKeyArray, session: str) -> Dataset:
         """D0: balls across the table without a robot, as the cameras measured them."""
         ball_key, camera_key = jax.random.split(key)
         balls = self._lobs(player, human_player.fresh((count,)), ball_key, (count,))
         measured = hidden_effects.measure(self.model, balls, self._study.reality.camera_noise, camera_key)
         return Dataset(measured.trajectories(session), session)
 
-    def fine_tune(self, player: Player, theta, statistics, updates: int, key, session: str) -> Cycle:
+    def fine_tune(
+        self,
+        player: Player,
+        theta: ArrayLike,
+        statistics: ObservationStatistics,
+        updates: int,
+        key: PRNGKeyArray,
+        session: str,
+    ) -> Cycle:
         """``updates`` updates from the parameters theta (976,) on, while the player rallies with the robot."""
         ask_key, rally_key, play_key, camera_key = jax.random.split(key, 4)
         config = build.bgs_config(self._settings.optimiser(), updates)
@@ -118,7 +130,7 @@ class VirtualReality:
         ]
         return Cycle(TrainState(state, statistics, ask_key), rows, measured.trajectories(session))
 
-    def score(self, player: Player, policy: Policy, balls: int, key) -> float:
+    def score(self, player: Player, policy: Policy, balls: int, key: PRNGKeyArray) -> float:
         """The paper's sparse reward by which a seed is chosen, over at least ``balls`` balls with the player."""
         turns = -(-balls // SELECTION_LANES)
         outcome, fault = self._compared(policy, player, self.known, key, turns=turns)
@@ -128,18 +140,20 @@ class VirtualReality:
         self,
         state: BGSState,
         rally: RallyState,
-        statistics,
+        statistics: ObservationStatistics,
         player: Player,
         model: SimModel,
-        key,
-        play_key,
+        key: PRNGKeyArray,
+        play_key: PRNGKeyArray,
         config: BGSConfig,
-    ):
+    ) -> tuple[BGSState, RallyState, tuple[ShotResult, BGSInfo]]:
         """``_chunk`` updates: state and rally after them, and each one's (ShotResult, BGSInfo)."""
         settings, lanes = self._settings, self._settings.episodes_per_update
         frozen = [_per_lane(x, lanes) for x in normalizer.normaliser(statistics)]
 
-        def update(carry, _):
+        def update(
+            carry: tuple[BGSState, RallyState], _: None
+        ) -> tuple[tuple[BGSState, RallyState], tuple[ShotResult, BGSInfo]]:
             state, rally = carry
             population = strategy.ask(jax.random.fold_in(key, state.updates), state, config)
             theta = jnp.repeat(population.members, settings.repeats, axis=1)  # the lanes of a member side by side
@@ -152,17 +166,19 @@ class VirtualReality:
         (state, rally), found = jax.lax.scan(update, (state, rally), None, length=self._chunk)
         return state, rally, found
 
-    def _returns(self, shots: ShotResult):
+    def _returns(self, shots: ShotResult) -> Array:
         """Weighted returns (L,) of what a robot measures; an episode that is not finite has none."""
         terms = shots.terms.at[rewards.TERMS.index("fault")].set(jnp.where(shots.fault, FAULT, 0.0))
         return jnp.where(shots.finite, sum(w * terms[i] for i, w in enumerate(self._weights) if w), jnp.nan)
 
-    def _shots_of(self, policy: Policy, player: Player, model: SimModel, key, turns: int):
+    def _shots_of(
+        self, policy: Policy, player: Player, model: SimModel, key: PRNGKeyArray, turns: int
+    ) -> tuple[Array, Array]:
         """Outcomes and faults (turns, SELECTION_LANES) of one policy."""
         policy = jax.tree.map(lambda x: _per_lane(x, SELECTION_LANES), policy)
         start_key, play_key = jax.random.split(key)
 
-        def shoot(rally, turn):
+        def shoot(rally: RallyState, turn: Array) -> tuple[RallyState, tuple[Array, Array]]:
             rally, shots = self.simulator.shots(policy, player, model, rally, jax.random.fold_in(play_key, turn))
             return rally, (shots.outcome, shots.fault | ~shots.finite)
 
@@ -180,6 +196,6 @@ class VirtualReality:
         }
 
 
-def _per_lane(x, lanes: int):
+def _per_lane(x: Array, lanes: int) -> Array:
     """One column for each of the lanes: (n,) -> (n, L)."""
     return jnp.broadcast_to(x[:, None], (x.shape[0], lanes))

@@ -13,10 +13,13 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import PRNGKeyArray
 
 from ballmodel import flight
 from ballmodel.constants import TABLE_LENGTH
@@ -30,6 +33,8 @@ from mjx_tt.sim.model import SimModel
 from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
 
 CAMERA_RATE = 125.0  # [Hz], the paper's cameras
+Carry = tuple[BallState, Array, Array, Array, Array]  # ball, bounced, seconds since, still seen, frames seen
+
 _SUBSTEPS = 4  # physics per camera frame
 _LONGEST = 1.6  # [s] that a ball is followed
 _AFTER_BOUNCE = 0.12  # [s] that a measured trajectory goes on after the bounce, which ends the free flight
@@ -100,13 +105,13 @@ def side_by_side(worlds: list[SimModel], lanes: int) -> SimModel:
 
 
 def differences(model: SimModel) -> dict[str, float]:
-    """What of a reality differs from what training believes, by dotted path."""
+    """Values of a reality that differ from what training believes, by dotted path."""
     nominal = models.paths()
     return {path: float(value) for path, value in models.paths(model).items() if value != nominal[path]}
 
 
-def content(model: SimModel, seed: int, without: tuple[str, ...]) -> dict:
-    """What is sealed: plain data."""
+def content(model: SimModel, seed: int, without: tuple[str, ...]) -> dict[str, Any]:
+    """Content to be sealed: plain data."""
     return {"seed": seed, "without": list(without), "reality": differences(model)}
 
 
@@ -128,16 +133,16 @@ class Measured:
 
 
 @partial(jax.jit, static_argnames="frames")
-def _fly(params: BallParams, state: BallState, frames: int):
+def _fly(params: BallParams, state: BallState, frames: int) -> tuple[Array | np.ndarray, Array]:
     """Positions (frames, 3, n) at the camera's rate and how many of them (n,) are taken."""
     dt = 1.0 / (CAMERA_RATE * _SUBSTEPS)
 
-    def substep(_, carry):
+    def substep(_: Array, carry: tuple[BallState, Array]) -> tuple[BallState, Array]:
         state, bounced = carry
         new, events = flight.step(params, state, dt)
         return new, bounced | events.table
 
-    def frame(carry, _):
+    def frame(carry: Carry, _: None) -> tuple[Carry, Array | np.ndarray]:
         state, bounced, since, seen, length = carry
         gone = (state.position[1] < -0.5 * TABLE_LENGTH - 0.3) | (state.position[2] < -0.5) | (since > _AFTER_BOUNCE)
         seen = seen & ~gone
@@ -151,7 +156,7 @@ def _fly(params: BallParams, state: BallState, frames: int):
     return positions, length
 
 
-def measure(model: SimModel, balls: BallState, noise: float, key) -> Measured:
+def measure(model: SimModel, balls: BallState, noise: float, key: PRNGKeyArray) -> Measured:
     """Balls (3, n) as the reality's cameras see them from the player's contact on: physics, calibration, noise [m]."""
     n = balls.position.shape[1]
     padded = jax.tree.map(lambda x: jnp.pad(jnp.asarray(x, jnp.float32), ((0, 0), (0, -n % 256)), mode="edge"), balls)

@@ -18,7 +18,6 @@ from rich.console import Console
 from ballmodel.io import read
 from ballmodel.trajectory import Dataset
 from experiments import measurements
-from experiments.config import build
 from experiments.config import robot as robots
 from experiments.config.study import Study
 from experiments.deploy import session
@@ -36,11 +35,11 @@ from experiments.study.workflow import Step, Waiting
 from experiments.training import finalize
 
 
-def look_up(study: Study) -> None:
+def look_up(study: Study, robot: str) -> None:
     """Raises ConfigError where the robot's YAML or a recording is missing or cannot be read."""
-    if study.robot not in (RIG, tuning.LOCK_STEP):
+    if robot not in (RIG, tuning.LOCK_STEP):
         try:
-            robots.load_robot(study.robot)
+            robots.load_robot(robot)
         except ConfigError as error:
             raise ConfigError(f"robot: {error}") from None
     for player in study.players:
@@ -48,7 +47,7 @@ def look_up(study: Study) -> None:
 
 
 def recording(study: Study, player: str) -> Dataset:
-    """What was recorded of a player before the study. Raises ConfigError naming the key and what is wrong."""
+    """Balls of a player recorded before the study. Raises ConfigError naming the key and what is wrong."""
     where, path = f"recordings.{player}", study.recordings[player]
     measured = checked(where, read, path)
     if not isinstance(measured, Dataset):
@@ -57,13 +56,13 @@ def recording(study: Study, player: str) -> Dataset:
 
 
 class RobotWorld:
-    """The robot of ``study.robot`` and the people who play with it."""
+    """A robot, as in ``study.robot``, and the people who play with it."""
 
-    def __init__(self, study: Study, console: Console) -> None:
-        self._study, self._console = study, console
+    def __init__(self, study: Study, robot: str, console: Console) -> None:
+        self._study, self._robot, self._console = study, robot, console
 
     def first_balls(self, player: str, name: str) -> Dataset:
-        """What was recorded of the player before the study. Raises ConfigError as ``recording`` does."""
+        """Balls of the player recorded before the study. Raises ConfigError as ``recording`` does."""
         measured = recording(self._study, player)
         # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
         label = name.rsplit("/", 1)[-1]
@@ -82,11 +81,11 @@ class RobotWorld:
             soft_wrap=True,
         )
         found = tuning.finetune(
-            str(source), settings, Run(folder), study.robot, None, None, "numpy", _seed(name), self._console
+            str(source), settings, Run(folder), self._robot, None, None, "numpy", _seed(name), self._console
         )
         if found is None:
             raise Waiting(f"{name}: fine-tuning with {player} is not finished; the same command goes on with it")
-        measured = measurements.read_all([str(folder / loop.HUMAN_BALLS)], None)
+        measured = measurements.read_trajectories([folder / loop.HUMAN_BALLS])
         change = found["difference"]["mean_return"]
         return measured, f"{settings.updates} updates, {len(measured):,} balls, mean return changed by {change:+.2f}"
 
@@ -97,7 +96,7 @@ class RobotWorld:
         return lambda trained: self._score(player, name, trained)
 
     def _score(self, player: str, name: str, trained: TrainedPolicy) -> float:
-        balls, robot = self._study.simulation.selection_episodes, self._study.robot
+        balls, robot = self._study.simulation.selection_episodes, self._robot
         experiment = loop.experiment_of(trained.source)
         if robot == tuning.LOCK_STEP:
             emulated = loop.lock_step_robot(experiment, seed=_seed(name))
@@ -127,7 +126,7 @@ def exported(trained: TrainedPolicy, console: Console) -> Path:
     """The artefact of a run, exported if it has none. Raises ConfigError for a policy that the robot cannot run."""
     folder = Run(trained.source).artefact
     if not (folder / "manifest.json").exists():
-        experiment = build.experiment(trained.config.model_copy(update={"initial_policy": None}), str(trained.source))
+        experiment = loop.experiment_of(trained.source)
         if not finalize.export_policy(folder, trained, experiment, None, console):
             raise ConfigError(f"{trained.source}: acts at another rate than the robot")
     return folder

@@ -1,4 +1,4 @@
-"""What the loop asks of a reality, and the virtual one as an answer."""
+"""Interface of the loop to a reality, and the virtual one that implements it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 import jax
+from jaxtyping import PRNGKeyArray
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Dataset
@@ -23,7 +24,7 @@ STUDY = 6  # purpose of a key, beside those of experiments.config.build
 
 
 class World(Protocol):
-    """What the loop asks of a seed's reality. ``name`` is that of the step, from which all chance follows."""
+    """A seed's reality for the loop. ``name`` is that of the step, from which all chance follows."""
 
     def first_balls(self, player: str, name: str) -> Dataset:
         """The player's balls across the table, without a robot."""
@@ -32,7 +33,7 @@ class World(Protocol):
         """Fine-tunes the policy of the run ``source`` into the run ``folder``; the player's hits and a sentence."""
 
     def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
-        """What says how good a policy is with the player; None where that is not asked."""
+        """Function that scores a policy with the player; None where scores are not needed."""
 
 
 class VirtualWorld:
@@ -41,7 +42,7 @@ class VirtualWorld:
     def __init__(self, study: Study, seed: int, reality: VirtualReality) -> None:
         self._study, self._seed, self.reality = study, seed, reality.at(seed)
 
-    def _key(self, name: str):
+    def _key(self, name: str) -> PRNGKeyArray:
         return jax.random.fold_in(build.key(self._seed, STUDY), zlib.crc32(name.encode()) >> 1)
 
     def first_balls(self, player: str, name: str) -> Dataset:
@@ -73,6 +74,6 @@ class VirtualWorld:
         return lambda p: self.reality.score(person, p.policy, balls, key)
 
 
-def _write_lines(path: Path, rows: list[dict]) -> None:
+def _write_lines(path: Path, rows: list[dict[str, float]]) -> None:
     with replacing(path) as temporary:
         temporary.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
