@@ -19,6 +19,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +44,8 @@ from mjx_tt.rally import human_player
 from mjx_tt.rally.end_reasons import ROWS
 from mjx_tt.rally.simulator import RallySimulator
 from mjx_tt.sim import model as models
+
+Row = dict[str, Any]  # of a table: cells by column
 
 UPDATE_BALLS = 30  # of fine-tuning: 5 pairs, 3 balls each
 ROUNDS = {"M0": 0, "M1": 60 * UPDATE_BALLS, "M2": 70 * UPDATE_BALLS}  # balls that are added
@@ -170,7 +173,7 @@ class Calibration:
             reached[name] = Reached(numbers, result.length[:, lane][~filtered[:, lane]], counts)
         return reached
 
-    def table(self, reached: dict[str, Reached]) -> list[dict]:
+    def table(self, reached: dict[str, Reached]) -> list[Row]:
         """A row for every player, model and number: target, reached, and the difference as a share of the range."""
         rows = []
         for name, person in reached.items():
@@ -191,7 +194,7 @@ class Calibration:
                     )
         return rows
 
-    def lengths(self, reached: dict[str, Reached]) -> list[dict]:
+    def lengths(self, reached: dict[str, Reached]) -> list[Row]:
         """A row for every player: rally lengths, the paper's and reached."""
         rows = []
         for name, person in reached.items():
@@ -218,7 +221,7 @@ class Calibration:
         return rows
 
 
-def tune(rows: list[dict]) -> None:
+def tune(rows: list[Row]) -> None:
     """Moves the ends of the players' spreads by half of what the numbers of these rows lack, and writes their files."""
     for name in human_player.names():
         path = human_player.FOLDER / f"{name}.yaml"
@@ -244,7 +247,7 @@ def tune(rows: list[dict]) -> None:
             )
 
 
-def medians_of(rows: list[dict]) -> dict[str, dict[str, float]]:
+def medians_of(rows: list[Row]) -> dict[str, dict[str, float]]:
     """Median deviation over the sixteen numbers, by player and model."""
     found: dict[str, dict[str, list[float]]] = {}
     for row in rows:
@@ -261,7 +264,7 @@ def sixteen(distribution: BallDistribution) -> np.ndarray:
     return np.array([low, high]).T.ravel()
 
 
-def write(folder: Path, rows: list[dict], lengths: list[dict]) -> None:
+def write(folder: Path, rows: list[Row], lengths: list[Row]) -> None:
     """calibration.csv, calibration_rallies.csv, calibration.json and calibration.png; prints the medians."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in (("calibration.csv", rows), ("calibration_rallies.csv", lengths)):
@@ -283,7 +286,7 @@ def write(folder: Path, rows: list[dict], lengths: list[dict]) -> None:
         )
 
 
-def picture(path: Path, rows: list[dict], lengths: list[dict]) -> None:
+def picture(path: Path, rows: list[Row], lengths: list[Row]) -> None:
     """Target and reached intervals of every player, model and coordinate, and the rally lengths, as PNG."""
     names, coordinates = list(dict.fromkeys(r["player"] for r in rows)), [n.removesuffix(" min") for n in NUMBERS[::2]]
     with plt.rc_context(STYLE):

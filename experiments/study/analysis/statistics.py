@@ -159,14 +159,16 @@ def normalised_by_model(rallies: Rallies) -> np.ndarray:
     return _standardised(rallies, lambda cell: (cell[0], cell[1], cell[3]), own_only=True)
 
 
-def _standardised(rallies: Rallies, group: Callable[[Cell], tuple], own_only: bool = False) -> np.ndarray:
+def _standardised(
+    rallies: Rallies, group: Callable[[Cell], tuple[int | str, ...]], own_only: bool = False
+) -> np.ndarray:
     length = rallies.length.astype(float)
     columns = zip(
         *(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")), strict=False
     )
     names = [group(cell) for cell in columns]
     out, own = np.full(length.size, np.nan), rallies.own
-    index: dict[tuple, list[int]] = {}
+    index: dict[tuple[int | str, ...], list[int]] = {}
     for i, name in enumerate(names):
         index.setdefault(name, []).append(i)
     for numbers in index.values():

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis.paper import BY_KEY, BY_SKILL, CROSS, FINAL, TEN
 from experiments.study.analysis.statistics import Models
 from mjx_tt.rally.human_player import FOLDER as VIRTUAL_PLAYERS
+
+T = TypeVar("T")
 
 ROUNDS = ("M0", "M1", "M2")
 DATASETS = ("D0", "D1", "D2")
@@ -145,8 +147,8 @@ class Study:
         return path if path.exists() else None
 
     @cached_property
-    def calibration(self) -> Any:
-        """The calibration of the virtual players: the folder's calibration.json or the shipped one; None with people.
+    def calibration(self) -> dict[str, Any]:
+        """The calibration of the virtual players: the folder's calibration.json or the shipped one; empty with people.
 
         Raises ConfigError.
         """
@@ -154,7 +156,7 @@ class Study:
         if path.exists():
             return _read(path, _calibration)
         virtual = self.settings and self.settings.get("robot") is None
-        return _read(VIRTUAL_PLAYERS / "calibration.json", _calibration) if virtual else None
+        return _read(VIRTUAL_PLAYERS / "calibration.json", _calibration) if virtual else {}
 
     @cached_property
     def effects(self) -> list[effect_costs.Outcome]:
@@ -278,7 +280,7 @@ def counted(rallies: scoring.Rallies) -> dict[tuple[int, str, str, str], int]:
     return out
 
 
-def _read(path: Path, parse: Callable[[Path], Any]) -> Any:
+def _read(path: Path, parse: Callable[[Path], T]) -> T:
     """Result of ``parse`` on a file; raises its errors as a ConfigError that names the file."""
     try:
         return parse(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -86,7 +88,7 @@ def changes(study: Study, m: Measurements) -> Figure | None:
 
 
 @styled
-def calibration(content: dict) -> Figure | None:
+def calibration(content: dict[str, Any]) -> Figure | None:
     """Virtual players against the paper's: deviations of the 16 numbers, and the rally statistics."""
     numbers_, lengths = content.get("numbers", []), content.get("rallies", [])
     if not numbers_ or not lengths:
