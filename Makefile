@@ -29,8 +29,13 @@ study-quick: $(READY)
 PYTEST   := $(BIN)/python -m pytest
 PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 
+# Where arrays are computed: every annotation is checked, types and ranks of arrays change only where the code says so.
+STRICT   := tests/ballmodel tests/bgs $(addprefix tests/mjx_tt/,robot sim env rally viz)
+ALL_ELSE := tests $(addprefix --ignore=,$(STRICT))
+
 test: $(READY)
-	$(PYTEST) $(PARALLEL) -m "not slow and not realtime"
+	STRICT_ARRAYS=1 $(PYTEST) $(PARALLEL) $(STRICT) -m "not slow and not realtime"
+	$(PYTEST) $(PARALLEL) $(ALL_ELSE) -m "not slow and not realtime"
 	$(PYTEST) -m "not slow and realtime"
 
 test-slow: $(READY)
