@@ -205,7 +205,7 @@ class LaterRewards(Section):
 
 
 class Training(Section):
-    """How long to train and what to keep of it."""
+    """Length of a training and what to keep of it."""
 
     updates: Count = 2000
     """Length of the training; a cosine schedule falls over it."""
@@ -361,12 +361,12 @@ _KINDS = {  # of YAML: the command that takes it, the key by which it is known
 
 
 def _kind(data: dict[str, Any]) -> str | None:
-    """What the keys of a YAML say that it is; None where they do not tell."""
+    """Kind of YAML that its keys point to; None where they do not tell."""
     return next((kind for kind, (_, key) in _KINDS.items() if key in data), None)
 
 
 def _hint(path: Path, what: str, shipped: dict[str, Path]) -> str:
-    """What may have been meant by a file that is not there: one of another command, one nearly of that name."""
+    """Guess at the file meant by one that is not there: one of another command, one nearly of that name."""
     twin = next(SHIPPED.glob(f"*/{path.stem}.yaml"), None)
     if path.stem not in shipped and twin:
         other = _kind(read_yaml(twin.read_text(encoding="utf-8"), str(twin)))

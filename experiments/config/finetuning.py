@@ -1,4 +1,4 @@
-"""What may be set in fine-tuning on a robot. Needs no JAX, as ``experiments.config.experiment``."""
+"""Settings of fine-tuning on a robot. Needs no JAX, as ``experiments.config.experiment``."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -29,8 +29,10 @@ from experiments.config.finetuning import FineTuning
 from experiments.config.finetuning import parse as parse_fine_tuning
 from experiments.errors import ConfigError
 
-PLAYERS = ("player1", "player2", "player3", "player4", "player5")
-EFFECTS = ("rubber", "table", "magnus", "spin", "noise", "latency", "camera", "drives", "encoders")
+Player = Literal["player1", "player2", "player3", "player4", "player5"]
+PLAYERS: tuple[Player, ...] = get_args(Player)
+Effect = Literal["rubber", "table", "magnus", "spin", "noise", "latency", "camera", "drives", "encoders"]
+EFFECTS: tuple[Effect, ...] = get_args(Effect)
 FEWEST_RALLIES = 50  # of each model that are reported
 
 
@@ -73,7 +75,7 @@ class Simulation(Section):
 class Reality(Section):
     """The virtual reality: effects that training does not know (``target_domain.hidden_effects``), drawn per seed."""
 
-    without: list[Literal[EFFECTS]] = []
+    without: list[Effect] = []
     """Effects that are left out: there, reality is what training believes."""
     sim_rate: Positive = 300.0
     """[Hz] of its physics."""
@@ -84,7 +86,7 @@ class Reality(Section):
 class Ablation(Section):
     """Hand-made ball distributions against the oracle's, zero-shot, for one player."""
 
-    player: Literal[PLAYERS] = "player4"
+    player: Player = "player4"
     """Who plays with the policies."""
     balls: list[str] = ["large", "medium", "narrow"]
     """The distributions by name."""
@@ -110,7 +112,7 @@ class Study(Section):
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
     """Folder of the study."""
-    players: Annotated[list[Literal[PLAYERS]], Field(min_length=1)] = list(PLAYERS)
+    players: Annotated[list[Player], Field(min_length=1)] = list(PLAYERS)
     """Virtual players, or people in their places."""
     seeds: Annotated[list[Seed], Field(min_length=1)] = [0]
     """Repetitions of the whole study, each with another reality, other initial policies and other chance."""
@@ -130,7 +132,7 @@ class Study(Section):
     """Rallies of every model."""
     robot: str | None = None
     """A robot.yaml, "rig" or "lockstep": reality is that robot and its operator; null: the virtual reality."""
-    recordings: dict[Literal[PLAYERS], str] = {}
+    recordings: dict[Player, str] = {}
     """With a robot: each player's first balls as measured, a file that `mjx-tt fit-human` reads."""
 
     @field_validator("players", "seeds")
@@ -163,6 +165,10 @@ class Study(Section):
                 f"recordings: {{{files}}}, files that `mjx-tt fit-human` reads"
             )
         return self
+
+    def recording(self, player: str) -> str:
+        """File of a player's first balls. Raises KeyError where there is none."""
+        return dict[str, str](self.recordings.items())[player]
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data that ``parse`` reads back, with every default written out."""

@@ -1,13 +1,15 @@
-"""What pydantic found wrong with a mapping, in the words of the person who wrote it."""
+"""Mistakes that pydantic found in a mapping, in the words of the person who wrote it."""
 
 from __future__ import annotations
 
 import difflib
 import re
 import types
+from collections.abc import Iterable
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 LONGEST = 120  # characters of what was given that are shown
 
@@ -30,13 +32,13 @@ def lines(error: ValidationError, model: type[BaseModel]) -> list[str]:
     ]
 
 
-def nearest(name: str, known) -> str:
+def nearest(name: str, known: Iterable[str]) -> str:
     """ "did you mean 'x'? " or nothing."""
     close = difflib.get_close_matches(name, list(known), 1)
     return f"did you mean {close[0]!r}? " if close else ""
 
 
-def _describe(mistake: dict[str, Any], path: str, owner: type[BaseModel]) -> tuple[str, str]:
+def _describe(mistake: ErrorDetails, path: str, owner: type[BaseModel]) -> tuple[str, str]:
     kind, given = mistake["type"], mistake["input"]
     if kind == "extra_forbidden":
         parent, _, name = path.rpartition(".")
@@ -62,12 +64,12 @@ def _describe(mistake: dict[str, Any], path: str, owner: type[BaseModel]) -> tup
 
 
 def _shown(given: Any) -> str:
-    """What was given, cut where it is long."""
+    """The given value as text, cut where it is long."""
     text = repr(given)
     return text if len(text) <= LONGEST else f"{text[:LONGEST]} ..."
 
 
-def _walk(mistake: dict[str, Any], model: type[BaseModel]) -> tuple[str, type[BaseModel]]:
+def _walk(mistake: ErrorDetails, model: type[BaseModel]) -> tuple[str, type[BaseModel]]:
     """The dotted path as it stands in the file, and the model whose key it ends with.
 
     Pydantic's location also holds names of union members, which the writer of the file has never seen.
@@ -104,6 +106,6 @@ def _members(annotation: Any) -> list[Any]:
 
 
 def _tags(section: type[BaseModel]) -> set[str]:
-    """How pydantic names this member of a union."""
+    """Pydantic's names of this member of a union."""
     kind = section.model_fields.get("kind")
     return {section.__name__, *(get_args(kind.annotation) if kind else ())}

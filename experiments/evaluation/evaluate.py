@@ -1,4 +1,4 @@
-"""How good a policy is: played on fresh balls, counted with an interval, written as evaluation.json."""
+"""Evaluation of a policy: played on fresh balls, counted with an interval, written as evaluation.json."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def draw_balls(experiment: Experiment, simulator: Simulator, episodes: int, key:
 class Played:
     """One policy's evaluation.
 
-    report    what evaluation.json holds
+    report    content of evaluation.json
     result    per episode, NumPy arrays (..., n)
     incoming  (2, n) [m] where each ball bounced on the robot's side
     """
@@ -96,7 +96,7 @@ def evaluate(
 def _reachable(
     experiment: Experiment, simulator: Simulator, balls: BallPool, key: jax.Array, count: int, policy: Policy
 ) -> dict[str, Any]:
-    """What the policy or motions optimised ball by ball return, the balls known and without noise."""
+    """Return rate of the policy or of motions optimised ball by ball, the balls known and without noise."""
     found = reachability.reachable(simulator, balls, experiment.model.model, key, count, policy)
     low, high = wilson(found.returned, found.balls)
     return {"return_rate": found.rate, "low": low, "high": high, "balls": found.balls, "by_policy": found.by_policy}
@@ -136,7 +136,7 @@ def selection_score(result: RolloutResult) -> float:
     return sparse_reward(result.outcome, ~result.finite | (collision < 0))
 
 
-def sparse_reward(outcome: np.ndarray, fault: np.ndarray) -> float:
+def sparse_reward(outcome: np.ndarray | jax.Array, fault: np.ndarray | jax.Array) -> float:
     """The paper's reward for choosing a seed: +1 hit, +1 landed on the human's side, -2 fault; mean over episodes."""
     score = (outcome != MISSED).astype(float) + (outcome == RETURNED)
     return float(np.mean(np.where(fault, -2.0, score)))

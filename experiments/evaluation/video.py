@@ -7,9 +7,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.runs.load_policy import TrainedPolicy
+from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.viz import rendering
 
@@ -25,7 +27,7 @@ def replay(
     balls = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), count)
     model = experiment.model
 
-    def play(policy, key, balls):
+    def play(policy: Policy, key: jax.Array, balls: BallPool) -> tuple[jax.Array, jax.Array, jax.Array]:
         drawn = simulator.draw(key, balls, model.model, model.randomise, count, 1)
         return simulator.replay(policy, drawn)
 

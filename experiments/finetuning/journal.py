@@ -50,7 +50,7 @@ class Entry:
 
     @property
     def place(self) -> tuple[str, int, int, int]:
-        """What the episode was played for."""
+        """The part of the fine-tuning that the episode was played for."""
         return self.phase, self.update, self.member, self.repeat
 
 

@@ -169,9 +169,9 @@ class Session:
 
     def _evaluate(self, phase: str) -> list[Entry] | None:
         """Episodes of the unperturbed policy."""
-        theta, update = np.asarray(self.state.bgs.average), 0 if phase == BEFORE else self.update
-        if phase == BEFORE and self.update:
-            theta = None  # played before the first update: only read
+        played_before = phase == BEFORE and self.update > 0  # before the first update: only read
+        theta = None if played_before else np.asarray(self.state.bgs.average)
+        update = 0 if phase == BEFORE else self.update
         entries = []
         for ball in range(self._settings.evaluation_balls):
             entry = self._episode((phase, update, 0, ball), theta)

@@ -1,8 +1,9 @@
-"""What fine-tuning measures: rows of metrics, the evaluation before and after, the curve, the human's balls."""
+"""Measurements of a fine-tuning: rows of metrics, the evaluation before and after, the curve, the human's balls."""
 
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -50,12 +51,12 @@ def evaluated(entries: list[Entry]) -> dict[str, Any]:
         "return_rate_low": returned[0],
         "return_rate_high": returned[1],
         "terms": {name: float(np.mean([e.terms[name] for e in entries])) for name in entries[0].terms},
-        "faults": _counts(entry.summary.fault for entry in entries if entry.summary.fault),
+        "faults": dict(Counter(entry.summary.fault for entry in entries if entry.summary.fault)),
     }
 
 
 def compare(entries: list[Entry], repeatable: bool) -> dict[str, Any]:
-    """What evaluation.json holds. Where both evaluations met the same balls, the difference is taken ball by ball."""
+    """Content of evaluation.json. Where both evaluations met the same balls, the difference is taken ball by ball."""
     kept = [entry for entry in entries if not entry.discarded]
     updates = max(e.update for e in kept if e.phase == AFTER)  # a run that was continued has several evaluations
     before = [e for e in kept if e.phase == BEFORE]
@@ -184,8 +185,8 @@ def _figure(entries: list[Entry], result: dict[str, Any], title: str) -> Figure:
     for at, name in zip(ends, (BEFORE, AFTER), strict=False):
         e = result[name]
         bars = [[e["mean_return"] - e["low"]], [e["high"] - e["mean_return"]]]
-        label = f"evaluated policy, {e['balls']} balls, 95 %" if name == BEFORE else None
-        upper.errorbar(at, e["mean_return"], bars, fmt="D", color=INK, markersize=5, capsize=3, label=label, zorder=4)
+        legend = f"evaluated policy, {e['balls']} balls, 95 %" if name == BEFORE else None
+        upper.errorbar(at, e["mean_return"], bars, fmt="D", color=INK, markersize=5, capsize=3, label=legend, zorder=4)
     upper.axhline(result["before"]["mean_return"], color=INK, linewidth=0.8, linestyle=":", zorder=1)
     upper.set_ylabel("mean return")
     upper.set_title(f"{title}\n{_headline(result)}")
@@ -222,10 +223,3 @@ def _rates(entries: list[Entry]) -> dict[str, float]:
         "hit_rate": (outcomes.count(RETURNED) + outcomes.count(HIT)) / len(outcomes),
         "fault_rate": sum(entry.summary.fault is not None for entry in entries) / len(entries),
     }
-
-
-def _counts(values) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for value in values:
-        counts[value] = counts.get(value, 0) + 1
-    return counts

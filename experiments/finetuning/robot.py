@@ -1,4 +1,4 @@
-"""What fine-tuning asks of a robot and of its operator, and the emulated robot in lock-step."""
+"""The interfaces of a robot and of its operator to fine-tuning, and the emulated robot in lock-step."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from typing import Any, Protocol
 import numpy as np
 
 import mjx_tt
+from ballmodel.state import BallState
 from experiments.errors import RunError
 from robot_io.control.episode import EpisodeSummary
 from robot_io.emulator.ball_launcher import Throws
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
 from robot_io.emulator.world import World
-from robot_io.log.messages import Ball
+from robot_io.log.messages import Ball, Record
 from robot_io.log.recorder import NullRecorder
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.policy.policy import Policy
@@ -49,20 +50,20 @@ class Robot(Protocol):
         """
 
     def describe(self) -> dict[str, Any]:
-        """What it is, as plain JSON data; a run is continued on a robot that says the same."""
+        """Its description as plain JSON data; a run is continued on a robot of the same description."""
 
 
 class Operator(Protocol):
     """The person at the robot, asked between episodes."""
 
     def discarded(self) -> bool:
-        """Whether the ball just played is to be played again; asked once after every ball."""
+        """True for a ball that is to be played again; called once after every ball."""
 
     def paused(self) -> bool:
-        """Whether to wait; asked again and again while it is so."""
+        """True while the fine-tuning is to wait; polled."""
 
     def stopped(self) -> bool:
-        """Whether to stop here; the same command continues later."""
+        """True to stop here; the same command continues later."""
 
 
 class NoOperator:
@@ -120,7 +121,7 @@ class BallRecorder(NullRecorder):
     def __init__(self) -> None:
         self._samples: dict[int, list[tuple[float, ...]]] = {}
 
-    def put(self, *records) -> None:
+    def put(self, *records: Record) -> None:
         for record in records:
             if isinstance(record, Ball):
                 sample = (record.capture_time, *map(float, record.position))
@@ -132,6 +133,6 @@ class BallRecorder(NullRecorder):
         return np.array(samples, float).reshape(-1, 4)
 
 
-def thrown(state) -> Throws:
+def thrown(state: BallState) -> Throws:
     """Balls of a pool, ``BallState`` of arrays (3, n), for the rig's thrower."""
     return Throws(*(np.asarray(part, float) for part in (state.position, state.velocity, state.spin)))

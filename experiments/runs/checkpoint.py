@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ballmodel.io.atomic_files import replacing, sync_folder
@@ -29,12 +30,13 @@ def save(folder: Path, update: int, tree: Any, notes: dict[str, Any]) -> Path:
     Raises CheckpointError when the disk refuses; earlier checkpoints are untouched.
     """
     path = folder / f"{update:08d}.npz"
-    arrays = {name: np.asarray(_data(leaf)) for name, leaf in _named_leaves(tree)}
-    text = json.dumps(notes | {"update": update})
+    # Any: a keyword of savez may also be one of its options.
+    arrays: dict[str, Any] = {name: np.asarray(_data(leaf)) for name, leaf in _named_leaves(tree)}
+    arrays[NOTES] = np.array(json.dumps(notes | {"update": update}))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, **arrays, **{NOTES: np.array(text)})
+            np.savez(file, **arrays)
             file.flush()
             os.fsync(file.fileno())
         sync_folder(folder)
@@ -102,7 +104,7 @@ def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
 
 
 def _is_key(leaf: Any) -> bool:
-    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _data(leaf: Any) -> Any:

@@ -98,7 +98,7 @@ class Run:
             )
 
     def _untouched(self) -> bool:
-        """Whether the folder holds no more than the records of a start: no checkpoint, no measurement, nothing else."""
+        """True where the folder holds no more than the records of a start: no checkpoint, no measurement."""
         kept = {CONFIG, SESSIONS, LOCK, self.checkpoints.name, self.metrics.name, self.tensorboard.name}
         if any(path.name not in kept for path in self.folder.iterdir()):
             return False
@@ -121,18 +121,18 @@ class Run:
             yield
 
     def trained(self, config: Config) -> bool:
-        """Whether training has reached its end under this configuration."""
+        """True where training has reached its end under this configuration."""
         if not self.status.exists():
             return False
         status = json.loads(self.status.read_text())
         return training_ended(config, status["update"], status["seconds"], status["return_rate"]) is not None
 
     def done(self, config: Config) -> bool:
-        """Whether nothing is left to do under this configuration: trained, exported and evaluated."""
+        """True where nothing is left to do under this configuration: trained, exported and evaluated."""
         return self.trained(config) and self.evaluation.exists()
 
     def read_evaluation(self) -> dict[str, Any]:
-        """What evaluation.json holds."""
+        """Content of evaluation.json."""
         return json.loads(self.evaluation.read_text())
 
 
@@ -159,7 +159,7 @@ def digest(config: Config) -> str:
 
 
 def provenance() -> dict[str, Any]:
-    """When, with which versions and from which commit: plain data."""
+    """Time, versions and commit, as plain data."""
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "python": platform.python_version(),
@@ -221,7 +221,7 @@ def differences(
 
 def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Leaves by dotted path."""
-    flat = {}
+    flat: dict[str, Any] = {}
     for key, value in data.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) and value else {f"{prefix}{key}": value}
     return flat

@@ -244,7 +244,9 @@ class Loop:
         return Step(f"seed{seed}/evaluation", "evaluation", len(pairs), inputs, (path,), run)
 
     def _effects(self, seed: int) -> Step:
-        models = [(player, model) for player in self.study.players for model in effect_costs.MODELS]
+        models: list[tuple[str, str]] = [
+            (player, model) for player in self.study.players for model in effect_costs.MODELS
+        ]
         places = [self._policy_of(seed, player, model) for player, model in models]
         path = self.seed_folder(seed) / effect_costs.FILE
 

@@ -109,7 +109,7 @@ def updates(study: Study, item: Simulated | Real) -> int:
 
 def pairings(study: Study) -> list[tuple[str, str, str]]:
     """Trainer, evaluator and model of every evaluation."""
-    found = []
+    found: list[tuple[str, str, str]] = []
     for trainer in study.players:
         own = [item.key for item in items(study, trainer) if not isinstance(item, Human)]
         if study.ablation and study.ablation.player == trainer:

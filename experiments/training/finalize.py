@@ -1,4 +1,4 @@
-"""What follows training: evaluation, pictures, artefact, and the lines that say where they are."""
+"""Steps after training: evaluation, pictures, artefact, and the lines that name their files."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def show_episodes(
                 drawn.append(video.draw(path, played, experiment.task.control_rate))
             except RuntimeError as error:
                 failed[path] = error
-    for path, error in failed.items():
-        console.print(f"{path}: not drawn: {error}", highlight=False)
+    for path, reason in failed.items():
+        console.print(f"{path}: not drawn: {reason}", highlight=False)
     return drawn
 
 

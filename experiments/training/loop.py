@@ -119,8 +119,8 @@ class Session:
         ]
         self.seconds += took
         self._batch = max(1, round(FETCH_SECONDS / share))
-        if evaluation_due:
-            rows[-1] |= self._evaluate()
+        if evaluation_due and self._evaluator is not None:
+            rows[-1] |= self._evaluate(self._evaluator)
         log.write(rows)
         progress.show(self.update, len(rows), took, rows[-1]["return_rate"])
         if time.monotonic() - self._saved[1] >= training.checkpoint_seconds:
@@ -135,11 +135,11 @@ class Session:
         balls = draw_balls(experiment, simulator, training.evaluate_episodes, key)
         return Evaluator(simulator, balls, model.model, model.randomise)
 
-    def _evaluate(self) -> dict[str, float]:
+    def _evaluate(self, evaluator: Evaluator) -> dict[str, float]:
         """The averaged parameters on the run's own set of fresh balls."""
         key = build.key(self._config.training.seed, build.PROGRESS_EPISODES)
         policy = Policy(self.state.bgs.average, *normalizer.normaliser(self.state.statistics))
-        result = self._evaluator.play(policy, key)
+        result = evaluator.play(policy, key)
         rate = return_rate(result)
         self.return_rate = rate.value
         return {"evaluation/return_rate": rate.value, "evaluation/low": rate.low, "evaluation/high": rate.high}
@@ -185,7 +185,7 @@ def _short(value: ArrayLike) -> float | None:
 
 @contextmanager
 def _stop_requests() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C or SIGTERM has come: the first asks for a stop, a second one acts at once."""
+    """Yields a function that is true once Ctrl-C or SIGTERM has come; a second one acts at once."""
     received = []
 
     def note(number: int, _frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""What training shows while it runs: a live line in a terminal, plain lines elsewhere."""
+"""Display of a running training: a live line in a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 

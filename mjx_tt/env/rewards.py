@@ -6,8 +6,8 @@ The paper gives names, ranges and weights; what each term measures in detail is 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
 TERMS = (
@@ -36,8 +36,8 @@ FACING = 0.3  # smallest y component of the blade's normal in good style (72 deg
 SOFT_RANGE = 0.05  # share of a joint's range at each end that the joint-angle term counts as unsafe
 
 # One episode on the robot has plain numbers, a batch in simulation arrays (...).
-Flag = Bool[ArrayLike, "*batch"] | bool
-Number = Float[ArrayLike, "*batch"] | float
+Flag = Bool[Array | np.ndarray, "*batch"] | np.bool_ | bool
+Number = Float[Array | np.ndarray, "*batch"] | np.floating | float
 
 
 def state_transition(
@@ -45,7 +45,7 @@ def state_transition(
     hit: Flag,
     crossed: Flag,
     returned: Flag,
-    landing: Float[ArrayLike, "2 *batch"],
+    landing: Float[Array | np.ndarray, "2 *batch"],
 ) -> Float[Array, "*batch"]:
     """Term 1, in [0, 5]: nearing the ball up to 3, hit 3, over the net 3.5, on the human's half 4, plus up to 1 more.
 

@@ -48,7 +48,7 @@ def look_up(study: Study, robot: str) -> None:
 
 def recording(study: Study, player: str) -> Dataset:
     """Balls of a player recorded before the study. Raises ConfigError naming the key and what is wrong."""
-    where, path = f"recordings.{player}", study.recordings[player]
+    where, path = f"recordings.{player}", study.recording(player)
     measured = checked(where, read, path)
     if not isinstance(measured, Dataset):
         raise ConfigError(f"{where}: {path} holds start states; measured trajectories are needed")
@@ -67,7 +67,7 @@ class RobotWorld:
         # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
         label = name.rsplit("/", 1)[-1]
         tracks = tuple(replace(t, session=label, name=str(i)) for i, t in enumerate(measured))
-        return Dataset(tracks, self._study.recordings[player])
+        return Dataset(tracks, self._study.recording(player))
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         """``mjx-tt finetune``; raises Waiting when the operator stopped it."""
