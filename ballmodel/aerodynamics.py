@@ -7,7 +7,8 @@ d omega / dt = -spin_decay omega
 
 The defaults are the paper's drag-only ball. The literature's k runs from 0.3 to 1.5, so it is a parameter to be
 identified, not a constant; over a wide range of spins it falls, and c says how soon: ``SATURATING_LIFT`` was fitted to
-1,597 shots with measured spin, whose constant k falls from 0.69 (S < 0.3) to 0.23 (S > 1). MJX cannot do this: it has only the inertia-box fluid model and drops lift silently.
+1,597 shots with measured spin, whose constant k falls from 0.69 (S < 0.3) to 0.23 (S > 1). MJX cannot do this: it
+has only the inertia-box fluid model and drops lift silently.
 """
 
 from __future__ import annotations

@@ -133,7 +133,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def program() -> NoReturn:
-    """What the shell runs."""
+    """Entry point of the shell."""
     stages.leave(main())
 
 

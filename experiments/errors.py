@@ -13,7 +13,7 @@ class ExperimentError(Exception):
 
 
 class ConfigError(ExperimentError):
-    """What was asked for cannot be: the message names file, dotted path, what was given and what is allowed."""
+    """A request that cannot be met: the message names file, dotted path, what was given and what is allowed."""
 
 
 class RunError(ExperimentError):
@@ -25,7 +25,7 @@ class CheckpointError(ExperimentError):
 
 
 def explained(error: Exception) -> bool:
-    """Whether the error's message is enough."""
+    """True where the error's message is enough."""
     # These need NumPy, which --help should not wait for.
     from robot_io.devices.egm.messages import EgmError
     from robot_io.errors import DeviceError, RefusedError
@@ -36,7 +36,7 @@ def explained(error: Exception) -> bool:
 
 
 def checked(where: str, function: Callable[..., T], *arguments: Any) -> T:
-    """What ``function`` returns; what it says about its arguments as a ConfigError that begins with ``where``."""
+    """Result of ``function``; its complaint about its arguments becomes a ConfigError that begins with ``where``."""
     try:
         return function(*arguments)
     except (ValueError, OSError, RuntimeError) as error:

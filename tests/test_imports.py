@@ -69,7 +69,7 @@ MOST_LINES = 400
 # Longer modules, each with its reason; those without one go when they are mended.
 LONG = {
     "mjx_tt/rally/human_player.py": "one person: what is measured of them, what they remember, how they answer",
-    "robot_io/control/bridge.py": "the one place where devices, gate, policy and episodes meet; to be cut when it plays rallies",
+    "robot_io/control/bridge.py": "devices, gate, policy and episodes meet only here; to be cut when it plays rallies",
     "robot_io/safety/gate.py": "one state machine, whose transitions a safety review reads together",
 }
 

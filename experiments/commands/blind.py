@@ -91,7 +91,7 @@ def _make(folder: Path, given: tuple[str, ...], trainer: str, evaluator: str, se
 
 
 def _show_progress(folder: Path, console: Console) -> None:
-    """How many rallies each code has."""
+    """Number of rallies of each code."""
     from rich.table import Table
 
     from experiments.study.analysis import scoring

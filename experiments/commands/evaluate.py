@@ -91,7 +91,7 @@ def evaluate(
 
 
 def _folder(policy: Path, *others: str | None) -> Path:
-    """Where an evaluation goes by default; ``others``: balls and model that are not the policy's own."""
+    """Default folder of an evaluation; ``others``: balls and model that are not the policy's own."""
     changed = [Path(text).with_suffix("").as_posix().replace("/", "-") for text in others if text]
     if (policy / CONFIG).exists():
         return policy / f"evaluation-{'-'.join(changed)}" if changed else policy

@@ -64,7 +64,7 @@ RigSeed = Annotated[int, option("K", "of the balls that are thrown")]
 
 
 def console() -> Console:
-    """Where a command writes. A file or a pipe gets whole lines: only a terminal's width is one to break them at."""
+    """Output of a command. A file or a pipe gets whole lines: only a terminal's width is one to break them at."""
     from rich.console import Console
 
     return Console(soft_wrap=not sys.stdout.isatty())

@@ -1,4 +1,4 @@
-"""What one would do without the diagnosis, on the same logs: four usual ways from residuals to a named cause.
+"""Baselines of the diagnosis, on the same logs: four usual ways from residuals to a named cause.
 
 All share one linearisation by finite differences of the generator's own physics: states fitted to whole flights under
 the nominal model, their six directions projected out of residuals and of every effect's column. Samples beyond five
@@ -126,7 +126,7 @@ def _solve(gram, right, index):
 
 
 def _lost(gram, right, index) -> float:
-    """What a subset takes off the residual's sum of squares."""
+    """Reduction by a subset of the residual's sum of squares."""
     return float(right[index] @ _solve(gram, right, index)) if index else 0.0
 
 

@@ -210,7 +210,7 @@ def test_policy_is_the_same_from_run_and_from_artefact(trained):
 
 
 def test_render(trained, tmp_path):
-    """What training drew is a video that plays; a picture can be asked for; a camera that is not there is named."""
+    """The video drawn after training plays; a picture can be asked for; a camera that is not there is named."""
     _, runs, _ = trained
     done = mjx_tt("render", runs / "tiny", "--out", tmp_path / "a.png", "--camera", "human")
     if "no OpenGL back end" in done.stderr:

@@ -76,7 +76,7 @@ def test_no_request_breaks_a_limit(requests, dtype, tolerance):
 
 
 def test_clipping_velocity_and_acceleration_alone_breaks_the_position_limits(requests):
-    """What the braking envelope is for; and these tests can fail."""
+    """Without the braking envelope the position limits break; and these tests can fail."""
 
     def clipped(request, previous, reference):
         return np.clip(np.clip(request, -V_MAX, V_MAX), previous - A_MAX * DT, previous + A_MAX * DT)

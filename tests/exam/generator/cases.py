@@ -180,7 +180,7 @@ class Case:
 
     @property
     def spin(self) -> str:
-        """What ``--spin`` has to say: whether the nominal ball may spin."""
+        """Value of ``--spin``: true where the nominal ball may spin."""
         return "none"
 
     @property
@@ -204,7 +204,7 @@ class BallCase:
         return measure(self.world, self.balls, self.case.noise, _generator(self.case, "noise"))
 
     def truth(self) -> dict:
-        """What is sealed: the case, the accepted answers, and the values on every model path that expresses them."""
+        """Sealed content: the case, the accepted answers, and the values on every model path that expresses them."""
         values: dict[str, float] = {}
         for cause, amount in self.amounts.items():
             if cause in EFFECTS and self.case.kind != "rare":

@@ -40,7 +40,7 @@ class Balls:
 
 @dataclass(frozen=True)
 class Log:
-    """What the tracker wrote; samples first, padded with NaN behind each ball's last."""
+    """Record of the tracker; samples first, padded with NaN behind each ball's last."""
 
     time: np.ndarray  # (T, B) [s] in the session
     position: np.ndarray  # (3, T, B) [m]

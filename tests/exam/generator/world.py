@@ -21,7 +21,7 @@ BISECTIONS = 30  # of one step: the time of the bounce to 2e-12 s
 
 @dataclass(frozen=True)
 class World:
-    """What is true; the defaults are the nominal simulation."""
+    """True parameters; the defaults are the nominal simulation."""
 
     drag_coefficient: float | np.ndarray = 0.47
     air_density: float | np.ndarray = 1.29  # [kg/m^3]
@@ -227,7 +227,7 @@ def rotation(angle_x, angle_y, angle_z):
 
 
 def camera(world: World, position: np.ndarray) -> np.ndarray:
-    """What the camera makes of true positions (3, ..., B): camera_scale R (1 + camera_distortion |p|^2) p."""
+    """Camera's image of true positions (3, ..., B): camera_scale R (1 + camera_distortion |p|^2) p."""
     r = rotation(world.camera_rotation_x, world.camera_rotation_y, world.camera_rotation_z)
     stretch = world.camera_scale * (1.0 + world.camera_distortion * np.sum(position**2, axis=0))
     seen = np.stack([stretch * sum(r[i][j] * position[j] for j in range(3)) for i in range(3)])
@@ -235,7 +235,7 @@ def camera(world: World, position: np.ndarray) -> np.ndarray:
 
 
 def seen(world: World, flight: Flight, stamp: np.ndarray) -> np.ndarray:
-    """What the tracker makes of a flight, without noise: positions (3, T, B) at its stamps (T, B) since the start.
+    """Tracker's samples of a flight, without noise: positions (3, T, B) at its stamps (T, B) since the start.
 
     Its filter, of time constant ``smoothing``, runs between the samples and ran before the first one.
     """

@@ -70,7 +70,7 @@ def index(serves, name):
 
 
 def landing(struck: Touch):
-    """Where the outgoing ball lands on the table's plane (2,), and the height of its centre over the net."""
+    """Landing of the outgoing ball on the table's plane (2,), and the height of its centre over the net."""
     return on_table(struck).position[:2], fly(struck, lambda p: -p[1])[1][2]
 
 

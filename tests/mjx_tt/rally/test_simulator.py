@@ -313,7 +313,7 @@ def test_players_meet_the_return_where_finer_steps_have_it():
 
 
 def test_corner_and_cord_of_the_robots_return():
-    """What the player cannot reach after a corner or a net cord is told by the row."""
+    """A ball out of the player's reach after a corner or a net cord has that row of the table."""
     position = np.array([[0.0, -1.0, 0.3], [0.3, -0.6, 0.25]])
     velocity = np.stack([aim(position[0], [0.7, 1.3, 0.02], 0.6), aim(position[1], [0.3, 0.0, 0.168], 0.25)])
     ball = BallState(*(jnp.asarray(x.T, jnp.float32) for x in (position, velocity, 0 * velocity)))

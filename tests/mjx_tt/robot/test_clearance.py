@@ -84,7 +84,7 @@ def mujocos(model, poses):
 
 
 def meets_box(start, way, centre, half):
-    """Whether the segment meets the box: the intervals inside the three slabs overlap."""
+    """True where the segment meets the box: the intervals inside the three slabs overlap."""
     with np.errstate(divide="ignore"):
         a, b = (centre - half - start) / way, (centre + half - start) / way
     return max(np.minimum(a, b).max(), 0.0) <= min(np.maximum(a, b).min(), 1.0)

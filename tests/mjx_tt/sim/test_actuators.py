@@ -84,7 +84,7 @@ def respond(lag, a, v, u, seconds, fine=FINE):
 
 
 def play_in(backlash, path):
-    """What is carried with play, sample by sample: it stays until the joint has come half the play from it."""
+    """Position of a part driven with play, sample by sample: it stays until the joint is half the play away."""
     out = [path[0]]
     for q in path[1:]:
         at = out[-1]
@@ -93,7 +93,7 @@ def play_in(backlash, path):
 
 
 def mean_velocities(command):
-    """What the finely simulated drives make of the commands (TICKS, 8, P): means over substeps, (steps, 8, P)."""
+    """Velocities of the finely simulated drives under commands (TICKS, 8, P): means over substeps, (steps, 8, P)."""
     v, means = np.zeros(command.shape[1:]), []
     for step in range(TICKS * SUBSTEPS):
         # Where the command changes inside the substep, both parts one after the other.

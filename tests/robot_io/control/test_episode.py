@@ -1,4 +1,4 @@
-"""What the tracker's samples tell about a ball, against how the ball really flew."""
+"""Outcome of a ball from the tracker's samples, against the ball's true flight."""
 
 from __future__ import annotations
 

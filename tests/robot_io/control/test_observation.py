@@ -1,4 +1,4 @@
-"""What the bridge shows the policy equals what the simulator shows it, when both see the same motion.
+"""The bridge's observations equal the simulator's, when both see the same motion.
 
 An episode is played in the simulator in float64. What happened at every substep goes to the bridge as bytes, the way
 devices send it: tracker datagrams, EGM packets, Modbus registers. The fixed delays of the simulator are the bridge's.

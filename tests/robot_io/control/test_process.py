@@ -22,7 +22,7 @@ class Escaped(BaseException):
 
 
 class ArmSocket:
-    """What ``EgmSocket`` is to the control process."""
+    """Stand-in for ``EgmSocket`` in the control process."""
 
     def __init__(self, simulation):
         self._simulation = simulation

@@ -389,7 +389,7 @@ def test_a_port_in_use(served):
 
 
 def is_sound(data):
-    """Whether the bytes begin with a request that may command the axis; by the Modbus specification, strictly."""
+    """True where the bytes begin with a request that may command the axis; by the Modbus specification, strictly."""
     if len(data) < 8:
         return False
     _, protocol, length, unit, function = struct.unpack(">HHHBB", data[:8])

@@ -52,7 +52,7 @@ def copy(exported, tmp_path):
 
 
 def _rewrite_manifest(folder, change):
-    """What somebody who knows the format could write: a changed manifest with a matching digest."""
+    """Forgery by somebody who knows the format: a changed manifest with a matching digest."""
     manifest = json.loads((folder / artefacts.MANIFEST).read_bytes())
     change(manifest)
     raw = json.dumps(manifest).encode()

@@ -161,8 +161,8 @@ def test_a_cleared_motion_is_clear_between_its_points(ours):
 
 
 def never_cleared(ours, a, b):
-    """How many gaps are smaller on the straight way from a to b (8,) than at its ends. Each by itself, with a margin
-    just above its smallest value, must be found too close."""
+    """Number of gaps that are smaller on the straight way from a to b (8,) than at its ends. Each by itself, with a
+    margin just above its smallest value, must be found too close."""
     gaps = ours.gaps(a[:, None] + np.linspace(0, 1, 1001) * (b - a)[:, None])
     rows = np.flatnonzero((gaps.min(1) < np.minimum(gaps[:, 0], gaps[:, -1]) - 0.01) & (gaps.min(1) > 0))
     for row in rows:

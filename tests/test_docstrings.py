@@ -1,0 +1,43 @@
+"""Docstrings begin with a noun or an imperative verb, as those of NumPy and JAX do, not with a question word."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.support.paths import ROOT
+
+FOLDERS = ("ballmodel", "benchmarks", "bgs", "examples", "experiments", "mjx_tt", "robot_io", "tests")
+QUESTIONS = ("What", "How", "Whether", "Where", "Who", "Why", "When")
+# Folders not mended yet, which go when they are.
+NOT_YET = ("experiments/deploy", "robot_io")
+
+WITH_DOCSTRING = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def docstrings(path: Path) -> Iterator[tuple[str, str]]:
+    """Place and text of every docstring of a module."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, WITH_DOCSTRING) and (text := ast.get_docstring(node)):
+            yield f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}", text
+
+
+def questions(folder: Path) -> list[str]:
+    """Docstrings below a folder that begin with a question word, one a line: its place and its first line."""
+    return [
+        f"{place}: {text.splitlines()[0]}"
+        for path in sorted(folder.rglob("*.py"))
+        for place, text in docstrings(path)
+        if text.split()[0].rstrip(",:") in QUESTIONS
+    ]
+
+
+def test_no_docstring_begins_with_a_question_word():
+    found = [line for folder in FOLDERS for line in questions(ROOT / folder)]
+    not_mended = [line for line in found if not line.startswith(tuple(f"{folder}/" for folder in NOT_YET))]
+    assert not not_mended, "begin with a noun or an imperative verb:\n" + "\n".join(not_mended)
+
+
+def test_folders_that_are_mended_leave_the_list():
+    assert [folder for folder in NOT_YET if not questions(ROOT / folder)] == []
