@@ -13,14 +13,13 @@ QUESTIONS = ("What", "How", "Whether", "Where", "Who", "Why", "When")
 # Folders not mended yet, which go when they are.
 NOT_YET = ("experiments/deploy", "robot_io")
 
-WITH_DOCSTRING = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-
 
 def docstrings(path: Path) -> Iterator[tuple[str, str]]:
-    """Place and text of every docstring of a module."""
+    """Place and text of every docstring of a module, those of fields among them."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, WITH_DOCSTRING) and (text := ast.get_docstring(node)):
-            yield f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}", text
+        match node:
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                yield f"{path.relative_to(ROOT)}:{node.lineno}", text.strip()
 
 
 def questions(folder: Path) -> list[str]:

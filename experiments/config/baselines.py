@@ -143,7 +143,7 @@ class Budget(Section):
     episodes: Count | None = None
     """Of training."""
     clock: Literal["wall", "cpu"] = "wall"
-    """What the minutes are of: the clock, or processor time of this program, for a machine that is busy otherwise."""
+    """Measure of the minutes: the clock, or processor time of this program, for a machine that is busy otherwise."""
 
     @model_validator(mode="after")
     def _limited(self) -> Budget:
@@ -173,7 +173,7 @@ class Comparison(Section):
     algorithms: Annotated[dict[Name, Algorithm], Field(min_length=1)]
     """By the name that the report gives them."""
     budget: Budget
-    """What each algorithm may spend with each seed."""
+    """Limits of each algorithm with each seed."""
     seeds: Annotated[list[Seed], Field(min_length=1)] = [0]
     """Repetitions of every training."""
     curve: Curve = Curve()

@@ -159,7 +159,7 @@ class Step(Section):
     weight_decay: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     """Share by which an update shrinks the parameters, over the learning rate."""
     schedule: Annotated[Constant | Cosine | Piecewise, Field(discriminator="kind")] = Cosine(kind="cosine")
-    """How the learning rate changes over the updates."""
+    """Change of the learning rate over the updates."""
 
 
 class SigmaFall(Section):
@@ -256,7 +256,7 @@ class Config(Section):
     optimiser: Optimiser = Optimiser()
     """Blackbox Gradient Sensing."""
     training: Training = Training()
-    """How long to train, and what to keep of it."""
+    """Length of a training, and what to keep of it."""
     evaluation: Evaluation = Evaluation()
     """The evaluation after training."""
     initial_policy: str | None = None

@@ -44,7 +44,7 @@ class Round(Section):
     real: Count
     """Updates in reality."""
     step: Step | None = None
-    """How the parameters move in this round's simulation; null: as the optimiser says."""
+    """Step of the parameters in this round's simulation; null: the optimiser's."""
     later_rewards: LaterRewards | None = None
     """Other reward weights for the rest of this round's simulation; null: those of the task throughout."""
 
@@ -87,7 +87,7 @@ class Ablation(Section):
     """Hand-made ball distributions against the oracle's, zero-shot, for one player."""
 
     player: Player = "player4"
-    """Who plays with the policies."""
+    """Player whose balls the policies meet."""
     balls: list[str] = ["large", "medium", "narrow"]
     """The distributions by name."""
 
@@ -123,7 +123,7 @@ class Study(Section):
     fine_tuning: FineTuning = FineTuning()
     """In reality; the number of updates is the round's."""
     reality: Reality = Reality()
-    """What the virtual reality has that training does not know."""
+    """Effects of the virtual reality that training does not know."""
     fresh: bool = True
     """Also the variant whose weights are not carried back from reality to simulation."""
     ablation: Ablation | None = Ablation()
