@@ -1,4 +1,4 @@
-"""What goes wrong at the robot before anything moves."""
+"""Errors at the robot before anything moves."""
 
 from __future__ import annotations
 

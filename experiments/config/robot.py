@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 import yaml
@@ -17,6 +17,10 @@ from experiments.errors import ConfigError, checked
 from robot_io.control.config import RobotConfig
 from robot_io.emulator.ball_launcher import Throws
 from robot_io.emulator.config import RigParams
+
+if TYPE_CHECKING:  # a robot.yaml is read without JAX
+    from ballmodel.distribution import BallDistribution
+    from mjx_tt.sim.model import SimModel
 
 COMMISSIONING = 0.1  # speed_scale of a robot.yaml that sets none: full speed is asked for, not forgotten
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -113,7 +117,7 @@ def _mapping(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def throws_of(balls, model, count: int, seed: int) -> Throws:
+def throws_of(balls: BallDistribution, model: SimModel, count: int, seed: int) -> Throws:
     """Balls to throw, drawn from a distribution as training draws them."""
     import jax
 

@@ -23,7 +23,7 @@ QUIT, PAUSE = "q", "h"
 
 @dataclass(frozen=True)
 class Key:
-    """What a key does, in words, and the request that it sends; None where the program decides."""
+    """A key's effect in words, and the request that it sends; None where the program decides."""
 
     text: str
     request: messages.Request | None = None

@@ -17,7 +17,7 @@ LONGEST_GAP = 0.1  # [s] without a sample that ends a flight
 
 
 def is_session(path: Path) -> bool:
-    """Whether an MCAP is a robot's log rather than a file of trajectories."""
+    """True when an MCAP is a robot's log rather than a file of trajectories."""
     if path.suffix.lower() != ".mcap" or not path.is_file():
         return False
     try:

@@ -85,7 +85,7 @@ class Axes(Protocol):
 
 @dataclass(frozen=True)
 class BridgeConfig:
-    """How the robot is played.
+    """Settings of play.
 
     delays           of the observations
     home             (8,) joint positions to wait at; None: the geometry's

@@ -1,4 +1,4 @@
-"""What a ball in play does, told from the tracker's samples: is it coming, was it hit, where did it land.
+"""A ball in play, told from the tracker's samples: is it coming, was it hit, where did it land.
 
 The robot's counterpart of the simulator's episode (``mjx_tt.env.task``), with the same meaning of every outcome.
 """
@@ -67,7 +67,7 @@ class EpisodeSummary:
 
 
 def in_play(tracker: Tracker, now: float) -> bool:
-    """Whether a ball is coming that the policy should take: over the human's half or the net, towards the robot."""
+    """True when a ball is coming that the policy should take: over the human's half or the net, towards the robot."""
     if tracker.seen is None or now - tracker.seen > 0.06:
         return False
     newest, slope = tracker.track.newest, tracker.track.slope(SPAN)
@@ -86,7 +86,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Kink:
-    """How the velocity (3,) changes at ``seen``, from ``before`` to ``after``, gravity taken out."""
+    """Change of the velocity (3,) at ``seen``, from ``before`` to ``after``, gravity taken out."""
 
     seen: _Seen
     before: np.ndarray
@@ -263,7 +263,7 @@ def _deflection(kink: _Kink) -> float:
 
 
 def _bounce(kink: _Kink, recent: deque[_Seen]) -> np.ndarray | None:
-    """Where (2,) [m] the ball touched the table; None where the kink is no bounce on it."""
+    """Place (2,) [m] where the ball touched the table; None where the kink is no bounce on it."""
     if not kink.lowest or kink.seen.position[2] > NEAR_TABLE or kink.after[2] - kink.before[2] < UPWARD:
         return None
     # Between its neighbours, where the parabolas before and after meet: both bend alike, so their chords do.

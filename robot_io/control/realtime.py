@@ -1,4 +1,4 @@
-"""What an ordinary Linux process can do to be on time; every refusal is reported, none is an error."""
+"""Means of an ordinary Linux process to be on time; every refusal is reported, none is an error."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ SILENCE = 1.0  # [s] after which the tracker may have been started anew
 
 @dataclass(frozen=True)
 class BallSample:
-    """What one frame showed; position (3,) [m] is None where no ball was seen; times in seconds."""
+    """Content of one frame; position (3,) [m] is None where no ball was seen; times in seconds."""
 
     sequence: int
     ball: int
@@ -87,7 +87,7 @@ def decode(datagram: bytes) -> BallSample:
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """Where the tracker sends to and what is accepted.
+    """Address that the tracker sends to, and limits of what is accepted.
 
     host, port       address that the bridge listens on
     source           IP address of the tracker; datagrams from elsewhere are ignored
@@ -168,7 +168,7 @@ class Tracker:
         return self.config.source_port is None and silent
 
     def _follows(self, sequence: int, captured: float) -> bool:
-        """Whether a frame comes after the newest by number and time; counts what was lost, or why it does not."""
+        """True when a frame comes after the newest by number and time; counts what was lost, or why it does not."""
         last = -np.inf if self.newest is None else self.newest.captured
         ahead = (sequence - (self._sequence or 0)) % SEQUENCE
         if ahead == 0 or ahead >= SEQUENCE // 2 or captured <= last:
@@ -186,7 +186,7 @@ class Tracker:
         return True
 
     def _reachable(self, sample: BallSample) -> bool:
-        """Whether a ball can have come here from the track's newest place."""
+        """True when a ball can have come here from the track's newest place."""
         newest = self.track.newest
         return newest is None or _near(newest[0], newest[1], sample)
 

@@ -125,7 +125,7 @@ class ArmController:
         self._sequence = 0
         self._now: float | None = None
         self._velocity = np.zeros(N_ARM_JOINTS)
-        self._reference: _Reference | None = None  # made by the first step after start_egm
+        self._reference: _Reference | None = None  # while EGM runs, from the first step on
         self._last_message = 0.0
         self._deceleration = np.array(params.stop_deceleration)
         self._max_speed = np.array(params.max_speed)
@@ -134,7 +134,7 @@ class ArmController:
 
     @property
     def cause(self) -> str | None:
-        """Why it stopped last, None while EGM runs or before anything happened."""
+        """Sentence of the last stop, None while EGM runs or before anything happened."""
         stops = [event.sentence for event in self.events if event.name not in ("motors_on", "rapid_start", "egm_start")]
         return None if self.egm_is_running or not stops else stops[-1]
 
@@ -225,9 +225,9 @@ class ArmController:
             self._reference = _Reference(now, position, self.params)
             self._last_message = now
         datagram = self._feedback(now, position)
-        if self.egm_is_running:
-            self._take_message(now)
-        if self.egm_is_running:
+        if self._reference is not None:
+            self._take_message(now, self._reference)
+        if self._reference is not None:
             speed, target = self._reference.at(now)
             wanted = speed + self.params.pos_corr_gain * (target - position)
             self._velocity = np.minimum(np.maximum(wanted, -self._max_speed), self._max_speed)
@@ -268,16 +268,16 @@ class ArmController:
             reported = start + (wanted - before) / (after - before) * (end - start)
         if not (self.egm_is_running or self.params.stream_always):
             return None
-        planned = self._reference.target if self.egm_is_running else position
+        planned = position if self._reference is None else self._reference.target
         states = self.motors_are_on, self.egm_is_running, self.rapid_is_running
         datagram = encode_robot(self._sequence, round(now * 1000.0), reported, planned, *states)
         self._sequence += 1
         return datagram
 
-    def _take_message(self, now: float) -> None:
+    def _take_message(self, now: float, reference: _Reference) -> None:
         if self._queue:
             message = self._queue.popleft()
-            self._reference.push(now + self.params.dead_time, message.velocity, message.position)
+            reference.push(now + self.params.dead_time, message.velocity, message.position)
             self._last_message = now
             self.statistics.consumed += 1
             return

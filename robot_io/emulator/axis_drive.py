@@ -57,7 +57,8 @@ class Drive:
         self._speed = params.speed
         self._allowed = False
         self._until = 0.0  # end of switching on or homing
-        self._now: float | None = None
+        self._now = 0.0
+        self._started = False  # by the first step, which begins the drive's time
         self._area = 0.0  # time integral of x
         self._past = Past(2.0 * params.smoothing + 0.01)
         self._position = 0.0
@@ -79,7 +80,7 @@ class Drive:
         elif self.power is Power.INHIBITED and not on and not self.fault_code:
             self.power = Power.READY
         elif self.power is Power.READY and on:
-            self.power, self._until = Power.SWITCHING_ON, (self._now or 0.0) + self.params.switch_on_time
+            self.power, self._until = Power.SWITCHING_ON, self._now + self.params.switch_on_time
         elif not on:
             self._switch_off()
 
@@ -99,7 +100,7 @@ class Drive:
         if not self.operating or self.v != 0.0:
             return False
         self.homing, self.homed, self.task = True, False, False
-        self._until = (self._now or 0.0) + self.params.homing_time
+        self._until = self._now + self.params.homing_time
         return True
 
     def abort_homing(self) -> None:
@@ -136,9 +137,8 @@ class Drive:
 
     def step(self, now: float) -> None:
         """Moves the generator on to ``now``."""
-        if self._now is None:
-            self._now = now
-        dt, self._now = now - self._now, now
+        dt = now - self._now if self._started else 0.0
+        self._started, self._now = True, now
         before = self.x
         if self.power is Power.SWITCHING_ON and now >= self._until:
             self.power = Power.OPERATING

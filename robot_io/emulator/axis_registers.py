@@ -27,7 +27,7 @@ def _words(value: int) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class AxisUnits:
-    """What the drive's set-up says about counts: [m] and [m/s] a count, and what 100 % stand for [m/s], [m/s^2]."""
+    """Counts by the drive's set-up: [m] and [m/s] of one count, and of 100 % [m/s], [m/s^2]."""
 
     position: float
     velocity: float = 1e-3
@@ -165,4 +165,4 @@ class FhppRegisters:
         return [int(scon) << 8 | int(spos), (cdir & ~CDIR.CONTT) << 8 | percent, high, low]
 
 
-REGISTERS = {"cmmt": CmmtRegisters, "fhpp": FhppRegisters}
+REGISTERS: dict[str, type[CmmtRegisters] | type[FhppRegisters]] = {"cmmt": CmmtRegisters, "fhpp": FhppRegisters}

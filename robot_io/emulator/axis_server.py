@@ -5,12 +5,16 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from typing import Protocol
+from collections.abc import Callable
+from typing import Protocol, cast
 
 from pymodbus.constants import ExcCodes
+from pymodbus.pdu import ModbusPDU
 from pymodbus.pdu.device import ModbusDeviceIdentification
+from pymodbus.pdu.register_message import ReadWriteMultipleRegistersRequest
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
+from pymodbus.transport import ModbusProtocol
 
 WATCH = 0.02  # [s] between looks at whether the connection is to be dropped
 READ, WRITE = (3,), (6, 16)  # function codes; 23 does both
@@ -27,12 +31,13 @@ IDENTITY = {
 
 
 class RegisterBank(Protocol):
-    """What a server needs of ``robot_io.emulator.axes.AxisEmulator``."""
+    """Part of ``robot_io.emulator.axes.AxisEmulator`` that a server needs."""
 
-    ranges: tuple[tuple[int, int], ...]
     disconnected: bool
     guard_tripped: bool
 
+    @property
+    def ranges(self) -> tuple[tuple[int, int], ...]: ...
     def read(self, address: int, count: int) -> list[int]: ...
     def write(self, address: int, values: list[int]) -> None: ...
     def readable(self, address: int, count: int) -> bool: ...
@@ -90,12 +95,13 @@ class AxisServer:
         )
         server = _SingleConnectionServer(
             device,
-            address=(self._host, self.port),
-            identity=ModbusDeviceIdentification(info_name=IDENTITY),
-            trace_pdu=self._check,
+            (self._host, self.port),
+            ModbusDeviceIdentification(info_name=IDENTITY),
+            self._check,
         )
         await server.serve_forever(background=True)
-        self.port = server.transport.sockets[0].getsockname()[1]
+        # What pymodbus declares as a transport is the server of asyncio while it listens.
+        self.port = cast(asyncio.Server, server.transport).sockets[0].getsockname()[1]
         self._started.set()
         try:
             while not self._finish.is_set():
@@ -109,20 +115,28 @@ class AxisServer:
             await server.shutdown()
             await asyncio.sleep(0)
 
-    def _check(self, sending: bool, pdu):
+    def _check(self, sending: bool, pdu: ModbusPDU) -> ModbusPDU:
         """Empties the writing half of a read/write request whose reading half is not possible.
 
         pymodbus would write first and complain about the address to read afterwards.
         """
         if (
             not sending
-            and pdu.function_code == READ_WRITE
+            and isinstance(pdu, ReadWriteMultipleRegistersRequest)
             and not self._bank.readable(pdu.read_address, pdu.read_count)
         ):
             pdu.write_registers = []
         return pdu
 
-    async def _action(self, function, start, address, count, registers, values) -> ExcCodes | None:
+    async def _action(
+        self,
+        function: int,
+        start: int,
+        address: int,
+        count: int,
+        registers: list[int],
+        values: list[int] | list[bool] | None,
+    ) -> ExcCodes | None:
         """Called by pymodbus for every access to the registers; ``values`` is None when reading."""
         try:
             if values is not None and function in (*WRITE, READ_WRITE):
@@ -138,15 +152,21 @@ class AxisServer:
 
 
 class _SingleConnectionServer(ModbusTcpServer):
-    def __init__(self, *args, **kwargs) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(
+        self,
+        device: SimDevice,
+        address: tuple[str, int],
+        identity: ModbusDeviceIdentification,
+        trace_pdu: Callable[[bool, ModbusPDU], ModbusPDU],
+    ) -> None:
+        super().__init__(device, address=address, identity=identity, trace_pdu=trace_pdu)
         self.closed = False
         self.refused = 0
 
-    def handle_new_connection(self):
+    def handle_new_connection(self) -> ModbusProtocol:
         if self.closed or self.active_connections:
             self.refused += 1
-            return _Refusal()
+            return cast(ModbusProtocol, _Refusal())  # asyncio, the caller, needs no more than a protocol
         return super().handle_new_connection()
 
     def drop(self) -> None:
@@ -155,8 +175,10 @@ class _SingleConnectionServer(ModbusTcpServer):
 
 
 class _Refusal(asyncio.Protocol):
-    def connection_made(self, transport) -> None:
-        transport.abort()
+    """A connection that is ended as soon as it is made."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        cast(asyncio.Transport, transport).abort()
 
 
 async def _wait(event: asyncio.Event, seconds: float) -> None:

@@ -112,7 +112,7 @@ class Rig:
         )
 
     def switch_on(self) -> None:
-        """What a person does at the arm's controller: motors on, RAPID, EGM."""
+        """Do what a person does at the arm's controller: motors on, RAPID, EGM."""
         self._pipes["arm"].send(("switch_on",))
 
     def motors_off(self) -> None:

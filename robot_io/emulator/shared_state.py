@@ -56,7 +56,17 @@ class Shared:
     def value(self, field: str) -> float:
         return float(self.views[field][0])
 
-    def publish(self, time: float, qpos, qvel, ball, number: int, in_play: bool, collisions: int, thrown: int) -> None:
+    def publish(
+        self,
+        time: float,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        ball: np.ndarray,
+        number: int,
+        in_play: bool,
+        collisions: int,
+        thrown: int,
+    ) -> None:
         """The world's state at ``time`` [s]."""
         views = self.views
         views["version"][0] += 1

@@ -1,4 +1,4 @@
-"""What a session's log is made of, and how a record travels from the control thread to the recorder process.
+"""Records of a session's log, and the form in which they travel from the control thread to the recorder process.
 
 All times are seconds of the control process's monotonic clock. A record's ``log_time`` says when the control process
 had it: measurements also carry the time at which they were true, and the two are never mixed.
@@ -102,7 +102,7 @@ class Joints:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Command:
-    """What the policy asked for and what went to the robot in one control tick.
+    """Velocity that the policy asked for and that which went to the robot in one control tick.
 
     requested  (8,) joint velocity asked for [m/s], [rad/s]
     sent       (8,) joint velocity commanded, after the limiter
@@ -177,7 +177,7 @@ class Action:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tick:
-    """How one control tick went; all in seconds, an age is infinite while nothing has come.
+    """Timing of one control tick; all in seconds, an age is infinite while nothing has come.
 
     time            when the tick began
     lateness        by which it began after its deadline

@@ -220,7 +220,13 @@ def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
     return _assemble(scan, metadata, attachments, columns, events)
 
 
-def _assemble(scan, metadata, attachments, columns, events) -> SessionLog:
+def _assemble(
+    scan: Scan,
+    metadata: dict[str, dict[str, str]],
+    attachments: dict[str, bytes],
+    columns: dict[str, _Column],
+    events: list[tuple[int, Event]],
+) -> SessionLog:
     offset = int(metadata["session"]["clock_offset_ns"])
     arrays = {name: column.arrays(offset) for name, column in columns.items()}
     captured, received, ids, positions = arrays[schema.BALL.name]

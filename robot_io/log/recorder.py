@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 from robot_io.log.messages import LARGEST, End, Event, Level, LogError, Record
 from robot_io.log.writer import Session, SessionWriter, sample_clock_offset, session
@@ -31,13 +31,13 @@ _ATOMIC = LARGEST + FRAME.size
 
 
 class SessionRecorder(Protocol):
-    """What the bridge asks of a recorder."""
+    """Recorder as the bridge uses it."""
 
     dropped: int  # records lost so far
 
     @property
     def failure(self) -> str | None:
-        """Why nothing is recorded any more; None while all is well."""
+        """Reason why nothing is recorded any more; None while all is well."""
 
     def put(self, *records: Record) -> None:
         """Takes records."""
@@ -46,10 +46,17 @@ class SessionRecorder(Protocol):
         """Finishes the log and returns its path."""
 
 
+class _Process(subprocess.Popen[bytes]):
+    """A process with pipes to its input and from its output."""
+
+    stdin: IO[bytes]
+    stdout: IO[bytes]
+
+
 class Recorder:
     """Records a session through a process of its own. Used by one thread, the control thread."""
 
-    def __init__(self, session: Session, process: subprocess.Popen) -> None:
+    def __init__(self, session: Session, process: _Process) -> None:
         self.dropped = 0
         self.malformed = 0
         self._session = session
@@ -82,7 +89,7 @@ class Recorder:
         made = session(folder, name, metadata, attachments or {}, sample_clock_offset(), time.monotonic(), host=True)
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
-        process = subprocess.Popen(
+        process = _Process(
             [sys.executable, "-m", "robot_io.log"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -118,7 +125,7 @@ class Recorder:
 
     @property
     def path(self) -> Path:
-        """Where the finished log will be."""
+        """Path of the log when it is finished."""
         return self._session.path
 
     @property
@@ -139,7 +146,8 @@ class Recorder:
         if self._broken:
             self.dropped += len(records)
             return
-        frames, size = [], 0
+        frames: list[bytes] = []
+        size = 0
         for record in records:
             try:
                 packed = record.pack()
@@ -303,7 +311,7 @@ class NullRecorder:
         pass
 
 
-def _line(process: subprocess.Popen, timeout: float) -> dict[str, Any] | None:
+def _line(process: _Process, timeout: float) -> dict[str, Any] | None:
     """The next line that the recorder process says, None when it says nothing in time."""
     line, deadline = b"", time.monotonic() + timeout
     while not line.endswith(b"\n"):

@@ -46,7 +46,7 @@ def salvage(path: str | os.PathLike, out: str | os.PathLike | None = None) -> Ov
 
 
 def salvaged_path(path: Path) -> Path:
-    """Where ``salvage`` writes to."""
+    """Path that ``salvage`` writes to."""
     if path.name.endswith(UNFINISHED):
         return path.with_name(path.name.removesuffix(UNFINISHED) + SUFFIX)
     return path.with_name(f"{path.name.removesuffix(SUFFIX)}.salvaged{SUFFIX}")

@@ -9,7 +9,7 @@ import os
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -31,21 +31,21 @@ LARGEST_CHUNK = 1 << 28  # bytes, unpacked
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
 _FOOTER_SIZE = _HEAD.size + 8 + 8 + 4
 _MALFORMED = (McapError, ZstdError, ValueError, OverflowError, struct.error)
-_READERS = {
-    Opcode.HEADER: mcap_records.Header,
-    Opcode.FOOTER: Footer,
-    Opcode.SCHEMA: Schema,
-    Opcode.CHANNEL: Channel,
-    Opcode.CHUNK: Chunk,
-    Opcode.MESSAGE_INDEX: mcap_records.MessageIndex,
-    Opcode.CHUNK_INDEX: mcap_records.ChunkIndex,
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.ATTACHMENT_INDEX: mcap_records.AttachmentIndex,
-    Opcode.STATISTICS: mcap_records.Statistics,
-    Opcode.METADATA: Metadata,
-    Opcode.METADATA_INDEX: mcap_records.MetadataIndex,
-    Opcode.SUMMARY_OFFSET: mcap_records.SummaryOffset,
-    Opcode.DATA_END: DataEnd,
+_READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.HEADER: mcap_records.Header.read,
+    Opcode.FOOTER: Footer.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.MESSAGE_INDEX: mcap_records.MessageIndex.read,
+    Opcode.CHUNK_INDEX: mcap_records.ChunkIndex.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.ATTACHMENT_INDEX: mcap_records.AttachmentIndex.read,
+    Opcode.STATISTICS: mcap_records.Statistics.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.METADATA_INDEX: mcap_records.MetadataIndex.read,
+    Opcode.SUMMARY_OFFSET: mcap_records.SummaryOffset.read,
+    Opcode.DATA_END: DataEnd.read,
 }
 
 
@@ -63,7 +63,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Overview:
-    """What a file holds, without its numbers.
+    """Contents of a file, without its numbers.
 
     path         the file
     metadata     MCAP metadata records by name; of one name, the last
@@ -88,7 +88,7 @@ class Overview:
     @property
     def duration(self) -> float:
         """[s] from the first message to the last."""
-        return 0.0 if self.first is None else (self.last - self.first) / NANO
+        return 0.0 if self.first is None or self.last is None else (self.last - self.first) / NANO
 
     @property
     def state(self) -> str:
@@ -131,16 +131,16 @@ class Scan:
                 return
             opcode, length = _HEAD.unpack_from(data, offset)
             end = offset + _HEAD.size + length
-            record, problem = None, None
+            record: McapRecord | str
             if opcode not in _READERS:
-                problem = f"no record starts here (kind {opcode:#x})"
+                record = f"no record starts here (kind {opcode:#x})"
             elif end > len(data):
-                problem = "the file ends within a record, unfinished or damaged"
+                record = "the file ends within a record, unfinished or damaged"
             else:
-                record, problem = _parse(opcode, data[offset + _HEAD.size : end])
-            if record is None:
+                record = _parse(opcode, data[offset + _HEAD.size : end])
+            if isinstance(record, str):
                 following = self._next_sound(offset)
-                self._fault(offset, following or len(data), problem)
+                self._fault(offset, following or len(data), record)
                 if following is None:
                     return
                 offset = following
@@ -209,7 +209,7 @@ class Scan:
         self._data_end = start - _HEAD.size - 4
         while start < footer:
             opcode, length = _HEAD.unpack_from(data, start)
-            record, _ = _parse(opcode, data[start + _HEAD.size : start + _HEAD.size + length])
+            record = _parse(opcode, data[start + _HEAD.size : start + _HEAD.size + length])
             if isinstance(record, Schema | Channel):
                 self._known.append(record)
             elif isinstance(record, mcap_records.ChunkIndex):
@@ -237,7 +237,7 @@ def check(path: str | os.PathLike) -> Overview:
 
 
 def glance(path: str | os.PathLike) -> Overview:
-    """What a finished file's summary says of it, in no time and unchecked; any other file is read as ``check`` does."""
+    """Reads a finished file's summary, in no time and unchecked; any other file is read as ``check`` does."""
     path = Path(path)
     try:
         with open(path, "rb") as file:
@@ -265,13 +265,13 @@ class _Stream(ReadDataStream):
         return data
 
 
-def _parse(opcode: int, content: bytes) -> tuple[McapRecord | None, str | None]:
-    """The record, or what is wrong with it."""
+def _parse(opcode: int, content: bytes) -> McapRecord | str:
+    """The record, or a sentence about its fault."""
     stream = _Stream(BytesIO(content))
     try:
-        record = _READERS[opcode].read(stream)
+        record = _READERS[opcode](stream)
     except (*_MALFORMED, UnicodeDecodeError) as error:
-        return None, f"a malformed record of kind {opcode:#x} ({type(error).__name__}: {error})"
+        return f"a malformed record of kind {opcode:#x} ({type(error).__name__}: {error})"
     if stream.count != len(content):
-        return None, f"a record of kind {opcode:#x} with {len(content)} bytes, {stream.count} of which make sense"
-    return record, None
+        return f"a record of kind {opcode:#x} with {len(content)} bytes, {stream.count} of which make sense"
+    return record

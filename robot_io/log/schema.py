@@ -57,6 +57,10 @@ def _own_messages() -> tuple[type, type]:
 Values, TickMessage = _own_messages()
 
 
+def _no_numbers(_: Any) -> list[float]:
+    return []
+
+
 @dataclass(frozen=True)
 class Topic:
     """One channel of the file.
@@ -71,7 +75,7 @@ class Topic:
     name: str
     message: Any
     width: int = 0
-    numbers: Callable[[Any], list[float]] | None = None
+    numbers: Callable[[Any], list[float]] = _no_numbers
     metadata: dict[str, str] = field(default_factory=dict)
 
     def schema(self) -> bytes:
@@ -174,7 +178,7 @@ def encode(record: Ball | Joints | Command | Observation | Action | Tick | Event
             message = TickMessage(tick=record.tick, **{name: getattr(record, name) for name in TICK_FIELDS})
             return [Encoded(TICK, record.time, record.time, record.tick, message)]
         case Event():
-            message = Log(level=int(record.level), name=record.name, message=record.text)
+            message = Log(level=Log.Level.ValueType(record.level), name=record.name, message=record.text)
             return [Encoded(EVENT, record.time, record.time, 0, message)]
     raise TypeError(f"{type(record).__name__} is no record with messages")
 

@@ -32,7 +32,7 @@ FORBIDDEN = frozenset('/\\:*?"<>|\0')  # in a file's name, somewhere
 
 @dataclass(frozen=True)
 class Session:
-    """What a recorder is started with, all of it ready to be written.
+    """Start data of a recorder, all of it ready to be written.
 
     folder, name     the file is folder/name.mcap, and folder/name.mcap.part until it is finished
     metadata         entries of the MCAP metadata record "session"

@@ -149,7 +149,7 @@ def architecture() -> dict[str, Any]:
 
 
 def differences(found: Any, expected: Any, path: str) -> list[str]:
-    """Where two pieces of JSON-like data differ, one line a leaf: "contract.version: found 2, expected 1"."""
+    """Differences of two pieces of JSON-like data, one line a leaf: "contract.version: found 2, expected 1"."""
     if isinstance(found, dict) and isinstance(expected, dict):
         lines = []
         for key in [*expected, *(k for k in found if k not in expected)]:

@@ -46,9 +46,10 @@ class StreamingPolicy:
             bad = [n for n, v in zip(contract.OBSERVATION_NAMES, observation, strict=True) if not np.isfinite(v)]
             raise ValueError(f"observation has a non-finite {', '.join(bad)}")
         x = (observation - self._mean) * self._inv_std
-        for past, weights, bias, gated in zip(self._past, self._weights, self._biases, contract.GATED, strict=True):
+        layers = zip(contract.DILATIONS, self._past, self._weights, self._biases, contract.GATED, strict=True)
+        for dilation, past, weights, bias, gated in layers:
             if not past:  # a constant history gives every layer a constant input
-                past.extend([x] * past.maxlen)
+                past.extend([x] * dilation)
             pre_activation = weights @ np.concatenate((past[0], x)) + bias
             past.append(x)
             x = gate(pre_activation, axis=0) if gated else np.tanh(pre_activation)

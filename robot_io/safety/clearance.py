@@ -1,4 +1,4 @@
-"""Where the robot's capsules are and how far they stay from the table, the floor and each other. NumPy, float64.
+"""Positions of the robot's capsules and their distances from the table, the floor and each other. NumPy, float64.
 
 ``robot_geometry.json`` (format 1) is written from the MJCF by ``python -m mjx_tt.robot.geometry_export``:
     joints          in contract order: name, type (slide or hinge), unit axis, pos and rot of the joint's frame in the
@@ -252,7 +252,7 @@ class RobotGeometry:
         return np.concatenate([alone, pairs, alone])
 
     def _bulge(self, dq: np.ndarray) -> np.ndarray:
-        """How far (R, B) a row's gap can differ from that along the chords, for joints moving straight by dq (8, B)."""
+        """Bounds (R, B) of a row's gap against that along the chords, for joints moving straight by dq (8, B)."""
         size = np.abs(dq) * self._hinge
         inner = np.cumsum(size, axis=0) - size
         bulge = self._levers @ (size * (size + 2.0 * inner)) / 8.0  # (capsules, B)

@@ -16,7 +16,7 @@ def _each(slide: float, hinge: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class SafetyConfig:
-    """What the gate allows; lengths in m, angles in rad, times in s, tuples in ``JOINT_NAMES`` order.
+    """Limits of the gate; lengths in m, angles in rad, times in s, tuples in ``JOINT_NAMES`` order.
 
     speed_scale      (0, 1], share of every requested velocity and of every velocity limit
     table_margin     smallest gap of arm and paddle to the table and to everything under it

@@ -1,4 +1,4 @@
-"""Why the robot stopped: enumerated causes and a latch that remembers them until the operator resets it."""
+"""Causes of a stop, enumerated, and a latch that remembers them until the operator resets it."""
 
 from __future__ import annotations
 

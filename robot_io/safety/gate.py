@@ -44,7 +44,7 @@ class GateState(Enum):
 
 @dataclass(frozen=True)
 class Sent:
-    """What the gate lets pass; the only thing that may be sent to the robot.
+    """Command that the gate lets pass; the only thing that may be sent to the robot.
 
     velocity  (8,) for the coming control period [m/s], [rad/s]
     position  (8,) reference at that period's end [m], [rad]; NaN while no finite position was ever measured
@@ -121,12 +121,12 @@ class SafetyGate:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the command in force is zero velocity."""
+        """True when the command in force is zero velocity."""
         return not self._velocity.any()
 
     @property
     def engaged(self) -> bool:
-        """Whether the reference is the gate's: from arming to disarming or reset. Otherwise nothing may be sent."""
+        """True when the reference is the gate's: from arming to disarming or reset. Otherwise nothing may be sent."""
         return self._engaged
 
     @property
@@ -357,7 +357,7 @@ class SafetyGate:
         return braked, (*rules, rule)
 
     def _clear(self, velocity: np.ndarray) -> bool:
-        """Whether this period and braking after it keep the margins, or leave a margin that is missed already."""
+        """True when this period and braking after it keep the margins, or leave a margin that is missed already."""
         way = self.braking_way(velocity)
         if self.geometry.first_too_close(way, self._margin, SLACK) is not None:
             return False

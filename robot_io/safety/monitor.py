@@ -1,4 +1,4 @@
-"""What measured positions and velocities say: are they numbers, within limits, clear, and where the robot was sent."""
+"""Checks of measured positions and velocities: are they numbers, within limits, clear, and where the robot was sent."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class FeedbackMonitor:
         self._forget(time - self._config.delay[1] - EARLY)
 
     def conditions(self, position: np.ndarray, velocity: np.ndarray) -> dict[Cause, str]:
-        """What is wrong with a measurement of finite numbers, each (8,); an empty sentence: nothing."""
+        """Faults of a measurement of finite numbers, each (8,); an empty sentence: nothing."""
         return {Cause.LIMIT: self._limit(position, velocity), Cause.CLEARANCE: self.contact(position)}
 
     def contact(self, position: np.ndarray) -> str:
-        """What touches at a position (8,), as a sentence; empty: nothing."""
+        """Contact at a position (8,), as a sentence; empty: nothing."""
         with np.errstate(all="ignore"):  # of numbers that no robot can measure
             gaps = self._geometry.gaps(position[:, None])[:, 0]
         row = int(gaps.argmin())

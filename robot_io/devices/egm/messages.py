@@ -11,10 +11,15 @@ reads. What it cannot accept raises ``EgmError`` and nothing else.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
+from numpy.typing import ArrayLike
+
+# Fields of a message made from descriptors are known at run time only, to the type checker not at all.
+Message = Any
 
 N_ARM_JOINTS = 6
 MAX_DATAGRAM = 1472  # [bytes], what fits one Ethernet frame; ABB's messages are a few hundred
@@ -91,7 +96,7 @@ _pool = descriptor_pool.DescriptorPool()
 _pool.AddSerializedFile(_schema().SerializeToString())
 
 
-def message_class(name: str):
+def message_class(name: str) -> type[Message]:
     """The protobuf class of an EGM message, e.g. ``EgmRobot``."""
     if name not in _FIELDS:
         raise ValueError(f"no EGM message {name!r}; there are {', '.join(_FIELDS)}")
@@ -116,7 +121,7 @@ class EgmError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class RobotMessage:
-    """What the controller reports (EgmRobot).
+    """State that the controller reports (EgmRobot).
 
     sequence         header.seqno, modulo 2**32
     time_ms          header.tm, the controller's clock [ms], modulo 2**32
@@ -136,7 +141,7 @@ class RobotMessage:
 
 @dataclass(frozen=True, eq=False)
 class SensorMessage:
-    """What the controller is asked to do (EgmSensor): position (6,) [rad] and velocity (6,) [rad/s], read-only."""
+    """Reference for the controller (EgmSensor): position (6,) [rad] and velocity (6,) [rad/s], read-only."""
 
     sequence: int
     position: np.ndarray
@@ -161,7 +166,13 @@ def decode_robot(datagram: bytes) -> RobotMessage:
 
 
 def encode_robot(
-    sequence: int, time_ms: int, position, planned, motors_on: bool, egm_running: bool, rapid_running: bool
+    sequence: int,
+    time_ms: int,
+    position: ArrayLike,
+    planned: ArrayLike,
+    motors_on: bool,
+    egm_running: bool,
+    rapid_running: bool,
 ) -> bytes:
     """An EgmRobot with measured and planned joint positions, both (6,) [rad]."""
     message = EgmRobot()
@@ -191,7 +202,7 @@ def decode_sensor(datagram: bytes) -> SensorMessage:
     )
 
 
-def encode_sensor(sequence: int, time_ms: int, position, velocity) -> bytes:
+def encode_sensor(sequence: int, time_ms: int, position: ArrayLike, velocity: ArrayLike) -> bytes:
     """An EgmSensor: position (6,) [rad], velocity (6,) [rad/s]. Raises ValueError where one is not six finite ones."""
     message = EgmSensor()
     message.header.seqno, message.header.tm = sequence % UINT32, time_ms % UINT32
@@ -201,7 +212,7 @@ def encode_sensor(sequence: int, time_ms: int, position, velocity) -> bytes:
     return message.SerializeToString()
 
 
-def _parse(kind, datagram: bytes):
+def _parse(kind: type[Message], datagram: bytes) -> Message:
     name = kind.DESCRIPTOR.name
     if len(datagram) > MAX_DATAGRAM:
         raise EgmError("oversized", f"a datagram of more than {MAX_DATAGRAM} bytes is no {name}")
@@ -216,19 +227,19 @@ def _parse(kind, datagram: bytes):
     return message
 
 
-def _require(message, *names: str) -> None:
+def _require(message: Message, *names: str) -> None:
     for name in names:
         if not message.HasField(name):
             raise EgmError("incomplete", f"{message.DESCRIPTOR.name} without {name}; it needs {', '.join(names)}")
 
 
-def _require_type(header, wanted: int) -> None:
+def _require_type(header: Message, wanted: int) -> None:
     if header.mtype != wanted:
         name = _HEADER.MessageType.Name
         raise EgmError("wrong_type", f"message type {name(header.mtype)}, expected {name(wanted)}")
 
 
-def _radians(joints, name: str) -> np.ndarray:
+def _radians(joints: Message, name: str) -> np.ndarray:
     degrees = joints.joints
     if len(degrees) != N_ARM_JOINTS:
         raise EgmError("joint_count", f"{name} has {len(degrees)} numbers, the arm has {N_ARM_JOINTS} joints")
@@ -239,7 +250,7 @@ def _radians(joints, name: str) -> np.ndarray:
     return radians
 
 
-def _degrees(radians, name: str) -> list[float]:
+def _degrees(radians: ArrayLike, name: str) -> list[float]:
     values = np.asarray(radians, np.float64)
     if values.shape != (N_ARM_JOINTS,):
         raise ValueError(f"{name} has shape {values.shape}, the arm needs ({N_ARM_JOINTS},)")

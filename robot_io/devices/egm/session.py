@@ -170,7 +170,7 @@ class EgmSession:
         return datagram
 
     def problem(self, now: float) -> str | None:
-        """Why the arm cannot be moved, as a sentence that says what to do; None when it can."""
+        """Reason why the arm cannot be moved, as a sentence that says what to do; None when it can."""
         feedback = self.feedback
         if feedback is None:
             return (
@@ -228,7 +228,7 @@ class EgmSession:
 
 
 def _order(sequence_change: int, time_change: int, silence: float, config: EgmConfig) -> str:
-    """How a packet follows the last accepted one: "next", "new" (session), "duplicate" or "out_of_order".
+    """Place of a packet after the last accepted one: "next", "new" (session), "duplicate" or "out_of_order".
 
     sequence_change  difference of the sequence numbers, taken modulo 2**32
     time_change      difference of the controller's clock [ms], taken modulo 2**32

@@ -24,20 +24,24 @@ DEFAULTS = AxesConfig()
 
 
 class _Channel:
-    """What is known of one axis and wanted of it."""
+    """State of one axis, and what is wanted of it.
+
+    position  [m] in the robot's coordinate, as last answered; 0 before
+    """
 
     def __init__(self, axis: Axis) -> None:
         self.axis = axis
         self.configured = False
         self.status: AxisStatus | None = None
         self.received = -math.inf
+        self.position = 0.0
         self.on = False  # shall be enabled
         self.was_enabled = False
         self.homing = False  # shall be homed
 
-    @property
-    def position(self) -> float:
-        return self.axis.zero + self.axis.direction * self.status.position
+    def answered(self, status: AxisStatus, now: float) -> None:
+        self.status, self.received = status, now
+        self.position = self.axis.zero + self.axis.direction * status.position
 
 
 class FestoAxes:
@@ -132,7 +136,7 @@ class FestoAxes:
         return all(c.status is None or not c.status.enabled or abs(c.status.velocity) < 0.005 for c in self._channels)
 
     def problem(self, now: float) -> str | None:
-        """Why the axes cannot follow commands, as a sentence that says what to do; None when they can."""
+        """Reason why the axes cannot follow commands, as a sentence that says what to do; None when they can."""
         fault, state = self.fault, self._state
         if fault is not None:
             return fault.sentence
@@ -236,7 +240,8 @@ class FestoAxes:
         return True
 
     def _commands(self, now: float) -> list[AxisCommand]:
-        moves = self._moves(now) if self._moving else []
+        target = self._target
+        moves = self._moves(target, now) if self._moving and target is not None else []
         if not moves:
             moves = [Move(c.position if c.status else 0.0, 0.0, 0.0) for c in self._channels]
         self.commanded = np.array([m.velocity for m in moves])
@@ -258,9 +263,9 @@ class FestoAxes:
             )
         return commands
 
-    def _moves(self, now: float) -> list[Move]:
+    def _moves(self, target: Target, now: float) -> list[Move]:
         """Each axis's move; none, and a fault, when one is too far off its reference."""
-        cfg, target, reference = self.config, self._target, self._target.at(now)
+        cfg, reference = self.config, target.at(now)
         self._reference.add(now, reference)
         moves = []
         for i, channel in enumerate(self._channels):
@@ -298,7 +303,7 @@ class FestoAxes:
         except ValueError as error:
             self._latch("bad_answer", f"{axis.name}: {error}.")
             return
-        channel.status, channel.received = status, now
+        channel.answered(status, now)
         if status.fault and not self._acknowledging:
             self._latch(
                 "drive_fault",
@@ -331,18 +336,19 @@ class FestoAxes:
 
     def _publish(self) -> None:
         channels = self._channels
-        if any(c.status is None for c in channels):
+        statuses = [c.status for c in channels if c.status is not None]
+        if len(statuses) < len(channels):
             return
         position = np.array([c.position for c in channels])
-        velocity = np.array([c.axis.direction * c.status.velocity for c in channels])
+        velocity = np.array([c.axis.direction * s.velocity for c, s in zip(channels, statuses, strict=True)])
         for array in (position, velocity):
             array.flags.writeable = False
         self._state = AxesState(
             position=position,
             velocity=velocity,
             received=min(c.received for c in channels),
-            enabled=all(c.status.enabled for c in channels),
-            homed=all(c.status.homed for c in channels),
+            enabled=all(s.enabled for s in statuses),
+            homed=all(s.homed for s in statuses),
         )
 
     def _fault_words(self, channel: _Channel) -> str:

@@ -81,7 +81,7 @@ class AxesConfig:
 
 @dataclass(frozen=True, eq=False)
 class AxesState:
-    """What the drives said.
+    """State of the drives by their answers.
 
     position  (2,) [m], velocity (2,) [m/s], read-only
     received  ``now`` of the older of the two answers [s]
@@ -97,7 +97,7 @@ class AxesState:
 
 @dataclass(frozen=True)
 class AxesFault:
-    """Why the axes were stopped: a short name and a sentence.
+    """Reason why the axes were stopped: a short name and a sentence.
 
     Names: axis_lost, drive_fault, switched_off, acknowledge_timeout, enable_timeout, homing_timeout, node_guard,
     bad_answer, following_error.

@@ -35,7 +35,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Move:
-    """What one axis is to do: go to ``position`` [m] at up to ``speed`` [m/s]; ``velocity`` is the set-point u."""
+    """Motion of one axis: to ``position`` [m] at up to ``speed`` [m/s]; ``velocity`` is the set-point u."""
 
     position: float
     speed: float
@@ -59,7 +59,7 @@ class Reference:
             past.popleft()
 
     def at(self, received: float) -> tuple[float, ...]:
-        """Where the axes should be by a state of the time ``received``; at first, where the stream began."""
+        """Position due in a state of the time ``received``; at first, where the stream began."""
         time, later = received - self._latency, self._past[-1]
         for earlier in reversed(self._past):
             if earlier[0] <= time:

@@ -1,4 +1,4 @@
-"""How registers reach an axis: over Modbus TCP, or straight into an emulator in the same process."""
+"""Links that carry registers to an axis: over Modbus TCP, or straight into an emulator in the same process."""
 
 from __future__ import annotations
 
@@ -30,11 +30,15 @@ class AxisLost(ConnectionError):
         self.reason = reason
 
 
-class RegisterLink(Protocol):
-    """One axis's register bank."""
+class Exchange(Protocol):
+    """Registers that are written and read in one go."""
 
     def exchange(self, write_address: int, values: list[int], read_address: int, count: int) -> list[int]:
         """Writes ``values`` from ``write_address`` on, then reads ``count`` registers. Raises AxisLost."""
+
+
+class RegisterLink(Exchange, Protocol):
+    """One axis's register bank behind a connection."""
 
     def close(self) -> None: ...
 
@@ -42,10 +46,10 @@ class RegisterLink(Protocol):
 class DirectLink:
     """Calls an emulator's register bank in this process.
 
-    bank: anything with ``exchange`` as in ``RegisterLink``, such as ``robot_io.emulator.axes.AxisEmulator``.
+    bank: anything with ``exchange``, such as ``robot_io.emulator.axes.AxisEmulator``.
     """
 
-    def __init__(self, bank: RegisterLink) -> None:
+    def __init__(self, bank: Exchange) -> None:
         self._bank = bank
 
     def exchange(self, write_address: int, values: list[int], read_address: int, count: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""What a positioning axis is told and what it answers, whatever registers carry it.
+"""Commands to a positioning axis and its answers, whatever registers carry it.
 
 Positions are in the drive's own coordinate, in metres; only the codecs (``cmmt``, ``fhpp``) know bits and counts.
 """
