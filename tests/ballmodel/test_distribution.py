@@ -197,7 +197,7 @@ def test_both_simulations_decide_alike_ball_by_ball():
     np.testing.assert_allclose(np.asarray(thrown.arrival)[both], arrival[both], atol=0.005)
 
 
-@pytest.mark.parametrize("name", ["large", "player3/M2", "narrow"])
+@pytest.mark.parametrize("name", [pytest.param("large", marks=pytest.mark.slow), "player3/M2", "narrow"])
 def test_the_coarse_flight_never_drops_a_ball_that_the_full_simulation_keeps(name):
     distribution, params = registry.load(name), ball_params()
     rng = np.random.default_rng(5)

@@ -181,6 +181,7 @@ def test_evaluate_artefact_on_other_balls_leaves_the_artefact_alone(trained):
     artefact.load(folder)
 
 
+@pytest.mark.slow
 def test_seeds_get_folders_of_their_own_and_the_best_is_selected(trained, tmp_path):
     yaml, _, _ = trained
     done = mjx_tt("train", yaml, "--out", tmp_path, "--seeds", "7", "--select", "--devices", 1)

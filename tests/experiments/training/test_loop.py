@@ -95,6 +95,7 @@ def assert_same_run(folder: Path, reference: Path) -> None:
     assert rows == expected_rows
 
 
+@pytest.mark.slow
 def test_killed_at_random_and_resumed_equals_uninterrupted(yaml, uninterrupted, tmp_path):
     delay = random.uniform(0.0, 1.0)
     killed = start(yaml, tmp_path / "run")

@@ -12,7 +12,7 @@ from robot_io.contract import ABB_JOINTS, LIMITS
 from robot_io.devices.egm.session import DEFAULT_PORT, EgmConfig
 from robot_io.emulator.arm import ArmParams
 
-FOLDER = Path(__file__).resolve().parents[3] / "examples" / "abb"
+FOLDER = Path(__file__).resolve().parents[2] / "examples" / "abb"
 MODULE, MOTION, PROTOCOL = (
     (FOLDER / name).read_text("ascii") for name in ("TableTennis.mod", "MOC.cfg", "transmission_protocol.txt")
 )

@@ -21,7 +21,7 @@ from examples.tracker.tracker_client import Frame, datagram
 from robot_io.devices.tracker import BallSample, Tracker, TrackerConfig, TrackerSocket, decode, encode
 
 HOME = "127.0.0.1"
-SOURCES = Path(__file__).resolve().parents[3] / "examples" / "tracker"
+SOURCES = Path(__file__).resolve().parents[2] / "examples" / "tracker"
 WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
 SECONDS, FRAMES = 1.2, 150  # the synthetic ball's second round begins at 1 s
 
