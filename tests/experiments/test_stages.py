@@ -34,12 +34,14 @@ def test_a_stage_says_what_and_how_long():
     assert re.fullmatch(r"run: compiling \.\.\. \d+\.\d s\nrun: failing \.\.\.\n", text.getvalue())
 
 
+@pytest.mark.realtime
 def test_ctrl_c_is_answered_where_python_does_not_run_and_the_second_one_ends():
     process = subprocess.Popen(
         [sys.executable, "-c", DEAF], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     try:
         assert process.stdout.readline() == "ready\n"
+        time.sleep(0.5)  # until the C code has begun
         process.send_signal(signal.SIGINT)
         assert process.stderr.readline() == "\n"
         assert "Ctrl-C again ends at once" in process.stderr.readline()
