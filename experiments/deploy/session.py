@@ -33,6 +33,7 @@ RESET_TIME = 5.0  # [s]
 SETTLE = 1.0  # [s] for the robot to come to rest after a fault
 RECOVERIES = 3  # times in a row that the rig is brought back after a fault before it counts as broken
 QUIET = 30.0  # [s] without a ball on the rig, after which something is wrong
+INTERRUPTED = 130  # exit status after Ctrl-C, as a shell gives it
 
 
 class Session:
@@ -184,7 +185,10 @@ def run(
     seconds: float | None,
     console: Console,
 ) -> int:
-    """Play until ``balls`` outcomes are known, ``seconds`` have passed, or the operator quits; 0: all went well."""
+    """Play until ``balls`` outcomes are known, ``seconds`` have passed, or the operator quits; the exit status.
+
+    0: all went well, 1: it ended early, 130: the operator ended it with Ctrl-C; the summary is written in any case.
+    """
     loaded = artefacts.load(artefact)
     with ExitStack() as stack:
         rig = None
@@ -210,8 +214,14 @@ def run(
             rig.throw(True)
         else:
             console.print("press p to prepare the axes, a to arm; space stops", highlight=False)
-        with Keyboard() as keyboard, View(console, f"{artefact} on {config.name}") as view:
-            episodes, faults, problem = _watch(session, rig, keyboard, view, balls, seconds, console)
+        episodes: list[EpisodeSummary] = []
+        faults: list[FaultReport] = []
+        try:
+            with Keyboard() as keyboard, View(console, f"{artefact} on {config.name}") as view:
+                problem = _watch(session, rig, keyboard, view, balls, seconds, console, episodes, faults)
+            status = 1 if problem else 0
+        except KeyboardInterrupt:
+            status, problem = INTERRUPTED, "stopped by Ctrl-C"
         session.close()
     summary = _summary(loaded, config, episodes, session, process.log_path(options))
     summary["faults"] = [asdict(fault) for fault in faults]
@@ -219,7 +229,7 @@ def run(
     _print(console, summary, log_folder / f"{name}.json")
     if problem:
         console.print(problem, style="red", highlight=False)
-    return 1 if problem else 0
+    return status
 
 
 def _watch(
@@ -230,50 +240,47 @@ def _watch(
     balls: int | None,
     seconds: float | None,
     console: Console,
-) -> tuple[list[EpisodeSummary], list[FaultReport], str | None]:
-    """The episodes played, the faults after which the rig was brought back, and why it ended early, or None."""
-    episodes: list[EpisodeSummary] = []
-    faults: list[FaultReport] = []
+    episodes: list[EpisodeSummary],
+    faults: list[FaultReport],
+) -> str | None:
+    """Play, adding the episodes played and the faults after which the rig was brought back; why it ended early."""
     in_a_row = 0
     end = time.monotonic() + (float("inf") if seconds is None else seconds)
     heard = time.monotonic()
     while time.monotonic() < end and (balls is None or len(episodes) < balls):
-        try:
-            for message in session.messages(0.1):
-                view.take(message)
-                if isinstance(message, Played):
-                    heard = time.monotonic()
-                    episodes.append(message.summary)
-                    in_a_row = in_a_row if message.summary.fault else 0
-                    if not console.is_terminal:
-                        console.print(f"ball {len(episodes)}: {message.summary.outcome}", highlight=False)
-            key = keyboard.pressed()
-            if key == QUIT:
-                break
-            if key == PAUSE:
-                session.send(messages.Pause(not (session.status and session.status.paused)))
-            elif key in KEYS and (request := KEYS[key].request) is not None:
-                session.send(request)
-            if key in KEYS:
-                view.say(KEYS[key].text)
-            if rig is not None:
-                rig.check()
-                if session.status and session.status.faults:
-                    fault, in_a_row = session.status.faults[0], in_a_row + 1
-                    text = f"{fault.cause}: {fault.text}"
-                    if in_a_row > RECOVERIES:
-                        return episodes, faults, f"stopped by {in_a_row} faults in a row, the last: {text}"
-                    faults.append(fault)
-                    console.print(f"fault, reset and resumed: {text}", style="red", highlight=False)
-                    try:
-                        session.recover(rig)
-                    except RefusedError as error:
-                        return episodes, faults, f"not brought back after {text}: {error}"
-                if time.monotonic() - heard > QUIET:
-                    return episodes, faults, f"no ball was played for {QUIET:g} s"
-        except KeyboardInterrupt:
-            return episodes, faults, "stopped by Ctrl-C"
-    return episodes, faults, None
+        for message in session.messages(0.1):
+            view.take(message)
+            if isinstance(message, Played):
+                heard = time.monotonic()
+                episodes.append(message.summary)
+                in_a_row = in_a_row if message.summary.fault else 0
+                if not console.is_terminal:
+                    console.print(f"ball {len(episodes)}: {message.summary.outcome}", highlight=False)
+        key = keyboard.pressed()
+        if key == QUIT:
+            break
+        if key == PAUSE:
+            session.send(messages.Pause(not (session.status and session.status.paused)))
+        elif key in KEYS and (request := KEYS[key].request) is not None:
+            session.send(request)
+        if key in KEYS:
+            view.say(KEYS[key].text)
+        if rig is not None:
+            rig.check()
+            if session.status and session.status.faults:
+                fault, in_a_row = session.status.faults[0], in_a_row + 1
+                text = f"{fault.cause}: {fault.text}"
+                if in_a_row > RECOVERIES:
+                    return f"stopped by {in_a_row} faults in a row, the last: {text}"
+                faults.append(fault)
+                console.print(f"fault, reset and resumed: {text}", style="red", highlight=False)
+                try:
+                    session.recover(rig)
+                except RefusedError as error:
+                    return f"not brought back after {text}: {error}"
+            if time.monotonic() - heard > QUIET:
+                return f"no ball was played for {QUIET:g} s"
+    return None
 
 
 def _summary(

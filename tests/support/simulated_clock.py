@@ -22,6 +22,7 @@ class FollowingAxes:
     """Linear axes that are where they were commanded to be at once; also stands for the thread around them."""
 
     cycles = late = 0
+    fault, homed = None, True
 
     def __init__(self, position: np.ndarray) -> None:
         self.position, self.stops, self.closed = np.array(position), 0, False
@@ -31,10 +32,15 @@ class FollowingAxes:
     def state(self):
         return self
 
+    axes = state
+
     def command(self, position, velocity, now):
         self.position = np.array(position)
 
     def start(self):
+        pass
+
+    def enable(self):
         pass
 
     def stop(self):

@@ -7,7 +7,11 @@ import os
 import shutil
 import signal
 import socket
+import subprocess
+import sys
+import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,6 +31,8 @@ from robot_io.emulator.processes import Rig, free_ports
 from robot_io.errors import DeviceError, RefusedError
 from robot_io.policy import artefact, export
 from robot_io.policy.policy import Policy
+from tests.support.paths import ROOT
+from tests.support.simulated_control import Simulated
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +72,26 @@ def test_plays_on_the_rig_and_leaves_a_log_and_a_summary(policy, tmp_path):
     assert session.metadata and len(session.episodes) == 2
     velocity = session.commands.sent
     assert np.abs(velocity).max() > 0 and (np.abs(velocity).max(axis=1) <= np.array(contract.LIMITS.velocity)).all()
+
+
+@pytest.mark.realtime
+def test_ctrl_c_ends_with_the_summary(policy, tmp_path):
+    command = [sys.executable, "-m", "experiments.cli", "run", str(policy), "--robot", "rig", "--log", str(tmp_path)]
+    pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, cwd=ROOT, start_new_session=True, **pipe) as running:
+        before = []
+        for line in running.stdout:
+            before.append(line)
+            if line.startswith("ball 1:"):
+                break
+        if running.poll() is None:
+            os.killpg(running.pid, signal.SIGINT)  # the whole group, as a terminal does
+        text = running.stdout.read()
+    assert running.returncode == 130, "".join(before) + text
+    assert "return rate" in text and "linear axes" in text and "stopped by Ctrl-C" in text
+    (summary,) = (json.loads(path.read_text()) for path in tmp_path.glob("*.json"))
+    assert summary["episodes"] >= 1 and summary["egm"]["replies"] > 100
+    assert len(log.read(summary["log"]).episodes) >= 1
 
 
 def test_flipped_bit_is_refused(policy, tmp_path):
@@ -150,6 +176,53 @@ def test_missing_devices_are_named_and_arming_is_refused(policy, monkeypatch):
             session.prepare(None)
         with pytest.raises(RefusedError, match="not armed: arm: No EGM packet"):
             session.arm()
+
+
+def until(session, condition):
+    """Take messages until a status fulfils the condition; 10 s at most."""
+    end = time.monotonic() + 10.0
+    while not (session.status and condition(session.status)):
+        assert time.monotonic() < end
+        list(session.messages(0.02))
+
+
+def test_arming_that_is_refused_after_a_reset_can_be_tried_again(policy, monkeypatch):
+    """Again and again: the emergency stop, a reset that works, axes that do not get ready at once."""
+    simulated = Simulated(policy, monkeypatch)
+    bridge, simulation = simulated.control.bridge, simulated.simulation
+
+    def control():
+        with simulated.control:
+            simulated.control.run()
+
+    def press(pressed):
+        simulated.script.append((0.0, lambda: bridge.estop(pressed, simulation.now)))
+
+    thread = threading.Thread(target=control, daemon=True)
+    monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
+    monkeypatch.setattr(play, "SETTLE", 0.0)
+    thread.start()
+    with play.Session(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:
+        until(session, lambda status: not status.missing and not status.present)
+        session.arm()
+        for _ in range(3):
+            press(True)
+            until(session, lambda status: status.state == "fault")
+            with pytest.raises(RefusedError, match="cannot reset while a cause is present: ESTOP"):
+                session.reset()
+            press(False)
+            until(session, lambda status: not status.present)
+            session.reset()
+            assert session.status.state == "disarmed"
+            monkeypatch.setattr(simulation.axes, "problem", lambda _: "gantry_x is switched off")
+            for _ in range(2):
+                with pytest.raises(RefusedError, match="not armed: axes: gantry_x is switched off"):
+                    session.arm()
+                session.reset()  # no fault is left: nothing to do, and no refusal
+            monkeypatch.setattr(simulation.axes, "problem", lambda _: None)
+            session.recover(SimpleNamespace(switch_on=lambda: None))
+            assert session.status.state == "ready" and session.status.at_home and not session.status.faults
+    assert not thread.is_alive()
 
 
 @pytest.fixture

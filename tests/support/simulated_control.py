@@ -1,0 +1,85 @@
+"""The control process on a simulated clock: sockets, axes and time are made up, all else is real."""
+
+from __future__ import annotations
+
+import multiprocessing
+from types import SimpleNamespace
+
+from robot_io.control import process, realtime
+from robot_io.control.config import RealTimeConfig, RobotConfig
+from robot_io.control.process import Control, ControlOptions
+from tests.support.simulated_clock import CONTROLLER, Simulation
+
+
+class ArmSocket:
+    """Stand-in for ``EgmSocket`` in the control process."""
+
+    def __init__(self, simulation):
+        self._simulation = simulation
+
+    def fileno(self):
+        return "arm"
+
+    def drain(self, session, now):
+        packets, self._simulation.packets = self._simulation.packets, []
+        return any([session.receive(packet, CONTROLLER, now) for packet in packets])
+
+    def send(self, reply, endpoint):
+        self._simulation.answered(reply)
+
+    def close(self):
+        pass
+
+
+class FrameSocket(ArmSocket):
+    def fileno(self):
+        return "tracker"
+
+    def drain(self):
+        frames = self._simulation.frames
+        while frames and frames[0][0] <= self._simulation.now:
+            yield frames.popleft()[1], "127.0.0.1", 5000
+
+
+class Simulated:
+    """A control process in this one; ``script``: what happens at moments [s] of its clock."""
+
+    def __init__(self, artefact, monkeypatch):
+        self.simulation = Simulation()
+        self.script = []
+        self.pipe, theirs = multiprocessing.Pipe()
+        monkeypatch.setattr(process, "EgmSocket", lambda *_: ArmSocket(self.simulation))
+        monkeypatch.setattr(process, "TrackerSocket", lambda *_: FrameSocket(self.simulation))
+        monkeypatch.setattr(process, "linear_axes", lambda _: None)
+        monkeypatch.setattr(process, "AxesThread", lambda _: self.simulation.axes)
+        monkeypatch.setattr(realtime, "prepare", lambda *_: [])
+        clock = SimpleNamespace(monotonic=lambda: self.simulation.now, sleep=self._sleep)
+        monkeypatch.setattr(process, "time", clock)
+        monkeypatch.setattr(process, "select", SimpleNamespace(select=self._select))
+        config = RobotConfig(realtime=RealTimeConfig(spin=0.0))
+        self.control = Control(config, ControlOptions(str(artefact)), theirs)
+        self.simulation.bridge = self.control.bridge
+
+    def _sleep(self, seconds):
+        self.simulation.advance()
+
+    def _select(self, read, write, _, seconds):
+        if write:
+            return [], write, []
+        simulation = self.simulation
+        end = simulation.now + seconds + 1e-9  # not before a deadline by rounding
+        while simulation.now < end and not simulation.packets:
+            simulation.advance()
+            while self.script and self.script[0][0] <= simulation.now:
+                self.script.pop(0)[1]()
+        ready = ["arm"] * bool(simulation.packets) + ["tracker"] * bool(simulation.frames)
+        return [f for f in read if f in ready or (isinstance(f, int) and self.pipe_waits())], [], []
+
+    def pipe_waits(self):
+        return self.control._pipe.poll()
+
+    def words(self):
+        found = []
+        while self.pipe.poll():
+            found.append(self.pipe.recv())
+        return found
