@@ -39,8 +39,7 @@ test: $(READY)
 	$(PYTEST) -m "not slow and realtime"
 
 test-slow: $(READY)
-	$(PYTEST) $(PARALLEL) -m "slow and not realtime"
-	$(PYTEST) -m "slow and realtime"
+	$(PYTEST) $(PARALLEL) -m slow
 
 test-all: test test-slow
 

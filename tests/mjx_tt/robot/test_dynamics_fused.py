@@ -86,6 +86,7 @@ def test_any_batch_shape_gives_the_same_numbers(batch):
         np.testing.assert_allclose(mine.reshape(model.nq, -1), theirs, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_whole_episodes_agree_with_mjx_in_float32():
     """200 control steps of four random policies in closed loop, with noise and the paper's latencies. The ball flies
