@@ -129,7 +129,7 @@ def measure_physics(sizes: Sizes, cores: int) -> dict:
 
 def measure_update(sizes: Sizes, cores: list[int]) -> dict:
     """Seconds per update at the start of training and under a trained policy, by number of devices; peak memory."""
-    scale = [f"optimiser.pairs={sizes.pairs}", f"optimiser.repeats={sizes.repeats}"]
+    scale = [f"optimiser.num_directions={sizes.pairs}", f"optimiser.repeats={sizes.repeats}"]
     n, common = len(cores), "optimiser.common_random_numbers=true"
     asked: dict[str, tuple[set[int] | None, dict[str, Any]]] = {
         "all_devices": (None, dict(changes=scale, devices=n)),
@@ -162,7 +162,7 @@ def measure_update(sizes: Sizes, cores: list[int]) -> dict:
 
 def measure_batch(pairs: int, repeats: int, rounds: int) -> dict:
     """Time of an update and of its roll-outs, all devices, by the number of episodes."""
-    changes = [f"optimiser.pairs={pairs}", f"optimiser.repeats={repeats}"]
+    changes = [f"optimiser.num_directions={pairs}", f"optimiser.repeats={repeats}"]
     with Worker("update", changes=changes) as update, Worker("rollout", changes=changes) as rollout:
         update.wait_ready(), rollout.wait_ready()
         measured = take_turns({"update": [update], "rollout": [rollout]}, rounds)

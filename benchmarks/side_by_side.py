@@ -17,7 +17,7 @@ from rich.console import Console
 
 from benchmarks.worker import Worker, take_turns
 
-CHANGES = ["optimiser.pairs=100", "optimiser.repeats=10", "task.sim_rate=150"]
+CHANGES = ["optimiser.num_directions=100", "optimiser.repeats=10", "task.sim_rate=150"]
 ROUNDS = 15
 
 

@@ -154,7 +154,7 @@ def rollout(changes: list[str], devices: int | None = None) -> Side:
     from mjx_tt.sim.model import SimModel
 
     trainer, state = _paper_trainer(changes)
-    simulator, columns = trainer.simulator, 2 * trainer.bgs_config.pairs
+    simulator, columns = trainer.simulator, 2 * trainer.bgs_config.num_directions
     repeats = trainer.episodes_per_update // columns
     episodes = simulator.draw(jax.random.key(2), trainer.pool, SimModel(), (), repeats, columns)
     theta = state.bgs.theta[:, None] + 0.025 * jax.random.normal(jax.random.key(3), (state.bgs.theta.shape[0], columns))

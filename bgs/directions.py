@@ -20,12 +20,12 @@ SCALES = ("sqrt_d", "chi")
 def sample(
     key: PRNGKeyArray,
     d: int,
-    pairs: int,
+    num_directions: int,
     orthogonal: bool = True,
     scale: str = "sqrt_d",
     dtype: DTypeLike = jnp.float32,
-) -> Float[Array, "d pairs"]:
-    """Draws the directions of one update, shape (d, pairs), one direction per column.
+) -> Float[Array, "d num_directions"]:
+    """Draws the directions of one update, shape (d, num_directions), one direction per column.
 
     orthogonal=True gives blocks of up to ``d`` mutually orthogonal columns, each block Haar-distributed and independent
     of the others. ``scale`` then sets the column norms: "sqrt_d" makes each exactly sqrt(d) (the authors' Iris);
@@ -34,19 +34,19 @@ def sample(
 
     Raises ValueError for a size below 1 or an unknown scale.
     """
-    if d < 1 or pairs < 1:
-        raise ValueError(f"directions.sample: d = {d} and pairs = {pairs} must both be at least 1")
+    if d < 1 or num_directions < 1:
+        raise ValueError(f"directions.sample: d = {d} and num_directions = {num_directions} must both be at least 1")
     if scale not in SCALES:
         raise ValueError(f"directions.sample: scale = {scale!r}, allowed are {SCALES}")
     if not orthogonal:
-        return jax.random.normal(key, (d, pairs), dtype)
+        return jax.random.normal(key, (d, num_directions), dtype)
     key_basis, key_norm = jax.random.split(key)
-    widths = [min(d, pairs - start) for start in range(0, pairs, d)]
+    widths = [min(d, num_directions - start) for start in range(0, num_directions, d)]
     block_keys = jax.random.split(key_basis, len(widths))
     basis = jnp.concatenate([_haar(k, d, width, dtype) for k, width in zip(block_keys, widths, strict=True)], axis=1)
     if scale == "sqrt_d":
         return math.sqrt(d) * basis
-    return jnp.sqrt(jax.random.chisquare(key_norm, d, (pairs,), dtype))[None] * basis
+    return jnp.sqrt(jax.random.chisquare(key_norm, d, (num_directions,), dtype))[None] * basis
 
 
 def _haar(key: PRNGKeyArray, d: int, width: int, dtype: DTypeLike) -> Float[Array, "d width"]:

@@ -85,12 +85,12 @@ def merge(a: ObservationStatistics, b: ObservationStatistics) -> ObservationStat
 
 
 def normaliser(statistics: ObservationStatistics) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Mean and inverse scale, each (n,), such that the policy sees (x - mean) * inverse_scale.
+    """Mean and inverse scale, each (n,), such that the policy sees (x - mean) * inv_std.
 
-    inverse_scale is 1 / (std + 1e-8) with the n - 1 standard deviation, and 0 for a component whose std is below 1e-7
+    inv_std is 1 / (std + 1e-8) with the n - 1 standard deviation, and 0 for a component whose std is below 1e-7
     (Iris). Before the second observation there is no deviation to speak of, and it is 1.
     """
     n = total(statistics)
     std = jnp.sqrt(statistics.m2 / jnp.maximum(n - 1, 1))
-    inverse_scale = jnp.where(std < MINIMUM_STD, 0, 1 / (std + STD_EPSILON))
-    return statistics.mean, jnp.where(n < 2, jnp.ones_like(std), inverse_scale)
+    inv_std = jnp.where(std < MINIMUM_STD, 0, 1 / (std + STD_EPSILON))
+    return statistics.mean, jnp.where(n < 2, jnp.ones_like(std), inv_std)

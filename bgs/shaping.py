@@ -42,16 +42,16 @@ class ShapedPairs:
 def shape(
     plus: Float[Array, "..."],
     minus: Float[Array, "..."],
-    keep: float = 0.3,
+    elite_fraction: float = 0.3,
     rank: str = "abs",
     weighting: str = "returns",
     normalise: str = "std",
 ) -> ShapedPairs:
     """Weights each direction by the returns (N,) at theta + sigma delta and theta - sigma delta (higher is better).
 
-    With D = plus - minus, k = max(1, int(keep * pairs left)) and s the standard deviation of the 2 k elite returns, an
-    elite's weight is D / (k s) and every other weight is 0 (Iris, ``ars_algorithm.py``). A pair with a non-finite
-    return is dropped before anything else, exactly as if it had not been evaluated.
+    With D = plus - minus, k = max(1, int(elite_fraction * finite pairs)) and s the standard deviation of the 2 k elite
+    returns, an elite's weight is D / (k s) and every other weight is 0 (Iris, ``ars_algorithm.py``). A pair with a
+    non-finite return is dropped before anything else, exactly as if it had not been evaluated.
 
     rank       "abs": |D| (Iris); "signed": D (the paper's Eq. 5 as printed); "max": the better of the two (ARS, Eq. 4)
     weighting  "returns", or "centered_rank": returns are first replaced by their ranks over all members, spread evenly
@@ -81,8 +81,8 @@ def shape(
     difference = plus - minus
     score = {"abs": jnp.abs(difference), "signed": difference, "max": jnp.maximum(plus, minus)}[rank]
     place = jnp.argsort(jnp.argsort(jnp.where(finite, score, -jnp.inf), descending=True))
-    # A table makes k Python's int(keep * n) for every n; a float32 product might round across a whole number.
-    n_elites_of = np.array([0] + [max(1, int(keep * n)) for n in range(1, plus.shape[0] + 1)], np.int32)
+    # A table makes k Python's int(elite_fraction * n) for every n; a float32 product might round across a whole number.
+    n_elites_of = np.array([0] + [max(1, int(elite_fraction * n)) for n in range(1, plus.shape[0] + 1)], np.int32)
     n_elites = jnp.asarray(n_elites_of)[n_finite]
     elites = place.astype(jnp.int32) < n_elites
 

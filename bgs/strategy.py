@@ -32,31 +32,31 @@ from bgs import shaping
 class BGSConfig:
     """Settings of the optimiser; the defaults are the paper's simulation settings (appendix, BGS hyper-parameters).
 
-    pairs       N, antithetic pairs per update
-    sigma       perturbation scale: members are theta +/- sigma delta; a number or a schedule over updates
-                (``bgs.optimizers``)
-    keep        fraction of the pairs that become elites, in (0, 1]
+    num_directions  N, antithetic pairs per update
+    sigma           perturbation scale: members are theta +/- sigma delta; a number or a schedule over updates
+                    (``bgs.optimizers``)
+    elite_fraction  fraction of the pairs that become elites, in (0, 1]
     rank        how elites are chosen: "abs", "signed" or "max" (``shaping.shape``)
-    weighting   "returns" or "centered_rank" (``shaping.shape``)
-    normalise   "std" or "none": division by the elites' standard deviation (``shaping.shape``)
-    orthogonal  orthogonal or independent Gaussian directions (``directions.sample``)
-    scale       "sqrt_d" or "chi": norms of orthogonal directions (``directions.sample``)
+    weighting       "returns" or "centered_rank" (``shaping.shape``)
+    normalise       "std" or "none": division by the elites' standard deviation (``shaping.shape``)
+    orthogonal      orthogonal or independent Gaussian directions (``directions.sample``)
+    scale           "sqrt_d" or "chi": norms of orthogonal directions (``directions.sample``)
     step        optax transformation, from ``bgs.optimizers.make`` or optax itself
-    average     decay per update of the moving average of theta, in [0, 1); 0 makes the average theta itself
+    ema_decay       decay per update of the moving average of theta, in [0, 1); 0 makes the average theta itself
 
     Raises ValueError naming the key, what was given and what is allowed.
     """
 
-    pairs: int = 200
+    num_directions: int = 200
     sigma: float | steps.Schedule = 0.025
-    keep: float = 0.3
+    elite_fraction: float = 0.3
     rank: str = "abs"
     weighting: str = "returns"
     normalise: str = "std"
     orthogonal: bool = True
     scale: str = "sqrt_d"
     step: optax.GradientTransformation = field(default_factory=steps.make)
-    average: float = 0.0
+    ema_decay: float = 0.0
 
     def __post_init__(self) -> None:
         choices = {
@@ -67,11 +67,15 @@ class BGSConfig:
         }
         for key, allowed in choices.items():
             self._require(key, getattr(self, key) in allowed, f"one of {allowed}")
-        self._require("pairs", isinstance(self.pairs, int) and self.pairs >= 1, "a whole number of at least 1")
+        self._require(
+            "num_directions",
+            isinstance(self.num_directions, int) and self.num_directions >= 1,
+            "a whole number of at least 1",
+        )
         number = callable(self.sigma) or 0 < self.sigma < float("inf")
         self._require("sigma", number, "a positive finite number or a schedule")
-        self._require("keep", 0 < self.keep <= 1, "a number in (0, 1]")
-        self._require("average", 0 <= self.average < 1, "a number in [0, 1)")
+        self._require("elite_fraction", 0 < self.elite_fraction <= 1, "a number in (0, 1]")
+        self._require("ema_decay", 0 <= self.ema_decay < 1, "a number in [0, 1)")
         self._require("step", isinstance(self.step, optax.GradientTransformation), "an optax.GradientTransformation")
 
     def _require(self, key: str, allowed: bool, wanted: str) -> None:
@@ -146,7 +150,7 @@ def ask(key: PRNGKeyArray, state: BGSState, config: BGSConfig) -> Population:
 @partial(jax.jit, static_argnames="config")
 def _sample(key: PRNGKeyArray, state: BGSState, config: BGSConfig) -> Float[Array, "d N"]:
     d, dtype = state.theta.shape[0], state.theta.dtype
-    return direction_sampling.sample(key, d, config.pairs, config.orthogonal, config.scale, dtype)
+    return direction_sampling.sample(key, d, config.num_directions, config.orthogonal, config.scale, dtype)
 
 
 def perturb(state: BGSState, directions: Float[Array, "d N"], config: BGSConfig) -> Population:
@@ -172,14 +176,14 @@ def tell(
     if directions.shape != expected or returns.shape != (2 * expected[1],):
         raise ValueError(f"tell: directions {directions.shape}, but theta and returns {returns.shape} need {expected}")
     plus, minus = returns[: expected[1]], returns[expected[1] :]
-    shaped = shaping.shape(plus, minus, config.keep, config.rank, config.weighting, config.normalise)
+    shaped = shaping.shape(plus, minus, config.elite_fraction, config.rank, config.weighting, config.normalise)
     # Accelerators would otherwise multiply float32 in a shorter format.
     gradient = jnp.matmul(directions, shaped.weights, precision=jax.lax.Precision.HIGHEST)
     # optax descends, returns are to rise.
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to an integer count
         change, opt_state = config.step.update(-gradient, state.opt_state, state.theta)
     theta = optax.apply_updates(state.theta, change)
-    average = config.average * state.average + (1 - config.average) * theta
+    average = config.ema_decay * state.average + (1 - config.ema_decay) * theta
 
     after = (theta, average, opt_state)
     before = (state.theta, state.average, state.opt_state)

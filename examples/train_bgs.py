@@ -11,7 +11,7 @@ import mjx_tt
 mjx_tt.configure()
 key, simulator = jax.random.key(0), mjx_tt.Simulator(mjx_tt.TaskConfig(sim_rate=150.0))
 balls = ballmodel.sample_pool(key, ballmodel.resolve("player3/M0"), mjx_tt.SimModel().ball, 4096)
-config = bgs.BGSConfig(pairs=50, keep=1.0, step=bgs.optimizers.make("adam", 0.01))
+config = bgs.BGSConfig(num_directions=50, elite_fraction=1.0, step=bgs.optimizers.make("adam", 0.01))
 state = bgs.init(mjx_tt.initial_theta(key), config)
 mean, inv_std = jax.numpy.zeros(11), jax.numpy.ones(11)  # bgs.normalizer learns them
 draw = jax.jit(lambda key: simulator.draw(key, balls, mjx_tt.SimModel(), (), 5, 100))

@@ -108,7 +108,7 @@ def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:
 
 def device_count(config: Config) -> int:
     """Devices to train on: the number asked for, or the most of those present that divide the perturbations evenly."""
-    asked, members = config.training.devices, 2 * config.optimiser.pairs
+    asked, members = config.training.devices, 2 * config.optimiser.num_directions
     if asked != "auto":
         return asked
     return max(n for n in range(1, len(jax.devices()) + 1) if members % n == 0)

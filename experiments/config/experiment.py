@@ -28,9 +28,9 @@ Decay = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 
 # Keys of the optimiser, which training and fine-tuning share; their defaults differ.
-Pairs = Annotated[Count, Field(description="Antithetic pairs of perturbations per update.")]
+NumDirections = Annotated[Count, Field(description="Antithetic pairs of perturbations per update.")]
 Sigma = Annotated[Positive, Field(description="Scale of the perturbations.")]
-Keep = Annotated[float, Field(gt=0, le=1, description="Share of the pairs that become elites.")]
+EliteFraction = Annotated[float, Field(gt=0, le=1, description="Share of the pairs that become elites.")]
 Rank = Annotated[
     Literal["abs", "signed", "max"],
     Field(description="Pairs are ranked by |D|, by D or by their better member, D the difference of their returns."),
@@ -46,7 +46,7 @@ Scale = Annotated[
     Literal["sqrt_d", "chi"],
     Field(description="Norm of orthogonal perturbations: the root of their dimension, or as of Gaussian vectors."),
 ]
-Average = Annotated[
+EmaDecay = Annotated[
     Decay,
     Field(description="Decay per update of the moving average of the parameters, which is exported; 0: none."),
 ]
@@ -174,13 +174,13 @@ class SigmaFall(Section):
 class Optimiser(Section):
     """Blackbox Gradient Sensing. The defaults are the recipe that trains best here; paper.yaml has the paper's."""
 
-    pairs: Pairs = 100
+    num_directions: NumDirections = 100
     repeats: Count = 10
     """Episodes per perturbation."""
     sigma: Sigma = 0.025
     sigma_fall: SigmaFall | None = None
     """Smaller perturbations later on: more returned in this simulation, fewer in another world; null: none."""
-    keep: Keep = 1.0
+    elite_fraction: EliteFraction = 1.0
     rank: Rank = "abs"
     weighting: Weighting = "returns"
     normalise: Normalise = "std"
@@ -188,7 +188,7 @@ class Optimiser(Section):
     scale: Scale = "sqrt_d"
     step: Step = Step()
     """From the gradient estimate to a change of the parameters."""
-    average: Average = 0.98
+    ema_decay: EmaDecay = 0.98
     common_random_numbers: bool = True
     """Both members of a pair meet the same balls, latencies and noise."""
     initial_scale: Positive = 0.1

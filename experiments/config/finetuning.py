@@ -9,14 +9,14 @@ from pydantic import Field, ValidationError
 
 from experiments.config import validation
 from experiments.config.experiment import (
-    Average,
     Constant,
     Count,
-    Keep,
+    EliteFraction,
+    EmaDecay,
     Normalise,
+    NumDirections,
     Optimiser,
     Orthogonal,
-    Pairs,
     Rank,
     Rewards,
     Scale,
@@ -38,11 +38,11 @@ class FineTuning(Section):
 
     updates: Count = 70
     """The paper's cycles have 60 or 70."""
-    pairs: Pairs = 5
+    num_directions: NumDirections = 5
     repeats: Count = 3
     """Episodes, hence balls, per perturbation."""
     sigma: Sigma = 0.025
-    keep: Keep = 0.6
+    elite_fraction: EliteFraction = 0.6
     rank: Rank = "abs"
     weighting: Weighting = "returns"
     normalise: Normalise = "std"
@@ -50,7 +50,7 @@ class FineTuning(Section):
     scale: Scale = "sqrt_d"
     step: Step = Step(kind="sgd", learning_rate=0.00375, schedule=Constant(kind="constant"))
     """From the gradient estimate to a change of the parameters."""
-    average: Average = 0.0
+    ema_decay: EmaDecay = 0.0
     rewards: Literal["sim", "real"] | Rewards = "real"
     """The paper's weights by name, or a mapping that changes single ones; only terms measured on a robot count."""
     evaluation_balls: Annotated[int, Field(ge=2)] = 50
@@ -60,7 +60,7 @@ class FineTuning(Section):
 
     @property
     def episodes_per_update(self) -> int:
-        return 2 * self.pairs * self.repeats
+        return 2 * self.num_directions * self.repeats
 
     def optimiser(self) -> Optimiser:
         """The same settings as the optimiser section of an experiment."""

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 LONGEST = 120  # characters of what was given that are shown
+RENAMED = {"pairs": "num_directions", "keep": "elite_fraction", "average": "ema_decay"}  # keys of the optimiser
 
 
 def lines(error: ValidationError, model: type[BaseModel]) -> list[str]:
@@ -43,6 +44,8 @@ def _describe(mistake: ErrorDetails, path: str, owner: type[BaseModel]) -> tuple
     if kind == "extra_forbidden":
         parent, _, name = path.rpartition(".")
         names = list(owner.model_fields)
+        if RENAMED.get(name) in names:
+            return "now called ", RENAMED[name]
         unknown = "unknown key" if path else "unknown key ''"  # which leaves nothing to begin the line with
         return f"{unknown}; {nearest(name, names)}allowed{f' in {parent}' if parent else ''}: ", ", ".join(names)
     if kind == "missing":

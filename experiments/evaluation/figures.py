@@ -87,7 +87,7 @@ def read_curve(folder: str | Path) -> Curve:
         raise RunError(
             f"{folder}: is a fine-tuning, with another count of balls and time; wanted is a training in simulation"
         )
-    return Curve(str(folder), rows, 2 * optimiser.pairs * optimiser.repeats)
+    return Curve(str(folder), rows, 2 * optimiser.num_directions * optimiser.repeats)
 
 
 def draw_curves(path: Path, curves: list[Curve]) -> Path:

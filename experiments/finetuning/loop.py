@@ -189,12 +189,12 @@ class Session:
         entries = []
         # The members take turns, so that a person who tires or warms up is the same to both of a pair.
         for repeat in range(settings.repeats):
-            for member in _order(settings.pairs):
+            for member in _order(settings.num_directions):
                 entry = self._episode((TRAINING, number, member, repeat), members[:, member])
                 if entry is None:
                     return False
                 entries.append(entry)
-        returns = np.zeros(2 * settings.pairs)
+        returns = np.zeros(2 * settings.num_directions)
         for entry in entries:
             returns[entry.member] += entry.returns / settings.repeats
         bgs, info = strategy.tell(self.state.bgs, population, jnp.asarray(returns, jnp.float32), self._bgs)

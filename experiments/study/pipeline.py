@@ -184,7 +184,7 @@ class Loop:
             return training.simulate(self.study, item, folder, human, source, name, self.console, score)
 
         optimiser = self.study.simulation.optimiser
-        work = updates(self.study, item) * optimiser.pairs * optimiser.repeats * self.study.simulation.seeds
+        work = updates(self.study, item) * optimiser.num_directions * optimiser.repeats * self.study.simulation.seeds
         return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run)
 
     def _real(self, seed: int, player: str, item: Real) -> Step:

@@ -70,7 +70,7 @@ class Trainer:
 
     @property
     def episodes_per_update(self) -> int:
-        return 2 * self.bgs_config.pairs * self._repeats
+        return 2 * self.bgs_config.num_directions * self._repeats
 
     def init(
         self,
@@ -93,7 +93,7 @@ class Trainer:
         return self._update.lower(state, self.pool)
 
     def _update_local(self, state: TrainState, pool: BallPool) -> tuple[TrainState, dict[str, jax.Array]]:
-        config, pairs = self.bgs_config, self.bgs_config.pairs
+        config, pairs = self.bgs_config, self.bgs_config.num_directions
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
         population = strategy.ask(direction_key, state.bgs, config)
         columns = pairs if self._crn else 2 * pairs

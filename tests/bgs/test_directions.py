@@ -62,7 +62,7 @@ def test_precision_follows_dtype():
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [((4, 0), "pairs = 0"), ((0, 4), "d = 0"), ((4, 4, True, "unit"), "scale = 'unit'.*sqrt_d.*chi")],
+    [((4, 0), "num_directions = 0"), ((0, 4), "d = 0"), ((4, 4, True, "unit"), "scale = 'unit'.*sqrt_d.*chi")],
 )
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):

@@ -27,7 +27,7 @@ BY_HAND = {
     "max": ((1.0, -1.25), 0.69921875),
 }
 
-_shape = jax.jit(shaping.shape, static_argnames=("keep", "rank", "weighting", "normalise"))
+_shape = jax.jit(shaping.shape, static_argnames=("elite_fraction", "rank", "weighting", "normalise"))
 
 
 def _tell(config, directions=DIRECTIONS, plus=PLUS, minus=MINUS, theta=(1.0, -1.0), dtype=jnp.float32):
@@ -42,7 +42,7 @@ def _update(state, config, directions=DIRECTIONS, plus=PLUS, minus=MINUS):
 
 
 def _config(**options):
-    return bgs.BGSConfig(**{"pairs": 5, "keep": 0.4, "step": optimizers.make("sgd", 0.1)} | options)
+    return bgs.BGSConfig(**{"num_directions": 5, "elite_fraction": 0.4, "step": optimizers.make("sgd", 0.1)} | options)
 
 
 @pytest.mark.parametrize("rank", shaping.RANKS)
@@ -76,7 +76,7 @@ def test_equal_returns_leave_theta_alone():
 
 @pytest.mark.parametrize(("rank", "weighting"), [("abs", "returns"), ("signed", "returns"), ("max", "centered_rank")])
 def test_failed_pair_counts_as_never_evaluated(rank, weighting):
-    config = _config(rank=rank, weighting=weighting, keep=0.5)
+    config = _config(rank=rank, weighting=weighting, elite_fraction=0.5)
     left = [0, 2, 4]
     removed, expected = _tell(config, DIRECTIONS[:, left], PLUS[left], MINUS[left])
     for bad in (np.nan, np.inf, -np.inf):
@@ -89,7 +89,7 @@ def test_failed_pair_counts_as_never_evaluated(rank, weighting):
 
 
 def test_update_with_every_pair_failed_changes_nothing_but_the_counter():
-    config = _config(step=optimizers.make("adam", 0.1), average=0.5)
+    config = _config(step=optimizers.make("adam", 0.1), ema_decay=0.5)
     moving, _ = _tell(config)
     nan = np.full(5, np.nan, np.float32)
     state, info = _update(moving, config, plus=nan, minus=nan)
@@ -99,11 +99,11 @@ def test_update_with_every_pair_failed_changes_nothing_but_the_counter():
 
 
 @pytest.mark.parametrize(
-    ("keep", "pairs", "elites"), [(0.01, 10, 1), (0.3, 200, 60), (0.6, 5, 3), (0.7, 10, 7), (1.0, 4, 4)]
+    ("elite_fraction", "pairs", "elites"), [(0.01, 10, 1), (0.3, 200, 60), (0.6, 5, 3), (0.7, 10, 7), (1.0, 4, 4)]
 )
-def test_number_of_elites(keep, pairs, elites):
+def test_number_of_elites(elite_fraction, pairs, elites):
     plus, minus = np.random.default_rng(0).normal(size=(2, pairs))
-    shaped = _shape(plus, minus, keep)
+    shaped = _shape(plus, minus, elite_fraction)
     assert shaped.n_elites == np.sum(shaped.elites) == elites
 
 
@@ -123,7 +123,7 @@ def test_gradient_of_a_quadratic_is_exact():
         hessian, slope = rng.normal(size=(d, d)), rng.normal(size=d)
         hessian = hessian + hessian.T
         value = lambda x: 0.5 * np.einsum("ib,ij,jb->b", x, hessian, x) + slope @ x  # noqa: E731
-        config = bgs.BGSConfig(pairs=d, keep=1.0, normalise="none", step=optimizers.make("sgd", 1.0))
+        config = bgs.BGSConfig(num_directions=d, elite_fraction=1.0, normalise="none", step=optimizers.make("sgd", 1.0))
         theta = rng.normal(size=d)
         state = bgs.init(theta, config)
         population = bgs.ask(jax.random.key(0), state, config)
@@ -140,7 +140,9 @@ def test_population_is_all_plus_then_all_minus():
 
 
 def test_perturbations_follow_their_schedule():
-    config = bgs.BGSConfig(pairs=1, sigma=optimizers.cosine(0.4, 0.1, 10, hold=0.5), step=optimizers.make("sgd", 1e-9))
+    config = bgs.BGSConfig(
+        num_directions=1, sigma=optimizers.cosine(0.4, 0.1, 10, hold=0.5), step=optimizers.make("sgd", 1e-9)
+    )
     state, spread, one = bgs.init(jnp.zeros(2), config), [], jnp.array([[1.0], [0.0]])
     for _ in range(12):
         population = bgs.perturb(state, one, config)
@@ -157,10 +159,10 @@ _ADAM = optimizers.make("adam", optimizers.cosine(0.1, 0.001, 400), b2=0.99)
 @pytest.mark.parametrize(
     "config",
     [
-        bgs.BGSConfig(pairs=20, step=_PLAIN),
-        bgs.BGSConfig(pairs=20, step=_PLAIN, orthogonal=False),
-        bgs.BGSConfig(pairs=20, step=_ADAM, keep=1.0, average=0.9),
-        bgs.BGSConfig(pairs=20, step=_ADAM, keep=1.0, weighting="centered_rank", scale="chi"),
+        bgs.BGSConfig(num_directions=20, step=_PLAIN),
+        bgs.BGSConfig(num_directions=20, step=_PLAIN, orthogonal=False),
+        bgs.BGSConfig(num_directions=20, step=_ADAM, elite_fraction=1.0, ema_decay=0.9),
+        bgs.BGSConfig(num_directions=20, step=_ADAM, elite_fraction=1.0, weighting="centered_rank", scale="chi"),
     ],
     ids=["plain", "gaussian", "adam", "ranks"],
 )
@@ -200,7 +202,7 @@ def test_update_norm_in_pure_noise():
 
 
 def test_moving_average_in_closed_form():
-    config = _config(average=0.9)
+    config = _config(ema_decay=0.9)
     state = bgs.init(jnp.array([1.0, -1.0]), config)
     expected = 0.9**4 * np.array([1.0, -1.0])
     for t in range(1, 5):
@@ -249,7 +251,9 @@ def test_schedule_advances_with_updates():
 def test_equal_configurations_share_one_compilation():
     before = strategy._sample._cache_size(), bgs.tell._cache_size()
     for seed in range(3):
-        config = bgs.BGSConfig(pairs=7, step=optimizers.make("adam", optimizers.cosine(0.01, 0.001, 50)), average=0.98)
+        config = bgs.BGSConfig(
+            num_directions=7, step=optimizers.make("adam", optimizers.cosine(0.01, 0.001, 50)), ema_decay=0.98
+        )
         state = bgs.init(jnp.zeros(11), config)
         for key in jax.random.split(jax.random.key(seed), 3):
             state, _ = bgs.tell(state, bgs.ask(key, state, config), jax.random.normal(key, 14), config)
@@ -259,17 +263,17 @@ def test_equal_configurations_share_one_compilation():
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("pairs", 0),
-        ("pairs", 2.5),
+        ("num_directions", 0),
+        ("num_directions", 2.5),
         ("sigma", 0.0),
         ("sigma", math.nan),
-        ("keep", 0.0),
-        ("keep", 1.1),
+        ("elite_fraction", 0.0),
+        ("elite_fraction", 1.1),
         ("rank", "top"),
         ("weighting", "z"),
         ("normalise", "max"),
         ("scale", "unit"),
-        ("average", 1.0),
+        ("ema_decay", 1.0),
         ("step", "adam"),
     ],
 )

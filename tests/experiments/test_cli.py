@@ -28,7 +28,7 @@ EXPERIMENT = """
 name: tiny
 balls: player5/M0
 task: {max_steps: 60, sim_rate: 75.0}
-optimiser: {pairs: 2, repeats: 2}
+optimiser: {num_directions: 2, repeats: 2}
 training: {updates: 3, pool: 64, evaluate_every: 2, evaluate_episodes: 8, devices: 1}
 evaluation: {episodes: 8, reachable_balls: null}
 """

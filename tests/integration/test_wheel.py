@@ -13,7 +13,13 @@ import pytest
 from tests.support.paths import ROOT
 
 PACKAGES = ("ballmodel", "bgs", "mjx_tt", "robot_io", "experiments")
-SMALL = ("task.max_steps=60", "optimiser.pairs=2", "optimiser.repeats=2", "training.updates=3", "training.pool=64")
+SMALL = (
+    "task.max_steps=60",
+    "optimiser.num_directions=2",
+    "optimiser.repeats=2",
+    "training.updates=3",
+    "training.pool=64",
+)
 SHORT = ("training.max_minutes=null", "training.devices=1", "evaluation.episodes=8", "evaluation.reachable_balls=null")
 
 

@@ -159,7 +159,7 @@ class VirtualReality:
             theta = jnp.repeat(population.members, settings.repeats, axis=1)  # the lanes of a member side by side
             shot_key = jax.random.fold_in(play_key, state.updates)
             rally, shots = self.simulator.shots(Policy(theta, *frozen), player, model, rally, shot_key)
-            returns = self._returns(shots).reshape(2 * settings.pairs, settings.repeats).mean(axis=1)
+            returns = self._returns(shots).reshape(2 * settings.num_directions, settings.repeats).mean(axis=1)
             state, info = strategy.tell(state, population, returns, config)
             return (state, rally), (shots, info)
 

@@ -189,7 +189,7 @@ SMALL = {
         "evaluation": {"episodes": 512, "sim_rate": 75},
     },
     "reality": {"ball_spin": {"mean_x": 300.0}},
-    "algorithms": {"ES": {"kind": "bgs", "optimiser": {"pairs": 2, "repeats": 2}}},
+    "algorithms": {"ES": {"kind": "bgs", "optimiser": {"num_directions": 2, "repeats": 2}}},
     "budget": {"episodes": 40},
     "curve": {"points": 2, "episodes": 512},
 }
@@ -229,7 +229,7 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
     assert missing("seeds=[0, 3]") == {"ES": [3]}
     assert missing("algorithms.P={kind: ppo}") == {"ES": [], "P": [0]}
     assert missing("reality.ball_spin.mean_x=100.0") == {"ES": [0]}  # to be evaluated again
-    for override in ("budget.episodes=80", "algorithms.ES.optimiser.pairs=3", "experiment.balls=narrow"):
+    for override in ("budget.episodes=80", "algorithms.ES.optimiser.num_directions=3", "experiment.balls=narrow"):
         with pytest.raises(RunError, match="ES/seed0.*other settings of (budget|algorithm|balls);"):
             missing(override)
 

@@ -51,7 +51,11 @@ def test_shipped_experiments_load_and_fit_the_schema(path):
 
 
 def test_schema_refuses_what_the_program_refuses():
-    for data in (with_value("trainin", {}), with_value("task.engine", "fast"), with_value("optimiser.keep", 0)):
+    for data in (
+        with_value("trainin", {}),
+        with_value("task.engine", "fast"),
+        with_value("optimiser.elite_fraction", 0),
+    ):
         with pytest.raises(jsonschema.ValidationError):
             jsonschema.validate(data, config.json_schema())
 
@@ -64,7 +68,10 @@ def test_schema_refuses_what_the_program_refuses():
         ("training.updates", 0, "training.updates: got 0", "greater than or equal to 1"),
         ("training.updates", "10", "training.updates: got '10'", "integer"),
         ("training.devices", "all", "training.devices: got 'all'", "integer or 'auto'"),
-        ("optimiser.pairs", True, "optimiser.pairs: got True", "integer"),
+        ("optimiser.num_directions", True, "optimiser.num_directions: got True", "integer"),
+        ("optimiser.keep", 0.3, "optimiser.keep: now called elite_fraction", ""),
+        ("optimiser.pairs", 5, "optimiser.pairs: now called num_directions", ""),
+        ("optimiser.average", 0.9, "optimiser.average: now called ema_decay", ""),
         ("optimiser.sigma", float("nan"), "optimiser.sigma: got nan", "finite"),
         ("optimiser.rank", "singed", "optimiser.rank: got 'singed'", "did you mean 'signed'?"),
         (
@@ -216,7 +223,13 @@ def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_curr
 def test_paper_settings_are_the_papers():
     """The table of hyper-parameters in the paper's appendix."""
     bgs = build.experiment(config.load(config.shipped()["paper"]), "paper").bgs
-    assert (bgs.pairs, bgs.sigma, bgs.keep, bgs.orthogonal, bgs.average) == (200, 0.025, 0.3, True, 0.0)
+    assert (bgs.num_directions, bgs.sigma, bgs.elite_fraction, bgs.orthogonal, bgs.ema_decay) == (
+        200,
+        0.025,
+        0.3,
+        True,
+        0.0,
+    )
     assert config.load(config.shipped()["paper"]).optimiser.repeats == 15
     falling = config.load(config.shipped()["player3_m2"])
     sigma = build.experiment(falling, "player3_m2").bgs.sigma

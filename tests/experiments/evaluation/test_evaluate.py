@@ -196,4 +196,4 @@ def test_what_has_no_learning_curve_is_named(tmp_path):
         figures.read_curve(run.folder)
     run.metrics.write_text(json.dumps(rising()[0]) + "\n")
     optimiser = run.config().optimiser
-    assert figures.read_curve(run.folder).balls == 2 * optimiser.pairs * optimiser.repeats
+    assert figures.read_curve(run.folder).balls == 2 * optimiser.num_directions * optimiser.repeats

@@ -102,7 +102,7 @@ def quiet() -> Console:
 
 
 def tune(source: Path, folder: Path, robot, operator=None, **settings):
-    wanted = {"updates": 3, "pairs": 3, "repeats": 2, "evaluation_balls": 4} | settings
+    wanted = {"updates": 3, "num_directions": 3, "repeats": 2, "evaluation_balls": 4} | settings
     return loop.finetune(source, FineTuning(**wanted), Run(folder), robot, quiet(), operator)
 
 
@@ -121,7 +121,7 @@ def last_theta(folder: Path) -> np.ndarray:
 
 def test_the_defaults_are_the_papers_real_settings():
     chosen = finetuning.load()
-    assert (chosen.step.learning_rate, chosen.sigma, chosen.pairs, chosen.repeats, chosen.keep) == (
+    assert (chosen.step.learning_rate, chosen.sigma, chosen.num_directions, chosen.repeats, chosen.elite_fraction) == (
         0.00375,
         0.025,
         5,
@@ -141,16 +141,17 @@ def test_the_defaults_are_the_papers_real_settings():
 
 def test_settings_come_from_file_then_command_line(tmp_path):
     path = tmp_path / "tuning.yaml"
-    path.write_text("updates: 12\npairs: 7\n")
-    chosen = finetuning.load(path, ("pairs=9", "step.learning_rate=0.001"))
-    assert (chosen.updates, chosen.pairs, chosen.repeats, chosen.step.learning_rate) == (12, 9, 3, 0.001)
+    path.write_text("updates: 12\nnum_directions: 7\n")
+    chosen = finetuning.load(path, ("num_directions=9", "step.learning_rate=0.001"))
+    assert (chosen.updates, chosen.num_directions, chosen.repeats, chosen.step.learning_rate) == (12, 9, 3, 0.001)
 
 
 @pytest.mark.parametrize(
     "data, named",
     [
-        ({"pair": 5}, "pairs"),
-        ({"keep": 0.0}, "keep"),
+        ({"repeat": 5}, "repeats"),
+        ({"pairs": 5}, "pairs: now called num_directions"),
+        ({"elite_fraction": 0.0}, "elite_fraction"),
         ({"rewards": "sim"}, "real"),
         ({"rewards": {"base": "real", "jerk": 0.3}}, "jerk"),
     ],
@@ -178,7 +179,7 @@ def test_reward_terms_of_a_real_episode():
 
 def test_an_update_follows_the_journal_by_the_papers_rule(source, tmp_path):
     """theta and every member are computed again in NumPy from the returns in the journal."""
-    toy, settings = Toy(fault_at=9), FineTuning(updates=2, pairs=3, repeats=2, evaluation_balls=2)
+    toy, settings = Toy(fault_at=9), FineTuning(updates=2, num_directions=3, repeats=2, evaluation_balls=2)
     tune(source, tmp_path / "run", toy, updates=2, evaluation_balls=2)
     theta = load_policy.load(source).policy.theta.astype(np.float32)
     bgs = build.bgs_config(settings.optimiser(), 2)
@@ -211,7 +212,7 @@ def test_an_update_follows_the_journal_by_the_papers_rule(source, tmp_path):
 
 
 def test_it_climbs_and_the_report_says_so(source, tmp_path):
-    easy = {"updates": 150, "pairs": 8, "repeats": 1, "keep": 1.0, "evaluation_balls": 10}
+    easy = {"updates": 150, "num_directions": 8, "repeats": 1, "elite_fraction": 1.0, "evaluation_balls": 10}
     report = tune(source, tmp_path / "run", Toy(), **easy)
     assert report["difference"]["paired"] and report["difference"]["significant"]
     assert report["difference"]["low"] > 0
@@ -225,7 +226,7 @@ def test_it_climbs_and_the_report_says_so(source, tmp_path):
 
 def test_the_artefact_is_what_the_robot_played_last(source, tmp_path):
     toy = Toy()
-    tune(source, tmp_path / "run", toy, average=0.5)
+    tune(source, tmp_path / "run", toy, ema_decay=0.5)
     exported = artefacts.load(tmp_path / "run" / "artefact")
     theta, mean, inverse_scale, _ = toy.played[-1]
     np.testing.assert_array_equal(exported.policy.mean, mean)
@@ -279,7 +280,7 @@ def test_killed_at_random_moments_it_ends_in_the_same_parameters(source, tmp_pat
 
 def lock_step_run(source: str, folder: str) -> None:
     """In a process of its own: a few balls on the emulated robot."""
-    settings = FineTuning(updates=2, pairs=2, repeats=1, evaluation_balls=2)
+    settings = FineTuning(updates=2, num_directions=2, repeats=1, evaluation_balls=2)
     loop.finetune(source, settings, Run(folder), LockStepRobot(throws()), Console())
 
 

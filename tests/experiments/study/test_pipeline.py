@@ -54,13 +54,13 @@ TINY = {
     "first_balls": 60,
     "simulation": {
         "task": {"max_steps": 60, "sim_rate": 150.0},
-        "optimiser": {"pairs": 2, "repeats": 2, "step": {"schedule": {"kind": "constant"}}},
+        "optimiser": {"num_directions": 2, "repeats": 2, "step": {"schedule": {"kind": "constant"}}},
         "pool": 64,
         "seeds": 1,
         "devices": 1,
         "rounds": [{"simulated": 6, "real": 2}, {"simulated": 3, "real": 4}, {"simulated": 3, "real": 4}],
     },
-    "fine_tuning": {"pairs": 5, "repeats": 1},
+    "fine_tuning": {"num_directions": 5, "repeats": 1},
     "reality": {"sim_rate": 75.0, "without": ["drives", "encoders"]},  # compiles in half the time
     "fresh": False,
     "ablation": None,
@@ -99,7 +99,7 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
     assert [r.real for r in shipped.simulation.rounds] == [60, 70, 70]
     assert len(shipped.players) == 5
     tuning = shipped.fine_tuning
-    settings = (tuning.pairs, tuning.repeats, tuning.keep, tuning.sigma, tuning.step.learning_rate)
+    settings = (tuning.num_directions, tuning.repeats, tuning.elite_fraction, tuning.sigma, tuning.step.learning_rate)
     assert settings == (5, 3, 0.6, 0.025, 0.00375)
     assert name not in experiment.shipped() and "quickstart" in experiment.shipped()
 
@@ -303,7 +303,7 @@ def test_an_update_is_the_papers_formula_of_what_the_robot_measures(virtual):
     cycle = virtual.fine_tune(person, theta, statistics, 2, key, "test")
     ask_key, rally_key, play_key, _ = jax.random.split(key, 4)
     tuning = study().fine_tuning
-    pairs, lanes = tuning.pairs, tuning.episodes_per_update
+    pairs, lanes = tuning.num_directions, tuning.episodes_per_update
     settings = build.bgs_config(tuning.optimiser(), 2)
     frozen = [np.repeat(np.asarray(x)[:, None], lanes, axis=1) for x in normalizer.normaliser(statistics)]
     rally = virtual.simulator.start(person, virtual.known, rally_key, lanes)
@@ -581,7 +581,7 @@ def test_a_folder_belongs_to_one_study(finished):
 @pytest.mark.slow
 def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
     """The emulated robot in lock-step; then the scoring sheet, by hand."""
-    tuning = {"pairs": 1, "repeats": 1, "evaluation_balls": 2}
+    tuning = {"num_directions": 1, "repeats": 1, "evaluation_balls": 2}
     small = [{"simulated": 2, "real": 1}] * 3
     what = study(
         robot="lockstep",

@@ -20,7 +20,7 @@ EXPERIMENT = """
 name: tiny
 balls: player5/M0
 task: {max_steps: 60, sim_rate: 75.0}
-optimiser: {pairs: 2, repeats: 2}
+optimiser: {num_directions: 2, repeats: 2}
 training: {updates: %d, pool: 64, evaluate_every: null, checkpoint_seconds: 0.2, devices: 1}
 """
 # The training itself without what follows it; a limit on the size of files stands for a full disk.

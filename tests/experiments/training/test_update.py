@@ -25,7 +25,7 @@ from mjx_tt.sim.model import SimModel
 
 PAIRS, REPEATS = 4, 2
 TASK = TaskConfig(sim_rate=75.0)  # one substep: compiles in half the time
-BGS = BGSConfig(pairs=PAIRS, sigma=0.05, keep=1.0, step=optimizers.make("sgd", 0.01))
+BGS = BGSConfig(num_directions=PAIRS, sigma=0.05, elite_fraction=1.0, step=optimizers.make("sgd", 0.01))
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ TINY = """
 name: tiny
 balls: narrow
 task: {{engine: {engine}}}
-optimiser: {{pairs: 1, repeats: 1, sigma: 1.0e-12, common_random_numbers: true}}
+optimiser: {{num_directions: 1, repeats: 1, sigma: 1.0e-12, common_random_numbers: true}}
 training: {{pool: 16, devices: 1}}
 """
 
