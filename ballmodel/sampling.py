@@ -118,6 +118,7 @@ def throw(
         new, events = step(params, state, dt)
         active = outcome == UNDECIDED
         first = active & events.table & ~bounced
+        # strict=False: the height of a bounce on the table is known.
         x, y = (jnp.where(first, now, before) for now, before in zip(events.position, (x, y), strict=False))
         in_box = (x >= landing_min[0]) & (x <= landing_max[0]) & (y >= landing_min[1]) & (y <= landing_max[1])
         outcome = jnp.where(active & events.net, HITS_NET, outcome)

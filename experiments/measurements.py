@@ -23,7 +23,7 @@ def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
         return parts[0]
     kinds = ", ".join(
         f"{path}: {'trajectories' if isinstance(p, Dataset) else 'states'}"
-        for path, p in zip(paths, parts, strict=False)
+        for path, p in zip(paths, parts, strict=True)
     )
     raise ConfigError(f"several files must all hold trajectories ({kinds}); fit the others one by one")
 
@@ -42,5 +42,5 @@ def write_csv(path: Path, dataset: Dataset) -> None:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for trajectory in dataset:
-            rows = zip(trajectory.time, *trajectory.position, strict=False)
+            rows = zip(trajectory.time, *trajectory.position, strict=True)
             writer.writerows((trajectory.session, trajectory.name, *(repr(float(v)) for v in row)) for row in rows)

@@ -53,7 +53,7 @@ class Arena:
         """Every ball of ``balls`` (``draw_balls``) once; NumPy arrays (..., R, P)."""
         chunks = _chunks(balls)
         keys = jax.random.split(key, len(chunks))
-        parts = [jax.tree.map(np.asarray, self._play(controller, *given)) for given in zip(chunks, keys, strict=False)]
+        parts = [jax.tree.map(np.asarray, self._play(controller, *given)) for given in zip(chunks, keys, strict=True)]
         episodes = [replace(part, observation_sums=0.0, observation_counts=0) for part in parts]
         return jax.tree.map(lambda *x: np.concatenate(x, axis=-2) if np.ndim(x[0]) else x[0], *episodes)
 

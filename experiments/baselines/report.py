@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ def write(folder: Path, comparison: Comparison) -> None:
         name: {seed: _run(folder / name / f"seed{seed}") for seed in comparison.seeds} for name in comparison.algorithms
     }
     summary = {name: _summary(seeds) for name, seeds in found.items()}
-    colours = dict(zip(found, COLOURS * (1 + len(found) // len(COLOURS)), strict=False))
+    colours = dict(zip(found, cycle(COLOURS), strict=False))
     run_dir.write_json(folder / "comparison.json", {"name": comparison.name, "algorithms": summary})
     _write_curves(folder / "curves.csv", found)
     with plt.rc_context(STYLE):
@@ -77,7 +78,7 @@ def _summary(seeds: dict[int, dict[str, Any]]) -> dict[str, Any]:
     for world in WORLDS:
         parts = [run[world] for run in seeds.values()]
         balls, returned = (
-            sum(count) for count in zip(*((p["episodes"], p["outcomes"]["returned"]) for p in parts), strict=False)
+            sum(count) for count in zip(*((p["episodes"], p["outcomes"]["returned"]) for p in parts), strict=True)
         )
         low, high = wilson(returned, balls)
         worlds[world] = {
@@ -112,8 +113,8 @@ def _curves(found: Runs, colours: Colours, clock: str) -> Figure:
     """Rates and mean return against episodes and against training time."""
     figure, grid = plt.subplots(3, 2, figsize=(11, 9), sharex="col", sharey="row")
     measures = {"return_rate": "returned", "hit_rate": "touched", "mean_return": "mean return"}
-    for row, (measure, label) in zip(grid, measures.items(), strict=False):
-        for axes, x in zip(row, ("episodes", "seconds" if clock == "wall" else "cpu_seconds"), strict=False):
+    for row, (measure, label) in zip(grid, measures.items(), strict=True):
+        for axes, x in zip(row, ("episodes", "seconds" if clock == "wall" else "cpu_seconds"), strict=True):
             for name, seeds in found.items():
                 for i, run in enumerate(seeds.values()):
                     # A logarithmic axis has no place for the evaluation before any episode.
@@ -154,9 +155,9 @@ def _bars(axes: Axes, heights: dict[str, float], colours: Colours) -> np.ndarray
 
 def _transfer(summary: Summary, colours: Colours) -> Figure:
     figure, row = plt.subplots(1, 2, figsize=(11, 4.2), sharey=True)
-    for axes, (world, title) in zip(row, WORLDS.items(), strict=False):
+    for axes, (world, title) in zip(row, WORLDS.items(), strict=True):
         place = _bars(axes, {name: part[world]["return_rate"] for name, part in summary.items()}, colours)
-        for at, part in zip(place, summary.values(), strict=False):
+        for at, part in zip(place, summary.values(), strict=True):
             found = part[world]
             rate, below = found["return_rate"], found["return_rate"] - found["low"]
             axes.errorbar(at, rate, [[below], [found["high"] - rate]], color=INK, capsize=4)
@@ -177,7 +178,7 @@ def _transfer(summary: Summary, colours: Colours) -> Figure:
 
 def _restlessness(summary: Summary, colours: Colours) -> Figure:
     figure, row = plt.subplots(1, len(RESTLESSNESS), figsize=(3.2 * len(RESTLESSNESS), 3.6))
-    for axes, (key, title) in zip(row, RESTLESSNESS.items(), strict=False):
+    for axes, (key, title) in zip(row, RESTLESSNESS.items(), strict=True):
         _bars(axes, {name: part["restlessness"][key] or 0.0 for name, part in summary.items()}, colours)
         axes.set_title(title, fontsize=9)
         axes.tick_params(axis="x", labelrotation=45)

@@ -103,7 +103,7 @@ def _landing_map(played: Played) -> Figure:
     _table(axes)
     for outcome, colour, label in ((HIT, HIT_COLOUR, "touched, not returned"), (RETURNED, RETURNED_COLOUR, "returned")):
         chosen = (result.outcome == outcome) & result.finite
-        x, y = (np.clip(v, *frame) for v, frame in zip(result.landing[:, chosen], LANDING_FRAME, strict=False))
+        x, y = (np.clip(v, *frame) for v, frame in zip(result.landing[:, chosen], LANDING_FRAME, strict=True))
         axes.scatter(x, y, s=9, color=colour, alpha=0.55, linewidth=0, label=f"{label} ({chosen.sum():,})")
     missed = int(np.sum(result.outcome == MISSED))
     axes.set_xlim(*LANDING_FRAME[0])
@@ -133,7 +133,7 @@ def _return_rate_map(played: Played) -> Figure:
     _table(axes)
     shown = np.ma.masked_where(count < FEWEST_BALLS, rate)
     mesh = axes.pcolormesh(*edges, shown.T, cmap="RdYlGn", vmin=0, vmax=1, edgecolor="white", linewidth=0.6, zorder=2)
-    for i, j in zip(*np.nonzero(count >= FEWEST_BALLS), strict=False):
+    for i, j in zip(*np.nonzero(count >= FEWEST_BALLS), strict=True):
         centre = (edges[0][i] + edges[0][i + 1]) / 2, (edges[1][j] + edges[1][j + 1]) / 2
         colour = INK if 0.15 < rate[i, j] < 0.88 else "white"
         axes.text(*centre, f"{100 * rate[i, j]:.0f}", ha="center", va="center", fontsize=7, color=colour, zorder=3)
@@ -152,7 +152,7 @@ def _rewards(terms: dict[str, float | None], weights: tuple[float, ...]) -> Figu
     place = np.arange(len(names))
     axes.barh(place, np.nan_to_num(weighted), color=[RETURNED_COLOUR if v >= 0 else MISSED_COLOUR for v in weighted])
     axes.axvline(0, color=INK, linewidth=0.8)
-    for i, (value, weight) in enumerate(zip(values, weights, strict=False)):
+    for i, (value, weight) in enumerate(zip(values, weights, strict=True)):
         end = max(np.nan_to_num(weighted[i]), 0)
         axes.text(end, i, f"  {value:.3g} x {weight:g}", va="center", fontsize=8, color=INK)
     axes.set_yticks(place, [name.replace("_", " ") for name in names])
@@ -233,14 +233,14 @@ def _curves(curves: list[Curve]) -> Figure:
         played = curve.balls * np.array([row["update"] for row in curve.rows])
         rate = _smooth(curve.rows, "return_rate")
         evaluated = np.array(["evaluation/return_rate" in row for row in curve.rows])
-        at = [row["evaluation/return_rate"] for row, there in zip(curve.rows, evaluated, strict=False) if there]
-        for axes, x in zip(panels, (minutes, played), strict=False):
+        at = [row["evaluation/return_rate"] for row, there in zip(curve.rows, evaluated, strict=True) if there]
+        for axes, x in zip(panels, (minutes, played), strict=True):
             axes.plot(x, rate, color=colour, label=f"{curve.name}, perturbed")
             if at:
                 axes.plot(
                     x[evaluated], at, "o--", color=colour, markersize=4, linewidth=1, label=f"{curve.name}, evaluated"
                 )
-    for axes, label in zip(panels, ("training time [min]", "balls"), strict=False):
+    for axes, label in zip(panels, ("training time [min]", "balls"), strict=True):
         axes.set_xscale("log")
         axes.set_xlim(left=max(line.get_xdata()[-1] for line in axes.lines) / 1000)  # the first updates say nothing
         axes.xaxis.set_major_formatter(lambda v, _: f"{v:,g}" if v < 1e6 else f"{v / 1e6:g} million")

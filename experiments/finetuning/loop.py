@@ -135,7 +135,7 @@ class Session:
     ) -> None:
         self._settings, self._run, self._robot, self._operator = settings, run, robot, operator
         self._bgs = build.bgs_config(settings.optimiser(), settings.updates)
-        self._weights = dict(zip(rewards.TERMS, build.reward_weights(settings.rewards), strict=False))
+        self._weights = dict(zip(rewards.TERMS, build.reward_weights(settings.rewards), strict=True))
         found = checkpoint.load_latest(run.checkpoints, first)
         self.state, notes = found or (first, {"update": 0, "seconds": 0.0})
         self.update, self._seconds = notes["update"], notes["seconds"]

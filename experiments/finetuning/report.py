@@ -182,7 +182,7 @@ def _figure(entries: list[Entry], result: dict[str, Any], title: str) -> Figure:
         ):
             lower.plot(updates, smooth(column[name]), color=colour, label=label, linewidth=1.5)
     ends = (0, result["updates"] + 1)
-    for at, name in zip(ends, (BEFORE, AFTER), strict=False):
+    for at, name in zip(ends, (BEFORE, AFTER), strict=True):
         e = result[name]
         bars = [[e["mean_return"] - e["low"]], [e["high"] - e["mean_return"]]]
         legend = f"evaluated policy, {e['balls']} balls, 95 %" if name == BEFORE else None

@@ -49,7 +49,7 @@ def play(
     policy = jax.tree.map(lambda *arrays: spread(arrays), *policies)
     people = human_player.stack([reality.player(evaluator) for _, evaluator, _ in pairings])
     person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), people)
-    low, high = (spread(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes)), strict=False))
+    low, high = (spread(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes)), strict=True))
     rallies = settings.rallies // lanes
     result = reality.simulator.play(
         policy,
@@ -94,7 +94,7 @@ def play_without(
         return jnp.tile(jnp.repeat(each, lanes, axis=-1), len(worlds))
 
     policy = jax.tree.map(lambda *arrays: per_model(arrays), *policies)
-    low, high = (per_model(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes)), strict=False))
+    low, high = (per_model(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes)), strict=True))
     person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), human_player.stack(people))
     world = realities.side_by_side(worlds, len(models) * lanes)
     result = reality.simulator.play(
@@ -135,7 +135,7 @@ def rallies_of(
 ) -> scoring.Rallies:
     """All rallies as scored lines; the sessions of a pairing count as one, their rallies in turn."""
     parts = []
-    for i, (pairing, code) in enumerate(zip(pairings, codes, strict=False)):
+    for i, (pairing, code) in enumerate(zip(pairings, codes, strict=True)):
         mine = slice(i * lanes, (i + 1) * lanes)
         parts.append(scoring.scored(seed, *pairing, code, result.length[:, mine].ravel(), result.end[:, mine].ravel()))
     return scoring.join(parts)

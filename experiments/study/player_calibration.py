@@ -291,7 +291,7 @@ def picture(path: Path, rows: list[Row], lengths: list[Row]) -> None:
     names, coordinates = list(dict.fromkeys(r["player"] for r in rows)), [n.removesuffix(" min") for n in NUMBERS[::2]]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(3, 3, figsize=(12.5, 9.5), layout="constrained")
-        for axis, coordinate in zip(axes.flat, coordinates, strict=False):
+        for axis, coordinate in zip(axes.flat[: len(coordinates)], coordinates, strict=True):
             for p, name in enumerate(names):
                 for m, model in enumerate(ROUNDS):
                     chosen = [r for r in rows if r["player"] == name and r["model"] == model]

@@ -187,7 +187,7 @@ def _with_values(node: Any, values: Mapping[str, Any]) -> Any:
 
 def draw(key: Key[Array, ""], model: SimModel, randomise: tuple[Range, ...], shape: tuple[int, ...]) -> SimModel:
     """The model with every range drawn uniformly for a batch of ``shape`` episodes."""
-    keys = jax.random.split(key, max(len(randomise), 1))
+    keys = jax.random.split(key, max(len(randomise), 1))  # one is left over where nothing is randomised
     drawn = {
         r.path: jax.random.uniform(k, shape, minval=r.low, maxval=r.high) for r, k in zip(randomise, keys, strict=False)
     }

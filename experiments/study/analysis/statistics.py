@@ -163,9 +163,7 @@ def _standardised(
     rallies: Rallies, group: Callable[[Cell], tuple[int | str, ...]], own_only: bool = False
 ) -> np.ndarray:
     length = rallies.length.astype(float)
-    columns = zip(
-        *(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")), strict=False
-    )
+    columns = zip(*(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")), strict=True)
     names = [group(cell) for cell in columns]
     out, own = np.full(length.size, np.nan), rallies.own
     index: dict[tuple[int | str, ...], list[int]] = {}

@@ -236,7 +236,7 @@ def _missing(study: Study) -> list[str]:
     if absent:
         out.append(f"players {', '.join(absent)}")
     r = study.rallies
-    there = set(zip(r.seed.tolist(), r.trainer.tolist(), r.evaluator.tolist(), r.model.tolist(), strict=False))
+    there = set(zip(r.seed.tolist(), r.trainer.tolist(), r.evaluator.tolist(), r.model.tolist(), strict=True))
     for seed in study.seeds:
         for player in study.players:
             lacking = [m for m in TEN if (seed, player, player, m) not in there]
@@ -274,7 +274,7 @@ def counted(rallies: scoring.Rallies) -> dict[tuple[int, str, str, str], int]:
     out: dict[tuple[int, str, str, str], int] = {}
     for s, t, e, m, f in zip(
         *(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model", "filtered")),
-        strict=False,
+        strict=True,
     ):
         out[s, t, e, m] = out.get((s, t, e, m), 0) + (not f)
     return out

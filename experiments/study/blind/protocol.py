@@ -62,7 +62,7 @@ def draw(models: Iterable[str], rng: np.random.Generator) -> dict[str, str]:
     models = list(models)
     if len(set(models)) < len(models):
         raise ValueError(f"each model once, got {', '.join(models)}")
-    return {models[k]: code for code, k in zip(codes(len(models)), rng.permutation(len(models)).tolist(), strict=False)}
+    return {models[k]: code for code, k in zip(codes(len(models)), rng.permutation(len(models)).tolist(), strict=True)}
 
 
 def seal(path: Path, content: Any) -> str:
@@ -302,7 +302,7 @@ def open_key(folder: Path) -> scoring.Rallies:
     for model, code in key["codes"].items():
         if artefact.load(folder / POLICIES / code).digest != key["digests"][model]:
             raise ConfigError(f"{folder / POLICIES / code}: is not the policy that was sealed under this code")
-        rally, length, end = (np.array(column, int) for column in zip(*map(astuple, sheet[code]), strict=False))
+        rally, length, end = (np.array(column, int) for column in zip(*map(astuple, sheet[code]), strict=True))
         one = scoring.scored(key["seed"], key["trainer"], key["evaluator"], model, code, length, end)
         parts.append(replace(one, rally=rally))
     rallies = scoring.join(parts)

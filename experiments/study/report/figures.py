@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -86,12 +88,12 @@ def aggregated(study: Study, m: Measurements) -> Figure | None:
 def _histogram(axes: Axes, m: Measurements) -> None:
     edges = np.array([2, *range(5, LONGEST + 1, 5), LONGEST + 1])
     shown = ("is2r-ft100", "s2r-ft100")
-    for key, offset in zip(shown, (-0.21, 0.21), strict=False):
+    for key, offset in zip(shown, (-0.21, 0.21), strict=True):
         values = lengths(m.raw, key, "all")
         if values.size:
             share = np.histogram(np.clip(values, edges[0], LONGEST), edges)[0] / values.size
             axes.bar(np.arange(share.size) + offset, 100 * share, 0.4, color=colour(key), label=SHORT[key])
-    names = [f"{a}-{b - 1}" for a, b in zip(edges[:-2], edges[1:-1], strict=False)] + [f"{LONGEST}+"]
+    names = [f"{a}-{b - 1}" for a, b in pairwise(edges[:-1])] + [f"{LONGEST}+"]
     axes.set_xticks(range(len(names)), names, rotation=60, fontsize=8)
     axes.set_xlabel("rally length")
     axes.set_ylabel("rallies [%]")
@@ -122,7 +124,7 @@ def by_skill(study: Study, m: Measurements) -> Figure | None:
     if not has(m.raw, FINAL):
         return None
     figure = Figure(figsize=(11, 6.8))
-    for column, (upper, lower) in zip(LEVELS, figure.subplots(2, 3).T, strict=False):
+    for column, (upper, lower) in zip(LEVELS, figure.subplots(2, 3).T, strict=True):
         boxes(upper, [lengths(m.raw, key, column) for key in FINAL], FINAL, "rally length", log=True)
         upper.set_title(level_label(column))
         bars(lower, [mean_of(m.raw, key, column) for key in FINAL], FINAL, "mean rally length, 95 %")
@@ -135,8 +137,8 @@ def checkpoints(study: Study, m: Measurements, normalise: bool = False) -> Figur
     if not has(m.raw, (*TEN, *filter(None, CURVES[FRESH]))):
         return None
     figure = Figure(figsize=(11, 4.2))
-    for axes, name in zip(figure.subplots(1, 3), LEVELS, strict=False):
-        shift = dict(zip(CURVES, (-0.06, 0.06, 0.0, -0.14), strict=False))
+    for axes, name in zip(figure.subplots(1, 3), LEVELS, strict=True):
+        shift = dict(zip(CURVES, (-0.06, 0.06, 0.0, -0.14), strict=True))
         for method, keys in CURVES.items():
             found = [
                 (i, key, mean)
@@ -151,7 +153,7 @@ def checkpoints(study: Study, m: Measurements, normalise: bool = False) -> Figur
             axes.errorbar(
                 x, y, err, color=COLOUR[method], linestyle="--" if dashed else "-", linewidth=1.6, capsize=2.5
             )
-            for at, value, (_, key, _) in zip(x, y, found, strict=False):
+            for at, value, (_, key, _) in zip(x, y, found, strict=True):
                 full = BY_KEY[key].fine_tuned
                 axes.plot(
                     at,
@@ -231,7 +233,7 @@ def cross_by_player(study: Study, m: Measurements) -> Figure | None:
     trainers = study.players
     figure = Figure(figsize=(10, 2.2 * len(trainers)))
     grid = figure.subplots(len(trainers), 2, squeeze=False)
-    for (left, right), trainer in zip(grid, trainers, strict=False):
+    for (left, right), trainer in zip(grid, trainers, strict=True):
         evaluators = (trainer, *CROSS[trainer])
         for axes, boot in ((left, m.raw), (right, m.cross_normalised)):
             for i, evaluator in enumerate(evaluators):
@@ -256,7 +258,7 @@ def by_player(study: Study, m: Measurements) -> Figure | None:
         return None
     figure = Figure(figsize=(11, 2.35 * len(study.players)))
     grid = figure.subplots(len(study.players), 2, squeeze=False)
-    for row, ((left, right), player) in enumerate(zip(grid, study.players, strict=False)):
+    for row, ((left, right), player) in enumerate(zip(grid, study.players, strict=True)):
         last = row == len(study.players) - 1
         bars(left, [evaluated(m.raw, player, player, key) for key in TEN], TEN, "mean, 95 %", last)
         boxes(right, [of_player(m.raw, player, key) for key in TEN], TEN, "rally length", log=True, labelled=last)

@@ -62,9 +62,9 @@ def zero_shot(study: Study, m: Measurements) -> Figure | None:
         return None
     figure = Figure(figsize=(11, 3.8))
     names = ("sim 1 → 35 %", "sim 2 → 65 %", "sim 3 → 100 %", "Oracle")
-    for axes, name in zip(figure.subplots(1, 3), LEVELS, strict=False):
+    for axes, name in zip(figure.subplots(1, 3), LEVELS, strict=True):
         for k, pair in enumerate(PAIRS):
-            for key, offset in zip(pair, (-0.2, 0.2), strict=False):
+            for key, offset in zip(pair, (-0.2, 0.2), strict=True):
                 bar(axes, k + offset, mean_of(m.raw, key, name), colour(key), 0.38)
         axes.set_xticks(range(len(PAIRS)), names, fontsize=7)
         axes.set_title(level_label(name))
@@ -92,7 +92,7 @@ def fine_tuning(study: Study, m: Measurements) -> Figure | None:
     if not any(curves.values()):
         return None
     figure = Figure(figsize=(11, 3.8))
-    for axes, name in zip(figure.subplots(1, 3, sharey=True), LEVELS, strict=False):
+    for axes, name in zip(figure.subplots(1, 3, sharey=True), LEVELS, strict=True):
         for method in CYCLES:
             found = curves[name, method]
             for curve in found:
@@ -216,7 +216,7 @@ def ends(study: Study, m: Measurements) -> Figure | None:
             shares,
             (colour(key), "#bdbdbd", "#ffffff"),
             (INK if not BY_KEY[key].fine_tuned else "white", INK, INK),
-            strict=False,
+            strict=True,
         ):
             axes.barh(row, share, left=left, color=shade, edgecolor="white", height=0.8)
             if share > 6:

@@ -70,8 +70,8 @@ def heatmaps(study: Study, which: Callable[[list[BallLog]], Grids]) -> Figure | 
     if not rows:
         return None
     figure = Figure(figsize=(9.2, 4.75 * len(rows) + 0.6))
-    for axes_row, player in zip(figure.subplots(len(rows), 2, squeeze=False), rows, strict=False):
-        for axes, key in zip(axes_row, METHODS, strict=False):
+    for axes_row, player in zip(figure.subplots(len(rows), 2, squeeze=False), rows, strict=True):
+        for axes, key in zip(axes_row, METHODS, strict=True):
             logs = study.logs(player, key)
             axes.set_axis_off()
             if not logs:

@@ -30,7 +30,7 @@ def evolution(study: Study, m: Measurements) -> Figure | None:
     figure = Figure(figsize=(11, 9.6))
     grid = figure.subplots(4, 2).ravel()
     quantities = [(part, axis) for part, axes in AXES.items() for axis in axes]
-    for k, (axes, (part, axis)) in enumerate(zip(grid, quantities, strict=False)):
+    for k, (axes, (part, axis)) in enumerate(zip(grid, quantities, strict=True)):
         for i, player in enumerate(study.players):
             for j, name in enumerate(ROUNDS):
                 at = i + 0.26 * (j - 1)
@@ -43,7 +43,7 @@ def evolution(study: Study, m: Measurements) -> Figure | None:
                     low, high = found.mean(axis=0)
                     axes.bar(at - 0.05, high - low, 0.09, low, color=SHADES[name])
                     if len(found) > 1:
-                        for end, value in zip(found.T, (low, high), strict=False):
+                        for end, value in zip(found.T, (low, high), strict=True):
                             axes.errorbar(
                                 at - 0.05, value, [[value - end.min()], [end.max() - value]], color=INK, linewidth=0.8
                             )

@@ -77,7 +77,7 @@ def boxes(
     labelled: bool = True,
 ) -> None:
     """Box plots of models in the paper's form. samples: (n,) rally lengths of each key, empty where there are none."""
-    for k, (values, key) in enumerate(zip(samples, keys, strict=False)):
+    for k, (values, key) in enumerate(zip(samples, keys, strict=True)):
         if not values.size:
             continue
         parts = axes.boxplot(
@@ -114,7 +114,7 @@ def bars(
     axes: Axes, intervals: Sequence[Interval | None], keys: Sequence[str], ylabel: str, labelled: bool = True
 ) -> None:
     """Bars of models with their intervals; None for a model that the study lacks."""
-    for k, (interval, key) in enumerate(zip(intervals, keys, strict=False)):
+    for k, (interval, key) in enumerate(zip(intervals, keys, strict=True)):
         bar(axes, k, interval, colour(key), 0.7)
     model_ticks(axes, keys, labelled)
     axes.set_ylabel(ylabel)
@@ -139,7 +139,7 @@ def error_bars(intervals: Sequence[Interval]) -> tuple[np.ndarray, np.ndarray]:
 
 def forest(axes: Axes, intervals: Sequence[Interval | None], labels: Sequence[str], colours: Sequence[Shade]) -> None:
     """Ratios with their intervals on a log scale around 1, from top to bottom."""
-    for row, (interval, shade) in enumerate(zip(intervals, colours, strict=False)):
+    for row, (interval, shade) in enumerate(zip(intervals, colours, strict=True)):
         if interval is None:
             axes.text(1.0, row, "not in this study", ha="center", va="center", fontsize=8, color=FAINT)
             continue

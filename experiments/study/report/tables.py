@@ -137,7 +137,7 @@ def significance(m: Measurements) -> Table:
             _p(d.p_policies),
             str(d.pairs),
         )
-        for (group, scale, a, b, d), p in zip(found, adjusted, strict=False)
+        for (group, scale, a, b, d), p in zip(found, adjusted, strict=True)
     ]
     head = (
         "players",
@@ -234,7 +234,7 @@ def ends(study: Study) -> Table:
                 str(number) if number <= 15 else "-",
                 text,
                 who,
-                *(f"{n:,} ({100 * n / max(g.sum(), 1):.1f} %)" for n, g in zip(counts, groups, strict=False)),
+                *(f"{n:,} ({100 * n / max(g.sum(), 1):.1f} %)" for n, g in zip(counts, groups, strict=True)),
             )
         )
     head = ("row", "how the rally ended", "ended by", "ten models", "i-S2R", "S2R+FT", "cross-evaluations")

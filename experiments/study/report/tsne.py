@@ -61,7 +61,7 @@ def embed(study: Study, player: str, seed: int) -> Plane | None:
         tsne = TSNE(perplexity=perplexity, init="pca", max_iter=ITERATIONS, angle=0.7, random_state=0)
         placed = tsne.fit_transform(standard)
     edges = np.cumsum([features.shape[1] for features in sets.values()])[:-1]
-    return Plane(player, {name: part.T for name, part in zip(sets, np.split(placed, edges), strict=False)})
+    return Plane(player, {name: part.T for name, part in zip(sets, np.split(placed, edges), strict=True)})
 
 
 def trained(study: Study, seed: int, player: str, name: str) -> np.ndarray | None:
@@ -93,8 +93,8 @@ def training(planes: list[Plane]) -> Figure | None:
     if not planes:
         return None
     figure, grid = _figure(planes, 3)
-    for row, plane in zip(grid, planes, strict=False):
-        for k, (axes, name) in enumerate(zip(row, DATASETS, strict=False)):
+    for row, plane in zip(grid, planes, strict=True):
+        for k, (axes, name) in enumerate(zip(row, DATASETS, strict=True)):
             _scatter(axes, plane, DATASETS[: k + 1])
             axes.set_title(f"{player_label(plane.player)}: {name}" if not k else name)
     _legend(figure, DATASETS)
@@ -107,8 +107,8 @@ def evaluation(planes: list[Plane]) -> Figure | None:
     if not planes:
         return None
     figure, grid = _figure(planes, 3)
-    for row, plane in zip(grid, planes, strict=False):
-        for k, (axes, key) in enumerate(zip(row, EVALUATIONS[:3], strict=False)):
+    for row, plane in zip(grid, planes, strict=True):
+        for k, (axes, key) in enumerate(zip(row, EVALUATIONS[:3], strict=True)):
             _scatter(axes, plane, DATASETS[: k + 1], key)
             axes.set_title(f"{player_label(plane.player)}: {key}" if not k else key)
     _legend(figure, DATASETS, (IS2R,))
@@ -121,8 +121,8 @@ def methods(planes: list[Plane]) -> Figure | None:
     if not planes:
         return None
     figure, grid = _figure(planes, 2)
-    for row, plane in zip(grid, planes, strict=False):
-        for axes, key, sets in zip(row, ("is2r-ft100", "s2r-ft100"), (DATASETS, DATASETS[:2]), strict=False):
+    for row, plane in zip(grid, planes, strict=True):
+        for axes, key, sets in zip(row, ("is2r-ft100", "s2r-ft100"), (DATASETS, DATASETS[:2]), strict=True):
             _scatter(axes, plane, sets, key)
         row[0].set_title(f"{player_label(plane.player)}: i-S2R")
         row[1].set_title("S2R+FT")
