@@ -47,14 +47,15 @@ class FitResult:
     converged: Bool[np.ndarray, " n"]
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class _Padded:
-    steps: Float[
-        np.ndarray, "gaps S n"
-    ]  # (T - 1, S, n) [s] lengths of the steps between samples; zero where there are fewer
-    time: Float[np.ndarray, "T n"]  # [s] since the first sample
-    position: Float[np.ndarray, "3 T n"]  # [m]
-    mask: Float[np.ndarray, "T n"]  # 1 for a sample, 0 for padding
+class _Measured:
+    """Flights of n balls, padded to T samples and to S steps between two of them."""
+
+    spin: Float[Array | np.ndarray, "3 n"]  # [rad/s] at the first sample
+    steps: Float[Array | np.ndarray, "gaps S n"]  # [s] lengths of the T - 1 gaps' steps; zero where there are fewer
+    position: Float[Array | np.ndarray, "3 T n"]  # [m]
+    mask: Float[Array | np.ndarray, "T n"]  # 1 for a sample, 0 for padding
 
 
 def _check(trajectories: Sequence[Trajectory]) -> None:
@@ -68,7 +69,10 @@ def _check(trajectories: Sequence[Trajectory]) -> None:
         )
 
 
-def _pad(trajectories: Sequence[Trajectory]) -> _Padded:
+def _pad(
+    trajectories: Sequence[Trajectory], spin: Float[np.ndarray, "3 n"]
+) -> tuple[_Measured, Float[np.ndarray, "3 n"], Float[np.ndarray, "3 n"]]:
+    """The padded flights, and position and velocity at the first sample of a parabola through each one's samples."""
     n = len(trajectories)
     length = -(-max(map(len, trajectories)) // PAD) * PAD
     time, position, mask = np.zeros((n, length)), np.zeros((n, 3, length)), np.zeros((n, length))
@@ -82,33 +86,24 @@ def _pad(trajectories: Sequence[Trajectory]) -> _Padded:
     counts = np.maximum(np.ceil(gap / DT * (1.0 - 1e-9)), 1.0)
     rows = np.arange(int(counts.max()))[None, :, None]
     steps = np.where(rows < counts[:, None], (gap / counts)[:, None], 0.0)
-    return _Padded(steps, time.T, np.moveaxis(position, 0, -1), mask.T)
+    measured = _Measured(spin, steps, np.moveaxis(position, 0, -1), mask.T)
+    powers = time.T[None] ** np.arange(3)[:, None, None] * measured.mask
+    moments = np.einsum("itn,jtn->nij", powers, powers)
+    sums = np.einsum("itn,atn->nia", powers, measured.position)
+    coefficients = np.linalg.solve(moments, sums)
+    return measured, coefficients[:, 0].T, coefficients[:, 1].T
 
 
-def _shape(
-    flight: FlightParams,
-    velocity: Float[Array, "3 n"],
-    spin: Float[Array, "3 n"],
-    steps: Float[Array, "gaps S n"],
-) -> Float[Array, "3 T n"]:
+def _shape(flight: FlightParams, velocity: Float[Array, "3 n"], measured: _Measured) -> Float[Array, "3 T n"]:
     """Positions (3, T, n) of a flight that starts at the origin."""
 
     def advance(state: BallState, dts: Array) -> tuple[BallState, Array]:
         state, _ = jax.lax.scan(lambda s, dt: (free_step(flight, s, dt), None), state, dts)
         return state, jnp.asarray(state.position)
 
-    start = BallState(jnp.zeros_like(velocity), velocity, spin)
-    _, positions = jax.lax.scan(advance, start, steps)
+    start = BallState(jnp.zeros_like(velocity), velocity, measured.spin)
+    _, positions = jax.lax.scan(advance, start, measured.steps)
     return jnp.moveaxis(jnp.concatenate([start.position[None], positions]), 0, 1)
-
-
-def _initial_guess(padded: _Padded) -> tuple[np.ndarray, np.ndarray]:
-    """Position and velocity, (3, n), at the first sample of a parabola through each trajectory's samples."""
-    powers = padded.time[None] ** np.arange(3)[:, None, None] * padded.mask
-    moments = np.einsum("itn,jtn->nij", powers, powers)
-    sums = np.einsum("itn,atn->nia", powers, padded.position)
-    coefficients = np.linalg.solve(moments, sums)
-    return coefficients[:, 0].T, coefficients[:, 1].T
 
 
 def _weights(distance: Array, mask: Array, huber: float | None) -> Array:
@@ -126,20 +121,17 @@ def _linearise(
     flight: FlightParams,
     x0: Float[Array, "3 n"],
     v0: Float[Array, "3 n"],
-    spin: Float[Array, "3 n"],
-    steps: Float[Array, "gaps S n"],
-    measured: Float[Array, "3 T n"],
-    mask: Float[Array, "T n"],
+    measured: _Measured,
     huber: float | None,
 ) -> tuple[Float[Array, " n"], Float[Array, "n 6 6"], Float[Array, "n 6"]]:
     """Cost (n,), normal matrix (n, 6, 6) and right-hand side (n, 6) of the weighted least squares at a state."""
 
     def shape(velocity: Array) -> Array:
-        return _shape(flight, velocity, spin, steps)
+        return _shape(flight, velocity, measured)
 
     directions = jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, *v0.shape))
     relative, slopes = jax.vmap(lambda e: jax.jvp(shape, (v0,), (e,)), out_axes=(None, 0))(directions)
-    residual = measured - relative - x0[:, None]
+    residual, mask = measured.position - relative - x0[:, None], measured.mask
     distance = jnp.sqrt(jnp.sum(residual * residual, axis=0))
     weight = _weights(distance, mask, huber)
     total = jnp.sum(weight, axis=0)
@@ -161,13 +153,10 @@ def _levenberg_marquardt(
     flight: FlightParams,
     x0: Float[Array, "3 n"],
     v0: Float[Array, "3 n"],
-    spin: Float[Array, "3 n"],
-    steps: Float[Array, "gaps S n"],
-    measured: Float[Array, "3 T n"],
-    mask: Float[Array, "T n"],
+    measured: _Measured,
     huber: float | None,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    linearise = partial(_linearise, flight, spin=spin, steps=steps, measured=measured, mask=mask, huber=huber)
+    linearise = partial(_linearise, flight, measured=measured, huber=huber)
 
     def unfinished(carry: dict[str, Array]) -> Array:
         return (carry["iteration"] < MAX_ITERATIONS) & ~jnp.all(carry["converged"])
@@ -208,7 +197,7 @@ def _levenberg_marquardt(
     }
     carry = jax.lax.while_loop(unfinished, iterate, carry)
     x0, v0 = carry["x0"], carry["v0"]
-    residual = measured - _shape(flight, v0, spin, steps) - x0[:, None]
+    residual, mask = measured.position - _shape(flight, v0, measured) - x0[:, None], measured.mask
     square = jnp.sum(residual * residual, axis=0)
     samples = jnp.sum(mask, axis=0)
     rms = jnp.sqrt(jnp.sum(mask * square, axis=0) / samples)
@@ -237,29 +226,19 @@ def fit_gauss_newton(
     spin = np.zeros((3, n)) if spin is None else np.asarray(spin, np.float64)
     if spin.shape != (3, n):
         raise ValueError(f"spin has shape {spin.shape}, (3, {n}) is wanted: one spin for each trajectory")
-    padded = _pad([*trajectories, *[trajectories[-1]] * extra])
     spins = np.pad(spin, ((0, 0), (0, extra)), mode="edge")
+    measured, x0, v0 = _pad([*trajectories, *[trajectories[-1]] * extra], spins)
     with jax.enable_x64(True):
-        x0, v0 = _initial_guess(padded)
-        result = _levenberg_marquardt(
-            without_nominal(flight), x0, v0, spins, padded.steps, padded.position, padded.mask, huber
-        )
+        result = _levenberg_marquardt(without_nominal(flight), x0, v0, measured, huber)
         x0, v0, rms, covariance, converged = (np.asarray(a)[..., :n] for a in result)
     return FitResult(BallState(x0, v0, spin), rms, covariance, converged)
 
 
 @jax.jit
-def _rms_distance(
-    unknowns: Float[Array, "6"],
-    flight: FlightParams,
-    spin: Float[Array, "3 1"],
-    steps: Float[Array, "gaps S 1"],
-    measured: Float[Array, "3 T 1"],
-    mask: Float[Array, "T 1"],
-) -> Float[Array, ""]:
-    flown = unknowns[:3, None, None] + _shape(flight, unknowns[3:, None], spin, steps)
-    square = jnp.sum((measured - flown) ** 2, axis=0)
-    return jnp.sqrt(jnp.sum(mask * square) / jnp.sum(mask))
+def _rms_distance(unknowns: Float[Array, "6"], flight: FlightParams, measured: _Measured) -> Float[Array, ""]:
+    flown = unknowns[:3, None, None] + _shape(flight, unknowns[3:, None], measured)
+    square = jnp.sum((measured.position - flown) ** 2, axis=0)
+    return jnp.sqrt(jnp.sum(measured.mask * square) / jnp.sum(measured.mask))
 
 
 def fit_nelder_mead(
@@ -270,16 +249,13 @@ def fit_nelder_mead(
     spin: (3,) [rad/s], zero without it. Raises ValueError when there are fewer than MIN_SAMPLES samples.
     """
     _check([trajectory])
-    padded = _pad([trajectory])
     spin = np.zeros(3) if spin is None else np.asarray(spin, np.float64)
-    start = np.concatenate(_initial_guess(padded))[:, 0]
+    measured, *guess = _pad([trajectory], spin[:, None])
+    start = np.concatenate(guess)[:, 0]
     # The simplex spans the guess's likely error: a centimetre, a tenth of a metre per second.
     simplex = start + np.vstack([np.zeros(6), np.diag([0.01] * 3 + [0.1] * 3)])
     with jax.enable_x64(True):
-        arguments = (
-            without_nominal(flight),
-            *map(jnp.asarray, (spin[:, None], padded.steps, padded.position, padded.mask)),
-        )
+        arguments = without_nominal(flight), jax.tree.map(jnp.asarray, measured)
         result = minimize(
             lambda unknowns: float(_rms_distance(unknowns, *arguments)),
             start,

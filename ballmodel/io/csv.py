@@ -12,9 +12,7 @@ import math
 import os
 from collections.abc import Iterable
 
-import numpy as np
-
-from ballmodel.trajectory import Dataset, Trajectory
+from ballmodel.trajectory import Dataset
 
 COLUMNS = ("session", "trajectory", "t", "x", "y", "z")
 NUMBERS = ("t", "x", "y", "z")
@@ -31,14 +29,7 @@ def read_csv(path: str | os.PathLike) -> Dataset:
             raise ValueError(f"{path}: row {reader.line_num + 1}: not readable as CSV in UTF-8: {error}") from None
     if not samples:
         raise ValueError(f"{path}: no row follows the header")
-    trajectories = []
-    for (session, name), rows in samples.items():
-        table = np.array(rows)
-        try:
-            trajectories.append(Trajectory(session, name, table[:, 0], table[:, 1:].T))
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
-    return Dataset(tuple(trajectories), str(path))
+    return Dataset.from_samples(samples, str(path))
 
 
 def _header(path: str | os.PathLike, row: list[str] | None) -> list[str]:

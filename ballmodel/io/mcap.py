@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 
-import numpy as np
 from mcap.exceptions import McapError
 from mcap.records import Channel, Footer, Message
 from mcap.stream_reader import StreamReader
@@ -17,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
 from ballmodel.io.atomic_files import replacing
-from ballmodel.trajectory import Dataset, Trajectory
+from ballmodel.trajectory import Dataset
 
 TOPIC = "/ball"
 FRAME = "table"
@@ -100,14 +99,7 @@ def read_mcap(path: str | os.PathLike, salvage: bool = False) -> Dataset:
     if not samples:
         listed = ", ".join(sorted(set(topics.values()))) or "none"
         raise ValueError(f"{path}: no sample on the topic {TOPIC}; topics in the file: {listed}")
-    trajectories = []
-    for (session, name), rows in samples.items():
-        table = np.array(rows)
-        try:
-            trajectories.append(Trajectory(session, name, table[:, 0], table[:, 1:].T))
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
-    return Dataset(tuple(trajectories), str(path))
+    return Dataset.from_samples(samples, str(path))
 
 
 def _sample(path: str | os.PathLike, index: int, data: bytes) -> tuple[str, str, tuple[float, float, float, float]]:

@@ -9,14 +9,13 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from experiments.config import experiment as config
 from experiments.config import validation
-from experiments.config.experiment import SHIPPED, Config, Count, Optimiser, Positive, Section, Seed
+from experiments.config.experiment import Config, Count, Name, Optimiser, Positive, Section, Seed
 from experiments.errors import ConfigError
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]  # also that of a folder
 Layers = Annotated[list[Count], Field(min_length=1)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Discount = Annotated[float, Field(gt=0, le=1, description="Worth of a reward one control step later.")]
@@ -186,10 +185,6 @@ class Comparison(Section):
             raise ValueError("different seeds")
         return seeds
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data that ``load`` reads back, with every default written out."""
-        return self.model_dump(mode="json")
-
 
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comparison, Config]:
     """Reads a comparison and the experiment that it names; ``overrides`` are "dotted.path=value".
@@ -199,10 +194,7 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comp
     """
     path = Path(path)
     data = config.read_mapping(path, overrides, "a comparison", Comparison, shipped(), _absolute)
-    try:
-        comparison = Comparison.model_validate(data)
-    except ValidationError as error:
-        raise ConfigError("\n".join(f"{path}: {line}" for line in validation.lines(error, Comparison))) from None
+    comparison = validation.validated(Comparison, data, str(path))
     experiment = _experiment(comparison.experiment, str(path))
     if experiment.training.later_rewards is not None:
         raise ConfigError(
@@ -219,7 +211,7 @@ def _absolute(data: dict[str, Any], folder: Path) -> None:
 
 def shipped() -> dict[str, Path]:
     """The comparisons that come with the program, by name."""
-    return {path.stem: path for path in sorted((SHIPPED / "compare").glob("*.yaml"))}
+    return config.shipped("compare")
 
 
 def _experiment(given: str | dict[str, Any], where: str) -> Config:

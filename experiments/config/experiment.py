@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ballmodel.io import yaml
 from experiments.config import validation
@@ -26,6 +26,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]  # also that of a folder
 
 # Keys of the optimiser, which training and fine-tuning share; their defaults differ.
 NumDirections = Annotated[Count, Field(description="Antithetic pairs of perturbations per update.")]
@@ -56,6 +57,10 @@ class Section(BaseModel):
     """A mapping of the YAML: unknown keys are errors, nothing is converted silently."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data that validates to the same, with every default written out."""
+        return self.model_dump(mode="json")
 
 
 class Rewards(Section):
@@ -245,7 +250,7 @@ class Evaluation(Section):
 class Config(Section):
     """One experiment."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    name: Name
     """Folder of the run."""
     balls: str | dict[str, Any]
     """A distribution's name such as player3/M1 or narrow, the path of a YAML, or the YAML's content."""
@@ -261,10 +266,6 @@ class Config(Section):
     """The evaluation after training."""
     initial_policy: str | None = None
     """A run folder or an exported artefact whose policy training starts from."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data that ``parse`` reads back, with every default written out."""
-        return self.model_dump(mode="json")
 
 
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
@@ -285,15 +286,12 @@ def _absolute(data: dict[str, Any], folder: Path) -> None:
 
 def parse(data: dict[str, Any], where: str) -> Config:
     """A Config from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
-    try:
-        return Config.model_validate(data)
-    except ValidationError as error:
-        raise ConfigError("\n".join(f"{where}: {line}" for line in validation.lines(error, Config))) from None
+    return validation.validated(Config, data, where)
 
 
-def shipped() -> dict[str, Path]:
-    """The experiments that come with the program, by name."""
-    return {path.stem: path for path in sorted((SHIPPED / "train").glob("*.yaml"))}
+def shipped(folder: str = "train") -> dict[str, Path]:
+    """The experiments that come with the program, by name, or the YAMLs of another folder of SHIPPED."""
+    return {path.stem: path for path in sorted((SHIPPED / folder).glob("*.yaml"))}
 
 
 def json_schema() -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from experiments.config import validation
 from experiments.config.experiment import (
@@ -86,10 +86,7 @@ def load(path: str | Path | None = None, overrides: tuple[str, ...] = ()) -> Fin
 
 def parse(data: dict[str, Any], where: str) -> FineTuning:
     """FineTuning from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
-    try:
-        settings = FineTuning.model_validate(data)
-    except ValidationError as error:
-        raise ConfigError("\n".join(f"{where}: {line}" for line in validation.lines(error, FineTuning))) from None
+    settings = validation.validated(FineTuning, data, where)
     if settings.rewards == "sim" or not isinstance(settings.rewards, str):
         _check_rewards(settings.rewards, where)
     return settings

@@ -10,13 +10,13 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from experiments.config import validation
+from experiments.config import experiment, validation
 from experiments.config.experiment import (
-    SHIPPED,
     Count,
     LaterRewards,
+    Name,
     Optimiser,
     Positive,
     Section,
@@ -27,7 +27,6 @@ from experiments.config.experiment import (
 )
 from experiments.config.finetuning import FineTuning
 from experiments.config.finetuning import parse as parse_fine_tuning
-from experiments.errors import ConfigError
 
 Player = Literal["player1", "player2", "player3", "player4", "player5"]
 PLAYERS: tuple[Player, ...] = get_args(Player)
@@ -110,7 +109,7 @@ class Evaluation(Section):
 class Study(Section):
     """One study."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    name: Name
     """Folder of the study."""
     players: Annotated[list[Player], Field(min_length=1)] = list(PLAYERS)
     """Virtual players, or people in their places."""
@@ -170,10 +169,6 @@ class Study(Section):
         """File of a player's first balls. Raises KeyError where there is none."""
         return dict[str, str](self.recordings.items())[player]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data that ``parse`` reads back, with every default written out."""
-        return self.model_dump(mode="json")
-
 
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Study:
     """Reads a study; ``overrides`` are "dotted.path=value".
@@ -193,14 +188,11 @@ def _absolute(data: dict[str, Any], folder: Path) -> None:
 
 def parse(data: dict[str, Any], where: str) -> Study:
     """A Study from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
-    try:
-        study = Study.model_validate(data)
-    except ValidationError as error:
-        raise ConfigError("\n".join(f"{where}: {line}" for line in validation.lines(error, Study))) from None
+    study = validation.validated(Study, data, where)
     parse_fine_tuning(study.fine_tuning.model_dump(mode="json"), f"{where}: fine_tuning")
     return study
 
 
 def shipped() -> dict[str, Path]:
     """The studies that come with the program, by name."""
-    return {path.stem: path for path in sorted((SHIPPED / "study").glob("*.yaml"))}
+    return experiment.shipped("study")

@@ -6,13 +6,25 @@ import difflib
 import re
 import types
 from collections.abc import Iterable
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from experiments.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
+
 LONGEST = 120  # characters of what was given that are shown
 RENAMED = {"pairs": "num_directions", "keep": "elite_fraction", "average": "ema_decay"}  # keys of the optimiser
+
+
+def validated(model: type[Model], data: dict[str, Any], where: str) -> Model:
+    """The model of parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{where}: {line}" for line in lines(error, model))) from None
 
 
 def lines(error: ValidationError, model: type[BaseModel]) -> list[str]:
