@@ -52,10 +52,10 @@ class FitResult:
 class _Measured:
     """Flights of n balls, padded to T samples and to S steps between two of them."""
 
-    spin: Float[Array | np.ndarray, "3 n"]  # [rad/s] at the first sample
-    steps: Float[Array | np.ndarray, "gaps S n"]  # [s] lengths of the T - 1 gaps' steps; zero where there are fewer
-    position: Float[Array | np.ndarray, "3 T n"]  # [m]
-    mask: Float[Array | np.ndarray, "T n"]  # 1 for a sample, 0 for padding
+    spin: Float[Array, "3 n"]  # [rad/s] at the first sample
+    steps: Float[Array, "gaps S n"]  # [s] lengths of the T - 1 gaps' steps; zero where there are fewer
+    position: Float[Array, "3 T n"]  # [m]
+    mask: Float[Array, "T n"]  # 1 for a sample, 0 for padding
 
 
 def _check(trajectories: Sequence[Trajectory]) -> None:
@@ -86,11 +86,11 @@ def _pad(
     counts = np.maximum(np.ceil(gap / DT * (1.0 - 1e-9)), 1.0)
     rows = np.arange(int(counts.max()))[None, :, None]
     steps = np.where(rows < counts[:, None], (gap / counts)[:, None], 0.0)
-    measured = _Measured(spin, steps, np.moveaxis(position, 0, -1), mask.T)
-    powers = time.T[None] ** np.arange(3)[:, None, None] * measured.mask
+    powers = time.T[None] ** np.arange(3)[:, None, None] * mask.T
     moments = np.einsum("itn,jtn->nij", powers, powers)
-    sums = np.einsum("itn,atn->nia", powers, measured.position)
+    sums = np.einsum("itn,atn->nia", powers, np.moveaxis(position, 0, -1))
     coefficients = np.linalg.solve(moments, sums)
+    measured = _Measured(*map(jnp.asarray, (spin, steps, np.moveaxis(position, 0, -1), mask.T)))
     return measured, coefficients[:, 0].T, coefficients[:, 1].T
 
 
@@ -227,8 +227,8 @@ def fit_gauss_newton(
     if spin.shape != (3, n):
         raise ValueError(f"spin has shape {spin.shape}, (3, {n}) is wanted: one spin for each trajectory")
     spins = np.pad(spin, ((0, 0), (0, extra)), mode="edge")
-    measured, x0, v0 = _pad([*trajectories, *[trajectories[-1]] * extra], spins)
     with jax.enable_x64(True):
+        measured, x0, v0 = _pad([*trajectories, *[trajectories[-1]] * extra], spins)
         result = _levenberg_marquardt(without_nominal(flight), x0, v0, measured, huber)
         x0, v0, rms, covariance, converged = (np.asarray(a)[..., :n] for a in result)
     return FitResult(BallState(x0, v0, spin), rms, covariance, converged)
@@ -250,14 +250,15 @@ def fit_nelder_mead(
     """
     _check([trajectory])
     spin = np.zeros(3) if spin is None else np.asarray(spin, np.float64)
-    measured, *guess = _pad([trajectory], spin[:, None])
+    with jax.enable_x64(True):
+        measured, *guess = _pad([trajectory], spin[:, None])
     start = np.concatenate(guess)[:, 0]
     # The simplex spans the guess's likely error: a centimetre, a tenth of a metre per second.
     simplex = start + np.vstack([np.zeros(6), np.diag([0.01] * 3 + [0.1] * 3)])
+    nominal = without_nominal(flight)
     with jax.enable_x64(True):
-        arguments = without_nominal(flight), jax.tree.map(jnp.asarray, measured)
         result = minimize(
-            lambda unknowns: float(_rms_distance(unknowns, *arguments)),
+            lambda unknowns: float(_rms_distance(unknowns, nominal, measured)),
             start,
             method="Nelder-Mead",
             options={"initial_simplex": simplex, "xatol": 1e-7, "fatol": 1e-10, "maxiter": 5000, "maxfev": 10000},
