@@ -49,7 +49,8 @@ ROOMS = {
     "ballmodel": "constants state trajectory io .",
     "bgs": ".",
     "mjx_tt": (
-        ". sim robot diagnosis/description diagnosis/robust diagnosis/verdict diagnosis/joint diagnosis/logs "
+        ". sim robot diagnosis/description diagnosis/robust diagnosis/verdict diagnosis/joint diagnosis/tracks "
+        "diagnosis/logs "
         "diagnosis/ball diagnosis/hits diagnosis "
         "viz diagnosis/report env rally"
     ),
