@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -58,18 +59,24 @@ def to_yaml(config: RobotConfig | RigParams) -> str:
 def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
     """An instance of a dataclass; omitted keys keep their defaults. Raises ConfigError with one line per mistake."""
 
+    try:
+        # By JSON, whose lists are tuples: nothing else is converted.
+        return _adapter(kind).validate_json(json.dumps({"file": data}, default=str)).file
+    except ValidationError as error:
+        lines = [_line(mistake, kind) for mistake in error.errors(include_url=False)]
+    raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
+
+
+@cache
+def _adapter(kind: type) -> TypeAdapter:
+    """Reader of files {"file": content} whose content is that dataclass."""
+
     class Content:  # pydantic takes the strictness of this class into the dataclasses inside
         __pydantic_config__ = STRICT
         file: Any
 
     Content.__annotations__["file"] = kind
-    adapter = TypeAdapter(dataclasses.dataclass(Content))
-    try:
-        # By JSON, whose lists are tuples: nothing else is converted.
-        return adapter.validate_json(json.dumps({"file": data}, default=str)).file
-    except ValidationError as error:
-        lines = [_line(mistake, kind) for mistake in error.errors(include_url=False)]
-    raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
+    return TypeAdapter(dataclasses.dataclass(Content))
 
 
 def _line(mistake: Any, kind: type) -> str:

@@ -434,7 +434,7 @@ def test_an_examination_goes_on_where_it_was(tmp_path):
 
 SLOW = pytest.mark.slow
 FIXED = [
-    (Case("none", (), 0.0, "ar1", 11, count=200), ("right",)),
+    pytest.param(Case("none", (), 0.0, "ar1", 11, count=200), ("right",), marks=SLOW),
     (Case("single", ("wind_x",), 20.0, "range", 13, count=200), ("right",)),
     pytest.param(Case("single", ("drag_coefficient",), 20.0, "ar1", 14, count=200), ("right",), marks=SLOW),
     pytest.param(Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",), marks=SLOW),

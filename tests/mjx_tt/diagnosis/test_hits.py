@@ -121,9 +121,9 @@ def judged(rubber: Rubber, seed: int):
     "name, rubber, change",
     [
         ("paddle_restitution", Rubber(restitution=0.837), -0.08),
-        ("paddle_friction", Rubber(gain=0.48), -0.20),
-        ("paddle_tilt", Rubber(tilt=0.04), 0.04),
-        ("paddle_offset", Rubber(offset=0.012), 0.012),
+        pytest.param("paddle_friction", Rubber(gain=0.48), -0.20, marks=pytest.mark.slow),
+        pytest.param("paddle_tilt", Rubber(tilt=0.04), 0.04, marks=pytest.mark.slow),
+        pytest.param("paddle_offset", Rubber(offset=0.012), 0.012, marks=pytest.mark.slow),
         ("ball_latency", Rubber(late=0.02), 0.02),
     ],
 )
@@ -134,7 +134,7 @@ def test_names_a_cause_at_the_paddle(name, rubber, change):
     assert abs(hits.causes[0].change - change) < 4 * hits.causes[0].error
 
 
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.slow)])
 def test_names_nothing_at_a_right_paddle(seed):
     hits = judged(Rubber(), seed)
     assert hits.hits == HITS and hits.causes == ()
