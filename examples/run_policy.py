@@ -13,5 +13,5 @@ observation = np.zeros(len(robot_io.OBSERVATION_NAMES))
 for tick in range(75):  # one second at 75 Hz
     observation[1] = 1.5 - 0.08 * tick  # the ball comes along y [m]
     velocity = policy.step(observation) * robot_io.LIMITS.policy_velocity  # [m/s], [rad/s]
-    print(tick, dict(zip(robot_io.JOINT_NAMES, velocity.round(3), strict=True)))
+    print(tick, dict(zip(robot_io.JOINT_NAMES, velocity.round(3).tolist(), strict=True)))
 assert "jax" not in sys.modules

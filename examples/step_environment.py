@@ -1,7 +1,7 @@
 """Step the task as a brax environment, compiled and batched, and as a vectorised one of Gymnasium."""
 
 import brax.envs
-import gymnasium
+import gymnasium  # pip install "mjx-tt[gymnasium]"
 import jax
 import jax.numpy as jnp
 

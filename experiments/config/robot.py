@@ -58,25 +58,27 @@ def to_yaml(config: RobotConfig | RigParams) -> str:
 
 def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
     """An instance of a dataclass; omitted keys keep their defaults. Raises ConfigError with one line per mistake."""
-
     try:
         # By JSON, whose lists are tuples: nothing else is converted.
-        return _adapter(kind).validate_json(json.dumps({"file": data}, default=str)).file
+        return _adapters()[kind].validate_json(json.dumps({"file": data}, default=str)).file
     except ValidationError as error:
         lines = [_line(mistake, kind) for mistake in error.errors(include_url=False)]
     raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
 
 
 @cache
-def _adapter(kind: type) -> TypeAdapter:
-    """Reader of files {"file": content} whose content is that dataclass."""
+def _adapters() -> dict[type, TypeAdapter]:
+    """Readers of files {"file": content}, by the dataclass of their content."""
+    found: dict[type, TypeAdapter] = {}
+    for kind in (RobotConfig, RigParams):
 
-    class Content:  # pydantic takes the strictness of this class into the dataclasses inside
-        __pydantic_config__ = STRICT
-        file: Any
+        class Content:  # pydantic takes the strictness of this class into the dataclasses inside
+            __pydantic_config__ = STRICT
+            file: Any
 
-    Content.__annotations__["file"] = kind
-    return TypeAdapter(dataclasses.dataclass(Content))
+        Content.__annotations__["file"] = kind
+        found[kind] = TypeAdapter(dataclasses.dataclass(Content))
+    return found
 
 
 def _line(mistake: Any, kind: type) -> str:
