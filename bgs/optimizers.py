@@ -38,14 +38,14 @@ def make(
     Raises ValueError naming the argument, what was given and what is allowed.
     """
     if kind not in KINDS:
-        raise ValueError(f"step.make: kind = {kind!r}, allowed are {KINDS}")
+        raise ValueError(f"optimizers.make: kind = {kind!r}, allowed are {KINDS}")
     if not callable(learning_rate):
         _positive("make", "learning_rate", learning_rate)
     for name, value in (("b1", b1), ("b2", b2)):
         if not 0 <= value < 1:
-            raise ValueError(f"step.make: {name} = {value}, allowed is [0, 1)")
+            raise ValueError(f"optimizers.make: {name} = {value}, allowed is [0, 1)")
     if not 0 <= weight_decay < float("inf"):
-        raise ValueError(f"step.make: weight_decay = {weight_decay}, allowed are finite numbers from 0 on")
+        raise ValueError(f"optimizers.make: weight_decay = {weight_decay}, allowed are finite numbers from 0 on")
     direction = optax.identity() if kind == "sgd" else optax.scale_by_adam(b1=b1, b2=b2)
     decay = [optax.add_decayed_weights(weight_decay)] if weight_decay else []
     return optax.chain(direction, *decay, optax.scale_by_learning_rate(learning_rate))
@@ -60,9 +60,9 @@ def cosine(value: float, final: float, updates: int, hold: float = 0.5) -> Sched
     _positive("cosine", "value", value)
     _positive("cosine", "final", final)
     if updates < 1:
-        raise ValueError(f"step.cosine: updates = {updates}, at least 1 is needed")
+        raise ValueError(f"optimizers.cosine: updates = {updates}, at least 1 is needed")
     if not 0 <= hold < 1:
-        raise ValueError(f"step.cosine: hold = {hold}, allowed is [0, 1)")
+        raise ValueError(f"optimizers.cosine: hold = {hold}, allowed is [0, 1)")
     held = int(hold * updates)
     fall = optax.cosine_decay_schedule(value, decay_steps=updates - held, alpha=final / value)
     return optax.join_schedules([optax.constant_schedule(value), fall], [held])
@@ -76,7 +76,9 @@ def piecewise(value: float, changes: tuple[tuple[int, float], ...]) -> Schedule:
     """
     starts, values = [0, *(start for start, _ in changes)], [value, *(new for _, new in changes)]
     if any(later <= earlier for earlier, later in pairwise(starts)):
-        raise ValueError(f"step.piecewise: changes at updates {starts[1:]}, allowed are increasing ones from 1 on")
+        raise ValueError(
+            f"optimizers.piecewise: changes at updates {starts[1:]}, allowed are increasing ones from 1 on"
+        )
     for given in values:
         _positive("piecewise", "value", given)
     return optax.join_schedules([optax.constant_schedule(v) for v in values], starts[1:])
@@ -84,4 +86,4 @@ def piecewise(value: float, changes: tuple[tuple[int, float], ...]) -> Schedule:
 
 def _positive(function: str, name: str, value: float) -> None:
     if not 0 < value < float("inf"):
-        raise ValueError(f"step.{function}: {name} = {value}, allowed are positive finite numbers")
+        raise ValueError(f"optimizers.{function}: {name} = {value}, allowed are positive finite numbers")

@@ -36,6 +36,8 @@ LONGEST_LEAD = 3.0  # control periods that commands may come ahead of the clock
 
 
 class GateState(Enum):
+    """State of the safety gate."""
+
     DISARMED = "disarmed"  # nothing moves; the reference is the measured position
     ARMED = "armed"  # requests pass as far as they are safe
     STOPPING = "stopping"  # slowing down to rest, then holding
