@@ -36,12 +36,12 @@ class BGSConfig:
     sigma           perturbation scale: members are theta +/- sigma delta; a number or a schedule over updates
                     (``bgs.optimizers``)
     elite_fraction  fraction of the pairs that become elites, in (0, 1]
-    rank        how elites are chosen: "abs", "signed" or "max" (``shaping.shape``)
+    rank            how elites are chosen: "abs", "signed" or "max" (``shaping.shape``)
     weighting       "returns" or "centered_rank" (``shaping.shape``)
     normalise       "std" or "none": division by the elites' standard deviation (``shaping.shape``)
     orthogonal      orthogonal or independent Gaussian directions (``directions.sample``)
     scale           "sqrt_d" or "chi": norms of orthogonal directions (``directions.sample``)
-    step        optax transformation, from ``bgs.optimizers.make`` or optax itself
+    step            optax transformation, from ``bgs.optimizers.make`` or optax itself
     ema_decay       decay per update of the moving average of theta, in [0, 1); 0 makes the average theta itself
 
     Raises ValueError naming the key, what was given and what is allowed.
