@@ -1,32 +1,36 @@
 """The bridge between policy and robot: what happens at a control tick and when something arrives. No sockets, no clock.
 
 DISARMED  nothing moves; the arm's packets are answered with its own position
-READY     goes to the home pose and waits there for a ball
+READY     goes to the home pose, and waits there for a ball
 ACTIVE    the policy plays the ball that is coming
 STOPPING  the operator's stop: slows down to rest, then DISARMED
 FAULT     slowed down and held until the operator resets it
 
-Everything that is sent has passed ``robot_io.safety.gate``. An exception in here is a fault: ``tick`` and
-whatever takes what arrives never raise. Times are seconds of one monotonic clock, passed in.
+Once it has been at the home pose since it was armed, the robot takes a ball wherever it is: it heads for home only
+while there is time. Everything that is sent has passed ``robot_io.safety.gate``. An exception in here is a fault:
+``tick`` and whatever takes what arrives never raise. Times are seconds of one monotonic clock, passed in.
 """
 
 from __future__ import annotations
 
 import math
 import traceback
-from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from enum import Enum
 from time import perf_counter
-from typing import Protocol
 
 import numpy as np
 
 from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, JOINT_NAMES, LIMITS, N_JOINTS
-from robot_io.control.episode import Episode, EpisodeSummary, in_play
-from robot_io.control.observation import Feedback, ObservationDelays, joints, observe
+from robot_io.control.episode import Episode, EpisodeSummary
+from robot_io.control.homing import check_homing
+from robot_io.control.interfaces import STANDARD_PLAY, Axes
+from robot_io.control.interfaces import BridgeConfig as BridgeConfig
+from robot_io.control.interfaces import BridgeState as BridgeState
+from robot_io.control.interfaces import Policy as Policy
+from robot_io.control.observation import Feedback, joints, observe
+from robot_io.control.play import Play
+from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.session import ArmFeedback, EgmSession
 from robot_io.devices.tracker import Tracker
 from robot_io.errors import RefusedError
@@ -41,8 +45,6 @@ from robot_io.log.messages import (
     Observation,
     Record,
     Tick,
-    episode_end,
-    episode_start,
     json_text,
 )
 from robot_io.log.recorder import NullRecorder, SessionRecorder
@@ -50,64 +52,8 @@ from robot_io.safety.clearance import BLADE, RobotGeometry
 from robot_io.safety.faults import Cause
 from robot_io.safety.gate import GateState, SafetyGate
 
-MAX_STEPS = 200  # control ticks of an episode, as in training
 AT_HOME = 0.02  # [m], [rad] of every joint
-HOMING_GAP = 0.03  # [m] of everything to everything while the linear axes search their references
-HOMING_PLACES = 21  # along each axis at which that is looked at
 LONGEST_STOP = 2.0  # [s] after which a stop ends although the measurement does not come to rest
-
-
-class BridgeState(Enum):
-    DISARMED = "disarmed"
-    READY = "ready"
-    ACTIVE = "active"
-    STOPPING = "stopping"
-    FAULT = "fault"
-
-
-class Policy(Protocol):
-    """``robot_io.policy.numpy_policy.StreamingPolicy`` or one that computes the same."""
-
-    def reset(self) -> None: ...
-
-    def step(self, observation: np.ndarray) -> np.ndarray: ...
-
-
-class Axes(Protocol):
-    """``FestoAxes`` or the thread that drives it."""
-
-    def command(self, position: np.ndarray, velocity: np.ndarray, now: float) -> None: ...
-
-    def stop(self) -> None: ...
-
-    def problem(self, now: float) -> str | None: ...
-
-
-@dataclass(frozen=True)
-class BridgeConfig:
-    """Settings of play.
-
-    delays           of the observations
-    home             (8,) joint positions to wait at; None: the geometry's
-    home_speed       share of the policy's velocity limits on the way home
-    home_braking     share of the acceleration limits there
-    """
-
-    delays: ObservationDelays = ObservationDelays()
-    home: tuple[float, ...] | None = None
-    home_speed: float = 0.5
-    home_braking: float = 0.3
-
-
-@dataclass
-class Counts:
-    """Since the start; for the operator's view."""
-
-    ticks: int = 0
-    balls: int = 0
-    outcomes: Counter[str] = field(default_factory=Counter)
-    rally: int = 0  # balls returned in a row
-    longest_rally: int = 0
 
 
 class Bridge:
@@ -116,7 +62,7 @@ class Bridge:
     arm       EGM session, fed by the owner of its socket before ``arm_received``
     axes      the linear axes; axes_state: their newest state, None before the first
     tracker   fed through ``tracker_received``
-    on_episode  called with every EpisodeSummary as soon as its outcome is known
+    on_episode  called with every EpisodeSummary as soon as its outcome is known, on_rally with every RallySummary
     """
 
     def __init__(
@@ -126,27 +72,24 @@ class Bridge:
         tracker: Tracker,
         gate: SafetyGate,
         policy: Policy | None = None,
-        config: BridgeConfig = BridgeConfig(),
+        config: BridgeConfig = STANDARD_PLAY,
         recorder: SessionRecorder | None = None,
         on_episode: Callable[[EpisodeSummary], None] | None = None,
+        on_rally: Callable[[RallySummary], None] | None = None,
     ) -> None:
         self.arm_session, self.axes, self.tracker, self.gate = arm, axes, tracker, gate
         self.config = config
         self.recorder = recorder or NullRecorder()
-        self.counts = Counts()
-        self.episode: Episode | None = None
-        self._policy = policy
-        self.policy_version = 0
-        self._on_episode = on_episode
+        self.play = Play(self._log, on_episode, on_rally, config.box)
+        self.counts = self.play.counts
+        self._policy, self.policy_version = policy, 0
         self._geometry: RobotGeometry = gate.geometry
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
-        self._feedback = Feedback(ball=tracker.track, axes=History(), arm=History())
+        self._feedback = Feedback(ball=self.play.strokes.track, axes=History(), arm=History())
         self._state = BridgeState.DISARMED
-        self._arm_session_id = 0
-        self._arm_sequence, self._arm_restarted = -1, False  # packets of the arm's; anew since it was armed
-        self._axes_received = -math.inf
-        self._tick_time = -math.inf
-        self._last_tick = -math.inf
+        # Session and packet of the arm's controller; True when it was started anew since it was armed.
+        self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
+        self._axes_received = self._tick_time = self._last_tick = -math.inf
         self._start = np.full(N_JOINTS, np.nan)  # reference at the start of the period
         self._policy_limit = np.array(LIMITS.policy_velocity)
         self._home_speed = config.home_speed * self._policy_limit
@@ -157,12 +100,13 @@ class Bridge:
         self._log_failure = ""  # why the log's file cannot be written
         self._errors: set[str] = set()  # of the program, each logged once
         self._stopping_since = -math.inf
-        self._waiting: deque[Episode] = deque()  # policy's part over, outcome open
-        self._last_ball = -1  # number of the ball that was played last
-        self._stop_wanted = False
-        self.paused = False
-        self._tracks: dict[int, list[tuple[float, ...]]] = {}  # incoming samples by episode
+        self._been_home, self.paused = False, False  # at the home pose since it was armed
         self.policy_seconds = 0.0  # of the last tick; 0 when the policy was not asked
+
+    @property
+    def episode(self) -> Episode | None:
+        """The ball that the policy plays."""
+        return self.play.episode
 
     # The operator
 
@@ -197,7 +141,7 @@ class Bridge:
         measured, velocity = joints(self._feedback)
         self.gate.arm(measured, now, velocity)
         self._arm_session_id = self.arm_session.session_id
-        self._arm_restarted = False
+        self._arm_restarted = self._been_home = False
         self._start = measured
         self._change(BridgeState.READY, now, "armed by the operator")
 
@@ -206,7 +150,7 @@ class Bridge:
         if self.state in (BridgeState.READY, BridgeState.ACTIVE):
             self.gate.brake(now)
             self._stopping_since = now
-            self._abort_episodes("stopped", now)
+            self.play.abort("stopped", now)
             self._change(BridgeState.STOPPING, now, "stopped by the operator")
         self.event(now, Level.INFO, "operator", "stop")
 
@@ -226,18 +170,7 @@ class Bridge:
         if self.state not in (BridgeState.DISARMED, BridgeState.FAULT) or not self.gate.at_rest:
             raise RefusedError(f"axes not homed: the state is {self.state.value}; stop the robot first")
         measured, _ = joints(self._feedback)
-        if not np.isfinite(measured[list(ABB_JOINTS)]).all():
-            raise RefusedError("axes not homed: the arm's position is not known; start its EGM session first")
-        places = np.meshgrid(*(np.linspace(LIMITS.lower[i], LIMITS.upper[i], HOMING_PLACES) for i in FESTO_JOINTS))
-        q = np.repeat(measured[:, None], places[0].size, axis=1)
-        q[list(FESTO_JOINTS)] = [axis.ravel() for axis in places]
-        gaps = self._geometry.gaps(q)
-        if not gaps.min() > HOMING_GAP:
-            row = self._geometry.rows[int(gaps.min(axis=1).argmin())]
-            raise RefusedError(
-                f"axes not homed: somewhere on their way {row} comes as near as {gaps.min():.3f} m, allowed is "
-                f"{HOMING_GAP} m; jog the arm to its home pose first"
-            )
+        check_homing(self._geometry, measured)
 
     def estop(self, pressed: bool, now: float) -> None:
         """Tells the state of the emergency stop."""
@@ -246,9 +179,7 @@ class Bridge:
     def discard(self, now: float) -> None:
         """Marks the ball in play, or the one before, as not to be used."""
         self.event(now, Level.INFO, "operator", "discard")
-        for episode in [self.episode, *self._waiting]:
-            if episode is not None:
-                episode.discarded = True
+        self.play.discard()
 
     def failed(self, error: BaseException, now: float) -> None:
         """Brake for an error of the program, wherever it was raised, and latch it as INTERNAL."""
@@ -306,13 +237,7 @@ class Bridge:
         if sample is None or sample.position is None:
             return
         self._log(Ball(sample.captured, now, sample.position, sample.ball))
-        if self.episode is not None and not self.episode.over and sample.ball == self.episode.ball:
-            self._tracks[self.episode.number].append((sample.captured, *sample.position))
-        following = [e for e in (self.episode, *self._waiting) if e is not None]
-        if following:
-            blade = self._blade(sample.captured)
-            for episode in following:
-                episode.follow(sample, blade, now)
+        self.play.follow(sample, self._blade, now, armed=self.gate.engaged, at_start=self._been_home)
 
     def axes_received(self, position: np.ndarray, received: float) -> None:
         """The linear axes' newest position (2,) [m], as it was at ``received``."""
@@ -331,11 +256,11 @@ class Bridge:
 
     def tick(self, deadline: float, now: float) -> np.ndarray:
         """One control period: observe, decide, pass the gate, hand over to the devices; the sent velocity (8,)."""
-        self.counts.ticks += 1
-        self.policy_seconds, request = 0.0, np.zeros(N_JOINTS)
+        self.counts.ticks, self.policy_seconds, request = self.counts.ticks + 1, 0.0, np.zeros(N_JOINTS)
         measured, measured_velocity = np.full(N_JOINTS, np.nan), np.zeros(N_JOINTS)
         with self._guarded(now):
             measured, measured_velocity = joints(self._feedback)
+            self.play.moved(measured_velocity)
             request = self._decide(now)
         sent = self.gate.command(request, measured, measured_velocity, now)
         self._start = self.gate.start if self.gate.engaged else measured
@@ -348,10 +273,8 @@ class Bridge:
             self._after(now)
         with self._guarded(now):
             ages, n = self._ages(now), self.counts.ticks
-            self._log(
-                Tick(n, now, now - deadline, self.policy_seconds, ages["ball"], ages["axes"], ages["arm"]),
-                Command(n, now, request, sent.velocity, self._start),
-            )
+            timing = Tick(n, now, now - deadline, self.policy_seconds, ages["ball"], ages["axes"], ages["arm"])
+            self._log(timing, Command(n, now, request, sent.velocity, self._start))
         if self.unlogged > self._reported_unlogged:
             self._reported_unlogged = self.unlogged
             self.event(now, Level.WARNING, "log_error", json_text({"unlogged": self.unlogged}))
@@ -360,14 +283,19 @@ class Bridge:
     def _decide(self, now: float) -> np.ndarray:
         """The requested velocity (8,), after a look at the devices and at the balls."""
         self._watch(now)
-        self._settle_episodes(now)
-        if self.paused:
-            self._last_ball = self.tracker.ball  # a ball that came while it held is not taken in mid-flight
-        if self.state is BridgeState.READY and not self.paused and self.at_home and in_play(self.tracker, now):
-            if self.tracker.ball != self._last_ball:
-                self._begin(now)
+        self.play.settle(now)
+        if self._state is BridgeState.ACTIVE and self.episode is None:
+            self._change(BridgeState.READY, now, "ball over")
+        ready = self.state is BridgeState.READY
+        self._been_home |= ready and self.at_home
+        if self.paused or not (ready or self.state is BridgeState.ACTIVE):
+            self.play.pass_over(now)
+        elif ready and self._policy is not None and self.play.due(now):
+            self.play.begin(self.tracker.ball, self.policy_version, now)
+            self._policy.reset()
+            self._change(BridgeState.ACTIVE, now, f"ball {self.tracker.ball}")
         if self.state is BridgeState.ACTIVE:
-            return self._play(now, self.episode, self._policy)
+            return self._ask_policy(now, self.episode, self._policy)
         return self._homeward() if self.state is BridgeState.READY else np.zeros(N_JOINTS)
 
     def _ages(self, now: float) -> dict[str, float]:
@@ -396,17 +324,7 @@ class Bridge:
         if armed and log_failure:
             self.gate.fault(Cause.INTERNAL, log_failure, now)
 
-    def _begin(self, now: float) -> None:
-        self.counts.balls += 1
-        self._last_ball = self.tracker.ball
-        self.episode = Episode(self.counts.balls, self.tracker.ball, now, self.policy_version)
-        self._tracks[self.counts.balls] = [(t, *x) for t, x in self.tracker.track.samples()]
-        if self._policy is not None:  # arming has looked
-            self._policy.reset()
-        self._log(episode_start(now, self.episode.number, ball=self.episode.ball))
-        self._change(BridgeState.ACTIVE, now, f"ball {self.episode.ball}")
-
-    def _play(self, now: float, episode: Episode | None, policy: Policy | None) -> np.ndarray:
+    def _ask_policy(self, now: float, episode: Episode | None, policy: Policy | None) -> np.ndarray:
         """The policy's request (8,)."""
         if episode is None or policy is None:
             self.gate.fault(Cause.INTERNAL, "neither ball nor policy to play", now)
@@ -439,52 +357,17 @@ class Bridge:
         speed = np.minimum(speed, distance / (3.0 * self.gate.period))
         return np.where(distance < 1e-4, 0.0, np.sign(error) * speed)
 
-    def _settle_episodes(self, now: float) -> None:
-        """Takes the policy off a ball that is over and reports the outcomes that are known."""
-        if self.episode is not None:
-            self.episode.check(now, MAX_STEPS)
-            if self.episode.over:
-                self._waiting.append(self.episode)
-                self.episode = None
-                if self._state is BridgeState.ACTIVE:
-                    self._change(BridgeState.READY, now, "ball over")
-        while self._waiting:
-            episode = self._waiting[0]
-            episode.check(now, MAX_STEPS)
-            if not episode.decided:
-                break
-            self._waiting.popleft()
-            self._report(episode.summary(), now)
-
-    def _report(self, summary: EpisodeSummary, now: float) -> None:
-        self.counts.outcomes[summary.outcome] += 1
-        self.counts.rally = self.counts.rally + 1 if summary.outcome == "returned" else 0
-        self.counts.longest_rally = max(self.counts.longest_rally, self.counts.rally)
-        details = {k: v for k, v in asdict(summary).items() if k not in ("number", "outcome")}
-        self._log(episode_end(now, summary.number, summary.outcome, {}, **details))
-        try:
-            if self._on_episode is not None:
-                self._on_episode(summary)
-        finally:
-            self._tracks.pop(summary.number, None)
-
-    def _abort_episodes(self, cause: str, now: float) -> None:
-        for episode in (self.episode, *self._waiting):
-            if episode is not None:
-                episode.abort(cause, now)
-
     def _after(self, now: float) -> None:
         """Follows the gate's state."""
         if self.gate.state is GateState.FAULT:
             faults = self.gate.faults
             if len(faults) > self._logged_faults:
                 for fault in faults[self._logged_faults :]:
-                    self.event(
-                        now, Level.ERROR, "fault", json_text({"cause": fault.cause.value, "text": fault.sentence})
-                    )
+                    text = json_text({"cause": fault.cause.value, "text": fault.sentence})
+                    self.event(now, Level.ERROR, "fault", text)
                 first, self._logged_faults = self._logged_faults == 0, len(faults)
                 if first:
-                    self._abort_episodes(faults[0].cause.value, now)
+                    self.play.abort(faults[0].cause.value, now)
                     self._change(BridgeState.DISARMED, now, f"fault: {faults[0].sentence}")
             if self.gate.at_rest:
                 self.axes.stop()
@@ -510,10 +393,6 @@ class Bridge:
             self.unlogged += len(records)
             if isinstance(error, OSError):  # nothing more will get into the file
                 self._log_failure = f"the log cannot be written: {error}"
-
-    def ball_track(self, summary: EpisodeSummary) -> np.ndarray:
-        """(n, 4) t [s], x, y, z [m] of the incoming ball until it was played; in ``on_episode`` only."""
-        return np.array(self._tracks.get(summary.number, [])).reshape(-1, 4)
 
     def joint_table(self) -> list[tuple[str, float, float]]:
         """Name, measured position and commanded velocity of every joint, for the view."""

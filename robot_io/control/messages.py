@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from robot_io.control.episode import EpisodeSummary
+from robot_io.control.rally import RallySummary
 from robot_io.policy.policy import Policy
 
 
@@ -90,6 +91,13 @@ class Played:
 
 
 @dataclass(frozen=True)
+class RallyOver:
+    """One rally with its length and end."""
+
+    summary: RallySummary
+
+
+@dataclass(frozen=True)
 class Failed:
     """The process ends; the robot stands."""
 
@@ -121,6 +129,8 @@ class Status:
     arm, axes, tracker  the reason why each cannot be used, or None
     joints          name, measured position, commanded velocity of each joint
     outcomes        balls by outcome
+    rally           paddle touches of the rally in play
+    rallies         that count, with the mean_rally and longest_rally of them; last_rally: the last one in words
     egm             fields of ``EgmStatistics``
     tracker_counts  datagrams by fate
     """
@@ -139,7 +149,10 @@ class Status:
     balls: int = 0
     outcomes: dict[str, int] = field(default_factory=dict)
     rally: int = 0
+    rallies: int = 0
+    mean_rally: float = 0.0
     longest_rally: int = 0
+    last_rally: str = ""
     egm: dict[str, Any] = field(default_factory=dict)
     tracker_counts: dict[str, int] = field(default_factory=dict)
     axes_cycles: int = 0
@@ -154,4 +167,4 @@ class Status:
         return "; ".join(f"{name}: {reason}" for name, reason in found.items() if reason)
 
 
-Message = Ready | Refused | PolicySet | Played | Failed | Ended | Status
+Message = Ready | Refused | PolicySet | Played | RallyOver | Failed | Ended | Status

@@ -26,6 +26,7 @@ from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState
 from robot_io.control.bridge import Policy as StepPolicy
 from robot_io.control.config import RobotConfig, linear_axes
 from robot_io.control.episode import EpisodeSummary
+from robot_io.control.rally import Box
 from robot_io.control.timings import Timings
 from robot_io.devices.egm.session import EgmConfig, EgmSession, EgmSocket
 from robot_io.devices.festo import AxesThread
@@ -51,12 +52,16 @@ Closing = TypeVar("Closing", bound=Closable)
 
 @dataclass(frozen=True)
 class ControlOptions:
-    """artefact: folder; backend: "numpy" or "jit"; log_folder and log_name of the MCAP, None: no log."""
+    """artefact: folder; backend: "numpy" or "jit"; log_folder and log_name of the MCAP, None: no log.
+
+    box: balls that the policy was trained for; None: nothing is out of distribution
+    """
 
     artefact: str
     backend: str = "numpy"
     log_folder: str | None = None
     log_name: str = "session"
+    box: Box | None = None
     metadata: tuple[tuple[str, str], ...] = ()
     attachments: tuple[tuple[str, str], ...] = ()
 
@@ -103,6 +108,7 @@ class Control:
         policy = make_policy(options.backend, loaded.policy)
         self.timings = Timings()
         self._opened: list[Closable] = []
+        self._unsent: deque[messages.Message] = deque()
         try:
             self._arm_socket = self._open(EgmSocket(config.arm.host, config.arm.port))
             self._tracker_socket = self._open(TrackerSocket(config.tracker))
@@ -119,16 +125,23 @@ class Control:
             )
             self._tracker = Tracker(config.tracker)
             gate = SafetyGate(config=config.safety)
-            bridge_config = BridgeConfig(delays=config.delays)
+            bridge_config = BridgeConfig(delays=config.delays, box=options.box)
             self.bridge = Bridge(
-                self._session, self._axes, self._tracker, gate, policy, bridge_config, recorder, self._episode
+                self._session,
+                self._axes,
+                self._tracker,
+                gate,
+                policy,
+                bridge_config,
+                recorder,
+                self._episode,
+                lambda summary: self._send(messages.RallyOver(summary)),
             )
             self._warm_up(policy, gate)
         except BaseException:
             self._close()
             raise
         self._quit = False
-        self._unsent: deque[messages.Message] = deque()
         self._status_at = 0.0
         self._period = 1.0 / config.rate
 
@@ -316,7 +329,7 @@ class Control:
             self._axes.home()
 
     def _episode(self, summary: EpisodeSummary) -> None:
-        self._send(messages.Played(summary, self.bridge.ball_track(summary)))
+        self._send(messages.Played(summary, self.bridge.play.track(summary.number)))
 
     def _send(self, message: messages.Message) -> None:
         self._unsent.append(message)
@@ -348,8 +361,11 @@ class Control:
             policy_version=bridge.policy_version,
             balls=counts.balls,
             outcomes=dict(counts.outcomes),
-            rally=counts.rally,
-            longest_rally=counts.longest_rally,
+            rally=counts.rallies.touches,
+            rallies=counts.rallies.rallies,
+            mean_rally=counts.rallies.touched / max(counts.rallies.rallies, 1),
+            longest_rally=counts.rallies.longest,
+            last_rally=counts.rallies.last,
             egm=asdict(self._session.statistics),
             tracker_counts=dict(self._tracker.counts),
             axes_cycles=self._axes.cycles,

@@ -17,6 +17,7 @@ from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_JOINTS
 from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState, Policy
 from robot_io.control.config import PROFILES, axis_range
 from robot_io.control.episode import EpisodeSummary
+from robot_io.control.interfaces import STANDARD_PLAY
 from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.festo import Axis, DirectLink, FestoAxes
 from robot_io.devices.tracker import Tracker, TrackerConfig
@@ -34,7 +35,6 @@ from robot_io.safety.gate import SafetyConfig, SafetyGate
 GRID = 3000  # ticks a second of the clock, so that 75, 125 and 250 Hz are whole numbers of them
 ARM, AXES, TRACK, CONTROL = GRID // 250, GRID // 125, GRID // 125, GRID // 75
 BRIDGE, CONTROLLER = ("127.0.0.1", 6510), ("127.0.0.1", 6511)
-STANDARD_PLAY = BridgeConfig()
 
 
 class LockStep:

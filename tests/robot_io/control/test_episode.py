@@ -7,7 +7,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from robot_io.control.episode import HIT, MISSED, RETURNED, Episode, in_play
+from robot_io.control.episode import HIT, MISSED, RETURNED, Episode
+from robot_io.control.strokes import in_play
 from robot_io.devices.tracker import BallSample, Tracker, TrackerConfig, encode
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.network import NetworkFaults
@@ -41,7 +42,7 @@ def followed(positions, noise=0.0, seed=0, lost=0.0, blade=BLADE):
         seen = position + noise * random.normal(size=3)
         now = i * DT + 0.015
         sample = tracker.receive(encode(BallSample(i, 1, i * DT, seen)), "127.0.0.1", now)
-        if episode is None and in_play(tracker, now):
+        if episode is None and in_play(tracker.track, tracker.seen, now):
             episode = Episode(1, 1, now)
         if episode is not None:
             episode.follow(sample, blade, now)
@@ -153,7 +154,7 @@ def test_the_policy_is_taken_off_as_soon_as_the_ball_is_hit_or_lost():
     positions, episode, tracker = flight(serve, bounce, out, last), None, Tracker(TrackerConfig())
     for i, position in enumerate(positions):
         sample = tracker.receive(encode(BallSample(i, 1, i * DT, position)), "127.0.0.1", i * DT)
-        if episode is None and in_play(tracker, i * DT):
+        if episode is None and in_play(tracker.track, tracker.seen, i * DT):
             episode = Episode(1, 1, i * DT)
             assert i <= 3  # three samples tell a velocity
         elif episode is not None:
@@ -187,12 +188,12 @@ def test_only_balls_that_come_are_in_play():
         for i in range(n):
             position = np.array(start) + np.array(velocity) * i * DT
             tracker.receive(encode(BallSample(i, 1, i * DT, position)), "127.0.0.1", i * DT)
-        return in_play(tracker, (n - 1) * DT + gap)
+        return in_play(tracker.track, tracker.seen, (n - 1) * DT + gap)
 
     assert seen([0, -3, 0]) and not seen([0, 3, 0]) and not seen([0, -0.9, 0]) and not seen([0, -3, 0], n=2)
     assert not seen([0, -3, 0], start=(0.2, -0.3, 0.4)) and not seen([0, -3, 0], start=(0.2, 1.2, -0.4))
     assert seen([0, -3, 0], gap=0.059) and not seen([0, -3, 0], gap=0.061)
-    assert not in_play(Tracker(TrackerConfig()), 0.0)
+    assert not in_play(Tracker(TrackerConfig()).track, None, 0.0)
 
 
 def truth(touches):

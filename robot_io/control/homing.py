@@ -1,0 +1,28 @@
+"""Homing of the linear axes: a motion that the drives make on their own, past the gate, so the arm must be clear."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, LIMITS
+from robot_io.errors import RefusedError
+from robot_io.safety.clearance import RobotGeometry
+
+HOMING_GAP = 0.03  # [m] of everything to everything while the linear axes search their references
+HOMING_PLACES = 21  # along each axis at which that is looked at
+
+
+def check_homing(geometry: RobotGeometry, measured: np.ndarray) -> None:
+    """Raise RefusedError unless the arm, measured (8,), is clear of everything wherever the linear axes may go."""
+    if not np.isfinite(measured[list(ABB_JOINTS)]).all():
+        raise RefusedError("axes not homed: the arm's position is not known; start its EGM session first")
+    places = np.meshgrid(*(np.linspace(LIMITS.lower[i], LIMITS.upper[i], HOMING_PLACES) for i in FESTO_JOINTS))
+    q = np.repeat(measured[:, None], places[0].size, axis=1)
+    q[list(FESTO_JOINTS)] = [axis.ravel() for axis in places]
+    gaps = geometry.gaps(q)
+    if not gaps.min() > HOMING_GAP:
+        row = geometry.rows[int(gaps.min(axis=1).argmin())]
+        raise RefusedError(
+            f"axes not homed: somewhere on their way {row} comes as near as {gaps.min():.3f} m, allowed is "
+            f"{HOMING_GAP} m; jog the arm to its home pose first"
+        )

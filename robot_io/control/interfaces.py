@@ -1,0 +1,59 @@
+"""Parts that a bridge is made of, as it sees them, its settings and its states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+
+from robot_io.control.observation import ObservationDelays
+from robot_io.control.rally import Box
+
+
+class BridgeState(Enum):
+    DISARMED = "disarmed"
+    READY = "ready"
+    ACTIVE = "active"
+    STOPPING = "stopping"
+    FAULT = "fault"
+
+
+class Policy(Protocol):
+    """``robot_io.policy.numpy_policy.StreamingPolicy`` or one that computes the same."""
+
+    def reset(self) -> None: ...
+
+    def step(self, observation: np.ndarray) -> np.ndarray: ...
+
+
+class Axes(Protocol):
+    """``FestoAxes`` or the thread that drives it."""
+
+    def command(self, position: np.ndarray, velocity: np.ndarray, now: float) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def problem(self, now: float) -> str | None: ...
+
+
+@dataclass(frozen=True)
+class BridgeConfig:
+    """Settings of play.
+
+    delays           of the observations
+    home             (8,) joint positions to wait at; None: the geometry's
+    home_speed       share of the policy's velocity limits on the way home
+    home_braking     share of the acceleration limits there
+    box              what the policy was trained for; None: no ball is out of distribution
+    """
+
+    delays: ObservationDelays = ObservationDelays()
+    home: tuple[float, ...] | None = None
+    home_speed: float = 0.5
+    home_braking: float = 0.3
+    box: Box | None = None
+
+
+STANDARD_PLAY = BridgeConfig()
