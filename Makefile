@@ -1,5 +1,6 @@
 # make demo   set up, train the quickstart, evaluate it, export it
-# make rig-demo  the same policy on the emulated robot, over real sockets in real time (trains it first if need be)
+# make rig-demo  the same policy plays 20 rallies with a virtual player on the emulated robot, over real sockets in
+#             real time (trains it first if need be)
 # make study-quick  the whole study in small: five virtual players, all methods, a report (twenty minutes on two cores; resumable)
 # make test   set up and run the tests but for the slow ones (docs/how-to/run-the-tests.md)
 # make test-all  the slow ones as well
@@ -20,7 +21,7 @@ demo: $(READY)
 
 rig-demo: $(READY)
 	test -e runs/quickstart/artefact/manifest.json || $(BIN)/mjx-tt train quickstart.yaml --out runs
-	$(BIN)/mjx-tt run runs/quickstart --robot rig --balls 30 --log runs/rig-demo
+	$(BIN)/mjx-tt run runs/quickstart --robot rig --rallies 20 --player player3 --log runs/rig-demo
 
 study-quick: $(READY)
 	$(BIN)/mjx-tt is2r study_quick.yaml --out runs

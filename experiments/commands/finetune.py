@@ -18,7 +18,7 @@ from experiments.commands.options import (
     start_jax,
     writable,
 )
-from experiments.commands.run import Backend, Distribution
+from experiments.commands.run import Backend, Distribution, Player, known_player
 from experiments.runs.locate import find_policy
 
 app = command(
@@ -28,6 +28,7 @@ app = command(
   mjx-tt finetune runs/quickstart --robot robot.yaml --out runs/anna
   mjx-tt finetune runs/quickstart --robot rig --out runs/rig             the emulated robot, in real time
   mjx-tt finetune runs/quickstart --robot lockstep --rig worn.yaml       as fast as this machine allows
+  mjx-tt finetune runs/quickstart --robot lockstep --player player3      through rallies with a virtual player
 
 Every ball is on disk before the next begins: the same command continues after an interruption, a crash or a power cut.
 """,
@@ -47,6 +48,7 @@ def finetune(
     out: Annotated[str | None, option("FOLDER", "of the run (default: POLICY-finetuned)")] = None,
     backend: Backend = "numpy",
     distribution: Distribution = None,
+    player: Player = None,
     rig: RigFile = None,
     seed: RigSeed = 0,
 ) -> int:
@@ -57,11 +59,12 @@ def finetune(
     find_policy(policy)
     existing(None if robot in ("rig", "lockstep") else robot, key="--robot")
     existing(rig, key="--rig")
+    known_player(player, robot, distribution)
     folder = out or f"{Path(policy).resolve().name}-finetuned"
     writable(folder)
     start_jax(1)
     from experiments.finetuning import session
     from experiments.runs.run_dir import Run
 
-    report = session.finetune(policy, chosen, Run(folder), robot, distribution, rig, backend, seed, console())
+    report = session.finetune(policy, chosen, Run(folder), robot, distribution, rig, backend, seed, console(), player)
     return 0 if report is not None else 130

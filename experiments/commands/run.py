@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,9 +20,11 @@ from experiments.commands.options import (
     start_jax,
     writable,
 )
+from experiments.errors import ConfigError
 from experiments.runs.locate import artefact_of
 
 Distribution = Annotated[str | None, option("NAME", "balls that are thrown (default: the policy's)")]
+Player = Annotated[str | None, option("NAME", "virtual player on the rig, player1 to player5, who answers")]
 Backend = Annotated[Literal["numpy", "jit"], Parameter(help="what computes the policy")]
 
 app = command(
@@ -29,6 +32,7 @@ app = command(
     "play: an exported policy on a robot, real or emulated",
     """\
   mjx-tt run runs/quickstart --robot rig --balls 30
+  mjx-tt run runs/quickstart --robot rig --rallies 20 --player player3
   mjx-tt run runs/quickstart/artefact --robot robot.yaml
   mjx-tt run runs/quickstart/artefact --robot rig --rig worn.yaml --distribution player1/M1
 
@@ -52,6 +56,8 @@ def run(
     *,
     robot: Annotated[str, option("YAML", 'a robot.yaml, or "rig" for the emulated robot')],
     balls: Annotated[int | None, count("end after N balls (default: when the operator quits)")] = None,
+    rallies: Annotated[int | None, count("end after N rallies that count")] = None,
+    player: Player = None,
     seconds: Annotated[float | None, option("S", "end after S seconds")] = None,
     backend: Backend = "numpy",
     log: Annotated[str, option("FOLDER", "for the MCAP log and the summary")] = "runs/robot",
@@ -63,11 +69,30 @@ def run(
     folder = artefact_of(artefact)
     existing(None if robot == "rig" else robot, key="--robot")
     existing(rig, key="--rig")
+    known_player(player, robot, distribution)
     writable(log)
     start_jax(1)
     from experiments.deploy import session
 
-    return session.run(Path(folder), robot, balls, distribution, backend, Path(log), rig, seed, seconds, console())
+    return session.run(
+        Path(folder), robot, balls, distribution, backend, Path(log), rig, seed, seconds, console(), rallies, player
+    )
+
+
+def known_player(player: str | None, robot: str, distribution: str | None) -> None:
+    """Raises ConfigError for a player who does not exist, has no rig to play in, or is to throw balls as well."""
+    if player is None:
+        return
+    if robot not in ("rig", "lockstep"):
+        raise ConfigError(f"--player {player}: virtual players play on the rig only; --robot is {robot}")
+    if distribution is not None:
+        raise ConfigError(
+            f"--player {player}, --distribution {distribution}: a player has balls of their own; one of both"
+        )
+    folder = resources.files("mjx_tt") / "assets" / "virtual_players"
+    names = sorted(Path(str(path)).stem for path in folder.iterdir() if str(path).endswith(".yaml"))
+    if player not in names:
+        raise ConfigError(f"--player {player}: unknown; allowed: {', '.join(names)}")
 
 
 def _ports(_type: Any, tokens: Sequence[Token]) -> tuple[int, ...]:

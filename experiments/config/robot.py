@@ -16,8 +16,8 @@ from experiments.config.experiment import read_yaml
 from experiments.config.validation import LONGEST, nearest
 from experiments.errors import ConfigError, checked
 from robot_io.control.config import RobotConfig
-from robot_io.emulator.ball_launcher import Throws
 from robot_io.emulator.config import RigParams
+from robot_io.emulator.opponent import Throws
 
 if TYPE_CHECKING:  # a robot.yaml is read without JAX
     from ballmodel.distribution import BallDistribution

@@ -101,7 +101,11 @@ class View:
         if not s.faults:
             lines += [Text(f"waiting: {text}", "yellow") for text in s.present.values()]
         outcomes = ", ".join(f"{n} {name}" for name, n in s.outcomes.items()) or "none yet"
-        lines.append(Text(f"balls {s.balls}: {outcomes}; in a row {s.rally}, longest {s.longest_rally}"))
+        lines.append(Text(f"balls {s.balls}: {outcomes}"))
+        rallies = (
+            f"rally {s.rally} touches; {s.rallies} rallies, {s.mean_rally:.1f} on average, longest {s.longest_rally}"
+        )
+        lines.append(Text(f"{rallies}; last: {s.last_rally}" if s.last_rally else rallies))
         joints = Table(box=None, pad_edge=False)
         for name in ("joint", "position", "command"):
             joints.add_column(name, justify="left" if name == "joint" else "right")

@@ -13,8 +13,10 @@ from rich.console import Console
 from experiments.config import build
 from experiments.config import robot as robots
 from experiments.deploy.operator_console import Keyboard
+from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.errors import ConfigError
 from mjx_tt.sim.model import SimModel
+from robot_io.control.rally import Box
 from robot_io.emulator.processes import Ports, Rig
 from robot_io.policy import artefact as artefacts
 
@@ -27,12 +29,26 @@ def scene() -> str:
     return str(resources.files("mjx_tt") / "assets" / "scene.xml")
 
 
-def rig_for(artefact: artefacts.Artefact, balls: str | None, params_path: str | None, seed: int) -> Rig:
-    """A rig that throws balls of a distribution: the named one, or that of the policy's training."""
+def rig_for(
+    artefact: artefacts.Artefact, balls: str | None, params_path: str | None, seed: int, player: str | None = None
+) -> Rig:
+    """A rig with a virtual player, or that throws balls of a distribution: the named one, or that of the training."""
+    if player is not None:
+        return Rig(scene(), VirtualPlayer(player, seed), robots.load_rig(params_path))
     chosen = balls or _trained_on(artefact)
     distribution = build.distribution(chosen, "--distribution")
     throws = robots.throws_of(distribution, SimModel(), THROWS, seed)
     return Rig(scene(), throws, robots.load_rig(params_path))
+
+
+def box_of(artefact: artefacts.Artefact) -> Box | None:
+    """Bounds of the balls that the policy was trained for; None where its artefact does not say."""
+    config = (artefact.manifest.get("provenance") or {}).get("config") or {}
+    if "balls" not in config:
+        return None
+    d = build.distribution(config["balls"], str(artefact.folder))
+    low, high = (*d.position_min, *d.velocity_min, *d.landing_min), (*d.position_max, *d.velocity_max, *d.landing_max)
+    return Box(tuple(map(float, low)), tuple(map(float, high)))
 
 
 def _trained_on(artefact: artefacts.Artefact) -> str | dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -12,17 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from experiments.config import robot as robots
+from experiments.deploy import session_report
 from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, Keyboard, View
-from experiments.deploy.rig import RIG, rig_for
+from experiments.deploy.rig import RIG, box_of, rig_for
+from experiments.deploy.session_report import PlayedSession
 from experiments.runs import run_dir
-from experiments.stats import wilson
 from robot_io.control import messages, process
 from robot_io.control.config import RobotConfig
-from robot_io.control.episode import EpisodeSummary
-from robot_io.control.messages import FaultReport, Message, Played, Refused, Request, Status
+from robot_io.control.messages import Message, Played, RallyOver, Refused, Request, Status
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
@@ -53,7 +53,7 @@ class Session:
             raise RefusedError(str(error) or "the control process ended at once") from None
         self.status: Status | None = None
         self.timings: dict[str, Any] = {}
-        self._episodes: deque[Played] = deque()  # that came while an answer was waited for
+        self._episodes: deque[Played | RallyOver] = deque()  # that came while an answer was waited for
 
     def __enter__(self) -> Session:
         return self
@@ -77,7 +77,7 @@ class Session:
     def _answers(self, seconds: float) -> Iterator[Message]:
         """``messages`` without the episodes, which are kept for it."""
         for message in self._received(seconds):
-            if isinstance(message, Played):
+            if isinstance(message, Played | RallyOver):
                 self._episodes.append(message)
             else:
                 yield message
@@ -184,8 +184,13 @@ def run(
     seed: int,
     seconds: float | None,
     console: Console,
+    rallies: int | None = None,
+    player: str | None = None,
 ) -> int:
-    """Play until ``balls`` outcomes are known, ``seconds`` have passed, or the operator quits; the exit status.
+    """Play until ``balls`` outcomes are known, ``rallies`` that count are over, ``seconds`` have passed, or until the
+    operator quits; the exit status.
+
+    player: virtual player who rallies with the robot on the rig.
 
     0: all went well, 1: it ended early, 130: the operator ended it with Ctrl-C; the summary is written in any case.
     """
@@ -194,7 +199,7 @@ def run(
         rig = None
         if robot == RIG:
             console.print("starting the rig ...", highlight=False)
-            rig = stack.enter_context(rig_for(loaded, distribution, rig_params, seed))
+            rig = stack.enter_context(rig_for(loaded, distribution, rig_params, seed, player))
             config, text = rig.robot, robots.to_yaml(rig.robot)
         else:
             config = robots.load_robot(robot)
@@ -202,7 +207,13 @@ def run(
         name = time.strftime("%Y%m%d-%H%M%S")
         git = run_dir.git_state()
         options = process.ControlOptions(
-            str(artefact), backend, str(log_folder), name, (("git", json.dumps(git)),), (("robot.yaml", text),)
+            str(artefact),
+            backend,
+            str(log_folder),
+            name,
+            box_of(loaded),
+            (("git", json.dumps(git)),),
+            (("robot.yaml", text),),
         )
         log_folder.mkdir(parents=True, exist_ok=True)
         session = stack.enter_context(Session(config, options, console))
@@ -214,19 +225,18 @@ def run(
             rig.throw(True)
         else:
             console.print("press p to prepare the axes, a to arm; space stops", highlight=False)
-        episodes: list[EpisodeSummary] = []
-        faults: list[FaultReport] = []
+        played = PlayedSession()
         try:
             with Keyboard() as keyboard, View(console, f"{artefact} on {config.name}") as view:
-                problem = _watch(session, rig, keyboard, view, balls, seconds, console, episodes, faults)
+                problem = _watch(session, rig, keyboard, view, balls, rallies, seconds, console, played)
             status = 1 if problem else 0
         except KeyboardInterrupt:
             status, problem = INTERRUPTED, "stopped by Ctrl-C"
         session.close()
-    summary = _summary(loaded, config, episodes, session, process.log_path(options))
-    summary["faults"] = [asdict(fault) for fault in faults]
+    summary = session_report.summary(loaded, config, played, session.status, session.timings, process.log_path(options))
+    summary |= {"faults": [asdict(fault) for fault in played.faults], "player": player}
     run_dir.write_json(log_folder / f"{name}.json", summary)
-    _print(console, summary, log_folder / f"{name}.json")
+    session_report.show(console, summary, log_folder / f"{name}.json")
     if problem:
         console.print(problem, style="red", highlight=False)
     return status
@@ -238,24 +248,31 @@ def _watch(
     keyboard: Keyboard,
     view: View,
     balls: int | None,
+    rallies: int | None,
     seconds: float | None,
     console: Console,
-    episodes: list[EpisodeSummary],
-    faults: list[FaultReport],
+    played: PlayedSession,
 ) -> str | None:
-    """Play, adding the episodes played and the faults after which the rig was brought back; why it ended early."""
+    """Play, adding to what was played; the reason why it ended early."""
     in_a_row = 0
     end = time.monotonic() + (float("inf") if seconds is None else seconds)
     heard = time.monotonic()
-    while time.monotonic() < end and (balls is None or len(episodes) < balls):
+    while time.monotonic() < end:
+        if len(played.episodes) >= (balls or math.inf) or len(played.counted) >= (rallies or math.inf):
+            break
         for message in session.messages(0.1):
             view.take(message)
             if isinstance(message, Played):
                 heard = time.monotonic()
-                episodes.append(message.summary)
+                played.episodes.append(message.summary)
                 in_a_row = in_a_row if message.summary.fault else 0
                 if not console.is_terminal:
-                    console.print(f"ball {len(episodes)}: {message.summary.outcome}", highlight=False)
+                    console.print(f"ball {len(played.episodes)}: {message.summary.outcome}", highlight=False)
+            elif isinstance(message, RallyOver):
+                played.rallies.append(message.summary)
+                if not console.is_terminal:
+                    rally = message.summary
+                    console.print(f"rally {rally.number}: {rally.length} touches, {rally.text}", highlight=False)
         key = keyboard.pressed()
         if key == QUIT:
             break
@@ -272,7 +289,7 @@ def _watch(
                 text = f"{fault.cause}: {fault.text}"
                 if in_a_row > RECOVERIES:
                     return f"stopped by {in_a_row} faults in a row, the last: {text}"
-                faults.append(fault)
+                played.faults.append(fault)
                 console.print(f"fault, reset and resumed: {text}", style="red", highlight=False)
                 try:
                     session.recover(rig)
@@ -281,66 +298,3 @@ def _watch(
             if time.monotonic() - heard > QUIET:
                 return f"no ball was played for {QUIET:g} s"
     return None
-
-
-def _summary(
-    loaded: artefacts.Artefact,
-    config: RobotConfig,
-    episodes: list[EpisodeSummary],
-    session: Session,
-    log_file: Path | None,
-) -> dict[str, Any]:
-    returned = sum(e.outcome == "returned" for e in episodes)
-    hit = sum(e.outcome != "missed" for e in episodes)
-    report: dict[str, Any] = {
-        "artefact": str(loaded.folder),
-        "artefact_sha256": loaded.digest,
-        "robot": config.name,
-        "episodes": len(episodes),
-        "returned": returned,
-        "hit": hit,
-    }
-    if episodes:
-        low, high = wilson(returned, len(episodes))
-        report |= {"return_rate": returned / len(episodes), "low": low, "high": high, "hit_rate": hit / len(episodes)}
-    evaluation = (loaded.manifest.get("provenance") or {}).get("evaluation")
-    if evaluation:
-        report["simulation"] = {k: evaluation[k] for k in ("return_rate", "low", "high", "episodes")}
-        report["simulation"]["balls"] = evaluation["balls"]["name"]
-    status = session.status
-    report["timings"] = session.timings or (status.timings if status else {})
-    report["egm"] = status.egm if status else {}
-    report |= {k: getattr(status, k, None) for k in ("axes_cycles", "axes_late", "tracker_counts", "log_dropped")}
-    report["log"] = None if log_file is None else str(log_file)
-    return report
-
-
-def _print(console: Console, report: dict[str, Any], path: Path) -> None:
-    table = Table(title=f"{report['artefact']} on {report['robot']}", title_justify="left", show_header=False)
-    if report["episodes"]:
-        text = f"{report['return_rate']:.1%}  ({report['returned']} of {report['episodes']}, 95 % interval "
-        table.add_row("return rate", text + f"{report['low']:.1%} to {report['high']:.1%})", style="bold")
-    if "simulation" in report:
-        s = report["simulation"]
-        table.add_row(
-            "in simulation",
-            f"{s['return_rate']:.1%}  ({s['episodes']:,} balls of {s['balls']}, {s['low']:.1%} to {s['high']:.1%})",
-        )
-    for name, t in report["timings"].items():
-        if isinstance(t, dict):
-            table.add_row(
-                f"{name}, ms",
-                f"p50 {t['p50_ms']:.3f}   p99 {t['p99_ms']:.3f}   p99.9 {t['p99.9_ms']:.3f}   max {t['max_ms']:.3f}",
-            )
-    if report["faults"]:
-        table.add_row("faults, reset", ", ".join(fault["cause"] for fault in report["faults"]))
-    table.add_row("ticks missed", str(report["timings"].get("missed_ticks", 0)))
-    if report["egm"]:
-        egm = report["egm"]
-        table.add_row("EGM", f"{egm['accepted']:,} packets, {egm['replies']:,} answers, {egm['lost']:,} lost")
-    if report["axes_cycles"] is not None:
-        table.add_row("linear axes", f"{report['axes_cycles']:,} exchanges, {report['axes_late']:,} late")
-    console.print(table)
-    for name, value in {"summary": path, "log": report["log"]}.items():
-        if value:
-            console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)

@@ -119,6 +119,6 @@ def _to_json(entry: Entry) -> dict[str, Any]:
 
 def _from_json(data: dict[str, Any]) -> Entry:
     summary = dict(data.pop("summary"))
-    summary["landing"] = tuple(summary["landing"])
+    summary |= {name: tuple(value) for name, value in summary.items() if isinstance(value, list)}
     trajectory = np.array(data.pop("trajectory"), float).reshape(-1, 4)
     return Entry(summary=EpisodeSummary(**summary), returns=data.pop("return"), trajectory=trajectory, **data)

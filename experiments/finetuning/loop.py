@@ -242,8 +242,10 @@ class Session:
         summary = played.summary
         terms = reward_terms(summary)
         returns = sum(self._weights[name] * value for name, value in terms.items())
-        # Asked whatever the bridge says, since the question is about this ball only.
+        # Asked whatever the bridge says, since the question is about this ball only. The human's own faults say nothing
+        # about the policy.
         discarded = self._operator.discarded() or summary.discarded or summary.fault == STOPPED
+        discarded |= summary.human_fault is not None
         return Entry(*place, number, summary, terms, returns, discarded, played.trajectory)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,17 +12,22 @@ import numpy as np
 import mjx_tt
 from ballmodel.state import BallState
 from experiments.errors import RunError
+from robot_io.control.bridge import BridgeState
 from robot_io.control.episode import EpisodeSummary
-from robot_io.emulator.ball_launcher import Throws
+from robot_io.control.rally import RallySummary
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
+from robot_io.emulator.opponent import Opponent, Throws
 from robot_io.emulator.world import World
+from robot_io.errors import RefusedError
 from robot_io.log.messages import Ball, Record
-from robot_io.log.recorder import NullRecorder
+from robot_io.log.recorder import NullRecorder, SessionRecorder
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.policy.policy import Policy
 
 SCENE = Path(mjx_tt.__file__).parent / "assets" / "scene.xml"
+EXCHANGE = 0.03  # [s] of play that an exchange of policies takes, as through the pipe of a control process
+LONGEST_WAIT = 120.0  # [s] of play for a ball
 REPORTING = 1.0  # [s] within which the outcome of an episode that a fault ended is known
 
 
@@ -113,6 +119,69 @@ class LockStepRobot:
 
     def describe(self) -> dict[str, Any]:
         return {"robot": "lock-step", "params": repr(self._params), "balls": int(self._throws.position.shape[1])}
+
+
+class LockStepRallies:
+    """The emulated robot in this process, in rallies with an opponent; one session, which is not repeated.
+
+    It takes balls only while an episode is asked for, and credits only those that the policy of that episode played.
+    recorder: of the whole session
+    """
+
+    repeatable = False
+
+    def __init__(
+        self,
+        opponent: Opponent,
+        params: RigParams | None = None,
+        scene: str | Path = SCENE,
+        recorder: SessionRecorder | None = None,
+    ) -> None:
+        self._params = params or RigParams()
+        self._made = partial(LockStep, scene, opponent, params=self._params, recorder=recorder)
+        self._rig: LockStep | None = None
+        self._version = 0
+
+    @property
+    def rallies(self) -> list[RallySummary]:
+        """Rallies so far."""
+        return [] if self._rig is None else self._rig.rallies
+
+    def play(self, policy: Policy, episode_number: int) -> PlayedBall:
+        """Play the next ball of the session, whatever ``episode_number`` is."""
+        if self._rig is None:
+            self._rig = self._made(policy=StreamingPolicy(policy))
+            self._rig.start()
+            self._rig.throwing = True
+        rig, bridge = self._rig, self._rig.bridge
+        self._version += 1
+        end = rig.now + LONGEST_WAIT
+        rig.run(EXCHANGE)
+        self._exchange(policy)
+        while rig.now < end:
+            rig.run(0.1, lambda: bool(rig.summaries) or bridge.state in (BridgeState.FAULT, BridgeState.DISARMED))
+            found = rig.summaries.popleft() if rig.summaries else None
+            if bridge.state in (BridgeState.FAULT, BridgeState.DISARMED):
+                rig.run(REPORTING)
+                rig.recover()
+            if found is not None and found.policy_version == self._version:
+                bridge.paused = True
+                return PlayedBall(found, rig.track)
+        raise RunError(f"no ball was played for {LONGEST_WAIT:g} s: {[str(f) for f in bridge.gate.faults]}")
+
+    def _exchange(self, policy: Policy) -> None:
+        """Hand the policy over as soon as the ball before is not played any more."""
+        rig = self._rig
+        while rig is not None:
+            try:
+                rig.bridge.set_policy(StreamingPolicy(policy), self._version)
+                rig.bridge.paused = False
+                return
+            except RefusedError:
+                rig.run(EXCHANGE)
+
+    def describe(self) -> dict[str, Any]:
+        return {"robot": "rallies in lock-step", "params": repr(self._params)}
 
 
 class BallRecorder(NullRecorder):

@@ -14,10 +14,12 @@ from experiments.config import robot as robots
 from experiments.config.build import Experiment
 from experiments.config.finetuning import FineTuning
 from experiments.deploy.operator_console import Keyboard, View
-from experiments.deploy.rig import RIG, rig_for
+from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session import Session
+from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.finetuning import loop
 from experiments.finetuning.bridge_robot import BridgeRobot
+from experiments.finetuning.robot import LockStepRallies, Robot
 from experiments.runs import load_policy, run_dir
 from experiments.training import finalize
 from robot_io.control import process
@@ -36,24 +38,34 @@ def finetune(
     backend: str,
     seed: int,
     console: Console,
+    player: str | None = None,
 ) -> dict[str, Any] | None:
-    """Fine-tune on the robot of a robot.yaml, on RIG or LOCK_STEP; the report, or None when the operator stopped it."""
+    """Fine-tune on the robot of a robot.yaml, on RIG or LOCK_STEP; the report, or None when the operator stopped it.
+
+    player: virtual player who rallies with the robot on RIG or LOCK_STEP, in place of thrown balls
+    """
     experiment = loop.experiment_of(source, distribution)
     if robot == LOCK_STEP:
-        lock_step = loop.lock_step_robot(experiment, robots.load_rig(rig_params), seed)
+        params = robots.load_rig(rig_params)
+        lock_step: Robot = (
+            loop.lock_step_robot(experiment, params, seed)
+            if player is None
+            else LockStepRallies(VirtualPlayer(player, seed), params)
+        )
         return loop.finetune(source, settings, run, lock_step, console, None, experiment)
     run.folder.mkdir(parents=True, exist_ok=True)
     artefact = _artefact_of(source, experiment, run.folder, console)
     with ExitStack() as stack:
         rig = None
         if robot == RIG:
-            rig = stack.enter_context(rig_for(artefacts.load(artefact), distribution, rig_params, seed))
+            rig = stack.enter_context(rig_for(artefacts.load(artefact), distribution, rig_params, seed, player))
         config = rig.robot if rig else robots.load_robot(robot)
         options = process.ControlOptions(
             str(artefact),
             backend,
             str(run.folder),
             time.strftime("%Y%m%d-%H%M%S"),
+            box_of(artefacts.load(artefact)),
             (("git", json.dumps(run_dir.git_state())),),
             (("robot.yaml", robots.to_yaml(config)),),
         )

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ballmodel.constants import AIR_DENSITY, BALL_AREA, BALL_MASS, DRAG_COEFFICIENT, GRAVITY, NET_HEIGHT
+from ballmodel.constants import GRAVITY, NET_HEIGHT
 from robot_io.control.kinks import (
+    DRAG,
     HALF_LENGTH,
     NEAR_TABLE,
     SIDE,
@@ -20,6 +21,7 @@ from robot_io.control.kinks import (
     bounce_place,
     deflection,
     find_kink,
+    landing,
     over_table,
     slope,
 )
@@ -36,8 +38,6 @@ UNSEEN = 0.25  # [s] without a sight of the ball after which it is out of play
 LONGEST_RETURN = 2.5  # [s] after the hit by which the outcome is decided
 FARTHEST = 3.0  # [m] of ball and blade, also where the blade's place is not known
 LAUNCH = 8  # samples from which the human's stroke is estimated
-DRAG = DRAG_COEFFICIENT * AIR_DENSITY * BALL_AREA / (2.0 * BALL_MASS)  # K_d [1/m]
-FALL_STEP = 0.005  # [s]
 
 NET, OWN_SIDE, LONG, LOST = "net", "own side", "long", "lost"  # faults of the human
 MISSED, HIT, RETURNED = "missed", "hit", "returned"
@@ -218,7 +218,7 @@ class Episode:
         if not self.over and self.steps >= max_steps:
             self.over = True
         if now - max(self._seen, self.started) > UNSEEN:
-            self._lose(None if self.bounced or self.over else LOST, now)
+            self._out_of_sight(now)
 
     def abort(self, fault: str | None, now: float) -> None:
         """Ends the episode at once; what was decided before stays."""
@@ -229,7 +229,18 @@ class Episode:
     def superseded(self, now: float) -> None:
         """Decide at once: another ball is in play, or the human struck this one again."""
         if not self.decided:
-            self._lose(None if self.bounced or self.over else LOST, now)
+            self._out_of_sight(now)
+
+    def _out_of_sight(self, now: float) -> None:
+        """Decide for a ball that is not seen any more: a return came down where it was flying to."""
+        samples = list(self._recent)[-SIDE:]
+        if self.hit and self.crossed and len(samples) == SIDE and samples[0].time > self._turned:
+            velocity = slope(samples)
+            velocity[2] -= 0.5 * GRAVITY * (samples[-1].time - samples[0].time)
+            place = landing(samples[-1].position, velocity)
+            self.landing = (float(place[0]), float(place[1]))
+            self.returned = over_table(place) and place[1] > 0.0
+        self._lose(None if self.bounced or self.over else LOST, now)
 
     def _lose(self, human_fault: str | None, now: float) -> None:
         self.human_fault = human_fault
@@ -240,12 +251,7 @@ class Episode:
         start = self._stroke()
         if start is None:
             return None
-        position, velocity = start
-        while position[2] > 0.0 and position[1] > BEHIND:
-            air = -DRAG * float(np.linalg.norm(velocity)) * velocity - np.array([0.0, 0.0, GRAVITY])
-            position = position + FALL_STEP * (velocity + 0.5 * FALL_STEP * air)
-            velocity = velocity + FALL_STEP * air
-        return position[:2]
+        return landing(*start)
 
     def _stroke(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Position (3,) [m] and velocity (3,) [m/s] at the first sample; None with under three samples."""

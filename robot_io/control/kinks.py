@@ -1,4 +1,4 @@
-"""Kinks in a ball's track: sudden changes of its velocity, and which of them are bounces on the table."""
+"""A ball's track: free flight, and kinks, sudden changes of the velocity, some of which are bounces on the table."""
 
 from __future__ import annotations
 
@@ -7,7 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballmodel.constants import GRAVITY, TABLE_LENGTH, TABLE_WIDTH
+from ballmodel.constants import (
+    AIR_DENSITY,
+    BALL_AREA,
+    BALL_MASS,
+    BALL_RADIUS,
+    DRAG_COEFFICIENT,
+    GRAVITY,
+    TABLE_LENGTH,
+    TABLE_WIDTH,
+)
 
 NEAR_TABLE = 0.12  # [m] height at which the lowest sample of a bounce can be: 125 Hz, two frames lost
 UPWARD = 1.0  # [m/s] gained by the vertical speed in a bounce; a fit over three samples is good to 0.3 m/s
@@ -15,6 +24,9 @@ EDGE = 0.02  # [m] by which a bounce may seem to miss the table
 HALF_WIDTH, HALF_LENGTH = TABLE_WIDTH / 2, TABLE_LENGTH / 2  # [m]
 SIDE = 3  # samples before and after a moment in which a change of velocity is looked for
 LONGEST_WINDOW = 0.12  # [s] of these samples together
+DRAG = DRAG_COEFFICIENT * AIR_DENSITY * BALL_AREA / (2.0 * BALL_MASS)  # K_d [1/m]
+FLIGHT_STEP = 0.005  # [s]
+RESTITUTION = 0.9  # of tables, by and large
 
 
 @dataclass(frozen=True)
@@ -79,3 +91,27 @@ def bounce_place(kink: Kink, recent: deque[Seen]) -> np.ndarray | None:
 
 def over_table(place: np.ndarray) -> bool:
     return abs(place[0]) < HALF_WIDTH + EDGE and abs(place[1]) < HALF_LENGTH + EDGE
+
+
+def landing(position: np.ndarray, velocity: np.ndarray, longest: float = 2.0) -> np.ndarray:
+    """Place (2,) [m] where a ball of position (3,) [m] and velocity (3,) [m/s] comes down to the table's height."""
+    for _ in range(round(longest / FLIGHT_STEP)):
+        if position[2] <= BALL_RADIUS:
+            break
+        position, velocity = _step(position, velocity, FLIGHT_STEP)
+    return position[:2]
+
+
+def flown(position: np.ndarray, velocity: np.ndarray, seconds: float) -> np.ndarray:
+    """Place (3,) [m] of a ball after ``seconds``, bounces on the table included."""
+    while seconds > 0.0:
+        position, velocity = _step(position, velocity, min(seconds, FLIGHT_STEP))
+        seconds -= FLIGHT_STEP
+        if position[2] < BALL_RADIUS and velocity[2] < 0.0 and over_table(position) and position[2] > -NEAR_TABLE:
+            velocity = velocity * [1.0, 1.0, -RESTITUTION]
+    return position
+
+
+def _step(position: np.ndarray, velocity: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    air = -DRAG * float(np.linalg.norm(velocity)) * velocity - np.array([0.0, 0.0, GRAVITY])
+    return position + seconds * (velocity + 0.5 * seconds * air), velocity + seconds * air

@@ -13,6 +13,7 @@ from enum import Enum
 import numpy as np
 
 from ballmodel.constants import GRAVITY
+from robot_io.control.kinks import flown
 from robot_io.devices.tracker import BallSample
 from robot_io.history import History
 
@@ -26,6 +27,7 @@ HUMAN_SIDE = 0.05  # [m] least y where a ball turns round at the human's paddle
 FARTHEST, LOWEST = -0.3, -0.35  # [m] y and z of a ball beyond which it is too late to play
 SAME_BALL = 0.12, 20.0  # [m], [m/s] by which a ball may be away from its last place
 RESUMED = 0.35, 2.0  # [m], [m/s] by which a ball that was out of sight may be away from where it flew
+LONGEST_GAP = 2.0  # [s] in which a ball out of sight can be the same one
 FALLEN = -0.9  # [m] height below which a ball that was out of sight has fallen
 
 
@@ -91,14 +93,13 @@ class Strokes:
         return Seen.STROKE
 
     def _predicted(self, time: float) -> np.ndarray | None:
-        """Place (3,) [m] at ``time`` of the ball of the newest samples, without drag; None while it is not known."""
+        """Place (3,) [m] at ``time`` of the ball of the newest samples; None while it is not known."""
         if len(self._recent) < TAIL:
             return None
         (first, start), (last, place) = self._recent[-TAIL], self._recent[-1]
-        gone = time - last
         velocity = (place - start) / (last - first)
         velocity[2] -= 0.5 * GRAVITY * (last - first)
-        return place + velocity * gone - np.array([0.0, 0.0, 0.5 * GRAVITY * gone * gone])
+        return flown(place, velocity, min(time - last, LONGEST_GAP))
 
     def _compared(self, time: float, position: np.ndarray, ball: int) -> Seen:
         """SAME or OTHER; an interrupted track is taken up again, with nothing known of the ball's velocity."""
@@ -112,7 +113,12 @@ class Strokes:
         expected = self._predicted(time)
         away = np.inf if expected is None else float(np.linalg.norm(position - expected))
         back = position[1] > place[1] + SAME_BALL[0]
-        flies = expected is not None and expected[2] > FALLEN and away < RESUMED[0] + RESUMED[1] * gone
+        flies = (
+            expected is not None
+            and gone < LONGEST_GAP
+            and expected[2] > FALLEN
+            and away < RESUMED[0] + RESUMED[1] * gone
+        )
         self._recent.clear()
         if self._coming:  # nobody can have struck it: it lies further on its way, if it is the same
             return Seen.OTHER if back or not (flies or ball == self._ball) else Seen.SAME

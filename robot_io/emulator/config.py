@@ -71,7 +71,8 @@ class RigParams:
     action_delay: float = 0.0
     arm_network: NetworkFaults = NetworkFaults()  # both ways
     tracker_network: NetworkFaults = NetworkFaults()
-    pause: float = 0.6  # [s] of the thrower
+    pause: float = 0.6  # [s] before a ball is thrown; patient: after the robot stood at home, else up to that
+    patient: bool = True
     seed: int = 0
 
     def __post_init__(self) -> None:

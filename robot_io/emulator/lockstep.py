@@ -18,14 +18,15 @@ from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState, Policy
 from robot_io.control.config import PROFILES, axis_range
 from robot_io.control.episode import EpisodeSummary
 from robot_io.control.interfaces import STANDARD_PLAY
+from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.festo import Axis, DirectLink, FestoAxes
 from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.arm import ArmController
 from robot_io.emulator.axes import AxisEmulator
-from robot_io.emulator.ball_launcher import Thrower, Throws
 from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams
 from robot_io.emulator.network import Network
+from robot_io.emulator.opponent import Opponent, Throws, ball_source
 from robot_io.emulator.tracker import TrackerEmulator
 from robot_io.emulator.world import World
 from robot_io.errors import RefusedError
@@ -40,14 +41,15 @@ BRIDGE, CONTROLLER = ("127.0.0.1", 6510), ("127.0.0.1", 6511)
 class LockStep:
     """A robot with its bridge, from power-on.
 
-    scene   the MJCF; throws: what is thrown, from ball number ``first`` on
+    scene   the MJCF
+    balls   what is thrown, from ball number ``first`` on, or who plays rallies
     world   one to use again, which is reset: making it takes a while
     """
 
     def __init__(
         self,
         scene: str | Path,
-        throws: Throws,
+        balls: Throws | Opponent,
         policy: Policy,
         params: RigParams = STANDARD_RIG,
         config: BridgeConfig = STANDARD_PLAY,
@@ -78,8 +80,10 @@ class LockStep:
         self._to_bridge = Network(params.arm_network, int(seed[1]))
         self._to_arm = Network(params.arm_network, int(seed[2]))
         self._frames = Network(params.tracker_network, int(seed[3]))
-        self.thrower = Thrower(throws, params.pause, first)
+        self.thrower = ball_source(balls, params, first)
         self.summaries: deque[EpisodeSummary] = deque()
+        self.rallies: list[RallySummary] = []
+        self.track = np.zeros((0, 4))  # t [s], x, y, z [m] of the newest ball with an outcome, on its way to the robot
         session = EgmSession(EgmConfig(controller_address=CONTROLLER[0]))
         self.bridge = Bridge(
             session,
@@ -89,7 +93,8 @@ class LockStep:
             policy,
             config,
             recorder,
-            self.summaries.append,
+            self._played,
+            self.rallies.append,
         )
         self._clock = 0
         self._setpoint = np.zeros(N_JOINTS)
@@ -99,6 +104,10 @@ class LockStep:
     @property
     def now(self) -> float:
         return self._clock / GRID
+
+    def _played(self, summary: EpisodeSummary) -> None:
+        self.summaries.append(summary)
+        self.track = self.bridge.play.track(summary.number)
 
     def step(self) -> None:
         """To the next moment at which anything happens."""
@@ -110,7 +119,8 @@ class LockStep:
             self._devices(now)
         if clock % TRACK == 0:
             world = self.world
-            self.cameras.step(now, world.number, world.ball if world.in_play else None)
+            number, seen = self.params.tracker.sees(world)
+            self.cameras.step(now, number, world.ball if seen else None)
         for datagram in self.cameras.due(now):
             self._frames.send(datagram, now)
         if self.bridge_alive:
@@ -171,6 +181,19 @@ class LockStep:
         self.bridge.arm(self.now)
         if not self.run(5.0, lambda: self.bridge.at_home):
             raise RefusedError(f"the rig does not reach its home pose: {self.bridge.gate.faults}")
+
+    def recover(self) -> None:
+        """Reset a fault and arm again, as an operator does; home is reached later. Raises RefusedError."""
+        self.run(2.5, lambda: self.bridge.gate.settled)
+        self.run(1.0)
+        if self.bridge.state is BridgeState.FAULT:
+            self.bridge.reset(self.now)
+        if self.axes.fault:
+            self.axes.acknowledge()
+            self.run(0.3)
+        self.axes.enable()
+        self.run(1.0, lambda: self.axes.problem(self.now) is None)
+        self.bridge.arm(self.now)
 
     def play(self, balls: int, longest: float = 20.0) -> list[EpisodeSummary]:
         """Plays until the outcomes of ``balls`` more balls are known; fewer when the bridge stops or time runs out."""

@@ -21,9 +21,9 @@ from robot_io.devices.tracker import TrackerConfig
 from robot_io.emulator.arm import ArmController, ArmStateError
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_server import serve
-from robot_io.emulator.ball_launcher import Thrower, Throws
 from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams
 from robot_io.emulator.network import Network
+from robot_io.emulator.opponent import Opponent, Throws, ball_source
 from robot_io.emulator.shared_state import Shared
 from robot_io.emulator.tracker import TrackerEmulator
 from robot_io.emulator.world import World
@@ -31,7 +31,7 @@ from robot_io.errors import DeviceError
 
 HOST = "127.0.0.1"
 WORLD_STEP = 0.002  # [s]
-START_TIME = 20.0  # [s]
+START_TIME = 60.0  # [s] of a process, an opponent's compilations included
 PORT_RANGE = 20000, 32000
 PRIORITY = 40  # of SCHED_FIFO, where it is allowed
 
@@ -69,14 +69,14 @@ class Rig:
     """
 
     def __init__(
-        self, scene: str, throws: Throws, params: RigParams = STANDARD_RIG, ports: Ports | None = None
+        self, scene: str, balls: Throws | Opponent, params: RigParams = STANDARD_RIG, ports: Ports | None = None
     ) -> None:
         self.params, self.ports = params, ports or free_ports()
         self._shared = Shared()
         self._shared["silent_until"][0] = -1.0
         context = multiprocessing.get_context("spawn")
         jobs: dict[str, tuple[Callable, tuple]] = {
-            "world": (_world, (scene, throws)),
+            "world": (_world, (scene, balls)),
             "arm": (_arm, ()),
             "axes": (_axes, ()),
             "tracker": (_tracker, ()),
@@ -203,14 +203,15 @@ def _paced(shared: Shared, pipe: Connection, period: float) -> Iterator[float]:
         yield deadline
 
 
-def _world(shared: Shared, params: RigParams, ports: Ports, pipe: Connection, scene: str, throws: Throws) -> None:
+def _world(
+    shared: Shared, params: RigParams, ports: Ports, pipe: Connection, scene: str, balls: Throws | Opponent
+) -> None:
     world = World(scene, params.world)
-    thrower = Thrower(throws, params.pause)
+    source = ball_source(balls, params)
 
     def publish(now: float) -> None:
-        shared.publish(
-            now, world.qpos, world.qvel, world.ball, world.number, world.in_play, world.collisions, thrower.thrown
-        )
+        number, seen = params.tracker.sees(world)
+        shared.publish(now, world.qpos, world.qvel, world.ball, number, seen, world.collisions, source.thrown)
 
     publish(time.monotonic())
     pipe.send("ready")
@@ -220,7 +221,7 @@ def _world(shared: Shared, params: RigParams, ports: Ports, pipe: Connection, sc
         world.advance(shared["setpoint"].copy(), min(now - last, 0.05))
         last = now
         if shared.value("throwing"):
-            thrower.update(world, now)
+            source.update(world, now)
         publish(now)
 
 

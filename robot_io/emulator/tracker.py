@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from robot_io.devices.tracker import BallSample, encode
+from robot_io.emulator.world import World
+
+IDENTITIES = ("ball", "stroke", "lost")
 
 
 @dataclass(frozen=True)
@@ -18,12 +21,25 @@ class TrackerParams:
     latency  [s] from capture to the datagram (paper: about 15 ms)
     noise    [m] standard deviation on each coordinate
     offset   [m] of the calibration, added to every position
+    identity  what a number stands for: "ball", one from its first stroke to the end of the rally; "stroke", one from
+             stroke to stroke; "lost", as "ball", but the ball is out of sight from its bounce on the human's half until
+             it is struck
     """
 
     rate: float = 125.0
     latency: float = 0.015
     noise: float = 0.003
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    identity: str = "ball"
+
+    def __post_init__(self) -> None:
+        if self.identity not in IDENTITIES:
+            raise ValueError(f"tracker.identity is {self.identity!r}, allowed: {', '.join(IDENTITIES)}")
+
+    def sees(self, world: World) -> tuple[int, bool]:
+        """Number of the ball, and True when it is seen."""
+        hidden = self.identity == "lost" and not world.answered
+        return world.strokes if self.identity == "stroke" else world.number, world.in_play and not hidden
 
 
 class TrackerEmulator:

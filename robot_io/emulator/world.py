@@ -85,7 +85,7 @@ class World:
         self._site = self.model.site("paddle").id
         self.home = robot.key("home").qpos[[robot.joint(name).qposadr[0] for name in JOINT_NAMES]].copy()
         self.in_play = False
-        self.number = 0  # of the ball in play
+        self.number = self.strokes = 0  # of the ball in play, of the human
         self._touching: set[int] = set()  # geoms
         self.touches: list[tuple[float, str, np.ndarray]] = []  # of the ball in play: time, geom, ball's position
         self._surfaces = {
@@ -98,7 +98,8 @@ class World:
     def reset(self) -> None:
         """Robot at home and at rest, ball away, time zero."""
         mujoco.mj_resetData(self.model, self.data)
-        self.number, self.collisions, self.touches, self._touching = 0, 0, [], set()
+        self.number = self.strokes = 0
+        self.collisions, self.touches, self._touching = 0, [], set()
         self.data.qpos[self._q] = self.home
         self.park()
         mujoco.mj_forward(self.model, self.data)
@@ -125,12 +126,31 @@ class World:
     def ball_velocity(self) -> np.ndarray:
         return self.data.qvel[self._ball_v : self._ball_v + 3].copy()
 
+    @property
+    def ball_spin(self) -> np.ndarray:
+        """Angular velocity (3,) [rad/s] in the table frame."""
+        v = self._ball_v
+        return self.data.xmat[self._ball_body].reshape(3, 3) @ self.data.qvel[v + 3 : v + 6]
+
+    @property
+    def answered(self) -> bool:
+        """False from the bounce of the robot's return on the human's half until it is struck again, or for ever."""
+        hit = next((t for t, name, _ in self.touches if name == "rig_paddle"), None)
+        return hit is None or not any(name == "col_table" and t > hit and p[1] > 0.0 for t, name, p in self.touches)
+
     def throw(self, position: Vector, velocity: Vector, spin: Vector = (0.0, 0.0, 0.0)) -> None:
         """Puts a new ball into play."""
         self._place(position, velocity, spin)
         mujoco.mj_kinematics(self.model, self.data)  # the ball's orientation is looked at before the next step
         self.in_play, self._touching, self.touches = True, set(), []
-        self.number += 1
+        self.number, self.strokes = self.number + 1, self.strokes + 1
+
+    def strike(self, velocity: Vector, spin: Vector) -> None:
+        """Gives the ball in play another velocity and spin, where it is."""
+        self._place(self.ball, velocity, spin)
+        mujoco.mj_kinematics(self.model, self.data)
+        self._touching, self.touches = set(), []
+        self.strokes += 1
 
     def park(self) -> None:
         """Takes the ball out of play."""

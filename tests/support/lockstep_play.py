@@ -7,9 +7,9 @@ from functools import cache
 import numpy as np
 
 from robot_io.contract import N_JOINTS
-from robot_io.emulator.ball_launcher import Throws
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
+from robot_io.emulator.opponent import Throws
 from robot_io.emulator.world import World, WorldParams
 from tests.support.paths import SCENE
 

@@ -27,7 +27,10 @@ def test_the_view_shows_state_faults_joints_and_counts():
         balls=3,
         outcomes={"returned": 2, "missed": 1},
         rally=1,
-        longest_rally=2,
+        rallies=4,
+        mean_rally=5.25,
+        longest_rally=12,
+        last_rally="2 touches: Human returning a ball over the table.",
         egm={"accepted": 1000, "rejected": {"stranger": 2}, "lost": 3},
         tracker_counts={"accepted": 40},
         axes_cycles=17,
@@ -42,7 +45,8 @@ def test_the_view_shows_state_faults_joints_and_counts():
     text = console.export_text()
     for shown in (
         "FAULT estop: the button is pressed",
-        "balls 3: 2 returned, 1 missed; in a row 1, longest 2",
+        "balls 3: 2 returned, 1 missed",
+        "rally 1 touches; 4 rallies, 5.2 on average, longest 12; last: 2 touches: Human returning a ball over",
         "-1.000 rad",
         "EGM 1,000 taken, 2 refused, 3 lost; tracker 40 taken",
         "17 cycles, 4 late; ticks missed 6; log lost 5",

@@ -39,7 +39,7 @@ from experiments.stats import t_interval, welch_interval
 from mjx_tt.env.policy import Policy, initial_theta
 from robot_io import contract
 from robot_io.control.episode import EpisodeSummary
-from robot_io.emulator.ball_launcher import Throws
+from robot_io.emulator.opponent import Throws
 from robot_io.policy import artefact as artefacts
 from robot_io.policy import export
 from tests.support.paths import ROOT

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robot_io.contract import JOINT_NAMES, LIMITS
-from robot_io.emulator.ball_launcher import Thrower, Throws
+from robot_io.emulator.opponent import Thrower, Throws
 from robot_io.emulator.world import BALL_RADIUS, PARKED, World, WorldParams
 from tests.oracles import ball_flight
 from tests.oracles.ball_flight import Touch

@@ -1,0 +1,118 @@
+"""Rallies through the bridge beside the simulator's: ``python -m benchmarks.robot_rallies POLICY [--player player3]``.
+
+The same policy and virtual player, in the rig in lock-step and in the simulator's rally code: lengths with 95 %
+intervals and how rallies ended; the bridge's counts are compared with what the world saw, and the trackers' numbers
+(per ball, per stroke, lost at the human's side) with each other.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.config.build import Experiment
+from experiments.deploy.rig import scene
+from experiments.deploy.virtual_player import VirtualPlayer
+from experiments.finetuning import loop
+from experiments.runs import load_policy
+from mjx_tt import platform
+from mjx_tt.env.policy import Policy
+from mjx_tt.rally import human_player
+from mjx_tt.rally.simulator import Box, RallySimulator
+from robot_io.control import rally
+from robot_io.control.config import RobotConfig
+from robot_io.control.interfaces import BridgeConfig
+from robot_io.control.rally import RallySummary
+from robot_io.emulator.config import RigParams
+from robot_io.emulator.lockstep import LockStep
+from robot_io.emulator.opponent import Rallies
+from robot_io.emulator.tracker import IDENTITIES, TrackerParams
+from robot_io.policy.numpy_policy import StreamingPolicy
+from robot_io.rally_ends import FILTERED, End
+
+LONGEST_RALLY = 60.0  # [s] per rally on average before something is wrong
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measures and prints; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("policy", help="run or artefact")
+    parser.add_argument("--player", default="player3")
+    parser.add_argument("--rallies", type=int, default=100, help="in the rig, for each tracker")
+    parser.add_argument("--simulated", type=int, default=2000, help="in the simulator")
+    parser.add_argument("--trackers", nargs="+", default=["ball"], choices=IDENTITIES)
+    parser.add_argument("--noise", type=float, default=0.003, help="[m] of the tracker")
+    parser.add_argument("--seed", type=int, default=1)
+    chosen = parser.parse_args(arguments)
+    platform.configure(devices=1)
+    experiment = loop.experiment_of(chosen.policy)
+    policy = load_policy.load(chosen.policy).policy.astype(np.float32)
+    box = Box.of(experiment.distribution)
+    simulated(policy, chosen.player, experiment, box, chosen.simulated, chosen.seed)
+    found = {}
+    for identity in chosen.trackers:
+        tracker = TrackerParams(identity=identity, noise=chosen.noise)
+        params = RigParams(tracker=tracker, seed=chosen.seed)
+        found[identity] = rig(policy, chosen.player, params, box, chosen.rallies, chosen.seed)
+    for identity, rallies in list(found.items())[1:]:
+        first = found[chosen.trackers[0]]
+        same = [(a.length, a.end) == (b.length, b.end) for a, b in zip(first, rallies, strict=False)]
+        print(f"{identity} and {chosen.trackers[0]}: {sum(same)} of {len(same)} rallies of equal length and end")
+    return 0
+
+
+def simulated(policy: Policy, player: str, experiment: Experiment, box: Box, rallies: int, seed: int) -> None:
+    """Rallies of the simulator, 10 in each lane."""
+    lanes = max(rallies // 10, 1)
+    spread = jax.tree.map(jnp.asarray, policy)
+    spread = replace(spread, theta=jnp.repeat(spread.theta[:, None], lanes, axis=1))
+    low, high = (jnp.repeat(end[:, None], lanes, axis=1) for end in (box.low, box.high))
+    people = human_player.stack([human_player.load(player)] * lanes)
+    simulator = RallySimulator(experiment.task)
+    result = simulator.play(spread, people, experiment.model.model, jax.random.key(seed), 10, Box(low, high))
+    length, end = np.asarray(result.length).ravel(), np.asarray(result.end).ravel()
+    counts = ~np.isin(end, [int(e) for e in FILTERED])
+    show("simulator", length[counts], Counter(End(e).name for e in end[counts]), float(np.sum(result.seconds)))
+
+
+def rig(policy: Policy, player: str, params: RigParams, box: Box, rallies: int, seed: int) -> list[RallySummary]:
+    """Rallies through the bridge in lock-step."""
+    config = BridgeConfig(RobotConfig().delays, box=rally.Box(tuple(box.low.tolist()), tuple(box.high.tolist())))
+    robot = LockStep(scene(), VirtualPlayer(player, seed), StreamingPolicy(policy), params, config)
+    robot.start()
+    robot.throwing, began = True, time.monotonic()
+    while len(robot.rallies) < rallies and robot.now < LONGEST_RALLY * rallies:
+        if robot.run(1.0, lambda: robot.bridge.state.value in ("fault", "disarmed")):
+            print(f"fault: {robot.bridge.gate.faults}")
+            robot.recover()
+    kept = [r for r in robot.rallies[:rallies] if not r.filtered]
+    show(params.tracker.identity, [r.length for r in kept], Counter(r.end for r in kept), robot.now)
+    assert isinstance(robot.thrower, Rallies)
+    seen = [r.touches for r in robot.thrower.played[: len(robot.rallies)]]
+    wrong = sum(a != b.length for a, b in zip(seen, robot.rallies, strict=False))
+    print(f"  lengths that differ from the world's: {wrong}; {robot.now / (time.monotonic() - began):.1f} x real time")
+    return robot.rallies[:rallies]
+
+
+def show(name: str, lengths: Sequence[int] | np.ndarray, ends: Counter[str], seconds: float) -> None:
+    """Mean with its interval by the bootstrap, the longest, and the ends."""
+    values = np.asarray(lengths, float)
+    means = np.random.default_rng(0).choice(values, (2000, values.size)).mean(axis=1)
+    low, high = np.quantile(means, [0.025, 0.975])
+    print(
+        f"{name}: {values.size} rallies, {values.mean():.2f} touches ({low:.2f} to {high:.2f}), longest "
+        f"{values.max():.0f}, {seconds:.0f} s of play"
+    )
+    print("  " + ", ".join(f"{n / values.size:.0%} {end.lower().replace('_', ' ')}" for end, n in ends.most_common()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
