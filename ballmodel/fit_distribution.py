@@ -8,17 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ballmodel import constants as c
 from ballmodel.distribution import BallDistribution, DistributionReport, fit_distribution
-from ballmodel.flight import BallParams
+from ballmodel.flight import BallParams, step
 from ballmodel.initial_state import MIN_SAMPLES, fit_gauss_newton
 from ballmodel.io import MeasuredStates
-from ballmodel.sampling import KEPT, OUTCOMES, SECOND_BOUNCE, throw
+from ballmodel.partial_params import without_nominal
+from ballmodel.sampling import DT, KEPT, OUTCOMES, OWN_SIDE, ROBOT_SIDE, SECOND_BOUNCE, Throw, throw
 from ballmodel.state import BallState
 from ballmodel.trajectory import Dataset, free_flight
 
 LANDED_TOGETHER = 512  # flights are simulated in multiples of it
-ROBOT_SIDE = ((-c.TABLE_WIDTH / 2, -c.TABLE_LENGTH / 2), (c.TABLE_WIDTH / 2, 0.0))  # [m] corners of its half
+AFTER_BOUNCE = 6  # steps after a serve's bounce on the server's side at which its ball starts: 20 ms
+LONGEST_SERVE = 300  # steps until that bounce
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,33 @@ class HumanReport:
     landing: np.ndarray  # (2, n) [m]
     fit_rms: np.ndarray  # (m,) [m] of each fitted flight; empty where states were measured
     outliers: DistributionReport
+    serves: int = 0  # of those that landed
+
+
+@jax.jit
+def _after_own_bounce(params: BallParams, state: BallState) -> BallState:
+    """Balls (3, n) AFTER_BOUNCE steps after their first bounce."""
+
+    def advance(carry: tuple[BallState, jax.Array], _: None) -> tuple[tuple[BallState, jax.Array], None]:
+        state, since = carry
+        new, events = step(params, state, DT)
+        over = since >= AFTER_BOUNCE
+        state = jax.tree.map(lambda a, b: jnp.where(over, a, b), state, new)
+        return (state, jnp.where((since > 0) | events.table, since + 1, 0)), None
+
+    since = jnp.zeros(state.position.shape[1:], jnp.int32)
+    (state, _), _ = jax.lax.scan(advance, (state, since), None, length=LONGEST_SERVE)
+    return state
+
+
+def _thrown(params: BallParams, state: BallState) -> tuple[Throw, BallState]:
+    """Flights of balls (3, n), and where serves among them start, in numbers that similar data sets share."""
+    n = state.position.shape[1]
+    padded = jax.tree.map(
+        lambda a: jnp.asarray(np.pad(a, ((0, 0), (0, -n % LANDED_TOGETHER)), mode="edge"), jnp.float32), state
+    )
+    thrown = throw(params, padded, *ROBOT_SIDE)
+    return jax.tree.map(lambda a: np.asarray(a)[..., :n], (thrown, padded))
 
 
 def fit_human(
@@ -41,11 +69,14 @@ def fit_human(
     eps: float | None = None,
     min_samples: int = 5,
     name: str = "",
+    serves: bool = False,
 ) -> tuple[BallDistribution, HumanReport]:
     """The 16 numbers of a person's balls, from trajectories or from start states.
 
     Landing points are those of the fitted states' simulated flights. A ball counts when it starts on the human's side,
     flies towards the robot, clears the net and lands on the robot's side. eps, min_samples: see ``fit_distribution``.
+    serves: balls that bounce on the human's side first count as well, from 20 ms after that bounce. Start states of a
+    recording may spin; trajectories are taken not to (mjx_tt.prediction.state_fit estimates their spins).
     Raises ValueError when no ball is left.
     """
     if isinstance(measured, Dataset):
@@ -60,17 +91,33 @@ def fit_human(
     state = jax.tree.map(lambda a: a[:, towards], state)
     if not towards.any():
         raise ValueError(f"{measured.source}: none of {towards.size} balls flies from the human's side to the robot's")
-    # In numbers that similar data sets share, so that one compiled flight serves them.
-    n, extra = int(towards.sum()), -int(towards.sum()) % LANDED_TOGETHER
-    padded = jax.tree.map(lambda a: jnp.asarray(np.pad(a, ((0, 0), (0, extra)), mode="edge"), jnp.float32), state)
-    thrown = jax.tree.map(lambda a: a[..., :n], throw(params, padded, *ROBOT_SIDE))
-    outcome = np.asarray(thrown.outcome)
+    thrown, _ = _thrown(params, state)
+    outcome, landing, served = np.asarray(thrown.outcome), np.asarray(thrown.landing), 0
+    own = outcome == OWN_SIDE
+    if serves and own.any():
+        _, start = _thrown(params, jax.tree.map(lambda a: a[:, own], state))
+        start = jax.tree.map(np.asarray, _after_own_bounce(without_nominal(params), start))
+        again, _ = _thrown(params, start)
+        state = jax.tree.map(lambda a, b: _replaced(a, own, b), state, start)
+        landing = _replaced(landing, own, np.asarray(again.landing))
+        outcome = _replaced(outcome, own, np.asarray(again.outcome))
+        served = int(np.isin(again.outcome, (KEPT, SECOND_BOUNCE)).sum())
     good = (outcome == KEPT) | (outcome == SECOND_BOUNCE)
     counts = np.bincount(outcome, minlength=len(OUTCOMES))
     outcomes = {text: int(count) for text, count in zip(OUTCOMES, counts, strict=True)}
     if not good.any():
-        raise ValueError(f"{measured.source}: none of {towards.size} balls lands on the robot's side: {outcomes}")
-    landed, landing = jax.tree.map(lambda a: a[:, good], state), np.asarray(thrown.landing)[:, good]
+        hint = "; serves are counted with serves=True" if own.any() and not serves else ""
+        raise ValueError(f"{measured.source}: none of {towards.size} balls lands on the robot's side: {outcomes}{hint}")
+    landed, landing = jax.tree.map(lambda a: a[:, good], state), landing[:, good]
     distribution, outliers = fit_distribution(landed, landing, eps, min_samples, name, measured.source)
-    report = HumanReport(len(measured), too_short, int((~towards).sum()), outcomes, landed, landing, rms, outliers)
+    report = HumanReport(
+        len(measured), too_short, int((~towards).sum()), outcomes, landed, landing, rms, outliers, served
+    )
     return distribution, report
+
+
+def _replaced(values: np.ndarray, where: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """The values (..., n) with those of the chosen balls replaced."""
+    out = np.array(values)
+    out[..., where] = new
+    return out

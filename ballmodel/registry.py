@@ -1,4 +1,7 @@
-"""Finds the paper's distributions by name: ``player1/M0`` to ``player5/M2``, large, medium, narrow, s2r-oracle."""
+"""Finds the paper's distributions by name: ``player1/M0`` to ``player5/M2``, large, medium, narrow, s2r-oracle.
+
+Balls are a box of 16 numbers or a mixture of start states; a YAML with the key ``components`` holds the latter.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,13 @@ import os
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from ballmodel.distribution import NOTES, BallDistribution, check_keys, load_distribution, parse_distribution
 from ballmodel.io.yaml import read as read_yaml
+from ballmodel.mixture import BallMixture, parse_mixture
 
+Balls: TypeAlias = BallDistribution | BallMixture
 T = TypeVar("T")
 
 FOLDER = Path(__file__).parent / "data"
@@ -71,11 +76,20 @@ def skill(player: str) -> Skill:
     return _find(_catalogue()[1], player, "player")
 
 
-def resolve(name_or_path: str | os.PathLike) -> BallDistribution:
-    """The named distribution, or the one in the YAML file at that path. Raises ValueError or FileNotFoundError."""
+def parse_balls(data: Any, where: str, name: str = "", source: str = "") -> Balls:
+    """Builds a distribution or a mixture from its YAML form; ``where`` opens every message. Raises ValueError."""
+    parse = parse_mixture if isinstance(data, dict) and "components" in data else parse_distribution
+    return parse(data, where, name, source)
+
+
+def resolve(name_or_path: str | os.PathLike) -> Balls:
+    """The named distribution, or the one or the mixture in the YAML file at that path.
+
+    Raises ValueError or FileNotFoundError.
+    """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
         return load(str(name_or_path))
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; a path to a distribution's YAML or one of {', '.join(names())}")
-    return load_distribution(path)
+    return parse_balls(read_yaml(path), str(path), path.stem)

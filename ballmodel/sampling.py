@@ -1,4 +1,4 @@
-"""Balls drawn from a human ball distribution.
+"""Balls drawn from a human ball distribution, a box or a mixture.
 
 A proposal is uniform in the box of start positions and velocities, without spin. It is kept when, in the full
 simulation, it clears the net, bounces exactly once on the table, inside the landing box on the robot's side, and then
@@ -9,6 +9,9 @@ floor.
 Wide distributions keep few proposals, so a coarse flight first throws out those that miss net or landing box by a
 margin larger than its own error; the full simulation alone decides about all others. Keeping the first n accepted
 proposals of a stream of independent ones leaves the distribution unbiased.
+
+A mixture proposes start states with spin and keeps most of them: its full simulation alone decides, in one compiled
+loop. Its landing box is the robot's half of the table.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from ballmodel import constants as c
 from ballmodel.contact import NET, TABLE, elevation, surface_gap
 from ballmodel.distribution import BallDistribution
 from ballmodel.flight import BallParams, free_step, step
+from ballmodel.mixture import BallMixture
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, ball_state
 from ballmodel.vec import Scalars, Vector
@@ -49,6 +53,7 @@ OUTCOMES = (
     "land outside the landing box",
     "bounce on the table a second time",
 )
+ROBOT_SIDE = ((-c.TABLE_WIDTH / 2, -c.TABLE_LENGTH / 2), (c.TABLE_WIDTH / 2, 0.0))  # [m] corners of its half
 KEPT, BAD_START, HITS_NET, OWN_SIDE, MISSES, OUTSIDE_BOX, SECOND_BOUNCE = range(len(OUTCOMES))
 UNDECIDED = -1
 
@@ -197,7 +202,7 @@ def _propose(
 
 def sample_pool(
     key: Key[Array, ""],
-    distribution: BallDistribution,
+    distribution: BallDistribution | BallMixture,
     params: BallParams,
     n: int,
     dt: float = DT,
@@ -211,6 +216,8 @@ def sample_pool(
     """
     if n < 1:
         raise ValueError(f"n is {n}; at least one ball is wanted")
+    if isinstance(distribution, BallMixture):
+        return _sample_mixture(key, distribution, without_nominal(params), n, dt, max(min_acceptance, 1e-3))
     ends = [f"{part}_{end}" for part in ("position", "velocity", "landing") for end in ("min", "max")]
     box = {end: jnp.asarray(getattr(distribution, end))[:, None] for end in ends}
     landing_box = (box["landing_min"][:, 0], box["landing_max"][:, 0])
@@ -255,7 +262,59 @@ def sample_pool(
     return BallPool(state, table[6], table[7:9], jnp.asarray(share[KEPT]), jnp.asarray(share))
 
 
-def _complaint(distribution: BallDistribution, proposals: int, shares: np.ndarray) -> str:
+def _sample_mixture(
+    key: Key[Array, ""], mixture: BallMixture, params: BallParams, n: int, dt: float, min_acceptance: float
+) -> BallPool:
+    """Pool of a mixture's balls. Raises ValueError where fewer than ``min_acceptance`` of the proposals are kept."""
+    components = [jnp.asarray(a, jnp.float32) for a in (np.log(np.maximum(mixture.weights, 1e-30)), mixture.means.T)]
+    factors = jnp.asarray(np.moveaxis(mixture.factors, 0, -1), jnp.float32)
+    most = int(np.ceil((n + 10.0) / min_acceptance / CHUNK))
+    table, counts = _fill(key, params, *components, factors, jnp.float32(dt), jnp.int32(most), n=n)
+    proposals = counts.sum()
+    shares = counts / proposals
+    if int(counts[KEPT]) < n:
+        raise ValueError(_complaint(mixture, int(proposals), np.asarray(shares)))
+    state = BallState(table[:3], table[3:6], table[6:9])
+    return BallPool(state, table[9], table[10:12], shares[KEPT], shares)
+
+
+@partial(jax.jit, static_argnames="n")
+def _fill(
+    key: Key[Array, ""],
+    params: BallParams,
+    log_weights: Float[Array, " k"],
+    means: Float[Array, "9 k"],
+    factors: Float[Array, "9 9 k"],
+    dt: Float[Array, ""],
+    most: Int[Array, ""],
+    n: int,
+) -> tuple[Float[Array, "12 n"], Float[Array, " outcomes"]]:
+    """State (9), arrival and landing (2) of the first n balls kept of at most ``most`` chunks, and the outcomes."""
+
+    def unfilled(carry: tuple[Array, Array, Array]) -> Array:
+        calls, counts, _ = carry
+        return (counts[KEPT] < n) & (calls < most)
+
+    def advance(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        calls, counts, table = carry
+        key_component, key_normal = jax.random.split(jax.random.fold_in(key, calls))
+        component = jax.random.categorical(key_component, log_weights, shape=(CHUNK,))
+        normal = jax.random.normal(key_normal, (9, CHUNK), jnp.float32)
+        rows = means[:, component] + jnp.sum(factors[:, :, component] * normal[None], axis=1)
+        thrown = throw(params, BallState(rows[:3], rows[3:6], rows[6:]), *ROBOT_SIDE, dt)
+        order = jnp.argsort(thrown.outcome != KEPT, stable=True)
+        rows = jnp.concatenate([rows, thrown.arrival[None], thrown.landing])[:, order]
+        table = jax.lax.dynamic_update_slice(table, rows, (0, counts[KEPT].astype(jnp.int32)))
+        found = jnp.sum(thrown.outcome[None] == jnp.arange(len(OUTCOMES))[:, None], axis=1)
+        return calls + 1, counts + found, table
+
+    zero = jnp.zeros((), jnp.int32)
+    start = (zero, jnp.zeros(len(OUTCOMES), jnp.int32), jnp.zeros((12, n + CHUNK), jnp.float32))
+    _, counts, table = jax.lax.while_loop(unfilled, advance, start)
+    return table[:, :n], counts.astype(jnp.float32)
+
+
+def _complaint(distribution: BallDistribution | BallMixture, proposals: int, shares: np.ndarray) -> str:
     reasons = sorted(
         ((share, text) for share, text in zip(shares[1:], OUTCOMES[1:], strict=True) if share > 0), reverse=True
     )

@@ -5,11 +5,19 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import numpy as np
+
 from ballmodel.io import MeasuredStates, read
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.csv import COLUMNS
 from ballmodel.trajectory import Dataset
 from experiments.errors import ConfigError, checked
+from mjx_tt.diagnosis.tracks import clean
+from mjx_tt.prediction import SpinPrior, fit_states
+from mjx_tt.prediction.state_fit import lift_known
+from mjx_tt.sim.model import SimModel
+
+LEAST_SAMPLES = 8  # of a stroke whose start and spin are fitted
 
 
 def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
@@ -34,6 +42,25 @@ def read_trajectories(paths: list[Path]) -> Dataset:
     if not isinstance(measured, Dataset):
         raise ConfigError(f"{measured.source}: holds start states; measured trajectories are needed")
     return measured
+
+
+def start_states(measured: Dataset, model: SimModel) -> tuple[MeasuredStates, list[str]]:
+    """Start states of the strokes in measured tracks, with spins where the model's ball is lifted; and a summary.
+
+    Raises ConfigError where no stroke is left.
+    """
+    strokes, record = clean(measured.trajectories)
+    strokes = tuple(t for t in strokes if len(t) >= LEAST_SAMPLES)
+    if not strokes:
+        raise ConfigError(f"{measured.source}: no stroke of {LEAST_SAMPLES} samples among {len(measured)} tracks")
+    spins = lift_known(model)
+    fitted = fit_states(strokes, model, None if spins else SpinPrior.still(), learn_prior=spins)
+    size = np.linalg.norm(fitted.state[6:], axis=0)
+    lines = [*record.lines(), f"{len(strokes)} strokes of {len(measured)} tracks; noise {1e3 * fitted.noise:.1f} mm"]
+    if spins:
+        low, middle, high = np.percentile(size, [5, 50, 95])
+        lines.append(f"spin {middle:.0f} rad/s in the median, {low:.0f} to {high:.0f} in 90 % of them")
+    return MeasuredStates(np.arange(len(strokes)), fitted.start, measured.source), lines
 
 
 def write_csv(path: Path, dataset: Dataset) -> None:

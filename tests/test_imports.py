@@ -52,7 +52,7 @@ ROOMS = {
     "mjx_tt": (
         ". sim robot diagnosis/description diagnosis/robust diagnosis/verdict diagnosis/joint diagnosis/tracks "
         "diagnosis/logs "
-        "diagnosis/ball diagnosis/hits diagnosis "
+        "diagnosis/ball diagnosis/hits diagnosis prediction "
         "viz diagnosis/report env rally"
     ),
     "experiments": (

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from ballmodel.distribution import BallDistribution
     from ballmodel.fit_distribution import HumanReport
+    from ballmodel.flight import BallParams
 
 app = command(
     "fit-human",
@@ -32,8 +33,10 @@ app = command(
   mjx-tt fit-human rallies.csv --out anna.yaml
   mjx-tt fit-human monday.mcap tuesday.mcap --out anna.yaml --name anna
   mjx-tt fit-human rallies.json --out deepmind.yaml          (DeepMind's ball states)
+  mjx-tt fit-human rallies.csv --model world.yaml --serves --out anna.yaml --mixture anna_mixture.yaml
 
-Then write "balls: anna.yaml" in an experiment.
+Then write "balls: anna.yaml" in an experiment, or "balls: anna_mixture.yaml" for balls with spin that keep together
+what belongs together.
 """,
 )
 import_app = command(
@@ -59,6 +62,15 @@ def fit_human(
     ] = None,
     min_samples: Annotated[int, count("balls that make a cluster (default: 5)")] = 5,
     format: Format = None,
+    model: Annotated[
+        str | None, option("YAML", "simulation model in which the balls fly; one with lift finds each ball's spin")
+    ] = None,
+    serves: Annotated[
+        bool, Parameter(help="count balls that bounce on the person's own side first, from that bounce on")
+    ] = False,
+    mixture: Annotated[
+        str | None, option("YAML", "file for a mixture over start states with spin, beside the box; with its picture")
+    ] = None,
 ) -> None:
     """Fits a distribution, writes its YAML and prints its 16 numbers beside those of the paper's players.
 
@@ -67,19 +79,28 @@ def fit_human(
     suffix(out, ".yaml", ".yml")
     if eps is not None and not 0.0 < eps < float("inf"):
         raise ConfigError(f"--eps {eps:g}: a positive number is wanted")
-    existing(*data)
+    existing(*data, model)
+    if mixture is not None:
+        suffix(mixture, ".yaml", ".yml")
     start_jax(None)
     from ballmodel.distribution import save_distribution
     from ballmodel.fit_distribution import fit_human as fit
     from ballmodel.flight import ball_params
     from ballmodel.trajectory import Dataset
-    from experiments.measurements import read_all
+    from experiments.measurements import read_all, start_states
     from mjx_tt import diagnosis
+    from mjx_tt.sim.model import ModelFile
 
     screen, path = console(), Path(out)
     measured = read_all(list(data), format)
+    world = checked("--model", ModelFile.load, model).model if model else None
+    if world is not None and isinstance(measured, Dataset):
+        checked("", diagnosis.check, measured.trajectories, measured.source)
+        measured, lines = start_states(measured, world)
+        screen.print(*lines, sep="\n", highlight=False)
     try:
-        distribution, report = fit(measured, ball_params(), eps, min_samples, name or path.stem)
+        ball = world.ball if world is not None else ball_params()
+        distribution, report = fit(measured, ball, eps, min_samples, name or path.stem, serves)
     except ValueError as error:
         if isinstance(measured, Dataset):
             checked("", diagnosis.check, measured.trajectories, measured.source)
@@ -89,6 +110,28 @@ def fit_human(
     _print_report(report, screen)
     _print_numbers(distribution, screen)
     screen.print(f"distribution: {path}  (use it in an experiment as  balls: {path.name})", highlight=False)
+    if mixture is not None:
+        _fit_mixture(report, distribution, ball, Path(mixture), screen)
+
+
+def _fit_mixture(report: HumanReport, box: BallDistribution, ball: BallParams, path: Path, console: Console) -> None:
+    """Fits and writes the mixture, compares balls of both with the strokes, and draws them."""
+    from ballmodel.mixture import fit_mixture, save_mixture
+    from experiments.evaluation import human_likeness
+
+    name = path.stem
+    try:
+        fitted, choice = fit_mixture(report.landed, name, box.source)
+    except ValueError as error:
+        raise ConfigError(f"--mixture {path}: {error}") from None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_mixture(path, fitted)
+    console.print(
+        f"mixture: {path}  ({choice.chosen} components of {choice.balls:,} balls, with spin; balls: {path.name})",
+        highlight=False,
+    )
+    for line in human_likeness.compare(report.landed, box, ball, path.with_suffix(".png")):
+        console.print(f"  {line}", highlight=False)
 
 
 @import_app.default
@@ -144,6 +187,8 @@ def _print_report(report: HumanReport, console: Console) -> None:
     console.print(
         f"{report.measured:,} balls measured, {report.too_short} too short, {report.elsewhere} not towards the robot"
     )
+    if report.serves:
+        console.print(f"{report.serves:,} serves among them, from 20 ms after the bounce on the own side")
     for outcome, number in report.outcomes.items():
         if number:
             console.print(f"  {number:,} {outcome}", highlight=False)

@@ -9,8 +9,8 @@ from typing import Any
 import jax
 
 from ballmodel import registry
-from ballmodel.distribution import BallDistribution, parse_distribution
 from ballmodel.io import yaml
+from ballmodel.registry import Balls
 from ballmodel.sampling import BallPool, sample_pool
 from bgs import optimizers
 from bgs.strategy import BGSConfig
@@ -30,13 +30,13 @@ class Experiment:
     """A configuration whose names and files have been looked up.
 
     config        with the content of the files that it named in their place, so that it stands alone
-    distribution  of the balls
+    distribution  of the balls: a box or a mixture
     model         nominal parameters and what is randomised around them
     task, bgs     settings of simulator and optimiser
     """
 
     config: Config
-    distribution: BallDistribution
+    distribution: Balls
     model: ModelFile
     task: TaskConfig
     bgs: BGSConfig
@@ -65,10 +65,10 @@ def experiment(config: Config, where: str) -> Experiment:
     )
 
 
-def distribution(balls: str | dict[str, Any], where: str) -> BallDistribution:
-    """The distribution of that name, in the YAML at that path, or with that content. Raises ConfigError."""
+def distribution(balls: str | dict[str, Any], where: str) -> Balls:
+    """The box or mixture of that name, in the YAML at that path, or with that content. Raises ConfigError."""
     if isinstance(balls, dict):
-        return checked(where, parse_distribution, balls, "content")
+        return checked(where, registry.parse_balls, balls, "content")
     return checked(where, registry.resolve, balls)
 
 

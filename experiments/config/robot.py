@@ -20,7 +20,7 @@ from robot_io.emulator.config import RigParams
 from robot_io.emulator.opponent import Throws
 
 if TYPE_CHECKING:  # a robot.yaml is read without JAX
-    from ballmodel.distribution import BallDistribution
+    from ballmodel.registry import Balls
     from mjx_tt.sim.model import SimModel
 
 COMMISSIONING = 0.1  # speed_scale of a robot.yaml that sets none: full speed is asked for, not forgotten
@@ -126,7 +126,7 @@ def _mapping(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def throws_of(balls: BallDistribution, model: SimModel, count: int, seed: int) -> Throws:
+def throws_of(balls: Balls, model: SimModel, count: int, seed: int) -> Throws:
     """Balls to throw, drawn from a distribution as training draws them."""
     import jax
 

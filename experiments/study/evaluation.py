@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from ballmodel.distribution import BallDistribution
 from ballmodel.io.atomic_files import replacing
+from ballmodel.registry import Balls
 from experiments.config import build
 from experiments.config.study import Study
 from experiments.study.analysis import effect_costs, scoring
@@ -35,7 +35,7 @@ def play(
     seed: int,
     pairings: list[tuple[str, str, str]],
     policies: list[Policy],
-    boxes: list[BallDistribution],
+    boxes: list[Balls],
 ) -> RallyResult:
     """Rallies of each pairing (trainer, evaluator, model) in ``evaluation.lanes`` sessions side by side.
 
@@ -70,7 +70,7 @@ def play_without(
     seed: int,
     models: list[tuple[str, str]],
     policies: list[Policy],
-    boxes: list[BallDistribution],
+    boxes: list[Balls],
 ) -> list[effect_costs.Outcome]:
     """Rallies of each (player, model) in every world of ``effects.WORLDS``, ``evaluation.rallies`` each, in one call.
 

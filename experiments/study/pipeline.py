@@ -14,9 +14,10 @@ from typing import Any
 
 from rich.console import Console
 
-from ballmodel.distribution import BallDistribution, load_distribution, save_distribution
+from ballmodel.distribution import load_distribution, save_distribution
 from ballmodel.fit_distribution import fit_human
 from ballmodel.flight import ball_params
+from ballmodel.registry import Balls
 from ballmodel.trajectory import Dataset
 from experiments import measurements
 from experiments.config import build
@@ -264,7 +265,7 @@ class Loop:
     def _policy_of(self, seed: int, trainer: str, model: str) -> Path:
         return self.model_folder(seed, trainer, "oracle-sim" if model == ORACLE else model) / POLICY
 
-    def _box(self, seed: int, trainer: str, model: str) -> BallDistribution:
+    def _box(self, seed: int, trainer: str, model: str) -> Balls:
         """The balls that a policy was last trained on in simulation."""
         made = {item.key: item for item in items(self.study, trainer) if not isinstance(item, Human)}
         item = made["oracle-sim" if model == ORACLE else model]

@@ -11,6 +11,7 @@ import numpy as np
 
 from ballmodel import registry
 from ballmodel.distribution import BallDistribution
+from ballmodel.mixture import BallMixture
 from ballmodel.sampling import sample_pool
 from mjx_tt.env import rewards
 from mjx_tt.env.brax import TableTennis, register_environment
@@ -22,7 +23,7 @@ from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io.policy import artefact
 
-Balls = BallDistribution | str | os.PathLike
+Balls = BallDistribution | BallMixture | str | os.PathLike
 Model = SimModel | ModelFile | str | os.PathLike | None
 OUTCOMES = {MISSED: "missed", HIT: "hit", RETURNED: "returned"}
 
@@ -56,7 +57,7 @@ class PlayedEpisodes:
 class Rollout:
     """Plays episodes of one world with any policy; compiled at the first call, whatever the number of episodes."""
 
-    def __init__(self, simulator: Simulator, distribution: BallDistribution, model: ModelFile) -> None:
+    def __init__(self, simulator: Simulator, distribution: registry.Balls, model: ModelFile) -> None:
         self.simulator, self.distribution, self.model = simulator, distribution, model
         self._evaluator: Evaluator | None = None
 
@@ -116,8 +117,8 @@ def load_policy(path: str | os.PathLike) -> Policy:
     return artefact.load(Path(path)).policy.astype(np.float32) if os.path.isdir(path) else Policy.load(path)
 
 
-def _distribution(balls: Balls) -> BallDistribution:
-    return balls if isinstance(balls, BallDistribution) else registry.resolve(balls)
+def _distribution(balls: Balls) -> registry.Balls:
+    return balls if isinstance(balls, BallDistribution | BallMixture) else registry.resolve(balls)
 
 
 def _model(model: Model) -> ModelFile:

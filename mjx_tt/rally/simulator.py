@@ -20,8 +20,10 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-from ballmodel.distribution import BallDistribution
+from ballmodel import constants as c
+from ballmodel.mixture import BallMixture
 from ballmodel.partial_params import without_nominal
+from ballmodel.registry import Balls
 from ballmodel.state import BallState, where
 from mjx_tt.env import rewards
 from mjx_tt.env.outgoing_ball import fly_out
@@ -52,8 +54,13 @@ class Box:
     high: Float[Array, "8 *#lanes"]
 
     @staticmethod
-    def of(distribution: BallDistribution) -> Box:
+    def of(distribution: Balls) -> Box:
+        """Bounds of a box, or three deviations about a mixture's components and the robot's half of the table."""
         d = distribution
+        if isinstance(d, BallMixture):
+            low, high = d.ends()
+            landing = (-c.TABLE_WIDTH / 2, -c.TABLE_LENGTH / 2, c.TABLE_WIDTH / 2, 0.0)
+            return Box(jnp.array([*low[:6], *landing[:2]]), jnp.array([*high[:6], *landing[2:]]))
         return Box(
             jnp.array([*d.position_min, *d.velocity_min, *d.landing_min]),
             jnp.array([*d.position_max, *d.velocity_max, *d.landing_max]),
@@ -170,7 +177,7 @@ class RallySimulator:
         model: SimModel,
         key: PRNGKeyArray,
         rallies: int,
-        box: Box | BallDistribution | None = None,
+        box: Box | Balls | None = None,
         max_touches: int = 400,
         capacity: int = 0,
     ) -> RallyResult:
@@ -180,7 +187,7 @@ class RallySimulator:
         of distribution, None: nothing is. A rally is broken off (End.NONE) at max_touches. capacity: human hits per
         lane that the log keeps.
         """
-        box = Box.of(box) if isinstance(box, BallDistribution) else box
+        box = box if box is None or isinstance(box, Box) else Box.of(box)
         return self._play(
             policy,
             player,
