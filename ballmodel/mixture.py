@@ -16,7 +16,8 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 
-from ballmodel.distribution import NOTES, check_keys
+from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
+from ballmodel.distribution import NOTES, BallDistribution, check_keys
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.yaml import read as read_yaml
 from ballmodel.state import BallState
@@ -76,10 +77,14 @@ class BallMixture:
         values, vectors = np.linalg.eigh(self.covariances)
         return vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
 
-    def ends(self, deviations: float = 3.0) -> tuple[Float[np.ndarray, "9"], Float[np.ndarray, "9"]]:
-        """Bounds of the start states: the components' means with this many standard deviations on either side."""
-        spread = deviations * np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
-        return (self.means - spread).min(axis=0), (self.means + spread).max(axis=0)
+    @property
+    def box(self) -> BallDistribution:
+        """Bounds: three standard deviations about the components' means, and the robot's half of the table."""
+        spread = 3.0 * np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+        low, high = (ends.tolist() for ends in ((self.means - spread).min(axis=0), (self.means + spread).max(axis=0)))
+        half_x, half_y = TABLE_WIDTH / 2, TABLE_LENGTH / 2
+        landing = ((-half_x, -half_y), (half_x, 0.0))
+        return BallDistribution(low[:3], high[:3], low[3:6], high[3:6], *landing, self.name, self.source)
 
     def to_dict(self) -> dict[str, Any]:
         """The YAML form."""

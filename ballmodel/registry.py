@@ -82,6 +82,11 @@ def parse_balls(data: Any, where: str, name: str = "", source: str = "") -> Ball
     return parse(data, where, name, source)
 
 
+def box_of(balls: Balls) -> BallDistribution:
+    """The box itself, or a mixture's bounds."""
+    return balls.box if isinstance(balls, BallMixture) else balls
+
+
 def resolve(name_or_path: str | os.PathLike) -> Balls:
     """The named distribution, or the one or the mixture in the YAML file at that path.
 

@@ -20,6 +20,7 @@ from experiments.commands import (
     is2r,
     log,
     options,
+    predict,
     render,
     run,
     train,
@@ -97,6 +98,8 @@ COMMANDS = (
     run.rig_app,
     log.app,
     diagnose_app,
+    predict.app,
+    predict.bench_app,
     train.schema_app,
     fit_human.balls_app,
 )

@@ -10,6 +10,7 @@ from ballmodel.io.aimy import read_aimy
 from ballmodel.io.csv import read_csv
 from ballmodel.io.deepmind import MeasuredStates, read_deepmind
 from ballmodel.io.mcap import read_mcap
+from ballmodel.io.spindoe import read_spindoe
 from ballmodel.trajectory import Dataset
 
 FORMATS: dict[str, Callable[[Path], Dataset | MeasuredStates]] = {
@@ -17,12 +18,13 @@ FORMATS: dict[str, Callable[[Path], Dataset | MeasuredStates]] = {
     "mcap": read_mcap,
     "deepmind": read_deepmind,
     "aimy": read_aimy,
+    "spindoe": read_spindoe,
 }
 SUFFIXES = {".csv": "csv", ".mcap": "mcap", ".json": "deepmind", ".hdf5": "aimy", ".h5": "aimy"}
 
 
 def read(path: str | os.PathLike, format: str | None = None) -> Dataset | MeasuredStates:
-    """Reads measured balls: trajectories from CSV, MCAP and AIMY files, start states from a DeepMind JSON.
+    """Reads measured balls: trajectories from CSV, MCAP, AIMY and SpinDOE, start states from a DeepMind JSON.
 
     ``format`` is a key of FORMATS; without it the file's suffix decides. Raises ValueError for an unknown format or
     suffix and for malformed content, FileNotFoundError when there is no such file.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from ballmodel import registry
 from experiments.config import build
 from experiments.config import robot as robots
 from experiments.deploy.operator_console import Keyboard
@@ -46,7 +47,7 @@ def box_of(artefact: artefacts.Artefact) -> Box | None:
     config = (artefact.manifest.get("provenance") or {}).get("config") or {}
     if "balls" not in config:
         return None
-    d = build.distribution(config["balls"], str(artefact.folder))
+    d = registry.box_of(build.distribution(config["balls"], str(artefact.folder)))
     low, high = (*d.position_min, *d.velocity_min, *d.landing_min), (*d.position_max, *d.velocity_max, *d.landing_max)
     return Box(tuple(map(float, low)), tuple(map(float, high)))
 

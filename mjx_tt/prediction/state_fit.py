@@ -21,7 +21,8 @@ from mjx_tt.sim.model import SimModel, with_values
 
 STEP = np.array([1e-4] * 3 + [2e-3] * 3 + [0.5] * 3)  # of the differences, [m], [m/s], [rad/s]
 WEAK = np.array([10.0] * 3 + [50.0] * 3)  # standard deviations of what is not known before, [m], [m/s]
-ROUNDS = 12
+ROUNDS = 20
+SETTLED = 5  # rounds before noise and prior follow the flights
 HUBER = 4.0  # deviations from which a sample counts less
 LEAST_NOISE = 5e-4  # [m]
 FALLBACK_NOISE = 3e-3  # [m] where a flight has too few samples to tell
@@ -111,31 +112,32 @@ def fit_states(
     state = np.concatenate([guess, np.repeat(prior.mean[:, None], g.n, axis=1)])
     weak = np.array([value for value, _, _ in shared.values()])
     theta, sigma = weak.copy(), noise or FALLBACK_NOISE
-    damping, cost, held = np.full(g.n, 1e-3), np.full(g.n, np.inf), state.copy()
+    damping, held = np.full(g.n, 1e-3), state.copy()
+    square, off = np.full(g.n, np.inf), np.zeros(g.n)  # of the states held
     problem = _Problem(g, axes, model, list(shared))
     covariance, spread = np.tile(np.eye(9), (g.n, 1, 1)), np.zeros(len(theta))
     for round_ in range(rounds):
         residual, jacobian = problem.linearise(state, theta, np.array([s for *_, s in shared.values()]))
-        if noise is None:
+        if noise is None and round_ >= SETTLED:
             sigma = _noise(residual, g.mask)
+        if learn_prior and round_ >= SETTLED:
+            prior = _learnt(state[6:], covariance[:, 6:, 6:])
         weight = _huber(residual, sigma) * g.mask
-        now = np.sum(weight * np.sum(residual**2, axis=0), axis=0) / sigma**2 + _of_prior(state, prior)
-        worse = now > cost * 1.01 + 1e-6
+        new = np.sum(weight * np.sum(residual**2, axis=0), axis=0), _of_prior(state, prior)
+        worse = new[0] / sigma**2 + new[1] > square / sigma**2 + off + 1e-3
         if worse.any() and not shared:
             state[:, worse] = held[:, worse]
-        damping = np.where(worse, damping * 10.0, np.maximum(damping * 0.2, 1e-9))
-        held, cost = state.copy(), np.where(worse, cost, now)
-        if worse.any() and not shared:
             residual, jacobian = problem.linearise(state, theta, np.zeros(0))
             weight = _huber(residual, sigma) * g.mask
+            new = np.sum(weight * np.sum(residual**2, axis=0), axis=0), _of_prior(state, prior)
+        damping = np.where(worse, damping * 10.0, np.maximum(damping * 0.2, 1e-9))
+        held, (square, off) = state.copy(), new
         step, change, covariance, spread = _solve(
             residual, jacobian, weight, sigma, state, prior, theta, shared, damping
         )
         state, theta = state + step, theta + change
         state[6:] = np.clip(state[6:], -1500.0, 1500.0)
-        if learn_prior and round_ >= 2:
-            prior = _learnt(state[6:], covariance[:, 6:, 6:])
-        if np.abs(step / STEP[:, None]).max() < 0.05 and round_ > 3:
+        if np.abs(step / STEP[:, None]).max() < 0.05 and round_ > SETTLED:
             break
     fitted = {path: (float(v), float(s)) for path, v, s in zip(shared, theta, spread, strict=True)}
     final = with_values(model, {path: v for path, (v, _) in fitted.items()})

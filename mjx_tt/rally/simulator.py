@@ -20,10 +20,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-from ballmodel import constants as c
-from ballmodel.mixture import BallMixture
 from ballmodel.partial_params import without_nominal
-from ballmodel.registry import Balls
+from ballmodel.registry import Balls, box_of
 from ballmodel.state import BallState, where
 from mjx_tt.env import rewards
 from mjx_tt.env.outgoing_ball import fly_out
@@ -55,12 +53,8 @@ class Box:
 
     @staticmethod
     def of(distribution: Balls) -> Box:
-        """Bounds of a box, or three deviations about a mixture's components and the robot's half of the table."""
-        d = distribution
-        if isinstance(d, BallMixture):
-            low, high = d.ends()
-            landing = (-c.TABLE_WIDTH / 2, -c.TABLE_LENGTH / 2, c.TABLE_WIDTH / 2, 0.0)
-            return Box(jnp.array([*low[:6], *landing[:2]]), jnp.array([*high[:6], *landing[2:]]))
+        """Bounds of a box or of a mixture."""
+        d = box_of(distribution)
         return Box(
             jnp.array([*d.position_min, *d.velocity_min, *d.landing_min]),
             jnp.array([*d.position_max, *d.velocity_max, *d.landing_max]),

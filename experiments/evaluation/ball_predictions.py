@@ -1,0 +1,51 @@
+"""Predictions of a log's strokes as CSV, for ``mjx-tt predict``."""
+
+from __future__ import annotations
+
+import csv
+from itertools import combinations_with_replacement
+from pathlib import Path
+
+import numpy as np
+
+from ballmodel.io.atomic_files import replacing
+from ballmodel.trajectory import Dataset
+from experiments.errors import ConfigError
+from mjx_tt.diagnosis.tracks import clean
+from mjx_tt.prediction.state_fit import fit_states, fly_on
+from mjx_tt.sim.model import SimModel
+
+PAIRS = tuple(combinations_with_replacement(range(3), 2))
+COLUMNS = ("session", "trajectory", "t", "x", "y", "z", "sd_x", "sd_y", "sd_z") + tuple(
+    f"cov_{'xyz'[i]}{'xyz'[j]}" for i, j in PAIRS
+)
+FEWEST = 6  # samples of a stroke
+
+
+def write(path: Path, measured: Dataset, model: SimModel, horizons: tuple[float, ...], seen: float | None) -> list[str]:
+    """Writes each stroke's places ``horizons`` [s] after the last sample seen; returns lines for people.
+
+    Raises ConfigError where no stroke has samples enough.
+    """
+    strokes, record = clean(measured.trajectories)
+    parts = [
+        t if seen is None else t.part(0, int(np.searchsorted(t.time, t.time[0] + seen + 1e-9, "right")))
+        for t in strokes
+    ]
+    parts = [t for t in parts if len(t) >= FEWEST]
+    if not parts:
+        raise ConfigError(f"{measured.source}: no stroke of {FEWEST} samples among {len(measured)} tracks")
+    fitted = fit_states(parts, model)
+    ahead = np.array([[t.time[-1] - t.time[0] + h for t in parts] for h in horizons])
+    flown, slope = fly_on(fitted, ahead)
+    covariance = np.einsum("atin,nij,btjn->abtn", slope, fitted.covariance, slope)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for n, t in enumerate(parts):
+            for h in range(len(horizons)):
+                place, spread = flown.position[:, 1 + h, 0, n], covariance[:, :, h, n]
+                numbers = [t.time[0] + ahead[h, n], *place, *np.sqrt(np.diag(spread)), *(spread[p] for p in PAIRS)]
+                writer.writerow([t.session, t.name, *(f"{v:.9g}" for v in numbers)])
+    return [*record.lines(), f"{path}: {len(parts)} strokes; noise {1e3 * fitted.noise:.1f} mm"]
