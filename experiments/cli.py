@@ -57,7 +57,10 @@ def diagnose(
     *logs: Annotated[str, Parameter("LOG", help="a file, or a folder of files", required=True)],
     out: Annotated[str, options.option("DIR", "where report, verdict and extended model go")],
     model: Annotated[str | None, options.option("YAML", "the model to judge; the nominal one by default")] = None,
-    spin: Annotated[Literal["none", "free"], Parameter(help="whether the model's ball may spin (none)")] = "none",
+    spin: Annotated[
+        Literal["auto", "none", "free"],
+        Parameter(help="whether balls may spin: free where the model has a Magnus force, else a cause (auto)"),
+    ] = "auto",
     without: Annotated[tuple[str, ...], options.option("NAMES", "effects to leave out of the catalogue")] = (),
     randomise: Annotated[bool, Parameter(help="extended.yaml draws what was fitted from its intervals")] = False,
     seed: Annotated[int, Parameter(help="of the bootstraps (0)")] = 0,

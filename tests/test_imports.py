@@ -51,7 +51,7 @@ ROOMS = {
     "bgs": ".",
     "mjx_tt": (
         ". sim robot diagnosis/description diagnosis/robust diagnosis/verdict diagnosis/joint diagnosis/tracks "
-        "diagnosis/logs "
+        "diagnosis/logs diagnosis/ball/effects diagnosis/ball/flights "
         "diagnosis/ball diagnosis/hits diagnosis prediction "
         "viz diagnosis/report env rally"
     ),

@@ -32,7 +32,7 @@ class Request:
     logs: Sequence[str]
     out: Path
     model: str | None = None
-    spin: str = "none"
+    spin: str = "auto"
     without: Sequence[str] = ()
     seed: int = 0
     randomise: bool = False
@@ -165,14 +165,17 @@ def save(found: diagnosis.Diagnosis, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     found.verdict.save(folder / "verdict.json")
     found.extended.save(folder / "extended.yaml")
+    if found.balls is not None and found.balls.spins is not None:
+        found.balls.spins.save(folder / "spins.csv")
     return folder / "extended.yaml"
 
 
 def draw(found: diagnosis.Diagnosis, folder: Path, title: str, console: Console, cost: Play | None = None) -> None:
     """Writes report.html and its pictures, and prints the paths."""
     report.write_report(folder, found, title, cost)
-    for name in ("report.html", "verdict.json", "extended.yaml"):
-        console.print(f"  {folder / name}", highlight=False)
+    for name in ("report.html", "verdict.json", "extended.yaml", "spins.csv"):
+        if (folder / name).exists():
+            console.print(f"  {folder / name}", highlight=False)
 
 
 def show(found: diagnosis.Diagnosis, console: Console) -> None:

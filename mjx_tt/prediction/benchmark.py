@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 from ballmodel.aerodynamics import SATURATING_LIFT
 from ballmodel.io import Events
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball.forward_model import grid, heading_axes
-from mjx_tt.diagnosis.ball.forward_model import predict as fly
+from mjx_tt.diagnosis.ball.flights.forward_model import grid, heading_axes
+from mjx_tt.diagnosis.ball.flights.forward_model import predict as fly
 from mjx_tt.diagnosis.tracks import Record, clean
 from mjx_tt.diagnosis.tracks.chains import take_apart
 from mjx_tt.prediction import baselines

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 
 from ballmodel.state import BallState
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball.forward_model import Flown, Grid, grid, heading_axes, leaves
-from mjx_tt.diagnosis.ball.forward_model import predict as fly
+from mjx_tt.diagnosis.ball.flights.forward_model import Flown, Grid, grid, heading_axes, leaves
+from mjx_tt.diagnosis.ball.flights.forward_model import predict as fly
 from mjx_tt.sim.model import SimModel, with_values
 
 STEP = np.array([1e-4] * 3 + [2e-3] * 3 + [0.5] * 3)  # of the differences, [m], [m/s], [rad/s]

@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.exam.generator import cases as drawing
-from tests.exam.generator import held_out, scoring
+from tests.exam.generator import held_out, human_strokes, scoring
 from tests.exam.generator.cases import BallCase, Case
 from tests.exam.generator.json_lines import append, read_lines
 from tests.exam.generator.sessions import draw_balls, measure
@@ -36,7 +36,7 @@ from tests.support.paths import ROOT
 
 DATA = ROOT.parent / "shared" / "data" / "aimy_launcher"
 FRESH = 100  # balls of the held-out test, which no diagnosis sees
-GAINED = ("none", "noise", "single", "pair", "triple")  # kinds whose true model is a model
+GAINED = ("none", "noise", "single", "pair", "triple", "many")  # kinds whose true model is a model
 # Kinds and sizes of each bar, and their share of --cases. Bars 6 and 9 are read off the others.
 BARS: dict[str, tuple[tuple[str, float | None, float], ...]] = {
     "1": (("none", None, 1.0), ("noise", None, 0.5)),
@@ -49,8 +49,14 @@ BARS: dict[str, tuple[tuple[str, float | None, float], ...]] = {
     "8": (("invented", None, 1.0),),
     "9": (("none", None, 1.0), ("single", 10.0, 1.0), ("pair", None, 1.0)),
     "10": (("robot", None, 1.0), ("unexcited", None, 0.25), ("robot_none", None, 0.25)),
+    "13": (("human_none", None, 1.0),),
+    "14": (("human_single", 10.0, 1.0), ("human_single", 20.0, 1.0)),
+    "15": (("human_pair", None, 1.0),),
+    "16": (("human_deleted", None, 0.5), ("human_invented", None, 0.5)),
+    "17": (("many", None, 1.0),),
     "extra": (("rare", None, 0.5), ("invisible", None, 0.1)),
 }
+PEOPLES_BARS = ("13", "14", "15", "16")
 ALONE = ("11", "12")  # time and real data: no drawn cases
 
 
@@ -78,8 +84,12 @@ def diagnose(files: list[Path], out: Path, options: list[str]) -> dict:
     return json.loads((out / "verdict.json").read_text())
 
 
-def _options(case: Case) -> list[str]:
-    options = [] if case.kind in ROBOT_KINDS else ["--spin", case.spin]
+def _options(case: Case, folder: Path) -> list[str]:
+    options = []
+    if case.human:
+        model = folder / "model.yaml"
+        model.write_text(f"ball:\n  flight:\n    magnus_coefficient: {drawing.MAGNUS}\n")
+        options = ["--model", str(model)]
     return [*options, "--without", ",".join(case.without)] if case.without else options
 
 
@@ -93,7 +103,7 @@ def examine(case: Case, folder: Path) -> dict:
     record: dict = {"key": case.name, "case": asdict(case)}
     started, worked = time.perf_counter(), time.process_time()
     try:
-        verdict = diagnose(files, folder / "out", _options(case))
+        verdict = diagnose(files, folder / "out", _options(case, folder))
     except (Exception, SystemExit) as error:
         (folder / "error.txt").write_text(traceback.format_exc())
         record |= {
@@ -121,7 +131,7 @@ def _with_reading(case: Case, truth: dict, files: list[Path], folder: Path) -> s
     cause = case.causes[0]
     others = [*truth["twins"][cause], *truth["kin"][cause]]
     reading = replace(case, without=tuple(others))
-    verdict = diagnose(files, folder / "reading", _options(reading))
+    verdict = diagnose(files, folder / "reading", _options(reading, folder))
     return scoring.score(truth, verdict)["outcome"]
 
 
@@ -168,7 +178,7 @@ def real_data(folder: Path) -> dict:
         with contextlib.redirect_stdout(io.StringIO()):
             if main(["import", str(DATA / f"{name}.hdf5"), "--out", str(csv)]):
                 raise RuntimeError(f"{name} could not be imported")
-        verdict = diagnose([csv], folder / name, ["--spin", "none"])
+        verdict = diagnose([csv], folder / name, [])
         found[name] = {k: verdict.get(k) for k in ("verdict", "causes", "unexplained", "held_out", "not_identifiable")}
     return found
 
@@ -273,6 +283,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--keep", action="store_true", help="keep logs, truths and reports of every case")
     options = parser.parse_args(arguments)
     bars = options.bars.split(",")
+    if not human_strokes.DATA.exists():
+        absent = [bar for bar in bars if bar in PEOPLES_BARS]
+        bars = [bar for bar in bars if bar not in PEOPLES_BARS]
+        if absent:
+            print(f"bars {', '.join(absent)} are left out: {human_strokes.DATA} is absent", flush=True)
     unknown = [bar for bar in bars if bar not in known]
     if unknown:
         parser.error(f"unknown bar {', '.join(unknown)}; known are {', '.join(known)}")

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
 from tests.exam import baselines, examination
-from tests.exam.generator import cases, held_out, robot, scoring
+from tests.exam.generator import cases, held_out, human_strokes, robot, scoring
 from tests.exam.generator.cases import EFFECTS, Case
 from tests.exam.generator.invented_defects import INVENTED
 from tests.exam.generator.json_lines import append, read_lines
@@ -422,17 +422,36 @@ def test_an_examination_goes_on_where_it_was(tmp_path):
     assert {c.kind for c in plan[:8]} == {"none", "noise", "single", "invented"}  # the kinds take turns
     assert len({c.name for c in plan}) == len(plan) == 70
     with pytest.raises(SystemExit):
-        examination.main(["--bars", "13", "--out", str(tmp_path)])
+        examination.main(["--bars", "99", "--out", str(tmp_path)])
     assert examination.by_itself(lambda: {"a": 1}) == {"a": 1}
     assert "not there" in examination.by_itself(lambda: Path("/not there").read_text())["error"]
     with pytest.raises(SystemExit):
         examination.main(["--part", "3/2", "--out", str(tmp_path)])
 
 
+PEOPLE = pytest.mark.skipif(not human_strokes.DATA.exists(), reason=f"strokes are absent: {human_strokes.DATA}")
+
+
+@PEOPLE
+def test_people_play_as_they_were_measured():
+    drawn = cases.build(Case("human_none", (), 0.0, "iid", 3, count=120))
+    assert drawn.world.magnus_coefficient == cases.MAGNUS and len(drawn.balls) == 120
+    flight = fly(drawn.world, drawn.balls.start, 0.7)
+    assert np.all(np.isfinite(flight.bounce_time)) and np.all(flight.bounce_state[1] < 0.0)
+    median = np.median(np.linalg.norm(drawn.balls.start[6:], axis=0))
+    assert 40.0 < median < 70.0, "of all strokes in the data it is 54 rad/s"
+    many = cases.draw("many", 20, 5)
+    assert {len(c.causes) for c in many} <= set(range(2, 9)) and all(len(set(c.causes)) == len(c.causes) for c in many)
+    assert all("magnus" not in c.causes for c in cases.draw("human_single", 40, 1, 10.0))
+
+
 # --- a small examination, fixed in time: the command line answers, then the seal is opened ----------------------------
 
 
 SLOW = pytest.mark.slow
+PEOPLE = pytest.mark.skipif(
+    not human_strokes.DATA.exists(), reason=f"measured strokes are absent: {human_strokes.DATA}"
+)
 FIXED = [
     pytest.param(Case("none", (), 0.0, "ar1", 11, count=200), ("right",), marks=SLOW),
     (Case("single", ("wind_x",), 20.0, "range", 13, count=200), ("right",)),
@@ -449,6 +468,14 @@ FIXED = [
         Case("single", ("air_density",), 20.0, "iid", 21, ("drag_coefficient", "ball_mass", "ball_radius"), 200),
         ("right",),
         marks=SLOW,
+    ),
+    pytest.param(Case("human_none", (), 0.0, "ar1", 31, count=200), ("right",), marks=[SLOW, PEOPLE]),
+    pytest.param(Case("human_single", ("table_height",), 10.0, "iid", 32, count=100), ("right",), marks=PEOPLE),
+    pytest.param(Case("human_single", ("wind_z",), 20.0, "range", 33, count=200), ("right",), marks=[SLOW, PEOPLE]),
+    pytest.param(
+        Case("human_pair", ("drag_coefficient", "table_tilt_x"), 20.0, "ar1", 34, count=200),
+        ("right",),
+        marks=[SLOW, PEOPLE],
     ),
     (Case("robot", ("joint_2.lag",), 0.0, "iid", 19), ("right",)),
     pytest.param(Case("unexcited", ("joint_3.acceleration_limit",), 0.0, "iid", 22), ("right",), marks=SLOW),

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mjx_tt.diagnosis.ball.forward_model import Grid
-from mjx_tt.diagnosis.ball.linearization import Linear
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid
+from mjx_tt.diagnosis.ball.flights.linearization import Linear
 
 DIRECTIONS = ("x", "y", "z", "along the flight")
 FORCES = (0, 3, 2)  # directions of forces: along y and along the flight are nearly one

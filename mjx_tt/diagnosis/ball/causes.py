@@ -12,7 +12,7 @@ from mjx_tt.diagnosis.ball import cross_validation, experiment_design, scores, s
 from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, shaking
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
-from mjx_tt.diagnosis.ball.linearization import MAGNUS, REFERENCE_MAGNUS
+from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, REFERENCE_MAGNUS
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Part, Unexplained
 
 BOOTSTRAP = 100
@@ -169,14 +169,15 @@ def _spin_cause(found: BallFindings, confidence: float, wide: float) -> Expresse
     if prior is None:
         raise ValueError("the chosen causes hold no spin")
     error = np.sqrt(np.diagonal(scores.sandwich(rated, [*choice.effects, *rated.always])))
+    n = problem.grid.n
     parameters: dict[str, Estimate] = {}
     if problem.coefficient is not None:
         k, half = float(found.situation.theta[problem.coefficient]), float(error[-1]) * wide
         low, high = (max(k - half, 0.0), k + half) if half < 0.5 * REFERENCE_MAGNUS else (0.3, 1.5)
         parameters[MAGNUS] = Estimate(problem.nominal[MAGNUS], k, low, high, "1")
-    own = error[len(choice.effects) : len(choice.effects) + 3]
+    own = prior.std / np.sqrt(n) if prior.conditional else error[len(choice.effects) : len(choice.effects) + 3]
     for axis, mean, std, e in zip("xyz", prior.mean, prior.std, own, strict=True):
-        half = wide * std / np.sqrt(2.0 * problem.grid.n)
+        half = wide * std / np.sqrt(2.0 * n)
         parameters[f"ball_spin.mean_{axis}"] = Estimate(
             0.0, float(mean), float(mean - wide * e), float(mean + wide * e), "rad/s"
         )
@@ -198,9 +199,11 @@ def _confidence(found: BallFindings, seed: int) -> list[float]:
     hits = np.zeros(len(choice.effects))
     for _ in range(BOOTSTRAP):
         count = rng.multinomial(n, np.full(n, 1.0 / n)).astype(float)
-        gains = scores.all_gains(
-            replace(rated, gram=np.tensordot(count, rated.ball_gram, 1), right=count @ rated.ball_right), tuple(useful)
-        )
+        drawn = rated.weighted(count)
+        if len(choice.effects) < scores.LARGEST_SUBSET:
+            gains = scores.all_gains(drawn, tuple(useful))
+        else:
+            gains = scores.neighbours(drawn, choice.effects, tuple(useful))
         top = max(gains.items(), key=lambda x: x[1] - choice.threshold * len(x[0]))[0]
         hits += [bool(set(group) & set(top)) for group in choice.groups]
     return [*(float(h) / BOOTSTRAP for h in hits), float(choice.spin)]

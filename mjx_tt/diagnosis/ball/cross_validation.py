@@ -13,9 +13,10 @@ from jaxtyping import Float
 
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
-from mjx_tt.diagnosis.ball.fit import fit_starts
-from mjx_tt.diagnosis.ball.forward_model import Grid
-from mjx_tt.diagnosis.ball.linearization import SPIN, BallProblem
+from mjx_tt.diagnosis.ball.flights.fit import fit_starts
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid
+from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE, SpinPrior
 from mjx_tt.diagnosis.verdict import HeldOut
 
 FIRST_PART = 0.3
@@ -43,18 +44,13 @@ def predictions(found: BallFindings, seed: int = 0) -> Prediction:
     fold = _folds(found, seed)
     theta = np.zeros((k, g.n))
     mean = np.zeros((3, g.n))
+    if choice.prior is not None and choice.prior.conditional:
+        mean += choice.prior.mean[:, None]
     rated = found.scores()
     chosen = [*choice.effects, *rated.always]
     for f in range(FOLDS):
         rest = fold != f
-        part = scores.Scores(
-            rated.ball_gram[rest].sum(axis=0),
-            rated.ball_right[rest].sum(axis=0),
-            rated.ball_gram[rest],
-            rated.ball_right[rest],
-            0.0,
-            rated.always,
-        )
+        part = rated.weighted(rest.astype(float))
         values = scores.solve(part, chosen) if chosen else np.zeros(0)
         mine = np.flatnonzero(~rest)
         for j, value in zip(chosen, values, strict=True):
@@ -63,11 +59,12 @@ def predictions(found: BallFindings, seed: int = 0) -> Prediction:
             else:
                 mean[j - k, mine] = value
     if choice.magnus is not None:
-        theta[problem.coefficient] = np.clip(theta[problem.coefficient], 0.2, 1.5)
+        theta[problem.coefficient] = np.clip(theta[problem.coefficient], *MAGNUS_RANGE)
     base = found.start0.copy()
     base[SPIN] = 0.0
     spun = problem.coefficient is None and choice.spin
-    prior0 = (np.zeros(3), np.full(3, 30.0)) if spun else None
+    # Where the nominal ball may spin, spins are no part of the extension: both models know the same of them.
+    prior0 = SpinPrior(choice.prior.mean, choice.prior.std) if spun and choice.prior is not None else None
     before = fit_starts(problem, np.zeros((k, g.n)), base, g, found.noise, prior0, rounds=4, keep=keep)
     error0 = _error(problem, np.zeros((k, g.n)), before, g, ~keep & g.mask)
     if not choice.effects and not choice.spin:
@@ -76,7 +73,7 @@ def predictions(found: BallFindings, seed: int = 0) -> Prediction:
     prior = None
     if choice.prior is not None:
         start[SPIN] = mean
-        prior = (choice.prior.mean, np.maximum(choice.prior.std, 1.0))
+        prior = SpinPrior(choice.prior.mean, choice.prior.std)
     after = fit_starts(problem, theta, start, g, found.noise, prior, rounds=4, keep=keep)
     return Prediction(error0, _error(problem, theta, after, g, ~keep & g.mask))
 

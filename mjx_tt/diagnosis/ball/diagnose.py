@@ -9,14 +9,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball import noise, scores, selection
+from mjx_tt.diagnosis.ball import evidence, posterior, scores, selection
 from mjx_tt.diagnosis.ball.effects import EFFECTS
-from mjx_tt.diagnosis.ball.fit import fast_spin, first_fit, heading
-from mjx_tt.diagnosis.ball.forward_model import grid
-from mjx_tt.diagnosis.ball.linearization import BallProblem, Linear, Projected, Situation
-from mjx_tt.diagnosis.ball.noise import Jitter, Noise
+from mjx_tt.diagnosis.ball.flights import noise
+from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading, own_spins
+from mjx_tt.diagnosis.ball.flights.forward_model import grid
+from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Projected, Situation
+from mjx_tt.diagnosis.ball.flights.noise import Jitter, Noise
 from mjx_tt.diagnosis.ball.scores import Scores
-from mjx_tt.diagnosis.ball.selection import Choice, Trial, search
+from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial, search
+from mjx_tt.diagnosis.ball.spins import Spins, estimate
 from mjx_tt.diagnosis.ball.unexplained import Finding, find
 from mjx_tt.diagnosis.logs import before_racket
 from mjx_tt.sim.model import SimModel
@@ -44,6 +46,8 @@ class BallFindings:
     age: Float[np.ndarray, " n"]
     seen: Bool[np.ndarray, " K"]  # the data could show the effect, and it was not left out
     imitated: tuple[str, ...]  # effects that were left out, each of which would replace two of the causes
+    spins: Spins | None  # of every ball, where balls spin
+    spin_notes: tuple[str, ...]  # what was tried about spin, and what it brought
 
     def scores(self) -> Scores:
         """Scores of the effects under the chosen treatment of spin."""
@@ -129,18 +133,27 @@ def _diagnose(
     nominal = Situation(np.zeros(len(fitted)), start)
     linear = problem.linearise(nominal)
     trial = Trial(fitted, *selection.shifts(linear, g), mode, seed, left_out=left_out)
-    if before is not None and before.choice.spin:
-        best = search(problem, trial, before.situation, before.choice.prior, say)
+    spin_notes: list[str] = []
+    if before is not None:
+        prior = before.choice.prior
+        own = prior is not None and prior.conditional
+        best = search(problem, replace(trial, spin="free") if own else trial, before.situation, prior, say)
+        best = replace(best, trial=replace(best.trial, spin=trial.spin))
+    elif mode == "free":
+        best = _spinning(problem, trial, nominal, say)
     else:
-        best = search(problem, trial, nominal, None, say, linear)
+        fitted_all = posterior.fit(problem, nominal, None, left_out, say)
+        best = search(problem, trial, fitted_all.at, None, say, fitted_all.linear)
     say("looking for what no entry explains")
     findings, survivors = find(best, g, sessions, age, names)
-    if mode == "none" and (findings or selection.bent_too_far(best.choice)):
+    if mode == "none" and before is None and (findings or evidence.bent_too_far(best.choice)):
         # Strong spin is out of reach of derivatives taken about balls that do not spin.
-        say("trying balls that spin fast")
-        other = search(problem, trial, *fast_spin(problem, start), say)
-        if other.choice.spin and selection.misfit(other, g) < selection.misfit(best, g):
-            best = other
+        say("trying balls that spin fast, each in its own way")
+        other = _spinning(problem, trial, nominal, say)
+        gained = evidence.misfit(best, g) - evidence.misfit(other, g)
+        spin_notes.append(_tried(gained))
+        if gained > 0.0:
+            best = replace(other, trial=replace(other.trial, spin="none"))
             findings, survivors = find(best, g, sessions, age, names)
     seen = selection.visible(scores.under(best.projected, best.choice.prior), best.trial)
     seen[list(left_out)] = False
@@ -160,7 +173,29 @@ def _diagnose(
         age,
         seen,
         selection.imitated(best.projected, best.trial, best.choice),
+        estimate(problem, best, kept),
+        tuple(spin_notes) if before is None else before.spin_notes,
     )
+
+
+def _tried(gained: float) -> str:
+    """Account of balls with spins of their own against balls without, by twice the log evidence gained."""
+    if gained > 0.0:
+        return f"spin was tried because something stayed open without it, and kept: its evidence is {gained:.0f} better"
+    return f"spin was tried because something stayed open without it, and dropped: its evidence is {-gained:.0f} worse"
+
+
+def _spinning(problem: BallProblem, trial: Trial, nominal: Situation, say: Callable[[str], None]) -> Settled:
+    """Choice of causes where each ball has a spin of its own, about which derivatives are taken."""
+    say("fitting each ball's spin")
+    fitted_all = posterior.fit(problem, *own_spins(problem, nominal), trial.left_out, say)
+    prior = fitted_all.prior
+    if prior is not None:
+        say(
+            f"spins of {prior.components} kind{'s' * (prior.components > 1)}: mean {np.round(prior.mean)}, "
+            f"deviation {np.round(prior.std)} rad/s about x, y, z"
+        )
+    return search(problem, replace(trial, spin="free"), fitted_all.at, prior, say, fitted_all.linear)
 
 
 def _sessions(

@@ -13,9 +13,9 @@ import numpy as np
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
-from mjx_tt.diagnosis.ball.forward_model import grid
-from mjx_tt.diagnosis.ball.linearization import BallProblem, Situation, project
-from mjx_tt.diagnosis.ball.noise import Noise, flight_frame
+from mjx_tt.diagnosis.ball.flights.forward_model import grid
+from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation, project
+from mjx_tt.diagnosis.ball.flights.noise import Noise, flight_frame
 from mjx_tt.diagnosis.verdict import Experiment
 
 BALLS, SAMPLES, RATE = 20, 75, 125.0

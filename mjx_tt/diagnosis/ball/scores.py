@@ -8,25 +8,20 @@ ball as it likes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
 
-from mjx_tt.diagnosis.ball.linearization import Projected
+from mjx_tt.diagnosis.ball.flights.linearization import Projected
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, SpinPrior, learned
 
-LARGEST_SUBSET = 3
-SPIN_ROUNDS = 25
+LARGEST_SUBSET = 3  # of which every set is tried
+MOST_CAUSES = 8
+SPIN_ROUNDS = 8
+TINY = 1e-3  # [rad/s] spread of balls that do not spin
 Subset = tuple[int, ...]  # columns of a Gram matrix, of effects or of all
-
-
-@dataclass(frozen=True)
-class SpinPrior:
-    """Gaussian distribution of the balls' spins [rad/s]."""
-
-    mean: Float[np.ndarray, 3]
-    std: Float[np.ndarray, 3]
 
 
 @dataclass(frozen=True)
@@ -40,27 +35,37 @@ class Scores:
     base: float  # gain of the random spread alone
     always: Subset  # columns that every subset holds: the mean spin, and the Magnus coefficient
 
+    def weighted(self, weight: Float[np.ndarray, " n"]) -> Scores:
+        """The same with each ball counted ``weight`` times; a prior, which no ball brings, stays as it is."""
+        prior = self.gram - self.ball_gram.sum(axis=0), self.right - self.ball_right.sum(axis=0)
+        gram = np.tensordot(weight, self.ball_gram, 1) + prior[0]
+        return replace(self, gram=gram, right=weight @ self.ball_right + prior[1])
+
 
 def without_spin(p: Projected) -> Scores:
     """Balls that do not spin."""
     return Scores(p.gram.sum(axis=0), p.right.sum(axis=0), p.gram, p.right, 0.0, ())
 
 
-def with_spin(p: Projected, std: np.ndarray) -> Scores:
-    """Balls whose spin is Gaussian with standard deviation (3,) about a mean that is fitted.
+def with_spin(p: Projected, prior: SpinPrior) -> Scores:
+    """Balls whose spin is Gaussian, each with its own spread, about a mean of all that is fitted.
 
     Where the nominal model has no Magnus force its coefficient comes along: the bounce spins every ball.
     """
+    middle, precision = prior.of_balls(len(p.gram), TINY)
+    offset = (middle - prior.mean[:, None]).T  # (n, 3) of each ball's own mean from that of all
     full = np.concatenate([p.spin_effect, p.spin_gram], axis=2)  # (n, 3, K + 3) spins against effects and mean spin
     top = np.concatenate([p.gram, p.spin_effect.swapaxes(1, 2)], axis=2)
     gram = np.concatenate([top, full], axis=1)
-    right = np.concatenate([p.right, p.spin_right], axis=1)
-    inner = p.spin_gram + np.diag(1.0 / np.maximum(std, 1e-6) ** 2)
+    spin_right = p.spin_right - (p.spin_gram @ offset[..., None])[..., 0]
+    right = np.concatenate([p.right, p.spin_right], axis=1) - np.einsum("nak,na->nk", full, offset)
+    inner = p.spin_gram + precision
     gram = gram - full.swapaxes(1, 2) @ np.linalg.solve(inner, full)
-    solved = np.linalg.solve(inner, p.spin_right[..., None])
+    solved = np.linalg.solve(inner, spin_right[..., None])
     right = right - (full.swapaxes(1, 2) @ solved)[..., 0]
-    explained = float((p.spin_right[..., None] * solved).sum())
-    _, spread = np.linalg.slogdet(np.eye(3) + p.spin_gram * (np.maximum(std, 1e-6) ** 2)[None, None, :])
+    explained = float((spin_right[..., None] * solved).sum())
+    explained += float((2.0 * p.spin_right * offset).sum() - np.einsum("na,nab,nb->", offset, p.spin_gram, offset))
+    _, spread = np.linalg.slogdet(np.eye(3) + np.linalg.solve(precision, p.spin_gram))
     k = p.gram.shape[1]
     return Scores(
         gram.sum(axis=0),
@@ -72,26 +77,58 @@ def with_spin(p: Projected, std: np.ndarray) -> Scores:
     )
 
 
+def with_own_spins(p: Projected, prior: SpinPrior) -> Scores:
+    """Balls whose derivatives were taken about spins of their own.
+
+    There the column of an effect that grows with spin (the coefficient k, the spin's decay) is made of the very spins
+    that the prior draws to its mean: to a random effect a larger k and smaller spins would look like a better fit, by
+    as much as the spins spread (the regressor correlates with the random effect: Mundlak, Econometrica 46, 1978). So a
+    spin that its flight shows well is an unknown of its own, without a prior, and the prior counts by how little the
+    flight shows.
+    """
+    middle, precision = prior.of_balls(len(p.gram), TINY)
+    inner = p.spin_gram + loosened(precision, p.spin_gram)
+    left = p.spin_right - np.einsum("nab,bn->na", p.spin_gram, middle)
+    gram = p.gram - p.spin_effect.swapaxes(1, 2) @ np.linalg.solve(inner, p.spin_effect)
+    solved = np.linalg.solve(inner, left[..., None])
+    right = p.right - np.einsum("nak,an->nk", p.spin_effect, middle)
+    right = right - (p.spin_effect.swapaxes(1, 2) @ solved)[..., 0]
+    total, sums = gram.sum(axis=0), right.sum(axis=0)
+    if p.coefficient is not None:
+        mean, std = MAGNUS_PRIOR
+        total[p.coefficient, p.coefficient] += std**-2
+        sums[p.coefficient] += mean * std**-2
+    return Scores(total, sums, gram, right, 0.0, () if p.coefficient is None else (p.coefficient,))
+
+
+def loosened(
+    precision: Float[np.ndarray, "n 3 3"], information: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, "n 3 3"]:
+    """P (P + L)^-1 P: a prior's precision P where the flight's information L is small, next to none where it is not."""
+    return precision @ np.linalg.solve(precision + information, precision)
+
+
 def under(p: Projected, prior: SpinPrior | None) -> Scores:
     """Scores of balls with spins of this distribution; of balls that do not spin where there is none."""
-    return without_spin(p) if prior is None else with_spin(p, prior.std)
+    if prior is None:
+        return without_spin(p)
+    return with_own_spins(p, prior) if prior.conditional else with_spin(p, prior)
 
 
-def fit_spin(p: Projected, effects: Subset, std: np.ndarray | None = None) -> SpinPrior:
-    """Maximum likelihood mean and spread of the spins beside the given effects, by expectation-maximisation."""
+def fit_spin(p: Projected, effects: Subset, prior: SpinPrior | None = None) -> SpinPrior:
+    """Maximum likelihood distribution of the spins beside the given effects. prior: to start from."""
     effects = tuple(e for e in effects if e != p.coefficient)
-    std = np.full(3, 30.0) if std is None else np.maximum(std, 1.0)
+    prior = SpinPrior(np.zeros(3), np.full(3, 30.0)) if prior is None else prior
     for _ in range(SPIN_ROUNDS):
-        scores = with_spin(p, std)
-        chosen = (*effects, *scores.always)
-        theta = solve(scores, chosen)
-        mean, others = theta[len(effects) : len(effects) + 3], [*effects, *scores.always[3:]]
-        left = p.spin_right - p.spin_effect[:, :, others] @ np.delete(theta, range(len(effects), len(effects) + 3))
-        left = left - p.spin_gram @ mean
-        inner = np.linalg.inv(p.spin_gram + np.diag(1.0 / np.maximum(std, 1e-6) ** 2))
-        omega = (inner @ left[..., None])[..., 0]
-        std = np.sqrt((omega**2 + np.diagonal(inner, axis1=1, axis2=2)).mean(axis=0))
-    return SpinPrior(mean, std)
+        rated = with_spin(p, prior)
+        chosen = (*effects, *rated.always)
+        theta = solve(rated, chosen)
+        others = [*effects, *rated.always[3:]]
+        change = np.delete(theta, range(len(effects), len(effects) + 3))
+        before, prior = prior, learned(p.spin_gram, p.spin_right - p.spin_effect[:, :, others] @ change)
+        if np.all(np.abs(prior.mean - before.mean) + np.abs(prior.std - before.std) < 0.02 * before.std + 0.02):
+            break
+    return prior
 
 
 def _sub(scores: Scores, chosen: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -115,14 +152,51 @@ def all_gains(scores: Scores, candidates: Subset, largest: int = LARGEST_SUBSET)
     """Gains of all subsets of the candidates up to a size."""
     out: dict[Subset, float] = {(): gain(scores, ())}
     for size in range(1, min(largest, len(candidates)) + 1):
-        subsets = list(combinations(candidates, size))
-        index = np.array([(*s, *scores.always) for s in subsets])
-        gram = scores.gram[index[:, :, None], index[:, None, :]]
-        right = scores.right[index]
-        scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-300))
-        unit = gram / scale[:, :, None] / scale[:, None, :] + 1e-9 * np.eye(index.shape[1])
-        x = np.linalg.solve(unit, (right / scale)[..., None])[..., 0]
-        out.update(zip(subsets, (scores.base + (x * right / scale).sum(axis=1)).tolist(), strict=True))
+        out |= _gains(scores, list(combinations(candidates, size)))
+    return out
+
+
+def _gains(scores: Scores, subsets: Sequence[Subset]) -> dict[Subset, float]:
+    """Gains of subsets of one size."""
+    index = np.array([(*s, *scores.always) for s in subsets])
+    gram = scores.gram[index[:, :, None], index[:, None, :]]
+    right = scores.right[index]
+    scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-300))
+    unit = gram / scale[:, :, None] / scale[:, None, :] + 1e-9 * np.eye(index.shape[1])
+    x = np.linalg.solve(unit, (right / scale)[..., None])[..., 0]
+    return dict(zip(subsets, (scores.base + (x * right / scale).sum(axis=1)).tolist(), strict=True))
+
+
+def neighbours(scores: Scores, subset: Subset, candidates: Subset) -> dict[Subset, float]:
+    """Gains of a subset and of all that differ from it by one member: one more, one less, or another in its place."""
+    others = [c for c in candidates if c not in subset]
+    less = [subset[:i] + subset[i + 1 :] for i in range(len(subset))]
+    out = {subset: gain(scores, subset)} | {rest: gain(scores, rest) for rest in less}
+    for near in ([(*subset, c) for c in others], [(*rest, c) for rest in less for c in others]):
+        if near:
+            out |= _gains(scores, [tuple(sorted(s)) for s in near])
+    return out
+
+
+def widened(
+    scores: Scores, gains: dict[Subset, float], candidates: Subset, threshold: float, most: int = MOST_CAUSES
+) -> dict[Subset, float]:
+    """Gains of larger sets as well, where the best of those at hand is as large as any: one member at a time.
+
+    threshold: gain that one more member must bring.
+    """
+
+    def worth(subset: Subset) -> float:
+        return out[subset] - threshold * len(subset)
+
+    out = dict(gains)
+    best = max(out, key=worth)
+    while LARGEST_SUBSET <= len(best) < most:
+        out |= neighbours(scores, best, candidates)
+        better = max(out, key=worth)
+        if better == best:
+            break
+        best = better
     return out
 
 

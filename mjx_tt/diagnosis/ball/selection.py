@@ -9,24 +9,24 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mjx_tt.diagnosis.ball import noise, scores
+from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.effects import Effect
-from mjx_tt.diagnosis.ball.fit import fit_starts
-from mjx_tt.diagnosis.ball.forward_model import Grid
-from mjx_tt.diagnosis.ball.linearization import SPIN, BallProblem, Linear, Projected, Situation, project, rows
-from mjx_tt.diagnosis.ball.noise import Noise
-from mjx_tt.diagnosis.ball.scores import LARGEST_SUBSET, Scores, SpinPrior, Subset
+from mjx_tt.diagnosis.ball.flights import noise
+from mjx_tt.diagnosis.ball.flights.fit import fit_starts
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid
+from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem, Linear, Projected, Situation, project, rows
+from mjx_tt.diagnosis.ball.flights.noise import Noise
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE, SpinPrior, learned
+from mjx_tt.diagnosis.ball.scores import LARGEST_SUBSET, Scores, Subset
 
 FLOOR = 0.003  # [m] shift of the last sample below which an effect is of no practical interest
 LEAST_GAIN = 14.0  # evidence that one more effect must bring at least
 SPIN_GAIN = 30.0  # and a spread of spins, which has six numbers
-MAGNUS_RANGE = (0.2, 2.0)  # of the coefficient k that any source reports, with a margin (0.3 to 1.5)
-LEAST_SHARE = 0.01  # of the whole gain that a member must bring: linearisation errors of a large effect are no cause
+LEAST_SHARE = 0.003  # of the whole gain that a member must bring: linearisation errors of a large effect are no cause
 ROUNDS = 4  # of choosing and linearising again
 SETTLED = 0.2  # of an estimate's error by which it may still have moved in the last round
-MAGNUS_KEPT = (0.2, 1.5)  # of the coefficient k about which derivatives are taken
+MAGNUS_KEPT = (0.2, 1.5)  # of the coefficient k about which derivatives are taken by balls of one spin
 CORNER = 5e-4  # [s] about the bounce of a spinning ball in which no sample counts
-SPIN_COST = 3.0  # squared error by which three more numbers of a ball must pay at least
 WIDEST = 10.0  # scales of an effect beyond which it is no explanation: beside others it may be all but invisible
 LEAST_Z = 3.5  # estimate over its ball-to-ball standard error
 ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
@@ -104,6 +104,7 @@ def _treated(p: Projected, trial: Trial, prior: SpinPrior | None, rng: np.random
     threshold = LEAST_GAIN
     if rest:
         threshold = max(threshold, scores.flip_threshold(rated, (*best, *rated.always), rest, rng))
+    gains = scores.widened(rated, gains, candidates, threshold)
     return _Treatment(rated, prior, candidates, gains, threshold)
 
 
@@ -136,8 +137,12 @@ def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
     theta, error = _estimated(t.rated, subset)
     count, prior, magnus = len(subset), None, None
     if t.prior is not None:
-        prior = SpinPrior(theta[count : count + 3], t.prior.std)
         magnus = None if p.coefficient is None else float(theta[-1])
+        if t.prior.conditional:
+            shown = [*subset] if p.coefficient is None else [*subset, p.coefficient]
+            prior = learned(p.spin_gram, p.spin_right - p.spin_effect[:, :, shown] @ theta)
+        else:
+            prior = t.prior.moved(theta[count : count + 3] - t.prior.mean)
     groups = tuple(_group(t, subset, i, gain, trial) for i in range(count))
     others = tuple((s, sp, g) for _, s, sp, g in found[:200] if (s, sp) != (subset, spin))[:8]
     return Choice(subset, theta[:count], error[:count], gain, prior, magnus, t.threshold, groups, others)
@@ -154,10 +159,11 @@ def refined(choice: Choice, p: Projected) -> Choice:
 
     With spin they stay: of coefficient and mean spin the flights show the product, and a step of each is none of that.
     """
-    if choice.spin or not choice.effects:
+    if not choice.effects or (choice.prior is not None and not choice.prior.conditional):
         return choice
-    theta, error = _estimated(scores.without_spin(p), choice.effects)
-    return replace(choice, theta=theta, error=error)
+    theta, error = _estimated(scores.under(p, choice.prior), choice.effects)
+    count = len(choice.effects)
+    return replace(choice, theta=theta[:count], error=error[:count])
 
 
 def _candidates(rated: Scores, p: Projected, trial: Trial, spin: bool) -> Subset:
@@ -177,7 +183,7 @@ def _holds(t: _Treatment, subset: Subset, gain: float, trial: Trial, top: float,
         if rms * trial.spin_shift < FLOOR or gain - plain < SPIN_GAIN:
             return False
     theta, error = _estimated(t.rated, subset)
-    if as_cause and len(t.rated.always) > 3:
+    if as_cause and len(t.rated.always) in (1, 4):
         # Spin that bends flights without what the bounce does to spinning balls is another force under its name.
         k, wide = theta[-1], 2.0 * error[-1]
         if k + wide < MAGNUS_RANGE[0] or k - wide > MAGNUS_RANGE[1]:
@@ -277,7 +283,8 @@ def search(
         theta[list(choice.effects)] = choice.theta
         if choice.magnus is not None:
             # In flight only k omega shows: a coefficient out of reason is kept within it, the spins take up the rest.
-            theta[problem.coefficient] = np.clip(choice.magnus, *MAGNUS_KEPT)
+            own = choice.prior is not None and choice.prior.conditional
+            theta[problem.coefficient] = np.clip(choice.magnus, *(MAGNUS_RANGE if own else MAGNUS_KEPT))
         settled = chosen_before == (choice.effects, choice.spin) and _close(theta, at.theta, choice)
         chosen_before, prior = (choice.effects, choice.spin), choice.prior
         at, bounces = _move(problem, moved, theta, choice, own_noise, g)
@@ -327,9 +334,9 @@ def fitted_spins(p: Projected, choice: Choice) -> Float[np.ndarray, "3 n"]:
     prior = choice.prior
     if prior is None:
         return np.zeros((3, len(p.gram)))
-    left = p.spin_right - p.spin_effect @ _theta(p, choice) - p.spin_gram @ prior.mean
-    inner = p.spin_gram + np.diag(1.0 / np.maximum(prior.std, 1e-3) ** 2)
-    return prior.mean[:, None] + np.linalg.solve(inner, left[..., None])[..., 0].T
+    middle, precision = prior.of_balls(len(p.gram), scores.TINY)
+    left = p.spin_right - p.spin_effect @ _theta(p, choice) - np.einsum("nab,bn->na", p.spin_gram, middle)
+    return middle + np.linalg.solve(p.spin_gram + precision, left[..., None])[..., 0].T
 
 
 def left_over(
@@ -353,8 +360,9 @@ def _move(
     """Situation at the chosen causes, starts fitted again; and where balls spin, the time of each one's own bounce."""
     if choice.prior is None:
         return Situation(theta, fit_starts(problem, theta, start, g, noise_now, rounds=3)), None
-    prior = (choice.prior.mean, np.maximum(choice.prior.std, 1.0))
-    start = fit_starts(problem, theta, start, g, noise_now, prior, rounds=3)
+    start = fit_starts(problem, theta, start, g, noise_now, choice.prior, rounds=5)
+    if choice.prior.conditional:
+        return Situation(theta, start), None
     bounces = problem.fly(theta, start).bounce_time[0]
     # About the mean spin, not about each ball's own: that is fitted to its noise, and derivatives taken there would
     # remember it (the first-order method of mixed models against its conditional form).
@@ -374,24 +382,3 @@ def _weights(linear: Linear, noise_now: Noise, g: Grid, bounces: np.ndarray | No
     with np.errstate(invalid="ignore"):
         astray = (g.time > ends[0] - CORNER) & (g.time < ends[1] + CORNER)
     return np.where(astray, 0.0, weight.T).T
-
-
-def misfit(settled: Settled, g: Grid) -> float:
-    """Twice the negative log likelihood of what a choice leaves under the noise that it leaves, and its price.
-
-    Each sample's whitened error is bounded: mis-tracked ones decide nothing.
-    """
-    n, p, choice = settled.noise, settled.projected, settled.choice
-    left = left_over(settled.linear, settled.at, p, choice, g)[0]
-    counts = g.mask & (p.weight.T > 0.0)
-    error = np.minimum((noise.whiten(left, n, g) ** 2).sum(axis=0), 3.0 * noise.HUBER**2)
-    spread = 2.0 * np.log(n.scale * np.sqrt(1.0 - n.memory[:, None] ** 2)).sum(axis=0)
-    own = SPIN_COST * g.n if choice.spin else 0.0
-    # As if the samples left out were as usual: to leave out must not pay.
-    share = g.mask.sum() / counts.sum()
-    return float(share * np.where(counts, error + spread, 0.0).sum() + own + choice.threshold * len(choice.effects))
-
-
-def bent_too_far(choice: Choice) -> bool:
-    """True if spin was chosen with a Magnus coefficient that no ball has: a line bent too far."""
-    return choice.magnus is not None and not MAGNUS_KEPT[0] <= choice.magnus <= MAGNUS_KEPT[1]

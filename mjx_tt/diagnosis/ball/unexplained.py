@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 from scipy.special import chdtri, fdtrc
 
 from mjx_tt.diagnosis.ball import basis_functions, scores, selection
-from mjx_tt.diagnosis.ball.forward_model import Grid
-from mjx_tt.diagnosis.ball.linearization import Linear, Projected, StartsOut
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid
+from mjx_tt.diagnosis.ball.flights.linearization import Linear, Projected, StartsOut
 from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial
 
 BLOCK_LEVEL = 2e-5  # chance of one block's false alarm
@@ -111,6 +111,8 @@ def _spin_holding(choice: Choice, trial: Trial, mean: np.ndarray, size: float) -
     """
     if choice.prior is None:
         return set()
+    if choice.prior.conditional:  # each ball's own: no mean of all could be part of a block
+        return {"magnus"}
     spread = float((choice.prior.std**2).sum())
     before, now = (np.sqrt(float((m**2).sum()) + spread) for m in (choice.prior.mean, mean))
     same_way = float(choice.prior.mean @ mean) + spread > 0.0
@@ -168,10 +170,13 @@ def _odd_balls(linear: Linear, flights: StartsOut, choice: Choice, g: Grid) -> F
     both = flights.project(np.stack(columns))
     gram, right = both.gram, both.right
     if choice.prior is not None:
-        inner = both.spin_gram + np.diag(1.0 / np.maximum(choice.prior.std, 1e-3) ** 2)
-        left = both.spin_right - both.spin_gram @ choice.prior.mean
+        middle, precision = choice.prior.of_balls(g.n, scores.TINY)
+        if choice.prior.conditional:
+            precision = scores.loosened(precision, both.spin_gram)
+        inner = both.spin_gram + precision
+        left = both.spin_right - np.einsum("nab,bn->na", both.spin_gram, middle)
         gram = gram - both.spin_effect.swapaxes(1, 2) @ np.linalg.solve(inner, both.spin_effect)
-        mean = both.spin_effect.swapaxes(1, 2) @ choice.prior.mean
+        mean = np.einsum("nak,an->nk", both.spin_effect, middle)
         right = right - mean - (both.spin_effect.swapaxes(1, 2) @ np.linalg.solve(inner, left[..., None]))[..., 0]
     scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-300))
     unit = gram / scale[:, :, None] / scale[:, None, :]

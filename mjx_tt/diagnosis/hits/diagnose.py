@@ -20,9 +20,9 @@ from mjx_tt.diagnosis.ball import scores, selection
 from mjx_tt.diagnosis.ball.causes import estimates, quantile, readings
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, flights
 from mjx_tt.diagnosis.ball.effects import EFFECTS, INVISIBLE, Effect
-from mjx_tt.diagnosis.ball.fit import first_fit, heading
-from mjx_tt.diagnosis.ball.forward_model import grid, predict
-from mjx_tt.diagnosis.ball.linearization import BallProblem
+from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading
+from mjx_tt.diagnosis.ball.flights.forward_model import grid, predict
+from mjx_tt.diagnosis.ball.flights.linearization import BallProblem
 from mjx_tt.diagnosis.ball.scores import Scores, Subset
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses, watched
 from mjx_tt.diagnosis.robust import deviation, huber_weights

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 
 from tests.exam.generator import robot
+from tests.exam.generator.human_strokes import draw_human
 from tests.exam.generator.invented_defects import INVENTED
 from tests.exam.generator.sessions import NOISES, WRONG_NOISES, Balls, Log, draw_balls, measure, shift, with_spin
 from tests.exam.generator.world import World
@@ -165,7 +166,8 @@ class Case:
     """One hidden case; everything follows from these numbers.
 
     kind: none, noise (nothing but the noise is wrong), invisible, single, pair, triple, gauge, deleted, invented, rare,
-        robot, unexcited, robot_none
+        many (2 to 8 causes of ordinary sizes), robot, unexcited, robot_none; human_none, human_single ... where people
+        play
     causes: catalogue names, a name of INVENTED, or <joint>.<effect>
     without: names that the diagnosis may not use
     """
@@ -179,9 +181,14 @@ class Case:
     count: int | None = None  # balls; None draws 200 to 500
 
     @property
-    def spin(self) -> str:
-        """Value of ``--spin``: true where the nominal ball may spin."""
-        return "none"
+    def human(self) -> bool:
+        """True where people play: every ball spins, under a Magnus force that the nominal model has."""
+        return self.kind.startswith("human_")
+
+    @property
+    def base(self) -> str:
+        """The kind, whoever plays."""
+        return self.kind.removeprefix("human_")
 
     @property
     def name(self) -> str:
@@ -239,9 +246,14 @@ def build(case: Case, balls: Balls | None = None) -> BallCase:
     for cause in case.causes:
         signs = EFFECTS[cause].signs if cause in EFFECTS else (-1, 1)
         sign = float(_generator(case, f"sign {cause}").choice(signs))
-        amounts[cause] = sign * (INVISIBLE.get(cause) or _scaled(case, cause, sign, few, target))
-    balls = own if balls is None else balls
-    world, spinning = World(), balls
+        if case.kind == "many":
+            amounts[cause] = sign * EFFECTS[cause].amount * abs(_generator(case, f"size {cause}").standard_normal())
+        else:
+            amounts[cause] = sign * (INVISIBLE.get(cause) or _scaled(case, cause, sign, few, target))
+    world = World(magnus_coefficient=MAGNUS) if case.human else World()
+    if balls is None:
+        balls = draw_human(_generator(case, "people"), case.count, world) if case.human else own
+    spinning = balls
     mean, std = np.zeros(3), np.zeros(3)
     for cause, amount in amounts.items():
         world, spinning = _apply(case, cause, amount, world, spinning)
@@ -385,9 +397,34 @@ KINDS = (
     "deleted",
     "invented",
     "rare",
+    "many",
     "robot",
     "unexcited",
     "robot_none",
+    "human_none",
+    "human_single",
+    "human_pair",
+    "human_deleted",
+    "human_invented",
+)
+# Of which a log with many causes has 2 to 8.
+MANY = (
+    "drag_coefficient",
+    "wind_x",
+    "wind_y",
+    "wind_z",
+    "gravity_scale",
+    "table_restitution",
+    "table_restitution_speed",
+    "table_friction",
+    "table_height",
+    "table_tilt_x",
+    "table_tilt_y",
+    "camera_scale",
+    "camera_rotation_x",
+    "camera_rotation_y",
+    "camera_distortion",
+    "tracker_smoothing",
 )
 
 
@@ -397,7 +434,10 @@ def draw(kind: str, count: int, seed: int, size_mm: float | None = None) -> list
         raise ValueError(f"unknown kind {kind!r}; known are {', '.join(KINDS)}")
     rng = np.random.default_rng([seed, zlib.crc32(kind.encode()), int(10 * (size_mm or 0))])
     noises = WRONG_NOISES if kind == "noise" else NOISES
-    singles, names = list(EFFECTS), []
+    human, kind = kind, kind.removeprefix("human_")
+    human = human if human != kind else ""
+    # Where every ball spins spin is no cause.
+    singles, names = [name for name in EFFECTS if not (human and name == "magnus")], []
     # The spin that the bounce itself gives a ball makes k 0.6 a shift of 7 mm.
     too_large = ("magnus",) if size_mm is not None and size_mm < 8.0 else ()
     while len(names) < count:
@@ -405,7 +445,7 @@ def draw(kind: str, count: int, seed: int, size_mm: float | None = None) -> list
     cases = []
     for i, causes in enumerate(names[:count]):
         size = size_mm or float(rng.choice(SIZES if kind == "single" else SIZES[1:]))
-        if kind in ("none", "noise", "robot", "unexcited", "robot_none"):
+        if kind in ("none", "noise", "many", "robot", "unexcited", "robot_none"):
             size = 0.0
         without: tuple[str, ...] = ()
         if kind == "deleted":
@@ -413,7 +453,9 @@ def draw(kind: str, count: int, seed: int, size_mm: float | None = None) -> list
             effect = EFFECTS[causes[0]]
             radius = tuple(k for k in effect.kin if k == "ball_radius")
             without = causes if i % 2 else (*causes, *effect.twins, *radius)
-        cases.append(Case(kind, tuple(causes), size, str(noises[i % len(noises)]), int(rng.integers(2**31)), without))
+        cases.append(
+            Case(human or kind, tuple(causes), size, str(noises[i % len(noises)]), int(rng.integers(2**31)), without)
+        )
     return cases
 
 
@@ -433,6 +475,8 @@ def _round(
         pool = [(name,) for name in INVENTED]
     elif kind == "rare":
         pool = [(name,) for name in ("wind_x", "magnus", "table_restitution", "drag_coefficient", "table_friction")]
+    elif kind == "many":
+        return [tuple(rng.choice(MANY, rng.integers(2, 9), replace=False).tolist()) for _ in range(10)]
     elif kind in ("pair", "triple"):
         return [_together(2 if kind == "pair" else 3, rng, singles) for _ in range(10)]
     else:

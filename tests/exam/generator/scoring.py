@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import beta, binom
 
+PEOPLE = "human_single human_pair human_deleted human_invented"
 ABSTAINED = ("unexplained", "undetermined")
 
 
@@ -22,7 +23,7 @@ def score(truth: dict, verdict: dict) -> dict:
     count as well.
     """
     case = truth["case"]
-    causes, kind = tuple(case["causes"]), case["kind"]
+    causes, kind = tuple(case["causes"]), case["kind"].removeprefix("human_")
     given = verdict["causes"] if verdict["verdict"] == "named" else []
     named = [{c["name"], *c.get("group", ())} for c in given]
     answer = "+".join(sorted(c["name"] for c in verdict["causes"])) if named else verdict["verdict"]
@@ -40,6 +41,8 @@ def score(truth: dict, verdict: dict) -> dict:
             any({c, *truth["twins"].get(c, ())} <= g for g in named) for c in causes if truth["twins"].get(c)
         )
         record["kin_reported"] = all(any(c in g and len(g) > 1 for g in named) for c in causes)
+        record["parameters"] = parameter_errors(truth, verdict)
+    if kind == "many":
         record["parameters"] = parameter_errors(truth, verdict)
     if kind == "robot" and record["outcome"] == "right":
         record["parameters"] = parameter_errors(truth, verdict)
@@ -203,6 +206,14 @@ def table(records: list[dict]) -> list[Row]:
         _share("10", "robot, delay within 2 ms", ">= 100 %", delays),
         _share("10", "robot, unexcited effect: declared, nothing named", ">= 95 %", declared),
         _share("10", "robot, nothing wrong: any name", "<= 2 %", named("robot_none")),
+        _share("13", "people play, nothing wrong: any name or flag", "<= 2 %", ended("human_none", wrong, flagged)),
+        _share("14", "people play, one effect, 10 mm: right group", ">= 90 %", ended("human_single", right, size=10.0)),
+        _share("14", "people play, one effect, 20 mm: right group", ">= 95 %", ended("human_single", right, size=20.0)),
+        _share("15", "people play, pairs: exact set", ">= 80 %", ended("human_pair", right)),
+        _share("16", "people play, never in the catalogue: flagged", ">= 85 %", ended("human_invented", flagged)),
+        _share("16", "people play, cause deleted: flagged or its twin", "-", ended("human_deleted", flagged, right)),
+        _share("14-16", "people play: wrong name", "<= 2 %", ended(PEOPLE, wrong)),
+        *_many_rows(by["many"]),
         _share("-", "in 5 % of the balls only: flagged or right", "-", ended("rare", flagged, right)),
         _share("-", "in 5 % of the balls only: wrong name", "-", ended("rare", wrong)),
         _share("-", "invisible in a ball log: named", "-", named("invisible")),
@@ -253,6 +264,33 @@ def _gain_rows(records: list[dict]) -> list[Row]:
     return [
         Row("9", "held-out gain over the true model's", ">= 90 %", len(useful), share, low, high, met),
         _share("9", "nothing wrong: error changed by at most 1 %", ">= 100 %", kept),
+    ]
+
+
+def _many_rows(records: list[dict]) -> list[Row]:
+    covered = [
+        bool(p["covered"]) for r in records for p in r.get("parameters", {}).values() if p["covered"] is not None
+    ]
+    shares = [
+        (g["nominal"] - g["extended"]) / (g["nominal"] - g["true"])
+        for g in (r["gain"] for r in records if r.get("gain"))
+        if g["nominal"] - g["true"] > 0.1
+    ]
+    low, high = _median_interval(shares)
+    median = float(np.median(shares)) if shares else math.nan
+    return [
+        _share("17", "2 to 8 ordinary causes: wrong name", "<= 2 %", [r["outcome"] == "wrong" for r in records]),
+        _share("17", "2 to 8 ordinary causes: 90 % intervals that cover", "85-95 %", covered),
+        Row(
+            "17",
+            "2 to 8 ordinary causes: gain over the true model's, median",
+            ">= 90 %",
+            len(shares),
+            median,
+            low,
+            high,
+            median >= 0.9 if shares else None,
+        ),
     ]
 
 

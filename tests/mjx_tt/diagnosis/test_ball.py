@@ -10,11 +10,12 @@ import pytest
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt import diagnosis
-from mjx_tt.diagnosis.ball import basis_functions, noise, scores
+from mjx_tt.diagnosis.ball import basis_functions, scores
 from mjx_tt.diagnosis.ball.effects import EFFECTS
-from mjx_tt.diagnosis.ball.fit import first_fit
-from mjx_tt.diagnosis.ball.forward_model import grid, heading_axes, leaves, predict
-from mjx_tt.diagnosis.ball.linearization import BallProblem, Projected, Situation
+from mjx_tt.diagnosis.ball.flights import noise
+from mjx_tt.diagnosis.ball.flights.fit import first_fit
+from mjx_tt.diagnosis.ball.flights.forward_model import grid, heading_axes, leaves, predict
+from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Projected, Situation
 from mjx_tt.sim import model
 from mjx_tt.sim.model import SimModel
 from tests.exam.generator.world import World, camera, fly, seen

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjx_tt.diagnosis.ball.effects import FLIGHT, Effect
-from mjx_tt.diagnosis.ball.forward_model import Flown, Grid, heading_axes, leaves, predict
-from mjx_tt.diagnosis.ball.noise import Noise, whiten
+from mjx_tt.diagnosis.ball.flights.forward_model import Flown, Grid, heading_axes, leaves, predict
+from mjx_tt.diagnosis.ball.flights.noise import Noise, whiten
 from mjx_tt.sim.model import SimModel
 
 SPIN = slice(6, 9)

@@ -7,11 +7,12 @@ outliers are weighted down by Huber's rule, and every test downstream takes its 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mjx_tt.diagnosis.ball.forward_model import Grid
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.robust import GAUSSIAN, huber_weights
 
 HUBER = 3.0  # whitened distance beyond which a sample counts linearly; a Gaussian's is beyond it in 3 % of cases
@@ -60,16 +61,24 @@ def estimate(residual: np.ndarray, frame: np.ndarray, g: Grid, unknowns: int = 6
     interval = _interval(g)
     samples = g.mask.sum(axis=0)
     freedom = np.sqrt(3.0 * samples / np.maximum(3.0 * samples - unknowns, 1.0))
+    gaps = np.diff(g.time, axis=0)
+    near = g.mask[1:] & g.mask[:-1] & (gaps < 1.5 * interval)
     masked = np.where(g.mask, residual, np.nan)
-    with np.errstate(all="ignore"):
-        own = GAUSSIAN * np.nanmedian(np.abs(masked), axis=1) * freedom  # (3, n)
+    steps = np.where(near, np.diff(residual, axis=1), np.nan)
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a ball without neighbouring samples
+        level = np.nanmedian(GAUSSIAN * np.nanmedian(np.abs(masked), axis=1) * freedom, axis=1)  # (3,)
+        own = GAUSSIAN * np.nanmedian(np.abs(steps), axis=1) / np.sqrt(2.0)  # (3, n)
+    # One axis against another, and one ball against another, by what neighbouring samples differ: noise does, a misfit
+    # is smooth. An axis or a ball that the model does not fit must not hide behind a noise of its own.
     shared = np.nanmedian(own, axis=1, keepdims=True)
+    shared = np.maximum(shared, 0.1 * np.sqrt(np.mean(shared**2)) + 1e-9)
     # A ball's own scale, shrunk to the others': it carries about as much information as half its samples.
     share = (samples / (samples + 20.0))[None]
-    scale = np.exp(share * np.log(np.maximum(own, 1e-9)) + (1.0 - share) * np.log(np.maximum(shared, 1e-9)))
-    scale = np.maximum(scale, 0.3 * shared + 1e-7)
+    own = np.where(np.isfinite(own), own, shared)
+    scale = np.exp(share * np.log(np.maximum(own, 1e-9)) + (1.0 - share) * np.log(shared))
+    scale = np.maximum(scale, 0.3 * shared) * np.sqrt(np.mean(level**2) / np.mean(shared**2)) + 1e-7
     z = np.clip(np.where(g.mask, residual / scale[:, None], 0.0), -HUBER, HUBER)
-    near = g.mask[1:] & g.mask[:-1] & (np.diff(g.time, axis=0) < 1.5 * interval)
     memory = np.zeros(3)
     for a in range(3):
         pairs, square = (z[a, 1:] * z[a, :-1])[near].sum(), 0.5 * ((z[a, 1:] ** 2 + z[a, :-1] ** 2)[near]).sum()
@@ -78,6 +87,15 @@ def estimate(residual: np.ndarray, frame: np.ndarray, g: Grid, unknowns: int = 6
         r = r + (1.0 + 4.0 * max(r, 0.0)) * (unknowns / 3.0) / max(float(samples.mean()), 1.0) * 0.5
         memory[a] = np.clip(r, 0.0, LARGEST_MEMORY)
     return Noise(frame, scale, memory, interval)
+
+
+def without_memory(noise: Noise, most: float = 0.0) -> Noise:
+    """The noise with no more memory than ``most``.
+
+    What a model does not explain yet is smooth along a flight and would pass for noise that remembers itself, which
+    hides the very thing.
+    """
+    return replace(noise, memory=np.minimum(noise.memory, most))
 
 
 def whiten(x: np.ndarray, noise: Noise, g: Grid) -> np.ndarray:

@@ -1,0 +1,49 @@
+"""Evidence for one treatment of the flights against another: likelihood, and the price of what it supposes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjx_tt.diagnosis.ball.flights import noise
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid
+from mjx_tt.diagnosis.ball.selection import MAGNUS_KEPT, Choice, Settled, fitted_spins, left_over
+
+SPIN_COST = 3.0  # squared error by which three more numbers of a ball must pay at least
+
+
+def misfit(settled: Settled, g: Grid) -> float:
+    """Twice the negative log likelihood of what a choice leaves under the noise that it leaves, and its price.
+
+    Each sample's whitened error is bounded: mis-tracked ones decide nothing.
+    """
+    n, p, choice = settled.noise, settled.projected, settled.choice
+    left = left_over(settled.linear, settled.at, p, choice, g)[0]
+    counts = g.mask & (p.weight.T > 0.0)
+    error = np.minimum((noise.whiten(left, n, g) ** 2).sum(axis=0), 3.0 * noise.HUBER**2)
+    spread = 2.0 * np.log(n.scale * np.sqrt(1.0 - n.memory[:, None] ** 2)).sum(axis=0)
+    own = _price_of_spins(settled, g.n)
+    # As if the samples left out were as usual: to leave out must not pay.
+    share = g.mask.sum() / counts.sum()
+    return float(share * np.where(counts, error + spread, 0.0).sum() + own + choice.threshold * len(choice.effects))
+
+
+def _price_of_spins(settled: Settled, n: int) -> float:
+    """Twice the negative log evidence of the spins beside what they explain: nothing where no ball spins.
+
+    By Laplace's approximation where each ball's own was found: how far they lie from their prior's mean, and how much
+    narrower the flights made them than the prior.
+    """
+    prior, p = settled.choice.prior, settled.projected
+    if prior is None:
+        return 0.0
+    if not prior.conditional:
+        return SPIN_COST * n
+    middle, precision = prior.of_balls(n)
+    away = fitted_spins(p, settled.choice) - middle
+    narrower = np.linalg.slogdet(np.eye(3) + np.linalg.solve(precision, p.spin_gram))[1]
+    return float(np.einsum("an,nab,bn->", away, precision, away) + narrower.sum())
+
+
+def bent_too_far(choice: Choice) -> bool:
+    """True if spin was chosen with a Magnus coefficient that no ball has: a line bent too far."""
+    return choice.magnus is not None and not MAGNUS_KEPT[0] <= choice.magnus <= MAGNUS_KEPT[1]

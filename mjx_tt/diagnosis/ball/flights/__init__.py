@@ -1,0 +1,1 @@
+"""Measured flights under a model: predictions, their derivatives, noise, and each ball's own start and spin."""

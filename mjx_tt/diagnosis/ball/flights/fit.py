@@ -1,0 +1,181 @@
+"""Fits of the balls' starts: position, velocity and spin of each under given changes of the model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mjx_tt.diagnosis.ball.flights import noise
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid, picked, predict
+from mjx_tt.diagnosis.ball.flights.linearization import SPIN, START_STEPS, BallProblem, Situation, project, rows
+from mjx_tt.diagnosis.ball.flights.noise import HUBER, Noise, nominal_noise, robust_weights, whiten
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, SpinPrior, learned
+
+WINDOWS = (0.1, 0.2, 0.3, 0.4)  # [s] of a flight that the first fit takes in turn
+LEAST_DAMPING = 1e-9
+SPINS_TO_TRY = ((0.0, 0.0, 0.0), (100.0, 0.0, 0.0), (-100.0, 0.0, 0.0))  # [rad/s] for each ball
+BROAD = SpinPrior(np.zeros(3), np.array([80.0, 60.0, 80.0]))  # [rad/s] of spins before anything is known of them
+
+
+def fit_starts(
+    problem: BallProblem,
+    theta: np.ndarray,
+    start: np.ndarray,
+    g: Grid,
+    noise: Noise | None = None,
+    prior: SpinPrior | None = None,
+    rounds: int = 4,
+    keep: np.ndarray | None = None,
+) -> np.ndarray:
+    """Starts (9, n) of all balls for given changes theta, (K,) or (K, n), by damped Gauss-Newton with robust weights.
+
+    prior: distribution of the spins; without it the balls do not spin (or keep the spin given).
+    keep: (T, n) samples that count, all by default.
+    """
+    return fit_with_cost(problem, theta, start, g, noise, prior, rounds, keep)[0]
+
+
+def fit_with_cost(
+    problem: BallProblem,
+    theta: np.ndarray,
+    start: np.ndarray,
+    g: Grid,
+    noise: Noise | None = None,
+    prior: SpinPrior | None = None,
+    rounds: int = 4,
+    keep: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Starts (9, n) as of ``fit_starts``, and the cost (n,) of each ball's fit: whitened squares, the prior's pull."""
+    noise = nominal_noise(g) if noise is None else noise
+    mask = g.mask if keep is None else g.mask & keep
+    g = replace(g, mask=mask)
+    size = 6 if prior is None else 9
+    damping = np.full(g.n, LEAST_DAMPING)
+    theta_v = np.repeat(theta[:, None], 1 + size, axis=1) if theta.ndim == 1 else theta[:, None]
+    if theta.ndim == 1:
+        theta_v = theta_v[:, :, None]
+    best_cost, best = np.full(g.n, np.inf), start
+    normal, right = np.zeros((g.n, size, size)), np.zeros((g.n, size))  # at the best place
+    middle, precision = prior.of_balls(g.n) if prior is not None else (np.zeros((3, g.n)), np.zeros((g.n, 3, 3)))
+    for _ in range(rounds + 1):
+        variants = np.repeat(start[:, None], 1 + size, axis=1)
+        for i in range(size):
+            variants[i, 1 + i] += START_STEPS[i]
+        flown = predict(
+            problem.model,
+            problem.values(np.broadcast_to(theta_v, (len(theta_v), 1 + size, g.n))),
+            variants,
+            g,
+            problem.axes,
+        )
+        base = flown.measured[:, :, 0]
+        columns = np.moveaxis(flown.measured[:, :, 1:] - base[:, :, None], 2, 0) / START_STEPS[:size, None, None, None]
+        residual = np.where(mask, g.measured - base, 0.0)
+        distance = np.sqrt((whiten(residual, noise, g) ** 2).sum(axis=0))
+        # Huber's own cost: with weights that follow the residual a step away from outliers would look like a gain.
+        cost = np.where(distance <= HUBER, distance**2, 2.0 * HUBER * distance - HUBER**2).sum(axis=0)
+        if prior is not None:
+            pull = start[SPIN] - middle
+            cost = cost + np.einsum("an,nab,bn->n", pull, precision, pull)
+        better = cost <= best_cost * (1.0 + 1e-9)
+        weight = robust_weights(residual, noise, g)
+        white, j = rows(residual[None], noise, weight, g)[..., 0], rows(columns, noise, weight, g)
+        here, slope = j.swapaxes(1, 2) @ j, (j.swapaxes(1, 2) @ white[..., None])[..., 0]
+        if prior is not None:
+            here[:, SPIN, SPIN] += precision
+            slope[:, SPIN] -= np.einsum("nab,bn->na", precision, start[SPIN] - middle)
+        normal, right = np.where(better[:, None, None], here, normal), np.where(better[:, None], slope, right)
+        best_cost, best = np.where(better, cost, best_cost), np.where(better, start, best)
+        damping = np.where(better, np.maximum(damping * 0.1, LEAST_DAMPING), np.maximum(damping * 30.0, 1e-3))
+        scale = np.sqrt(np.diagonal(normal, axis1=1, axis2=2)) + 1e-12
+        damped = normal / scale[:, :, None] / scale[:, None, :] + damping[:, None, None] * np.eye(size)
+        change = np.linalg.solve(damped + 1e-12 * np.eye(size), (right / scale)[..., None])[..., 0] / scale
+        start = best.copy()
+        start[:size] += change.T
+    return best, best_cost
+
+
+def fit_spins(
+    problem: BallProblem,
+    theta: np.ndarray,
+    start: np.ndarray,
+    g: Grid,
+    noise: Noise | None = None,
+    prior: SpinPrior = BROAD,
+    tries: Sequence[tuple[float, float, float]] = SPINS_TO_TRY,
+) -> np.ndarray:
+    """Starts (9, n) with a spin of each ball's own, of any size: the best of fits from several spins.
+
+    A ball may slide or roll at the bounce, and each is a valley of its own: from balls that do not spin the other one
+    is not always found. prior: wide, so that only what the flight does not show is drawn to it.
+    """
+    count = len(tries)
+    many = picked(g, np.tile(np.arange(g.n), count))
+    tried = BallProblem(many, problem.model, problem.effects, heading(many))
+    begin = np.tile(start, count)
+    begin[SPIN] = np.repeat(np.array(tries, float).T, g.n, axis=1)
+    changes = theta if theta.ndim == 1 else np.tile(theta, count)
+    tiled = None
+    if noise is not None:
+        tiled = replace(noise, frame=np.tile(noise.frame, count), scale=np.tile(noise.scale, count))
+    fitted, cost = fit_with_cost(tried, changes, begin, many, tiled, prior, rounds=8)
+    best = np.argmin(np.where(np.isfinite(cost), cost, np.inf).reshape(count, g.n), axis=0)
+    return fitted.reshape(9, count, g.n)[:, best, np.arange(g.n)]
+
+
+def heading(g: Grid) -> np.ndarray:
+    """(3, n) way of each ball over its first samples."""
+    k = np.minimum(g.last, 8)
+    return g.measured[:, k, np.arange(g.n)] - g.measured[:, 0]
+
+
+def first_fit(
+    problem: BallProblem,
+    theta: np.ndarray | None = None,
+    spin: np.ndarray | None = None,
+    part: np.ndarray | None = None,
+) -> np.ndarray:
+    """(9, n) starts: a parabola through the first samples, then ever longer parts of the flight.
+
+    A flight that bounces has other minima for a start that is far off; growing windows keep the bounce where it is.
+    theta: (K,) or (K, n) changes of the effects, none by default. spin: (3,) or (3, n) [rad/s] of the balls, in
+    their own axes. part: (T, n) samples that count.
+    """
+    g = problem.grid if part is None else replace(problem.grid, mask=problem.grid.mask & part)
+    theta = np.zeros(len(problem.effects)) if theta is None else theta
+    early = g.mask & (g.time <= WINDOWS[0])
+    early[:8] |= g.mask[:8]
+    start = np.zeros((9, g.n))
+    for i in range(g.n):
+        time, place = g.time[early[:, i], i], g.measured[:, early[:, i], i]
+        fall = np.array([0.0, 0.0, -4.9])[:, None] * time**2
+        line = np.polynomial.polynomial.polyfit(time, (place - fall).T, 1)
+        start[:3, i], start[3:6, i] = line
+    if spin is not None:
+        start[SPIN] = spin[:, None] if spin.ndim == 1 else spin
+    for window in WINDOWS:
+        keep = (g.time <= window) | (np.arange(len(g.time)) < 8)[:, None]
+        start = fit_starts(problem, theta, start, g, rounds=2, keep=keep)
+    return fit_starts(problem, theta, start, g, rounds=4)
+
+
+def own_spins(problem: BallProblem, nominal: Situation) -> tuple[Situation, SpinPrior]:
+    """Situation with a spin of each ball's own under the nominal model, and the distribution of all.
+
+    Where the nominal model has no Magnus force, under a coefficient k of the middle of what is known of it.
+    """
+    g, theta = problem.grid, nominal.theta.copy()
+    if problem.coefficient is not None:
+        theta[problem.coefficient] = MAGNUS_PRIOR[0]
+    start = fit_spins(problem, theta, nominal.start, g)
+    for _ in range(2):
+        at = Situation(theta, start)
+        linear = problem.linearise(at)
+        frame = noise.flight_frame(linear.base.velocity[:, :, 0])
+        own = noise.without_memory(noise.estimate(linear.residual, frame, g, 9))
+        p = project(linear, Situation(np.zeros_like(theta), start), own, robust_weights(linear.residual, own, g), g)
+        prior = learned(p.spin_gram, p.spin_right)
+        start = fit_starts(problem, theta, start, g, own, prior)
+    return Situation(theta, start), prior

@@ -1,0 +1,133 @@
+"""All effects of the catalogue at once: their posterior under what is known of them before a ball is measured.
+
+Real set-ups are wrong in many places by ordinary amounts, and the best change of one number depends on all others. So
+before any is named all are fitted together: Gauss-Newton on the nonlinear model, each ball's start projected out and
+its spin marginalised about its own best fit (the conditional linearisation of Lindstrom and Bates, Biometrics 46,
+1990), until nothing moves. An effect's prior is Student's with the catalogue's ``scale``: ordinary sizes cost little,
+a large one is not forbidden. Intervals take their spread from ball to ball.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_tt.diagnosis.ball import scores
+from mjx_tt.diagnosis.ball.flights import noise
+from mjx_tt.diagnosis.ball.flights.fit import fit_starts
+from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Situation, project
+from mjx_tt.diagnosis.ball.flights.noise import Noise
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior, learned
+
+ROUNDS = 7
+SETTLED = 0.2  # of a standard deviation by which nothing moves any more
+MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
+LONGEST_MOVE = 3.0  # scales by which an effect may change in a round
+FREEDOM = 4.0  # degrees of Student's distribution of an effect's size
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Changes of all effects together, and the situation about which they were found."""
+
+    theta: Float[np.ndarray, " K"]
+    covariance: Float[np.ndarray, "K K"]
+    free: tuple[int, ...]  # effects that were fitted; the others stay at zero
+    at: Situation
+    linear: Linear
+    noise: Noise
+    prior: SpinPrior | None
+    converged: bool
+
+    @property
+    def std(self) -> Float[np.ndarray, " K"]:
+        """Standard deviations of the changes."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+def fit(
+    problem: BallProblem,
+    at: Situation,
+    prior: SpinPrior | None,
+    left_out: Container[int],
+    say: Callable[[str], None],
+) -> Posterior:
+    """Maximum of the posterior of all effects that are not left out, from a situation with or without spins."""
+    g, effects = problem.grid, problem.effects
+    free = [
+        i
+        for i, e in enumerate(effects)
+        if i not in left_out and not (prior is None and (e.needs_spin or i == problem.coefficient))
+    ]
+    mean, scale = np.zeros(len(effects)), np.array([e.scale for e in effects])
+    if problem.coefficient is not None:
+        mean[problem.coefficient], scale[problem.coefficient] = MAGNUS_PRIOR
+    covariance = np.diag(scale**2)
+    converged = False
+    for round_ in range(ROUNDS):
+        linear = problem.linearise(at)
+        frame = noise.flight_frame(linear.base.velocity[:, :, 0])
+        own = noise.estimate(linear.residual, frame, g, 6 if prior is None else 9)
+        own = noise.without_memory(own, MEMORY[min(round_, len(MEMORY) - 1)])
+        p = project(linear, at, own, noise.robust_weights(linear.residual, own, g), g)
+        if prior is not None:
+            prior = learned(p.spin_gram, p.spin_right - p.spin_effect @ at.theta)
+        rated = scores.under(p, prior)
+        theta, covariance = _solved(rated, at.theta, free, mean, scale, problem)
+        change = theta - at.theta
+        # An effect that starts with a threshold has no derivative to settle on.
+        smooth = [i for i in free if effects[i].step is None]
+        moved = float(np.max(np.abs(change[smooth]) / np.sqrt(np.diagonal(covariance))[smooth], initial=0.0))
+        at = Situation(theta, fit_starts(problem, theta, at.start, g, own, prior, rounds=3))
+        say(f"all effects at once, round {round_ + 1}: moved by {moved:.1f} deviations")
+        if moved < SETTLED:
+            converged = True
+            break
+    linear = problem.linearise(at)
+    return Posterior(at.theta, covariance, tuple(free), at, linear, own, prior, converged)
+
+
+def _solved(
+    rated: scores.Scores,
+    before: np.ndarray,
+    free: list[int],
+    mean: np.ndarray,
+    scale: np.ndarray,
+    problem: BallProblem,
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K K"]]:
+    """Changes of all effects from the scores, and their covariance by the sandwich over balls."""
+    count, low = len(scale), np.array([e.low for e in problem.effects])
+    away = (before - mean) / scale
+    precision = (FREEDOM + 1.0) / (FREEDOM + away**2) / scale**2
+    held: list[int] = []
+    while True:
+        chosen = [i for i in free if i not in held]
+        every = [*chosen, *rated.always]
+        pull = np.zeros(len(every))
+        pull[: len(chosen)] = precision[chosen]
+        goal = np.zeros(len(every))
+        goal[: len(chosen)] = mean[chosen]
+        gram, right = rated.gram[np.ix_(every, every)] + np.diag(pull), rated.right[every] + pull * goal
+        size = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
+        inverse = np.linalg.pinv(gram * size[:, None] * size, hermitian=True) * size[:, None] * size
+        found = inverse @ right
+        below = [i for i, value in zip(chosen, found, strict=False) if value < low[i]]
+        if not below:
+            break
+        held += below
+    left = rated.ball_right[:, every] - rated.ball_gram[:, every][:, :, every] @ found
+    spread = left.T @ left + np.diag(pull)
+    full = inverse @ spread @ inverse
+    theta = np.zeros(count)
+    theta[chosen] = found[: len(chosen)]
+    theta[held] = low[held]
+    step = LONGEST_MOVE * scale
+    theta = before + np.clip(theta - before, -step, step)
+    if problem.coefficient is not None and problem.coefficient in free:
+        theta[problem.coefficient] = np.clip(theta[problem.coefficient], *MAGNUS_RANGE)
+    covariance = np.diag(scale**2)
+    covariance[np.ix_(chosen, chosen)] = full[: len(chosen), : len(chosen)]
+    return theta, covariance

@@ -1,0 +1,57 @@
+"""Spin of each ball, as the diagnosis found it: means, standard deviations, and a table of them."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ballmodel.io.atomic_files import replacing
+from ballmodel.trajectory import Trajectory
+from mjx_tt.diagnosis.ball import scores
+from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem
+from mjx_tt.diagnosis.ball.selection import Settled, fitted_spins
+
+HEADER = ("session", "trajectory", "t", *(f"{kind}_{axis}" for kind in ("spin", "std") for axis in "xyz"))
+
+
+@dataclass(frozen=True)
+class Spins:
+    """Spins [rad/s] at each ball's first sample, in the table's axes; for a fixed coefficient k."""
+
+    session: tuple[str, ...]
+    name: tuple[str, ...]
+    time: Float[np.ndarray, " n"]  # [s] of the first sample
+    mean: Float[np.ndarray, "3 n"]
+    std: Float[np.ndarray, "3 n"]
+
+    def save(self, path: Path) -> None:
+        """Writes a CSV: session, trajectory, t [s], spin and its standard deviation about x, y, z [rad/s]."""
+        with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(HEADER)
+            for i, (session, name) in enumerate(zip(self.session, self.name, strict=True)):
+                numbers = [*self.mean[:, i], *self.std[:, i]]
+                writer.writerow([session, name, f"{self.time[i]:.6f}", *(f"{x:.3f}" for x in numbers)])
+
+
+def estimate(problem: BallProblem, settled: Settled, balls: Sequence[Trajectory]) -> Spins | None:
+    """Posterior of every ball's spin beside the chosen causes; None where no ball spins."""
+    prior, p = settled.choice.prior, settled.projected
+    if prior is None:
+        return None
+    precision = prior.of_balls(len(balls), scores.TINY)[1]
+    mean = settled.at.start[SPIN] if prior.conditional else fitted_spins(p, settled.choice)
+    covariance = np.linalg.inv(p.spin_gram + precision)
+    variance = np.einsum("can,nab,cbn->cn", problem.axes, covariance, problem.axes)
+    return Spins(
+        tuple(t.session for t in balls),
+        tuple(t.name for t in balls),
+        np.array([t.time[0] for t in balls]),
+        np.einsum("can,an->cn", problem.axes, mean),
+        np.sqrt(variance),
+    )

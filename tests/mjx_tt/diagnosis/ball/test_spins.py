@@ -1,0 +1,137 @@
+"""Spins of each ball's own: their distribution against scikit-learn's, their estimates against the truth, and finding
+causes beside them; sets of many causes against every set there is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from sklearn.mixture import GaussianMixture
+
+from mjx_tt import SimModel
+from mjx_tt.diagnosis import diagnose, load_logs
+from mjx_tt.diagnosis.ball import scores
+from mjx_tt.diagnosis.ball.flights import spin_prior
+from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior, learned
+from tests.exam.generator.sessions import draw_balls, measure, with_spin
+from tests.exam.generator.world import World
+from tests.exam.generator.write import ball_csv
+
+pytestmark = pytest.mark.optimised
+
+
+def _two_kinds(rng, n=600):
+    topspin = rng.random(n) < 0.6
+    spin = np.where(topspin[:, None], rng.normal([90, 0, -10], [12, 9, 15], (n, 3)), rng.normal(-60, 20, (n, 3)))
+    return spin, topspin
+
+
+def test_spins_that_are_seen_exactly_are_mixed_as_scikit_learn_mixes_them():
+    spin, topspin = _two_kinds(np.random.default_rng(0))
+    information = np.repeat(1e6 * np.eye(3)[None], len(spin), axis=0)
+    found = learned(information, 1e6 * spin, most=2)
+    theirs = GaussianMixture(2, random_state=0, tol=1e-6, max_iter=500).fit(spin)
+    assert found.components == 2
+    own, covariance = found.own_mean.T, found.own_covariance
+    for kind in (True, False):
+        mine = own[topspin == kind].mean(axis=0)
+        k = int(np.argmin(np.linalg.norm(theirs.means_ - mine, axis=1)))
+        np.testing.assert_allclose(mine, theirs.means_[k], atol=0.5)
+        np.testing.assert_allclose(covariance[topspin == kind].mean(axis=0), theirs.covariances_[k], rtol=0.05, atol=6)
+    np.testing.assert_allclose(found.mean, spin.mean(axis=0), atol=0.5)
+    np.testing.assert_allclose(found.std, spin.std(axis=0), rtol=0.02)
+
+
+def test_a_distribution_is_learned_through_flights_that_show_little():
+    rng = np.random.default_rng(1)
+    n, mean, std = 4000, np.array([40.0, 0.0, -5.0]), np.array([30.0, 20.0, 10.0])
+    spin = mean + std * rng.standard_normal((n, 3))
+    sigma = np.array([8.0, 30.0, 15.0])  # of what a flight shows about each axis
+    seen = spin + sigma * rng.standard_normal((n, 3))
+    found = learned(np.repeat(np.diag(sigma**-2)[None], n, axis=0), seen / sigma**2, most=1)
+    assert np.all(np.abs(found.mean - mean) < 5 * np.hypot(std, sigma) / np.sqrt(n))
+    np.testing.assert_allclose(found.std, std, rtol=0.2)
+
+
+def test_one_kind_of_spin_is_called_one():
+    rng = np.random.default_rng(2)
+    spin = rng.normal([40, 0, 0], [30, 20, 25], (300, 3))
+    assert learned(np.repeat(0.04 * np.eye(3)[None], 300, axis=0), 0.04 * spin).components == 1
+
+
+def test_a_prior_counts_by_how_little_a_flight_shows():
+    precision = np.repeat(np.diag([0.25, 0.25, 0.25])[None], 2, axis=0)
+    nothing, all_of_it = scores.loosened(precision, np.stack([np.zeros((3, 3)), 1e6 * np.eye(3)]))
+    np.testing.assert_allclose(nothing, precision[0])
+    assert np.abs(all_of_it).max() < 1e-6
+
+
+def test_the_prior_moves_with_its_mean():
+    prior = SpinPrior(np.ones(3), np.ones(3), np.zeros((3, 5)), np.repeat(np.eye(3)[None], 5, axis=0))
+    moved = prior.moved(np.array([1.0, 2.0, 3.0]))
+    np.testing.assert_array_equal(moved.mean, [2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(moved.of_balls(5)[0][:, 4], [1.0, 2.0, 3.0])
+    assert moved.of_some(np.array([0, 2])).own_mean.shape == (3, 2)
+    assert spin_prior.MAGNUS_RANGE[0] > 0.0
+
+
+def test_large_sets_of_causes_are_found_one_member_at_a_time():
+    rng = np.random.default_rng(3)
+    n, k = 40, 9
+    columns = rng.standard_normal((n, 30, k))
+    true = np.array([3.0, 0, -2.5, 0, 2.0, 0, 1.8, -1.5, 0])
+    target = columns @ true + rng.standard_normal((n, 30))
+    gram, right = np.einsum("nmk,nml->nkl", columns, columns), np.einsum("nmk,nm->nk", columns, target)
+    rated = scores.Scores(gram.sum(axis=0), right.sum(axis=0), gram, right, 0.0, ())
+    small = scores.all_gains(rated, tuple(range(k)))
+    wide = scores.widened(rated, small, tuple(range(k)), 14.0)
+    best = max(wide, key=lambda s: wide[s] - 14.0 * len(s))
+    every = {s: scores.gain(rated, s) for size in range(k + 1) for s in combinations(range(k), size)}
+    assert best == max(every, key=lambda s: every[s] - 14.0 * len(s)) == (0, 2, 4, 6, 7)
+    assert all(np.isclose(wide[s], every[s], rtol=1e-6) for s in wide)
+    half = rated.weighted(np.r_[np.ones(20), np.zeros(20)])
+    np.testing.assert_allclose(half.gram, gram[:20].sum(axis=0))
+
+
+def _log(tmp_path, world, balls, rng):
+    path = tmp_path / "ball.csv"
+    path.write_text(ball_csv(measure(world, balls, "iid", rng)))
+    return load_logs([path])
+
+
+@pytest.mark.parametrize("restitution, friction", [(0.88, 0.18), (0.80, 0.11)])
+def test_two_ordinary_causes_far_from_nominal_are_both_found(tmp_path, restitution, friction):
+    """The straight line from the nominal model leads to a spin that is not there."""
+    rng = np.random.default_rng(4)
+    found = diagnose(_log(tmp_path, World(restitution=restitution, friction=friction), draw_balls(rng, 60), rng))
+    causes = {c.name: c for c in found.verdict.causes}
+    assert found.verdict.verdict == "named" and set(causes) == {"table_restitution", "table_friction"}
+    for name, path, true in (
+        ("table_restitution", "ball.table.restitution", restitution),
+        ("table_friction", "ball.table.friction", friction),
+    ):
+        estimate = causes[name].parameters[path]
+        assert abs(estimate.estimate - true) < 0.003 and estimate.high - estimate.low < 0.01
+
+
+def test_spins_of_any_size_are_estimated_with_their_intervals(tmp_path):
+    """Balls of two kinds, fast topspin and backspin, under another integrator; k is known, nothing is wrong."""
+    rng = np.random.default_rng(5)
+    balls = draw_balls(rng, 80)
+    spin = _two_kinds(rng, 80)[0].T * np.where(balls.human, 1.0, -1.0)
+    nominal = SimModel()
+    flight = replace(nominal.ball.flight, magnus_coefficient=0.6)
+    nominal = replace(nominal, ball=replace(nominal.ball, flight=flight))
+    logs = _log(tmp_path, World(magnus_coefficient=0.6), with_spin(balls, spin), rng)
+    found = diagnose(logs, nominal)
+    assert found.verdict.verdict == "none"
+    spins = found.balls.spins
+    kept = [int(name) for name in spins.name]
+    error = (spins.mean - spin[:, kept]) / spins.std
+    assert 0.8 < np.mean(np.abs(error) < 1.645) < 0.97, "90 % intervals"
+    assert np.median(np.abs(spins.mean - spin[:, kept])[[0, 2]]) < 5.0
+    spins.save(tmp_path / "spins.csv")
+    rows = np.genfromtxt(tmp_path / "spins.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    np.testing.assert_allclose(rows["spin_x"], spins.mean[0], atol=1e-3)
