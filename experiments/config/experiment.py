@@ -28,25 +28,9 @@ Decay = Annotated[float, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]  # also that of a folder
 
-# Keys of the optimiser, which training and fine-tuning share; their defaults differ.
+# Keys of the optimiser, which training and fine-tuning share but for their defaults; see also ``Shaping``.
 NumDirections = Annotated[Count, Field(description="Antithetic pairs of perturbations per update.")]
-Sigma = Annotated[Positive, Field(description="Scale of the perturbations.")]
 EliteFraction = Annotated[float, Field(gt=0, le=1, description="Share of the pairs that become elites.")]
-Rank = Annotated[
-    Literal["abs", "signed", "max"],
-    Field(description="Pairs are ranked by |D|, by D or by their better member, D the difference of their returns."),
-]
-Weighting = Annotated[
-    Literal["returns", "centered_rank"], Field(description="Weights follow the returns or their centred ranks.")
-]
-Normalise = Annotated[
-    Literal["std", "none"], Field(description="Weights are divided by the standard deviation of the elites' returns.")
-]
-Orthogonal = Annotated[bool, Field(description="Orthogonal perturbations; false: independent ones.")]
-Scale = Annotated[
-    Literal["sqrt_d", "chi"],
-    Field(description="Norm of orthogonal perturbations: the root of their dimension, or as of Gaussian vectors."),
-]
 EmaDecay = Annotated[
     Decay,
     Field(description="Decay per update of the moving average of the parameters, which is exported; 0: none."),
@@ -176,21 +160,32 @@ class SigmaFall(Section):
     """Share of the updates before the fall."""
 
 
-class Optimiser(Section):
+class Shaping(Section):
+    """Keys of Blackbox Gradient Sensing that training and fine-tuning share with their defaults."""
+
+    sigma: Positive = 0.025
+    """Scale of the perturbations."""
+    rank: Literal["abs", "signed", "max"] = "abs"
+    """Pairs are ranked by |D|, by D or by their better member, D the difference of their returns."""
+    weighting: Literal["returns", "centered_rank"] = "returns"
+    """Weights follow the returns or their centred ranks."""
+    normalise: Literal["std", "none"] = "std"
+    """Weights are divided by the standard deviation of the elites' returns."""
+    orthogonal: bool = True
+    """Orthogonal perturbations; false: independent ones."""
+    scale: Literal["sqrt_d", "chi"] = "sqrt_d"
+    """Norm of orthogonal perturbations: the root of their dimension, or as of Gaussian vectors."""
+
+
+class Optimiser(Shaping):
     """Blackbox Gradient Sensing. The defaults are the recipe that trains best here; paper.yaml has the paper's."""
 
     num_directions: NumDirections = 100
     repeats: Count = 10
     """Episodes per perturbation."""
-    sigma: Sigma = 0.025
     sigma_fall: SigmaFall | None = None
     """Smaller perturbations later on: more returned in this simulation, fewer in another world; null: none."""
     elite_fraction: EliteFraction = 1.0
-    rank: Rank = "abs"
-    weighting: Weighting = "returns"
-    normalise: Normalise = "std"
-    orthogonal: Orthogonal = True
-    scale: Scale = "sqrt_d"
     step: Step = Step()
     """From the gradient estimate to a change of the parameters."""
     ema_decay: EmaDecay = 0.98

@@ -13,18 +13,12 @@ from experiments.config.experiment import (
     Count,
     EliteFraction,
     EmaDecay,
-    Normalise,
     NumDirections,
     Optimiser,
-    Orthogonal,
-    Rank,
     Rewards,
-    Scale,
-    Section,
     Seed,
-    Sigma,
+    Shaping,
     Step,
-    Weighting,
     apply_override,
     read_yaml,
 )
@@ -33,7 +27,7 @@ from experiments.errors import ConfigError
 MEASURED = ("state_transition", "net_clearance", "hit_and_land", "fault")  # terms that a real episode tells
 
 
-class FineTuning(Section):
+class FineTuning(Shaping):
     """Fine-tuning of one policy on a robot. The defaults are the paper's "real fine-tuning"."""
 
     updates: Count = 70
@@ -41,13 +35,7 @@ class FineTuning(Section):
     num_directions: NumDirections = 5
     repeats: Count = 3
     """Episodes, hence balls, per perturbation."""
-    sigma: Sigma = 0.025
     elite_fraction: EliteFraction = 0.6
-    rank: Rank = "abs"
-    weighting: Weighting = "returns"
-    normalise: Normalise = "std"
-    orthogonal: Orthogonal = True
-    scale: Scale = "sqrt_d"
     step: Step = Step(kind="sgd", learning_rate=0.00375, schedule=Constant(kind="constant"))
     """From the gradient estimate to a change of the parameters."""
     ema_decay: EmaDecay = 0.0
