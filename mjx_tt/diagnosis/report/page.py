@@ -21,7 +21,7 @@ from mjx_tt.diagnosis.ball import selection
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE
 from mjx_tt.diagnosis.diagnose import Diagnosis
 from mjx_tt.diagnosis.hits.diagnose import LEAST_SHIFT, RETURN
-from mjx_tt.diagnosis.report import figures, residuals, text
+from mjx_tt.diagnosis.report import cleaning, figures, residuals, text
 from mjx_tt.diagnosis.report.rivals import rivals
 from mjx_tt.diagnosis.verdict import Cause
 from mjx_tt.viz.html import Page, environment
@@ -85,6 +85,7 @@ def _page(d: Diagnosis, title: str, play: Play | None) -> Page:
         ("Gain on data that was not used", "held_out", _held_out),
         ("What it costs in play", "play", lambda d, page: _play(play, page)),
         ("What to measure next", "next", _next),
+        ("What was taken out of the tracks", "cleaned", _cleaned),
         ("Data and noise", "data", _data),
     )
     for heading, template, context in sections:
@@ -311,6 +312,17 @@ def _next(d: Diagnosis, page: Page) -> Context:
     causes = [c for c in d.verdict.causes if len(c.group) > 1]
     readings = dict.fromkeys(r for c in causes for r in c.separating_measurement.split("; ") if r)
     return {"steps": d.verdict.next_experiment, "few": FEW, "readings": list(readings)}
+
+
+def _cleaned(d: Diagnosis, page: Page) -> Context:
+    if d.record is None or not d.record.entries:
+        return None
+    taken = any(e.samples for e in d.record.entries)
+    return {
+        "lines": d.record.lines(),
+        "picture": page.embed("taken_out", cleaning.taken_out(d.record)) if taken else None,
+        "entries": [str(e) for e in d.record.entries],
+    }
 
 
 def _data(d: Diagnosis, page: Page) -> Context:

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from ballmodel.trajectory import Trajectory
+from mjx_tt.diagnosis.report.cleaning import taken_out
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.diagnosis.tracks.frame import check
 from tests.exam.generator.sessions import draw_balls, measure
-from tests.exam.generator.world import World
+from tests.exam.generator.world import World, fly
 
 SIGMA = 0.003  # [m]
 DT = 1 / 125
+WORLD = World()
 
 
 @cache
 def flights(n: int = 24, seed: int = 0, noise: str = "iid") -> tuple[Trajectory, ...]:
     """Strokes of people and returns, one bounce each, with 3 mm of noise."""
     rng = np.random.default_rng(seed)
-    log = measure(World(), draw_balls(rng, n), noise, rng)
+    log = measure(WORLD, draw_balls(rng, n), noise, rng)
     out = []
     for i in range(n):
         seen = np.isfinite(log.position[0, :, i])
@@ -160,22 +162,28 @@ def rallies(rng) -> Dirty:
 
 
 def on_the_floor(rng) -> Dirty:
-    """Missed balls that fall to the floor and bounce there."""
+    """Missed balls that fly on past the table's end to the floor and bounce there."""
     tracks, touched, strokes = [], set(), []
-    for t in flights():
-        p0, v = t.position[:, -1], np.polyfit(t.time[-10:] - t.time[-1], t.position[:, -10:].T, 1)[0]
-        hit = (v[2] + np.sqrt(v[2] ** 2 + 2 * 9.81 * (p0[2] + 0.74))) / 9.81
-        time = np.arange(1, int((hit + 0.3) / DT)) * DT
-        after = np.maximum(time - hit, 0.0)
-        up = 0.8 * (9.81 * hit - v[2])
-        z = np.where(time < hit, p0[2] + v[2] * time - 4.905 * time**2, -0.74 + up * after - 4.905 * after**2)
-        p = np.stack([p0[0] + v[0] * time, p0[1] + v[1] * time, z]) + SIGMA * rng.standard_normal((3, time.size))
-        tracks.append(Trajectory(t.session, t.name, np.r_[t.time, t.time[-1] + time], np.c_[t.position, p]))
-        falling = time < hit
-        strokes.append(
-            Trajectory(t.session, t.name, np.r_[t.time, t.time[-1] + time[falling]], np.c_[t.position, p[:, falling]])
-        )
+    flight = fly(WORLD, draw_balls(np.random.default_rng(0), 24).start, 1.65)
+    ended = np.where(np.isfinite(flight.end_time), flight.end_time, 0.0)
+    beyond = np.abs(flight.at(ended[None] - 1e-6)[1, 0]) > 1.40
+    flight = replace(flight, end_time=np.full(24, np.inf))  # what the generator's table does not end, the real one does
+    time = np.repeat(np.arange(200)[:, None] * DT, 24, axis=1)
+    for i, (t, p) in enumerate(zip(flights(), np.moveaxis(flight.at(time), 2, 0), strict=True)):
+        k = int(np.argmax(p[2] < -0.74))
+        if not beyond[i] or not 0 < k < 165:
+            tracks.append(t)
+            strokes.append(t)
+            continue
+        v = (p[:, k - 1] - p[:, k - 2]) / DT * [1.0, 1.0, -0.8]
+        after = np.arange(30) * DT
+        p[:, k : k + 30] = (p[:, k - 1] + v * after[:, None] - np.outer(4.905 * after**2, [0, 0, 1])).T
+        p = p[:, : k + 30] + SIGMA * rng.standard_normal((3, k + 30))
+        stamps = t.time[0] + np.arange(k + 30) * DT
+        tracks.append(Trajectory(t.session, t.name, stamps, p))
+        strokes.append(Trajectory(t.session, t.name, stamps[:k], p[:, :k]))
         touched.add(t.label)
+    assert len(touched) > 6
     return Dirty(tracks, touched, strokes, "floor")
 
 
@@ -331,3 +339,14 @@ def test_another_origin_is_named_with_its_offset(shift, hint):
 @pytest.mark.parametrize("dirt", KINDS, ids=lambda d: d.__name__)
 def test_dirt_is_no_other_frame(dirt):
     check(dirt(np.random.default_rng(1)).tracks, "log.csv")
+
+
+def test_the_picture_shows_every_kind_that_lost_samples():
+    made = outliers(np.random.default_rng(1))
+    made.tracks += on_the_floor(np.random.default_rng(1)).tracks
+    record = clean(made.tracks)[1]
+    side, above = taken_out(record).axes
+    labels = side.get_legend_handles_labels()[1]
+    assert labels == ["samples off every flight", "flights after the floor"]
+    drawn = sum(len(line.get_xdata()) for line in above.lines if line.get_marker() == ".")
+    assert drawn == sum(e.samples for e in record.entries)
