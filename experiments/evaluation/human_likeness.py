@@ -84,6 +84,7 @@ def compare(landed: BallState, box: BallDistribution, ball: BallParams, picture:
     rows = start_states(landed)
     order = np.random.default_rng(seed).permutation(len(rows))
     count = min(HELD_OUT, len(rows) // 4)
+    count = count if count >= FEWEST else 0
     held, known = rows[order[:count]], rows[order[count:]]
     mixture, _ = fit_mixture(_state(known), seed=seed)
     keys = jax.random.split(jax.random.key(seed))
@@ -93,8 +94,8 @@ def compare(landed: BallState, box: BallDistribution, ball: BallParams, picture:
     }
     _draw(rows, drawn, picture)
     lines = [f"{picture}: strokes, mixture and box side by side"]
-    if count < FEWEST:
-        return [*lines, f"{count} held-out strokes are too few to compare with, {FEWEST} are wanted"]
+    if not count:
+        return [*lines, f"{len(rows)} strokes are too few to hold out a quarter and compare, {4 * FEWEST} are wanted"]
     for title, columns in (("position and velocity", 6), ("spin as well", 9)):
         for name, balls in drawn.items():
             found = likeness(balls[:, :columns], held[:, :columns], known[:, :columns], seed)
