@@ -155,9 +155,11 @@ class Session:
                 self.reset()
                 self.arm()
                 return
-            except RefusedError:  # a busy machine may be late again: a new fault, or a condition that is over by now
+            except RefusedError as error:  # a busy machine may be late again: a new fault, or what is over by now
                 if attempt == RECOVERIES - 1 or not self.process.is_alive():
                     raise
+                if "jog" in str(error):
+                    rig.jog()
 
     def close(self) -> None:
         """Stops the robot in order, then the process."""

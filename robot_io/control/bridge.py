@@ -104,8 +104,7 @@ class Bridge:
         self.policy_seconds = 0.0  # of the last tick; 0 when the policy was not asked
 
     @property
-    def episode(self) -> Episode | None:
-        """The ball that the policy plays."""
+    def episode(self) -> Episode | None:  # that the policy plays
         return self.play.episode
 
     # The operator
@@ -150,8 +149,9 @@ class Bridge:
         if self.state in (BridgeState.READY, BridgeState.ACTIVE):
             self.gate.brake(now)
             self._stopping_since = now
-            self.play.abort("stopped", now)
             self._change(BridgeState.STOPPING, now, "stopped by the operator")
+            with self._guarded(now):
+                self.play.abort("stopped", now)
         self.event(now, Level.INFO, "operator", "stop")
 
     def reset(self, now: float) -> None:
@@ -367,8 +367,8 @@ class Bridge:
                     self.event(now, Level.ERROR, "fault", text)
                 first, self._logged_faults = self._logged_faults == 0, len(faults)
                 if first:
-                    self.play.abort(faults[0].cause.value, now)
                     self._change(BridgeState.DISARMED, now, f"fault: {faults[0].sentence}")
+                    self.play.abort(faults[0].cause.value, now)
             if self.gate.at_rest:
                 self.axes.stop()
         elif self._state is BridgeState.STOPPING and self.gate.at_rest:

@@ -183,7 +183,10 @@ class LockStep:
             raise RefusedError(f"the rig does not reach its home pose: {self.bridge.gate.faults}")
 
     def recover(self) -> None:
-        """Reset a fault and arm again, as an operator does; home is reached later. Raises RefusedError."""
+        """Reset a fault and arm again, as an operator does, who jogs the arm where needed; home is reached later.
+
+        Raises RefusedError.
+        """
         self.run(2.5, lambda: self.bridge.gate.settled)
         self.run(1.0)
         if self.bridge.state is BridgeState.FAULT:
@@ -192,8 +195,19 @@ class LockStep:
             self.axes.acknowledge()
             self.run(0.3)
         self.axes.enable()
-        self.run(1.0, lambda: self.axes.problem(self.now) is None)
-        self.bridge.arm(self.now)
+        self.run(0.3)
+        if not self.axes.homed:
+            self.axes.home()
+        self.run(3.0, lambda: self.axes.problem(self.now) is None)
+        self.run(0.1)
+        try:
+            self.bridge.arm(self.now)
+        except RefusedError as error:
+            if "jog" not in str(error):
+                raise
+            self.world.jog()
+            self.run(0.5)
+            self.bridge.arm(self.now)
 
     def play(self, balls: int, longest: float = 20.0) -> list[EpisodeSummary]:
         """Plays until the outcomes of ``balls`` more balls are known; fewer when the bridge stops or time runs out."""

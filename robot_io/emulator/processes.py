@@ -131,6 +131,10 @@ class Rig:
         """The tracker sends nothing for a while."""
         self._pipes["tracker"].send(("drop_out", seconds))
 
+    def jog(self) -> None:
+        """Put the arm to its home pose, as somebody does with the controller's own pendant."""
+        self._shared["jog"][0] = 1.0
+
     def throw(self, on: bool) -> None:
         """Starts or ends the throwing of balls."""
         self._shared["throwing"][0] = on
@@ -220,6 +224,9 @@ def _world(
         now = time.monotonic()
         world.advance(shared["setpoint"].copy(), min(now - last, 0.05))
         last = now
+        if shared.value("jog"):
+            world.jog()
+            shared["jog"][0] = 0.0
         if shared.value("throwing"):
             source.update(world, now)
         publish(now)

@@ -26,6 +26,7 @@ _FIELDS = {
     "thrown": 1,
     "finish": 1,
     "estop": 1,
+    "jog": 1,
     "silent_until": 1,
 }
 

@@ -27,7 +27,7 @@ from ballmodel.constants import (
     TABLE_FRICTION,
     TABLE_RESTITUTION,
 )
-from robot_io.contract import JOINT_NAMES
+from robot_io.contract import ABB_JOINTS, JOINT_NAMES
 
 SHELL_INERTIA = SHELL_INERTIA_FACTOR * BALL_MASS * BALL_RADIUS**2
 SOLIMP = [0.95, 0.95, 0.001, 0.5, 2.0]  # the same impedance at any depth: a linear spring
@@ -151,6 +151,12 @@ class World:
         mujoco.mj_kinematics(self.model, self.data)
         self._touching, self.touches = set(), []
         self.strokes += 1
+
+    def jog(self) -> None:
+        """Puts the arm to its home pose, as somebody does with the controller's own pendant."""
+        arm = list(ABB_JOINTS)
+        self.data.qpos[self._q[arm]], self.data.qvel[self._v[arm]] = self.home[arm], 0.0
+        mujoco.mj_forward(self.model, self.data)
 
     def park(self) -> None:
         """Takes the ball out of play."""

@@ -112,6 +112,7 @@ class SafetyGate:
         self._measured: tuple[np.ndarray, np.ndarray] | None = None  # position and velocity, when credible
         self._unexplained = np.zeros(N_JOINTS)
         self._deviation = np.zeros(N_JOINTS)  # of the measured position from the way of the reference
+        self._offset = np.zeros(N_JOINTS)  # the same, remembered while the reference moves
         self._measured_velocity: np.ndarray | None = None
         self._last: float | None = None  # time of the command before
         self._lead = 0.0  # [s] that commands are ahead of the clock
@@ -204,7 +205,7 @@ class SafetyGate:
         self._reference = self._start = position
         self._inside = np.ones(self._margin.shape, bool)
         self._stop.restart()
-        self._deviation = np.zeros(N_JOINTS)
+        self._deviation, self._offset = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
         self._lead, self._last = 0.0, None
         self._monitor.restart(position, now)
 
@@ -335,6 +336,10 @@ class SafetyGate:
                 rules.append("escape")
             scaled = slowed
         velocity = limit_velocity(scaled, self._velocity, self._reference, self.period, self.limits)
+        if self._offset.any():  # what is measured keeps the range as well, not only the reference
+            beside = limit_velocity(velocity, self._velocity, self._reference + self._offset, self.period, self.limits)
+            beside = np.clip(beside, self._velocity - self._step, self._velocity + self._step)
+            velocity = np.where(self._offset > 0.0, np.minimum(velocity, beside), np.maximum(velocity, beside))
         clipped = np.clip(scaled, -self._v_max, self._v_max)
         rated = np.clip(clipped, self._velocity - self._step, self._velocity + self._step)
         for name, before, after in (
@@ -449,6 +454,7 @@ class SafetyGate:
             return
         self._unexplained = self._monitor.unexplained(position, now)
         self._deviation = self._monitor.deviation(position)
+        self._offset = self._monitor.offset(self._deviation, self._offset, self.period)
         if not self._latch:
             sentence = self._monitor.following_error(self._unexplained)
             if sentence:

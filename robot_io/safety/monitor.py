@@ -13,6 +13,7 @@ from robot_io.safety.config import SafetyConfig
 from robot_io.safety.faults import Cause
 
 EXACT = 0.002  # [m], [rad] by which a robot may go beside its reference unnoticed
+FORGOTTEN = 1.0  # [s] in which a controller takes a deviation away: EGM's position correction with gain 1
 EARLY = 0.1  # [s] by which a measurement may be looked at before the end of the newest period
 
 
@@ -63,6 +64,16 @@ class FeedbackMonitor:
         """Vector (8,) from the nearest place in the window of ``unexplained`` to the position; zero below EXACT."""
         found = position - np.clip(position, self._low, self._high)
         return np.where(np.abs(found) > EXACT, found, 0.0)
+
+    def offset(self, deviation: np.ndarray, before: np.ndarray, period: float) -> np.ndarray:
+        """Distance (8,) by which the robot is taken to go beside its reference: ``deviation``, while it can be told.
+
+        Behind a reference that moves a deviation hides in the window; the one ``before`` is kept then, and forgotten in
+        the time in which a controller takes it away.
+        """
+        kept = before * np.exp(-period / FORGOTTEN)
+        told = (self._high - self._low < EXACT) | (np.abs(deviation) > np.abs(kept))
+        return np.where(told, deviation, kept)
 
     def following_error(self, error: np.ndarray) -> str:
         """Following error over the actuation-delay window as a sentence; empty: none. error (8,): ``unexplained``."""

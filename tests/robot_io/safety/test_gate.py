@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import deque
 from dataclasses import replace
 
 import mujoco
@@ -733,3 +734,27 @@ def test_the_blade_is_no_faster_than_allowed():
         keeps_limits(ideal.velocities, ideal.positions)
         assert ("blade_speed" in changed) == (allowed == limit)
     assert fastest[limit] < 1.15 * limit and fastest[10.0] > 4.0
+
+
+@pytest.mark.parametrize("beside", [0.02, 0.03])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_measured_joint_keeps_its_range_beside_its_reference(sign, beside):
+    """An arm that stands ``beside`` its reference, 80 ms late and 0.2 % fast, on a way to its limit at full speed."""
+    joint = 6
+    gate, q = SafetyGate(geometry=GEOMETRY), HOME.copy()
+    late = deque([q.copy()] * 7, maxlen=7)  # references
+    now, dt, started = 1.0, gate.period, q[joint]
+    gate.arm(q, now, ZERO)
+    found, before = [], q.copy()
+    for i in range(160):
+        measured = late[0].copy()
+        measured[joint] += sign * beside * min(i / 20, 1.0) + 0.002 * (measured[joint] - started)
+        request = np.zeros(8)
+        request[joint] = sign * LIMITS.velocity[joint] if i > 60 else 0.0
+        gate.command(request, measured, (measured - before) / dt, now)
+        before, now = measured, now + dt
+        late.append(gate.reference)
+        found.append(measured[joint])
+    limit = LIMITS.upper[joint] if sign > 0 else LIMITS.lower[joint]
+    assert gate.state is GateState.ARMED, gate.faults
+    assert sign * (limit - max(found, key=lambda x: sign * x)) > 0.0

@@ -130,9 +130,12 @@ def fail(*_, **__):
         "axes.command",
         "axes.stop",
         "arm_session.problem",
-        "_on_episode",
+        "play._on_episode",
+        "play.settle",
+        "play.strokes.add",
+        "play.moved",
         "_homeward",
-        "_play",
+        "_ask_policy",
     ],
 )
 def test_an_exception_anywhere_brakes_the_robot_and_is_a_fault(part):
