@@ -130,8 +130,8 @@ class Rallies:
         self._wish = (0.0, 0.0)
 
     def update(self, world: World, now: float) -> bool:
-        """Serve or answer when it is time; True when the opponent struck the ball."""
-        return self._state(world, now)
+        """Serve or answer when it is time, by the world's own clock; True when the opponent struck the ball."""
+        return self._state(world, world.time)
 
     def _waiting(self, world: World, now: float) -> bool:
         if self.patient:
