@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -18,12 +19,14 @@ from rich.console import Console
 
 from experiments.config.finetuning import FineTuning
 from experiments.deploy.virtual_player import VirtualPlayer
+from experiments.errors import RunError
 from experiments.finetuning import loop
 from experiments.finetuning.journal import Journal
 from experiments.finetuning.robot import LockStepRallies, PlayedBall
 from experiments.runs.run_dir import Run
 from mjx_tt import platform
 from robot_io.emulator.config import RigParams
+from robot_io.errors import RefusedError
 from robot_io.log.messages import Action, Event, Observation, Record
 from robot_io.log.recorder import NullRecorder
 from robot_io.policy.numpy_policy import StreamingPolicy
@@ -51,11 +54,14 @@ class Memory(NullRecorder):
 class Watched(LockStepRallies):
     """Keeps the policy of each ball that was asked for, in order."""
 
-    def __init__(self, opponent: VirtualPlayer, params: RigParams, log: Memory) -> None:
+    def __init__(self, opponent: VirtualPlayer, params: RigParams, log: Memory, minutes: float) -> None:
         super().__init__(opponent, params, recorder=log)
+        self._end = time.monotonic() + 60.0 * minutes
         self.asked: list[tuple[Policy, int]] = []  # policy, number of the episode that came back
 
     def play(self, policy: Policy, episode_number: int) -> PlayedBall:
+        if time.monotonic() > self._end:
+            raise RefusedError("the time is over")
         played = super().play(policy, episode_number)
         self.asked.append((policy, played.summary.number))
         return played
@@ -69,15 +75,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--updates", type=int, default=70)
     parser.add_argument("--balls", type=int, default=100, help="in each of the evaluations before and after")
     parser.add_argument("--pause", type=float, default=1.0, help="[s] longest between two rallies")
+    parser.add_argument("--minutes", type=float, default=120.0, help="after which what was played is checked")
     parser.add_argument("--seed", type=int, default=1)
     chosen = parser.parse_args(arguments)
     platform.configure(devices=1)
     log = Memory()
     params = RigParams(patient=False, pause=chosen.pause, seed=chosen.seed)
-    robot = Watched(VirtualPlayer(chosen.player, chosen.seed), params, log)
+    robot = Watched(VirtualPlayer(chosen.player, chosen.seed), params, log, chosen.minutes)
     settings = FineTuning(updates=chosen.updates, evaluation_balls=chosen.balls)
     with TemporaryDirectory() as folder:
-        found = loop.finetune(chosen.policy, settings, Run(folder), robot, Console())
+        found = None
+        try:
+            found = loop.finetune(chosen.policy, settings, Run(folder), robot, Console())
+        except (RefusedError, RunError) as error:
+            print(f"ended early: {error}")
         journal = Journal(Path(folder) / loop.JOURNAL)
         journal.close()
     wrong, unplayed = 0, 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.festo import Axis, DirectLink, FestoAxes
 from robot_io.devices.tracker import Tracker, TrackerConfig
-from robot_io.emulator.arm import ArmController
+from robot_io.emulator.arm import ArmController, ArmStateError
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams
 from robot_io.emulator.network import Network
@@ -99,7 +100,7 @@ class LockStep:
         self._clock = 0
         self._setpoint = np.zeros(N_JOINTS)
         self.throwing = False
-        self.bridge_alive = True
+        self.bridge_alive = self.arm_connected = True
 
     @property
     def now(self) -> float:
@@ -126,7 +127,8 @@ class LockStep:
         if self.bridge_alive:
             self._bridge(now, clock)
         for reply in self._to_arm.due(now):
-            self.arm.receive(reply, BRIDGE, now)
+            if self.arm_connected:
+                self.arm.receive(reply, BRIDGE, now)
         if self.throwing:
             self.thrower.update(self.world, now)
 
@@ -137,7 +139,7 @@ class LockStep:
         self._setpoint[abb] = speed
         for i, emulator in zip(FESTO_JOINTS, self.emulators, strict=True):
             self._setpoint[i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
-        if datagram is not None:
+        if datagram is not None and self.arm_connected:
             self._to_bridge.send(datagram, now)
 
     def _bridge(self, now: float, clock: int) -> None:
@@ -187,10 +189,11 @@ class LockStep:
 
         Raises RefusedError.
         """
+        for action in (self.arm.motors_on, self.arm.start_rapid, self.arm.start_egm):
+            with suppress(ArmStateError):  # it is so already
+                action()
         self.run(2.5, lambda: self.bridge.gate.settled)
         self.run(1.0)
-        if self.bridge.state is BridgeState.FAULT:
-            self.bridge.reset(self.now)
         if self.axes.fault:
             self.axes.acknowledge()
             self.run(0.3)
@@ -200,6 +203,8 @@ class LockStep:
             self.axes.home()
         self.run(3.0, lambda: self.axes.problem(self.now) is None)
         self.run(0.1)
+        if self.bridge.state is BridgeState.FAULT:
+            self.bridge.reset(self.now)
         try:
             self.bridge.arm(self.now)
         except RefusedError as error:
