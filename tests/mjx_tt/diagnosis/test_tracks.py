@@ -200,24 +200,22 @@ def in_the_hand(rng) -> Dirty:
 
 
 def at_the_net(rng) -> Dirty:
-    """Balls that touch the cord and drop behind the net."""
+    """Low balls that touch the cord and drop behind the net."""
     tracks, touched, strokes = list(flights()), set(), list(flights())
-    for i in range(0, 24, 3):
-        t = tracks[i]
+    for i, t in enumerate(flights()):
         k = int(np.argmax(np.sign(t.position[1]) != np.sign(t.position[1, 0])))
-        cord = t.position[:, k] * [1.0, 0.0, 0.0] + [0.0, 0.0, 0.165]
-        time = (np.arange(len(t)) - k) * DT
-        before = time <= 0
-        v = np.polyfit(time[max(k - 12, 0) : k], t.position[:, max(k - 12, 0) : k].T, 1)[0]
-        v[2] = -0.5
-        fall = -0.5 * 9.81 * np.array([[0], [0], [1]]) * time**2
-        p = cord[:, None] + v[:, None] * time + fall
-        slow = cord[:, None] + (v * [1, 0.1, 0])[:, None] * time + fall
-        keep = before | (time < 0.17)
-        p = np.where(before, p, slow) + SIGMA * rng.standard_normal(p.shape)
-        tracks[i] = _with(t, p[:, keep], t.time[keep])
-        strokes[i] = _with(t, p[:, before], t.time[before])
+        if t.position[2, k] > 0.21:
+            continue
+        at = t.position[:, k]
+        time = np.arange(1, 20) * DT
+        v = (at - t.position[:, k - 8]) / (8 * DT) * [1.0, 0.1, 0.0]
+        p = at[:, None] + v[:, None] * time - 4.905 * np.array([[0], [0], [1]]) * time**2
+        p += SIGMA * rng.standard_normal(p.shape)
+        stamps = t.time[k] + time
+        tracks[i] = Trajectory(t.session, t.name, np.r_[t.time[: k + 1], stamps], np.c_[t.position[:, : k + 1], p])
+        strokes[i] = t.part(0, k + 1)
         touched.add(t.label)
+    assert len(touched) > 2
     return Dirty(tracks, touched, strokes, "net")
 
 
