@@ -12,6 +12,11 @@ from pathlib import Path
 from ballmodel.io.atomic_files import replacing
 from mjx_tt.sim.model import Range
 
+NOT_ADOPTED = (
+    "causes are named beside something that no entry explains, which they may stand for: the extended model does not "
+    "hold them"
+)
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -132,8 +137,8 @@ class Part:
 def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict, dict[str, float], tuple[Range, ...]]:
     """Verdict of all parts, and values and ranges of the extended model.
 
-    Of what one part alone can say, the unexplained and the held-out error, the first part's counts. Names that are
-    not to be relied on change the model only if they predict better. notes: warnings that stand before the parts' own.
+    Of what one part alone can say, the unexplained and the held-out error, the first part's counts. A part that leaves
+    something unexplained changes nothing, and causes that others could replace only if they predict better. notes: warnings that stand before the parts' own.
     """
 
     def every(name: str) -> tuple:
@@ -150,6 +155,9 @@ def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict,
         kind = "undetermined"
     else:
         kind = "named" if named else "none"
+    warnings = [*notes, *every("warnings")]
+    if any(p.unexplained is not None and p.named for p in parts):
+        warnings.append(NOT_ADOPTED)
     verdict = Verdict(
         kind,
         tuple(n.cause for n in named),
@@ -159,10 +167,12 @@ def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict,
         every("not_excited"),
         every("next_experiment"),
         every("runners_up"),
-        (*notes, *every("warnings")),
+        tuple(warnings),
     )
-    if kind in ("unexplained", "undetermined") and not (held_out and held_out.low > 0.0):
+    if kind == "undetermined" and not (held_out and held_out.low > 0.0):
         return verdict, {}, ()
-    values = {path: value for p in parts for path, value in p.beside.items()}
-    values |= {path: value for n in named for path, value in n.values.items()}
-    return verdict, values, tuple(r for n in named for r in n.ranges)
+    # Beside what no entry explains a name may stand for just that, however well it predicts: nothing to train on.
+    sound = [p for p in parts if p.unexplained is None]
+    values = {path: value for p in sound for path, value in p.beside.items()}
+    values |= {path: value for p in sound for n in p.named for path, value in n.values.items()}
+    return verdict, values, tuple(r for p in sound for n in p.named for r in n.ranges)

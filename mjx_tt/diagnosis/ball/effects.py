@@ -267,7 +267,7 @@ EFFECTS: tuple[Effect, ...] = (
         meaning="scale of the camera's calibration",
         claim="The camera measures lengths too {way:long|short}, scale {instead}",
         path=SENSING + "camera_scale",
-        scale=0.02,
+        scale=0.01,
         unit="1",
         reading="the table's corners, 2.74 m apart",
     ),
