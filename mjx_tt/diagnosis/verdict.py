@@ -138,7 +138,8 @@ def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict,
     """Verdict of all parts, and values and ranges of the extended model.
 
     Of what one part alone can say, the unexplained and the held-out error, the first part's counts. A part that leaves
-    something unexplained changes nothing, and causes that others could replace only if they predict better. notes: warnings that stand before the parts' own.
+    something unexplained changes nothing, and causes that others could replace only if they predict better. notes:
+    warnings that stand before the parts' own.
     """
 
     def every(name: str) -> tuple:

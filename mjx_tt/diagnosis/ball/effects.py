@@ -121,6 +121,17 @@ EFFECTS: tuple[Effect, ...] = (
         needs_spin=True,
     ),
     Effect(
+        name="lift_saturation",
+        meaning="lift that grows less than in proportion to spin",
+        claim="The lift of fast spinning balls stays {way:further behind|closer to} proportion, saturation {instead}",
+        path=FLIGHT + "lift_saturation",
+        scale=3.0,
+        unit="1",
+        reading="balls of one speed and several spins, each marked and filmed from the side",
+        needs_spin=True,
+        low=0.0,
+    ),
+    Effect(
         name="spin_decay",
         meaning="loss of spin in flight",
         claim="The ball loses its spin {way:faster|more slowly} in flight, {instead}",
