@@ -29,6 +29,7 @@ class World:
     mass: float | np.ndarray = 0.0027  # [kg]
     radius: float | np.ndarray = 0.020  # [m]
     magnus_coefficient: float | np.ndarray = 0.0
+    lift_saturation: float | np.ndarray = 0.0  # c in C_L = k S / (1 + c S), S = |omega| r / |u|
     spin_decay: float | np.ndarray = 0.0  # [1/s]
     buoyancy: float | np.ndarray = 0.0  # fraction of gravity
     gravity_x: float | np.ndarray = 0.0  # [m/s^2]
@@ -90,6 +91,9 @@ def derivative(world: World, state: np.ndarray) -> np.ndarray:
     out[5] = world.gravity_z * weight - drag * uz
     if np.any(world.magnus_coefficient):
         lift = world.magnus_coefficient * per_area * world.radius
+        if np.any(world.lift_saturation):
+            ratio = world.radius * np.sqrt(np.sum(spin**2, axis=0)) / np.sqrt(ux * ux + uy * uy + uz * uz)
+            lift = lift / (1.0 + world.lift_saturation * ratio)
         out[3] += lift * (spin[1] * uz - spin[2] * uy)
         out[4] += lift * (spin[2] * ux - spin[0] * uz)
         out[5] += lift * (spin[0] * uy - spin[1] * ux)

@@ -14,6 +14,7 @@ NOT_EXAMINED = {
     "ball_radius",  # a twin of drag, as the mass is
     "magnus_coefficient",  # named as magnus, the nominal ball does not spin
     "spin_decay",
+    "lift_saturation",  # ball/test_spins
     "paddle_restitution",  # hits: test_hits
     "paddle_friction",
     "paddle_tilt",

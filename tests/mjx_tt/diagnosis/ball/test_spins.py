@@ -116,16 +116,33 @@ def test_two_ordinary_causes_far_from_nominal_are_both_found(tmp_path, restituti
         assert abs(estimate.estimate - true) < 0.003 and estimate.high - estimate.low < 0.01
 
 
+def _model(magnus_coefficient):
+    nominal = SimModel()
+    flight = replace(nominal.ball.flight, magnus_coefficient=magnus_coefficient)
+    return replace(nominal, ball=replace(nominal.ball, flight=flight))
+
+
+@pytest.mark.slow
+def test_lift_that_saturates_with_spin_is_named(tmp_path):
+    rng = np.random.default_rng(6)
+    balls = draw_balls(rng, 200)
+    size = rng.uniform(10.0, 160.0, 200) * np.where(balls.human, 1.0, -1.0)
+    spin = size * rng.choice([1.0, 1.0, -0.6], 200) * np.array([1.0, 0.1, 0.2])[:, None]
+    logs = _log(tmp_path, World(magnus_coefficient=0.9, lift_saturation=1.5), with_spin(balls, spin), rng)
+    found = diagnose(logs, _model(0.9))
+    assert found.verdict.verdict == "named"
+    causes = {c.name: c for c in found.verdict.causes}
+    estimate = causes["lift_saturation"].parameters["ball.flight.lift_saturation"]
+    assert set(causes) == {"lift_saturation"} and estimate.low - 0.2 < 1.5 < estimate.high + 0.2
+
+
 def test_spins_of_any_size_are_estimated_with_their_intervals(tmp_path):
     """Balls of two kinds, fast topspin and backspin, under another integrator; k is known, nothing is wrong."""
     rng = np.random.default_rng(5)
     balls = draw_balls(rng, 80)
     spin = _two_kinds(rng, 80)[0].T * np.where(balls.human, 1.0, -1.0)
-    nominal = SimModel()
-    flight = replace(nominal.ball.flight, magnus_coefficient=0.6)
-    nominal = replace(nominal, ball=replace(nominal.ball, flight=flight))
     logs = _log(tmp_path, World(magnus_coefficient=0.6), with_spin(balls, spin), rng)
-    found = diagnose(logs, nominal)
+    found = diagnose(logs, _model(0.6))
     assert found.verdict.verdict == "none"
     spins = found.balls.spins
     kept = [int(name) for name in spins.name]
