@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.flights import noise
-from mjx_tt.diagnosis.ball.flights.fit import fit_starts
+from mjx_tt.diagnosis.ball.flights.fit import fit_starts, refit_worst
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Situation, project
 from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior, learned
@@ -86,6 +86,9 @@ def fit(
         if moved < SETTLED:
             converged = True
             break
+    if prior is not None:
+        start = refit_worst(problem, at.theta, at.start, g, own, prior)
+        at = Situation(at.theta, fit_starts(problem, at.theta, start, g, own, prior))
     linear = problem.linearise(at)
     return Posterior(at.theta, covariance, tuple(free), at, linear, own, prior, converged)
 

@@ -16,6 +16,8 @@ from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, SpinPrior, le
 WINDOWS = (0.1, 0.2, 0.3, 0.4)  # [s] of a flight that the first fit takes in turn
 LEAST_DAMPING = 1e-9
 SPINS_TO_TRY = ((0.0, 0.0, 0.0), (100.0, 0.0, 0.0), (-100.0, 0.0, 0.0))  # [rad/s] for each ball
+OTHER_SPINS = (*SPINS_TO_TRY, (0.0, 0.0, 100.0), (0.0, 0.0, -100.0), (0.0, 100.0, 0.0), (0.0, -100.0, 0.0))
+WORST = 1.35  # times the median cost of a sample beyond which a ball is tried again
 BROAD = SpinPrior(np.zeros(3), np.array([80.0, 60.0, 80.0]))  # [rad/s] of spins before anything is known of them
 
 
@@ -123,6 +125,28 @@ def fit_spins(
     fitted, cost = fit_with_cost(tried, changes, begin, many, tiled, prior, rounds=8)
     best = np.argmin(np.where(np.isfinite(cost), cost, np.inf).reshape(count, g.n), axis=0)
     return fitted.reshape(9, count, g.n)[:, best, np.arange(g.n)]
+
+
+def refit_worst(
+    problem: BallProblem, theta: np.ndarray, start: np.ndarray, g: Grid, noise: Noise, prior: SpinPrior
+) -> np.ndarray:
+    """Starts (9, n) with those of the balls that fit worst tried again from other spins, and kept where that is better.
+
+    A ball whose fit ended in the wrong valley would look like one that flies unlike the others.
+    """
+    cost = fit_with_cost(problem, theta, start, g, noise, prior, rounds=0)[1]
+    per_sample = cost / np.maximum(g.mask.sum(axis=0), 1)
+    worst = np.flatnonzero(per_sample > WORST * np.median(per_sample))
+    if not worst.size:
+        return start
+    few = picked(g, worst)
+    own = replace(noise, frame=noise.frame[..., worst], scale=noise.scale[:, worst])
+    some = BallProblem(few, problem.model, problem.effects, heading(few))
+    again = fit_spins(some, theta, start[:, worst], few, own, prior.of_some(worst), OTHER_SPINS)
+    again, new = fit_with_cost(some, theta, again, few, own, prior.of_some(worst), rounds=4)
+    out = start.copy()
+    out[:, worst] = np.where(new < cost[worst], again, start[:, worst])
+    return out
 
 
 def heading(g: Grid) -> np.ndarray:
