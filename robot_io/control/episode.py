@@ -25,7 +25,7 @@ from robot_io.control.kinks import (
     over_table,
     slope,
 )
-from robot_io.control.strokes import COMING, LEAVING
+from robot_io.control.strokes import COMING, GAP, LEAVING
 from robot_io.devices.tracker import BallSample
 
 REACH = 0.35  # [m] between ball and blade when the ball turns round, else it did not touch the blade
@@ -233,7 +233,9 @@ class Episode:
 
     def _out_of_sight(self, now: float) -> None:
         """Decide for a ball that is not seen any more: a return came down where it was flying to."""
-        samples = list(self._recent)[-SIDE:]
+        samples = list(self._recent)
+        gaps = [i for i in range(1, len(samples)) if samples[i].time - samples[i - 1].time > GAP]
+        samples = samples[: gaps[0] if gaps else None][-SIDE:]  # after a gap it may have been struck already
         if self.hit and self.crossed and len(samples) == SIDE and samples[0].time > self._turned:
             velocity = slope(samples)
             velocity[2] -= 0.5 * GRAVITY * (samples[-1].time - samples[0].time)
