@@ -1,4 +1,4 @@
-"""What of a verdict goes into the extended model, by parts written out by hand."""
+"""Values of a verdict that go into the extended model, by parts written out by hand."""
 
 from __future__ import annotations
 
