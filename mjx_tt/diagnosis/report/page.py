@@ -21,7 +21,7 @@ from mjx_tt.diagnosis.ball import selection
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE
 from mjx_tt.diagnosis.diagnose import Diagnosis
 from mjx_tt.diagnosis.hits.diagnose import LEAST_SHIFT, RETURN
-from mjx_tt.diagnosis.report import cleaning, figures, residuals, text
+from mjx_tt.diagnosis.report import cleaning, figures, residuals, spins, text
 from mjx_tt.diagnosis.report.rivals import rivals
 from mjx_tt.diagnosis.verdict import Cause
 from mjx_tt.viz.html import Page, environment
@@ -83,6 +83,7 @@ def _page(d: Diagnosis, title: str, play: Play | None) -> Page:
         ("What these logs cannot tell", "open_questions", _open_questions),
         ("Parameters", "parameters", _parameters),
         ("Gain on data that was not used", "held_out", _held_out),
+        ("Spin of the balls", "spins", _spins),
         ("What it costs in play", "play", lambda d, page: _play(play, page)),
         ("What to measure next", "next", _next),
         ("What was taken out of the tracks", "cleaned", _cleaned),
@@ -312,6 +313,19 @@ def _next(d: Diagnosis, page: Page) -> Context:
     causes = [c for c in d.verdict.causes if len(c.group) > 1]
     readings = dict.fromkeys(r for c in causes for r in c.separating_measurement.split("; ") if r)
     return {"steps": d.verdict.next_experiment, "few": FEW, "readings": list(readings)}
+
+
+def _spins(d: Diagnosis, page: Page) -> Context:
+    found = d.balls
+    if found is None or (found.spins is None and not found.spin_notes):
+        return None
+    context: dict[str, object] = {"notes": found.spin_notes, "picture": None}
+    if found.spins is not None:
+        context["picture"] = page.embed("spins", spins.spins(found.spins))
+        context["balls"] = len(found.spins.name)
+        context["size"] = f"{np.median(np.linalg.norm(found.spins.mean, axis=0)):.0f}"
+        context["deviation"] = f"{np.median(found.spins.std):.1f}"
+    return context
 
 
 def _cleaned(d: Diagnosis, page: Page) -> Context:
