@@ -19,6 +19,7 @@ from PIL import Image
 from ballmodel.trajectory import Trajectory
 from mjx_tt import diagnosis as gap
 from mjx_tt.diagnosis.ball import effects as catalogue
+from mjx_tt.diagnosis.ball.spins import Spins
 from mjx_tt.diagnosis.hits.diagnose import HitCause, HitFindings
 from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.diagnosis.joint import effects as joint_effects
@@ -277,6 +278,20 @@ def test_unexplained_says_where_and_how_much(windy, joints, tmp_path):
     assert "5 of 60 balls fly unlike the others" in words.sentence(replace(windy, verdict=subset))
     page, _ = written(tmp_path, replace(joints, verdict=v))
     assert ("span", {"class": "badge unexplained"}) in page.tags
+
+
+def test_spins_are_drawn_and_what_was_tried_is_told(windy, tmp_path):
+    mean = np.random.default_rng(0).normal([[60.0], [0.0], [5.0]], 30.0, (3, 40))
+    names = tuple(map(str, range(40)))
+    spins = Spins(("day",) * 40, names, np.zeros(40), mean, np.full((3, 40), 4.0))
+    note = "spin was tried because something stayed open without it, and kept: its evidence is 850 better"
+    page, files = written(tmp_path, replace(windy, balls=replace(windy.balls, spins=spins, spin_notes=(note,))))
+    section = page.sections["Spin of the balls"]
+    assert "40 balls" in section and "4.0 rad/s" in section and "S" + note[1:] in section
+    assert f"median {np.median(np.linalg.norm(mean, axis=0)):.0f} rad/s" in section
+    assert "spins.png" in [f.name for f in files]
+    page, _ = written(tmp_path / "without", windy)
+    assert "Spin of the balls" not in page.sections
 
 
 def hit_findings(names=("paddle_offset",)) -> HitFindings:
