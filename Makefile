@@ -40,7 +40,7 @@ test: $(READY)
 	$(PYTEST) -m "not slow and realtime"
 
 test-slow: $(READY)
-	$(PYTEST) $(PARALLEL) -m slow
+	USERS_FUSION=1 $(PYTEST) $(PARALLEL) -m slow
 
 test-all: test test-slow
 
