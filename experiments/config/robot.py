@@ -15,6 +15,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from experiments.config.experiment import read_yaml
 from experiments.config.validation import LONGEST, nearest
 from experiments.errors import ConfigError, checked
+from robot_io.calibrated import Calibration
 from robot_io.control.config import RobotConfig
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.opponent import Throws
@@ -34,12 +35,18 @@ WORDS = {
     "tuple_type": "a list",
     "finite_number": "a finite number",
 }
-Config = TypeVar("Config", RobotConfig, RigParams)
+Config = TypeVar("Config", RobotConfig, RigParams, Calibration)
 
 
 def load_robot(path: str | Path) -> RobotConfig:
-    """A robot.yaml; without ``safety.speed_scale`` the robot is slow: COMMISSIONING. Raises ConfigError."""
+    """A robot.yaml, its calibration in it or in a file that it names. Raises ConfigError.
+
+    Without ``safety.speed_scale`` the robot is slow: COMMISSIONING.
+    """
     data = _mapping(path)
+    if isinstance(named := data.get("calibration"), str):  # relative to robot.yaml
+        file = Path(path).parent / named
+        data["calibration"] = plain(fill(Calibration, _mapping(file), str(file)))
     safety = data.setdefault("safety", {})
     if isinstance(safety, dict):
         safety.setdefault("speed_scale", COMMISSIONING)
@@ -51,9 +58,14 @@ def load_rig(path: str | Path | None) -> RigParams:
     return RigParams() if path is None else fill(RigParams, _mapping(path), str(path))
 
 
-def to_yaml(config: RobotConfig | RigParams) -> str:
+def to_yaml(config: RobotConfig | RigParams | Calibration) -> str:
     """Every key of a robot or rig with its value, ready to be edited."""
-    return yaml.safe_dump(json.loads(json.dumps(dataclasses.asdict(config))), sort_keys=False)
+    return yaml.safe_dump(plain(config), sort_keys=False)
+
+
+def plain(config: RobotConfig | RigParams | Calibration) -> dict[str, Any]:
+    """The same as a mapping, with lists for tuples."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
 def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
@@ -70,7 +82,7 @@ def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
 def _adapters() -> dict[type, TypeAdapter]:
     """Readers of files {"file": content}, by the dataclass of their content."""
     found: dict[type, TypeAdapter] = {}
-    for kind in (RobotConfig, RigParams):
+    for kind in (RobotConfig, RigParams, Calibration):
 
         class Content:  # pydantic takes the strictness of this class into the dataclasses inside
             __pydantic_config__ = STRICT

@@ -23,7 +23,7 @@ import numpy as np
 
 from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, JOINT_NAMES, LIMITS, N_JOINTS
 from robot_io.control.episode import Episode, EpisodeSummary
-from robot_io.control.homing import check_homing
+from robot_io.control.homing import check_homing, towards
 from robot_io.control.interfaces import STANDARD_PLAY, Axes
 from robot_io.control.interfaces import BridgeConfig as BridgeConfig
 from robot_io.control.interfaces import BridgeState as BridgeState
@@ -296,7 +296,9 @@ class Bridge:
             self._change(BridgeState.ACTIVE, now, f"ball {self.tracker.ball}")
         if self.state is BridgeState.ACTIVE:
             return self._ask_policy(now, self.episode, self._policy)
-        return self._homeward() if self.state is BridgeState.READY else np.zeros(N_JOINTS)
+        if self.state is not BridgeState.READY:
+            return np.zeros(N_JOINTS)
+        return towards(self._home, self.gate.reference, self._home_speed, self._home_braking, self.gate.period)
 
     def _ages(self, now: float) -> dict[str, float]:
         arm, seen = self.arm_session.feedback, self.tracker.received
@@ -316,6 +318,8 @@ class Bridge:
         arm, axes = self.arm_session.problem(now), self.axes.problem(now)
         self.gate.condition(Cause.ARM_NOT_READY, arm is not None, arm or "", now)
         self.gate.condition(Cause.AXIS_LOST, axes is not None, axes or "", now)
+        clock = self.tracker.clock.problem
+        self.gate.condition(Cause.CLOCK, clock is not None, clock or "", now)
         armed = self._state in (BridgeState.READY, BridgeState.ACTIVE)
         if armed and self.arm_session.session_id != self._arm_session_id:
             self._arm_session_id = self.arm_session.session_id
@@ -329,7 +333,7 @@ class Bridge:
         if episode is None or policy is None:
             self.gate.fault(Cause.INTERNAL, "neither ball nor policy to play", now)
             return np.zeros(N_JOINTS)
-        observation = observe(self._feedback, self.config.delays, now)
+        observation = observe(self._feedback, self.config.delays, now, self.config.base)
         if observation is None:
             if self._feedback.ball.at(now - self.config.delays.ball) is None:
                 episode.over = True  # frames come, as the gate has checked, but the ball is out of sight
@@ -348,14 +352,6 @@ class Bridge:
         episode.steps += 1
         self._log(Observation(self.counts.ticks, now, observation), Action(self.counts.ticks, now, action))
         return action * self._policy_limit
-
-    def _homeward(self) -> np.ndarray:
-        """Velocity (8,) towards the home pose: as fast as it can still be braked, and slower than the policy may."""
-        error = self._home - self.gate.reference
-        distance = np.abs(error)
-        speed = np.minimum(self._home_speed, np.sqrt(2.0 * self._home_braking * distance))
-        speed = np.minimum(speed, distance / (3.0 * self.gate.period))
-        return np.where(distance < 1e-4, 0.0, np.sign(error) * speed)
 
     def _after(self, now: float) -> None:
         """Follows the gate's state."""

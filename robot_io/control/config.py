@@ -5,6 +5,8 @@ from __future__ import annotations
 import ipaddress
 from dataclasses import dataclass, field
 
+from robot_io.calibrated import RANGES as CALIBRATION_RANGES
+from robot_io.calibrated import Calibration
 from robot_io.contract import CONTROL_RATE, FESTO_JOINTS, LIMITS
 from robot_io.control.observation import ObservationDelays
 from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
@@ -15,6 +17,7 @@ from robot_io.safety.config import SafetyConfig
 PROFILES = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
 ANSWER_TIME = 0.035  # [s] for an axis to answer: less than the age at which its state counts as stale
 AXIS_NAMES = ("gantry_x", "gantry_y")
+SAME_ZERO = 1e-4  # [m] by which the zeros of a linear axis may differ from those of the robot's calibration
 
 PORT = (1, 65535)
 # Allowed in a robot.yaml: watchdogs, margins and time-outs end where they would no longer protect
@@ -46,6 +49,8 @@ RANGES = {
     "tracker.oldest": (0.01, 0.2),
     "tracker.ahead": (0.0, 0.02),
     "tracker.clock_offset": (-1e10, 1e10),
+    "tracker.clock_bound": (0.001, 0.02),
+    "tracker.latency": (0.0, 0.1),
     "safety.speed_scale": (0.001, 1.0),
     "safety.table_margin": (0.01, 0.5),
     "safety.self_margin": (0.01, 0.5),
@@ -64,6 +69,7 @@ RANGES = {
     "safety.stale_policy": (0.02, 0.1),
     "realtime.priority": (1, 99),
     "realtime.spin": (0.0, 0.005),
+    **{f"calibration.{key}": allowed for key, allowed in CALIBRATION_RANGES.items()},
 }
 
 
@@ -115,6 +121,7 @@ class RobotConfig:
     delays: ObservationDelays = ObservationDelays()
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     realtime: RealTimeConfig = RealTimeConfig()
+    calibration: Calibration = Calibration()
 
     def __post_init__(self) -> None:
         if self.rate != CONTROL_RATE:
@@ -132,6 +139,12 @@ class RobotConfig:
                 raise ValueError(
                     f"safety.following_error[{i}] is {self.safety.following_error[i]} m, allowed is 0.005 to 0.1"
                 )
+        measured, zeros = self.calibration.robot, tuple(axis.zero for axis in self.axes)
+        if measured.date and any(abs(a - b) > SAME_ZERO for a, b in zip(measured.axes_zero, zeros, strict=True)):
+            raise ValueError(
+                f"calibration.robot.axes_zero is {measured.axes_zero}, axes[0].zero and axes[1].zero are {zeros}: the "
+                "robot was calibrated with other zeros; calibrate it again (mjx-tt calibrate robot)"
+            )
         for path in ("arm.host", "arm.controller", "tracker.host", "tracker.source"):
             device, name = path.split(".")
             value = getattr(getattr(self, device), name)

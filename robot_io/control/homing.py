@@ -1,4 +1,4 @@
-"""Homing of the linear axes: a motion that the drives make on their own, past the gate, so the arm must be clear."""
+"""Ways to a known place: of the axes to their references, past the gate, so the arm must be clear; of the robot."""
 
 from __future__ import annotations
 
@@ -26,3 +26,12 @@ def check_homing(geometry: RobotGeometry, measured: np.ndarray) -> None:
             f"axes not homed: somewhere on their way {row} comes as near as {gaps.min():.3f} m, allowed is "
             f"{HOMING_GAP} m; jog the arm to its home pose first"
         )
+
+
+def towards(target: np.ndarray, at: np.ndarray, speed: np.ndarray, braking: np.ndarray, period: float) -> np.ndarray:
+    """Velocity (8,) from ``at`` to the target: at most ``speed``, and such that ``braking`` suffices to stop there."""
+    error = target - at
+    distance = np.abs(error)
+    wanted = np.minimum(speed, np.sqrt(2.0 * braking * distance))
+    wanted = np.minimum(wanted, distance / (3.0 * period))
+    return np.where(distance < 1e-4, 0.0, np.sign(error) * wanted)

@@ -8,7 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
-from robot_io.control.observation import ObservationDelays
+from robot_io.calibrated import Frame
+from robot_io.control.observation import HERE, ObservationDelays
 from robot_io.control.rally import Box
 
 
@@ -47,6 +48,7 @@ class BridgeConfig:
     home_speed       share of the policy's velocity limits on the way home
     home_braking     share of the acceleration limits there
     box              what the policy was trained for; None: no ball is out of distribution
+    base             where the robot stands, from where the model has it
     """
 
     delays: ObservationDelays = ObservationDelays()
@@ -54,6 +56,7 @@ class BridgeConfig:
     home_speed: float = 0.5
     home_braking: float = 0.3
     box: Box | None = None
+    base: Frame = HERE
 
 
 STANDARD_PLAY = BridgeConfig()

@@ -11,8 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from robot_io.calibrated import Frame
 from robot_io.contract import N_JOINTS
 from robot_io.history import History
+
+HERE = Frame()
 
 
 @dataclass(frozen=True)
@@ -38,11 +41,14 @@ class Feedback:
     arm: History
 
 
-def observe(feedback: Feedback, delays: ObservationDelays, now: float) -> np.ndarray | None:
-    """The observation (11,) at ``now`` in the order of the contract; None while a device has nothing recent to say."""
+def observe(feedback: Feedback, delays: ObservationDelays, now: float, base: Frame = HERE) -> np.ndarray | None:
+    """The observation (11,) at ``now`` in the order of the contract; None while a device has nothing recent to say.
+
+    base  where the robot stands: policies know the ball as it is seen from there
+    """
     ball = feedback.ball.at(now - delays.ball)
     axes, arm = feedback.axes.at(now - delays.axes), feedback.arm.at(now - delays.arm)
-    return None if ball is None or axes is None or arm is None else np.concatenate([ball, axes, arm])
+    return None if ball is None or axes is None or arm is None else np.concatenate([base.inward(ball), axes, arm])
 
 
 def joints(feedback: Feedback) -> tuple[np.ndarray, np.ndarray]:

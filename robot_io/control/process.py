@@ -35,6 +35,7 @@ from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.policy.policy import Policy
+from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.gate import SafetyGate
 
 STATUS_PERIOD = 0.2  # [s]
@@ -104,13 +105,13 @@ class Control:
 
     def __init__(self, config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
         self._config, self._options, self._pipe = config, options, pipe
-        loaded = artefacts.load(options.artefact)
+        loaded, arm, found = artefacts.load(options.artefact), config.arm, config.calibration.robot
         policy = make_policy(options.backend, loaded.policy)
         self.timings = Timings()
         self._opened: list[Closable] = []
         self._unsent: deque[messages.Message] = deque()
         try:
-            self._arm_socket = self._open(EgmSocket(config.arm.host, config.arm.port))
+            self._arm_socket = self._open(EgmSocket(arm.host, arm.port))
             self._tracker_socket = self._open(TrackerSocket(config.tracker))
             recorder: log.SessionRecorder = log.NullRecorder()
             if options.log_folder is not None:
@@ -121,11 +122,11 @@ class Control:
             self._recorder = self._open(recorder)
             self._axes = self._open(AxesThread(linear_axes(config)))
             self._session = EgmSession(
-                EgmConfig(config.arm.controller, config.arm.controller_port, timeout=config.arm.timeout)
+                EgmConfig(arm.controller, arm.controller_port, timeout=arm.timeout, zeros=found.joint_zeros)
             )
-            self._tracker = Tracker(config.tracker)
-            gate = SafetyGate(config=config.safety)
-            bridge_config = BridgeConfig(delays=config.delays, box=options.box)
+            self._tracker = Tracker(config.tracker, config.calibration)
+            gate = SafetyGate(geometry=RobotGeometry.load().moved(found.base), config=config.safety)
+            bridge_config = BridgeConfig(delays=config.delays, box=options.box, base=found.base)
             self.bridge = Bridge(
                 self._session,
                 self._axes,

@@ -23,6 +23,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from robot_io.calibrated import UNCALIBRATED, Calibration
+from robot_io.devices.clock import Clock
 from robot_io.errors import DeviceError
 from robot_io.history import History
 
@@ -94,7 +96,10 @@ class TrackerConfig:
     source_port      port that it sends from; None takes that of the first valid frame, and again after 1 s of silence
     oldest           [s] age at which a frame is too old to be used
     ahead            [s] by which a capture time may lie in the future: clocks that differ by more are refused
-    clock_offset     [s] added to capture times: bridge's monotonic clock minus the tracker's clock
+    clock_offset     [s] added to capture times: bridge's monotonic clock minus the tracker's clock; None: measured in
+                     the first second of frames, which is not used otherwise
+    clock_bound      [s] by which the measured offset may miss it before the robot is stopped
+    latency          [s] least time from a capture to its arrival, from which the offset is measured
     """
 
     host: str = "127.0.0.1"
@@ -102,21 +107,28 @@ class TrackerConfig:
     source: str = "127.0.0.1"
     oldest: float = 0.15
     ahead: float = 0.005
-    clock_offset: float = 0.0
+    clock_offset: float | None = 0.0
+    clock_bound: float = 0.01
+    latency: float = 0.015
     source_port: int | None = None
 
 
 class Tracker:
     """Keeps the ball's track from datagrams; knows no sockets and reads no clock."""
 
-    def __init__(self, config: TrackerConfig) -> None:
-        self.config = config
+    def __init__(self, config: TrackerConfig, calibration: Calibration = UNCALIBRATED) -> None:
+        self.config, self.frame = config, calibration.tracker
+        clock = calibration.clock
+        drift = clock.drift if clock.date else None
+        self.clock = Clock(config.clock_offset, config.latency, config.clock_bound, drift)
+        self.measured = 0  # seconds of the clock so far
         self.track = History(length=256, longest_hold=0.06)
         self.ball = -1  # number of the ball that the track belongs to
         self.received: float | None = None  # [s] when the last accepted frame came
         self.seen: float | None = None  # [s] capture time of the last frame that showed a ball
         self.newest: BallSample | None = None
         self.counts: Counter[str] = Counter()
+        self._heard: float | None = None  # [s] when the last frame came, accepted or not
         self._sequence: int | None = None
         self._port = config.source_port  # that frames are taken from
         self._far: int | None = None  # sequence number far ahead of the track's, not confirmed yet
@@ -133,7 +145,15 @@ class Tracker:
         except ValueError as error:
             self.counts[str(error).split(":")[0]] += 1
             return None
-        captured = sample.captured + self.config.clock_offset
+        if silent and self._heard is not None and now - self._heard > SILENCE:
+            self.clock.restart()
+        self._heard = now
+        self.measured += self.clock.add(sample.captured, now)
+        offset = self.clock.offset(sample.captured)
+        if offset is None:
+            self.counts["clock"] += 1
+            return None
+        captured = sample.captured + offset
         age = now - captured
         if age < -self.config.ahead or age > self.config.oldest:
             self.counts["future" if age < 0 else "stale"] += 1
@@ -143,7 +163,8 @@ class Tracker:
         self._sequence, self._far = sample.sequence, None
         self.received = now
         self._port = port if self._unpinned(silent) else self._port
-        sample = BallSample(sample.sequence, sample.ball, captured, sample.position)
+        position = None if sample.position is None else self.frame.outward(sample.position)
+        sample = BallSample(sample.sequence, sample.ball, captured, position)
         self.newest = sample
         if sample.position is None:
             self.counts["accepted"] += 1

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from robot_io.devices.festo import AxesConfig
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.axis_drive import DriveParams
+from robot_io.emulator.hidden import HiddenErrors
 from robot_io.emulator.network import NetworkFaults
 from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.world import WorldParams
@@ -53,6 +54,11 @@ RANGES = {
     "action_delay": (0.0, 1.0),
     "pause": (0.0, 600.0),
     "seed": (0, 2**31),
+    "hidden.camera_position": (-5.0, 5.0),
+    "hidden.camera_angles": (-1.5, 1.5),
+    "hidden.joint_zeros": (-0.05, 0.05),
+    "hidden.clock_offset": (-1e6, 1e6),
+    "hidden.clock_drift": (-1e-3, 1e-3),
 }
 
 
@@ -74,6 +80,7 @@ class RigParams:
     pause: float = 0.6  # [s] before a ball is thrown; patient: after the robot stood at home, else up to that
     patient: bool = True
     seed: int = 0
+    hidden: HiddenErrors = HiddenErrors()
 
     def __post_init__(self) -> None:
         check_ranges(self, RANGES)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from robot_io.calibrated import UNCALIBRATED, Calibration
 from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_JOINTS
 from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState, Policy
 from robot_io.control.config import PROFILES, axis_range
@@ -32,10 +33,12 @@ from robot_io.emulator.tracker import TrackerEmulator
 from robot_io.emulator.world import World
 from robot_io.errors import RefusedError
 from robot_io.log.recorder import SessionRecorder
+from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.gate import SafetyConfig, SafetyGate
 
 GRID = 3000  # ticks a second of the clock, so that 75, 125 and 250 Hz are whole numbers of them
 ARM, AXES, TRACK, CONTROL = GRID // 250, GRID // 125, GRID // 125, GRID // 75
+SAME_CLOCK = TrackerConfig()
 BRIDGE, CONTROLLER = ("127.0.0.1", 6510), ("127.0.0.1", 6511)
 
 
@@ -45,6 +48,7 @@ class LockStep:
     scene   the MJCF
     balls   what is thrown, from ball number ``first`` on, or who plays rallies
     world   one to use again, which is reset: making it takes a while
+    tracker, calibration  what the bridge knows of the installation
     """
 
     def __init__(
@@ -58,6 +62,8 @@ class LockStep:
         recorder: SessionRecorder | None = None,
         first: int = 0,
         world: World | None = None,
+        tracker: TrackerConfig = SAME_CLOCK,
+        calibration: Calibration = UNCALIBRATED,
     ) -> None:
         self.params = params
         self.world = world or World(scene, params.world)
@@ -77,7 +83,7 @@ class LockStep:
             AXES_CONFIG,
         )
         seed = np.random.SeedSequence([params.seed, first]).generate_state(4)
-        self.cameras = TrackerEmulator(params.tracker, int(seed[0]))
+        self.cameras = TrackerEmulator(params.tracker, int(seed[0]), params.hidden)
         self._to_bridge = Network(params.arm_network, int(seed[1]))
         self._to_arm = Network(params.arm_network, int(seed[2]))
         self._frames = Network(params.tracker_network, int(seed[3]))
@@ -85,14 +91,15 @@ class LockStep:
         self.summaries: deque[EpisodeSummary] = deque()
         self.rallies: list[RallySummary] = []
         self.track = np.zeros((0, 4))  # t [s], x, y, z [m] of the newest ball with an outcome, on its way to the robot
-        session = EgmSession(EgmConfig(controller_address=CONTROLLER[0]))
+        found = calibration.robot
+        session = EgmSession(EgmConfig(controller_address=CONTROLLER[0], zeros=found.joint_zeros))
         self.bridge = Bridge(
             session,
             self.axes,
-            Tracker(TrackerConfig()),
-            SafetyGate(config=safety),
+            Tracker(tracker, calibration),
+            SafetyGate(geometry=RobotGeometry.load().moved(found.base), config=safety),
             policy,
-            config,
+            replace(config, base=found.base),
             recorder,
             self._played,
             self.rallies.append,
@@ -135,7 +142,7 @@ class LockStep:
     def _devices(self, now: float) -> None:
         qpos, qvel = self.world.qpos, self.world.qvel
         abb = list(ABB_JOINTS)
-        speed, datagram = self.arm.step(now, qpos[abb], qvel[abb])
+        speed, datagram = self.arm.step(now, self.params.hidden.counted(qpos[abb]), qvel[abb])
         self._setpoint[abb] = speed
         for i, emulator in zip(FESTO_JOINTS, self.emulators, strict=True):
             self._setpoint[i] = emulator.step(now, float(qpos[i]), float(qvel[i]))

@@ -246,7 +246,7 @@ def _arm(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> N
                 _operate(controller, pipe.recv()[0])
             now = time.monotonic()
             qpos, qvel = shared.read("qpos", "qvel")
-            setpoint, datagram = controller.step(now, qpos[rows], qvel[rows])
+            setpoint, datagram = controller.step(now, params.hidden.counted(qpos[rows]), qvel[rows])
             shared["setpoint"][rows] = setpoint
             if datagram is not None:
                 out.send(datagram, now)
@@ -305,7 +305,7 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> 
 
 def _tracker(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> None:
     cameras, network = (
-        TrackerEmulator(params.tracker, params.seed + 2),
+        TrackerEmulator(params.tracker, params.seed + 2, params.hidden),
         Network(params.tracker_network, params.seed + 3),
     )
     period = 1.0 / params.tracker.rate

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robot_io.devices.tracker import BallSample, encode
+from robot_io.emulator.hidden import NOTHING_HIDDEN, HiddenErrors
 from robot_io.emulator.world import World
 
 IDENTITIES = ("ball", "stroke", "lost")
@@ -45,8 +46,8 @@ class TrackerParams:
 class TrackerEmulator:
     """Frames of the ball; ``step`` once per 1 / rate seconds."""
 
-    def __init__(self, params: TrackerParams, seed: int) -> None:
-        self._params, self._random = params, np.random.default_rng(seed)
+    def __init__(self, params: TrackerParams, seed: int, hidden: HiddenErrors = NOTHING_HIDDEN) -> None:
+        self._params, self._hidden, self._random = params, hidden, np.random.default_rng(seed)
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._sequence = 0
         self._silent_until = -np.inf
@@ -59,9 +60,12 @@ class TrackerEmulator:
         """Captures a frame: the ball's number and true position (3,) [m], None when there is none."""
         params = self._params
         if position is not None:
-            position = position + params.noise * self._random.normal(size=3) + np.array(params.offset)
+            position = (
+                self._hidden.seen(position) + params.noise * self._random.normal(size=3) + np.array(params.offset)
+            )
         if now >= self._silent_until:
-            self._waiting.append((now + params.latency, encode(BallSample(self._sequence, ball, now, position))))
+            frame = BallSample(self._sequence, ball, self._hidden.stamped(now), position)
+            self._waiting.append((now + params.latency, encode(frame)))
         self._sequence += 1
 
     def due(self, now: float) -> list[bytes]:

@@ -12,6 +12,7 @@ Gaps are signed: negative by how deep a capsule overlaps, at most by its radius 
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from robot_io.calibrated import Frame
 from robot_io.contract import JOINT_NAMES, N_JOINTS
 
 Array = TypeVar("Array", bound=Any)  # of NumPy or JAX
@@ -158,6 +160,17 @@ class RobotGeometry:
             remedy = "write it with python -m mjx_tt.robot.geometry_export"
             raise GeometryError(f"{source}: cannot be read ({error}); {remedy}") from error
         return cls(data, str(source))
+
+    def moved(self, base: Frame) -> RobotGeometry:
+        """The same robot on a base that stands elsewhere; table and floor stay."""
+        if base.neutral:
+            return self
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = base.matrix, base.position
+        other = copy.copy(self)
+        other._basis = self._basis.copy()
+        other._basis[0] = (place @ self._basis[0].reshape(4, 4, 4)).reshape(4, 16)
+        return other
 
     def ends(self, q: np.ndarray) -> np.ndarray:
         """World end points (2, 3, capsules, B) of every capsule's axis at joint positions q (8, B)."""

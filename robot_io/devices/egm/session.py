@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from robot_io.contract import ABB_JOINTS
 from robot_io.devices.egm.messages import MAX_DATAGRAM, UINT32, decode_robot, encode_sensor
 from robot_io.devices.egm.messages import EgmError as EgmError
 
@@ -34,12 +35,14 @@ class EgmConfig:
     controller_port     port that packets are taken from; None learns it. Two senders at once are then a problem
     period              the controller's cycle [s]
     timeout             age [s] at which feedback is stale: ``problem`` says so, and the next packet opens a new session
+    zeros               (6,) [rad] added to every position that comes, and taken from every one that goes
     """
 
     controller_address: str | None = None
     controller_port: int | None = None
     period: float = 0.004
     timeout: float = 0.05
+    zeros: tuple[float, ...] = (0.0,) * len(ABB_JOINTS)
 
     def __post_init__(self) -> None:
         if self.controller_address is not None:
@@ -108,6 +111,7 @@ class EgmSession:
         self.session_id = 0
         self.endpoint: tuple[str, int] | None = None
         self.statistics = EgmStatistics()
+        self._zeros = np.array(config.zeros)
         self._time_ms = 0
         self._pending = False
         self._reply_sequence = 0
@@ -143,7 +147,7 @@ class EgmSession:
         self.feedback = ArmFeedback(
             sequence=message.sequence,
             time=message.time_ms / 1000.0,
-            position=message.position,
+            position=_read_only(message.position + self._zeros),
             motors_on=message.motors_on,
             egm_running=message.egm_running,
             rapid_running=message.rapid_running,
@@ -161,7 +165,10 @@ class EgmSession:
         """
         if not self._pending:
             return None
-        datagram = encode_sensor(self._reply_sequence, int(now * 1000.0), position, velocity)
+        wire = np.asarray(position, float)
+        if wire.shape == self._zeros.shape:
+            wire = wire - self._zeros
+        datagram = encode_sensor(self._reply_sequence, int(now * 1000.0), wire, velocity)
         self._pending = False
         if self._is_stale(now):
             return None
@@ -246,6 +253,11 @@ def _order(sequence_change: int, time_change: int, silence: float, config: EgmCo
         return "out_of_order"
     neighbour = 0 < steps < RECENT / config.period and 0 <= elapsed < RECENT
     return "next" if neighbour and silence <= config.timeout else "new"
+
+
+def _read_only(values: np.ndarray) -> np.ndarray:
+    values.flags.writeable = False
+    return values
 
 
 def _signed(difference: int) -> int:

@@ -89,11 +89,13 @@ def test_every_number_of_a_robot_has_a_ceiling():
     data = yaml.safe_load(robot.to_yaml(RobotConfig()))
     found = {".".join(str(key) for key in path if isinstance(key, str)) for path in paths(data)}
     sections = {"arm", "axes", "axes_motion", "tracker", "delays", "safety", "realtime"}
+    sections |= {"calibration", *(f"calibration.{part}" for part in ("tracker", "robot", "clock"))}
     words = {
         "name",
         "rate",
         "axis_profile",
         "realtime.lock_memory",
+        *(f"calibration.{part}.date" for part in ("tracker", "robot", "clock")),
         *(f"{d}.{n}" for d in ("arm", "axes", "tracker") for n in ("host", "controller", "source")),
     }
     delays = {f"delays.{name}" for name in ("ball", "arm", "axes")}  # bounded by themselves, at 0.1 s

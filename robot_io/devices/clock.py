@@ -1,0 +1,110 @@
+"""The tracker's clock against the bridge's: measured all the time from when frames were captured and when they came.
+
+A frame comes no earlier than ``latency`` after its capture, and now and then hardly later. So the least delay of every
+second, less that latency, is the offset between the clocks; a line through them is its drift. What frames cannot tell
+is an error of ``latency`` itself: the offset is wrong by as much. Contacts of ball and paddle in a log tell it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+WINDOW = 1.0  # [s] of which the least delay counts
+KEPT = 60  # windows that the line goes through
+SETTLED = 10  # windows from which on a drift is told, and judged
+STEP = 0.5  # share of ``bound`` by which a second may miss the line of those before it
+MOST_DRIFT = 5e-4  # of any clock that works
+ONE_OFF = 3  # seconds in a row that miss it before that counts
+
+
+class Clock:
+    """Offset of one session, bridge's clock less tracker's.
+
+    offset    [s] as configured; None: that of the first second of frames
+    latency   [s] least time from a capture to its arrival
+    bound     [s] by which the measured offset may miss the configured one, and a second the line of those before
+    drift     as calibrated; None: offsets stay as configured, and are only watched
+    """
+
+    def __init__(self, offset: float | None, latency: float, bound: float, drift: float | None = None) -> None:
+        self._given, self._latency, self._bound, self._nominal = offset, latency, bound, drift
+        self._corrects = offset is None or drift is not None
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was measured: the tracker may have been started anew."""
+        self._windows: deque[tuple[float, float]] = deque(maxlen=KEPT)  # capture and delay of the least delayed
+        self._least: tuple[float, float] | None = None
+        self._began = -math.inf
+        self._floor: float | None = None if self._given is not None else self._latency
+        self._missed, self._jumped = 0, False
+        self.drift, self._level, self._at = self._nominal or 0.0, self._given, 0.0
+        self.windows = 0  # complete ones
+
+    def offset(self, captured: float) -> float | None:
+        """Offset [s] at a capture on the tracker's clock; None while it is not known."""
+        if self._level is None or not self._corrects or not self.windows:
+            return self._level
+        return self._level + self.drift * (captured - self._at)
+
+    def add(self, captured: float, now: float) -> bool:
+        """Take a frame's capture [s, tracker's clock] and arrival [s, bridge's]; True when a second was completed."""
+        delay = now - captured
+        if captured < self._began:
+            return False
+        if self._least is None or delay < self._least[1]:
+            self._least = captured, delay
+        if self._began == -math.inf:
+            self._began = captured
+        if captured - self._began < WINDOW:
+            return False
+        self._began = captured
+        window, self._least = self._least, None
+        self._close(*window)
+        return True
+
+    def _close(self, captured: float, delay: float) -> None:
+        if self._floor is None:  # the configured offset holds at the start: what is over is the frames' latency
+            self._floor = delay - (self._given or 0.0)
+        if self.windows >= SETTLED:
+            expected = self._line(captured)
+            self._missed = self._missed + 1 if abs(delay - expected) > STEP * self._bound else 0
+            if 0 < self._missed < ONE_OFF:
+                return  # one slow second tells nothing about the clocks
+            if self._missed:
+                self._windows.clear()
+                self.windows, self._missed, self._jumped = 0, 0, True
+        self._windows.append((captured, delay))
+        self.windows += 1
+        self._jumped &= self.windows < SETTLED
+        times, delays = np.array(self._windows).T
+        if len(times) >= SETTLED:
+            i, j = np.triu_indices(len(times), k=len(times) // 2)
+            self.drift = float(np.median((delays[j] - delays[i]) / (times[j] - times[i])))
+        level = float(np.median(delays - self.drift * (times - captured)))
+        self._at = captured
+        if self._corrects:
+            self._level = level - self._floor
+        self.measured = level - self._floor
+
+    def _line(self, captured: float) -> float:
+        return self.measured + (self._floor or 0.0) + self.drift * (captured - self._at)
+
+    @property
+    def problem(self) -> str | None:
+        """Reason why capture times cannot be trusted, as a sentence; None when they can."""
+        if self._jumped:
+            return f"the tracker's clock jumped by more than {1e3 * STEP * self._bound:.1f} ms against the bridge's"
+        if self.windows < SETTLED:
+            return None
+        if abs(self.drift) > MOST_DRIFT:
+            return f"the tracker's clock drifts by {1e6 * self.drift:+.0f} ppm, allowed are {1e6 * MOST_DRIFT:.0f}"
+        if self._given is not None and not self._corrects and abs(self.measured - self._given) > self._bound:
+            return (
+                f"the tracker's clock is off by {1e3 * (self.measured - self._given):+.1f} ms (tracker.clock_bound: "
+                f"{1e3 * self._bound:.1f} ms); calibrate it (mjx-tt calibrate clock)"
+            )
+        return None

@@ -1,0 +1,48 @@
+"""Errors of an installation that nobody told the bridge of: what a calibration has to find.
+
+Written without ``robot_io.calibrated`` on purpose: angles about fixed axes here, rotation vectors there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class HiddenErrors:
+    """Differences between the rig and what the bridge is told of it.
+
+    camera_position  [m] of the tracker's origin in the table frame
+    camera_angles    [rad] by which its axes are turned about the table's x, then y, then z axis
+    joint_zeros      (6) [rad] true angle where the arm's controller reports 0
+    clock_offset     [s] that the tracker's clock shows when the bridge's shows 0
+    clock_drift      seconds per second that the tracker's clock gains
+    """
+
+    camera_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    joint_zeros: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    clock_offset: float = 0.0
+    clock_drift: float = 0.0
+
+    def seen(self, point: np.ndarray) -> np.ndarray:
+        """Coordinates (3,) that the tracker gives to a point (3,) of the table frame [m]."""
+        x, y, z = point - np.array(self.camera_position)
+        a, b, c = (-angle for angle in self.camera_angles)  # undone in the opposite order
+        x, y = x * np.cos(c) - y * np.sin(c), x * np.sin(c) + y * np.cos(c)
+        x, z = x * np.cos(b) + z * np.sin(b), z * np.cos(b) - x * np.sin(b)
+        y, z = y * np.cos(a) - z * np.sin(a), y * np.sin(a) + z * np.cos(a)
+        return np.array([x, y, z])
+
+    def stamped(self, now: float) -> float:
+        """Time [s] on the tracker's clock at ``now`` on the bridge's."""
+        return now + self.clock_offset + self.clock_drift * now if self.clock_offset or self.clock_drift else now
+
+    def counted(self, angles: np.ndarray) -> np.ndarray:
+        """Angles (6,) [rad] of which the arm's controller knows where the joints are at ``angles``."""
+        return angles - np.array(self.joint_zeros)
+
+
+NOTHING_HIDDEN = HiddenErrors()
