@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from robot_io.devices.festo import AxesConfig
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.axis_drive import DriveParams
-from robot_io.emulator.hidden import HiddenErrors
 from robot_io.emulator.network import NetworkFaults
 from robot_io.emulator.tracker import TrackerParams
+from robot_io.emulator.tracker.hidden import HiddenErrors
 from robot_io.emulator.world import WorldParams
 from robot_io.ranges import check_ranges
 

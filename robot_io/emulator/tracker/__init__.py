@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robot_io.devices.tracker import BallSample, encode
-from robot_io.emulator.hidden import NOTHING_HIDDEN, HiddenErrors
-from robot_io.emulator.world import World
+from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
+
+if TYPE_CHECKING:
+    from robot_io.emulator.world import World
 
 IDENTITIES = ("ball", "stroke", "lost")
 
