@@ -151,6 +151,14 @@ class Encoded:
     message: Any  # without its timestamp
 
 
+def stamps(message: Any) -> list[Any]:
+    """The timestamps that a message holds: its own, or one for each of its frames or entities."""
+    fields = message.DESCRIPTOR.fields_by_name
+    if "timestamp" in fields:
+        return [message.timestamp]
+    return [part.timestamp for name in ("transforms", "entities") if name in fields for part in getattr(message, name)]
+
+
 def encode(record: Ball | Joints | Command | Observation | Action | Tick | Event) -> list[Encoded]:
     """The messages of a record; the caller stamps them with ``publish_time``."""
     match record:

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 from ballmodel.io.atomic_files import sync_folder
 from robot_io import contract
-from robot_io.log import schema
+from robot_io.log import schema, view
 from robot_io.log.messages import End, LogError, Metadata, as_strings, unpack
 
 FORMAT = "mjx-tt session log"
@@ -156,13 +156,15 @@ class SessionWriter:
             self._writer.add_attachment(start, start, name, media_type, content)
         schemas: dict[str, int] = {}
         self._channels = {}
-        for topic in schema.TOPICS.values():
+        for topic in (*schema.TOPICS.values(), *view.TOPICS.values()):
             schema_name = topic.message.DESCRIPTOR.full_name
             if schema_name not in schemas:
                 schemas[schema_name] = self._writer.register_schema(schema_name, "protobuf", topic.schema())
             self._channels[topic.name] = self._writer.register_channel(
                 topic.name, "protobuf", schemas[schema_name], topic.metadata
             )
+        self._view = view.View()
+        self._add_message(self._view.scene(float(session.metadata["start_time"])))
         self._file.flush()
 
     def write(self, packed: bytes) -> None:
@@ -173,18 +175,8 @@ class SessionWriter:
         elif isinstance(record, End):
             self._end = record
         else:
-            for encoded in schema.encode(record):
-                published, logged = self._nanoseconds(encoded.publish_time), self._nanoseconds(encoded.log_time)
-                stamp = encoded.message.timestamp
-                stamp.seconds, stamp.nanos = divmod(published, schema.NANO)
-                self._writer.add_message(
-                    self._channels[encoded.topic.name],
-                    log_time=logged,
-                    data=encoded.message.SerializeToString(),
-                    publish_time=published,
-                    sequence=encoded.sequence % schema.SEQUENCE,
-                )
-                self.messages += 1
+            for encoded in (*schema.encode(record), *self._view.encode(record)):
+                self._add_message(encoded)
         self._unflushed = True
 
     def flush(self) -> None:
@@ -218,6 +210,19 @@ class SessionWriter:
         os.rename(self._session.unfinished, path)
         sync_folder(path.parent)
         return path
+
+    def _add_message(self, encoded: schema.Encoded) -> None:
+        published, logged = self._nanoseconds(encoded.publish_time), self._nanoseconds(encoded.log_time)
+        for stamp in schema.stamps(encoded.message):
+            stamp.seconds, stamp.nanos = divmod(published, schema.NANO)
+        self._writer.add_message(
+            self._channels[encoded.topic.name],
+            log_time=logged,
+            data=encoded.message.SerializeToString(),
+            publish_time=published,
+            sequence=encoded.sequence % schema.SEQUENCE,
+        )
+        self.messages += 1
 
     def _add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         self._writer.add_metadata(name, {**entries, "checksum": checksum(name, entries)})

@@ -185,6 +185,8 @@ def test_standard_readers_open_the_file(recording):
             "/action": 300,
             "/tick": 300,
             "/event": 2,
+            "/scene": 1,
+            "/tf": 250,
         }
         messages = {}
         for schema, channel, message, decoded in reader.iter_decoded_messages():
@@ -362,7 +364,7 @@ def test_a_dead_recorder_is_noticed_and_does_not_disturb(tmp_path):
 
 def test_a_disk_that_takes_no_more_is_told_and_what_it_took_is_kept(tmp_path):
     recorder = log.Recorder.start(tmp_path, "big", {})
-    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (30_000, 30_000))
+    resource.prlimit(recorder._process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
     start = time.monotonic()
     for k in range(20_000):
         recorder.put(*tick(k, start + k / 75))
@@ -434,7 +436,7 @@ def test_cut_files_give_their_complete_chunks(recording, tmp_path):
     whole = recording.read_bytes()
     cut = tmp_path / "cut.mcap.part"
     sizes = []
-    for share in (0.3, 0.6, 0.9):
+    for share in (0.3, 0.5, 0.7):
         cut.write_bytes(whole[: int(share * len(whole))])
         assert log.check(cut).state == "interrupted"
         session = log.read(cut, salvage=True)
