@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from numbers import Real
 from typing import Any
 
 Ranges = Mapping[str, tuple[float, float]]
@@ -14,15 +14,32 @@ def check_ranges(config: Any, ranges: Ranges) -> None:
 
     config  a dataclass; a path leads through its fields, and through every entry of a tuple. None is not checked.
     """
+    for where, value, allowed in outside(config, ranges):
+        raise ValueError(f"{where} is {value}, allowed is {allowed}")
+
+
+def outside(config: Any, ranges: Ranges) -> Iterator[tuple[str, Any, str]]:
+    """Values that are no number in their range: where each stands, what it is, and what is allowed in words.
+
+    config  a dataclass, or what a file of it holds; omitted keys and None are not looked at
+    """
     for path, (low, high) in ranges.items():
+        allowed = f"{low:g} to {high:g}" if low < high else f"{low:g}"
         for where, value in _values(config, path.split(".")):
-            if value is not None and not (low <= value <= high and math.isfinite(value)):
-                raise ValueError(f"{where} is {value}, allowed is {low:g} to {high:g}")
+            if value is None or (is_number(value) and low <= value <= high):
+                continue
+            yield where, value, allowed
+
+
+def is_number(value: Any) -> bool:
+    """True for a real number; booleans are none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _values(owner: Any, path: list[str], where: str = "") -> list[tuple[str, Any]]:
-    if isinstance(owner, tuple):
+    if isinstance(owner, (tuple, list)):
         return [found for i, entry in enumerate(owner) for found in _values(entry, path, f"{where}[{i}]")]
     if not path:
         return [(where, owner)]
-    return _values(getattr(owner, path[0]), path[1:], f"{where}.{path[0]}".removeprefix("."))
+    below = owner.get(path[0]) if isinstance(owner, dict) else getattr(owner, path[0], None)
+    return _values(below, path[1:], f"{where}.{path[0]}".removeprefix("."))

@@ -40,7 +40,7 @@ def write_all() -> None:
     """Write every generated page."""
     from experiments.config import baselines, experiment, study
     from experiments.config.finetuning import FineTuning
-    from experiments.config.robot import COMMISSIONING
+    from experiments.config.robot import COMMISSIONING, RANGES
     from robot_io.control.config import RobotConfig
     from robot_io.emulator.config import RigParams
 
@@ -54,8 +54,8 @@ def write_all() -> None:
     _write("verdict", schema_page("Verdict", "", verdict, {}))
     _write("model", model_page())
     slow = f"Without `safety.speed_scale` a robot moves at {COMMISSIONING:.0%} of its speed."
-    _write("robot", dataclass_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", RobotConfig, slow))
-    _write("rig", dataclass_page("rig.yaml", "mjx-tt run --robot rig --rig", RigParams))
+    _write("robot", dataclass_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", RobotConfig, RANGES, slow))
+    _write("rig", dataclass_page("rig.yaml", "mjx-tt run --robot rig --rig", RigParams, RANGES))
     _write("command-line", command_line_page())
     described: dict[int, str] = {}
     for package in PACKAGES:
@@ -155,8 +155,11 @@ def _type(key: dict[str, Any], definitions: dict[str, Any], anchors: dict[str, s
     return {"string": "text", "boolean": "true, false", "null": "`null`"}.get(kind, kind)
 
 
-def dataclass_page(title: str, command: str, kind: type, remark: str = "") -> str:
-    """Page with one table per dataclass that a YAML fills."""
+def dataclass_page(
+    title: str, command: str, kind: type, ranges: dict[type, dict[str, tuple[float, float]]], remark: str = ""
+) -> str:
+    """Page with one table per dataclass that a YAML fills, with the ranges outside which a number is refused."""
+    allowed = ranges[kind]
     lines = [f"# {title}", "", f"The YAML of `{command}`. Every key has a default. {remark}"]
     waiting, done = [("", kind)], []
     while waiting:
@@ -168,18 +171,19 @@ def dataclass_page(title: str, command: str, kind: type, remark: str = "") -> st
         summary, meanings = field_notes(kind)
         lines += ["", f"## {path}" if path else "", "", _cell(summary), ""]
         told = bool(meanings) or any(map(dataclasses.is_dataclass, hints.values()))
-        lines += ["| key | type | default |" + " meaning |" * told, "|---|---|---|" + "---|" * told]
+        lines += ["| key | type | default | allowed |" + " meaning |" * told, "|---|---|---|---|" + "---|" * told]
         for field in dataclasses.fields(kind):
             hint = hints[field.name]
             inner = next((h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h)), None)
             below = f"{path}.{field.name}".lstrip(".")
             if inner is not None:
                 waiting.append((below, inner))
-                lines.append(f"| `{field.name}` | mapping | section `{below}` | {_cell(field_notes(inner)[0])} |")
+                lines.append(f"| `{field.name}` | mapping | section `{below}` | | {_cell(field_notes(inner)[0])} |")
             else:
                 text = hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
                 meaning = f" {_cell(meanings.get(field.name, ''))} |" * told
-                lines.append(f"| `{field.name}` | {_cell(text)} | `{_plain(field)}` |{meaning}")
+                bounds = "{:g} to {:g}".format(*allowed[below]) if below in allowed else ""
+                lines.append(f"| `{field.name}` | {_cell(text)} | `{_plain(field)}` | {bounds} |{meaning}")
     return "\n".join(lines) + "\n"
 
 

@@ -15,10 +15,14 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from experiments.config.experiment import read_yaml
 from experiments.config.validation import LONGEST, nearest
 from experiments.errors import ConfigError, checked
+from robot_io.calibrated import RANGES as CALIBRATION_RANGES
 from robot_io.calibrated import Calibration
+from robot_io.control import config as robot_config
 from robot_io.control.config import RobotConfig
+from robot_io.emulator import config as rig_config
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.opponent import Throws
+from robot_io.ranges import is_number, outside
 
 if TYPE_CHECKING:  # a robot.yaml is read without JAX
     from ballmodel.registry import Balls
@@ -35,6 +39,7 @@ WORDS = {
     "tuple_type": "a list",
     "finite_number": "a finite number",
 }
+RANGES = {RobotConfig: robot_config.RANGES, RigParams: rig_config.RANGES, Calibration: CALIBRATION_RANGES}
 Config = TypeVar("Config", RobotConfig, RigParams, Calibration)
 
 
@@ -68,13 +73,33 @@ def plain(config: RobotConfig | RigParams | Calibration) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
+@cache
+def _defaults(kind: type[Config]) -> dict[str, Any]:
+    return plain(kind())
+
+
+def _completed(given: Any, defaults: Any) -> Any:
+    """Content with the keys that its mappings omit, as the whole has them, which need not be their class's defaults."""
+    if not (isinstance(given, dict) and isinstance(defaults, dict)):
+        return given
+    return defaults | {key: _completed(value, defaults.get(key)) for key, value in given.items()}
+
+
 def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
     """An instance of a dataclass; omitted keys keep their defaults. Raises ConfigError with one line per mistake."""
+    found = {path: (value, words) for path, value, words in outside(data, RANGES[kind]) if is_number(value)}
+    lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
     try:
         # By JSON, whose lists are tuples: nothing else is converted.
-        return _adapters()[kind].validate_json(json.dumps({"file": data}, default=str)).file
+        content = _completed(data, _defaults(kind))
+        config = _adapters()[kind].validate_json(json.dumps({"file": content}, default=str)).file
     except ValidationError as error:
-        lines = [_line(mistake, kind) for mistake in error.errors(include_url=False)]
+        for mistake in error.errors(include_url=False):
+            # A number outside its range is told above, and what a dataclass says of its section then as well.
+            if not found or (mistake["type"] != "value_error" and _path(mistake) not in found):
+                lines.append(_line(mistake, kind))
+    if not lines:
+        return config
     raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
 
 
@@ -99,14 +124,15 @@ def _line(mistake: Any, kind: type) -> str:
     owner: Any = kind
     for part in parents:
         owner = _member(owner, part)
-    path = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in mistake["loc"][1:])[1:]
+    path = _path(mistake)
     given, reason = mistake["input"], mistake["type"]
-    shown = repr(given) if len(repr(given)) <= LONGEST else f"{repr(given)[:LONGEST]} ..."
+    shown = _shown(given)
     if reason == "unexpected_keyword_argument":
         names = [f.name for f in dataclasses.fields(owner)]
         return f"{path}: unknown key; {nearest(str(last), names)}allowed: {', '.join(names)}"
     if reason == "value_error":
-        return f"{path and path + ': '}{mistake['ctx']['error']}"
+        kind_of_section = getattr(_member(owner, last), "__name__", "")
+        return f"{path and path + '.'}{str(mistake['ctx']['error']).removeprefix(kind_of_section + '.')}"
     if reason in ("too_long", "missing"):
         tuple_of = owner if reason == "missing" else _member(owner, last)
         at = path.rpartition("[")[0] if reason == "missing" else path
@@ -115,6 +141,14 @@ def _line(mistake: Any, kind: type) -> str:
     if reason in ("dataclass_type", "dataclass_exact_type"):
         allowed = f"a mapping of {', '.join(f.name for f in dataclasses.fields(_member(owner, last)))}"
     return f"{path}: got {shown}; allowed: {allowed}"
+
+
+def _path(mistake: Any) -> str:
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in mistake["loc"][1:])[1:]
+
+
+def _shown(given: Any) -> str:
+    return repr(given) if len(repr(given)) <= LONGEST else f"{repr(given)[:LONGEST]} ..."
 
 
 def _member(owner: Any, part: str | int) -> Any:

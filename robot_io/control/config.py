@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from robot_io.calibrated import RANGES as CALIBRATION_RANGES
 from robot_io.calibrated import Calibration
 from robot_io.contract import CONTROL_RATE, FESTO_JOINTS, LIMITS
-from robot_io.control.observation import ObservationDelays
+from robot_io.control.observation import LONGEST_DELAY, ObservationDelays
 from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.ranges import check_ranges
@@ -23,6 +23,7 @@ PORT = (1, 65535)
 # Allowed in a robot.yaml: watchdogs, margins and time-outs end where they would no longer protect
 # (docs/concepts/safety.md).
 RANGES = {
+    "rate": (CONTROL_RATE, CONTROL_RATE),
     "arm.port": PORT,
     "arm.timeout": (0.01, 0.1),
     "arm.controller_port": PORT,
@@ -51,6 +52,9 @@ RANGES = {
     "tracker.clock_offset": (-1e10, 1e10),
     "tracker.clock_bound": (0.001, 0.02),
     "tracker.latency": (0.0, 0.1),
+    "delays.ball": (0.0, LONGEST_DELAY),
+    "delays.arm": (0.0, LONGEST_DELAY),
+    "delays.axes": (0.0, LONGEST_DELAY),
     "safety.speed_scale": (0.001, 1.0),
     "safety.table_margin": (0.01, 0.5),
     "safety.self_margin": (0.01, 0.5),
@@ -124,10 +128,8 @@ class RobotConfig:
     calibration: Calibration = Calibration()
 
     def __post_init__(self) -> None:
-        if self.rate != CONTROL_RATE:
-            raise ValueError(f"rate is {self.rate} Hz, policies act at {CONTROL_RATE} Hz")
         if self.axis_profile not in PROFILES:
-            raise ValueError(f"axis_profile {self.axis_profile!r} does not exist, allowed: {', '.join(PROFILES)}")
+            raise ValueError(f"axis_profile is {self.axis_profile!r}, allowed: {', '.join(PROFILES)}")
         if len(self.axes) != len(FESTO_JOINTS):
             raise ValueError(f"{len(self.axes)} axes given, the robot has {len(FESTO_JOINTS)}: {', '.join(AXIS_NAMES)}")
         check_ranges(self, RANGES)

@@ -16,6 +16,7 @@ from robot_io.contract import N_JOINTS
 from robot_io.history import History
 
 HERE = Frame()
+LONGEST_DELAY = 0.1  # [s]
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,8 @@ class ObservationDelays:
 
     def __post_init__(self) -> None:
         for name in ("ball", "arm", "axes"):
-            if not 0 <= getattr(self, name) <= 0.1:
-                raise ValueError(f"observation delay {name} = {getattr(self, name)} s, allowed is 0 to 0.1")
+            if not 0 <= getattr(self, name) <= LONGEST_DELAY:
+                raise ValueError(f"{name} is {getattr(self, name)} s, allowed is 0 to {LONGEST_DELAY}")
 
 
 @dataclass(frozen=True)

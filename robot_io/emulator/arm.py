@@ -63,7 +63,7 @@ class ArmParams:
         for name in ("stop_deceleration", "lower", "upper", "max_speed"):
             values = getattr(self, name)
             if len(values) != N_ARM_JOINTS or not np.isfinite(values).all():
-                raise ValueError(f"ArmParams.{name} needs {N_ARM_JOINTS} finite numbers, got {values}")
+                raise ValueError(f"ArmParams.{name} is {values}, allowed are {N_ARM_JOINTS} finite numbers")
         for name in ("cycle", "low_pass", "comm_timeout", "queue_length"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"ArmParams.{name} {getattr(self, name)} must be positive")
@@ -73,7 +73,9 @@ class ArmParams:
         if min(self.stop_deceleration) <= 0 or min(self.max_speed) <= 0 or not self.overspeed >= 1:
             raise ValueError("ArmParams: stop_deceleration and max_speed must be positive, overspeed at least 1")
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
-            raise ValueError(f"ArmParams: lower {self.lower} must be below upper {self.upper} in every joint")
+            raise ValueError(
+                f"ArmParams.lower is {self.lower}, allowed is less than upper, {self.upper}, in each joint"
+            )
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from robot_io.devices.festo import AxesConfig
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.axis_drive import DriveParams
-from robot_io.emulator.network import NetworkFaults
+from robot_io.emulator.network import FAULT_RANGES, NetworkFaults
 from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.tracker.hidden import HiddenErrors
 from robot_io.emulator.world import WorldParams
@@ -51,6 +51,7 @@ RANGES = {
     "tracker.latency": (0.0, 1.0),
     "tracker.noise": (0.0, 1.0),
     "tracker.offset": (-1.0, 1.0),
+    **{f"{side}_network.{name}": bounds for side in ("arm", "tracker") for name, bounds in FAULT_RANGES.items()},
     "action_delay": (0.0, 1.0),
     "pause": (0.0, 600.0),
     "seed": (0, 2**31),

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
+
+from robot_io.ranges import check_ranges
+
+FAULT_RANGES = {
+    **{name: (0.0, 1.0) for name in ("loss", "duplication", "bit_flip", "reordering")},
+    **{name: (0.0, 10.0) for name in ("hold", "delay", "jitter")},
+}
 
 
 @dataclass(frozen=True)
@@ -21,10 +28,7 @@ class NetworkFaults:
     jitter: float = 0.0  # standard deviation of an additional half-normal delay
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value, share = getattr(self, f.name), f.name in ("loss", "duplication", "bit_flip", "reordering")
-            if not 0 <= value <= (1.0 if share else 10.0):
-                raise ValueError(f"network.{f.name} = {value}, allowed is 0 to {1 if share else 10}")
+        check_ranges(self, FAULT_RANGES)
 
 
 class Network:

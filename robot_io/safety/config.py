@@ -67,6 +67,6 @@ class SafetyConfig:
         for name in ("still", "following_error"):
             values = getattr(self, name)
             if len(values) != N_JOINTS or not all(0.0 < v < math.inf for v in values):
-                raise ValueError(f"SafetyConfig.{name} is {values}, {N_JOINTS} positive numbers are needed")
+                raise ValueError(f"SafetyConfig.{name} is {values}, allowed are {N_JOINTS} positive numbers")
         if not 0.0 <= self.delay[0] < self.delay[1] < math.inf:
-            raise ValueError(f"SafetyConfig.delay is {self.delay}, needed is (shortest, longest) in seconds")
+            raise ValueError(f"SafetyConfig.delay is {self.delay}, allowed are a shortest and a longer time in s")

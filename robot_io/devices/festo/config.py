@@ -74,8 +74,8 @@ class AxesConfig:
                 raise ValueError(f"AxesConfig.{name} is {value}, it must be positive and finite")
         if self.gain * self.latency > 1 / math.e:
             raise ValueError(
-                f"gain {self.gain} / s overshoots with a latency of {self.latency} s: "
-                f"at most {1 / math.e / self.latency:.2f}"
+                f"gain is {self.gain} / s, allowed with a latency of {self.latency} s is up to "
+                f"{1 / math.e / self.latency:.2f}: more overshoots"
             )
 
 

@@ -38,7 +38,7 @@ class TrackerParams:
 
     def __post_init__(self) -> None:
         if self.identity not in IDENTITIES:
-            raise ValueError(f"tracker.identity is {self.identity!r}, allowed: {', '.join(IDENTITIES)}")
+            raise ValueError(f"identity is {self.identity!r}, allowed: {', '.join(IDENTITIES)}")
 
     def sees(self, world: World) -> tuple[int, bool]:
         """Number of the ball, and True when it is seen."""

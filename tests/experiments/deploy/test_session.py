@@ -128,13 +128,13 @@ def test_another_interface_is_refused(policy, tmp_path, change, named):
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        ("rate: 60", "policies act at 75"),
+        ("rate: 60", "rate: got 60; allowed: 75"),
         ("arm: {hots: 10.0.0.1}", "did you mean 'host'"),
         ("axis_profile: cmtm", "cmmt, fhpp"),
-        ("safety: {speed_scale: 2.0}", "speed_scale is 2.0"),
+        ("safety: {speed_scale: 2.0}", "speed_scale: got 2.0; allowed: 0.001 to 1"),
         ("axes: [{port: 502}]", "allowed: 2"),
         ("tracker: {port: '6520'}", "allowed: int"),
-        ("delays: {ball: 40}", "allowed is 0 to 0.1"),
+        ("delays: {ball: 40}", "delays.ball: got 40; allowed: 0 to 0.1"),
     ],
 )
 def test_mistakes_in_robot_yaml_are_named(tmp_path, content, named):
