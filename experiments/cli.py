@@ -13,6 +13,7 @@ from rich.console import Console
 from experiments import stages
 from experiments.commands import (
     blind,
+    calibrate,
     compare,
     evaluate,
     finetune,
@@ -100,6 +101,7 @@ COMMANDS = (
     compare.app,
     run.rig_app,
     log.app,
+    calibrate.app,
     diagnose_app,
     predict.app,
     predict.bench_app,

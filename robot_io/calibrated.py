@@ -12,6 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
+from robot_io.ranges import check_ranges
+
 Triple = tuple[float, float, float]
 ZERO: Triple = (0.0, 0.0, 0.0)
 
@@ -105,27 +107,6 @@ class ClockCalibration:
     date: str = ""
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """What ``mjx-tt calibrate`` found."""
-
-    tracker: TrackerCalibration = TrackerCalibration()
-    robot: RobotCalibration = RobotCalibration()
-    clock: ClockCalibration = ClockCalibration()
-
-    def __post_init__(self) -> None:
-        for name in ("tracker", "robot", "clock"):
-            when = getattr(self, name).date
-            try:
-                if when and date.fromisoformat(when).isoformat() != when:
-                    raise ValueError
-            except ValueError:
-                raise ValueError(f"{name}.date is {when!r}, allowed is YYYY-MM-DD or nothing") from None
-            if not when and getattr(self, name) != type(getattr(self, name))():
-                raise ValueError(f"{name}.date is empty, but {name} was changed; allowed is the day of its measurement")
-
-
-UNCALIBRATED = Calibration()
 # Allowed in a calibration; a residual beyond its range says that the points contradict each other.
 RANGES = {
     "tracker.position": (-20.0, 20.0),
@@ -143,3 +124,27 @@ RANGES = {
     "clock.lag": (-0.1, 0.2),
     "clock.residual": (0.0, 0.002),
 }
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """All of one robot."""
+
+    tracker: TrackerCalibration = TrackerCalibration()
+    robot: RobotCalibration = RobotCalibration()
+    clock: ClockCalibration = ClockCalibration()
+
+    def __post_init__(self) -> None:
+        for name in ("tracker", "robot", "clock"):
+            when = getattr(self, name).date
+            try:
+                if when and date.fromisoformat(when).isoformat() != when:
+                    raise ValueError
+            except ValueError:
+                raise ValueError(f"{name}.date is {when!r}, allowed is YYYY-MM-DD or nothing") from None
+            if not when and getattr(self, name) != type(getattr(self, name))():
+                raise ValueError(f"{name}.date is empty, but {name} was changed; allowed is the day of its measurement")
+        check_ranges(self, RANGES)
+
+
+UNCALIBRATED = Calibration()

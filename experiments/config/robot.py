@@ -50,12 +50,16 @@ def load_robot(path: str | Path) -> RobotConfig:
     """
     data = _mapping(path)
     if isinstance(named := data.get("calibration"), str):  # relative to robot.yaml
-        file = Path(path).parent / named
-        data["calibration"] = plain(fill(Calibration, _mapping(file), str(file)))
+        data["calibration"] = plain(load_calibration(Path(path).parent / named))
     safety = data.setdefault("safety", {})
     if isinstance(safety, dict):
         safety.setdefault("speed_scale", COMMISSIONING)
     return fill(RobotConfig, data, str(path))
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """A calibration of its own. Raises ConfigError."""
+    return fill(Calibration, _mapping(path), str(path))
 
 
 def load_rig(path: str | Path | None) -> RigParams:

@@ -52,6 +52,7 @@ from robot_io.safety.clearance import BLADE, RobotGeometry
 from robot_io.safety.faults import Cause
 from robot_io.safety.gate import GateState, SafetyGate
 
+CLOCK_EVERY = 10  # seconds of frames between two reports of the tracker's clock
 AT_HOME = 0.02  # [m], [rad] of every joint
 LONGEST_STOP = 2.0  # [s] after which a stop ends although the measurement does not come to rest
 
@@ -94,7 +95,7 @@ class Bridge:
         self._policy_limit = np.array(LIMITS.policy_velocity)
         self._home_speed = config.home_speed * self._policy_limit
         self._home_braking = config.home_braking * np.array(LIMITS.acceleration)
-        self._logged_faults = 0
+        self._logged_faults = self._clock_windows = 0
         self.unlogged = 0  # records that could not be logged
         self._reported_unlogged = 0
         self._log_failure = ""  # why the log's file cannot be written
@@ -233,7 +234,10 @@ class Bridge:
             self._follow_ball(datagram, source, now, port)
 
     def _follow_ball(self, datagram: bytes, source: str, now: float, port: int | None) -> None:
-        sample = self.tracker.receive(datagram, source, now, port)
+        sample, clock = self.tracker.receive(datagram, source, now, port), self.tracker.clock
+        if clock.windows >= self._clock_windows + CLOCK_EVERY or clock.windows < self._clock_windows:
+            self._clock_windows = clock.windows
+            self.event(now, Level.INFO, "clock", json_text(clock.report()))
         if sample is None or sample.position is None:
             return
         self._log(Ball(sample.captured, now, sample.position, sample.ball))

@@ -43,6 +43,7 @@ class Clock:
         self._missed, self._jumped = 0, False
         self.drift, self._level, self._at = self._nominal or 0.0, self._given, 0.0
         self.windows = 0  # complete ones
+        self.measured, self.residual = 0.0, 0.0  # [s] offset by the frames, and how far seconds miss the line
 
     def offset(self, captured: float) -> float | None:
         """Offset [s] at a capture on the tracker's clock; None while it is not known."""
@@ -89,9 +90,15 @@ class Clock:
         if self._corrects:
             self._level = level - self._floor
         self.measured = level - self._floor
+        self.residual = float(np.sqrt(np.mean((delays - self.drift * (times - captured) - level) ** 2)))
 
     def _line(self, captured: float) -> float:
         return self.measured + (self._floor or 0.0) + self.drift * (captured - self._at)
+
+    def report(self) -> dict[str, float]:
+        """Everything that was measured, for the log."""
+        found = {"offset": self.measured, "at": self._at, "drift": self.drift, "residual": self.residual}
+        return found | {"seconds": self.windows}
 
     @property
     def problem(self) -> str | None:

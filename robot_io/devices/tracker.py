@@ -121,7 +121,6 @@ class Tracker:
         clock = calibration.clock
         drift = clock.drift if clock.date else None
         self.clock = Clock(config.clock_offset, config.latency, config.clock_bound, drift)
-        self.measured = 0  # seconds of the clock so far
         self.track = History(length=256, longest_hold=0.06)
         self.ball = -1  # number of the ball that the track belongs to
         self.received: float | None = None  # [s] when the last accepted frame came
@@ -148,7 +147,7 @@ class Tracker:
         if silent and self._heard is not None and now - self._heard > SILENCE:
             self.clock.restart()
         self._heard = now
-        self.measured += self.clock.add(sample.captured, now)
+        self.clock.add(sample.captured, now)
         offset = self.clock.offset(sample.captured)
         if offset is None:
             self.counts["clock"] += 1

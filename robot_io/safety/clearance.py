@@ -172,8 +172,12 @@ class RobotGeometry:
         other._basis[0] = (place @ self._basis[0].reshape(4, 4, 4)).reshape(4, 16)
         return other
 
-    def ends(self, q: np.ndarray) -> np.ndarray:
-        """World end points (2, 3, capsules, B) of every capsule's axis at joint positions q (8, B)."""
+    def hand(self, q: np.ndarray) -> np.ndarray:
+        """Transforms (B, 4, 4) from the last joint's frame to the world at joint positions q (8, B)."""
+        return self._frames(q)[-1]
+
+    def _frames(self, q: np.ndarray) -> np.ndarray:
+        """Transforms (8, B, 4, 4) from every joint's frame to the world."""
         n = q.shape[1]
         values = np.stack([np.ones_like(q), np.sin(q), 1.0 - np.cos(q), q], axis=-1)  # (8, B, 4)
         local = np.matmul(values, self._basis).reshape(N_JOINTS, n, 4, 4)
@@ -181,6 +185,11 @@ class RobotGeometry:
         world[0] = local[0]
         for i in range(1, N_JOINTS):
             np.matmul(world[i - 1], local[i], out=world[i])
+        return world
+
+    def ends(self, q: np.ndarray) -> np.ndarray:
+        """World end points (2, 3, capsules, B) of every capsule's axis at joint positions q (8, B)."""
+        world = self._frames(q)
         points = np.matmul(world[self._joint, :, :3], self._local)  # (capsules, B, 3, 2)
         return np.ascontiguousarray(points.transpose(3, 2, 0, 1))
 

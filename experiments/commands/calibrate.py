@@ -1,0 +1,116 @@
+"""``mjx-tt calibrate``: tracker, robot and clock of one installation, from measured points and logs into a YAML."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from experiments.commands.options import command, console, existing, option
+from experiments.errors import checked
+
+if TYPE_CHECKING:
+    import numpy as np
+    from rich.console import Console
+
+    from robot_io.calibrated import Calibration, ClockCalibration, RobotCalibration, TrackerCalibration
+
+app = command(
+    "calibrate",
+    "find where tracker, robot and clock are, from measured points and logs",
+    """\
+  mjx-tt calibrate tracker ball.csv              table_x, table_y, table_z and ball_x, ball_y, ball_z of every point
+  mjx-tt calibrate robot touches.csv --robot robot.yaml        table_x, ... and gantry_x ... joint_6 of every touch
+  mjx-tt calibrate clock runs/robot/20261121-153000.mcap       a session of half a minute or more
+
+Writes calibration.yaml, each part beside the others; robot.yaml names it: "calibration: calibration.yaml".
+mjx-tt robot check writes the points, but for the columns of the table.
+""",
+)
+
+
+@app.default
+def calibrate(
+    part: Annotated[Literal["tracker", "robot", "clock"], Parameter("PART")],
+    source: Annotated[str, Parameter("FILE", help="CSV of points, or the log of a session")],
+    /,
+    *,
+    robot: Annotated[
+        str | None, option("YAML", "robot.yaml, whose zeros of the axes are kept with the robot's")
+    ] = None,
+    out: Annotated[str, option("YAML", "calibration that is written or extended")] = "calibration.yaml",
+) -> int:
+    """Returns the exit status."""
+    existing(source, robot)
+    from dataclasses import replace
+    from datetime import date
+
+    from experiments.config import robot as robots
+    from robot_io.calibrated import Calibration
+    from robot_io.control.config import AxisConfig
+
+    path, target, today, screen = Path(source), Path(out), date.today().isoformat(), console()
+    known = robots.load_calibration(target) if target.exists() else Calibration()
+    if part == "tracker":
+        known = replace(known, tracker=_tracker(path, today, screen))
+    elif part == "robot":
+        axes = robots.load_robot(robot).axes if robot else (AxisConfig(), AxisConfig())
+        zeros = axes[0].zero, axes[1].zero
+        known = replace(known, robot=_robot(path, zeros, today, screen))
+    else:
+        known = replace(known, clock=_clock(path, known, today, screen))
+    text = robots.to_yaml(known)
+    robots.fill(Calibration, robots.plain(known), str(target))  # what run would refuse is not written
+    target.write_text(text, encoding="utf-8")
+    screen.print(f"{target}: {part} written; robot.yaml names it: calibration: {target.name}", highlight=False)
+    return 0
+
+
+def _tracker(path: Path, today: str, screen: Console) -> TrackerCalibration:
+    from robot_io.calibration import points, tracker
+
+    lines, (table, seen) = checked("", points.read, path, points.TABLE, points.BALL)
+    fit = checked(str(path), tracker.fit, table, seen, today)
+    _show_points(screen, path, lines, fit.residuals, fit.used)
+    position, turn = 1e3 * fit.deviation[:3], 1e3 * fit.deviation[3:]
+    screen.print(
+        f"residual {1e3 * fit.calibration.residual:.2f} mm; standard deviations: {position[0]:.2f} mm at the points' "
+        f"centre, turned about x, y, z {turn[0]:.2f}, {turn[1]:.2f}, {turn[2]:.2f} mrad",
+        highlight=False,
+    )
+    return fit.calibration
+
+
+def _robot(path: Path, zeros: tuple[float, float], today: str, screen: Console) -> RobotCalibration:
+    from robot_io.calibration import points, robot
+
+    lines, table, joints, paddle = checked("", points.touched, path)
+    fit = checked(str(path), robot.fit, table, joints, paddle, zeros, today)
+    _show_points(screen, path, lines, fit.residuals, fit.used)
+    found = fit.calibration
+    values = (*found.joint_zeros, *found.base_position, *found.base_rotation, *found.tip)
+    for name, value, deviation in zip(robot.NAMES, values, fit.deviation, strict=True):
+        unit = "mrad" if "zero" in name or "turned" in name else "mm"
+        screen.print(f"  {name:24} {1e3 * value:+8.2f} +- {1e3 * deviation:.2f} {unit}", highlight=False)
+    screen.print(f"residual {1e3 * found.residual:.2f} mm", highlight=False)
+    for text in fit.unknown:
+        screen.print(f"not separated by these poses, left near 0: {text}", style="yellow", highlight=False)
+    return found
+
+
+def _clock(path: Path, known: Calibration, today: str, screen: Console) -> ClockCalibration:
+    from robot_io import log
+    from robot_io.calibration import clock
+
+    found, told = checked(str(path), clock.fit, checked("", log.read, path), known, today)
+    for line in told:
+        screen.print(line, highlight=False)
+    return found
+
+
+def _show_points(screen: Console, path: Path, lines: list[int], residuals: np.ndarray, used: np.ndarray) -> None:
+    for line, residual, good in zip(lines, residuals, used, strict=True):
+        if not good:
+            screen.print(f"{path}: line {line}: {1e3 * residual:.1f} mm off: not used", style="yellow", highlight=False)
+    screen.print(f"{int(used.sum())} of {len(lines)} points used", highlight=False)

@@ -1,0 +1,110 @@
+"""Contacts of ball and paddle in a session's log: what ties the tracker's clock and frame to the robot's.
+
+At a contact the ball's surface is on the blade. Where the ball's track turns is known to about a millisecond by itself;
+the joints' log says where the blade was then. Over many contacts with a moving blade the lag of the joints' times and
+the gap that is left follow by least squares. Only their sum with the arm's own delay of feedback is seen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballmodel.constants import BALL_RADIUS, GRAVITY, PADDLE_RADIUS, PADDLE_THICKNESS
+from robot_io.calibrated import Calibration
+from robot_io.log import SessionLog
+from robot_io.safety.clearance import RobotGeometry
+
+SIDE = 4  # samples before and after the turn
+TURN = 2.0  # [m/s] by which v_y changes at least
+LONGEST = 0.012  # [s] between two samples around it
+BLADE = np.array([0.2503, 0.0, 0.0])  # [m] its centre in the last joint's frame; its normal is y
+REACH = BALL_RADIUS + PADDLE_THICKNESS / 2  # [m] from the blade's middle plane to the ball's centre
+LAGS = np.arange(-0.03, 0.1001, 0.005)  # [s] that are tried
+GAP = 0.005  # [m] that calibrations leave at most, a prior's standard deviation
+FEWEST = 8
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Of one session.
+
+    count  contacts that could be used
+    lag    [s] by which joint positions are logged later than the ball, NaN for too few; lag_deviation [s]
+    gap    [m] that is left between ball and blade, positive: they seem not to touch
+    """
+
+    count: int
+    lag: float
+    lag_deviation: float
+    gap: float
+
+
+def measure(log: SessionLog, calibration: Calibration) -> Contacts:
+    """Contacts of a log, with the robot where its calibration says."""
+    geometry = RobotGeometry.load().moved(calibration.robot.base)
+    found = [turn for ball in np.unique(log.ball.id) for turn in _turns(log, log.ball.id == ball)]
+    time, position = log.joints.time, log.joints.position
+    known = np.isfinite(position).all(0)
+    time, position = time[known], position[:, known]
+    if len(found) < FEWEST or time.size < 2:
+        return Contacts(len(found), math.nan, math.nan, math.nan)
+    moments, places, before = (np.array(column) for column in zip(*found, strict=True))
+
+    def gaps(lag: float) -> tuple[np.ndarray, np.ndarray]:
+        """Gap (n,) at every contact, and distance (n,) from the blade's centre within it."""
+        q = np.array([np.interp(moments + lag, time, joint) for joint in position])
+        hand = geometry.hand(q)
+        away = places - (hand[:, :3, :3] @ BLADE + hand[:, :3, 3])
+        normal = hand[:, :3, 1]
+        side = np.sign(np.einsum("ni,ni->n", before - places, normal))
+        along = np.einsum("ni,ni->n", away, normal)
+        return side * along - REACH, np.linalg.norm(away - along[:, None] * normal, axis=1)
+
+    def spread(lag: float) -> float:
+        gap, beside = gaps(lag)
+        return float(np.median(np.abs(gap) + (beside > PADDLE_RADIUS)))
+
+    lag = float(min(LAGS, key=spread))
+    for _ in range(8):
+        gap, beside = gaps(lag)
+        slope = (gaps(lag + 1e-3)[0] - gaps(lag - 1e-3)[0]) / 2e-3
+        good = (beside < PADDLE_RADIUS + 0.02) & (np.abs(gap - np.median(gap)) < 0.03)
+        if good.sum() < FEWEST:
+            return Contacts(int(good.sum()), math.nan, math.nan, math.nan)
+        sigma = max(1.4826 * float(np.median(np.abs(gap[good] - np.median(gap[good])))), 1e-3)
+        rows = np.stack([slope[good], -np.ones(good.sum())], axis=1) / sigma
+        precision = rows.T @ rows + np.diag([0.0, GAP**-2])
+        step, bias = np.linalg.solve(precision, -rows.T @ gap[good] / sigma)
+        lag += float(np.clip(step, -0.02, 0.02))
+    return Contacts(int(good.sum()), lag, float(np.sqrt(np.linalg.inv(precision)[0, 0])), float(bias))
+
+
+def _turns(log: SessionLog, mine: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Moment, place and a place before it, of every turn on the robot's side in one ball's track."""
+    order = np.argsort(log.ball.capture_time[mine], kind="stable")
+    t, p = log.ball.capture_time[mine][order], log.ball.position[:, mine][:, order]
+    found, last = [], -math.inf
+    for i in range(SIDE, len(t) - SIDE):
+        if t[i] - last < 0.1 or p[1, i] > -0.3 or np.diff(t[i - SIDE : i + SIDE]).max() > LONGEST:
+            continue
+        first, second = slice(i - SIDE, i), slice(i, i + SIDE)
+        v, w = (np.polyfit(t[s], p[1, s], 1)[0] for s in (first, second))
+        if w - v < TURN or v > 0.0 or w < 0.0:
+            continue
+        a, b = (_line(t[s], p[:, s], t[i]) for s in (first, second))
+        moment = float((a[0, 1] - b[0, 1]) / (b[1, 1] - a[1, 1]) + t[i])
+        if t[i - 1] - 0.002 <= moment <= t[i] + 0.002:
+            place = a[0] + a[1] * (moment - t[i]) - np.array([0, 0, 0.5 * GRAVITY]) * (moment - t[i]) ** 2
+            found.append((moment, place, p[:, i - SIDE]))
+            last = t[i]
+    return found
+
+
+def _line(t: np.ndarray, p: np.ndarray, at: float) -> np.ndarray:
+    """(2, 3) place and velocity at a moment by a parabola through samples (3, n)."""
+    u = t - at
+    x = p + 0.5 * GRAVITY * np.outer([0.0, 0.0, 1.0], u**2)
+    return np.linalg.lstsq(np.stack([np.ones_like(u), u], axis=1), x.T, rcond=None)[0]

@@ -1,0 +1,117 @@
+"""Robot to table: base, joint zeros and paddle from touched points, by least squares through the kinematics.
+
+Every number has a prior: nobody mounts a base a metre off, and what the poses cannot tell stays where it was. Which
+combinations those are is said: of each, the data know less than the prior does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from robot_io.calibrated import RANGES, Frame, RobotCalibration
+from robot_io.contract import ABB_JOINTS, JOINT_NAMES
+from robot_io.safety.clearance import RobotGeometry
+
+NAMES = (
+    *(f"zero of {JOINT_NAMES[i]}" for i in ABB_JOINTS),
+    *(f"base {axis}" for axis in "xyz"),
+    *(f"base turned about {axis}" for axis in "xyz"),
+    *(f"paddle {axis}" for axis in "xyz"),
+)
+PRIOR = np.array([0.02] * 6 + [0.01] * 3 + [0.005] * 3 + [0.002] * 3)  # standard deviations [rad], [m]
+TOUCH = 0.001  # [m] of a touch along each axis
+FEWEST = 8
+OUTLIER = 4.0  # robust deviations beyond which a touch is not used
+FINEST = 0.001  # [m] least deviation that is taken for one
+UNKNOWN = 3.0  # variance that the prior has over what the data leave, below which they do not tell a combination
+NAMED = 0.3  # share of a combination from which on a number is named
+
+
+@dataclass(frozen=True)
+class RobotFit:
+    """Found numbers.
+
+    residuals   (n,) [m] distance of every touch
+    used        (n,) touches that agree
+    deviation   (15,) standard deviations in the order of ``NAMES``, priors included
+    unknown     combinations that the poses do not separate, in words
+    """
+
+    calibration: RobotCalibration
+    residuals: np.ndarray
+    used: np.ndarray
+    deviation: np.ndarray
+    unknown: tuple[str, ...]
+
+
+def fit(
+    table: np.ndarray,
+    joints: np.ndarray,
+    paddle: np.ndarray,
+    axes_zero: tuple[float, float],
+    date: str,
+    geometry: RobotGeometry | None = None,
+) -> RobotFit:
+    """The robot's calibration from touches.
+
+    table   (n, 3) [m] touched points in the table frame
+    joints  (n, 8) what axes and controller report there
+    paddle  (n, 3) [m] nominal touching points in the last joint's frame
+
+    Raises ValueError for too few touches, or when no majority agrees.
+    """
+    n, shape = len(table), geometry or RobotGeometry.load()
+    if n < FEWEST:
+        raise ValueError(f"{n} touched points with joint positions; at least {FEWEST} are needed")
+
+    def misses(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        x = x * PRIOR
+        q = joints[rows].T.copy()
+        q[list(ABB_JOINTS)] += x[:6, None]
+        hand = shape.hand(q)
+        points = np.einsum("nij,nj->ni", hand[:, :3, :3], paddle[rows] + x[12:15]) + hand[:, :3, 3]
+        return Frame(tuple(x[6:9]), tuple(x[9:12])).outward(points) - table[rows]
+
+    def cost(x: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return np.concatenate([(misses(x, rows) / TOUCH).ravel(), x])
+
+    every = np.arange(n)
+    solved = least_squares(cost, np.zeros(len(PRIOR)), args=(every,), loss="cauchy", f_scale=2.0)
+    for _ in range(3):
+        residuals = np.linalg.norm(misses(solved.x, every), axis=1)
+        used = residuals <= OUTLIER * max(1.4826 * float(np.median(residuals)) / 1.54, FINEST)
+        if used.sum() < max(FEWEST, n / 2):
+            raise ValueError(f"only {used.sum()} of {n} touches agree with each other; measure them again")
+        solved = least_squares(cost, solved.x, args=(np.flatnonzero(used),))
+    residuals = np.linalg.norm(misses(solved.x, every), axis=1)
+    if np.median(residuals) > RANGES["robot.residual"][1]:
+        raise ValueError(f"no calibration fits: half of the touches are {np.median(residuals):.3f} m off or more")
+    x = np.round(solved.x * PRIOR, 7).tolist()
+    found = RobotCalibration(
+        tuple(x[6:9]),
+        tuple(x[9:12]),
+        tuple(x[:6]),
+        tuple(x[12:15]),
+        axes_zero,
+        round(float(np.sqrt((residuals[used] ** 2).mean())), 6),
+        int(used.sum()),
+        date,
+    )
+    deviation = PRIOR * np.sqrt(np.diag(np.linalg.inv(solved.jac.T @ solved.jac)))
+    return RobotFit(found, residuals, used, deviation, _unknown(solved.jac[:-15]))
+
+
+def _unknown(jacobian: np.ndarray) -> tuple[str, ...]:
+    """Combinations of which the data know less than the prior, from the scaled Jacobian (m, 15)."""
+    information, directions = np.linalg.eigh(jacobian.T @ jacobian)
+    found = []
+    for known, direction in zip(information, directions.T, strict=True):
+        if known > UNKNOWN:
+            continue
+        direction = direction * np.sign(direction[np.abs(direction).argmax()])
+        parts = [(s, name) for s, name in zip(direction, NAMES, strict=True) if abs(s) > NAMED]
+        found.append(" ".join(f"{'+' if s > 0 else '-'} {name}" for s, name in sorted(parts, key=lambda p: -abs(p[0]))))
+    return tuple(text.removeprefix("+ ") for text in found)
