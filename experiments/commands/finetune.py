@@ -46,7 +46,7 @@ def finetune(
     ] = None,
     overrides: Annotated[tuple[str, ...], changes("change one setting")] = (),
     out: Annotated[str | None, option("FOLDER", "of the run (default: POLICY-finetuned)")] = None,
-    backend: Backend = "numpy",
+    backend: Backend = "auto",
     distribution: Distribution = None,
     player: Player = None,
     rig: RigFile = None,

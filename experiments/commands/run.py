@@ -25,7 +25,9 @@ from experiments.runs.locate import artefact_of
 
 Distribution = Annotated[str | None, option("NAME", "balls that are thrown (default: the policy's)")]
 Player = Annotated[str | None, option("NAME", "virtual player on the rig, player1 to player5, who answers")]
-Backend = Annotated[Literal["numpy", "jit"], Parameter(help="what computes the policy")]
+Backend = Annotated[
+    Literal["auto", "numpy", "jit"], Parameter(help="computes the policy; auto: JAX where it is as fast as NumPy")
+]
 
 app = command(
     "run",
@@ -59,7 +61,7 @@ def run(
     rallies: Annotated[int | None, count("end after N rallies that count")] = None,
     player: Player = None,
     seconds: Annotated[float | None, option("S", "end after S seconds")] = None,
-    backend: Backend = "numpy",
+    backend: Backend = "auto",
     log: Annotated[str, option("FOLDER", "for the MCAP log and the summary")] = "runs/robot",
     distribution: Distribution = None,
     rig: RigFile = None,

@@ -33,8 +33,7 @@ from robot_io.devices.festo import AxesThread
 from robot_io.devices.tracker import Tracker, TrackerSocket
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
-from robot_io.policy.numpy_policy import StreamingPolicy
-from robot_io.policy.policy import Policy
+from robot_io.policy.backends import choose, make_policy
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.gate import SafetyGate
 
@@ -53,29 +52,18 @@ Closing = TypeVar("Closing", bound=Closable)
 
 @dataclass(frozen=True)
 class ControlOptions:
-    """artefact: folder; backend: "numpy" or "jit"; log_folder and log_name of the MCAP, None: no log.
+    """artefact: folder; backend: of ``robot_io.policy.backends``; log_folder and log_name of the MCAP, None: no log.
 
     box: balls that the policy was trained for; None: nothing is out of distribution
     """
 
     artefact: str
-    backend: str = "numpy"
+    backend: str = "auto"
     log_folder: str | None = None
     log_name: str = "session"
     box: Box | None = None
     metadata: tuple[tuple[str, str], ...] = ()
     attachments: tuple[tuple[str, str], ...] = ()
-
-
-def make_policy(backend: str, policy: Policy) -> StepPolicy:
-    """A policy for the loop. Raises ValueError for an unknown backend."""
-    if backend == "numpy":
-        return StreamingPolicy(policy)
-    if backend == "jit":
-        from robot_io.policy.jax_policy import JitPolicy  # imports JAX
-
-        return JitPolicy(policy)
-    raise ValueError(f"policy backend {backend!r}, allowed: numpy, jit")
 
 
 def start(config: RobotConfig, options: ControlOptions) -> tuple[BaseProcess, Connection]:
@@ -106,7 +94,8 @@ class Control:
     def __init__(self, config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
         self._config, self._options, self._pipe = config, options, pipe
         loaded, arm, found = artefacts.load(options.artefact), config.arm, config.calibration.robot
-        policy = make_policy(options.backend, loaded.policy)
+        self._backend, self._computed = choose(options.backend, loaded.policy)
+        policy = make_policy(self._backend, loaded.policy)
         self.timings = Timings()
         self._opened: list[Closable] = []
         self._unsent: deque[messages.Message] = deque()
@@ -179,7 +168,8 @@ class Control:
         """Until told to quit."""
         report = realtime.prepare(self._config.realtime.priority, self._config.realtime.lock_memory)
         self._axes.start()  # afterwards: a thread inherits the scheduling of the one that starts it
-        self._pipe.send(messages.Ready(report))
+        self._pipe.send(messages.Ready([*report, self._computed]))
+        self.bridge.event(time.monotonic(), log.Level.INFO, "policy", self._computed)
         try:
             self._loop()
         except BaseException as error:  # nothing leaves the loop before the robot stands
@@ -308,7 +298,7 @@ class Control:
                 case messages.Pause(on):
                     self.bridge.paused = on
                 case messages.SetPolicy(policy, version):
-                    self.bridge.set_policy(make_policy(self._options.backend, policy), version)
+                    self.bridge.set_policy(make_policy(self._backend, policy), version)
                     self._send(messages.PolicySet(version))
                 case messages.Quit():
                     self._quit = True

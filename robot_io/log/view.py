@@ -81,7 +81,7 @@ class View:
         return Encoded(SCENE, time, time, 0, update)
 
     def encode(self, record: Record) -> Iterator[Encoded]:
-        """What follows from a record; never raises."""
+        """Messages that follow from a record; never raises."""
         if isinstance(record, Joints):
             if self._is_due(record, record.time, RATE) and np.isfinite(record.position).all():
                 yield Encoded(TF, record.log_time, record.time, 0, self._frames(record.position.tolist()))

@@ -57,7 +57,7 @@ class Simulated:
         monkeypatch.setattr(process, "time", clock)
         monkeypatch.setattr(process, "select", SimpleNamespace(select=self._select))
         config = RobotConfig(realtime=RealTimeConfig(spin=0.0))
-        self.control = Control(config, ControlOptions(str(artefact)), theirs)
+        self.control = Control(config, ControlOptions(str(artefact), "numpy"), theirs)
         self.simulation.bridge = self.control.bridge
 
     def _sleep(self, seconds):
