@@ -46,7 +46,10 @@ JAX_ALLOWED = {
 # The rooms of each package from the ground up: a module imports from its own room and from rooms further left. A room
 # is a folder without the folders in it ("." is the package's own), or a module that stands apart from its folder.
 ROOMS = {
-    "robot_io": ". devices/egm devices devices/festo safety policy log calibration control emulator/tracker emulator",
+    "robot_io": (
+        ". devices/egm devices devices/festo safety policy log calibration "
+        "control/commissioning control emulator/tracker emulator"
+    ),
     "ballmodel": "constants state trajectory io .",
     "bgs": ".",
     "mjx_tt": (

@@ -77,11 +77,6 @@ def plain(config: RobotConfig | RigParams | Calibration) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
-@cache
-def _defaults(kind: type[Config]) -> dict[str, Any]:
-    return plain(kind())
-
-
 def _completed(given: Any, defaults: Any) -> Any:
     """Content with the keys that its mappings omit, as the whole has them, which need not be their class's defaults."""
     if not (isinstance(given, dict) and isinstance(defaults, dict)):
@@ -95,7 +90,7 @@ def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
     lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
     try:
         # By JSON, whose lists are tuples: nothing else is converted.
-        content = _completed(data, _defaults(kind))
+        content = _completed(data, plain(kind()))
         config = _adapters()[kind].validate_json(json.dumps({"file": content}, default=str)).file
     except ValidationError as error:
         for mistake in error.errors(include_url=False):

@@ -21,10 +21,11 @@ from time import perf_counter
 
 import numpy as np
 
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, JOINT_NAMES, LIMITS, N_JOINTS
+from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, LIMITS, N_JOINTS
+from robot_io.control.commissioning import jog
+from robot_io.control.commissioning.homing import check_homing, towards
 from robot_io.control.episode import Episode, EpisodeSummary
-from robot_io.control.homing import check_homing, towards
-from robot_io.control.interfaces import STANDARD_PLAY, Axes
+from robot_io.control.interfaces import STANDARD_PLAY, Axes, action_of
 from robot_io.control.interfaces import BridgeConfig as BridgeConfig
 from robot_io.control.interfaces import BridgeState as BridgeState
 from robot_io.control.interfaces import Policy as Policy
@@ -93,7 +94,7 @@ class Bridge:
         self._axes_received = self._tick_time = self._last_tick = -math.inf
         self._start = np.full(N_JOINTS, np.nan)  # reference at the start of the period
         self._policy_limit = np.array(LIMITS.policy_velocity)
-        self._home_speed = config.home_speed * self._policy_limit
+        self._home_speed = (jog.SPEED if config.jog else config.home_speed) * self._policy_limit
         self._home_braking = config.home_braking * np.array(LIMITS.acceleration)
         self._logged_faults = self._clock_windows = 0
         self.unlogged = 0  # records that could not be logged
@@ -101,12 +102,8 @@ class Bridge:
         self._log_failure = ""  # why the log's file cannot be written
         self._errors: set[str] = set()  # of the program, each logged once
         self._stopping_since = -math.inf
-        self._been_home, self.paused = False, False  # at the home pose since it was armed
+        self._been_home, self.paused = False, config.jog  # at the home pose since it was armed
         self.policy_seconds = 0.0  # of the last tick; 0 when the policy was not asked
-
-    @property
-    def episode(self) -> Episode | None:  # that the policy plays
-        return self.play.episode
 
     # The operator
 
@@ -115,10 +112,14 @@ class Bridge:
         return BridgeState.FAULT if self.gate.state is GateState.FAULT else self._state
 
     @property
+    def measured(self) -> np.ndarray:
+        """Newest positions (8,); NaN for what has not reported."""
+        return joints(self._feedback)[0]
+
+    @property
     def at_home(self) -> bool:
         """At the home pose and at rest, by reference and by measurement."""
-        measured, _ = joints(self._feedback)
-        near = np.abs(measured - self._home) < 2 * AT_HOME
+        near = np.abs(self.measured - self._home) < 2 * AT_HOME
         return bool(near.all() and (np.abs(self.gate.reference - self._home) < AT_HOME).all() and self.gate.at_rest)
 
     def set_policy(self, policy: Policy, version: int = 0) -> None:
@@ -143,7 +144,14 @@ class Bridge:
         self._arm_session_id = self.arm_session.session_id
         self._arm_restarted = self._been_home = False
         self._start = measured
+        self._home = measured if self.config.jog else self._home
         self._change(BridgeState.READY, now, "armed by the operator")
+
+    def jog(self, step: np.ndarray) -> None:
+        """Move on by a step (8,) from where it is commanded to be. Raises RefusedError."""
+        if not self.config.jog or self.state is not BridgeState.READY:
+            raise RefusedError(f"not jogged: the state is {self.state.value}; arm it first, in mjx-tt robot jog")
+        self._home = self.gate.reference + step
 
     def stop(self, now: float) -> None:
         """The operator's stop: slows down, holds, and ends DISARMED."""
@@ -170,8 +178,7 @@ class Bridge:
         """
         if self.state not in (BridgeState.DISARMED, BridgeState.FAULT) or not self.gate.at_rest:
             raise RefusedError(f"axes not homed: the state is {self.state.value}; stop the robot first")
-        measured, _ = joints(self._feedback)
-        check_homing(self._geometry, measured)
+        check_homing(self._geometry, self.measured)
 
     def estop(self, pressed: bool, now: float) -> None:
         """Tells the state of the emergency stop."""
@@ -288,7 +295,7 @@ class Bridge:
         """The requested velocity (8,), after a look at the devices and at the balls."""
         self._watch(now)
         self.play.settle(now)
-        if self._state is BridgeState.ACTIVE and self.episode is None:
+        if self._state is BridgeState.ACTIVE and self.play.episode is None:
             self._change(BridgeState.READY, now, "ball over")
         ready = self.state is BridgeState.READY
         self._been_home |= ready and self.at_home
@@ -299,10 +306,9 @@ class Bridge:
             self._policy.reset()
             self._change(BridgeState.ACTIVE, now, f"ball {self.tracker.ball}")
         if self.state is BridgeState.ACTIVE:
-            return self._ask_policy(now, self.episode, self._policy)
-        if self.state is not BridgeState.READY:
-            return np.zeros(N_JOINTS)
-        return towards(self._home, self.gate.reference, self._home_speed, self._home_braking, self.gate.period)
+            return self._ask_policy(now, self.play.episode, self._policy)
+        way = self._home, self.gate.reference, self._home_speed, self._home_braking, self.gate.period
+        return towards(*way) if self.state is BridgeState.READY else np.zeros(N_JOINTS)
 
     def _ages(self, now: float) -> dict[str, float]:
         arm, seen = self.arm_session.feedback, self.tracker.received
@@ -346,9 +352,7 @@ class Bridge:
             return np.zeros(N_JOINTS)
         began = perf_counter()
         try:
-            action = np.asarray(policy.step(observation), float)
-            if action.shape != (N_JOINTS,):
-                raise ValueError(f"an action of shape {action.shape}, needed is ({N_JOINTS},)")
+            action = action_of(policy, observation)
         except Exception as error:  # whatever a policy does, the robot is braked
             self.gate.fault(Cause.MALFORMED_COMMAND, f"the policy failed: {type(error).__name__}: {error}", now)
             return np.zeros(N_JOINTS)
@@ -393,8 +397,3 @@ class Bridge:
             self.unlogged += len(records)
             if isinstance(error, OSError):  # nothing more will get into the file
                 self._log_failure = f"the log cannot be written: {error}"
-
-    def joint_table(self) -> list[tuple[str, float, float]]:
-        """Name, measured position and commanded velocity of every joint, for the view."""
-        measured, _ = joints(self._feedback)
-        return list(zip(JOINT_NAMES, measured.tolist(), self.gate.velocity.tolist(), strict=True))

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from robot_io.calibrated import Frame
+from robot_io.contract import N_JOINTS
 from robot_io.control.observation import HERE, ObservationDelays
 from robot_io.control.rally import Box
 
@@ -27,6 +28,14 @@ class Policy(Protocol):
     def reset(self) -> None: ...
 
     def step(self, observation: np.ndarray) -> np.ndarray: ...
+
+
+def action_of(policy: Policy, observation: np.ndarray) -> np.ndarray:
+    """The policy's answer (8,). Raises ValueError for another shape, and whatever the policy raises."""
+    action = np.asarray(policy.step(observation), float)
+    if action.shape != (N_JOINTS,):
+        raise ValueError(f"an action of shape {action.shape}, needed is ({N_JOINTS},)")
+    return action
 
 
 class Axes(Protocol):
@@ -49,6 +58,7 @@ class BridgeConfig:
     home_braking     share of the acceleration limits there
     box              what the policy was trained for; None: no ball is out of distribution
     base             where the robot stands, from where the model has it
+    jog              once armed it stays where it is, takes no balls and moves as ``jog`` asks
     """
 
     delays: ObservationDelays = ObservationDelays()
@@ -57,6 +67,7 @@ class BridgeConfig:
     home_braking: float = 0.3
     box: Box | None = None
     base: Frame = HERE
+    jog: bool = False
 
 
 STANDARD_PLAY = BridgeConfig()

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from robot_io.contract import JOINT_NAMES
 from robot_io.control.episode import EpisodeSummary
 from robot_io.control.rally import RallySummary
 from robot_io.policy.policy import Policy
+
+if TYPE_CHECKING:
+    from robot_io.control.bridge import Bridge
+    from robot_io.control.commissioning.dry import DryAxes
+    from robot_io.control.timings import Timings
+    from robot_io.devices.festo import AxesThread
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,20 @@ class Pause:
 
 
 @dataclass(frozen=True)
+class Jog:
+    """Move by a step (8,) [m], [rad]."""
+
+    step: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class JogBlade:
+    """Move the blade by a step (3,) [m] in the table frame, without turning it."""
+
+    step: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class SetPolicy:
     """Exchange the policy; ``version`` is in the summary of every episode that it plays. Answered by PolicySet."""
 
@@ -57,7 +78,7 @@ class Quit:
     """Stop the robot and end the process."""
 
 
-Request = Prepare | Arm | Stop | Reset | Discard | Pause | SetPolicy | Quit
+Request = Prepare | Arm | Stop | Reset | Discard | Pause | Jog | JogBlade | SetPolicy | Quit
 
 
 @dataclass(frozen=True)
@@ -128,6 +149,9 @@ class Status:
     present         sentences of conditions that keep the robot from being armed, by cause
     arm, axes, tracker  the reason why each cannot be used, or None
     joints          name, measured position, commanded velocity of each joint
+    ball            (3) [m] where the tracker's newest frame shows it, in the table frame; None: nowhere
+    clock           ``Clock.report`` of the tracker's
+    dry             nothing is sent: arm and axes move in thought
     outcomes        balls by outcome
     rally           paddle touches of the rally in play
     rallies         that count, with the mean_rally and longest_rally of them; last_rally: the last one in words
@@ -145,6 +169,9 @@ class Status:
     axes: str | None
     tracker: str | None
     joints: list[tuple[str, float, float]]
+    ball: tuple[float, ...] | None = None
+    clock: dict[str, float] = field(default_factory=dict)
+    dry: bool = False
     policy_version: int = 0
     balls: int = 0
     outcomes: dict[str, int] = field(default_factory=dict)
@@ -159,6 +186,44 @@ class Status:
     axes_late: int = 0
     log_dropped: int = 0
     timings: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, bridge: Bridge, axes: AxesThread | DryAxes, timings: Timings, dropped: int, now: float, dry: bool
+    ) -> Status:
+        """The state at ``now``; ``dropped``: records that the log lost."""
+        counts, tracker, session = bridge.counts, bridge.tracker, bridge.arm_session
+        seen, heard = tracker.newest, tracker.received
+        positions, velocities = bridge.measured.tolist(), bridge.gate.velocity.tolist()
+        return cls(
+            time=now,
+            state=bridge.state.value,
+            paused=bridge.paused,
+            at_home=bridge.state.value in ("ready", "active") and bridge.at_home,
+            faults=tuple(FaultReport(f.cause.value, f.sentence) for f in bridge.gate.faults),
+            present={cause.value: text for cause, text in bridge.gate.present.items()},
+            arm=session.problem(now),
+            axes=axes.problem(now),
+            tracker="silent" if heard is None or now - heard >= 0.5 else None,
+            joints=list(zip(JOINT_NAMES, positions, velocities, strict=True)),
+            ball=None if seen is None or seen.position is None else tuple(seen.position.tolist()),
+            clock=tracker.clock.report(),
+            dry=dry,
+            policy_version=bridge.policy_version,
+            balls=counts.balls,
+            outcomes=dict(counts.outcomes),
+            rally=counts.rallies.touches,
+            rallies=counts.rallies.rallies,
+            mean_rally=counts.rallies.touched / max(counts.rallies.rallies, 1),
+            longest_rally=counts.rallies.longest,
+            last_rally=counts.rallies.last,
+            egm=asdict(session.statistics),
+            tracker_counts=dict(tracker.counts),
+            axes_cycles=axes.cycles,
+            axes_late=axes.late,
+            log_dropped=dropped,
+            timings=timings.summary(),
+        )
 
     @property
     def missing(self) -> str:

@@ -12,7 +12,7 @@ import select
 import signal
 import time
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -21,9 +21,12 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from robot_io import log
+from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_OBSERVATION, n_parameters
 from robot_io.control import messages, realtime
-from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState
+from robot_io.control.bridge import Bridge, BridgeConfig
 from robot_io.control.bridge import Policy as StepPolicy
+from robot_io.control.commissioning.dry import DryArm, DryAxes
+from robot_io.control.commissioning.jog import blade_step, joint_step
 from robot_io.control.config import RobotConfig, linear_axes
 from robot_io.control.episode import EpisodeSummary
 from robot_io.control.rally import Box
@@ -34,6 +37,7 @@ from robot_io.devices.tracker import Tracker, TrackerSocket
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
 from robot_io.policy.backends import choose, make_policy
+from robot_io.policy.policy import Policy
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.gate import SafetyGate
 
@@ -52,18 +56,22 @@ Closing = TypeVar("Closing", bound=Closable)
 
 @dataclass(frozen=True)
 class ControlOptions:
-    """artefact: folder; backend: of ``robot_io.policy.backends``; log_folder and log_name of the MCAP, None: no log.
+    """artefact: folder, None: a policy that stands still.
 
+    backend: of ``robot_io.policy.backends``; log_folder and log_name of the MCAP, None: no log.
     box: balls that the policy was trained for; None: nothing is out of distribution
+    dry: nothing is sent to arm and axes, which move in thought; jog: no balls are taken, the operator moves the robot
     """
 
-    artefact: str
+    artefact: str | None
     backend: str = "auto"
     log_folder: str | None = None
     log_name: str = "session"
     box: Box | None = None
     metadata: tuple[tuple[str, str], ...] = ()
     attachments: tuple[tuple[str, str], ...] = ()
+    dry: bool = False
+    jog: bool = False
 
 
 def start(config: RobotConfig, options: ControlOptions) -> tuple[BaseProcess, Connection]:
@@ -93,9 +101,12 @@ class Control:
 
     def __init__(self, config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
         self._config, self._options, self._pipe = config, options, pipe
-        loaded, arm, found = artefacts.load(options.artefact), config.arm, config.calibration.robot
-        self._backend, self._computed = choose(options.backend, loaded.policy)
-        policy = make_policy(self._backend, loaded.policy)
+        arm, found = config.arm, config.calibration.robot
+        loaded = None if options.artefact is None else artefacts.load(options.artefact)
+        still = Policy(np.zeros(n_parameters()), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION))
+        chosen, backend = (still, "numpy") if loaded is None else (loaded.policy, options.backend)
+        self._backend, self._computed = choose(backend, chosen)
+        policy = make_policy(self._backend, chosen)
         self.timings = Timings()
         self._opened: list[Closable] = []
         self._unsent: deque[messages.Message] = deque()
@@ -104,18 +115,24 @@ class Control:
             self._tracker_socket = self._open(TrackerSocket(config.tracker))
             recorder: log.SessionRecorder = log.NullRecorder()
             if options.log_folder is not None:
-                metadata = {"artefact": options.artefact, "artefact_sha256": loaded.digest, "robot": config.name}
+                metadata = {
+                    "artefact": options.artefact,
+                    "artefact_sha256": loaded.digest if loaded else "",
+                    "robot": config.name,
+                }
                 recorder = log.Recorder.start(
                     options.log_folder, options.log_name, metadata | dict(options.metadata), dict(options.attachments)
                 )
             self._recorder = self._open(recorder)
-            self._axes = self._open(AxesThread(linear_axes(config)))
-            self._session = EgmSession(
-                EgmConfig(arm.controller, arm.controller_port, timeout=arm.timeout, zeros=found.joint_zeros)
+            gate = SafetyGate(geometry=RobotGeometry.load().moved(found.base), config=config.safety)
+            egm = EgmConfig(arm.controller, arm.controller_port, timeout=arm.timeout, zeros=found.joint_zeros)
+            home = gate.geometry.home
+            self._session = DryArm(egm, home[list(ABB_JOINTS)]) if options.dry else EgmSession(egm)
+            self._axes: AxesThread | DryAxes = self._open(
+                DryAxes(home[list(FESTO_JOINTS)]) if options.dry else AxesThread(linear_axes(config))
             )
             self._tracker = Tracker(config.tracker, config.calibration)
-            gate = SafetyGate(geometry=RobotGeometry.load().moved(found.base), config=config.safety)
-            bridge_config = BridgeConfig(delays=config.delays, box=options.box, base=found.base)
+            bridge_config = BridgeConfig(delays=config.delays, box=options.box, base=found.base, jog=options.jog)
             self.bridge = Bridge(
                 self._session,
                 self._axes,
@@ -258,6 +275,10 @@ class Control:
             self.bridge.axes_received(state.position, state.received)
 
     def _tick(self, deadline: float, now: float) -> None:
+        if isinstance(self._session, DryArm) and isinstance(self._axes, DryAxes):
+            self._session.pretend(now, self.bridge.gate.engaged)
+            self._axes.pretend(now)
+            self.bridge.arm_received(now)
         self._take_axes()
         self.bridge.tick(deadline, now)
         self.timings.lateness.add(now - deadline)
@@ -295,6 +316,10 @@ class Control:
                     self.bridge.reset(now)
                 case messages.Discard():
                     self.bridge.discard(now)
+                case messages.Jog(step):
+                    self.bridge.jog(joint_step(np.array(step)))
+                case messages.JogBlade(step):
+                    self.bridge.jog(blade_step(self.bridge.gate.geometry, self.bridge.gate.reference, np.array(step)))
                 case messages.Pause(on):
                     self.bridge.paused = on
                 case messages.SetPolicy(policy, version):
@@ -337,33 +362,7 @@ class Control:
 
     def status(self, now: float) -> messages.Status:
         """State of everything at ``now``."""
-        bridge, counts, heard = self.bridge, self.bridge.counts, self._tracker.received
-        return messages.Status(
-            time=now,
-            state=bridge.state.value,
-            paused=bridge.paused,
-            at_home=bridge.state in (BridgeState.READY, BridgeState.ACTIVE) and bridge.at_home,
-            faults=tuple(messages.FaultReport(f.cause.value, f.sentence) for f in bridge.gate.faults),
-            present={cause.value: text for cause, text in bridge.gate.present.items()},
-            arm=self._session.problem(now),
-            axes=self._axes.problem(now),
-            tracker="silent" if heard is None or now - heard >= 0.5 else None,
-            joints=bridge.joint_table(),
-            policy_version=bridge.policy_version,
-            balls=counts.balls,
-            outcomes=dict(counts.outcomes),
-            rally=counts.rallies.touches,
-            rallies=counts.rallies.rallies,
-            mean_rally=counts.rallies.touched / max(counts.rallies.rallies, 1),
-            longest_rally=counts.rallies.longest,
-            last_rally=counts.rallies.last,
-            egm=asdict(self._session.statistics),
-            tracker_counts=dict(self._tracker.counts),
-            axes_cycles=self._axes.cycles,
-            axes_late=self._axes.late,
-            log_dropped=self._recorder.dropped,
-            timings=self.timings.summary(),
-        )
+        return messages.Status.of(self.bridge, self._axes, self.timings, self._recorder.dropped, now, self._options.dry)
 
 
 def wait_for(pipe: Connection, kind: type[Wanted], seconds: float) -> Wanted:

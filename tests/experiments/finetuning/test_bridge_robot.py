@@ -85,7 +85,7 @@ def test_a_ball_is_credited_to_the_policy_that_played_it(gap):
     step = Constant.step
 
     def watched(policy, observation):
-        played.setdefault(bridge.episode.number, set()).add(round(1e4 * float(policy.action[0])))
+        played.setdefault(bridge.play.episode.number, set()).add(round(1e4 * float(policy.action[0])))
         return step(policy, observation)
 
     Constant.step = watched

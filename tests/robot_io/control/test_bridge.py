@@ -37,7 +37,7 @@ def test_nothing_moves_before_the_bridge_is_armed():
     rig.throwing = True
     start = rig.world.qpos
     rig.run(1.0)
-    assert rig.thrower.thrown == 1 and rig.bridge.state is BridgeState.DISARMED and rig.bridge.episode is None
+    assert rig.thrower.thrown == 1 and rig.bridge.state is BridgeState.DISARMED and rig.bridge.play.episode is None
     np.testing.assert_allclose(rig.world.qpos, start, rtol=0, atol=1e-5)
     np.testing.assert_allclose(start, rig.world.home, rtol=0, atol=1e-4)  # drives without a position controller
 

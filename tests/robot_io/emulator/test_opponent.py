@@ -162,7 +162,7 @@ def test_nothing_is_played_or_counted_before_the_robot_is_armed_and_was_at_home(
     rig.throwing = True
     start = rig.world.qpos
     rig.run(3.0)
-    assert rig.world.strokes >= 2 and not rig.rallies and not rig.summaries and rig.bridge.episode is None
+    assert rig.world.strokes >= 2 and not rig.rallies and not rig.summaries and rig.bridge.play.episode is None
     np.testing.assert_allclose(rig.world.qpos, start, rtol=0, atol=1e-4)
     rig.axes.enable()
     rig.run(1.0, lambda: rig.axes.state is not None and rig.axes.state.enabled)
