@@ -99,6 +99,7 @@ COMMANDS = (
     is2r.report_app,
     blind.app,
     compare.app,
+    run.robot_app,
     run.rig_app,
     log.app,
     calibrate.app,

@@ -49,6 +49,42 @@ rig_app = command(
   mjx-tt rig --out rig.yaml          and in another terminal:  mjx-tt run ARTEFACT --robot rig.yaml
 """,
 )
+robot_app = command(
+    "robot",
+    "bring a robot into service: a dry run, small motions by hand",
+    """\
+  mjx-tt robot check --robot robot.yaml                             tracker and arm are heard, nothing is sent
+  mjx-tt robot check --robot robot.yaml --artefact runs/quickstart  and a policy plays the balls in thought
+  mjx-tt robot jog --robot robot.yaml                               armed, slow, in small steps
+
+m notes where ball and joints are, for mjx-tt calibrate.
+""",
+)
+
+
+@robot_app.default
+def robot(
+    action: Annotated[Literal["check", "jog"], Parameter("ACTION")],
+    /,
+    *,
+    robot: Annotated[str, option("YAML", "a robot.yaml")],
+    artefact: Annotated[str | None, option("FOLDER", "of check: a policy, or its run")] = None,
+    points: Annotated[str, option("CSV", "where points are noted")] = "points.csv",
+    log: Annotated[str, option("FOLDER", "for the MCAP log")] = "runs/robot",
+    seconds: Annotated[float | None, option("S", "end after S seconds")] = None,
+) -> int:
+    """Returns the exit status."""
+    existing(robot, key="--robot")
+    writable(log)
+    if action == "jog" and artefact is not None:
+        raise ConfigError(f"--artefact {artefact}: jog plays no balls; allowed with check only")
+    folder = None if artefact is None else Path(artefact_of(artefact))
+    start_jax(1)
+    from experiments.deploy import commissioning
+
+    if action == "check":
+        return commissioning.check(Path(robot), folder, Path(log), Path(points), seconds, console())
+    return commissioning.jog(Path(robot), Path(log), Path(points), seconds, console())
 
 
 @app.default

@@ -93,7 +93,7 @@ class View:
         head = Text.assemble(
             (f"{self._title}  ", "bold"),
             (s.state.upper(), COLOURS[s.state]),
-            "  holding" if s.paused else "",
+            "  in thought" if s.dry else "  holding" if s.paused else "",
             "  at home" if s.at_home else "",
         )
         lines = [head]
@@ -106,6 +106,9 @@ class View:
             f"rally {s.rally} touches; {s.rallies} rallies, {s.mean_rally:.1f} on average, longest {s.longest_rally}"
         )
         lines.append(Text(f"{rallies}; last: {s.last_rally}" if s.last_rally else rallies))
+        ball = "no ball" if s.ball is None else "ball {:+.3f} {:+.3f} {:+.3f} m in the table frame".format(*s.ball)
+        clock = f"tracker's clock {1e6 * s.clock['drift']:+.1f} ppm over {s.clock['seconds']} s" if s.clock else ""
+        lines.append(Text(f"{ball}; {clock}"))
         joints = Table(box=None, pad_edge=False)
         for name in ("joint", "position", "command"):
             joints.add_column(name, justify="left" if name == "joint" else "right")

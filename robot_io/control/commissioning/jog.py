@@ -27,7 +27,10 @@ def joint_step(step: np.ndarray) -> np.ndarray:
 
 
 def blade_step(geometry: RobotGeometry, q: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Step (8,) of the joints at q (8,) that moves the blade by (3,) [m] without turning it. Raises RefusedError."""
+    """Step (8,) of the joints at q (8,) that moves the blade by (3,) [m] without turning it.
+
+    Shorter where a joint would move further than ``LARGEST``. Raises RefusedError.
+    """
     step = np.asarray(step, float)
     if step.shape != (3,) or not np.linalg.norm(step) <= LARGEST_BLADE:
         raise RefusedError(f"not jogged: the blade by {step.tolist()} m; at most {LARGEST_BLADE} m at a time")
@@ -39,4 +42,4 @@ def blade_step(geometry: RobotGeometry, q: np.ndarray, step: np.ndarray) -> np.n
     missed = np.abs(jacobian @ found - wanted).max()
     if missed > 0.1 * LARGEST_BLADE + 0.1 * np.linalg.norm(step):
         raise RefusedError(f"not jogged: from here the blade cannot move like that ({1e3 * missed:.1f} mm off)")
-    return joint_step(np.clip(found, -LARGEST, LARGEST))
+    return joint_step(found / max(1.0, float((np.abs(found) / LARGEST).max())))
