@@ -60,6 +60,8 @@ RANGES = {
     "safety.self_margin": (0.01, 0.5),
     "safety.floor_margin": (0.15, 0.7),
     "safety.blade_speed": (0.05, 10.0),
+    "safety.blade_acceleration": (1.0, 180.0),
+    "safety.overshoot": (0.005, 0.2),
     "safety.escape_speed": (0.001, 0.1),
     "safety.still": (0.001, 0.1),
     "safety.overspeed": (1.05, 2.0),

@@ -31,6 +31,7 @@ Array = TypeVar("Array", bound=Any)  # of NumPy or JAX
 FORMAT = 1
 SHIPPED = "robot_geometry.json"
 BLADE = "col_blade_axis"  # the capsule whose middle is the blade's centre
+WORST = 4  # vectors beside a way that are looked at along all of it
 LEVELS = 5  # halvings of a stretch before it counts as too close
 
 _KEYS = ("format", "joints", "capsules", "table", "floor", "table_capsules", "blade_capsules", "self_pairs", "home")
@@ -193,14 +194,13 @@ class RobotGeometry:
         points = np.matmul(world[self._joint, :, :3], self._local)  # (capsules, B, 3, 2)
         return np.ascontiguousarray(points.transpose(3, 2, 0, 1))
 
-    def blade_speed(self, q: np.ndarray, velocity: np.ndarray, duration: float) -> float:
-        """Mean speed [m/s] of the blade's centre from positions q (8,) at ``velocity`` (8,) for ``duration`` [s]."""
-        ends = self.ends(np.stack([q, q + velocity * duration], axis=1))[:, :, self._names.index(BLADE)].mean(axis=0)
-        return float(np.linalg.norm(ends[:, 1] - ends[:, 0])) / duration
+    def middles(self, capsule: str, q: np.ndarray) -> np.ndarray:
+        """World positions (3, B) [m] of the middle of a capsule's axis at joint positions q (8, B)."""
+        return self.ends(q)[:, :, self._names.index(capsule)].mean(axis=0)
 
     def middle(self, capsule: str, q: np.ndarray) -> np.ndarray:
-        """World position (3,) [m] of the middle of a capsule's axis at joint positions q (8,)."""
-        return self.ends(q[:, None])[:, :, self._names.index(capsule), 0].mean(axis=0)
+        """As ``middles`` at joint positions q (8,): (3,)."""
+        return self.middles(capsule, q[:, None])[:, 0]
 
     def clearances(self, q: np.ndarray) -> Clearances:
         """The simulation's clearances at joint positions q (8, B)."""
@@ -252,6 +252,18 @@ class RobotGeometry:
             e0, e1 = np.concatenate([e0, ends], -1), np.concatenate([ends, e1], -1)
             g0, g1 = np.concatenate([g0, gaps], -1), np.concatenate([gaps, g1], -1)
         return int(unclear.any(1).argmax())
+
+    def clear_beside(self, way: np.ndarray, beside: np.ndarray, margin: np.ndarray) -> bool:
+        """True when a robot that goes beside the way (8, N) by any of the vectors (8, K) keeps gaps of ``margin`` (R,).
+
+        A gap that starts with less must not become smaller. Of the vectors the worst where the way ends are examined,
+        at the way's points.
+        """
+        there = (self.gaps(way[:, -1:] + beside) - margin[:, None]).min(axis=0)
+        worst = beside[:, there.argsort()[:WORST]]
+        q = way[:, None] + worst[:, :, None]
+        gaps = self.gaps(q.reshape(N_JOINTS, -1)).reshape(-1, *q.shape[1:])
+        return bool((gaps >= np.minimum(margin[:, None], gaps[..., 0])[..., None]).all())
 
     def _to_box(self, box: Box, ends: np.ndarray) -> np.ndarray:
         some = ends[:, :, self._table_rows]

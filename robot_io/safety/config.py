@@ -22,7 +22,10 @@ class SafetyConfig:
     table_margin     smallest gap of arm and paddle to the table and to everything under it
     self_margin      smallest gap of the watched pairs of the robot's own parts
     floor_margin     smallest gap of arm and paddle to the floor; the rails of the gantry end 0.15 m above it
-    blade_speed      [m/s] of the blade's centre; what would be faster is braked as far as needed
+    blade_speed      [m/s] of the blade's centre, and blade_acceleration [m/s^2], each as a mean over a control period
+                     and also while braking; what would be more is braked as far as needed
+    overshoot        (8,) by which a drive may run beyond its reference; kept from the ends of the range where it is
+                     more than the limiter's margin
     escape_speed     share of the velocity limits while a gap is smaller than its margin
     still            measured speed (8,) above which the robot counts as moving and is not armed
     overspeed        measured speed over its limit that is a fault
@@ -38,7 +41,9 @@ class SafetyConfig:
     table_margin: float = 0.02
     self_margin: float = 0.02
     floor_margin: float = 0.17
-    blade_speed: float = 10.0
+    blade_speed: float = 8.0
+    blade_acceleration: float = 150.0
+    overshoot: tuple[float, ...] = _each(0.01, 0.06)
     escape_speed: float = 0.05
     still: tuple[float, ...] = _each(0.02, 0.05)
     overspeed: float = 1.5
@@ -58,13 +63,11 @@ class SafetyConfig:
         for name in ("table_margin", "self_margin", "floor_margin"):
             if not SLACK < getattr(self, name) < 1.0:
                 raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)} m, allowed is {SLACK} m to 1 m")
-        if not 0.0 < self.blade_speed < math.inf:
-            raise ValueError(f"SafetyConfig.blade_speed is {self.blade_speed} m/s, it must be positive and finite")
         ages = ("stale_arm", "stale_axes", "stale_tracker", "stale_policy")
-        for name in ("overspeed", "late", "following_ticks", *ages):
+        for name in ("blade_speed", "blade_acceleration", "overspeed", "late", "following_ticks", *ages):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)}, it must be positive and finite")
-        for name in ("still", "following_error"):
+        for name in ("still", "overshoot", "following_error"):
             values = getattr(self, name)
             if len(values) != N_JOINTS or not all(0.0 < v < math.inf for v in values):
                 raise ValueError(f"SafetyConfig.{name} is {values}, allowed are {N_JOINTS} positive numbers")

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from robot_io.contract import CONTROL_RATE, JOINT_NAMES, JOINT_UNITS, LIMITS, N_JOINTS, JointLimits
 from robot_io.errors import RefusedError
 from robot_io.limits import limit_velocity
-from robot_io.safety.clearance import RobotGeometry
+from robot_io.safety.clearance import BLADE, RobotGeometry
 from robot_io.safety.config import SLACK
 from robot_io.safety.config import SafetyConfig as SafetyConfig
 from robot_io.safety.faults import Cause, Fault, FaultLatch
@@ -29,6 +29,7 @@ from robot_io.safety.monitor import FeedbackMonitor, eight, worst
 from robot_io.safety.stopping import StopReference
 
 SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
+HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
 TOUCH = 0.01  # [m] smallest gap of the way that lies beside the reference by the measured deviation
 INSIDE = 1e-6  # [m] by which a gap must miss its margin to count as inside: more than rounding
 ROUNDING = 1e-9  # of each limit, allowed in the check of our own results
@@ -51,7 +52,8 @@ class Sent:
     velocity  (8,) for the coming control period [m/s], [rad/s]
     position  (8,) reference at that period's end [m], [rad]; NaN while no finite position was ever measured
     changed   names of the rules that changed the request, in order: speed_scale, escape, velocity, acceleration,
-              position, blade_speed or clearance, or the state's name when it is not armed; empty: sent as requested
+              position, blade_speed, blade_acceleration or clearance, or the state's name when it is not armed; empty:
+              sent as requested
     state     after this command
     """
 
@@ -96,6 +98,8 @@ class SafetyGate:
         # Beyond the limiter's own margin by this the limiter still leads back within a period or two.
         outside = np.array(limits.margin) - 0.25 * self._step * period
         self._low, self._high = np.array(limits.lower) + outside, np.array(limits.upper) - outside
+        margin = np.maximum(limits.margin, config.overshoot)
+        self._overshooting = replace(self.limits, margin=tuple(margin.tolist()))
         margins = {"table": config.table_margin, "self": config.self_margin, "floor": config.floor_margin}
         self._margin = np.array([margins[kind] for kind in self.geometry.kinds])
         self._touch = np.minimum(self._margin, TOUCH)
@@ -336,6 +340,13 @@ class SafetyGate:
                 rules.append("escape")
             scaled = slowed
         velocity = limit_velocity(scaled, self._velocity, self._reference, self.period, self.limits)
+        inner = limit_velocity(velocity, self._velocity, self._reference, self.period, self._overshooting)
+        # Nothing is led out of the room for the overshoot, but nothing goes farther into it.
+        velocity = np.where(
+            inner < velocity,
+            np.maximum(inner, np.minimum(velocity, 0.0)),
+            np.minimum(inner, np.maximum(velocity, 0.0)),
+        )
         if self._offset.any():  # what is measured keeps the range as well, not only the reference
             beside = limit_velocity(velocity, self._velocity, self._reference + self._offset, self.period, self.limits)
             beside = np.clip(beside, self._velocity - self._step, self._velocity + self._step)
@@ -351,26 +362,48 @@ class SafetyGate:
                 rules.append(name)
         if (velocity == braked).all():  # cleared before, or at rest
             return velocity, tuple(rules)
-        rule = ""
+        # Between two velocities that keep the kinematic limits every one does: they bound each joint by itself.
+        whole, rule = self._blade_share(braked, velocity)
+        if rule:
+            rules.append(rule)
         for share in SHARES:
-            # Between two velocities that keep the kinematic limits every one does: they bound each joint by itself.
-            tried = velocity if share == 1.0 else braked + share * (velocity - braked)
-            if self.geometry.blade_speed(self._reference, tried, self.period) > self.config.blade_speed:
-                rule = "blade_speed"
-            elif self._clear(tried):
-                return tried, tuple(rules if share == 1.0 else [*rules, rule])
-            else:
-                rule = "clearance"
-        return braked, (*rules, rule)
+            tried = velocity if share * whole == 1.0 else braked + share * whole * (velocity - braked)
+            way = self.braking_way(tried)
+            if not self._too_fast(way) and self._clear(way):
+                return tried, tuple(rules if share == 1.0 else [*rules, "clearance"])
+        return braked, (*rules, "clearance")
 
-    def _clear(self, velocity: np.ndarray) -> bool:
-        """True when this period and braking after it keep the margins, or leave a margin that is missed already."""
-        way = self.braking_way(velocity)
+    def _blade_share(self, braked: np.ndarray, velocity: np.ndarray) -> tuple[float, str]:
+        """Share of the way from braking to a velocity (8,) that keeps the blade's limits, and the limit that binds."""
+        rule = self._too_fast(self.braking_way(velocity))
+        if not rule:
+            return 1.0, ""
+        low, high = 0.0, 1.0
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            fast = self._too_fast(self.braking_way(braked + middle * (velocity - braked)))
+            low, high = (low, middle) if fast else (middle, high)
+        return low, rule
+
+    def _too_fast(self, way: np.ndarray) -> str:
+        """The limit of the blade that is broken on a way (8, N) of this period and of braking after it; empty: none."""
+        way = np.concatenate([self._start[:, None], way, way[:, -1:]], axis=1)  # with the period in force and rest
+        velocity = np.diff(self.geometry.middles(BLADE, way)) / self.period
+        if np.linalg.norm(velocity[:, 1:], axis=0).max() > self.config.blade_speed:
+            return "blade_speed"
+        acceleration = np.linalg.norm(np.diff(velocity), axis=0) / self.period
+        return "blade_acceleration" if acceleration.max() > self.config.blade_acceleration else ""
+
+    def _clear(self, way: np.ndarray) -> bool:
+        """True when a way of this period and of braking keeps the margins, or leaves one that is missed already."""
         if self.geometry.first_too_close(way, self._margin, SLACK) is not None:
             return False
         if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
             if self.geometry.first_too_close(way + self._deviation[:, None], self._touch, SLACK) is not None:
                 return False
+        beside = self._monitor.beside
+        if beside.size and not self.geometry.clear_beside(way, beside, self._touch):
+            return False
         if self._inside.any():
             gaps = self.geometry.gaps(way)[self._inside]
             return bool((gaps[:, -1] > gaps[:, 0]).all())
@@ -453,7 +486,7 @@ class SafetyGate:
         if not self._engaged:
             return
         self._unexplained = self._monitor.unexplained(position, now)
-        self._deviation = self._monitor.deviation(position)
+        self._deviation = self._monitor.deviation(position, now)
         self._offset = self._monitor.offset(self._deviation, self._offset, self.period)
         if not self._latch:
             sentence = self._monitor.following_error(self._unexplained)

@@ -14,6 +14,7 @@ from robot_io.safety.faults import Cause
 
 EXACT = 0.002  # [m], [rad] by which a robot may go beside its reference unnoticed
 FORGOTTEN = 1.0  # [s] in which a controller takes a deviation away: EGM's position correction with gain 1
+WORSE = 1.5  # times the deviations seen: the next one may be larger than all of them
 EARLY = 0.1  # [s] by which a measurement may be looked at before the end of the newest period
 
 
@@ -28,10 +29,12 @@ class FeedbackMonitor:
         self._past: deque[tuple[float, np.ndarray]] = deque()  # times and references at the ends of periods
         self._low = self._high = np.zeros(N_JOINTS)  # of the references in the window
         self._off = 0  # measurements in a row with a following error
+        self._beside: deque[tuple[float, np.ndarray]] = deque()  # times and deviations
 
     def restart(self, position: np.ndarray, now: float) -> None:
         """The reference (8,) has been here until now."""
         self._past, self._off = deque([(now, position)]), 0
+        self._beside.clear()
 
     def sent(self, reference: np.ndarray, time: float) -> None:
         """The reference (8,) will be here at ``time``, on a straight way from the one before."""
@@ -60,10 +63,20 @@ class FeedbackMonitor:
         self._low, self._high = np.min(seen, axis=0), np.max(seen, axis=0)
         return np.maximum(self._low - position, position - self._high)
 
-    def deviation(self, position: np.ndarray) -> np.ndarray:
+    def deviation(self, position: np.ndarray, now: float) -> np.ndarray:
         """Vector (8,) from the nearest place in the window of ``unexplained`` to the position; zero below EXACT."""
         found = position - np.clip(position, self._low, self._high)
-        return np.where(np.abs(found) > EXACT, found, 0.0)
+        found = np.where(np.abs(found) > EXACT, found, 0.0)
+        while self._beside and self._beside[0][0] < now - FORGOTTEN:
+            self._beside.popleft()
+        if found.any():
+            self._beside.append((now, found))
+        return found
+
+    @property
+    def beside(self) -> np.ndarray:
+        """Deviations (8, K) of the last ``FORGOTTEN`` seconds times ``WORSE``: where a noisy robot may be next."""
+        return WORSE * np.array([found for _, found in self._beside]).reshape(-1, N_JOINTS).T
 
     def offset(self, deviation: np.ndarray, before: np.ndarray, period: float) -> np.ndarray:
         """Distance (8,) by which the robot is taken to go beside its reference: ``deviation``, while it can be told.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from robot_io.contract import LIMITS
+from robot_io.control import bridge
 from robot_io.control.bridge import BridgeState
 from robot_io.log.messages import Event, json_text
 from robot_io.log.recorder import NullRecorder
@@ -134,11 +135,11 @@ def fail(*_, **__):
         "play.settle",
         "play.strokes.add",
         "play.moved",
-        "_homeward",
+        "towards",
         "_ask_policy",
     ],
 )
-def test_an_exception_anywhere_brakes_the_robot_and_is_a_fault(part):
+def test_an_exception_anywhere_brakes_the_robot_and_is_a_fault(part, monkeypatch):
     """And the arm gets an answer to every packet, at last one that holds it where it is."""
     simulation = armed(Constant([0, 0, 0.3, 0, 0, 0, 0, 0]))
     simulation.run(0.7)
@@ -147,7 +148,7 @@ def test_an_exception_anywhere_brakes_the_robot_and_is_a_fault(part):
     owner = simulation.bridge
     for step in path:
         owner = getattr(owner, step)
-    setattr(owner, name, fail)
+    monkeypatch.setattr(bridge if name == "towards" else owner, name, fail)
     if part == "axes.stop":
         simulation.bridge.estop(True, simulation.now)
     answered = len(simulation.replies)
