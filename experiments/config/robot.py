@@ -90,7 +90,7 @@ def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
     lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
     try:
         # By JSON, whose lists are tuples: nothing else is converted.
-        content = _completed(data, plain(kind()))
+        content = _completed(data, _defaults()[kind])
         config = _adapters()[kind].validate_json(json.dumps({"file": content}, default=str)).file
     except ValidationError as error:
         for mistake in error.errors(include_url=False):
@@ -100,6 +100,12 @@ def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
     if not lines:
         return config
     raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
+
+
+@cache
+def _defaults() -> dict[type, dict[str, Any]]:
+    """Content of a file that omits nothing and changes nothing, by its dataclass."""
+    return {kind: plain(kind()) for kind in RANGES}
 
 
 @cache
