@@ -26,7 +26,7 @@ from experiments.runs.locate import artefact_of
 Distribution = Annotated[str | None, option("NAME", "balls that are thrown (default: the policy's)")]
 Player = Annotated[str | None, option("NAME", "virtual player on the rig, player1 to player5, who answers")]
 Backend = Annotated[
-    Literal["auto", "numpy", "jit"], Parameter(help="computes the policy; auto: JAX where it is as fast as NumPy")
+    Literal["auto", "numpy", "jit"], Parameter(help="computes the policy; auto: JAX unless it is missing or slow")
 ]
 
 app = command(

@@ -1,4 +1,4 @@
-"""The policy for the control loop: compiled by JAX where that is as fast, else by NumPy, which is always there."""
+"""The policy for the control loop: compiled by JAX where that is fast enough, else by NumPy, which is always there."""
 
 from __future__ import annotations
 

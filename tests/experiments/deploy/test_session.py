@@ -75,6 +75,26 @@ def test_plays_on_the_rig_and_leaves_a_log_and_a_summary(policy, tmp_path):
 
 
 @pytest.mark.realtime
+def test_a_virtual_player_rallies_in_real_time(policy, tmp_path):
+    """The policy misses; the person serves again, and log and summary agree on the rallies."""
+    console = Console(record=True, width=200)
+    options = {"rallies": 2, "player": "player3"}
+    status = play.run(policy, deploy_rig.RIG, None, None, "auto", tmp_path, None, 0, None, console, **options)
+    text = console.export_text()
+    assert status == 0 and "policy compiled by JAX" in text, text
+    (summary,) = (json.loads(path.read_text()) for path in tmp_path.glob("*.json"))
+    played = summary["rallies"]["list"]
+    assert summary["rallies"]["count"] == 2 and len(played) >= 2 and summary["player"] == "player3"
+    session = log.read(summary["log"])
+    logged = [json.loads(event.text) for event in session.events if event.name == "rally"]
+    keys = ("number", "length", "end", "filtered")
+    assert [[r[k] for k in keys] for r in logged][: len(played)] == [[r[k] for k in keys] for r in played]
+    strokes = sum(event.name == "stroke" for event in session.events)
+    assert strokes >= len(played) and all(rally["length"] >= 1 for rally in played)
+    assert [event.text for event in session.events if event.name == "policy"][0].startswith("policy compiled by JAX")
+
+
+@pytest.mark.realtime
 def test_ctrl_c_ends_with_the_summary(policy, tmp_path):
     command = [sys.executable, "-m", "experiments.cli", "run", str(policy), "--robot", "rig", "--log", str(tmp_path)]
     pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
