@@ -187,6 +187,8 @@ class Control:
         self._axes.start()  # afterwards: a thread inherits the scheduling of the one that starts it
         self._pipe.send(messages.Ready([*report, self._computed]))
         self.bridge.event(time.monotonic(), log.Level.INFO, "policy", self._computed)
+        while any(self._tracker_socket.drain()):
+            pass  # frames that waited while this process started would be taken for those of a slow clock
         try:
             self._loop()
         except BaseException as error:  # nothing leaves the loop before the robot stands
