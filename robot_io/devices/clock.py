@@ -16,6 +16,7 @@ WINDOW = 1.0  # [s] of which the least delay counts
 KEPT = 60  # windows that the line goes through
 SETTLED = 10  # windows from which on a drift is told, and judged
 STEP = 0.5  # share of ``bound`` by which a second may miss the line of those before it
+RHYTHM = 0.5  # of the time between two captures that must lie between the arrivals, or the frames waited together
 MOST_DRIFT = 5e-4  # of any clock that works
 ONE_OFF = 3  # seconds in a row that miss it before that counts
 
@@ -32,6 +33,7 @@ class Clock:
     def __init__(self, offset: float | None, latency: float, bound: float, drift: float | None = None) -> None:
         self._given, self._latency, self._bound, self._nominal = offset, latency, bound, drift
         self._corrects = offset is None or drift is not None
+        self._last: tuple[float, float] | None = None  # capture and arrival of the newest frame
         self.restart()
 
     def restart(self) -> None:
@@ -53,9 +55,12 @@ class Clock:
 
     def add(self, captured: float, now: float) -> bool:
         """Take a frame's capture [s, tracker's clock] and arrival [s, bridge's]; True when a second was completed."""
-        delay = now - captured
-        if captured < self._began:
+        delay, last, self._last = now - captured, self._last, (captured, now)
+        if captured < self._began or last is None:
             return False
+        gap, silence = captured - last[0], now - last[1]
+        if not RHYTHM * gap <= silence <= gap + self._bound:
+            return False  # it waited while the bridge stood still, and tells nothing about the clocks
         if self._least is None or delay < self._least[1]:
             self._least = captured, delay
         if self._began == -math.inf:

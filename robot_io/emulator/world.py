@@ -39,6 +39,7 @@ FLOOR = -0.74  # [m] height of the ball's centre on the floor
 STICKING = 2.0 / 5.0  # share of the slip that brings the contact point of a thin shell to rest
 NET = (0.1, 0.3)  # restitution and friction
 PHASES = 6  # of a contact's beginning within a step, for the calibration
+RESTING = 0.1  # [m/s]
 FINE = 4  # steps instead of one near a surface
 NEAR = 0.06  # [m] from the ball's centre: a ball at 20 m/s moves 0.02 m in a step
 
@@ -183,8 +184,13 @@ class World:
             return
         steps = FINE if self._near_surface() else 1
         self._integrate(steps, duration / steps)
-        if self.data.qpos[self._ball_q + 2] < FLOOR or abs(self.data.qpos[self._ball_q + 1]) > 5.0:
+        if self.data.qpos[self._ball_q + 2] < FLOOR or abs(self.data.qpos[self._ball_q + 1]) > 5.0 or self._resting():
             self.park()
+
+    def _resting(self) -> bool:
+        """True for a ball that lies on the table: nobody plays it any more."""
+        height, velocity = self.data.qpos[self._ball_q + 2], self.data.qvel[self._ball_v : self._ball_v + 3]
+        return bool(height < 2.0 * BALL_RADIUS and velocity @ velocity < RESTING**2)
 
     def _near_surface(self) -> bool:
         x, y, z = self.data.qpos[self._ball_q : self._ball_q + 3]

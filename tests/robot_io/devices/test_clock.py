@@ -63,3 +63,20 @@ def test_a_clock_that_runs_away_is_told():
     clock = Clock(None, LATENCY, BOUND)
     fed(clock, 30.0, drift=1e-3)
     assert "ppm" in clock.problem
+
+
+@pytest.mark.parametrize("length", [0.2, 0.9, 3.0])
+@pytest.mark.parametrize("offset", [0.0, None])
+def test_frames_that_waited_while_the_bridge_stood_still_tell_nothing(offset, length):
+    clock = Clock(offset, LATENCY if offset is None else None, BOUND)
+    stalls = np.arange(101.7, 200.0, 2.0 * length + 1.3)
+    for i in range(12000):
+        stamp = 100.0 + i * 0.008
+        came = stamp + LATENCY
+        stall = stalls[max(np.searchsorted(stalls, came) - 1, 0)]
+        if stall < came < stall + length:
+            came = stall + length
+            if length > 1.0 and stamp - LATENCY < stall:
+                clock.restart()  # as the tracker does after a second without a frame
+        clock.add(stamp, came)
+        assert clock.problem is None and abs(clock.measured) < 1e-3

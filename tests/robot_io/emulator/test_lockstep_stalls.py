@@ -28,7 +28,7 @@ LOWER, UPPER = np.array(LIMITS.lower), np.array(LIMITS.upper)
 
 
 class Watched:
-    """A rig at play, with the farthest that its joints were outside their ranges [m], [rad], and the blade's extremes."""
+    """A rig at play; the farthest that its joints were outside their ranges [m], [rad], and the blade's extremes."""
 
     def __init__(self, seed):
         self.rig = playing(Swing(0.4 + 0.1 * (seed % 5)))
@@ -113,9 +113,7 @@ def played(count, seed=0, say=lambda text: None):
                 recovered = watched.recover()
                 found["recovered"] += recovered
                 if not recovered:
-                    say(
-                        f"{number} {kind} {seconds:.2f} s, {faults[0]}: then {rig.bridge.state}, {rig.bridge.gate.faults}"
-                    )
+                    say(f"{number} {kind} {seconds:.2f} s, {faults[0]}: {rig.bridge.state}, {rig.bridge.gate.faults}")
                     watched = Watched(seed)
             except RefusedError as error:
                 found["refused"] += 1
