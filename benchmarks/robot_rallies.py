@@ -23,6 +23,7 @@ from experiments.deploy.rig import scene
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.finetuning import loop
 from experiments.runs import load_policy
+from experiments.stats import wilson
 from mjx_tt import platform
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
@@ -35,6 +36,7 @@ from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
 from robot_io.emulator.opponent import Rallies
 from robot_io.emulator.tracker import IDENTITIES, TrackerParams
+from robot_io.emulator.world import World
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.rally_ends import FILTERED, End
 
@@ -48,7 +50,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--player", default="player3")
     parser.add_argument("--rallies", type=int, default=100, help="in the rig, for each tracker")
     parser.add_argument("--simulated", type=int, default=2000, help="in the simulator")
-    parser.add_argument("--trackers", nargs="+", default=["ball"], choices=IDENTITIES)
+    parser.add_argument("--trackers", nargs="+", default=["ball"], choices=IDENTITIES, help="the first with each other")
+    parser.add_argument("--pairs", type=int, default=60, help="rallies by which two trackers are compared")
     parser.add_argument("--noise", type=float, default=0.003, help="[m] of the tracker")
     parser.add_argument("--seed", type=int, default=1)
     chosen = parser.parse_args(arguments)
@@ -56,16 +59,13 @@ def main(arguments: list[str] | None = None) -> int:
     experiment = loop.experiment_of(chosen.policy)
     policy = load_policy.load(chosen.policy).policy.astype(np.float32)
     box = Box.of(experiment.distribution)
-    simulated(policy, chosen.player, experiment, box, chosen.simulated, chosen.seed)
-    found = {}
-    for identity in chosen.trackers:
-        tracker = TrackerParams(identity=identity, noise=chosen.noise)
-        params = RigParams(tracker=tracker, seed=chosen.seed)
-        found[identity] = rig(policy, chosen.player, params, box, chosen.rallies, chosen.seed)
-    for identity, rallies in list(found.items())[1:]:
-        first = found[chosen.trackers[0]]
-        same = [(a.length, a.end) == (b.length, b.end) for a, b in zip(first, rallies, strict=False)]
-        print(f"{identity} and {chosen.trackers[0]}: {sum(same)} of {len(same)} rallies of equal length and end")
+    if chosen.simulated:
+        simulated(policy, chosen.player, experiment, box, chosen.simulated, chosen.seed)
+    tracker = TrackerParams(identity=chosen.trackers[0], noise=chosen.noise)
+    if chosen.rallies:
+        rig(policy, chosen.player, RigParams(tracker=tracker, seed=chosen.seed), box, chosen.rallies, chosen.seed)
+    for identity in chosen.trackers[1:]:
+        compare(policy, chosen.player, tracker, identity, box, chosen.pairs)
     return 0
 
 
@@ -83,10 +83,57 @@ def simulated(policy: Policy, player: str, experiment: Experiment, box: Box, ral
     show("simulator", length[counts], Counter(End(e).name for e in end[counts]), float(np.sum(result.seconds)))
 
 
-def rig(policy: Policy, player: str, params: RigParams, box: Box, rallies: int, seed: int) -> list[RallySummary]:
+class Serial(VirtualPlayer):
+    """A player whose chance in each session follows from ``session`` alone."""
+
+    session = 0
+
+    def prepare(self) -> None:
+        super().prepare()
+        self._turn = 1000 * self.session
+
+
+def compare(policy: Policy, player: str, tracker: TrackerParams, identity: str, box: Box, pairs: int) -> None:
+    """The first rally of each of so many sessions with either tracker, all else alike, noise included while it can."""
+    world, person, config = World(scene(), RigParams().world), Serial(player), bridge_config(box)
+    found: list[list[RallySummary]] = []
+    for person.session in range(pairs):
+        pair = []
+        for chosen in (tracker, replace(tracker, identity=identity)):
+            params = RigParams(tracker=chosen, seed=person.session)
+            robot = LockStep(scene(), person, StreamingPolicy(policy), params, config, world=world)
+            pair += first_rally(robot)
+        if len(pair) == 2:
+            found.append(pair)
+    same = sum((a.length, a.end) == (b.length, b.end) for a, b in found)
+    differences = np.array([b.length - a.length for a, b in found], float)
+    means = np.random.default_rng(0).choice(differences, (2000, len(found))).mean(axis=1)
+    low, high = np.quantile(means, [0.025, 0.975])
+    share = wilson(same, len(found))
+    print(
+        f"{identity} and {tracker.identity}, noise {1e3 * tracker.noise:g} mm: {same} of {len(found)} rallies of equal "
+        f"length and end ({share[0]:.0%} to {share[1]:.0%}); lengths differ by {differences.mean():+.2f} "
+        f"({low:+.2f} to {high:+.2f}) touches; mean {np.mean([a.length for a, _ in found]):.2f}, longest "
+        f"{max(a.length for a, _ in found)}"
+    )
+
+
+def first_rally(robot: LockStep) -> list[RallySummary]:
+    """The first rally from power-on; none where a fault came before its end."""
+    robot.start()
+    robot.throwing = True
+    robot.run(LONGEST_RALLY, lambda: bool(robot.rallies) or bool(robot.bridge.gate.faults))
+    return robot.rallies[:1]
+
+
+def bridge_config(box: Box) -> BridgeConfig:
+    """The bridge's, with that box of balls."""
+    return BridgeConfig(RobotConfig().delays, box=rally.Box(tuple(box.low.tolist()), tuple(box.high.tolist())))
+
+
+def rig(policy: Policy, player: str, params: RigParams, box: Box, rallies: int, seed: int) -> None:
     """Rallies through the bridge in lock-step."""
-    config = BridgeConfig(RobotConfig().delays, box=rally.Box(tuple(box.low.tolist()), tuple(box.high.tolist())))
-    robot = LockStep(scene(), VirtualPlayer(player, seed), StreamingPolicy(policy), params, config)
+    robot = LockStep(scene(), VirtualPlayer(player, seed), StreamingPolicy(policy), params, bridge_config(box))
     robot.start()
     robot.throwing, began = True, time.monotonic()
     while len(robot.rallies) < rallies and robot.now < LONGEST_RALLY * rallies:
@@ -99,7 +146,6 @@ def rig(policy: Policy, player: str, params: RigParams, box: Box, rallies: int, 
     seen = [r.touches for r in robot.thrower.played[: len(robot.rallies)]]
     wrong = sum(a != b.length for a, b in zip(seen, robot.rallies, strict=False))
     print(f"  lengths that differ from the world's: {wrong}; {robot.now / (time.monotonic() - began):.1f} x real time")
-    return robot.rallies[:rallies]
 
 
 def show(name: str, lengths: Sequence[int] | np.ndarray, ends: Counter[str], seconds: float) -> None:
