@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 
 from experiments.config import robot as robots
-from experiments.deploy import session_report
+from experiments.deploy import contradictions, session_report
 from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, Keyboard, View
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session_report import PlayedSession
@@ -205,6 +205,7 @@ def run(
             config, text = rig.robot, robots.to_yaml(rig.robot)
         else:
             config = robots.load_robot(robot)
+            contradictions.check(config, robot, log_folder)
             text = Path(robot).read_text(encoding="utf-8")
         name = time.strftime("%Y%m%d-%H%M%S")
         git = run_dir.git_state()
@@ -215,7 +216,7 @@ def run(
             name,
             box_of(loaded),
             (("git", json.dumps(git)),),
-            (("robot.yaml", text),),
+            (("robot.yaml", text), ("calibration.yaml", robots.to_yaml(config.calibration))),
         )
         log_folder.mkdir(parents=True, exist_ok=True)
         session = stack.enter_context(Session(config, options, console))
@@ -236,6 +237,7 @@ def run(
             status, problem = INTERRUPTED, "stopped by Ctrl-C"
         session.close()
     summary = session_report.summary(loaded, config, played, session.status, session.timings, process.log_path(options))
+    summary |= contradictions.observed(config, process.log_path(options))
     summary |= {"faults": [asdict(fault) for fault in played.faults], "player": player}
     run_dir.write_json(log_folder / f"{name}.json", summary)
     session_report.show(console, summary, log_folder / f"{name}.json")

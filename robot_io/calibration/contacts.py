@@ -86,20 +86,19 @@ def _turns(log: SessionLog, mine: np.ndarray) -> list[tuple[float, np.ndarray, n
     """Moment, place and a place before it, of every turn on the robot's side in one ball's track."""
     order = np.argsort(log.ball.capture_time[mine], kind="stable")
     t, p = log.ball.capture_time[mine][order], log.ball.position[:, mine][:, order]
-    found, last = [], -math.inf
-    for i in range(SIDE, len(t) - SIDE):
-        if t[i] - last < 0.1 or p[1, i] > -0.3 or np.diff(t[i - SIDE : i + SIDE]).max() > LONGEST:
-            continue
-        first, second = slice(i - SIDE, i), slice(i, i + SIDE)
-        v, w = (np.polyfit(t[s], p[1, s], 1)[0] for s in (first, second))
-        if w - v < TURN or v > 0.0 or w < 0.0:
-            continue
-        a, b = (_line(t[s], p[:, s], t[i]) for s in (first, second))
-        moment = float((a[0, 1] - b[0, 1]) / (b[1, 1] - a[1, 1]) + t[i])
-        if t[i - 1] - 0.002 <= moment <= t[i] + 0.002:
-            place = a[0] + a[1] * (moment - t[i]) - np.array([0, 0, 0.5 * GRAVITY]) * (moment - t[i]) ** 2
-            found.append((moment, place, p[:, i - SIDE]))
-            last = t[i]
+    found: list[tuple[float, np.ndarray, np.ndarray]] = []
+    turn = np.full(len(t) + 1, -math.inf)
+    for i in range(SIDE, len(t) - SIDE + 1):
+        if p[1, i - 1] < -0.3 and np.diff(t[i - SIDE : i + SIDE]).max() <= LONGEST:
+            v, w = (np.polyfit(t[s] - t[i - 1], p[1, s], 1)[0] for s in (slice(i - SIDE, i), slice(i, i + SIDE)))
+            turn[i] = w - v if v < 0.0 < w else -math.inf
+    for i in np.flatnonzero(turn > TURN).tolist():
+        if turn[i] < turn[max(i - SIDE, 0) : i + SIDE].max():
+            continue  # a sample beside the contact is taken for one of the other side
+        a, b = (_line(t[s], p[:, s], t[i]) for s in (slice(i - SIDE, i), slice(i, i + SIDE)))
+        since = float((a[0, 1] - b[0, 1]) / (b[1, 1] - a[1, 1]))
+        place = a[0] + a[1] * since - np.array([0.0, 0.0, 0.5 * GRAVITY]) * since**2
+        found.append((float(t[i]) + since, place, p[:, i - SIDE]))
     return found
 
 

@@ -1,0 +1,57 @@
+"""Calibrations against the contacts of ball and paddle in the last session that was played with them."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from experiments.config import robot as robots
+from experiments.errors import ConfigError
+from robot_io import log
+from robot_io.calibration import contacts
+from robot_io.control.config import RobotConfig
+
+LAG = 0.005  # [s] by which the joints' lag may differ from the calibrated one, on top of two standard deviations
+GAP = 0.010  # [m] between ball and blade at their contacts, beyond which tracker or robot is not where it is said to be
+
+
+def observed(config: RobotConfig, log_file: Path | None) -> dict[str, Any]:
+    """Entries of a session's summary: its calibration, and the contacts in its log where something is calibrated."""
+    found = config.calibration
+    entries: dict[str, Any] = {"calibration": robots.plain(found)}
+    if log_file is not None and log_file.exists() and (found.tracker.date or found.robot.date or found.clock.date):
+        entries["contacts"] = asdict(contacts.measure(log.read(log_file), found))
+    return entries
+
+
+def check(config: RobotConfig, where: str, log_folder: Path) -> None:
+    """Raise ConfigError where the newest session of this robot with this calibration contradicts it."""
+    same = robots.plain(config.calibration)
+    for path in sorted(log_folder.glob("*.json"), reverse=True):
+        try:
+            session = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            continue
+        if isinstance(session, dict) and session.get("robot") == config.name and session.get("calibration") == same:
+            _judge(config, session.get("contacts") or {}, where, path)
+            return
+
+
+def _judge(config: RobotConfig, seen: dict[str, Any], where: str, path: Path) -> None:
+    lag, gap, deviation = (seen.get(key) for key in ("lag", "gap", "lag_deviation"))
+    if lag is None or gap is None or deviation is None or not math.isfinite(lag):
+        return
+    again = f"calibrate again, or remove {path} if it was an exception"
+    if abs(gap) > GAP:
+        raise ConfigError(
+            f"{where}: calibration.tracker.position and calibration.robot.joint_zeros: in {path} ball and blade were "
+            f"{1e3 * gap:+.1f} mm apart at {seen['count']} contacts, allowed are {1e3 * GAP:.0f}; {again}"
+        )
+    known = config.calibration.clock.lag
+    if known is not None and abs(lag - known) > LAG + 2.0 * deviation:
+        raise ConfigError(
+            f"{where}: calibration.clock.lag is {known} s, in {path} {seen['count']} contacts show {lag:.4f} s; {again}"
+        )
