@@ -18,7 +18,7 @@ from rich.text import Text
 from robot_io.control import messages
 
 COLOURS = {"disarmed": "white", "ready": "green", "active": "bold green", "stopping": "yellow", "fault": "bold red"}
-QUIT, PAUSE = "q", "h"
+QUIT, PAUSE, RECOVER = "q", "h", "c"
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ KEYS = {
     "a": Key("arm: the robot goes to its home pose", messages.Arm()),
     " ": Key("stop", messages.Stop()),
     "r": Key("reset a fault", messages.Reset()),
+    RECOVER: Key("continue after a fault: switch on, reset and arm"),
     "d": Key("discard this ball", messages.Discard()),
     PAUSE: Key("pause: take no new balls, or resume"),
     QUIT: Key("stop and end"),

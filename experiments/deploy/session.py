@@ -16,7 +16,8 @@ from rich.console import Console
 
 from experiments.config import robot as robots
 from experiments.deploy import contradictions, session_report
-from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, Keyboard, View
+from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, RECOVER, Keyboard, View
+from experiments.deploy.recovery import Recovery
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session_report import PlayedSession
 from experiments.runs import run_dir
@@ -261,11 +262,16 @@ def _watch(
     in_a_row = 0
     end = time.monotonic() + (float("inf") if seconds is None else seconds)
     heard = time.monotonic()
+    recovery: Recovery | None = None
     while time.monotonic() < end:
         if len(played.episodes) >= (balls or math.inf) or len(played.counted) >= (rallies or math.inf):
             break
         for message in session.messages(0.1):
             view.take(message)
+            if isinstance(message, Refused):
+                recovery = None
+            elif isinstance(message, Status) and recovery is not None:
+                recovery = _continued(session, recovery, message, view)
             if isinstance(message, Played):
                 heard = time.monotonic()
                 played.episodes.append(message.summary)
@@ -278,6 +284,8 @@ def _watch(
                     rally = message.summary
                     console.print(f"rally {rally.number}: {rally.length} touches, {rally.text}", highlight=False)
         key = keyboard.pressed()
+        if key is not None:  # whatever it is, the operator wants something else
+            recovery = Recovery(time.monotonic()) if key == RECOVER else None
         if key == QUIT:
             break
         if key == PAUSE:
@@ -302,3 +310,15 @@ def _watch(
             if time.monotonic() - heard > QUIET:
                 return f"no ball was played for {QUIET:g} s"
     return None
+
+
+def _continued(session: Session, recovery: Recovery, status: Status, view: View) -> Recovery | None:
+    """One step of a recovery; None when it has ended."""
+    try:
+        request = recovery.step(status, time.monotonic())
+    except TimeoutError as error:
+        view.say(str(error))
+        return None
+    if request is not None:
+        session.send(request)
+    return None if recovery.done else recovery

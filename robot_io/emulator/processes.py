@@ -123,6 +123,10 @@ class Rig:
         """A fault of one linear axis's drive."""
         self._pipes["axes"].send(("fault", axis, code))
 
+    def connect_arm(self, connected: bool) -> None:
+        """Pulls the network cable of the arm's controller or plugs it in again."""
+        self._pipes["arm"].send(("reconnect" if connected else "disconnect",))
+
     def connect_axis(self, axis: int, connected: bool) -> None:
         """Pulls a linear axis's network cable or plugs it in again."""
         self._pipes["axes"].send(("reconnect" if connected else "disconnect", axis))
@@ -240,15 +244,19 @@ def _arm(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> N
         wire.bind((HOST, 0))
         wire.setblocking(False)
         pipe.send("ready")
-        rows = list(ABB_JOINTS)
+        rows, connected = list(ABB_JOINTS), True
         for _ in _paced(shared, pipe, params.arm.cycle):
             while pipe.poll():
-                _operate(controller, pipe.recv()[0])
+                request = pipe.recv()[0]
+                if request in ("reconnect", "disconnect"):
+                    connected = request == "reconnect"
+                else:
+                    _operate(controller, request)
             now = time.monotonic()
             qpos, qvel = shared.read("qpos", "qvel")
             setpoint, datagram = controller.step(now, params.hidden.counted(qpos[rows]), qvel[rows])
             shared["setpoint"][rows] = setpoint
-            if datagram is not None:
+            if datagram is not None and connected:
                 out.send(datagram, now)
             for ready in out.due(now):
                 try:
@@ -257,9 +265,11 @@ def _arm(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> N
                     pass  # nobody listens
             while True:
                 try:
-                    back.send((received := wire.recvfrom(2048))[0], now)
+                    received = wire.recvfrom(2048)
                 except OSError:
                     break
+                if connected:
+                    back.send(received[0], now)
                 if received[1] != client:
                     controller.receive(received[0], received[1], now)  # counted as a stranger's
             for reply in back.due(now):

@@ -122,7 +122,7 @@ def played(count, seed=0, say=lambda text: None):
         for name, value in watched.worst.items():
             worst[name] = max(worst[name], value)
         rig.summaries.clear()
-        if number % 50 == 49:
+        if number % 10 == 9:
             say(f"{number + 1}: {dict(found)} {dict(worst)}")
     return found, worst
 
