@@ -9,6 +9,7 @@ from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.axis_drive import DriveParams
 from robot_io.emulator.network import FAULT_RANGES, NetworkFaults
 from robot_io.emulator.tracker import TrackerParams
+from robot_io.emulator.tracker.cameras import RANGES as CAMERA_RANGES
 from robot_io.emulator.tracker.hidden import HiddenErrors
 from robot_io.emulator.world import WorldParams
 from robot_io.ranges import check_ranges
@@ -52,6 +53,7 @@ RANGES = {
     "tracker.noise": (0.0, 1.0),
     "tracker.offset": (-1.0, 1.0),
     **{f"{side}_network.{name}": bounds for side in ("arm", "tracker") for name, bounds in FAULT_RANGES.items()},
+    **CAMERA_RANGES,
     "action_delay": (0.0, 1.0),
     "pause": (0.0, 600.0),
     "seed": (0, 2**31),

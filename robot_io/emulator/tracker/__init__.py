@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robot_io.devices.tracker import BallSample, encode
+from robot_io.emulator.tracker.cameras import CameraPair, CameraParams
 from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ class TrackerParams:
     identity  what a number stands for: "ball", one from its first stroke to the end of the rally; "stroke", one from
              stroke to stroke; "lost", as "ball", but the ball is out of sight from its bounce on the human's half until
              it is struck
+    cameras  two that triangulate the ball, lose it and mistake it for another
     """
 
     rate: float = 125.0
@@ -35,6 +37,7 @@ class TrackerParams:
     noise: float = 0.003
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     identity: str = "ball"
+    cameras: CameraParams = CameraParams()
 
     def __post_init__(self) -> None:
         if self.identity not in IDENTITIES:
@@ -53,6 +56,7 @@ class TrackerEmulator:
         self._params, self._hidden, self._random = params, hidden, np.random.default_rng(seed)
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._sequence = 0
+        self._cameras = CameraPair(params.cameras, params.rate, self._random) if params.cameras.triangulated else None
         self._silent_until = -np.inf
 
     def drop_out(self, until: float) -> None:
@@ -62,10 +66,11 @@ class TrackerEmulator:
     def step(self, now: float, ball: int, position: np.ndarray | None) -> None:
         """Captures a frame: the ball's number and true position (3,) [m], None when there is none."""
         params = self._params
+        if self._cameras is not None:
+            ball, position = self._cameras.see(ball, position)
         if position is not None:
-            position = (
-                self._hidden.seen(position) + params.noise * self._random.normal(size=3) + np.array(params.offset)
-            )
+            noise = 0.0 if self._cameras else params.noise * self._random.normal(size=3)
+            position = self._hidden.seen(position) + noise + np.array(params.offset)
         if now >= self._silent_until:
             frame = BallSample(self._sequence, ball, self._hidden.stamped(now), position)
             self._waiting.append((now + params.latency, encode(frame)))
