@@ -56,6 +56,9 @@ class Clock:
     def add(self, captured: float, now: float) -> bool:
         """Take a frame's capture [s, tracker's clock] and arrival [s, bridge's]; True when a second was completed."""
         delay, last, self._last = now - captured, self._last, (captured, now)
+        if captured < self._began - WINDOW:  # the clock was set back
+            self.restart()
+            self._jumped = True
         if captured < self._began or last is None:
             return False
         gap, silence = captured - last[0], now - last[1]

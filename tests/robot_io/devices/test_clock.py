@@ -57,6 +57,8 @@ def test_a_jump_is_told_and_measured_anew():
     fed(clock, 5.0, offset=0.05, start=132.0)
     assert "jumped" in clock.problem
     assert fed(clock, 20.0, offset=0.05, start=137.0) < 0.001 and clock.problem is None
+    fed(clock, 3.0, offset=-30.0, start=157.0)
+    assert "jumped" in clock.problem and fed(clock, 12.0, offset=-30.0, start=160.0) < 0.001
 
 
 def test_a_clock_that_runs_away_is_told():

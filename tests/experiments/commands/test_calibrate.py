@@ -1,0 +1,92 @@
+"""``mjx-tt calibrate``: from measured points to a robot.yaml that the bridge applies, on a rig with hidden errors."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments import cli
+from experiments.config import robot as robots
+from experiments.errors import ConfigError
+from robot_io.contract import JOINT_NAMES
+from robot_io.devices.tracker import TrackerConfig
+from robot_io.emulator.config import RigParams
+from robot_io.emulator.tracker import TrackerParams
+from tests.support.hidden_rig import HIDDEN, grid, touches
+from tests.support.lockstep_play import lockstep
+
+
+def write(path, names, rows):
+    with open(path, "w", encoding="utf-8", newline="") as stream:
+        csv.writer(stream).writerows([names, *rows])
+    return str(path)
+
+
+@pytest.fixture
+def measured(tmp_path, monkeypatch):
+    """Two CSVs, each with a wrong point."""
+    monkeypatch.chdir(tmp_path)
+    xyz = [f"{what}_{axis}" for what in ("table", "ball") for axis in "xyz"]
+    table, seen = grid()
+    seen[3] += [0.05, 0.0, 0.0]
+    write("ball.csv", xyz, np.concatenate([table, seen], axis=1))
+    table, joints, paddle = touches()
+    table[7] += [0.0, 0.04, 0.0]
+    names = [*xyz[:3], *JOINT_NAMES, *(f"paddle_{axis}" for axis in "xyz")]
+    write("touches.csv", names, np.concatenate([table, joints, paddle], axis=1))
+    return tmp_path
+
+
+def test_what_was_hidden_is_found_written_and_applied(measured, capsys):
+    (measured / "robot.yaml").write_text("name: lab\ncalibration: calibration.yaml\n")
+    (measured / "calibration.yaml").write_text("")
+    assert cli.main(["calibrate", "tracker", "ball.csv"]) == 0
+    assert cli.main(["calibrate", "robot", "touches.csv", "--robot", "robot.yaml"]) == 0
+    told = capsys.readouterr().out
+    assert "ball.csv: line 5: 49." in told and "14 of 15 points used" in told
+    assert "touches.csv: line 9: " in told and "39 of 40 points used" in told and "zero of joint_6" in told
+    found = robots.load_robot("robot.yaml").calibration
+    assert found.tracker.date == found.robot.date and found.tracker.points == 14
+    np.testing.assert_allclose(found.robot.joint_zeros, HIDDEN.joint_zeros, atol=0.002)
+
+    hidden = replace(HIDDEN, clock_offset=-321.0)
+    params = RigParams(pause=0.05, tracker=TrackerParams(noise=0.0, latency=0.016), hidden=hidden)
+    told_clock = TrackerConfig(clock_offset=None, latency=0.016)
+    rig = lockstep(params=params, tracker=told_clock, calibration=found)
+    rig.run(1.5)
+    rig.start()
+    rig.throwing, track = True, {}
+    while rig.now < 6.0:
+        rig.step()
+        track[round(rig.now, 6)] = rig.world.ball
+        seen = rig.bridge.tracker.newest
+        if seen.position is not None and (true := track.get(round(seen.captured / 0.008) * 0.008)) is not None:
+            assert abs(seen.captured - round(seen.captured / 0.008) * 0.008) < 0.001  # frames are taken every 8 ms
+            assert np.linalg.norm(seen.position - true) < 0.002
+    assert rig.thrower.thrown >= 1
+    np.testing.assert_allclose(rig.bridge.measured, rig.world.qpos, atol=0.005)  # 2 mrad, and 29 ms of motion
+
+
+def test_files_that_cannot_be_used_are_refused(measured, capsys):
+    assert cli.main(["calibrate", "tracker", "touches.csv"]) == 1
+    assert "touches.csv: no columns ball_x, ball_y, ball_z" in capsys.readouterr().err
+    write("few.csv", ["table_x", "table_y", "table_z", "ball_x", "ball_y", "ball_z"], np.zeros((3, 6)))
+    assert cli.main(["calibrate", "tracker", "few.csv", "--out", "new.yaml"]) == 1
+    assert "few.csv: 3 points" in capsys.readouterr().err and not (measured / "new.yaml").exists()
+
+
+def test_calibrations_that_contradict_are_refused_by_file_and_key(tmp_path):
+    path, calibration = tmp_path / "robot.yaml", tmp_path / "found.yaml"
+    path.write_text("calibration: found.yaml\naxes: [{zero: -1.0}, {zero: -0.5}]")
+    calibration.write_text("robot: {axes_zero: [-1.0, -0.4], joint_zeros: [0.01, 0, 0, 0, 0, 0], date: '2026-11-22'}")
+    with pytest.raises(ConfigError, match=r"robot.yaml: calibration.robot.axes_zero is .*calibrate it again"):
+        robots.load_robot(path)
+    calibration.write_text("tracker: {residual: 0.012, date: '2026-11-22'}")
+    with pytest.raises(ConfigError, match=r"found.yaml: tracker.residual: got 0.012; allowed: 0 to 0.005"):
+        robots.load_robot(path)
+    calibration.write_text("clock: {drift: 4.0e-5}")
+    with pytest.raises(ConfigError, match=r"found.yaml: clock.date is empty, but clock was changed"):
+        robots.load_robot(path)
