@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict, dataclass, field
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -123,3 +124,6 @@ def show(console: Console, report: dict[str, Any], path: Path) -> None:
     for name, value in {"summary": path, "log": report["log"]}.items():
         if value:
             console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
+    if report["log"]:
+        layout = resources.files("robot_io.log") / "layout.json"
+        console.print(f"  to see it  Foxglove or Lichtblick, with the layout {layout}", highlight=False, soft_wrap=True)
