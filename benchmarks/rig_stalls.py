@@ -129,7 +129,7 @@ def recovered(rig: Rig, session: Session) -> str:
     recovery = Recovery(time.monotonic())
     while not recovery.done:
         for message in session.messages(0.3):
-            if isinstance(message, Refused):
+            if isinstance(message, Refused) and recovery.refused(message):
                 return message.sentence
             if isinstance(message, Status):
                 try:

@@ -268,7 +268,7 @@ def _watch(
             break
         for message in session.messages(0.1):
             view.take(message)
-            if isinstance(message, Refused):
+            if isinstance(message, Refused) and recovery is not None and recovery.refused(message):
                 recovery = None
             elif isinstance(message, Status) and recovery is not None:
                 recovery = _continued(session, recovery, message, view)

@@ -342,6 +342,8 @@ class Control:
         if self._axes.axes.fault:
             self._axes.acknowledge()
         self._axes.enable()
+        if not self._axes.axes.answering:  # whether they must be homed is not known: a cable was out
+            raise RefusedError("axes not ready: one of them does not answer yet; try again")
         if not self._axes.axes.homed:
             self.bridge.check_homing()
             self._axes.home()

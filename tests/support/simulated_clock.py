@@ -22,7 +22,7 @@ class FollowingAxes:
     """Linear axes that are where they were commanded to be at once; also stands for the thread around them."""
 
     cycles = late = 0
-    fault, homed = None, True
+    fault, homed, answering = None, True, True
 
     def __init__(self, position: np.ndarray) -> None:
         self.position, self.stops, self.closed = np.array(position), 0, False

@@ -59,6 +59,7 @@ class DryAxes:
     late: int = 0
     fault: None = None
     homed: bool = True
+    answering: bool = True
 
     @property
     def state(self) -> DryAxes:

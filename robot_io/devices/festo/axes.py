@@ -79,6 +79,11 @@ class FestoAxes:
         return self._state
 
     @property
+    def answering(self) -> bool:
+        """Both axes answered in the last cycle: what they know of themselves is known here."""
+        return all(c.status is not None for c in self._channels)
+
+    @property
     def homed(self) -> bool:
         """Both axes answer and know where they are."""
         return all(c.status is not None and c.status.homed for c in self._channels)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from experiments.deploy.recovery import LONGEST, Recovery
-from robot_io.control.messages import Arm, FaultReport, Prepare, Reset, Status
+from robot_io.control.messages import Arm, FaultReport, Prepare, Refused, Reset, Status
 
 FAULT = FaultReport("stale_arm", "nothing heard")
 
@@ -31,6 +31,14 @@ def test_each_step_is_sent_once_and_when_nothing_stands_against_it():
 def test_without_a_fault_nothing_is_reset():
     recovery = Recovery(0.0)
     assert [recovery.step(status("disarmed", ()), 1.0) for _ in range(2)] == [Prepare(), Arm()] and recovery.done
+
+
+def test_axes_that_do_not_answer_yet_are_prepared_again():
+    recovery = Recovery(0.0)
+    assert recovery.step(status(), 1.0) == Prepare()
+    assert not recovery.refused(Refused(Prepare(), "one of them does not answer yet"))
+    assert [recovery.step(status(), 1.0) for _ in range(2)] == [Prepare(), Reset()]
+    assert recovery.refused(Refused(Reset(), "cannot reset: it still moves"))
 
 
 def test_what_is_missing_is_told_when_it_lasts():

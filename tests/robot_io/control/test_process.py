@@ -89,6 +89,22 @@ def test_a_request_that_fails_is_refused_and_play_goes_on(simulated):
     assert isinstance(words[-1], messages.Ended) and simulated.simulation.now >= 11.0
 
 
+def test_axes_that_do_not_answer_yet_are_not_homed(simulated):
+    """A cable that was out: the drives know where they are, and here nobody knows that they do."""
+    pipe, axes = simulated.pipe, simulated.simulation.axes
+    axes.homed = axes.answering = False
+    simulated.script = [
+        (10.2, lambda: pipe.send(messages.Prepare())),
+        (10.4, lambda: axes.__dict__.update(homed=True, answering=True)),
+        (10.5, lambda: pipe.send(messages.Prepare())),
+        (10.7, lambda: pipe.send(messages.Quit())),
+    ]
+    with simulated.control:
+        simulated.control.run()
+    refused = [message.sentence for message in simulated.words() if isinstance(message, messages.Refused)]
+    assert refused == ["axes not ready: one of them does not answer yet; try again"]
+
+
 def test_the_robot_stands_before_the_process_quits(simulated):
     control = simulated.control
 
