@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import jax
-import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int, UInt32
 
@@ -16,7 +15,7 @@ from mjx_tt.env import rewards
 from mjx_tt.sim.actuators import Drives, DriveState
 from mjx_tt.sim.latency import Delay
 from mjx_tt.sim.model import SimModel
-from mjx_tt.sim.sensors import Camera
+from mjx_tt.sim.sensors import Camera, Filters
 
 Tick: TypeAlias = Int[Array, ""] | int  # control steps since the start
 
@@ -141,9 +140,7 @@ class EpisodeState:
     observations: Float[Array, "depth captured *batch"]
     controller: Any  # pytree, whatever the controller remembers
     drive: DriveState
-    filtered: (
-        Float[Array | np.ndarray, "3 *batch"] | None
-    )  # [m] the ball's position as the tracker smooths it; None: it does not
+    filters: Filters  # of the tracker
     ball: BallState
     bounced: Bool[Array, "*batch"]
     hit: Bool[Array, "*batch"]

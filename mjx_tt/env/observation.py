@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Float
 
@@ -11,6 +10,7 @@ from ballmodel.state import BallState
 from mjx_tt.env.episode import Episodes, EpisodeState, Prepared, TaskConfig, Tick
 from mjx_tt.robot.scalar_algebra import materialise
 from mjx_tt.sim import latency, noise
+from mjx_tt.sim.sensors import Filters
 from robot_io.contract import N_JOINTS
 
 
@@ -51,14 +51,14 @@ def capture(
     config: TaskConfig,
     i: Tick,
     ball: BallState,
-    filtered: Float[Array | np.ndarray, "3 *batch"] | None,
+    filters: Filters,
     joints: Float[Array, "8 *batch"],
 ) -> Float[Array, "captured *batch"]:
     """Share of the state at substep boundary ``i`` in the quantities that the delayed sensors see."""
     n, timestep = config.substeps, 1.0 / config.sim_rate
     seen_at = latency.capture_weight(prepared.ball, i, n, timestep)[None]
     parts = [
-        seen_at * (ball.position if filtered is None else filtered),
+        seen_at * filters.seen(ball.position),
         latency.capture_weight(prepared.joints, i, n, timestep) * joints,
     ]
     if episodes.model.sensing.jitter is not None:

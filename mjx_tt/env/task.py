@@ -37,6 +37,7 @@ from mjx_tt.robot.kinematics import Joints, PaddleKinematics
 from mjx_tt.robot.scalar_algebra import materialise
 from mjx_tt.sim import actuators as drives
 from mjx_tt.sim import latency, sensors
+from mjx_tt.sim.sensors import Filters
 from robot_io.contract import FESTO_JOINTS, LIMITS, N_JOINTS, N_OBSERVATION
 from robot_io.limits import limit_velocity
 
@@ -125,7 +126,7 @@ class Task:
             observations=jnp.broadcast_to(captured, (self._observation_depth, *captured.shape)),
             controller=controller.start(first),
             drive=drives.at_rest(prepared.drives, home),
-            filtered=None if tracker.smoothing is None else episodes.ball.position,
+            filters=Filters.at(tracker, episodes.ball.position),
             ball=episodes.ball,
             bounced=false,
             hit=false,
@@ -162,7 +163,7 @@ class Task:
         commands = latency.ring_write(s.commands, tick, command)
         old = latency.ring_read(commands, tick - prepared.action.periods - 1)
         new = latency.ring_read(commands, tick - prepared.action.periods)
-        (qpos, qvel, pose, drive, filtered, ball, flags, closest), captured = self._substeps(
+        (qpos, qvel, pose, drive, filters, ball, flags, closest), captured = self._substeps(
             s, episodes, prepared, old, new
         )
         bounced, hit, live = flags
@@ -182,7 +183,7 @@ class Task:
             latency.ring_write(s.observations, tick, captured),
             controller_state,
             drive,
-            filtered,
+            filters,
             ball,
             bounced,
             hit,
@@ -205,11 +206,11 @@ class Task:
         tracker, drive_params = episodes.model.sensing, prepared.drives
         old, new = drives.reachable(drive_params, old), drives.reachable(drive_params, new)
 
-        def captured_at(i: Tick, ball: BallState, filtered: Array | np.ndarray | None, joints: Array) -> Array:
-            return observation.capture(episodes, prepared, self.config, i, ball, filtered, joints)
+        def captured_at(i: Tick, ball: BallState, filters: Filters, joints: Array) -> Array:
+            return observation.capture(episodes, prepared, self.config, i, ball, filters, joints)
 
         def substep(i: Tick, carry: tuple) -> tuple:
-            (qpos, qvel, pose, drive, filtered, ball, (bounced, hit, live), closest), captured = carry
+            (qpos, qvel, pose, drive, filters, ball, (bounced, hit, live), closest), captured = carry
             share = latency.old_command_share(prepared.action, i, timestep)
             velocity, drive = drives.follow(drive_params, drive, new + share * (old - new), timestep)
             control = jnp.asarray(materialise(row(gain) * velocity))
@@ -219,8 +220,8 @@ class Task:
             moved, events = flight.step(params, ball, timestep, (pose, after))
             moved, events = materialise((moved, events))
             before, ball = ball, where(live, moved, ball)
-            if filtered is not None and tracker.smoothing is not None:
-                filtered = sensors.smoothed(tracker.smoothing, filtered, before.position, ball.position, timestep)
+            struck = live & (events.table | events.paddle)
+            filters = filters.stepped(tracker, before, ball, struck, timestep - events.time, timestep)
             own_side = events.table & (events.position[1] < 0.0)
             over = (events.table & (bounced | ~own_side)) | events.net | events.paddle
             y_min, z_min = OUT_OF_REACH
@@ -231,9 +232,9 @@ class Task:
             distance = norm(ball.position - after.position)
             closest = jnp.where(live & bounced, jnp.minimum(closest, distance), closest)
             live = live & ~over
-            captured = captured + captured_at(i + 1, ball, filtered, carried)
-            return materialise(((qpos, qvel, after, drive, filtered, ball, (bounced, hit, live), closest), captured))
+            captured = captured + captured_at(i + 1, ball, filters, carried)
+            return materialise(((qpos, qvel, after, drive, filters, ball, (bounced, hit, live), closest), captured))
 
-        start = (s.qpos, s.qvel, s.pose, s.drive, s.filtered, s.ball, (s.bounced, s.hit, s.live), s.sums.closest)
-        captured = captured_at(0, s.ball, s.filtered, s.qpos if s.drive.output is None else s.drive.output)
+        start = (s.qpos, s.qvel, s.pose, s.drive, s.filters, s.ball, (s.bounced, s.hit, s.live), s.sums.closest)
+        captured = captured_at(0, s.ball, s.filters, s.qpos if s.drive.output is None else s.drive.output)
         return jax.lax.fori_loop(0, n, substep, (start, captured))

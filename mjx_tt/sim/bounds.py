@@ -41,6 +41,8 @@ BOUNDS: tuple[tuple[str, tuple[float, float]], ...] = (
     ("sensing.camera_scale", (0.5, 2.0)),
     ("sensing.clock_rate", (0.5, 2.0)),
     ("sensing.smoothing", (0.0, 1.0)),  # [s]
+    ("sensing.filter_time", (0.0, 1.0)),  # [s]
+    ("sensing.filter_gate", (1e-4, 10.0)),  # [m]
     ("sensing.jitter", (0.0, 0.1)),  # [s]
     ("*.velocity_gain", (-3.0, 3.0)),  # a drive that is wired the wrong way round included
     ("drives.*.joint_offset", (-3.2, 3.2)),  # [rad], [m]

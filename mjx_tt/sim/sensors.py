@@ -8,13 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ballmodel import constants as c
 from ballmodel.partial_params import optional, value_or
+from ballmodel.state import BallState
 from ballmodel.vec import Scalars, dot, row
 
-SHORTEST = 1e-9  # [s], keeps the filter's exponent finite
+SHORTEST = 1e-9  # [s], keeps the filters' exponents finite
+FILTER_GATE = 0.03  # [m]: ten deviations of a usual tracker's noise
+SOFT_GATE = 0.3  # of the gate, below and above it: noise blurs where a filter starts afresh
 
 
 @jax.tree_util.register_dataclass
@@ -25,7 +28,8 @@ class SensingParams:
     measured = camera_scale R (1 + camera_distortion |p|^2) p + offset + noise,   R = Rz Ry Rx
     with p the ball's position, delayed by ``latency.ball_observation`` times ``clock_rate`` and, with ``smoothing``,
     filtered: df/dt = (p - f) / smoothing. (Filter and camera commute but for the distortion's change along the flight;
-    the noise is added behind both.)
+    the noise is added behind both.) With ``filter_time`` the tracker predicts by constant acceleration and corrects
+    (``Lag``): it is wrong for a moment behind every bounce.
     """
 
     # Half width of the uniform noise on each coordinate, per control step [m]: "2 x the diameter" is its whole width.
@@ -41,6 +45,10 @@ class SensingParams:
     # Measured over true time. A policy reads no clock: all that this can do to it is to stretch the tracker's latency.
     clock_rate: Float[Array, "*#batch"] | float | None = optional(1.0)
     smoothing: Float[Array, "*#batch"] | float | None = optional(0.0)  # [s] time constant of the tracker's filter
+    filter_time: Float[Array, "*#batch"] | float | None = optional(0.0)  # [s] memory of a filter that predicts
+    filter_gate: Float[Array, "*#batch"] | float | None = optional(
+        FILTER_GATE
+    )  # [m] surprise that makes it start afresh
     jitter: Float[Array, "*#batch"] | float | None = optional(
         0.0
     )  # [s] deviation of the moment of each measurement, Gaussian
@@ -90,3 +98,84 @@ def smoothed(
     tau = row(jnp.maximum(time_constant, SHORTEST))
     behind = (after - before) * (tau / timestep)  # by which f follows a steady p
     return jnp.asarray(after) - behind + (filtered - before + behind) * jnp.exp(-timestep / tau)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Lag:
+    """Estimate minus truth of a causal filter that assumes constant acceleration.
+
+    The fading-memory filter of second degree (Morrison, Introduction to Sequential Smoothing and Prediction, 1969), the
+    steady form of a Kalman filter with this model: a flight shows no lag, a jump of the velocity leaves one that fades
+    with the filter's memory. A surprise beyond the gate opens the filter: it starts afresh at what it measures.
+    """
+
+    position: Float[Array, "3 *batch"]  # [m]
+    velocity: Float[Array, "3 *batch"]  # [m/s]
+    acceleration: Float[Array, "3 *batch"]  # [m/s^2]
+
+    def predicted(self, dt: Scalars, jump: Float[Array, "3 *batch"], since: Scalars) -> Lag:
+        """The lag after ``dt`` [s] without a measurement; jump: of the ball's velocity [m/s], ``since`` [s] ago."""
+        moved = self.position + row(dt) * self.velocity + row(0.5 * dt**2) * self.acceleration - row(since) * jump
+        return Lag(moved, self.velocity + row(dt) * self.acceleration - jump, self.acceleration)
+
+    def corrected(self, dt: Scalars, memory: Scalars, gate: Scalars) -> Lag:
+        """The lag after a measurement, ``dt`` [s] after the one before. memory [s], gate [m]."""
+        kept = jnp.exp(-dt / jnp.maximum(memory, SHORTEST))
+        surprise = jnp.sqrt(dot(self.position, self.position) + SHORTEST**2)
+        share = jnp.clip(0.5 - 0.5 * (surprise - gate) / (SOFT_GATE * gate), 0.0, 1.0)
+        shut = row(share * share * (3.0 - 2.0 * share))
+        spread = jnp.maximum(dt, SHORTEST)
+        gains = kept**3, 1.5 * (1.0 - kept) ** 2 * (1.0 + kept) / spread, ((1.0 - kept) ** 3) / spread**2
+        position = jnp.asarray(shut * row(gains[0]) * self.position)
+        velocity = jnp.asarray(shut * (self.velocity - row(gains[1]) * self.position))
+        return Lag(position, velocity, jnp.asarray(shut * (self.acceleration - row(gains[2]) * self.position)))
+
+
+def jump(
+    before: Float[Array | np.ndarray, "3 *batch"], after: Float[Array | np.ndarray, "3 *batch"], dt: Scalars
+) -> Float[Array, "3 *batch"]:
+    """Jump of a velocity (3, ...) [m/s] at a contact within ``dt`` [s], in which gravity acted as well."""
+    return jnp.stack([after[0] - before[0], after[1] - before[1], after[2] - before[2] + c.GRAVITY * dt])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Filters:
+    """What the tracker's filters remember of a ball; None for one that the parameters omit."""
+
+    smooth: Float[Array | np.ndarray, "3 *batch"] | None  # [m]
+    lag: Lag | None
+
+    @classmethod
+    def at(cls, params: SensingParams, position: Float[Array | np.ndarray, "3 *batch"]) -> Filters:
+        """Filters that have settled on a position [m]."""
+        zero = jnp.zeros_like(position)
+        lag = None if params.filter_time is None else Lag(zero, zero, zero)
+        return cls(None if params.smoothing is None else position, lag)
+
+    def seen(self, position: Float[Array | np.ndarray, "3 *batch"]) -> Float[Array | np.ndarray, "3 *batch"]:
+        """The position [m] that the filters make of one."""
+        seen = position if self.smooth is None else self.smooth
+        return seen if self.lag is None else seen + self.lag.position
+
+    def stepped(
+        self,
+        params: SensingParams,
+        before: BallState,
+        after: BallState,
+        contact: Bool[Array, "*batch"],
+        since: Scalars,
+        timestep: float,
+    ) -> Filters:
+        """The filters a substep later. contact: True where something struck the ball in it, ``since`` [s] ago."""
+        smooth, lag = self.smooth, self.lag
+        if smooth is not None and params.smoothing is not None:
+            smooth = smoothed(params.smoothing, jnp.asarray(smooth), before.position, after.position, timestep)
+        if lag is not None and params.filter_time is not None:
+            struck = jnp.where(contact, jump(before.velocity, after.velocity, timestep), 0.0)
+            gate = value_or(params.filter_gate, FILTER_GATE)
+            lag = lag.predicted(timestep, struck, jnp.where(contact, since, 0.0)).corrected(
+                timestep, params.filter_time, gate
+            )
+        return Filters(smooth, lag)

@@ -477,6 +477,7 @@ FIXED = [
         ("right",),
         marks=[SLOW, PEOPLE],
     ),
+    pytest.param(Case("kalman", (), 0.0, "iid", 41, count=200), ("right",), marks=SLOW),
     (Case("robot", ("joint_2.lag",), 0.0, "iid", 19), ("right",)),
     pytest.param(Case("unexcited", ("joint_3.acceleration_limit",), 0.0, "iid", 22), ("right",), marks=SLOW),
     (Case("robot_none", (), 0.0, "iid", 20), ("right",)),

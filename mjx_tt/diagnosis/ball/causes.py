@@ -78,7 +78,9 @@ def _causes(found: BallFindings, without: Container[str], seed: int) -> tuple[li
     for i, j in enumerate(choice.effects):
         if matters[i]:
             named.append(_effect_cause(found, i, confidence[i], wide, without))
-        elif any(matters):  # too small to be named, but the others' sizes were fitted beside it
+        elif (
+            any(matters) and choice.theta[i] >= found.trial.effects[j].low
+        ):  # too small to be named, but the others' sizes were fitted beside it
             change = found.trial.effects[j].values(nominal, choice.theta[i])
             beside |= {path: float(value) for path, value in change.items()}
     if choice.prior is not None:
@@ -226,8 +228,13 @@ def _unseen(found: BallFindings, without: Container[str], hits: bool) -> tuple[l
 
 
 def _undetermined(found: BallFindings) -> bool:
-    """True if another set of the same size explains as much, and differs by more than members of the groups."""
+    """True if another set of the same size explains as much, and differs by more than members of the groups.
+
+    Where nothing is large enough to be named there is nothing to choose between.
+    """
     choice = found.choice
+    if not any(selection.named(choice, found.trial)) and not choice.spin:
+        return False
     for subset, spun, gain in choice.runners_up:
         if len(subset) != len(choice.effects) or spun != choice.spin or choice.gain - gain > selection.TIE:
             continue

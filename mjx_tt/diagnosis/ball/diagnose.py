@@ -25,6 +25,8 @@ from mjx_tt.sim.model import SimModel
 
 FEWEST_SAMPLES = 15  # of a flight
 FEWEST_BALLS = 12
+TRACKERS = {"tracker_smoothing", "tracker_filter", "tracker_gate"}
+BLURRED, BLUR = 5.0, (0.04, 0.12)  # memories of a tracker's filter for which it settles behind a bounce; [s] of it
 
 
 @dataclass(frozen=True)
@@ -72,21 +74,43 @@ def diagnose_balls(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> BallFindings:
-    """Chooses the causes, and once more without the samples around the bounce where the time stamps prove to be shaky.
+    """Chooses the causes, and once more without samples around the bounce that a tracker proves to have blurred.
 
-    A jitter of the time stamps rounds the corner of the bounce as a tracker's filter does.
+    Time stamps that shake round the corner of the bounce, and so does a filter that predicts: for a moment behind it
+    the samples say more about the tracker than about the table. What a bounce does to a ball stays.
     spin: "none" when the nominal ball does not spin, so that spin is a cause; "free" when every ball may.
     without: effects to omit from the catalogue. Raises ValueError when there are too few flights.
     """
+    say = progress or (lambda text: None)
     found = _diagnose(trajectories, model, spin, without, seed, progress)
+    near = _blurred(found)
+    if near is not None:
+        say("the tracker filters: once more without most of the samples behind the bounce")
+        found = _diagnose(trajectories, model, spin, without, seed, progress, near, found)
     shaken = None if "latency_jitter" in without else shaking(found)
     if shaken is None:
         return found
-    (progress or (lambda text: None))(
-        f"time stamps shake by {1e3 * shaken.seconds:.1f} ms: once more without the bounce's samples"
-    )
+    say(f"time stamps shake by {1e3 * shaken.seconds:.1f} ms: once more without the bounce's samples")
     near = np.abs(found.problem.grid.time - found.linear.base.bounce_time[0]) < 3.0 * shaken.seconds
     return _diagnose(trajectories, model, spin, without, seed, progress, near, found)
+
+
+def _blurred(found: BallFindings) -> Bool[np.ndarray, "T n"] | None:
+    """Samples behind the bounce that a predicting filter blurs, but the first, which shows the filter; None without it.
+
+    A filter that starts afresh settles in a way of its own, which no catalogue holds: it may also show in sets that
+    explain more than the chosen one, but with a size that no filter has.
+    """
+    choice, names = found.choice, [e.name for e in found.trial.effects]
+    filters = [t for j, t in zip(choice.effects, choice.theta, strict=True) if names[j] == "tracker_filter"]
+    better = {names[j] for subset, _, gain in choice.runners_up if gain > choice.gain for j in subset}
+    if not filters and (not better & TRACKERS or TRACKERS & {names[j] for j in choice.effects}):
+        return None
+    filters = filters or [0.0]
+    g = found.problem.grid
+    behind = g.time - found.linear.base.bounce_time[0]
+    first = (behind > 0.0) & (np.cumsum(behind > 0.0, axis=0) == 1)
+    return (behind > 0.0) & (behind < np.clip(BLURRED * filters[0], *BLUR)) & ~first
 
 
 def shaking(found: BallFindings) -> Jitter | None:
@@ -136,18 +160,19 @@ def _diagnose(
     start = first_fit(problem)
     nominal = Situation(np.zeros(len(fitted)), start)
     linear = problem.linearise(nominal)
-    trial = Trial(fitted, *selection.shifts(linear, g), mode, seed, left_out=left_out)
+    trial = Trial(fitted, *selection.shifts(linear, g, fitted), mode, seed, left_out=left_out)
     spin_notes: list[str] = []
     if before is not None:
         prior = before.choice.prior
         own = prior is not None and prior.conditional
         best = search(problem, replace(trial, spin="free") if own else trial, before.situation, prior, say)
         best = replace(best, trial=replace(best.trial, spin=trial.spin))
+        if own and mode == "none" and evidence.shift_of_spins(best) < selection.FLOOR:
+            best = _plain(problem, replace(trial, spin="never"), nominal, say)
     elif mode == "free":
         best = _spinning(problem, trial, nominal, say)
     else:
-        fitted_all = posterior.fit(problem, nominal, None, left_out, say)
-        best = search(problem, trial, fitted_all.at, None, say, fitted_all.linear)
+        best = _plain(problem, trial, nominal, say)
     say("looking for what no entry explains")
     findings, survivors = find(best, g, sessions, age, names)
     if mode == "none" and before is None and (findings or evidence.bent_too_far(best.choice)):
@@ -155,8 +180,9 @@ def _diagnose(
         say("trying balls that spin fast, each in its own way")
         other = _spinning(problem, trial, nominal, say)
         gained = evidence.misfit(best, g) - evidence.misfit(other, g)
-        spin_notes.append(_tried(gained))
-        if gained > 0.0:
+        shift = evidence.shift_of_spins(other)
+        spin_notes.append(_tried(gained, shift))
+        if gained > 0.0 and shift >= selection.FLOOR:
             best = replace(other, trial=replace(other.trial, spin="none"))
             findings, survivors = find(best, g, sessions, age, names)
     seen = selection.visible(scores.under(best.projected, best.choice.prior), best.trial)
@@ -182,8 +208,19 @@ def _diagnose(
     )
 
 
-def _tried(gained: float) -> str:
-    """Account of balls with spins of their own against balls without, by twice the log evidence gained."""
+def _plain(problem: BallProblem, trial: Trial, nominal: Situation, say: Callable[[str], None]) -> Settled:
+    """Choice of causes about balls that do not spin to begin with."""
+    fitted_all = posterior.fit(problem, nominal, None, trial.left_out, say)
+    return search(problem, trial, fitted_all.at, None, say, fitted_all.linear)
+
+
+def _tried(gained: float, shift: float) -> str:
+    """Account of balls with spins of their own, which shift [m] flights, against balls without, by twice the log
+    evidence gained."""
+    if gained > 0.0 and shift < selection.FLOOR:
+        return (
+            f"spin was tried because something stayed open without it, and dropped: it moves balls {1e3 * shift:.1f} mm"
+        )
     if gained > 0.0:
         return f"spin was tried because something stayed open without it, and kept: its evidence is {gained:.0f} better"
     return f"spin was tried because something stayed open without it, and dropped: its evidence is {-gained:.0f} worse"

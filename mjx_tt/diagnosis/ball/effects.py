@@ -43,6 +43,7 @@ class Effect(Description):
     low: float = -np.inf  # smallest change that makes sense
     at_paddle: bool = False  # only a hit shows it, with the joints' log beside the ball's
     needs_spin: bool = False  # shows only on balls that spin
+    fades: bool = False  # shows for a moment only and is gone at the flight's end
     fit: bool = True  # False: not a shift of the path, found by other means
     invisible: str = ""  # reason for which no log of the ball's positions shows it
 
@@ -381,6 +382,29 @@ EFFECTS: tuple[Effect, ...] = (
         reading="a ball stopped by hand",
         step=0.006,
         low=0.0,
+    ),
+    Effect(
+        name="tracker_filter",
+        meaning="a tracker that predicts by constant acceleration",
+        claim="The tracker filters positions by constant acceleration and is wrong behind bounces, memory {instead}",
+        path=SENSING + "filter_time",
+        scale=0.02,
+        unit="s",
+        reading="a ball that bounces, seen by the tracker and by a second camera; or the tracker's settings",
+        step=0.02,
+        low=0.0,
+        fades=True,
+    ),
+    Effect(
+        name="tracker_gate",
+        meaning="the surprise at which a tracker's filter starts afresh",
+        claim="The tracker's filter starts afresh {way:later|earlier} than the model says, at {instead}",
+        path=SENSING + "filter_gate",
+        scale=0.015,
+        unit="m",
+        reading="the tracker's settings",
+        low=-0.028,
+        fades=True,
     ),
     Effect(  # found by time_jitter
         name="latency_jitter",

@@ -44,6 +44,14 @@ def _price_of_spins(settled: Settled, n: int) -> float:
     return float(np.einsum("an,nab,bn->", away, precision, away) + narrower.sum())
 
 
+def shift_of_spins(settled: Settled) -> float:
+    """Median shift [m] of a flight's last sample by a usual spin of the log; 0 where nothing spins."""
+    prior = settled.choice.prior
+    if prior is None:
+        return 0.0
+    return float(np.sqrt(np.sum(prior.std**2 + prior.mean**2))) * settled.trial.spin_shift
+
+
 def bent_too_far(choice: Choice) -> bool:
     """True if spin was chosen with a Magnus coefficient that no ball has: a line bent too far."""
     return choice.magnus is not None and not MAGNUS_KEPT[0] <= choice.magnus <= MAGNUS_KEPT[1]

@@ -194,7 +194,10 @@ def _holds(t: _Treatment, subset: Subset, gain: float, trial: Trial, top: float,
             return False
         if brought < max(t.threshold, LEAST_SHARE * top):
             return False
-        if theta[i] < trial.effects[j].low or abs(theta[i]) > WIDEST * trial.effects[j].scale:
+        # A size that cannot be is no cause, but a small one may stand for how the true cause differs from its entry.
+        if theta[i] < trial.effects[j].low and abs(theta[i]) * trial.shift[j] >= FLOOR:
+            return False
+        if abs(theta[i]) > WIDEST * trial.effects[j].scale:
             return False
     return True
 
@@ -266,7 +269,7 @@ def search(
     frame = noise.flight_frame(linear.base.velocity[:, :, 0])
     own_noise = noise.estimate(linear.residual, frame, g)
     if np.any(at.start[SPIN]):  # effects that show on spinning balls alone have a size there
-        shift, spin_shift = shifts(linear, g)
+        shift, spin_shift = shifts(linear, g, trial.effects)
         trial = replace(trial, shift=shift, spin_shift=spin_shift)
     for round_ in range(ROUNDS):
         if round_:
@@ -281,6 +284,7 @@ def search(
             own_noise = noise.estimate(left, frame, g, 9 if choice.spin else 6)
         theta = np.zeros(len(problem.effects))
         theta[list(choice.effects)] = choice.theta
+        theta = np.maximum(theta, [e.low for e in problem.effects])
         if choice.magnus is not None:
             # In flight only k omega shows: a coefficient out of reason is kept within it, the spins take up the rest.
             own = choice.prior is not None and choice.prior.conditional
@@ -301,10 +305,11 @@ def _close(theta: np.ndarray, before: np.ndarray, choice: Choice) -> bool:
     return bool(np.all(np.abs(theta - before)[chosen] <= SETTLED * choice.error))
 
 
-def shifts(linear: Linear, g: Grid) -> tuple[np.ndarray, float]:
+def shifts(linear: Linear, g: Grid, effects: Sequence[Effect]) -> tuple[np.ndarray, float]:
     """Median shift [m] of the last sample of the balls concerned, per unit of each effect and per rad/s of spin.
 
     Against a nominal flight from the same measured start: what the effect does to the first samples is carried along.
+    Of an effect that fades the largest shift of a flight counts.
     """
     last = g.last
     balls = np.arange(g.n)
@@ -314,6 +319,8 @@ def shifts(linear: Linear, g: Grid) -> tuple[np.ndarray, float]:
     end = linear.effects[:, :, last, balls] - carried
     spin = linear.starts[SPIN][:, :, last, balls]
     size = np.linalg.norm(end, axis=1)
+    for i in (i for i, e in enumerate(effects) if e.fades):
+        size[i] = np.linalg.norm(np.where(g.mask, linear.effects[i], 0.0), axis=0).max(axis=0)
     concerned = [s[s > 1e-3 * s.max()] for s in size]
     return np.array([np.median(s) if s.size else 0.0 for s in concerned]), float(
         np.median(np.linalg.norm(spin, axis=1))

@@ -11,12 +11,14 @@ import numpy as np
 from tests.exam.generator import robot
 from tests.exam.generator.human_strokes import draw_human
 from tests.exam.generator.invented_defects import INVENTED
+from tests.exam.generator.kalman_tracker import lag, tracked
 from tests.exam.generator.sessions import NOISES, WRONG_NOISES, Balls, Log, draw_balls, measure, shift, with_spin
 from tests.exam.generator.world import World
 
 MAGNUS = 0.6  # k of a ball that curves
 RARE_SHARE, RARE_FACTOR = 0.05, 6.0  # an effect of a few balls, and by how much more than the case's size
 SCALING_BALLS, SCALING_ROUNDS = 80, 5
+LEAST_LAG = 0.005  # [m] of a Kalman filter that is worth a name
 
 
 @dataclass(frozen=True)
@@ -206,9 +208,11 @@ class BallCase:
     amounts: dict[str, float]
     spin_mean: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) [rad/s] of balls that fly towards -y
     spin_std: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    filter: tuple[float, float] | None = None  # jerk and gate of the tracker's Kalman filter
 
     def log(self) -> Log:
-        return measure(self.world, self.balls, self.case.noise, _generator(self.case, "noise"))
+        log = measure(self.world, self.balls, self.case.noise, _generator(self.case, "noise"))
+        return log if self.filter is None else replace(log, position=tracked(log.position, *self.filter))
 
     def truth(self) -> dict:
         """Sealed content: the case, the accepted answers, and the values on every model path that expresses them."""
@@ -261,7 +265,21 @@ def build(case: Case, balls: Balls | None = None) -> BallCase:
             mean, std = (amount * s for s in _spin_shape(case))
     if case.kind == "rare":
         world, spinning = _only_some(case, world, spinning, balls)
-    return BallCase(case, world, spinning, amounts, mean, std)
+    kalman = _kalman(case, few) if case.kind == "kalman" else None
+    if kalman is not None:
+        amounts["tracker_filter"] = kalman[0]
+    return BallCase(case, world, spinning, amounts, mean, std, kalman and kalman[1:])
+
+
+def _kalman(case: Case, balls: Balls) -> tuple[float, float, float]:
+    """Largest error [m] of a tracker's filter that matters on these balls, its jerk and its gate."""
+    rng = _generator(case, "filter")
+    clean = measure(World(), balls, "iid", rng).clean
+    while True:
+        jerk, gate = float(np.exp(rng.uniform(np.log(10.0), np.log(200.0)))), float(rng.uniform(10.0, 80.0))
+        size = lag(clean, jerk, gate)
+        if size > LEAST_LAG:
+            return size, jerk, gate
 
 
 def _scaled(case: Case, cause: str, sign: float, balls: Balls, target: float) -> float:
@@ -401,6 +419,7 @@ KINDS = (
     "robot",
     "unexcited",
     "robot_none",
+    "kalman",
     "human_none",
     "human_single",
     "human_pair",
@@ -445,7 +464,7 @@ def draw(kind: str, count: int, seed: int, size_mm: float | None = None) -> list
     cases = []
     for i, causes in enumerate(names[:count]):
         size = size_mm or float(rng.choice(SIZES if kind == "single" else SIZES[1:]))
-        if kind in ("none", "noise", "many", "robot", "unexcited", "robot_none"):
+        if kind in ("none", "noise", "many", "robot", "unexcited", "robot_none", "kalman"):
             size = 0.0
         without: tuple[str, ...] = ()
         if kind == "deleted":
@@ -463,7 +482,7 @@ def _round(
     kind: str, rng: np.random.Generator, singles: list[str], too_large: tuple[str, ...]
 ) -> list[tuple[str, ...]]:
     """One round of causes of a kind, shuffled."""
-    if kind in ("none", "noise", "robot_none"):
+    if kind in ("none", "noise", "robot_none", "kalman"):
         return [()]
     if kind == "invisible":
         return [(name,) for name in INVISIBLE]

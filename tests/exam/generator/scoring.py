@@ -28,7 +28,7 @@ def score(truth: dict, verdict: dict) -> dict:
     named = [{c["name"], *c.get("group", ())} for c in given]
     answer = "+".join(sorted(c["name"] for c in verdict["causes"])) if named else verdict["verdict"]
     record = {"verdict": verdict["verdict"], "answer": answer, "groups": [sorted(g) for g in named]}
-    accepted = {c: {c} for c in causes}
+    accepted = {c: {c} for c in (("tracker_filter",) if kind == "kalman" else causes)}
     if "magnus" in accepted:  # spins, and a k that is not the nominal one: both are true
         accepted["magnus"].add("magnus_coefficient")
     if kind == "deleted":
@@ -214,6 +214,8 @@ def table(records: list[dict]) -> list[Row]:
         _share("16", "people play, cause deleted: flagged or its twin", "-", ended("human_deleted", flagged, right)),
         _share("14-16", "people play: wrong name", "<= 2 %", ended(PEOPLE, wrong)),
         *_many_rows(by["many"]),
+        _share("18", "a tracker's Kalman filter: named", ">= 90 %", ended("kalman", right)),
+        _share("18", "a tracker's Kalman filter: wrong name", "<= 2 %", ended("kalman", wrong)),
         _share("-", "in 5 % of the balls only: flagged or right", "-", ended("rare", flagged, right)),
         _share("-", "in 5 % of the balls only: wrong name", "-", ended("rare", wrong)),
         _share("-", "invisible in a ball log: named", "-", named("invisible")),

@@ -15,6 +15,8 @@ NOT_EXAMINED = {
     "magnus_coefficient",  # named as magnus, the nominal ball does not spin
     "spin_decay",
     "lift_saturation",  # ball/test_spins
+    "tracker_filter",  # cases of their own: Kalman filters
+    "tracker_gate",
     "paddle_restitution",  # hits: test_hits
     "paddle_friction",
     "paddle_tilt",

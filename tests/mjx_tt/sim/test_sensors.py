@@ -12,9 +12,11 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from ballmodel import constants as c
 from ballmodel.partial_params import without_nominal
 from mjx_tt.sim import model, sensors
 from mjx_tt.sim.model import SensingParams
+from mjx_tt.sim.sensors import Lag
 from tests.support import scripted_episodes
 from tests.support.scripted_episodes import TICKS, episodes, play, task
 
@@ -123,8 +125,55 @@ def test_a_fast_clock_stretches_the_trackers_latency(seen):
 
 
 def test_a_tracker_without_errors_is_left_out():
-    left = {name: None for name in (*CAMERA, "smoothing", "jitter", "clock_rate")}
+    left = dict.fromkeys((*CAMERA, "smoothing", "filter_time", "filter_gate", "jitter", "clock_rate"))
     assert sensors.camera(replace(SensingParams(), **left)) is None
     assert without_nominal(SensingParams()) == replace(SensingParams(), **left)
     one = sensors.camera(without_nominal(SensingParams(camera_scale=1.02)))
     np.testing.assert_allclose(one.seen(START), 1.02 * START, rtol=1e-6)
+
+
+def test_a_filter_of_constant_acceleration_fades_behind_a_jump_of_the_velocity():
+    """Transfer function of its error: (T s)^3 / (T s + 1)^3; a jump dv answers with dv (t - t^2 / 2T) exp(-t / T)."""
+    memory, step, kick = 0.02, 2e-5, np.array([1.0, -2.0, 4.0])
+
+    def advance(lag, _):
+        lag = lag.predicted(step, still, 0.0).corrected(step, memory, 1e6)
+        return lag, lag.position
+
+    with jax.enable_x64(True):
+        still = jnp.zeros(3)
+        _, error = jax.lax.scan(advance, Lag(still, still, still).predicted(0.0, jnp.array(kick), 0.0), length=5000)
+    t = step * np.arange(1, 5001)[:, None]
+    wanted = -kick * (t - t**2 / (2.0 * memory)) * np.exp(-t / memory)
+    np.testing.assert_allclose(error, wanted, atol=5e-3 * np.abs(wanted).max())
+
+
+def test_a_filter_that_is_surprised_starts_afresh():
+    still, kick = jnp.zeros(3), jnp.array([0.0, 0.0, 5.0])
+    seen = []
+    for gate in (0.02, 0.2):
+        lag = Lag(still, still, still).predicted(0.008, kick, 0.008).corrected(0.008, 0.03, gate)
+        seen.append(float(jnp.linalg.norm(lag.position)))
+    # Innovation 40 mm; at the wider gate the share exp(-3 dt / T) of it stays.
+    assert seen[0] < 2e-3
+    np.testing.assert_allclose(seen[1], 0.04 * np.exp(-3 * 0.008 / 0.03), rtol=0.01)
+
+
+def test_a_filter_of_constant_acceleration_is_wrong_behind_a_bounce_in_an_episode():
+    """A ball dropped without drag: bounce and the error behind it in closed form, sampled at the substeps' rate."""
+    height, memory, g = 0.8, 0.04, 9.81
+    values = {"sensing.filter_time": jnp.full(8, memory).at[0].set(0.0), "sensing.filter_gate": jnp.full(8, 5.0)}
+    values["ball.flight.drag_coefficient"] = jnp.zeros(8)
+    with jax.enable_x64(True):
+        simulation = model.with_values(scripted_episodes.model(), values)
+        at = np.array([0.0, -0.6, c.BALL_RADIUS + height])
+        record = play(task(), episodes(at, np.zeros(3), None, simulation))
+    ball = record.controller[:, :3]
+    error = ball[:, 2, 1] - ball[:, 2, 0]
+    since = np.maximum(np.arange(TICKS) * T - np.sqrt(2.0 * height / g), 0.0)
+    kick = (1.0 + c.TABLE_RESTITUTION) * np.sqrt(2.0 * g * height)
+    wanted = -kick * (since - since**2 / (2.0 * memory)) * np.exp(-since / memory)
+    first = (since > 0.0) & (since < 0.2)
+    assert np.abs(wanted[first]).max() > 0.06
+    np.testing.assert_allclose(error[first], wanted[first], atol=0.15 * np.abs(wanted).max())
+    np.testing.assert_allclose(error[since == 0.0], 0.0, atol=1e-9)

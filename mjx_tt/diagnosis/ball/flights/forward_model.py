@@ -23,6 +23,7 @@ from ballmodel.partial_params import value_or, without_nominal
 from ballmodel.state import BallState
 from ballmodel.trajectory import Trajectory
 from mjx_tt.sim.model import SensingParams, SimModel, paths, with_values
+from mjx_tt.sim.sensors import FILTER_GATE, Lag, jump
 
 LONGEST_STEP = 0.01  # [s]; second order: 0.05 mm over a flight
 PAD = 16  # numbers of steps are rounded up to it, so that similar logs share one compiled program
@@ -153,6 +154,8 @@ def _fly(
     rate = jnp.broadcast_to(jnp.asarray(value_or(sensing.clock_rate, 1.0), start.dtype), shape)
     smoothing = jnp.broadcast_to(jnp.asarray(value_or(sensing.smoothing, 0.0), start.dtype), shape)
     tau = jnp.maximum(smoothing, 1e-9)
+    memory = jnp.broadcast_to(jnp.asarray(value_or(sensing.filter_time, 0.0), start.dtype), shape)
+    gate = jnp.broadcast_to(jnp.asarray(value_or(sensing.filter_gate, FILTER_GATE), start.dtype), shape)
 
     def follow(filtered: Array, before: Array, after: Array, dt: Array) -> Array:
         """The filter's output after a piece of straight motion: exact."""
@@ -168,8 +171,8 @@ def _fly(
         return replace(pose, position=pose.position - late * pose.velocity, normal=pose.normal - late * turned)
 
     def advance(carry: tuple, inputs: tuple) -> tuple[tuple, tuple[Array, ...]]:
-        state, filtered, elapsed, bounced, at, incoming, struck = carry
-        dt, *blade = inputs
+        state, filtered, (lag, unmeasured), elapsed, bounced, at, incoming, struck = carry
+        dt, sampled, *blade = inputs
         dt = dt / rate
         pair = tuple(jax.tree.map(lambda x: jnp.broadcast_to(x, (3, *shape)), moved(pose)) for pose in blade) or None
         new, events = flight.step(ball, state, dt, pair)
@@ -180,29 +183,39 @@ def _fly(
         t = jnp.where(hit, events.time, dt)
         corner = jnp.where(hit, events.position, new.position)
         filtered = follow(follow(filtered, state.position, corner, t), corner, new.position, dt - t)
+        kick = jnp.where(hit, jump(state.velocity, new.velocity, dt), 0.0)
+        lag, unmeasured = lag.predicted(dt, kick, dt - t), unmeasured + dt
+        met = lag.corrected(unmeasured, memory, gate)
+        lag = jax.tree.map(lambda a, b: jnp.where(sampled, a, b), met, lag)
+        unmeasured = jnp.where(sampled, 0.0, unmeasured)
         first = landed & (bounced == jnp.inf)
         bounced = jnp.where(first, (elapsed + t) * rate, bounced)
         at = jnp.where(first, events.position, at)
         incoming = jnp.where(first, state.velocity, incoming)
         struck = jnp.where(events.paddle & moving & (struck == jnp.inf), (elapsed + events.time) * rate, struck)
-        carry = (new, filtered, elapsed + dt, bounced, at, incoming, struck)
-        return carry, (new.position, new.velocity, filtered)
+        carry = (new, filtered, (lag, unmeasured), elapsed + dt, bounced, at, incoming, struck)
+        return carry, (new.position, new.velocity, filtered, lag.position)
 
     state = BallState(start[:3], start[3:6], start[6:])
     zero = jnp.zeros_like(start[0])
     # In steady motion the filter trails by tau v: it was running before the first sample.
     filtered = start[:3] - smoothing * start[3:6]
-    carry = (state, filtered, zero, zero + jnp.inf, start[:3] * 0.0, start[:3] * 0.0, zero + jnp.inf)
+    still = jnp.zeros_like(start[:3])
+    carry = (state, filtered, (Lag(still, still, still), zero), zero, zero + jnp.inf, still, still, zero + jnp.inf)
+    # Steps at whose end the tracker measures: behind a ball's last sample nothing moves.
+    columns = jnp.arange(shape[0])
+    frames = jnp.zeros((len(steps) + 1, *shape), bool).at[index, columns].set(True)[1:]
     ends = () if paddle is None else (slice(None, -1), slice(1, None))
     blades = tuple(jax.tree.map(lambda x, part=part: x[part], paddle) for part in ends)
-    (_, _, _, bounced, at, incoming, struck), (x, v, y) = jax.lax.scan(advance, carry, (steps, *blades))
+    inputs = (steps, frames, *blades)
+    (_, _, _, _, bounced, at, incoming, struck), (x, v, y, behind) = jax.lax.scan(advance, carry, inputs)
 
-    def sampled(first: Array | np.ndarray, later: Array) -> Array:
+    def taken(first: Array | np.ndarray, later: Array) -> Array:
         at_steps = jnp.moveaxis(jnp.concatenate([first[None], later]), 0, 1)  # (3, L + 1, ...)
         return jnp.take_along_axis(at_steps, index[None], axis=1)
 
-    position, velocity = sampled(state.position, x), sampled(state.velocity, v)
-    seen = jnp.where(smoothing > 0.0, sampled(filtered, y), position)
+    position, velocity = taken(state.position, x), taken(state.velocity, v)
+    seen = jnp.where(smoothing > 0.0, taken(filtered, y), position) + taken(still, behind)
     return _camera(sensing, seen), position, velocity, bounced, at, incoming, struck
 
 
