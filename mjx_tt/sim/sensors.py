@@ -142,7 +142,7 @@ def jump(
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Filters:
-    """What the tracker's filters remember of a ball; None for one that the parameters omit."""
+    """Memories of the tracker's filters of a ball; None for one that the parameters omit."""
 
     smooth: Float[Array | np.ndarray, "3 *batch"] | None  # [m]
     lag: Lag | None
