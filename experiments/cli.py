@@ -44,6 +44,7 @@ diagnose_app = options.command(
     """\
   mjx-tt diagnose session1.csv session2.mcap --out diagnosis
   mjx-tt diagnose robot/ --out diagnosis                    a folder with command.csv and state.csv
+  mjx-tt diagnose robot/ --home home --out diagnosis        and the encoders' zeros: it began to move at home
   mjx-tt diagnose session1.csv --policy runs/quickstart --out diagnosis          what the defect costs in play
   mjx-tt train my.yaml --set model=diagnosis/extended.yaml                       train with what was found
 
@@ -63,6 +64,10 @@ def diagnose(
         Parameter(help="whether balls may spin: free where the model has a Magnus force, else a cause (auto)"),
     ] = "auto",
     without: Annotated[tuple[str, ...], options.option("NAMES", "effects to leave out of the catalogue")] = (),
+    home: Annotated[
+        str,
+        options.option("POSE", "where joints truly rest at first: home, or joint_1=0.52,gantry_x=0 [rad, m]"),
+    ] = "",
     randomise: Annotated[bool, Parameter(help="extended.yaml draws what was fitted from its intervals")] = False,
     seed: Annotated[int, Parameter(help="of the bootstraps (0)")] = 0,
     policy: Annotated[
@@ -77,7 +82,7 @@ def diagnose(
 
     screen, folder = options.console(), Path(out)
     names = tuple(name for part in without for name in part.split(",") if name)
-    request = diagnosis.Request(logs, folder, model, spin, names, seed, randomise, policy, retrain)
+    request = diagnosis.Request(logs, folder, model, spin, names, seed, randomise, policy, retrain, home)
     found = diagnosis.diagnose(request, screen)
     extended = diagnosis.save(found, folder)
     diagnosis.show(found, screen)

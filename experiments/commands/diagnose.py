@@ -21,8 +21,10 @@ from experiments.training import loop
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis import report
 from mjx_tt.diagnosis.report import Play, Rate
+from mjx_tt.robot.model import home_qpos, load_model
 from mjx_tt.sim import model
 from mjx_tt.sim.model import ModelFile
+from robot_io.contract import JOINT_NAMES
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Request:
     randomise: bool = False
     policy: str | None = None
     retrain: int = 0
+    home: str = ""
 
     def check(self) -> None:
         """Refuses at once a request that would fail after the work. Raises ConfigError."""
@@ -49,11 +52,28 @@ class Request:
             raise ConfigError(f"--retrain {self.retrain}: a number of updates is wanted")
         if self.policy is not None and load(self.policy).config is None:
             raise ConfigError(f"{self.policy}: does not say how it was trained; give the run that it came from")
+        resting_pose(self.home)
         existing = next(p for p in (self.out, *self.out.absolute().parents) if p.exists())
         if not existing.is_dir():
             raise ConfigError(f"--out {self.out}: {existing} is a file, a folder is wanted")
         if not os.access(existing, os.W_OK):
             raise ConfigError(f"--out {self.out}: {existing} cannot be written to")
+
+
+def resting_pose(text: str) -> dict[str, float]:
+    """Positions [rad], [m] by joint: the robot's home pose, or pairs joint=position. Raises ConfigError."""
+    if text in ("", "home"):
+        return dict(zip(JOINT_NAMES, home_qpos(load_model()).tolist(), strict=True)) if text else {}
+    pose = {}
+    for pair in text.split(","):
+        joint, _, value = pair.partition("=")
+        if joint not in JOINT_NAMES:
+            raise ConfigError(f"--home {text}: no joint {joint!r}; there are {', '.join(JOINT_NAMES)}, or home for all")
+        try:
+            pose[joint] = float(value)
+        except ValueError:
+            raise ConfigError(f"--home {text}: {joint} at {value!r}; a number is wanted [rad], [m]") from None
+    return pose
 
 
 def read_logs(paths: Sequence[str]) -> diagnosis.Logs:
@@ -86,6 +106,9 @@ def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
     nominal = checked("--model", ModelFile.load, request.model) if request.model else ModelFile(model.SimModel())
     logs = checked("", read_logs, request.logs)
     balls, joints = len(logs.balls), len(logs.joints)
+    home = resting_pose(request.home)
+    if home and not joints:
+        raise ConfigError(f"--home {request.home}: the logs hold no joints")
     console.print(
         f"{balls} trajectories, {joints} joints from {', '.join(str(p) for p in request.logs)}", highlight=False
     )
@@ -113,6 +136,7 @@ def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
         say,
         provenance,
         request.randomise,
+        home,
     )
 
 

@@ -7,7 +7,7 @@ found.verdict.causes, found.extended
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,12 +55,15 @@ def diagnose(
     progress: Callable[[str], None] | None = None,
     provenance: dict | None = None,
     randomise: bool = False,
+    home: Mapping[str, float] | None = None,
 ) -> Diagnosis:
     """Finds what ``model`` gets wrong about the logs.
 
     spin: "none" where the nominal ball does not spin, so that spin is a cause; "free" where every ball has a spin of
     its own; "auto" for "free" where the model has a Magnus force and "none" where it has none. without: effects of the
     catalogue to omit. randomise: the extended model draws the fitted parameters from their intervals in training.
+    home: true positions [rad], [m] in which joints rest before their first motion; joints that are not logged are not
+    looked at.
     Raises ValueError for unknown names, too few balls, or logs without anything to diagnose.
     """
     model = SimModel() if model is None else model
@@ -85,7 +88,12 @@ def diagnose(
     if logs.joints:
         nominal = {r.joint: nominal_response(model, r.joint) for r in logs.joints}
         robot = diagnose_joints(
-            logs.joints, nominal, seed, lambda name, done, count: say(f"joint {done} of {count}: {name}"), of_joints
+            logs.joints,
+            nominal,
+            seed,
+            lambda name, done, count: say(f"joint {done} of {count}: {name}"),
+            of_joints,
+            {joint: at for joint, at in (home or {}).items() if joint in nominal},
         )
     if found is not None and prediction is not None:
         parts += [

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from rich.console import Console
 
 from experiments import cli
 from experiments.commands import diagnose
 from experiments.deploy import session_logs
+from experiments.errors import ConfigError
 from mjx_tt import diagnosis as gap
+from tests.exam.generator import robot as joints_of
 
 pytestmark = pytest.mark.optimised
 
@@ -200,3 +205,32 @@ def test_an_unknown_effect_cannot_be_left_out(tmp_path):
     logs = gap.load_logs([write(tmp_path / "log.csv", flights())])
     with pytest.raises(ValueError, match="did you mean 'table_friction'"):
         gap.diagnose(logs, without=["table_fricton"])
+
+
+def test_a_wrong_zero_of_an_encoder_is_named_where_the_pose_at_rest_is_given(tmp_path):
+    """The examiner's joints start at 0; two seconds at rest stand before their strokes."""
+    joints = {name: joints_of.nominal(name) for name in ("joint_1", "joint_2")}
+    joints["joint_2"] = replace(joints["joint_2"], joint_offset=0.012)
+    rng = np.random.default_rng(3)
+    time, velocity = joints_of.commands(rng, 20.0)
+    command, state = ["t,joint,velocity"], ["t,joint,position"]
+    for name, joint in joints.items():
+        row = np.where(time < 2.0, 0.0, velocity[joints_of.JOINTS.index(name)])
+        seen = np.arange(5000) / joints_of.ARM_RATE
+        at = joints_of.respond(joint, time, row, seen) + rng.normal(0.0, joints_of.ENCODER, seen.size)
+        command += [f"{t},{name},{v}" for t, v in zip(time, row, strict=True)]
+        state += [f"{t},{name},{q}" for t, q in zip(seen, at, strict=True)]
+    (tmp_path / "command.csv").write_text("\n".join(command))
+    (tmp_path / "state.csv").write_text("\n".join(state))
+    request = diagnose.Request([str(tmp_path)], tmp_path / "out", home="joint_1=0,joint_2=0")
+    (cause,) = diagnose.diagnose(request, Console(quiet=True)).verdict.causes
+    estimate = cause.parameters["joint_2.joint_offset"]
+    assert cause.name == "joint_2.joint_offset" and estimate.low <= 0.012 <= estimate.high
+    without = diagnose.diagnose(replace(request, home=""), Console(quiet=True)).verdict
+    assert not without.causes and any("joint_2.joint_offset" in why for why in without.not_identifiable)
+
+
+@pytest.mark.parametrize("home, said", [("joint_9=0", "no joint 'joint_9'"), ("joint_1=left", "a number is wanted")])
+def test_a_pose_at_rest_that_cannot_be_is_refused(home, said):
+    with pytest.raises(ConfigError, match=said):
+        diagnose.resting_pose(home)
