@@ -52,6 +52,18 @@ class Unexplained:
 
 
 @dataclass(frozen=True)
+class Together:
+    """Change of one effect where all effects of the ball are fitted at once, named or not."""
+
+    name: str
+    change: float
+    low: float  # 90 % interval
+    high: float
+    prior: float  # size that would surprise nobody
+    unit: str
+
+
+@dataclass(frozen=True)
 class HeldOut:
     """Prediction of data that the fit did not use."""
 
@@ -84,6 +96,7 @@ class Verdict:
     next_experiment: tuple[Experiment, ...]
     runners_up: tuple[dict, ...] = field(default=())
     warnings: tuple[str, ...] = field(default=())
+    together: tuple[Together, ...] = field(default=())
 
     def to_dict(self) -> dict[str, object]:
         """Plain data; a number that is not finite (a limit that was never reached) is null."""
@@ -132,6 +145,7 @@ class Part:
     next_experiment: tuple[Experiment, ...] = ()
     runners_up: tuple[dict, ...] = ()
     warnings: tuple[str, ...] = ()
+    together: tuple[Together, ...] = ()
 
 
 def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict, dict[str, float], tuple[Range, ...]]:
@@ -169,6 +183,7 @@ def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict,
         every("next_experiment"),
         every("runners_up"),
         tuple(warnings),
+        every("together"),
     )
     if kind == "undetermined" and not (held_out and held_out.low > 0.0):
         return verdict, {}, ()

@@ -13,7 +13,7 @@ from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, shaking
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, REFERENCE_MAGNUS
-from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Part, Unexplained
+from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Part, Together, Unexplained
 
 BOOTSTRAP = 100
 LEVEL = 0.90  # of intervals
@@ -65,6 +65,24 @@ def part(
             f"two of the causes together are just what {name} alone would look like, which was left out"
             for name in found.imitated
         ),
+        _together(found),
+    )
+
+
+def _together(found: BallFindings) -> tuple[Together, ...]:
+    """All effects that were fitted at once, with 90 % intervals."""
+    fitted, wide = found.together, quantile(found.problem.grid.n - 10)
+    return tuple(
+        Together(
+            effect.name,
+            float(fitted.theta[i]),
+            float(fitted.theta[i] - wide * fitted.std[i]),
+            float(fitted.theta[i] + wide * fitted.std[i]),
+            effect.scale,
+            effect.unit,
+        )
+        for i, effect in enumerate(found.trial.effects)
+        if i in fitted.free
     )
 
 

@@ -16,6 +16,7 @@ from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Projected, Situation
 from mjx_tt.diagnosis.ball.flights.noise import Jitter, Noise
+from mjx_tt.diagnosis.ball.posterior import Posterior
 from mjx_tt.diagnosis.ball.scores import Scores
 from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial, search
 from mjx_tt.diagnosis.ball.spins import Spins, estimate
@@ -48,6 +49,7 @@ class BallFindings:
     age: Float[np.ndarray, " n"]
     seen: Bool[np.ndarray, " K"]  # the data could show the effect, and it was not left out
     imitated: tuple[str, ...]  # effects that were left out, each of which would replace two of the causes
+    together: Posterior  # all effects fitted at once, before any was chosen
     spins: Spins | None  # of every ball, where balls spin
     spin_notes: tuple[str, ...]  # what was tried about spin, and what it brought
 
@@ -163,27 +165,27 @@ def _diagnose(
     trial = Trial(fitted, *selection.shifts(linear, g, fitted), mode, seed, left_out=left_out)
     spin_notes: list[str] = []
     if before is not None:
-        prior = before.choice.prior
+        prior, together = before.choice.prior, before.together
         own = prior is not None and prior.conditional
         best = search(problem, replace(trial, spin="free") if own else trial, before.situation, prior, say)
         best = replace(best, trial=replace(best.trial, spin=trial.spin))
         if own and mode == "none" and evidence.shift_of_spins(best) < selection.FLOOR:
-            best = _plain(problem, replace(trial, spin="never"), nominal, say)
+            best, together = _plain(problem, replace(trial, spin="never"), nominal, say)
     elif mode == "free":
-        best = _spinning(problem, trial, nominal, say)
+        best, together = _spinning(problem, trial, nominal, say)
     else:
-        best = _plain(problem, trial, nominal, say)
+        best, together = _plain(problem, trial, nominal, say)
     say("looking for what no entry explains")
     findings, survivors = find(best, g, sessions, age, names)
     if mode == "none" and before is None and (findings or evidence.bent_too_far(best.choice)):
         # Strong spin is out of reach of derivatives taken about balls that do not spin.
         say("trying balls that spin fast, each in its own way")
-        other = _spinning(problem, trial, nominal, say)
+        other, theirs = _spinning(problem, trial, nominal, say)
         gained = evidence.misfit(best, g) - evidence.misfit(other, g)
         shift = evidence.shift_of_spins(other)
         spin_notes.append(_tried(gained, shift))
         if gained > 0.0 and shift >= selection.FLOOR:
-            best = replace(other, trial=replace(other.trial, spin="none"))
+            best, together = replace(other, trial=replace(other.trial, spin="none")), theirs
             findings, survivors = find(best, g, sessions, age, names)
     seen = selection.visible(scores.under(best.projected, best.choice.prior), best.trial)
     seen[list(left_out)] = False
@@ -203,15 +205,18 @@ def _diagnose(
         age,
         seen,
         selection.imitated(best.projected, best.trial, best.choice),
+        together,
         estimate(problem, best, kept),
         tuple(spin_notes) if before is None else before.spin_notes,
     )
 
 
-def _plain(problem: BallProblem, trial: Trial, nominal: Situation, say: Callable[[str], None]) -> Settled:
-    """Choice of causes about balls that do not spin to begin with."""
+def _plain(
+    problem: BallProblem, trial: Trial, nominal: Situation, say: Callable[[str], None]
+) -> tuple[Settled, Posterior]:
+    """Choice of causes about balls that do not spin to begin with, and all effects at once."""
     fitted_all = posterior.fit(problem, nominal, None, trial.left_out, say)
-    return search(problem, trial, fitted_all.at, None, say, fitted_all.linear)
+    return search(problem, trial, fitted_all.at, None, say, fitted_all.linear), fitted_all
 
 
 def _tried(gained: float, shift: float) -> str:
@@ -226,8 +231,10 @@ def _tried(gained: float, shift: float) -> str:
     return f"spin was tried because something stayed open without it, and dropped: its evidence is {-gained:.0f} worse"
 
 
-def _spinning(problem: BallProblem, trial: Trial, nominal: Situation, say: Callable[[str], None]) -> Settled:
-    """Choice of causes where each ball has a spin of its own, about which derivatives are taken."""
+def _spinning(
+    problem: BallProblem, trial: Trial, nominal: Situation, say: Callable[[str], None]
+) -> tuple[Settled, Posterior]:
+    """Choice of causes where each ball has a spin of its own, about which derivatives are taken; and all at once."""
     say("fitting each ball's spin")
     fitted_all = posterior.fit(problem, *own_spins(problem, nominal), trial.left_out, say)
     prior = fitted_all.prior
@@ -236,7 +243,7 @@ def _spinning(problem: BallProblem, trial: Trial, nominal: Situation, say: Calla
             f"spins of {prior.components} kind{'s' * (prior.components > 1)}: mean {np.round(prior.mean)}, "
             f"deviation {np.round(prior.std)} rad/s about x, y, z"
         )
-    return search(problem, replace(trial, spin="free"), fitted_all.at, prior, say, fitted_all.linear)
+    return search(problem, replace(trial, spin="free"), fitted_all.at, prior, say, fitted_all.linear), fitted_all
 
 
 def _sessions(

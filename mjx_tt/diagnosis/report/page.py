@@ -264,7 +264,15 @@ def _parameters(d: Diagnosis, page: Page) -> Context:
             estimate = Markup("<b>{}</b>").format(middle)
             rows.append((_code(c.name) if not k else role, _code(path), nominal, estimate, f"{low} to {high}", unit))
     shifts = figures.forest_rows(d.verdict.causes, d.balls)
-    return {"rows": rows, "forest": page.embed("parameters", figures.forest(shifts)) if shifts else ""}
+    together = [
+        (_code(t.name), f"{t.change:+.3g}", f"{t.low:+.3g} to {t.high:+.3g}", f"± {t.prior:g}", t.unit)
+        for t in sorted(d.verdict.together, key=lambda t: -abs(t.change) / max(t.high - t.change, 1e-12))
+    ]
+    return {
+        "together": together,
+        "rows": rows,
+        "forest": page.embed("parameters", figures.forest(shifts)) if shifts else "",
+    }
 
 
 def _held_out(d: Diagnosis, page: Page) -> Context:
