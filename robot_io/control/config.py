@@ -158,9 +158,10 @@ class RobotConfig:
                 raise ValueError(f"{path} is {value!r}, allowed is an IPv4 address such as 192.168.125.1") from None
 
 
-def axis_range(i: int) -> tuple[float, float]:
-    """Range [m] that is ever commanded to linear axis ``i``: the limiter's."""
-    return LIMITS.lower[i] + LIMITS.margin[i], LIMITS.upper[i] - LIMITS.margin[i]
+def axis_range(i: int, safety: SafetyConfig) -> tuple[float, float]:
+    """Range [m] that is ever commanded to linear axis ``i``: the gate's, so that no drive goes beyond it by itself."""
+    room = max(LIMITS.margin[i], safety.overshoot[i])
+    return LIMITS.lower[i] + room, LIMITS.upper[i] - room
 
 
 def linear_axes(config: RobotConfig) -> FestoAxes:
@@ -169,5 +170,7 @@ def linear_axes(config: RobotConfig) -> FestoAxes:
     for i, axis in enumerate(config.axes):
         link = ModbusLink(axis.host, axis.port, ANSWER_TIME, axis.device_id)
         profile = PROFILES[config.axis_profile]()
-        axes.append(Axis(AXIS_NAMES[i], link, profile, *axis_range(i), zero=axis.zero, direction=axis.direction))
+        axes.append(
+            Axis(AXIS_NAMES[i], link, profile, *axis_range(i, config.safety), zero=axis.zero, direction=axis.direction)
+        )
     return FestoAxes(axes, config.axes_motion)

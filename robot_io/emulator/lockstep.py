@@ -77,7 +77,12 @@ class LockStep:
         ]
         self.axes = FestoAxes(
             [
-                Axis(name, DirectLink(emulator), PROFILES[params.axis_profile](), *axis_range(i))
+                Axis(
+                    name,
+                    DirectLink(emulator),
+                    PROFILES[params.axis_profile](),
+                    *axis_range(i, safety or SafetyConfig()),
+                )
                 for i, (name, emulator) in enumerate(zip(("gantry_x", "gantry_y"), self.emulators, strict=True))
             ],
             AXES_CONFIG,

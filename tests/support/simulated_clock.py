@@ -43,6 +43,9 @@ class FollowingAxes:
     def enable(self):
         pass
 
+    def home(self):
+        self.homed = True
+
     def stop(self):
         self.stops += 1
 

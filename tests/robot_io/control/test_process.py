@@ -105,6 +105,24 @@ def test_axes_that_do_not_answer_yet_are_not_homed(simulated):
     assert refused == ["axes not ready: one of them does not answer yet; try again"]
 
 
+def test_axes_are_homed_only_with_the_arm_clear(simulated):
+    pipe, axes, home = simulated.pipe, simulated.simulation.axes, simulated.simulation.arm.copy()
+    axes.homed, seen = False, []
+    over_the_table = home + [0.0, 1.2, 0.0, 0.0, 0.0, 0.0]
+    simulated.simulation.arm = over_the_table
+    simulated.script = [
+        (10.2, lambda: pipe.send(messages.Prepare())),
+        (10.4, lambda: seen.append(axes.homed)),
+        (10.4, lambda: setattr(simulated.simulation, "arm", home)),
+        (10.5, lambda: pipe.send(messages.Prepare())),
+        (10.7, lambda: pipe.send(messages.Quit())),
+    ]
+    with simulated.control:
+        simulated.control.run()
+    (refused,) = [message.sentence for message in simulated.words() if isinstance(message, messages.Refused)]
+    assert "jog the arm" in refused and seen == [False] and axes.homed
+
+
 def test_the_robot_stands_before_the_process_quits(simulated):
     control = simulated.control
 

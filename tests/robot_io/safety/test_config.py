@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from robot_io.contract import ABB_JOINTS, LIMITS
+from robot_io.control.config import axis_range
 from robot_io.devices.egm.messages import encode_sensor
 from robot_io.emulator.arm import ArmController, ArmParams
 from robot_io.safety.clearance import RobotGeometry
@@ -69,3 +70,9 @@ def test_without_room_for_the_overshoot_joint_5_leaves_its_range():
     """So the drive overshoots, and the room is what keeps it in."""
     worst, gate = swung(6, SafetyConfig(speed_scale=1.0, overshoot=LIMITS.margin))
     assert worst > 0.002 and gate.faults[0].cause.value == "limit"
+
+
+def test_the_drives_of_the_axes_keep_the_same_room():
+    """What they were sent last they reach by themselves when the bridge stands still."""
+    assert axis_range(1, SafetyConfig()) == (-0.48, 0.48)
+    assert axis_range(0, SafetyConfig(overshoot=LIMITS.margin)) == (-0.99, 0.99)
