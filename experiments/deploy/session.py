@@ -282,7 +282,8 @@ def _watch(
                 played.rallies.append(message.summary)
                 if not console.is_terminal:
                     rally = message.summary
-                    console.print(f"rally {rally.number}: {rally.length} touches, {rally.text}", highlight=False)
+                    touches = f"{rally.length} touch{'es' * (rally.length > 1)}"
+                    console.print(f"rally {rally.number}: {touches}: {rally.text}", highlight=False)
         key = keyboard.pressed()
         if key is not None:  # whatever it is, the operator wants something else
             recovery = Recovery(time.monotonic()) if key == RECOVER else None
