@@ -15,7 +15,7 @@ from robot_io.calibration import contacts
 from robot_io.control.config import RobotConfig
 
 LAG = 0.005  # [s] by which the joints' lag may differ from the calibrated one, on top of two standard deviations
-GAP = 0.010  # [m] between ball and blade at their contacts, beyond which tracker or robot is not where it is said to be
+SPREAD = 0.015  # [m] of the gaps at contacts, beyond which tracker or robot is not where it is said to be
 
 
 def observed(config: RobotConfig, log_file: Path | None) -> dict[str, Any]:
@@ -41,14 +41,14 @@ def check(config: RobotConfig, where: str, log_folder: Path) -> None:
 
 
 def _judge(config: RobotConfig, seen: dict[str, Any], where: str, path: Path) -> None:
-    lag, gap, deviation = (seen.get(key) for key in ("lag", "gap", "lag_deviation"))
-    if lag is None or gap is None or deviation is None or not math.isfinite(lag):
+    lag, spread, deviation = (seen.get(key) for key in ("lag", "spread", "lag_deviation"))
+    if lag is None or spread is None or deviation is None or not math.isfinite(lag):
         return
     again = f"calibrate again, or remove {path} if it was an exception"
-    if abs(gap) > GAP:
+    if spread > SPREAD:
         raise ConfigError(
-            f"{where}: calibration.tracker.position and calibration.robot.joint_zeros: in {path} ball and blade were "
-            f"{1e3 * gap:+.1f} mm apart at {seen['count']} contacts, allowed are {1e3 * GAP:.0f}; {again}"
+            f"{where}: calibration.tracker.position and calibration.robot.joint_zeros: in {path} the gaps between ball "
+            f"and blade spread by {1e3 * spread:.1f} mm, allowed are {1e3 * SPREAD:g}; {again}"
         )
     known = config.calibration.clock.lag
     if known is not None and abs(lag - known) > LAG + 2.0 * deviation:

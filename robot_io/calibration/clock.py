@@ -25,7 +25,7 @@ def fit(log: SessionLog, known: Calibration, today: str) -> tuple[ClockCalibrati
         f"offset {newest['offset']:+.6f} s (bridge less tracker), drift {1e6 * newest['drift']:+.2f} ppm, "
         f"seconds miss the line by {1e3 * newest['residual']:.3f} ms",
         f"{seen.count} contacts: joints are logged {1e3 * seen.lag:.1f} +- {1e3 * seen.lag_deviation:.1f} ms after the "
-        f"ball, {1e3 * seen.gap:+.1f} mm are left between them"
+        f"ball; the gaps between them then spread by {1e3 * seen.spread:.1f} mm"
         if sure
         else f"{seen.count} contacts with the paddle: too few to tell the lag of the joints; lag is left empty",
     ]

@@ -1,8 +1,9 @@
 """Contacts of ball and paddle in a session's log: what ties the tracker's clock and frame to the robot's.
 
 At a contact the ball's surface is on the blade. Where the ball's track turns is known to about a millisecond by itself;
-the joints' log says where the blade was then. Over many contacts with a moving blade the lag of the joints' times and
-the gap that is left follow by least squares. Only their sum with the arm's own delay of feedback is seen.
+the joints' log says where the blade was some lag later. The lag is that at which half of the contacts leave a gap and
+half overlap. It is one number for several errors: the arm's own delay of feedback, a clock that is off, and, by the
+blade's speed of some 2 m/s, a ball or a robot that is not where it is said to be.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ LONGEST = 0.012  # [s] between two samples around it
 BLADE = np.array([0.2503, 0.0, 0.0])  # [m] its centre in the last joint's frame; its normal is y
 REACH = BALL_RADIUS + PADDLE_THICKNESS / 2  # [m] from the blade's middle plane to the ball's centre
 LAGS = np.arange(-0.03, 0.1001, 0.005)  # [s] that are tried
-GAP = 0.005  # [m] that calibrations leave at most, a prior's standard deviation
+EDGE = 0.03  # [m] beyond the blade's edge where a contact can still seem to be
+STEP = 0.004  # [s] over which the blade's speed is taken
+SLOWEST = 0.5  # [m/s] of the blade along its normal, below which a contact tells no time
 FEWEST = 8
 
 
@@ -33,13 +36,13 @@ class Contacts:
 
     count  contacts that could be used
     lag    [s] by which joint positions are logged later than the ball, NaN for too few; lag_deviation [s]
-    gap    [m] that is left between ball and blade, positive: they seem not to touch
+    spread [m] of the gaps between ball and blade that are left then, a robust standard deviation
     """
 
     count: int
     lag: float
     lag_deviation: float
-    gap: float
+    spread: float
 
 
 def measure(log: SessionLog, calibration: Calibration) -> Contacts:
@@ -53,33 +56,34 @@ def measure(log: SessionLog, calibration: Calibration) -> Contacts:
         return Contacts(len(found), math.nan, math.nan, math.nan)
     moments, places, before = (np.array(column) for column in zip(*found, strict=True))
 
-    def gaps(lag: float) -> tuple[np.ndarray, np.ndarray]:
-        """Gap (n,) at every contact, and distance (n,) from the blade's centre within it."""
-        q = np.array([np.interp(moments + lag, time, joint) for joint in position])
-        hand = geometry.hand(q)
-        away = places - (hand[:, :3, :3] @ BLADE + hand[:, :3, 3])
-        normal = hand[:, :3, 1]
+    def gaps(lag: float) -> np.ndarray:
+        """Gap (n,) [m] at every contact, negative where the blade moves away; NaN beside it or where it rests."""
+        hand, later = (
+            geometry.hand(np.array([np.interp(moments + lag + dt, time, joint) for joint in position]))
+            for dt in (0.0, STEP)
+        )
+        centre, normal = hand[:, :3, :3] @ BLADE + hand[:, :3, 3], hand[:, :3, 1]
+        away = places - centre
         side = np.sign(np.einsum("ni,ni->n", before - places, normal))
         along = np.einsum("ni,ni->n", away, normal)
-        return side * along - REACH, np.linalg.norm(away - along[:, None] * normal, axis=1)
+        beside = np.linalg.norm(away - along[:, None] * normal, axis=1)
+        speed = side * np.einsum("ni,ni->n", later[:, :3, :3] @ BLADE + later[:, :3, 3] - centre, normal) / STEP
+        gap = np.sign(speed) * (side * along - REACH)
+        return np.where((beside < PADDLE_RADIUS + EDGE) & (np.abs(speed) > SLOWEST), gap, np.nan)
 
-    def spread(lag: float) -> float:
-        gap, beside = gaps(lag)
-        return float(np.median(np.abs(gap) + (beside > PADDLE_RADIUS)))
-
-    lag = float(min(LAGS, key=spread))
-    for _ in range(8):
-        gap, beside = gaps(lag)
-        slope = (gaps(lag + 1e-3)[0] - gaps(lag - 1e-3)[0]) / 2e-3
-        good = (beside < PADDLE_RADIUS + 0.02) & (np.abs(gap - np.median(gap)) < 0.03)
-        if good.sum() < FEWEST:
-            return Contacts(int(good.sum()), math.nan, math.nan, math.nan)
-        sigma = max(1.4826 * float(np.median(np.abs(gap[good] - np.median(gap[good])))), 1e-3)
-        rows = np.stack([slope[good], -np.ones(good.sum())], axis=1) / sigma
-        precision = rows.T @ rows + np.diag([0.0, GAP**-2])
-        step, bias = np.linalg.solve(precision, -rows.T @ gap[good] / sigma)
-        lag += float(np.clip(step, -0.02, 0.02))
-    return Contacts(int(good.sum()), lag, float(np.sqrt(np.linalg.inv(precision)[0, 0])), float(bias))
+    tried = np.array([gaps(lag) for lag in LAGS])
+    known_there = np.isfinite(tried).sum(1)
+    middle = np.where(known_there >= FEWEST, np.nanmedian(np.where(known_there[:, None], tried, 0.0), axis=1), np.nan)
+    crossing = np.flatnonzero((middle[:-1] > 0.0) & (middle[1:] <= 0.0))
+    if not crossing.size:
+        return Contacts(int(known_there.max()), math.nan, math.nan, math.nan)
+    i = int(crossing[0])
+    slope = (middle[i + 1] - middle[i]) / (LAGS[i + 1] - LAGS[i])
+    lag = float(LAGS[i] - middle[i] / slope)
+    left = gaps(lag)
+    left = left[np.isfinite(left)]
+    spread = 1.4826 * float(np.median(np.abs(left - np.median(left))))
+    return Contacts(left.size, lag, 1.2533 * spread / math.sqrt(left.size) / abs(float(slope)), spread)
 
 
 def _turns(log: SessionLog, mine: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:

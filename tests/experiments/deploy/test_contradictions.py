@@ -24,7 +24,7 @@ def session(folder, name, found, **contacts):
 
 
 def test_only_the_newest_session_with_the_same_calibration_counts(tmp_path):
-    found, good = config(), {"count": 20, "lag": 0.035, "lag_deviation": 0.001, "gap": 0.002}
+    found, good = config(), {"count": 20, "lag": 0.035, "lag_deviation": 0.001, "spread": 0.006}
     contradictions.check(found, "robot.yaml", tmp_path)
     session(tmp_path, "1.json", found, **good | {"lag": 0.045})
     with pytest.raises(
@@ -35,8 +35,8 @@ def test_only_the_newest_session_with_the_same_calibration_counts(tmp_path):
     session(tmp_path, "2.json", found, **good)
     (tmp_path / "3.json").write_text("[")
     contradictions.check(found, "robot.yaml", tmp_path)
-    session(tmp_path, "4.json", found, **good | {"gap": -0.013})
-    with pytest.raises(ConfigError, match=r"calibration.tracker.position .*-13.0 mm apart"):
+    session(tmp_path, "4.json", found, **good | {"spread": 0.023})
+    with pytest.raises(ConfigError, match=r"calibration.tracker.position .*spread by 23.0 mm"):
         contradictions.check(found, "robot.yaml", tmp_path)
-    session(tmp_path, "5.json", found, count=3, lag=math.nan, lag_deviation=math.nan, gap=math.nan)
+    session(tmp_path, "5.json", found, count=3, lag=math.nan, lag_deviation=math.nan, spread=math.nan)
     contradictions.check(found, "robot.yaml", tmp_path)
