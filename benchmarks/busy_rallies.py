@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--busy", type=int, default=2, help="processes that only compute")
     parser.add_argument("--player", default="player3")
-    parser.add_argument("--backend", default="numpy")
+    parser.add_argument("--backend", default="auto")
     chosen = parser.parse_args(arguments)
     others = [multiprocessing.Process(target=compute, daemon=True) for _ in range(chosen.busy)]
     for other in others:
