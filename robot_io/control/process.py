@@ -323,7 +323,7 @@ class Control:
                 case messages.JogBlade(step):
                     self.bridge.jog(blade_step(self.bridge.gate.geometry, self.bridge.gate.reference, np.array(step)))
                 case messages.Pause(on):
-                    self.bridge.paused = on
+                    self.bridge.paused = on or self._options.jog
                 case messages.SetPolicy(policy, version):
                     self.bridge.set_policy(make_policy(self._backend, policy), version)
                     self._send(messages.PolicySet(version))
