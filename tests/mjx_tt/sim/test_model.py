@@ -18,7 +18,7 @@ def test_yaml_keeps_every_parameter(tmp_path):
     values = {}
     for i, path in enumerate(model.paths()):
         low, high = np.clip(bounds.of(path), -200.0, 200.0)
-        values[path] = float(low + (0.2 + 0.003 * i) * (high - low))
+        values[path] = float(low + (0.2 + 0.00307 * i) * (high - low))
     values["ball.flight.integrator"] = "midpoint"
     ranges = (Range("ball.table.restitution", 0.85, 0.95), Range("latency.abb_action", 0.06, 0.08))
     file = ModelFile(model.with_values(SimModel(), values), ranges, {"source": "diagnosis of session 3", "gain": 0.12})
