@@ -101,7 +101,7 @@ def _log(tmp_path, world, balls, rng):
     return load_logs([path])
 
 
-@pytest.mark.parametrize("restitution, friction", [(0.88, 0.18), (0.80, 0.11)])
+@pytest.mark.parametrize("restitution, friction", [(0.88, 0.18), pytest.param(0.80, 0.11, marks=pytest.mark.slow)])
 def test_two_ordinary_causes_far_from_nominal_are_both_found(tmp_path, restitution, friction):
     """The straight line from the nominal model leads to a spin that is not there."""
     rng = np.random.default_rng(4)
@@ -136,6 +136,7 @@ def test_lift_that_saturates_with_spin_is_named(tmp_path):
     assert set(causes) == {"lift_saturation"} and estimate.low - 0.2 < 1.5 < estimate.high + 0.2
 
 
+@pytest.mark.slow
 def test_spins_of_any_size_are_estimated_with_their_intervals(tmp_path):
     """Balls of two kinds, fast topspin and backspin, under another integrator; k is known, nothing is wrong."""
     rng = np.random.default_rng(5)
