@@ -185,6 +185,8 @@ class Control:
         """Until told to quit."""
         report = realtime.prepare(self._config.realtime.priority, self._config.realtime.lock_memory)
         self._axes.start()  # afterwards: a thread inherits the scheduling of the one that starts it
+        if self._options.dry:
+            self._take_axes()  # known at once
         self._pipe.send(messages.Ready([*report, self._computed]))
         self.bridge.event(time.monotonic(), log.Level.INFO, "policy", self._computed)
         while any(self._tracker_socket.drain()):
@@ -272,15 +274,16 @@ class Control:
                 self.timings.reply.add(time.monotonic() - began)
 
     def _take_axes(self) -> None:
+        if isinstance(self._session, DryArm) and isinstance(self._axes, DryAxes):
+            now = time.monotonic()
+            self._session.pretend(now, self.bridge.gate.engaged)
+            self._axes.pretend(now)
+            self.bridge.arm_received(now)
         state = self._axes.state
         if state is not None:
             self.bridge.axes_received(state.position, state.received)
 
     def _tick(self, deadline: float, now: float) -> None:
-        if isinstance(self._session, DryArm) and isinstance(self._axes, DryAxes):
-            self._session.pretend(now, self.bridge.gate.engaged)
-            self._axes.pretend(now)
-            self.bridge.arm_received(now)
         self._take_axes()
         self.bridge.tick(deadline, now)
         self.timings.lateness.add(now - deadline)
