@@ -43,7 +43,7 @@ class SafetyConfig:
     floor_margin: float = 0.17
     blade_speed: float = 8.0
     blade_acceleration: float = 150.0
-    overshoot: tuple[float, ...] = _each(0.02, 0.06)
+    overshoot: tuple[float, ...] = _each(0.03, 0.06)
     escape_speed: float = 0.05
     still: tuple[float, ...] = _each(0.02, 0.05)
     overspeed: float = 1.5
