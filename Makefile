@@ -37,7 +37,7 @@ ALL_ELSE := tests $(addprefix --ignore=,$(STRICT))
 test: $(READY)
 	STRICT_ARRAYS=1 $(PYTEST) $(PARALLEL) $(STRICT) -m "not slow and not realtime"
 	$(PYTEST) $(PARALLEL) $(ALL_ELSE) -m "not slow and not realtime"
-	$(PYTEST) -m "not slow and realtime"
+	$(PYTEST) tests/examples tests/experiments tests/robot_io -m "not slow and realtime"
 
 test-slow: $(READY)
 	USERS_FUSION=1 $(PYTEST) $(PARALLEL) -m slow

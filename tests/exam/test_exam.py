@@ -454,7 +454,7 @@ PEOPLE = pytest.mark.skipif(
 )
 FIXED = [
     pytest.param(Case("none", (), 0.0, "ar1", 11, count=200), ("right",), marks=SLOW),
-    (Case("single", ("wind_x",), 20.0, "range", 13, count=200), ("right",)),
+    pytest.param(Case("single", ("wind_x",), 20.0, "range", 13, count=200), ("right",), marks=SLOW),
     pytest.param(Case("single", ("drag_coefficient",), 20.0, "ar1", 14, count=200), ("right",), marks=SLOW),
     pytest.param(Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",), marks=SLOW),
     pytest.param(Case("invented", ("air_jet",), 20.0, "iid", 17, count=200), ("flagged",), marks=SLOW),

@@ -124,7 +124,7 @@ def judged(rubber: Rubber, seed: int):
         pytest.param("paddle_friction", Rubber(gain=0.48), -0.20, marks=pytest.mark.slow),
         pytest.param("paddle_tilt", Rubber(tilt=0.04), 0.04, marks=pytest.mark.slow),
         pytest.param("paddle_offset", Rubber(offset=0.012), 0.012, marks=pytest.mark.slow),
-        ("ball_latency", Rubber(late=0.02), 0.02),
+        pytest.param("ball_latency", Rubber(late=0.02), 0.02, marks=pytest.mark.slow),
     ],
 )
 def test_names_a_cause_at_the_paddle(name, rubber, change):

@@ -212,7 +212,7 @@ def truth(touches):
     return HIT if hit else MISSED
 
 
-@pytest.mark.parametrize("lost", [0.0, 0.1])
+@pytest.mark.parametrize("lost", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_outcomes_agree_with_the_world_in_lock_step(lost):
     """40 balls at a paddle that stands in the way of some of them, 3 mm of noise."""
     network = NetworkFaults(loss=lost, duplication=lost, reordering=lost)
