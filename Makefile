@@ -40,7 +40,8 @@ test: $(READY)
 	$(PYTEST) tests/examples tests/experiments tests/robot_io -m "not slow and realtime"
 
 test-slow: $(READY)
-	USERS_FUSION=1 $(PYTEST) $(PARALLEL) -m slow
+	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m slow
+	USERS_FUSION=1 $(PYTEST) tests/experiments/study -m slow
 
 test-all: test test-slow
 

@@ -11,8 +11,8 @@ import pytest
 # the tests run the programs that users get, as those marked ``optimised`` do, in which computing is most of the work.
 UNOPTIMISED = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1") == "1"
 # And with XLA's older code generation for fused operations in a third of that. Its rounding depends on how many
-# episodes a device holds: the slow tests, which compare studies of several processes bit by bit, take the code that
-# users get.
+# episodes a device holds: the slow tests that compare studies of several processes bit by bit take the code that users
+# get, which unoptimised is too slow for MJX.
 if UNOPTIMISED and os.environ.get("USERS_FUSION", "0") != "1":
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
 CACHE = Path(__file__).parent.parent / ".cache" / "jax"
