@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import jax
@@ -16,6 +17,7 @@ from mjx_tt.env.rollout import Simulator
 from mjx_tt.viz import rendering
 
 SIZE = (640, 360)
+FRAME_RATE = 40.0  # [Hz] at most: without a graphics card a frame takes a quarter of a second to draw
 PAUSE = 0.3  # [s] the last frame of an episode stays
 
 
@@ -50,6 +52,8 @@ def draw(path: Path, episodes: list[tuple[np.ndarray, np.ndarray]], rate: float,
         at = int(np.argmin(ball[:, 1]))  # the ball turns where it meets the paddle
         rendering.render_png(path, qpos[at], ball[at], camera)
         return path
+    stride = math.ceil(rate / FRAME_RATE)
+    rate, episodes = rate / stride, [(qpos[::stride], ball[::stride]) for qpos, ball in episodes]
     pause = round(PAUSE * rate)
     parts = [tuple(np.concatenate([a, np.repeat(a[-1:], pause, axis=0)]) for a in episode) for episode in episodes]
     qpos, ball = (np.concatenate(part) for part in zip(*parts, strict=True))
