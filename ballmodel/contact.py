@@ -35,9 +35,8 @@ class SurfaceParams:
     restitution_slope: Float[jax.Array, "*#batch"] | float  # [s/m], loss of e per normal speed
     friction: Float[jax.Array, "*#batch"] | float  # mu
     height: Float[jax.Array, "*#batch"] | float  # [m], shift of the surface along z from its nominal place
-    tilt_x: Float[jax.Array, "*#batch"] | float | None = optional(
-        0.0
-    )  # slope dz/dx of the surface, about the table's centre
+    # slope dz/dx of the surface, about the table's centre
+    tilt_x: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
     tilt_y: Float[jax.Array, "*#batch"] | float | None = optional(0.0)  # slope dz/dy
 
 
@@ -53,9 +52,8 @@ class PaddleParams:
     thickness: Float[jax.Array, "*#batch"] | float = c.PADDLE_THICKNESS  # [m]
     # [rad], turns the blade's normal about the blade's horizontal in-plane axis; positive turns it downwards (closes)
     tilt: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
-    offset: Float[jax.Array, "*#batch"] | float | None = optional(
-        0.0
-    )  # [m], shift of the blade along its (turned) normal
+    # [m], shift of the blade along its (turned) normal
+    offset: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
 
 
 def table_params() -> SurfaceParams:

@@ -45,16 +45,13 @@ class JointDrive:
     Units are those of the joint: [m] for the gantry's axes, [rad] for the arm's joints.
     """
 
-    action_delay: Float[Array, "*#batch"] | float | None = optional(
-        0.0
-    )  # [s] more than latency.abb_action or festo_action draws
-    observation_delay: Float[Array, "*#batch"] | float | None = optional(
-        0.0
-    )  # [s] more than latency.*_observation draws
+    # [s] more than latency.abb_action or festo_action draws
+    action_delay: Float[Array, "*#batch"] | float | None = optional(0.0)
+    # [s] more than latency.*_observation draws
+    observation_delay: Float[Array, "*#batch"] | float | None = optional(0.0)
     lag: Float[Array, "*#batch"] | float | None = optional(0.0)  # [s]
-    velocity_gain: Float[Array, "*#batch"] | float | None = optional(
-        1.0
-    )  # reached over commanded, beside actuation.velocity_gain
+    # reached over commanded, beside actuation.velocity_gain
+    velocity_gain: Float[Array, "*#batch"] | float | None = optional(1.0)
     joint_offset: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m], [rad] measured less true position
     velocity_limit: Float[Array, "*#batch"] | float | None = optional(NO_VELOCITY_LIMIT)  # [m/s], [rad/s]
     acceleration_limit: Float[Array, "*#batch"] | float | None = optional(NO_ACCELERATION_LIMIT)  # [m/s^2], [rad/s^2]

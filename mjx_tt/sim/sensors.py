@@ -46,12 +46,10 @@ class SensingParams:
     clock_rate: Float[Array, "*#batch"] | float | None = optional(1.0)
     smoothing: Float[Array, "*#batch"] | float | None = optional(0.0)  # [s] time constant of the tracker's filter
     filter_time: Float[Array, "*#batch"] | float | None = optional(0.0)  # [s] memory of a filter that predicts
-    filter_gate: Float[Array, "*#batch"] | float | None = optional(
-        FILTER_GATE
-    )  # [m] surprise that makes it start afresh
-    jitter: Float[Array, "*#batch"] | float | None = optional(
-        0.0
-    )  # [s] deviation of the moment of each measurement, Gaussian
+    # [m] surprise that makes it start afresh
+    filter_gate: Float[Array, "*#batch"] | float | None = optional(FILTER_GATE)
+    # [s] deviation of the moment of each measurement, Gaussian
+    jitter: Float[Array, "*#batch"] | float | None = optional(0.0)
 
 
 @jax.tree_util.register_dataclass

@@ -14,7 +14,7 @@ from ballmodel.initial_state import fit_gauss_newton, fit_nelder_mead
 from ballmodel.io import read
 from ballmodel.sampling import sample_pool
 from ballmodel.trajectory import Dataset, Trajectory, free_flight
-from tests.support.paths import DATA
+from tests.support.paths import MEASURED
 
 pytestmark = pytest.mark.optimised
 
@@ -176,12 +176,12 @@ def test_trajectories_of_a_distribution_give_its_numbers_back():
     assert kept.mean() > 0.9
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured data in {DATA}")
+@pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")
 def test_launcher_balls_and_what_their_residuals_say():
     """A drag-only flight misses a topspin ball by more than a spinless one, and Magnus lift explains the difference."""
     rms = {}
     for session in ("no_spin_robot_simple", "mn5008_topspin"):
-        flights = [free_flight(t) for t in read(DATA / "aimy_launcher" / f"{session}.hdf5")]
+        flights = [free_flight(t) for t in read(MEASURED / "aimy_launcher" / f"{session}.hdf5")]
         result = fit_gauss_newton(flights, FlightParams())
         assert result.converged.all()
         rms[session] = np.median(result.rms)
@@ -194,9 +194,9 @@ def test_launcher_balls_and_what_their_residuals_say():
     assert rms["no_spin_robot_simple"] < rms["mn5008_topspin"] < 0.03
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured data in {DATA}")
+@pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")
 def test_measured_states_give_a_distribution_of_human_size():
-    distribution, report = fit_human(read(DATA / "deepmind_ball_states" / "rallies.json"), ball_params())
+    distribution, report = fit_human(read(MEASURED / "deepmind_ball_states" / "rallies.json"), ball_params())
     assert report.measured == 13088
     assert sum(report.outcomes.values()) + report.elsewhere == 13088
     # The paper's players never exceed 9 m/s; the outlier share must be small for minima and maxima to mean something.

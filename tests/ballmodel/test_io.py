@@ -10,9 +10,9 @@ import pytest
 
 from ballmodel.io import read, read_mcap, write_mcap
 from ballmodel.trajectory import Dataset, Trajectory, first_bounce, free_flight
-from tests.support.paths import DATA
+from tests.support.paths import MEASURED
 
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured data in {DATA}")
+needs_data = pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")
 
 GOOD = "session,trajectory,t,x,y,z\nmon,1,0.00,0.1,1.2,0.3\nmon,1,0.01,0.1,1.15,0.31\nmon,2,0.0,0,1,0.2\n"
 
@@ -200,7 +200,7 @@ def test_mcap_that_is_none_and_times_before_zero(tmp_path):
 
 @needs_data
 def test_deepmind_states():
-    data = read(DATA / "deepmind_ball_states" / "rallies.json")
+    data = read(MEASURED / "deepmind_ball_states" / "rallies.json")
     assert len(data) == 13088
     np.testing.assert_allclose(data.state.velocity[:, 0], [0.78, -5.55, 0.52], atol=1e-6)
     np.testing.assert_allclose(data.state.spin[:, 0], [62.81, -5.84, -7.62], atol=1e-6)
@@ -229,7 +229,7 @@ def test_malformed_deepmind_states_name_entry_and_field(tmp_path):
 @needs_data
 def test_aimy_balls_fly_to_the_robot_and_bounce_on_its_half():
     for session, count in (("mn5008_topspin", 15), ("no_spin_robot_simple", 48)):
-        data = read(DATA / "aimy_launcher" / f"{session}.hdf5")
+        data = read(MEASURED / "aimy_launcher" / f"{session}.hdf5")
         assert (len(data), data.sessions) == (count, (session,))
         # Two recordings end some 20 mm above the table, before the bounce.
         cut_short = {"9", "14"} if session == "mn5008_topspin" else set()

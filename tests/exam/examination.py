@@ -32,9 +32,9 @@ from tests.exam.generator.cases import BallCase, Case
 from tests.exam.generator.json_lines import append, read_lines
 from tests.exam.generator.sessions import draw_balls, measure
 from tests.exam.generator.write import write
-from tests.support.paths import ROOT
+from tests.support.paths import MEASURED, ROOT
 
-DATA = ROOT.parent / "shared" / "data" / "aimy_launcher"
+DATA = MEASURED / "aimy_launcher"
 FRESH = 100  # balls of the held-out test, which no diagnosis sees
 GAINED = ("none", "noise", "single", "pair", "triple", "many")  # kinds whose true model is a model
 # Kinds and sizes of each bar, and their share of --cases. Bars 6 and 9 are read off the others.

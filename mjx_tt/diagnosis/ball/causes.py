@@ -96,9 +96,8 @@ def _causes(found: BallFindings, without: Container[str], seed: int) -> tuple[li
     for i, j in enumerate(choice.effects):
         if matters[i]:
             named.append(_effect_cause(found, i, confidence[i], wide, without))
-        elif (
-            any(matters) and choice.theta[i] >= found.trial.effects[j].low
-        ):  # too small to be named, but the others' sizes were fitted beside it
+        elif any(matters) and choice.theta[i] >= found.trial.effects[j].low:
+            # Too small to be named, but the others' sizes were fitted beside it.
             change = found.trial.effects[j].values(nominal, choice.theta[i])
             beside |= {path: float(value) for path, value in change.items()}
     if choice.prior is not None:

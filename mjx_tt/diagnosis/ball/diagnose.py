@@ -93,8 +93,8 @@ def diagnose_balls(
     if shaken is None:
         return found
     say(f"time stamps shake by {1e3 * shaken.seconds:.1f} ms: once more without the bounce's samples")
-    near = np.abs(found.problem.grid.time - found.linear.base.bounce_time[0]) < 3.0 * shaken.seconds
-    return _diagnose(trajectories, model, spin, without, seed, progress, near, found)
+    shaky = np.abs(found.problem.grid.time - found.linear.base.bounce_time[0]) < 3.0 * shaken.seconds
+    return _diagnose(trajectories, model, spin, without, seed, progress, shaky if near is None else near | shaky, found)
 
 
 def _blurred(found: BallFindings) -> Bool[np.ndarray, "T n"] | None:
@@ -145,11 +145,8 @@ def _diagnose(
         )
     gone = set(without)
     if "magnus" in gone and model.ball.flight.magnus_coefficient == 0.0:
-        gone |= {
-            "magnus_coefficient",
-            "lift_saturation",
-            "spin_decay",
-        }  # without the force the nominal model has no use for either
+        # Without the force the nominal model has no use for either.
+        gone |= {"magnus_coefficient", "lift_saturation", "spin_decay"}
     fitted = tuple(e for e in EFFECTS if e.fit and not e.at_paddle and not (e.needs_spin and e.name in gone))
     left_out = tuple(i for i, e in enumerate(fitted) if e.gone(gone))
     mode = "never" if spin == "none" and "magnus" in gone else spin

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import json
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
 from tests.exam.generator.sessions import FAR, FEWEST, INTERVAL, MOST, NET, Balls
 from tests.exam.generator.world import World, fly
+from tests.support.paths import MEASURED
 
-DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "deepmind_ball_states" / "rallies.json"
+DATA = MEASURED / "deepmind_ball_states" / "rallies.json"
 FIELDS = [f"{kind}_{axis}" for kind in ("pos", "vel", "w_vel") for axis in "xyz"]
 
 

@@ -19,7 +19,7 @@ from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Projected, 
 from mjx_tt.sim import model
 from mjx_tt.sim.model import SimModel
 from tests.exam.generator.world import World, camera, fly, seen
-from tests.support.paths import DATA
+from tests.support.paths import MEASURED
 
 pytestmark = pytest.mark.optimised
 
@@ -236,7 +236,7 @@ def test_the_size_of_a_filter_is_no_more_off_than_its_interval_says():
 @pytest.mark.slow
 @pytest.mark.parametrize(("session", "spins"), [("mn5008_topspin", True), ("no_spin_robot_simple", False)])
 def test_a_launchers_topspin_is_named_and_its_straight_balls_are_not(session, spins):
-    path = DATA / "aimy_launcher" / f"{session}.hdf5"
+    path = MEASURED / "aimy_launcher" / f"{session}.hdf5"
     if not path.exists():
         pytest.skip(f"{path} is not there: measured balls of a launcher")
     verdict = diagnosis.diagnose(diagnosis.load_logs([path])).verdict
