@@ -9,3 +9,7 @@ class DeviceError(RuntimeError):
 
 class RefusedError(RuntimeError):
     """The robot was asked for something that is not safe now; the message names the reason."""
+
+
+class JogFirstError(RefusedError):
+    """It is not safe where the robot is: somebody has to jog it elsewhere first."""

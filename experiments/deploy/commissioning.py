@@ -12,16 +12,18 @@ from rich.console import Console
 from experiments.config import robot as robots
 from experiments.deploy.operator_console import KEYS, QUIT, Key, Keyboard, View
 from experiments.deploy.session import Session
+from robot_io.calibrated import Calibration
+from robot_io.calibration import points
 from robot_io.contract import FESTO_JOINTS, JOINT_NAMES, N_JOINTS
 from robot_io.control import messages, process
-from robot_io.control.config import RobotConfig
-from robot_io.control.messages import Request, Status
+from robot_io.control.messages import Request
 from robot_io.errors import RefusedError
 
-COLUMNS = ("table_x", "table_y", "table_z", "ball_x", "ball_y", "ball_z", *JOINT_NAMES)
-MARK = "m"
-MARK_TIME = 1.0  # [s] over which a mark takes the mean
-STILL = 0.003, 0.002  # [m] of the ball, [m] or [rad] of the joints: spread within that time above which it moves
+COLUMNS = (*points.TABLE, *points.BALL, *JOINT_NAMES)
+MARK = Key("note this point, of the last second", messages.Mark())
+# Between the halves of a second, and by noise, each [m] or [rad]: more is no point. A tracker may be noisy: the mean of
+# a hundred frames is not.
+STILL = {"ball": (0.003, 0.01), "joints": (0.002, 0.002)}
 STEPS = ((0.001, 0.002), (0.005, 0.01), (0.02, 0.05))  # [m], [rad] of small, middle and large steps
 JOG_KEYS = {
     **{key: KEYS[key] for key in ("p", "a", " ", "r")},
@@ -29,22 +31,22 @@ JOG_KEYS = {
     "x y z": Key("or the blade, along an axis of the table"),
     "+ -": Key("move a step"),
     "s": Key("size of the steps"),
-    MARK: Key("note this point"),
+    "m": MARK,
     QUIT: KEYS[QUIT],
 }
-CHECK_KEYS = {**{key: KEYS[key] for key in ("a", " ", "r")}, MARK: Key("note where the ball lies"), QUIT: KEYS[QUIT]}
+CHECK_KEYS = {**{key: KEYS[key] for key in ("a", " ", "r")}, "m": MARK, QUIT: KEYS[QUIT]}
 
 
 def check(
-    robot: Path, artefact: Path | None, log_folder: Path, points: Path, seconds: float | None, console: Console
+    robot: Path, artefact: Path | None, log_folder: Path, noted: Path, seconds: float | None, console: Console
 ) -> int:
     """Compute and log everything, send nothing: tracker and arm are heard, arm and axes move in thought."""
-    return _operate(robot, artefact, log_folder, points, seconds, console, dry=True)
+    return _operate(robot, artefact, log_folder, noted, seconds, console, dry=True)
 
 
-def jog(robot: Path, log_folder: Path, points: Path, seconds: float | None, console: Console) -> int:
+def jog(robot: Path, log_folder: Path, noted: Path, seconds: float | None, console: Console) -> int:
     """Move the robot in small steps through the safety gate."""
-    return _operate(robot, None, log_folder, points, seconds, console, dry=False)
+    return _operate(robot, None, log_folder, noted, seconds, console, dry=False)
 
 
 class Jogger:
@@ -69,7 +71,7 @@ class Jogger:
     def _step(self, sign: float) -> Request:
         metres, radians = STEPS[self._size]
         if isinstance(self._chosen, str):
-            return messages.JogBlade(tuple(sign * metres * (axis == self._chosen) for axis in "xyz"))
+            return messages.Jog(tuple(sign * metres * (axis == self._chosen) for axis in "xyz"))
         size = metres if self._chosen in FESTO_JOINTS else radians
         return messages.Jog(tuple(sign * size * (i == self._chosen) for i in range(N_JOINTS)))
 
@@ -81,46 +83,26 @@ class Jogger:
         return f"{name}, {f'{1e3 * metres:g} mm' if self._chosen in FESTO_JOINTS else f'{1e3 * radians:g} mrad'} a step"
 
 
-class Marks:
-    """Means over ``MARK_TIME`` of what tracker and joints report, before any calibration, as lines of a CSV."""
+def note(path: Path, found: Calibration, seen: messages.Marked, with_joints: bool) -> str:
+    """Add what tracker and joints reported, before any calibration, to a CSV of points; what was done, as a sentence.
 
-    def __init__(self, path: Path, config: RobotConfig, with_joints: bool) -> None:
-        self._path, self._found, self._with_joints = path, config.calibration, with_joints
-        self._until = -np.inf
-        self._balls: list[np.ndarray] = []
-        self._joints: list[np.ndarray] = []
-
-    def begin(self) -> None:
-        self._until, self._balls, self._joints = time.monotonic() + MARK_TIME, [], []
-
-    def take(self, status: Status) -> str | None:
-        """Take a state; a sentence when a mark was written or given up."""
-        if self._until == -np.inf:
-            return None
-        if status.ball is not None:
-            self._balls.append(self._found.tracker.inward(np.array(status.ball)))
-        self._joints.append(np.array([position for _, position, _ in status.joints]))
-        if time.monotonic() < self._until:
-            return None
-        self._until = -np.inf
-        ball, joints = _steady(self._balls, STILL[0]), _steady(self._joints, STILL[1])
-        if ball is None and (joints is None or not self._with_joints):
-            return "not noted: nothing stands still"
-        if joints is not None:
-            joints[2:] -= self._found.robot.joint_zeros
-        values = ["", "", "", *_cells(ball, 3), *_cells(joints if self._with_joints else None, N_JOINTS)]
-        new = not self._path.exists()
-        with open(self._path, "a", encoding="utf-8", newline="") as stream:
-            lines = csv.writer(stream)
-            lines.writerows([COLUMNS, values] if new else [values])
-        return f"noted in {self._path}; fill in table_x, table_y, table_z of its last line"
-
-
-def _steady(values: list[np.ndarray], spread: float) -> np.ndarray | None:
-    """Mean, where there are some, all finite, and they do not differ."""
-    if not values or not np.isfinite(values).all() or (np.std(values, axis=0) > spread).any():
-        return None
-    return np.mean(values, axis=0)
+    with_joints  False: the joints are not those of a robot
+    """
+    left_out = {"ball": seen.ball.trouble(*STILL["ball"])}
+    ball = None if left_out["ball"] else found.tracker.inward(seen.ball.mean)
+    joints = None
+    if with_joints:
+        left_out["joints"] = seen.axes.trouble(*STILL["joints"]) or seen.arm.trouble(*STILL["joints"])
+        if not left_out["joints"]:
+            joints = np.concatenate([seen.axes.mean, seen.arm.mean - found.robot.joint_zeros])
+    reasons = "; ".join(f"no {what}: {trouble}" for what, trouble in left_out.items() if trouble)
+    if ball is None and joints is None:
+        return f"not noted: {reasons}"
+    new = not path.exists()
+    with open(path, "a", encoding="utf-8", newline="") as stream:
+        lines = csv.writer(stream)
+        lines.writerows([COLUMNS] * new + [["", "", "", *_cells(ball, 3), *_cells(joints, N_JOINTS)]])
+    return f"noted in {path}{reasons and f' ({reasons})'}; fill in table_x, table_y, table_z of its last line"
 
 
 def _cells(values: np.ndarray | None, count: int) -> list[str]:
@@ -131,13 +113,16 @@ def _operate(
     robot: Path,
     artefact: Path | None,
     log_folder: Path,
-    points: Path,
+    noted: Path,
     seconds: float | None,
     console: Console,
     dry: bool,
 ) -> int:
     config, name = robots.load_robot(robot), time.strftime("%Y%m%d-%H%M%S")
-    attachments = (("robot.yaml", robot.read_text(encoding="utf-8")),)
+    attachments = (
+        ("robot.yaml", robot.read_text(encoding="utf-8")),
+        ("calibration.yaml", robots.to_yaml(config.calibration)),
+    )
     folder = None if artefact is None else str(artefact)
     title = f"{config.name}: nothing is sent" if dry else f"{config.name}: by hand"
     log_folder.mkdir(parents=True, exist_ok=True)
@@ -145,7 +130,7 @@ def _operate(
     options = process.ControlOptions(
         folder, log_folder=str(log_folder), log_name=log_name, attachments=attachments, dry=dry, jog=not dry
     )
-    keys, jogger, marks = CHECK_KEYS if dry else JOG_KEYS, Jogger(), Marks(points, config, not dry)
+    keys, jogger = CHECK_KEYS if dry else JOG_KEYS, Jogger()
     with Session(config, options, console) as session:
         for line in session.report:
             console.print(f"  {line}", highlight=False)
@@ -154,18 +139,15 @@ def _operate(
             while time.monotonic() < end:
                 for message in session.messages(0.1):
                     view.take(message)
-                    if isinstance(message, Status) and (told := marks.take(message)):
-                        view.say(told)
+                    if isinstance(message, messages.Marked):
+                        view.say(note(noted, config.calibration, message, not dry))
                 key = keyboard.pressed() or ""
                 if key == QUIT:
                     break
-                request = KEYS[key].request if key in keys and key in KEYS else None
+                request = keys[key].request if key in keys else None
                 if not dry and key and request is None:
                     request = jogger.pressed(key)
                     view.say(str(jogger))
-                if key == MARK:
-                    marks.begin()
-                    view.say("hold still ...")
                 if request is not None:
                     session.send(request)
         status = session.status

@@ -15,19 +15,23 @@ from robot_io.calibration import contacts
 from robot_io.control.config import RobotConfig
 
 LAG = 0.005  # [s] by which the joints' lag may differ from the calibrated one, on top of two standard deviations
+SESSIONS = Path("runs/robot")  # where mjx-tt run leaves them unless told otherwise
 SPREAD = 0.015  # [m] of the gaps at contacts, beyond which tracker or robot is not where it is said to be
 
 
-def observed(config: RobotConfig, log_file: Path | None) -> dict[str, Any]:
-    """Entries of a session's summary: its calibration, and the contacts in its log where something is calibrated."""
+def observed(config: RobotConfig, log_file: Path | None) -> dict[str, float | None] | None:
+    """Contacts in a session's log, null where too few tell; None without a log, or where nothing is calibrated.
+
+    Raises LogError.
+    """
     found = config.calibration
-    entries: dict[str, Any] = {"calibration": robots.plain(found)}
-    if log_file is not None and log_file.exists() and (found.tracker.date or found.robot.date or found.clock.date):
-        entries["contacts"] = asdict(contacts.measure(log.read(log_file), found))
-    return entries
+    if log_file is None or not log_file.exists() or not (found.tracker.date or found.robot.date or found.clock.date):
+        return None
+    seen = asdict(contacts.measure(log.read(log_file), found))
+    return {key: value if math.isfinite(value) else None for key, value in seen.items()}
 
 
-def check(config: RobotConfig, where: str, log_folder: Path) -> None:
+def check(config: RobotConfig, where: str, log_folder: Path = SESSIONS) -> None:
     """Raise ConfigError where the newest session of this robot with this calibration contradicts it."""
     same = robots.plain(config.calibration)
     for path in sorted(log_folder.glob("*.json"), reverse=True):

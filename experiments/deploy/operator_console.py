@@ -108,7 +108,7 @@ class View:
         )
         lines.append(Text(f"{rallies}; last: {s.last_rally}" if s.last_rally else rallies))
         ball = "no ball" if s.ball is None else "ball {:+.3f} {:+.3f} {:+.3f} m in the table frame".format(*s.ball)
-        clock = f"tracker's clock {1e6 * s.clock['drift']:+.1f} ppm over {s.clock['seconds']} s" if s.clock else ""
+        clock = f"tracker's clock {-1e6 * s.clock['drift']:+z.1f} ppm over {s.clock['seconds']} s" if s.clock else ""
         lines.append(Text(f"{ball}; {clock}"))
         joints = Table(box=None, pad_edge=False)
         for name in ("joint", "position", "command"):

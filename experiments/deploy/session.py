@@ -25,7 +25,7 @@ from robot_io.control import messages, process
 from robot_io.control.config import RobotConfig
 from robot_io.control.messages import Message, Played, RallyOver, Refused, Request, Status
 from robot_io.emulator.processes import Rig
-from robot_io.errors import RefusedError
+from robot_io.errors import JogFirstError, RefusedError
 from robot_io.policy import artefact as artefacts
 
 READY_TIME = 60.0  # [s] for the control process to start
@@ -102,7 +102,7 @@ class Session:
         while time.monotonic() < end:
             for message in self._answers(0.3):
                 if isinstance(message, Refused):
-                    raise RefusedError(message.sentence)
+                    raise message.error
                 if isinstance(message, Status):
                     yield message
 
@@ -110,7 +110,8 @@ class Session:
         """Switch the axes on and home them, on the rig the arm too, until nothing is missing. Raises RefusedError."""
         if rig is not None:
             rig.switch_on()
-        end, refusal, again = time.monotonic() + PREPARE_TIME, "", True
+        end, again = time.monotonic() + PREPARE_TIME, True
+        refusal: RefusedError | None = None
         while time.monotonic() < end:
             if again:
                 self.send(messages.Prepare())
@@ -119,9 +120,10 @@ class Session:
                 if isinstance(message, Status) and not message.missing:
                     return
                 if isinstance(message, Refused):  # until the arm has sent its position, or an axis has answered
-                    refusal, again = f"; {message.sentence}", True
+                    refusal, again = message.error, True
         missing = "no status" if self.status is None else self.status.missing
-        raise RefusedError(f"the robot does not get ready within {PREPARE_TIME:g} s: {missing}{refusal}")
+        text = f"the robot does not get ready within {PREPARE_TIME:g} s: {missing}"
+        raise RefusedError(text) if refusal is None else type(refusal)(f"{text}; {refusal}")
 
     def reset(self) -> None:
         """Reset a fault and wait until it is gone; without a fault there is nothing to do. Raises RefusedError."""
@@ -159,7 +161,7 @@ class Session:
             except RefusedError as error:  # a busy machine may be late again: a new fault, or what is over by now
                 if attempt == RECOVERIES - 1 or not self.process.is_alive():
                     raise
-                if "jog" in str(error):
+                if isinstance(error, JogFirstError):
                     rig.jog()
 
     def close(self) -> None:
@@ -237,14 +239,27 @@ def run(
         except KeyboardInterrupt:
             status, problem = INTERRUPTED, "stopped by Ctrl-C"
         session.close()
-    summary = session_report.summary(loaded, config, played, session.status, session.timings, process.log_path(options))
-    summary |= contradictions.observed(config, process.log_path(options))
+    log_file = process.log_path(options)
+    summary = session_report.summary(loaded, config, played, session.status, session.timings, log_file)
     summary |= {"faults": [asdict(fault) for fault in played.faults], "player": player}
-    run_dir.write_json(log_folder / f"{name}.json", summary)
-    session_report.show(console, summary, log_folder / f"{name}.json")
+    _finish(summary, config, log_file, log_folder / f"{name}.json", console)
     if problem:
         console.print(problem, style="red", highlight=False)
     return status
+
+
+def _finish(summary: dict[str, Any], config: RobotConfig, log_file: Path | None, path: Path, console: Console) -> None:
+    """Write and show a session's summary, then add the contacts in its log, without which it is whole as well."""
+    summary["calibration"] = robots.plain(config.calibration)
+    run_dir.write_json(path, summary)
+    try:
+        contacts = contradictions.observed(config, log_file)
+        if contacts is not None:
+            run_dir.write_json(path, summary | {"contacts": contacts})
+    except (Exception, KeyboardInterrupt) as error:  # whatever it is, what was played is not to be lost
+        reason = f"{type(error).__name__}: {error}".removesuffix(": ")
+        console.print(f"contacts of ball and paddle not measured: {reason}", style="yellow", highlight=False)
+    session_report.show(console, summary, path)
 
 
 def _watch(
@@ -282,7 +297,7 @@ def _watch(
                 played.rallies.append(message.summary)
                 if not console.is_terminal:
                     rally = message.summary
-                    touches = f"{rally.length} touch{'es' * (rally.length > 1)}"
+                    touches = f"{rally.length} touch{'es' * (rally.length != 1)}"
                     console.print(f"rally {rally.number}: {touches}: {rally.text}", highlight=False)
         key = keyboard.pressed()
         if key is not None:  # whatever it is, the operator wants something else

@@ -13,6 +13,7 @@ from rich.console import Console
 from experiments.config import robot as robots
 from experiments.config.build import Experiment
 from experiments.config.finetuning import FineTuning
+from experiments.deploy import contradictions
 from experiments.deploy.operator_console import Keyboard, View
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session import Session
@@ -44,6 +45,9 @@ def finetune(
 
     player: virtual player who rallies with the robot on RIG or LOCK_STEP, in place of thrown balls
     """
+    installed = None if robot in (LOCK_STEP, RIG) else robots.load_robot(robot)
+    if installed is not None:
+        contradictions.check(installed, robot)
     experiment = loop.experiment_of(source, distribution)
     if robot == LOCK_STEP:
         params = robots.load_rig(rig_params)
@@ -59,7 +63,7 @@ def finetune(
         rig = None
         if robot == RIG:
             rig = stack.enter_context(rig_for(artefacts.load(artefact), distribution, rig_params, seed, player))
-        config = rig.robot if rig else robots.load_robot(robot)
+        config = rig.robot if rig else installed or robots.load_robot(robot)
         options = process.ControlOptions(
             str(artefact),
             backend,
@@ -67,7 +71,7 @@ def finetune(
             time.strftime("%Y%m%d-%H%M%S"),
             box_of(artefacts.load(artefact)),
             (("git", json.dumps(run_dir.git_state())),),
-            (("robot.yaml", robots.to_yaml(config)),),
+            (("robot.yaml", robots.to_yaml(config)), ("calibration.yaml", robots.to_yaml(config.calibration))),
         )
         session = stack.enter_context(Session(config, options, console))
         keyboard = stack.enter_context(Keyboard())

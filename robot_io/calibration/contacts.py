@@ -21,7 +21,6 @@ from robot_io.safety.clearance import RobotGeometry
 SIDE = 4  # samples before and after the turn
 TURN = 2.0  # [m/s] by which v_y changes at least
 LONGEST = 0.012  # [s] between two samples around it
-BLADE = np.array([0.2503, 0.0, 0.0])  # [m] its centre in the last joint's frame; its normal is y
 REACH = BALL_RADIUS + PADDLE_THICKNESS / 2  # [m] from the blade's middle plane to the ball's centre
 LAGS = np.arange(-0.03, 0.1001, 0.005)  # [s] that are tried
 EDGE = 0.03  # [m] beyond the blade's edge where a contact can still seem to be
@@ -48,6 +47,7 @@ class Contacts:
 def measure(log: SessionLog, calibration: Calibration) -> Contacts:
     """Contacts of a log, with the robot where its calibration says."""
     geometry = RobotGeometry.load().moved(calibration.robot.base)
+    blade = geometry.blade
     found = [turn for ball in np.unique(log.ball.id) for turn in _turns(log, log.ball.id == ball)]
     time, position = log.joints.time, log.joints.position
     known = np.isfinite(position).all(0)
@@ -62,12 +62,12 @@ def measure(log: SessionLog, calibration: Calibration) -> Contacts:
             geometry.hand(np.array([np.interp(moments + lag + dt, time, joint) for joint in position]))
             for dt in (0.0, STEP)
         )
-        centre, normal = hand[:, :3, :3] @ BLADE + hand[:, :3, 3], hand[:, :3, 1]
+        centre, normal = hand[:, :3, :3] @ blade + hand[:, :3, 3], hand[:, :3, 1]
         away = places - centre
         side = np.sign(np.einsum("ni,ni->n", before - places, normal))
         along = np.einsum("ni,ni->n", away, normal)
         beside = np.linalg.norm(away - along[:, None] * normal, axis=1)
-        speed = side * np.einsum("ni,ni->n", later[:, :3, :3] @ BLADE + later[:, :3, 3] - centre, normal) / STEP
+        speed = side * np.einsum("ni,ni->n", later[:, :3, :3] @ blade + later[:, :3, 3] - centre, normal) / STEP
         gap = np.sign(speed) * (side * along - REACH)
         return np.where((beside < PADDLE_RADIUS + EDGE) & (np.abs(speed) > SLOWEST), gap, np.nan)
 

@@ -7,7 +7,7 @@
     paddle_x, paddle_y, paddle_z  point of the paddle that touches, in the last joint's frame; without these columns it
                                 is the blade's end
 
-Other columns are ignored: ``mjx-tt robot check`` writes all but the table's.
+Other columns are ignored: ``mjx-tt robot check`` notes the ball's columns, ``jog`` the joints' as well.
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ballmodel.constants import PADDLE_RADIUS
 from robot_io.contract import JOINT_NAMES
+from robot_io.safety.clearance import RobotGeometry
 
 TABLE = ("table_x", "table_y", "table_z")
 BALL = ("ball_x", "ball_y", "ball_z")
 PADDLE = ("paddle_x", "paddle_y", "paddle_z")
-BLADE_END = (0.3263, 0.0, 0.0)  # [m] of the nominal paddle, in the last joint's frame
 
 
 def read(path: Path, *groups: tuple[str, ...]) -> tuple[list[int], list[np.ndarray]]:
@@ -49,7 +50,8 @@ def touched(path: Path) -> tuple[list[int], np.ndarray, np.ndarray, np.ndarray]:
     """Line numbers, table points (n, 3), joint readings (n, 8) and touching points (n, 3) of the paddle."""
     with_paddle = PADDLE[0] in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0]
     lines, (table, joints, *paddle) = read(path, TABLE, JOINT_NAMES, *([PADDLE] if with_paddle else []))
-    return lines, table, joints, paddle[0] if paddle else np.tile(BLADE_END, (len(lines), 1))
+    end = RobotGeometry.load().blade + np.array([PADDLE_RADIUS, 0.0, 0.0])  # of the nominal paddle
+    return lines, table, joints, paddle[0] if paddle else np.tile(end, (len(lines), 1))
 
 
 def _number(path: Path, line: int, name: str, text: str | None) -> float:

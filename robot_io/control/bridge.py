@@ -87,7 +87,7 @@ class Bridge:
         self._policy, self.policy_version = policy, 0
         self._geometry: RobotGeometry = gate.geometry
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
-        self._feedback = Feedback(ball=self.play.strokes.track, axes=History(), arm=History())
+        self.feedback = Feedback(ball=self.play.strokes.track, axes=History(256), arm=History(256))  # a second
         self._state = BridgeState.DISARMED
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
@@ -114,7 +114,7 @@ class Bridge:
     @property
     def measured(self) -> np.ndarray:
         """Newest positions (8,); NaN for what has not reported."""
-        return joints(self._feedback)[0]
+        return joints(self.feedback)[0]
 
     @property
     def at_home(self) -> bool:
@@ -139,7 +139,7 @@ class Bridge:
                 raise RefusedError(f"not armed: {what}: {problem}")
         if self.tracker.received is None or now - self.tracker.received > 0.5:
             raise RefusedError("not armed: the ball tracker is silent: start it, and check its address and clock")
-        measured, velocity = joints(self._feedback)
+        measured, velocity = joints(self.feedback)
         self.gate.arm(measured, now, velocity)
         self._arm_session_id = self.arm_session.session_id
         self._arm_restarted = self._been_home = False
@@ -148,10 +148,10 @@ class Bridge:
         self._change(BridgeState.READY, now, "armed by the operator")
 
     def jog(self, step: np.ndarray) -> None:
-        """Move on by a step (8,) from where it is commanded to be. Raises RefusedError."""
+        """Move on by a step, (8,) or (3,) of the blade, from where it is commanded to be. Raises RefusedError."""
         if not self.config.jog or self.state is not BridgeState.READY:
             raise RefusedError(f"not jogged: the state is {self.state.value}; arm it first, in mjx-tt robot jog")
-        self._home = self.gate.reference + step
+        self._home = self.gate.reference + jog.joints_of(step, self._geometry, self.gate.reference)
 
     def stop(self, now: float) -> None:
         """The operator's stop: slows down, holds, and ends DISARMED."""
@@ -221,8 +221,8 @@ class Bridge:
 
     def _arm_reference(self, feedback: ArmFeedback, now: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Position (6,) and velocity (6,) for the arm at ``now``; None: hold the measured place."""
-        if self._feedback.arm.add(feedback.received, feedback.position):
-            position, velocity = joints(self._feedback)
+        if self.feedback.arm.add(feedback.received, feedback.position):
+            position, velocity = joints(self.feedback)
             self._log(Joints(feedback.received, position, velocity))
         # Where the old reference would lead a controller that was started anew, nobody has asked for.
         self._arm_restarted |= feedback.sequence < self._arm_sequence
@@ -254,11 +254,11 @@ class Bridge:
         """The linear axes' newest position (2,) [m], as it was at ``received``."""
         if received > self._axes_received:
             self._axes_received = received
-            self._feedback.axes.add(received, position)
+            self.feedback.axes.add(received, position)
 
     def _blade(self, time: float) -> np.ndarray:
         """The blade's centre (3,) [m] at ``time``."""
-        axes, arm = self._feedback.axes.at(time), self._feedback.arm.at(time)
+        axes, arm = self.feedback.axes.at(time), self.feedback.arm.at(time)
         if axes is None or arm is None:
             return np.full(3, np.inf)
         return self._geometry.middle(BLADE, np.concatenate([axes, arm]))
@@ -270,7 +270,7 @@ class Bridge:
         self.counts.ticks, self.policy_seconds, request = self.counts.ticks + 1, 0.0, np.zeros(N_JOINTS)
         measured, measured_velocity = np.full(N_JOINTS, np.nan), np.zeros(N_JOINTS)
         with self._guarded(now):
-            measured, measured_velocity = joints(self._feedback)
+            measured, measured_velocity = joints(self.feedback)
             self.play.moved(measured_velocity)
             request = self._decide(now)
         sent = self.gate.command(request, measured, measured_velocity, now)
@@ -343,9 +343,9 @@ class Bridge:
         if episode is None or policy is None:
             self.gate.fault(Cause.INTERNAL, "neither ball nor policy to play", now)
             return np.zeros(N_JOINTS)
-        observation = observe(self._feedback, self.config.delays, now, self.config.base)
+        observation = observe(self.feedback, self.config.delays, now, self.config.base)
         if observation is None:
-            if self._feedback.ball.at(now - self.config.delays.ball) is None:
+            if self.feedback.ball.at(now - self.config.delays.ball) is None:
                 episode.over = True  # frames come, as the gate has checked, but the ball is out of sight
             else:
                 self.gate.fault(Cause.INTERNAL, "no joint positions to observe while a ball is in play", now)

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robot_io.contract import JOINT_NAMES
+from robot_io.control.commissioning.mark import Stay
 from robot_io.control.episode import EpisodeSummary
 from robot_io.control.rally import RallySummary
+from robot_io.errors import RefusedError
 from robot_io.policy.policy import Policy
 
 if TYPE_CHECKING:
@@ -53,16 +55,14 @@ class Pause:
 
 @dataclass(frozen=True)
 class Jog:
-    """Move by a step (8,) [m], [rad]."""
+    """Move the joints by a step (8,) [m], [rad], or the blade by (3,) [m] in the table frame, without turning it."""
 
     step: tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class JogBlade:
-    """Move the blade by a step (3,) [m] in the table frame, without turning it."""
-
-    step: tuple[float, ...]
+class Mark:
+    """Tell where ball and joints were during the last second. Answered by Marked."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Quit:
     """Stop the robot and end the process."""
 
 
-Request = Prepare | Arm | Stop | Reset | Discard | Pause | Jog | JogBlade | SetPolicy | Quit
+Request = Prepare | Arm | Stop | Reset | Discard | Pause | Jog | Mark | SetPolicy | Quit
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,11 @@ class Refused:
     """The reason why ``request`` was not carried out."""
 
     request: Request
-    sentence: str
+    error: RefusedError
+
+    @property
+    def sentence(self) -> str:
+        return str(self.error)
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,15 @@ class RallyOver:
     """One rally with its length and end."""
 
     summary: RallySummary
+
+
+@dataclass(frozen=True)
+class Marked:
+    """Stays of the ball (3,) [m] in the table frame, the axes (2,) [m] and the arm (6,) [rad]."""
+
+    ball: Stay
+    axes: Stay
+    arm: Stay
 
 
 @dataclass(frozen=True)
@@ -232,4 +245,4 @@ class Status:
         return "; ".join(f"{name}: {reason}" for name, reason in found.items() if reason)
 
 
-Message = Ready | Refused | PolicySet | Played | RallyOver | Failed | Ended | Status
+Message = Ready | Refused | PolicySet | Played | RallyOver | Marked | Failed | Ended | Status

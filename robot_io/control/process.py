@@ -26,7 +26,7 @@ from robot_io.control import messages, realtime
 from robot_io.control.bridge import Bridge, BridgeConfig
 from robot_io.control.bridge import Policy as StepPolicy
 from robot_io.control.commissioning.dry import DryArm, DryAxes
-from robot_io.control.commissioning.jog import blade_step, joint_step
+from robot_io.control.commissioning.mark import Stay
 from robot_io.control.config import RobotConfig, linear_axes
 from robot_io.control.episode import EpisodeSummary
 from robot_io.control.rally import Box
@@ -103,9 +103,12 @@ class Control:
         self._config, self._options, self._pipe = config, options, pipe
         arm, found = config.arm, config.calibration.robot
         loaded = None if options.artefact is None else artefacts.load(options.artefact)
-        still = Policy(np.zeros(n_parameters()), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION))
-        chosen, backend = (still, "numpy") if loaded is None else (loaded.policy, options.backend)
-        self._backend, self._computed = choose(backend, chosen)
+        if loaded is None:
+            chosen = Policy(np.zeros(n_parameters()), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION))
+            self._backend, self._computed = "numpy", "no policy given: at play the robot stands still"
+        else:
+            chosen = loaded.policy
+            self._backend, self._computed = choose(options.backend, chosen)
         policy = make_policy(self._backend, chosen)
         self.timings = Timings()
         self._opened: list[Closable] = []
@@ -119,6 +122,7 @@ class Control:
                     "artefact": options.artefact,
                     "artefact_sha256": loaded.digest if loaded else "",
                     "robot": config.name,
+                    "robot_base": [found.base_position, found.base_rotation],
                 }
                 recorder = log.Recorder.start(
                     options.log_folder, options.log_name, metadata | dict(options.metadata), dict(options.attachments)
@@ -322,9 +326,10 @@ class Control:
                 case messages.Discard():
                     self.bridge.discard(now)
                 case messages.Jog(step):
-                    self.bridge.jog(joint_step(np.array(step)))
-                case messages.JogBlade(step):
-                    self.bridge.jog(blade_step(self.bridge.gate.geometry, self.bridge.gate.reference, np.array(step)))
+                    self.bridge.jog(np.array(step))
+                case messages.Mark():
+                    seen = self._tracker.track, self.bridge.feedback.axes, self.bridge.feedback.arm
+                    self._send(messages.Marked(*(Stay.of(history, now) for history in seen)))
                 case messages.Pause(on):
                     self.bridge.paused = on or self._options.jog
                 case messages.SetPolicy(policy, version):
@@ -335,10 +340,10 @@ class Control:
                 case _:
                     raise RefusedError(f"unknown request {request!r}")
         except RefusedError as error:
-            self._send(messages.Refused(request, str(error)))
+            self._send(messages.Refused(request, error))
         except Exception as error:  # a request that cannot be carried out must not end the play
             name = type(request).__name__
-            self._send(messages.Refused(request, f"{name}: {type(error).__name__}: {error}"))
+            self._send(messages.Refused(request, RefusedError(f"{name}: {type(error).__name__}: {error}")))
 
     def _prepare_axes(self) -> None:
         """Acknowledge faults, switch on, and home what is not homed. Raises RefusedError where homing is not safe."""

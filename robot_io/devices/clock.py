@@ -18,7 +18,7 @@ SETTLED = 10  # windows from which on a drift is told, and judged
 STEP = 0.5  # share of ``bound`` by which a second may miss the line of those before it
 RHYTHM = 0.5  # of the time between two captures that must lie between the arrivals, or the frames waited together
 MOST_DRIFT = 5e-4  # of any clock that works
-ONE_OFF = 3  # seconds in a row that miss it before that counts
+ONE_OFF = 3  # seconds that miss it, and frames from before it, in a row before that counts
 
 
 class Clock:
@@ -31,9 +31,12 @@ class Clock:
     """
 
     def __init__(self, offset: float | None, latency: float, bound: float, drift: float | None = None) -> None:
-        self._given, self._latency, self._bound, self._nominal = offset, latency, bound, drift
+        self._given, self._bound, self._nominal = offset, bound, drift
         self._corrects = offset is None or drift is not None
         self._last: tuple[float, float] | None = None  # capture and arrival of the newest frame
+        # Shortest delay of a frame: by the first second, where the offset is given, and kept, or a later second could
+        # be wrong by anything.
+        self._floor: float | None = None if offset is not None else latency
         self.restart()
 
     def restart(self) -> None:
@@ -41,8 +44,7 @@ class Clock:
         self._windows: deque[tuple[float, float]] = deque(maxlen=KEPT)  # capture and delay of the least delayed
         self._least: tuple[float, float] | None = None
         self._began = -math.inf
-        self._floor: float | None = None if self._given is not None else self._latency
-        self._missed, self._jumped = 0, False
+        self._missed, self._set_back, self._jumped = 0, 0, False
         self.drift, self._level, self._at = self._nominal or 0.0, self._given, 0.0
         self.windows = 0  # complete ones
         self.measured, self.residual = 0.0, 0.0  # [s] offset by the frames, and how far seconds miss the line
@@ -56,7 +58,8 @@ class Clock:
     def add(self, captured: float, now: float) -> bool:
         """Take a frame's capture [s, tracker's clock] and arrival [s, bridge's]; True when a second was completed."""
         delay, last, self._last = now - captured, self._last, (captured, now)
-        if captured < self._began - WINDOW:  # the clock was set back
+        self._set_back = self._set_back + 1 if captured < self._began - WINDOW else 0
+        if self._set_back >= ONE_OFF:  # it was not one damaged stamp
             self.restart()
             self._jumped = True
         if captured < self._began or last is None:
@@ -116,10 +119,10 @@ class Clock:
         if self.windows < SETTLED:
             return None
         if abs(self.drift) > MOST_DRIFT:
-            return f"the tracker's clock drifts by {1e6 * self.drift:+.0f} ppm, allowed are {1e6 * MOST_DRIFT:.0f}"
+            return f"the tracker's clock drifts by {-1e6 * self.drift:+.0f} ppm, allowed are {1e6 * MOST_DRIFT:.0f}"
         if self._given is not None and not self._corrects and abs(self.measured - self._given) > self._bound:
             return (
-                f"the tracker's clock is off by {1e3 * (self.measured - self._given):+.1f} ms (tracker.clock_bound: "
+                f"the tracker's clock is off by {1e3 * (self._given - self.measured):+.1f} ms (tracker.clock_bound: "
                 f"{1e3 * self._bound:.1f} ms); calibrate it (mjx-tt calibrate clock)"
             )
         return None

@@ -31,7 +31,7 @@ from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
 from robot_io.emulator.tracker import TrackerEmulator
 from robot_io.emulator.world import World
-from robot_io.errors import RefusedError
+from robot_io.errors import JogFirstError, RefusedError
 from robot_io.log.recorder import SessionRecorder
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.gate import SafetyConfig, SafetyGate
@@ -219,9 +219,7 @@ class LockStep:
             self.bridge.reset(self.now)
         try:
             self.bridge.arm(self.now)
-        except RefusedError as error:
-            if "jog" not in str(error):
-                raise
+        except JogFirstError:
             self.world.jog()
             self.run(0.5)
             self.bridge.arm(self.now)

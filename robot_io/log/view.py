@@ -30,10 +30,12 @@ from ballmodel.constants import (
     TABLE_THICKNESS,
     TABLE_WIDTH,
 )
+from robot_io.calibrated import Frame
 from robot_io.log.messages import Ball, Event, Joints, Record
 from robot_io.log.schema import FRAME, Encoded, Topic
 from robot_io.safety.clearance import BLADE, SHIPPED
 
+HERE = Frame()
 RATE = 30.0  # [1/s] of the robot's frames; viewers interpolate
 BALL_RATE = 70.0  # [1/s] of the ball's
 BALL_FRAME = "ball"
@@ -49,9 +51,13 @@ TOPICS = {topic.name: topic for topic in (TF, SCENE, STATE)}
 
 
 class View:
-    """Messages for viewers, from the records of one session in their order."""
+    """Messages for viewers, from the records of one session in their order.
 
-    def __init__(self) -> None:
+    base  where the robot stands, from where the model has it
+    """
+
+    def __init__(self, base: Frame = HERE) -> None:
+        self._base, self._turned = base, _quaternion(base.matrix)
         geometry = json.loads((resources.files("robot_io.safety") / SHIPPED).read_text(encoding="utf-8"))
         self._joints = geometry["joints"]
         self._fixed = [_quaternion(np.array(joint["rot"], float)) for joint in self._joints]
@@ -109,6 +115,8 @@ class View:
             else:
                 s = math.sin(0.5 * q)
                 turned = _product(fixed, (*(s * a for a in joint["axis"]), math.cos(0.5 * q)))
+            if parent == FRAME:
+                place, turned = self._base.outward(np.array(place)).tolist(), _product(self._turned, turned)
             _frame(message, parent, joint["name"], place, turned)
             parent = joint["name"]
         return message

@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 from ballmodel.io.atomic_files import sync_folder
 from robot_io import contract
+from robot_io.calibrated import Frame
 from robot_io.log import schema, view
 from robot_io.log.messages import End, LogError, Metadata, as_strings, unpack
 
@@ -163,7 +164,7 @@ class SessionWriter:
             self._channels[topic.name] = self._writer.register_channel(
                 topic.name, "protobuf", schemas[schema_name], topic.metadata
             )
-        self._view = view.View()
+        self._view = view.View(Frame(*map(tuple, json.loads(session.metadata.get("robot_base", "[]")))))
         self._add_message(self._view.scene(float(session.metadata["start_time"])))
         self._file.flush()
 

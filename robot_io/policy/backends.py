@@ -14,7 +14,6 @@ from robot_io.policy.policy import Policy
 if TYPE_CHECKING:
     from robot_io.policy.jax_policy import JitPolicy
 
-BACKENDS = ("auto", "numpy", "jit")
 TRIALS = 300  # steps of each that are timed, after as many that are not
 SLOWER = 0.2e-3  # [s] by which nine of ten of JAX's steps may take longer than NumPy's: 1.5 % of a control period
 

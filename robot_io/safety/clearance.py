@@ -194,6 +194,16 @@ class RobotGeometry:
         points = np.matmul(world[self._joint, :, :3], self._local)  # (capsules, B, 3, 2)
         return np.ascontiguousarray(points.transpose(3, 2, 0, 1))
 
+    @property
+    def blade(self) -> np.ndarray:
+        """The blade's centre (3,) [m] in the last joint's frame; its normal is y."""
+        return self._local[self._names.index(BLADE), 0, :3].mean(axis=1)
+
+    def blade_points(self, q: np.ndarray) -> np.ndarray:
+        """World end points (3, 4, B) [m] of the blade's capsules at joint positions q (8, B)."""
+        ends = self.ends(q)[:, :, self._table_rows[self._blade_rows]]
+        return ends.swapaxes(0, 1).reshape(3, -1, q.shape[1])
+
     def middles(self, capsule: str, q: np.ndarray) -> np.ndarray:
         """World positions (3, B) [m] of the middle of a capsule's axis at joint positions q (8, B)."""
         return self.ends(q)[:, :, self._names.index(capsule)].mean(axis=0)

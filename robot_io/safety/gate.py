@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robot_io.contract import CONTROL_RATE, JOINT_NAMES, JOINT_UNITS, LIMITS, N_JOINTS, JointLimits
-from robot_io.errors import RefusedError
+from robot_io.errors import JogFirstError, RefusedError
 from robot_io.limits import limit_velocity
 from robot_io.safety.clearance import BLADE, RobotGeometry
 from robot_io.safety.config import SLACK
@@ -192,10 +192,10 @@ class SafetyGate:
             i = int(outside.argmax())
             allowed = f"[{self._low[i]:.4f}, {self._high[i]:.4f}] {JOINT_UNITS[i]}"
             found = f"{JOINT_NAMES[i]} is at {position[i]:.4f}"
-            raise RefusedError(f"not armed: {found}, allowed is {allowed}; jog it back")
+            raise JogFirstError(f"not armed: {found}, allowed is {allowed}; jog it back")
         touching = self._monitor.contact(position)
         if touching:
-            raise RefusedError(f"not armed: {touching}; jog it away")
+            raise JogFirstError(f"not armed: {touching}; jog it away")
         given = self._measured_velocity if measured_velocity is None else measured_velocity
         if given is None:
             raise RefusedError("not armed: no measured velocity yet")
@@ -369,9 +369,13 @@ class SafetyGate:
         for share in SHARES:
             tried = velocity if share * whole == 1.0 else braked + share * whole * (velocity - braked)
             way = self.braking_way(tried)
-            if not self._too_fast(way) and self._clear(way):
-                return tried, tuple(rules if share == 1.0 else [*rules, "clearance"])
-        return braked, (*rules, "clearance")
+            if self._too_fast(way):
+                continue
+            if self._clear(way):
+                return tried, tuple(rules)
+            if rules[-1:] != ["clearance"]:
+                rules.append("clearance")
+        return braked, tuple(rules)
 
     def _blade_share(self, braked: np.ndarray, velocity: np.ndarray) -> tuple[float, str]:
         """Share of the way from braking to a velocity (8,) that keeps the blade's limits, and the limit that binds."""

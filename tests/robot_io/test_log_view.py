@@ -11,6 +11,7 @@ import foxglove.messages as published
 import mujoco
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.json_format import MessageToDict
 from mcap.reader import make_reader
@@ -18,8 +19,10 @@ from scipy.spatial.transform import Rotation
 
 import mjx_tt
 from robot_io import log
+from robot_io.calibrated import Frame
 from robot_io.contract import JOINT_NAMES, LIMITS
 from robot_io.log.view import BALL_FRAME, View
+from robot_io.safety.clearance import BLADE, RobotGeometry
 
 RANDOM = np.random.default_rng(5)
 POSES = RANDOM.uniform(np.array(LIMITS.lower), np.array(LIMITS.upper), (8, 8))
@@ -146,6 +149,30 @@ def test_the_layout_is_one_of_foxgloves():
     for panel, config in LAYOUT["configById"].items():
         known = CONFIGS[panel.partition("!")[0]]()._to_dict()
         assert set(config) <= set(known), panel
+
+
+def test_a_calibrated_robot_is_drawn_where_the_gate_has_it():
+    base = Frame((0.02, -0.03, 0.01), (0.01, -0.02, 0.03))
+    geometry = RobotGeometry.load().moved(base)
+    for time, pose in enumerate(POSES):
+        (encoded,) = View(base).encode(log.Joints(float(time), pose, np.zeros(8)))
+        place, turned = np.zeros(3), Rotation.identity()
+        for frame in encoded.message.transforms:
+            place = place + turned.apply([getattr(frame.translation, axis) for axis in "xyz"])
+            turned = turned * Rotation.from_quat([getattr(frame.rotation, axis) for axis in "xyzw"])
+        np.testing.assert_allclose(place + turned.apply(geometry.blade), geometry.middle(BLADE, pose), atol=1e-9)
+
+
+def test_the_log_of_a_calibrated_robot_draws_it_there(tmp_path):
+    places = []
+    for name, metadata in (("as_made", {}), ("calibrated", {"robot_base": [[0.02, -0.03, 0.01], [0.0, 0.0, 0.0]]})):
+        with log.FileRecorder.start(tmp_path, name, metadata) as recorder:
+            recorder.put(log.Joints(0.0, POSES[0], np.zeros(8)))
+        with open(recorder.close(), "rb") as file:
+            (_, _, message), *_ = make_reader(file).iter_messages(topics=["/tf"])
+        places.append(FrameTransforms.FromString(message.data).transforms[0].translation)
+    shift = [getattr(places[1], axis) - getattr(places[0], axis) for axis in "xyz"]
+    np.testing.assert_allclose(shift, [0.02, -0.03, 0.01], atol=1e-12)
 
 
 def test_a_view_never_raises_and_skips_what_is_broken():

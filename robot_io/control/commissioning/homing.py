@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, LIMITS
-from robot_io.errors import RefusedError
+from robot_io.errors import JogFirstError, RefusedError
 from robot_io.safety.clearance import RobotGeometry
 
 HOMING_GAP = 0.03  # [m] of everything to everything while the linear axes search their references
@@ -22,7 +22,7 @@ def check_homing(geometry: RobotGeometry, measured: np.ndarray) -> None:
     gaps = geometry.gaps(q)
     if not gaps.min() > HOMING_GAP:
         row = geometry.rows[int(gaps.min(axis=1).argmin())]
-        raise RefusedError(
+        raise JogFirstError(
             f"axes not homed: somewhere on their way {row} comes as near as {gaps.min():.3f} m, allowed is "
             f"{HOMING_GAP} m; jog the arm to its home pose first"
         )

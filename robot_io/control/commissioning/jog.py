@@ -11,11 +11,14 @@ from robot_io.safety.clearance import RobotGeometry
 SPEED = 0.03  # share of the policy's velocity limits
 LARGEST = np.array([0.02 if i in FESTO_JOINTS else 0.05 for i in range(N_JOINTS)])  # [m], [rad] of a step
 LARGEST_BLADE = 0.02  # [m]
-BLADE = np.array(
-    [[0.19, 0, 0, 1], [0.31, 0, 0, 1], [0.25, 0, 0.06, 1], [0.25, 0, -0.06, 1]]
-)  # in the last joint's frame
+MISSED = 0.2  # share of a step of the blade that its points may miss it by
 TINY = 1e-4  # of a joint, for the Jacobian
 DAMPING = 1e-3
+
+
+def joints_of(step: np.ndarray, geometry: RobotGeometry, q: np.ndarray) -> np.ndarray:
+    """Step (8,) of the joints at q (8,) for one of theirs or, (3,) [m], of the blade. Raises RefusedError."""
+    return blade_step(geometry, q, step) if np.shape(step) == (3,) else joint_step(step)
 
 
 def joint_step(step: np.ndarray) -> np.ndarray:
@@ -35,11 +38,12 @@ def blade_step(geometry: RobotGeometry, q: np.ndarray, step: np.ndarray) -> np.n
     if step.shape != (3,) or not np.linalg.norm(step) <= LARGEST_BLADE:
         raise RefusedError(f"not jogged: the blade by {step.tolist()} m; at most {LARGEST_BLADE} m at a time")
     beside = q[:, None] + TINY * np.concatenate([np.zeros((N_JOINTS, 1)), np.eye(N_JOINTS)], axis=1)
-    points = (geometry.hand(beside) @ BLADE.T)[:, :3].transpose(1, 2, 0).reshape(-1, N_JOINTS + 1)  # x y z of each
+    points = geometry.blade_points(beside).reshape(-1, N_JOINTS + 1)  # x of each, then y, then z
     jacobian = (points[:, 1:] - points[:, :1]) / TINY
-    wanted = np.repeat(step, len(BLADE))
+    wanted = np.repeat(step, len(points) // 3)
     found = np.linalg.solve(jacobian.T @ jacobian + DAMPING**2 * np.eye(N_JOINTS), jacobian.T @ wanted)
     missed = np.abs(jacobian @ found - wanted).max()
-    if missed > 0.1 * LARGEST_BLADE + 0.1 * np.linalg.norm(step):
+    if missed > MISSED * np.linalg.norm(step):
         raise RefusedError(f"not jogged: from here the blade cannot move like that ({1e3 * missed:.1f} mm off)")
-    return joint_step(found / max(1.0, float((np.abs(found) / LARGEST).max())))
+    shorter = found / max(1.0, float((np.abs(found) / LARGEST).max()))
+    return joint_step(np.clip(shorter, -LARGEST, LARGEST))  # which rounding may have missed

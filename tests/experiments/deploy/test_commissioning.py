@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import re
 import socket
 import threading
 import time
+from collections import deque
 
 import numpy as np
 import pytest
@@ -13,19 +15,41 @@ from rich.console import Console
 
 from experiments.config import robot as robots
 from experiments.deploy import commissioning
-from experiments.deploy.commissioning import Jogger, Marks
+from experiments.deploy.commissioning import Jogger
 from robot_io import log
+from robot_io.calibrated import Calibration
 from robot_io.control import messages
+from robot_io.control.commissioning.mark import Stay
 from robot_io.control.config import ArmConfig, AxisConfig, RobotConfig
+from robot_io.control.messages import Marked
 from robot_io.devices.egm.messages import encode_robot
 from robot_io.devices.tracker import BallSample, TrackerConfig, encode
 from robot_io.emulator.processes import HOST, free_ports
+from robot_io.history import History
 
-ARM = np.array([-1.4, 0.1, -0.5, 0.05, 0.9, 0.2])
+ARM_HEARD = np.array([-1.4, 0.1, -0.5, 0.05, 0.9, 0.2])
+
+
+class Keys:
+    """Keys that an operator presses, each so many seconds after the first look at them."""
+
+    def __init__(self, *keys):
+        self._keys, self._began = deque(keys), None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def pressed(self):
+        self._began = self._began or time.monotonic()
+        due = self._keys and time.monotonic() - self._began >= self._keys[0][0]
+        return self._keys.popleft()[1] if due else None
 
 
 @pytest.mark.realtime
-def test_a_dry_run_hears_everything_and_sends_nothing(tmp_path):
+def test_a_dry_run_hears_everything_notes_the_ball_and_sends_nothing(tmp_path, monkeypatch):
     ports, got, finish = free_ports(), [], threading.Event()
     listeners = [socket.create_server((HOST, port)) for port in ports.axes]
     controller, tracker = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
@@ -36,7 +60,7 @@ def test_a_dry_run_hears_everything_and_sends_nothing(tmp_path):
         count = 0
         while not finish.wait(0.004):
             count, now = count + 1, time.monotonic()
-            controller.sendto(encode_robot(count, 4 * count, ARM, ARM, True, True, True), (HOST, ports.arm))
+            controller.sendto(encode_robot(count, 4 * count, ARM_HEARD, ARM_HEARD, True, True, True), (HOST, ports.arm))
             if count % 2:
                 frame = encode(BallSample(count // 2, 1, now - 0.015, np.array([0.1, 0.2, 0.3])))
                 tracker.sendto(frame, (HOST, ports.tracker))
@@ -53,8 +77,9 @@ def test_a_dry_run_hears_everything_and_sends_nothing(tmp_path):
     config = RobotConfig(arm=ArmConfig(HOST, ports.arm), axes=axes, tracker=TrackerConfig(HOST, ports.tracker))
     path.write_text(robots.to_yaml(config))
     console = Console(record=True, width=300)
+    monkeypatch.setattr(commissioning, "Keyboard", lambda: Keys((1.5, "m"), (2.0, "q")))
     try:
-        assert commissioning.check(path, None, tmp_path, tmp_path / "points.csv", 2.0, console) == 0
+        assert commissioning.check(path, None, tmp_path, tmp_path / "points.csv", 20.0, console) == 0
     finally:
         finish.set()
         thread.join()
@@ -63,43 +88,69 @@ def test_a_dry_run_hears_everything_and_sends_nothing(tmp_path):
     text = console.export_text()
     assert not got and "ball at +0.100 +0.200 +0.300 m in the table frame" in text and " 0 answered" in text
     session = log.read(next(tmp_path.glob("*-check.mcap")))
-    np.testing.assert_allclose(session.joints.position[2:, -1], ARM, atol=1e-6)
+    np.testing.assert_allclose(session.joints.position[2:, -1], ARM_HEARD, atol=1e-6)
     assert session.ball.id.size > 100 and session.ticks.tick.size > 50
-
-
-def status(ball, joints):
-    names = [(str(i), float(q), 0.0) for i, q in enumerate(joints)]
-    return messages.Status(1.0, "ready", False, True, (), {}, None, None, None, names, ball)
-
-
-def test_points_are_noted_as_they_were_before_any_calibration(tmp_path, monkeypatch):
-    found = robots.fill(
-        RobotConfig,
-        {
-            "calibration": {
-                "tracker": {"position": [0.01, 0.0, 0.0], "date": "2026-11-22"},
-                "robot": {"joint_zeros": [0.01] * 6, "date": "2026-11-22"},
-            }
-        },
-        "robot.yaml",
-    )
-    now = [0.0]
-    monkeypatch.setattr(commissioning.time, "monotonic", lambda: now[0])
-    marks = Marks(tmp_path / "points.csv", found, with_joints=True)
-    for spread in (0.0, 0.05):  # the second time ball and arm move
-        marks.begin()
-        told = None
-        for i in range(12):
-            now[0] += 0.1
-            told = told or marks.take(status((0.5 + spread * i, 0.2, 0.02), np.arange(8) * 0.1 + spread * i))
-    assert "nothing stands still" in told
     (line,) = csv.DictReader(open(tmp_path / "points.csv", encoding="utf-8"))
-    assert line["table_x"] == "" and float(line["ball_x"]) == pytest.approx(0.49)
-    assert float(line["gantry_y"]) == pytest.approx(0.1) and float(line["joint_1"]) == pytest.approx(0.19)
+    assert [float(line[f"ball_{axis}"]) for axis in "xyz"] == [0.1, 0.2, 0.3] and line["joint_1"] == ""
+
+
+FOUND = robots.fill(
+    Calibration,
+    {
+        "tracker": {"position": [0.01, 0.0, 0.0], "date": "2026-11-22"},
+        "robot": {"joint_zeros": [0.01] * 6, "date": "2026-11-22"},
+    },
+    "calibration.yaml",
+)
+
+
+def stay(place, noise=0.0, speed=0.0, seconds=1.2, rate=125.0, seed=0):
+    """Of something that was at ``place`` in the middle of the last second."""
+    history, random = History(256), np.random.default_rng(seed)
+    for i in range(round(seconds * rate)):
+        t = -seconds + (i + 1) / rate
+        history.add(t, np.asarray(place) + speed * (t + 0.5) + noise * random.normal(size=len(place)))
+    return Stay.of(history, 0.0)
+
+
+AXES, ARM = np.array([0.2, -0.3]), np.arange(6) * 0.1
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_resting_ball_is_noted_in_spite_of_the_trackers_noise(tmp_path, seed):
+    """As it was before any calibration; the mean of 125 frames at 3 mm is known to 0.3 mm."""
+    path, ball = tmp_path / "points.csv", stay((0.5, 0.2, 0.02), noise=0.003, seed=seed)
+    told = commissioning.note(path, FOUND, Marked(ball, stay(AXES), stay(ARM)), with_joints=True)
+    assert ball.count == 125 and told == f"noted in {path}; fill in table_x, table_y, table_z of its last line"
+    (line,) = csv.DictReader(open(path, encoding="utf-8"))
+    assert line["table_x"] == "" and float(line["ball_x"]) == pytest.approx(0.49, abs=0.0012)
+    assert float(line["gantry_y"]) == pytest.approx(-0.3) and float(line["joint_2"]) == pytest.approx(0.09)
+
+
+@pytest.mark.parametrize(
+    "ball, why",
+    [
+        (stay((0.5, 0.2, 0.02), noise=0.003, speed=0.02), "no ball: moves by"),
+        (stay((0.5, 0.2, 0.02), noise=0.03), "no ball: (scatters|moves) by"),
+        (stay((0.5, 0.2, 0.02), seconds=0.1), "no ball: 12 samples in the last second, at least 30"),
+        (stay((0.5, 0.2, 0.02), seconds=0.0), "no ball: 0 samples"),
+    ],
+)
+def test_what_is_left_out_is_said(tmp_path, ball, why):
+    path = tmp_path / "points.csv"
+    told = commissioning.note(path, FOUND, Marked(ball, stay(AXES), stay(ARM)), with_joints=True)
+    assert re.search(rf"noted in .* [(]{why}", told)
+    (line,) = csv.DictReader(open(path, encoding="utf-8"))
+    assert line["ball_x"] == "" and line["joint_1"] != ""
+    for moving, with_joints in ((stay(ARM, speed=0.01), True), (stay(ARM), False)):
+        assert commissioning.note(path, FOUND, Marked(ball, stay(AXES), moving), with_joints).startswith(
+            "not noted: no"
+        )
+    assert len(path.read_text().splitlines()) == 2
 
 
 def test_keys_choose_and_move():
     jogger = Jogger()
     assert jogger.pressed("4") is None and jogger.pressed("-") == messages.Jog((0, 0, 0, -0.002, 0, 0, 0, 0))
     assert jogger.pressed("z") is None and jogger.pressed("s") is None
-    assert jogger.pressed("+") == messages.JogBlade((0, 0, 0.005)) and str(jogger) == "blade along z, 5 mm a step"
+    assert jogger.pressed("+") == messages.Jog((0, 0, 0.005)) and str(jogger) == "blade along z, 5 mm a step"

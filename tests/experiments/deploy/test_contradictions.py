@@ -6,11 +6,18 @@ import json
 import math
 
 import pytest
+from rich.console import Console
 
 from experiments.config import robot as robots
+from experiments.config.finetuning import FineTuning
 from experiments.deploy import contradictions
+from experiments.deploy import session as play
 from experiments.errors import ConfigError
+from experiments.finetuning import session as tuning
+from experiments.runs import run_dir
+from robot_io.calibration import contacts
 from robot_io.control.config import RobotConfig
+from robot_io.log.messages import LogError
 
 
 def config(lag=0.034):
@@ -20,7 +27,7 @@ def config(lag=0.034):
 
 def session(folder, name, found, **contacts):
     summary = {"robot": found.name, "calibration": robots.plain(found.calibration), "contacts": contacts}
-    (folder / name).write_text(json.dumps(summary))
+    run_dir.write_json(folder / name, summary)
 
 
 def test_only_the_newest_session_with_the_same_calibration_counts(tmp_path):
@@ -38,5 +45,44 @@ def test_only_the_newest_session_with_the_same_calibration_counts(tmp_path):
     session(tmp_path, "4.json", found, **good | {"spread": 0.023})
     with pytest.raises(ConfigError, match=r"calibration.tracker.position .*spread by 23.0 mm"):
         contradictions.check(found, "robot.yaml", tmp_path)
-    session(tmp_path, "5.json", found, count=3, lag=math.nan, lag_deviation=math.nan, spread=math.nan)
+    session(tmp_path, "5.json", found, count=3, lag=None, lag_deviation=None, spread=None)
     contradictions.check(found, "robot.yaml", tmp_path)
+
+
+def summary():
+    keys = ("artefact", "egm", "axes_cycles", "log")
+    return dict.fromkeys(keys) | {"robot": "lab", "episodes": 0, "timings": {}, "faults": []}
+
+
+@pytest.mark.parametrize(
+    "seen", [contacts.Contacts(3, math.nan, math.nan, math.nan), KeyboardInterrupt(), LogError("x")]
+)
+def test_a_session_keeps_its_summary_whatever_its_contacts_tell(tmp_path, monkeypatch, seen):
+    def measure(*_):
+        if isinstance(seen, BaseException):
+            raise seen
+        return seen
+
+    log_file, path, console = tmp_path / "1.mcap", tmp_path / "1.json", Console(record=True)
+    log_file.touch()
+    monkeypatch.setattr(contradictions.log, "read", lambda _: None)
+    monkeypatch.setattr(contradictions.contacts, "measure", measure)
+    play._finish(summary(), config(), log_file, path, console)
+    written = json.loads(path.read_text())
+    assert written["calibration"]["clock"]["lag"] == 0.034
+    if isinstance(seen, BaseException):
+        assert "contacts" not in written and "not measured: " + type(seen).__name__ in console.export_text()
+    else:
+        assert written["contacts"] == {"count": 3, "lag": None, "lag_deviation": None, "spread": None}
+    contradictions.check(config(), "robot.yaml", tmp_path)
+
+
+def test_fine_tuning_refuses_what_a_session_contradicts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found, folder = config(), tmp_path / "runs" / "robot"
+    (tmp_path / "robot.yaml").write_text(robots.to_yaml(found))
+    folder.mkdir(parents=True)
+    session(folder, "1.json", found, count=20, lag=0.045, lag_deviation=0.001, spread=0.006)
+    run = run_dir.Run(tmp_path / "run")
+    with pytest.raises(ConfigError, match=r"robot.yaml: calibration.clock.lag .*1.json"):
+        tuning.finetune("nowhere", FineTuning(), run, "robot.yaml", None, None, "numpy", 0, Console())

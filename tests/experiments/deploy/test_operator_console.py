@@ -8,6 +8,7 @@ from rich.console import Console
 
 from experiments.deploy.operator_console import KEYS, View
 from robot_io.control import messages
+from robot_io.errors import RefusedError
 
 
 def test_the_view_shows_state_faults_joints_and_counts():
@@ -42,12 +43,12 @@ def test_the_view_shows_state_faults_joints_and_counts():
         timings={"missed_ticks": 6, "tick": {"p50_ms": 1.0, "p99_ms": 2.0, "max_ms": 3.0}},
     )
     with view:
-        view.take(messages.Refused(messages.Arm(), "not now"))
+        view.take(messages.Refused(messages.Arm(), RefusedError("not now")))
         view.take(status)
         console.print(view._draw(status))
     text = console.export_text()
     for shown in (
-        "ball +0.100 -0.200 +0.020 m in the table frame; tracker's clock -40.0 ppm over 60 s",
+        "ball +0.100 -0.200 +0.020 m in the table frame; tracker's clock +40.0 ppm over 60 s",
         "in thought",
         "FAULT estop: the button is pressed",
         "balls 3: 2 returned, 1 missed",

@@ -6,6 +6,7 @@ import pytest
 
 from experiments.deploy.recovery import LONGEST, Recovery
 from robot_io.control.messages import Arm, FaultReport, Prepare, Refused, Reset, Status
+from robot_io.errors import RefusedError
 
 FAULT = FaultReport("stale_arm", "nothing heard")
 
@@ -36,9 +37,9 @@ def test_without_a_fault_nothing_is_reset():
 def test_axes_that_do_not_answer_yet_are_prepared_again():
     recovery = Recovery(0.0)
     assert recovery.step(status(), 1.0) == Prepare()
-    assert not recovery.refused(Refused(Prepare(), "one of them does not answer yet"))
+    assert not recovery.refused(Refused(Prepare(), RefusedError("one of them does not answer yet")))
     assert [recovery.step(status(), 1.0) for _ in range(2)] == [Prepare(), Reset()]
-    assert recovery.refused(Refused(Reset(), "cannot reset: it still moves"))
+    assert recovery.refused(Refused(Reset(), RefusedError("cannot reset: it still moves")))
 
 
 def test_what_is_missing_is_told_when_it_lasts():

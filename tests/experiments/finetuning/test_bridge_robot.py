@@ -62,7 +62,7 @@ class Session:
             elif isinstance(request, messages.Pause):
                 bridge.paused = request.on
         except RefusedError as error:
-            self._report(messages.Refused(request, str(error)))
+            self._report(messages.Refused(request, error))
 
 
 class Nobody:

@@ -333,7 +333,7 @@ def test_the_axes_are_homed_only_with_the_arm_out_of_the_way():
     for joint, value in ((1, 1.4), (2, 0.9), (4, -1.5)):
         stretched = home.copy()
         stretched[joint] = value
-        rig.bridge._feedback.arm.add(rig.now + 1e-3, stretched)
+        rig.bridge.feedback.arm.add(rig.now + 1e-3, stretched)
         if rig.bridge._geometry.gaps(np.array([[0.0, 0.5, *stretched]]).T).min() < 0.0:
             with pytest.raises(RefusedError, match="axes not homed: .* jog the arm to its home pose"):
                 rig.bridge.check_homing()

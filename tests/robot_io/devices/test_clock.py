@@ -64,7 +64,29 @@ def test_a_jump_is_told_and_measured_anew():
 def test_a_clock_that_runs_away_is_told():
     clock = Clock(None, LATENCY, BOUND)
     fed(clock, 30.0, drift=1e-3)
-    assert "ppm" in clock.problem
+    assert "drifts by +999 ppm" in clock.problem
+
+
+def test_silence_does_not_make_a_fixed_offset_right_again():
+    """Broken on purpose: the tracker falls silent for a second now and then, and its clock gains 40 ppm."""
+    clock = Clock(0.0, LATENCY, BOUND)
+    for start in range(100, 460, 30):
+        fed(clock, 28.0, drift=4e-5, offset=-4e-5 * 100.0, start=float(start))
+        if start < 300:
+            assert clock.problem is None
+        clock.restart()  # as the tracker does
+    fed(clock, 15.0, drift=4e-5, offset=-4e-5 * 100.0, start=460.0)
+    assert "is off by +1" in clock.problem and "tracker.clock_bound" in clock.problem
+
+
+@pytest.mark.parametrize("offset", [0.0, None])
+def test_single_frames_from_the_past_tell_nothing(offset):
+    clock = Clock(offset, LATENCY, BOUND)
+    fed(clock, 30.0)
+    for i in range(10):
+        clock.add(127.5 + i, 130.0 + i)
+        fed(clock, 0.9, start=130.0 + i)
+        assert clock.problem is None and clock.windows > 25
 
 
 @pytest.mark.parametrize("length", [0.2, 0.9, 3.0])

@@ -759,6 +759,17 @@ def test_the_blade_keeps_its_limits_and_braking_keeps_them_too(limits):
         assert (found > 0.9 * np.array(limits)).any() and {"blade_speed", "blade_acceleration"} & changed
 
 
+def test_the_rule_that_refuses_a_command_is_the_one_that_is_told():
+    """Even braking breaks a limit that has become smaller on the way; nothing is near."""
+    ideal = Ideal(SafetyConfig(speed_scale=1.0))
+    for _ in range(8):
+        ideal.tick(swing(ideal.position, np.array([0.0, 0.0, 1.0])))
+    ideal.gate.config = replace(ideal.gate.config, blade_speed=0.1)
+    changed = ideal.tick(swing(ideal.position, np.array([0.0, 0.0, 1.0]))).changed
+    assert "blade_speed" in changed and "clearance" not in changed
+    assert (np.abs(ideal.velocities[:, -1]) <= np.abs(ideal.velocities[:, -2])).all()  # it brakes
+
+
 def test_attacks_keep_the_blades_limits(attacked):
     for ideal in attacked:
         speed, acceleration = blade_motion(ideal.positions)
