@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from experiments.commands.options import command, console, existing, option
+from experiments.commands.options import command, console, existing, option, writable
 from experiments.errors import checked
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ app = command(
   mjx-tt calibrate clock runs/robot/20261121-153000.mcap       a session of half a minute or more
 
 Writes calibration.yaml, each part beside the others; robot.yaml names it: "calibration: calibration.yaml".
-mjx-tt robot check writes the points, but for the columns of the table.
+mjx-tt robot check writes the ball's columns of the points, robot jog the joints' as well; the table's are yours.
 """,
 )
 
@@ -43,26 +43,30 @@ def calibrate(
 ) -> int:
     """Returns the exit status."""
     existing(source, robot)
-    from dataclasses import replace
+    target = Path(out)
+    writable(target.parent)
+    from dataclasses import asdict
     from datetime import date
 
     from experiments.config import robot as robots
+    from experiments.runs import run_dir
     from robot_io.calibrated import Calibration
     from robot_io.control.config import AxisConfig
 
-    path, target, today, screen = Path(source), Path(out), date.today().isoformat(), console()
+    path, today, screen = Path(source), date.today().isoformat(), console()
     known = robots.load_calibration(target) if target.exists() else Calibration()
+    found: TrackerCalibration | RobotCalibration | ClockCalibration
     if part == "tracker":
-        known = replace(known, tracker=_tracker(path, today, screen))
+        found = _tracker(path, today, screen)
     elif part == "robot":
-        axes = robots.load_robot(robot).axes if robot else (AxisConfig(), AxisConfig())
-        zeros = axes[0].zero, axes[1].zero
-        known = replace(known, robot=_robot(path, zeros, today, screen))
+        axes = robots.load_robot(robot, calibrated=False).axes if robot else (AxisConfig(), AxisConfig())
+        found = _robot(path, (axes[0].zero, axes[1].zero), today, screen)
     else:
-        known = replace(known, clock=_clock(path, known, today, screen))
-    text = robots.to_yaml(known)
-    robots.fill(Calibration, robots.plain(known), str(target))  # what run would refuse is not written
-    target.write_text(text, encoding="utf-8")
+        found = _clock(path, known, today, screen)
+    # What run would refuse is not written.
+    known = robots.fill(Calibration, robots.plain(known) | {part: asdict(found)}, str(target))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    run_dir.write_yaml(target, robots.plain(known))
     screen.print(f"{target}: {part} written; robot.yaml names it: calibration: {target.name}", highlight=False)
     return 0
 
@@ -100,10 +104,18 @@ def _robot(path: Path, zeros: tuple[float, float], today: str, screen: Console) 
 
 
 def _clock(path: Path, known: Calibration, today: str, screen: Console) -> ClockCalibration:
+    from experiments.config import robot as robots
+    from experiments.config.experiment import read_yaml
     from robot_io import log
+    from robot_io.calibrated import Calibration
     from robot_io.calibration import clock
 
-    found, told = checked(str(path), clock.fit, checked("", log.read, path), known, today)
+    session = checked("", log.read, path)
+    then = session.attachments.get("calibration.yaml")  # what joints and ball were logged with
+    if then is not None:
+        where = f"{path}: calibration.yaml"
+        known = robots.fill(Calibration, read_yaml(then.decode(), where) or {}, where)
+    found, told = checked(str(path), clock.fit, session, known, today)
     for line in told:
         screen.print(line, highlight=False)
     return found

@@ -43,12 +43,16 @@ RANGES = {RobotConfig: robot_config.RANGES, RigParams: rig_config.RANGES, Calibr
 Config = TypeVar("Config", RobotConfig, RigParams, Calibration)
 
 
-def load_robot(path: str | Path) -> RobotConfig:
+def load_robot(path: str | Path, calibrated: bool = True) -> RobotConfig:
     """A robot.yaml, its calibration in it or in a file that it names. Raises ConfigError.
 
     Without ``safety.speed_scale`` the robot is slow: COMMISSIONING.
+
+    calibrated  False: its calibration is not looked at
     """
     data = _mapping(path)
+    if not calibrated:
+        data.pop("calibration", None)
     if isinstance(named := data.get("calibration"), str):  # relative to robot.yaml
         data["calibration"] = plain(load_calibration(Path(path).parent / named))
     safety = data.setdefault("safety", {})

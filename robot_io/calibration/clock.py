@@ -16,18 +16,18 @@ SURE = 0.005  # [s] of a lag's standard deviation from which on it is kept
 def fit(log: SessionLog, known: Calibration, today: str) -> tuple[ClockCalibration, list[str]]:
     """The calibration, and what was found in words. Raises ValueError for a log with too little in it."""
     reports = [json.loads(event.text) for event in log.events if event.name == "clock"]
-    newest = reports[-1] if reports else {"seconds": 0}
-    if newest["seconds"] < LEAST:
-        raise ValueError(f"{newest['seconds']} s of the tracker's frames in one go; at least {LEAST} are needed")
+    longest = max(reversed(reports), key=lambda report: report["seconds"], default={"seconds": 0})
+    if longest["seconds"] < LEAST:
+        raise ValueError(f"{longest['seconds']} s of the tracker's frames in one go; at least {LEAST} are needed")
     seen = contacts.measure(log, known)
     sure = math.isfinite(seen.lag) and seen.lag_deviation < SURE
     told = [
-        f"offset {newest['offset']:+.6f} s (bridge less tracker), drift {1e6 * newest['drift']:+.2f} ppm, "
-        f"seconds miss the line by {1e3 * newest['residual']:.3f} ms",
+        f"offset {longest['offset']:+.6f} s (bridge less tracker), drift {1e6 * longest['drift']:+.2f} ppm, "
+        f"seconds miss the line by {1e3 * longest['residual']:.3f} ms",
         f"{seen.count} contacts: joints are logged {1e3 * seen.lag:.1f} +- {1e3 * seen.lag_deviation:.1f} ms after the "
         f"ball; the gaps between them then spread by {1e3 * seen.spread:.1f} mm"
         if sure
         else f"{seen.count} contacts with the paddle: too few to tell the lag of the joints; lag is left empty",
     ]
     lag = round(seen.lag, 5) if sure else None
-    return ClockCalibration(round(newest["drift"], 9), lag, round(newest["residual"], 7), today), told
+    return ClockCalibration(round(longest["drift"], 9), lag, round(longest["residual"], 7), today), told

@@ -147,7 +147,8 @@ class RobotConfig:
         if measured.date and any(abs(a - b) > SAME_ZERO for a, b in zip(measured.axes_zero, zeros, strict=True)):
             raise ValueError(
                 f"calibration.robot.axes_zero is {measured.axes_zero}, axes[0].zero and axes[1].zero are {zeros}: the "
-                "robot was calibrated with other zeros; calibrate it again (mjx-tt calibrate robot)"
+                "robot was calibrated with other zeros; take calibration out of robot.yaml, note points and "
+                "calibrate it again (mjx-tt calibrate robot)"
             )
         for path in ("arm.host", "arm.controller", "tracker.host", "tracker.source"):
             device, name = path.split(".")

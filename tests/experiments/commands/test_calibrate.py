@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,10 +12,13 @@ import pytest
 from experiments import cli
 from experiments.config import robot as robots
 from experiments.errors import ConfigError
+from robot_io import log
+from robot_io.calibrated import Calibration, RobotCalibration
 from robot_io.contract import JOINT_NAMES
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.tracker import TrackerParams
+from tests.support.contact_log import made_up
 from tests.support.hidden_rig import HIDDEN, grid, touches
 from tests.support.lockstep_play import lockstep
 
@@ -42,7 +46,6 @@ def measured(tmp_path, monkeypatch):
 
 def test_what_was_hidden_is_found_written_and_applied(measured, capsys):
     (measured / "robot.yaml").write_text("name: lab\ncalibration: calibration.yaml\n")
-    (measured / "calibration.yaml").write_text("")
     assert cli.main(["calibrate", "tracker", "ball.csv"]) == 0
     assert cli.main(["calibrate", "robot", "touches.csv", "--robot", "robot.yaml"]) == 0
     told = capsys.readouterr().out
@@ -58,15 +61,16 @@ def test_what_was_hidden_is_found_written_and_applied(measured, capsys):
     rig = lockstep(params=params, tracker=told_clock, calibration=found)
     rig.run(1.5)
     rig.start()
-    rig.throwing, track = True, {}
+    rig.throwing, track, compared = True, {}, set()
     while rig.now < 6.0:
         rig.step()
-        track[round(rig.now, 6)] = rig.world.ball
+        track[round(rig.now / 0.001)] = rig.world.ball
         seen = rig.bridge.tracker.newest
-        if seen.position is not None and (true := track.get(round(seen.captured / 0.008) * 0.008)) is not None:
-            assert abs(seen.captured - round(seen.captured / 0.008) * 0.008) < 0.001  # frames are taken every 8 ms
+        if seen.position is not None and (true := track.get(8 * (number := round(seen.captured / 0.008)))) is not None:
+            assert abs(seen.captured - 0.008 * number) < 0.001  # frames are taken every 8 ms
             assert np.linalg.norm(seen.position - true) < 0.002
-    assert rig.thrower.thrown >= 1
+            compared.add(number)
+    assert rig.thrower.thrown >= 1 and len(compared) > 300
     np.testing.assert_allclose(rig.bridge.measured, rig.world.qpos, atol=0.005)  # 2 mrad, and 29 ms of motion
 
 
@@ -76,6 +80,38 @@ def test_files_that_cannot_be_used_are_refused(measured, capsys):
     write("few.csv", ["table_x", "table_y", "table_z", "ball_x", "ball_y", "ball_z"], np.zeros((3, 6)))
     assert cli.main(["calibrate", "tracker", "few.csv", "--out", "new.yaml"]) == 1
     assert "few.csv: 3 points" in capsys.readouterr().err and not (measured / "new.yaml").exists()
+    assert cli.main(["calibrate", "tracker", "ball.csv", "--out", "ball.csv/new.yaml"]) == 1
+    assert "ball.csv: cannot be written: Not a directory" in capsys.readouterr().err
+
+
+def test_a_calibration_that_run_would_refuse_is_named_and_not_written(measured, capsys):
+    table, joints, paddle = touches(replace(HIDDEN, joint_zeros=(0.055, *HIDDEN.joint_zeros[1:])))
+    names = [f"table_{axis}" for axis in "xyz"] + [*JOINT_NAMES, *(f"paddle_{axis}" for axis in "xyz")]
+    write("far.csv", names, np.concatenate([table, joints, paddle], axis=1))
+    before = "tracker: {points: 7, date: '2026-11-22'}"
+    (measured / "calibration.yaml").write_text(before)
+    assert cli.main(["calibrate", "robot", "far.csv"]) == 1
+    told = capsys.readouterr().err
+    assert "calibration.yaml: robot.joint_zeros" in told and "allowed: -0.05 to 0.05" in told
+    assert (measured / "calibration.yaml").read_text() == before
+
+
+def test_the_clock_is_found_with_the_base_that_a_session_was_logged_with(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made, then = made_up(0.031, gap=0.012), Calibration(robot=RobotCalibration((0.0, 0.012, 0.0), date="2026-11-22"))
+    with log.FileRecorder.start(tmp_path, "1", {}, {"calibration.yaml": robots.to_yaml(then)}) as recorder:
+        records = [log.Joints(t, q, np.zeros(8)) for t, q in zip(made.joints.time, made.joints.position.T, strict=True)]
+        ball = made.ball
+        for captured, place, number in zip(ball.capture_time, ball.position.T, ball.id, strict=True):
+            records.append(log.Ball(captured, captured, place, int(number)))
+        for seconds, drift in ((60, -4e-5), (0, 0.0)):  # at the end the tracker fell silent
+            report = {"offset": -3.2, "at": 100.0, "drift": drift, "residual": 1e-5, "seconds": seconds}
+            records.append(log.Event(99.0 - seconds, log.Level.INFO, "clock", json.dumps(report)))
+        recorder.put(*sorted(records, key=lambda record: record.log_time))
+    assert cli.main(["calibrate", "clock", "1.mcap"]) == 0
+    assert "drift -40.00 ppm" in capsys.readouterr().out
+    found = robots.load_calibration("calibration.yaml").clock
+    assert found.drift == -4e-5 and found.lag == pytest.approx(0.031, abs=0.003)
 
 
 def test_calibrations_that_contradict_are_refused_by_file_and_key(tmp_path):
@@ -84,6 +120,7 @@ def test_calibrations_that_contradict_are_refused_by_file_and_key(tmp_path):
     calibration.write_text("robot: {axes_zero: [-1.0, -0.4], joint_zeros: [0.01, 0, 0, 0, 0, 0], date: '2026-11-22'}")
     with pytest.raises(ConfigError, match=r"robot.yaml: calibration.robot.axes_zero is .*calibrate it again"):
         robots.load_robot(path)
+    assert robots.load_robot(path, calibrated=False).axes[1].zero == -0.5  # for another calibration
     calibration.write_text("tracker: {residual: 0.012, date: '2026-11-22'}")
     with pytest.raises(ConfigError, match=r"found.yaml: tracker.residual: got 0.012; allowed: 0 to 0.005"):
         robots.load_robot(path)

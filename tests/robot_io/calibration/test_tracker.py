@@ -41,7 +41,7 @@ def test_deviations_are_those_of_repeated_measurements():
     np.testing.assert_allclose(turns, np.mean([f.deviation[3:] for f in fits], axis=0), rtol=0.4)
 
 
-def test_points_that_cannot_tell_are_refused(tmp_path):
+def test_points_that_cannot_tell_are_refused():
     table, seen = grid()
     with pytest.raises(ValueError, match="4 points .* at least 5"):
         tracker.fit(table[:4], seen[:4], "2026-11-22")
