@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import is_dataclass
 from numbers import Real
 from typing import Any
 
@@ -13,6 +14,8 @@ def check_ranges(config: Any, ranges: Ranges) -> None:
     """Raise ValueError naming the first field outside its range, the value and the range.
 
     config  a dataclass; a path leads through its fields, and through every entry of a tuple. None is not checked.
+
+    Raises AttributeError for a path through a field that a dataclass does not have.
     """
     for where, value, allowed in outside(config, ranges):
         raise ValueError(f"{where} is {value}, allowed is {allowed}")
@@ -41,5 +44,8 @@ def _values(owner: Any, path: list[str], where: str = "") -> list[tuple[str, Any
         return [found for i, entry in enumerate(owner) for found in _values(entry, path, f"{where}[{i}]")]
     if not path:
         return [(where, owner)]
-    below = owner.get(path[0]) if isinstance(owner, dict) else getattr(owner, path[0], None)
+    if is_dataclass(owner):
+        below = getattr(owner, path[0])  # an error for a path that is none: it would check nothing
+    else:
+        below = owner.get(path[0]) if isinstance(owner, dict) else None
     return _values(below, path[1:], f"{where}.{path[0]}".removeprefix("."))

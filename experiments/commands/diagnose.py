@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -69,10 +70,14 @@ def resting_pose(text: str) -> dict[str, float]:
         joint, _, value = pair.partition("=")
         if joint not in JOINT_NAMES:
             raise ConfigError(f"--home {text}: no joint {joint!r}; there are {', '.join(JOINT_NAMES)}, or home for all")
+        if joint in pose:
+            raise ConfigError(f"--home {text}: {joint} is given twice; once is allowed")
         try:
             pose[joint] = float(value)
         except ValueError:
-            raise ConfigError(f"--home {text}: {joint} at {value!r}; a number is wanted [rad], [m]") from None
+            pose[joint] = math.nan
+        if not math.isfinite(pose[joint]):
+            raise ConfigError(f"--home {text}: {joint} at {value!r}; a number is wanted [rad], [m], and a finite one")
     return pose
 
 

@@ -5,11 +5,13 @@ Errors are those of pixels, hence larger in depth than across, and larger far fr
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 Place = tuple[float, float, float]
+BESIDE = 0.1  # [m]
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,17 @@ class CameraParams:
     lost_for: float = 0.05
     false_sight: float = 0.0
     switch: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("first", "second"):
+            place = getattr(self, name)
+            if math.hypot(*place[:2]) < BESIDE:
+                raise ValueError(
+                    f"{name} is {place}, allowed is a place at least {BESIDE} m beside the table's centre: a camera "
+                    "that looks straight down has no upper edge"
+                )
+        if math.dist(self.first, self.second) < BESIDE:
+            raise ValueError(f"second is {self.second}, allowed is a place at least {BESIDE} m away from first")
 
 
 FORGOTTEN = 0.1  # [s] out of sight after which the ball gets another number

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.config import robot as robots
+from experiments.errors import ConfigError
 from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.tracker import TrackerEmulator, TrackerParams
@@ -19,6 +21,19 @@ PAIR = CameraParams(triangulated=True)
 def seen(params, ball, frames=4000, number=1):
     pair = CameraPair(params, 125.0, np.random.default_rng(0))
     return [pair.see(number, np.asarray(ball, float)) for _ in range(frames)]
+
+
+@pytest.mark.parametrize(
+    "wrong, named",
+    [
+        ({"first": [0, 0, 2.2]}, "tracker.cameras.first is (0.0, 0.0, 2.2)"),
+        ({"second": [0.05, 0, 3]}, "tracker.cameras.second is (0.05, 0.0, 3.0)"),
+        ({"first": [2.6, -1.6, 2.15]}, "tracker.cameras.second is (2.6, -1.6, 2.2), allowed .* away from first"),
+    ],
+)
+def test_cameras_that_cannot_triangulate_are_refused(wrong, named):
+    with pytest.raises(ConfigError, match=named.replace("(", "[(]").replace(")", "[)]")):
+        robots.fill(RigParams, {"tracker": {"cameras": {"triangulated": True, **wrong}}}, "rig.yaml")
 
 
 def test_noise_is_that_of_pixels_in_each_direction():

@@ -1,0 +1,20 @@
+"""``mjx-tt diagnose``: what is refused before the work."""
+
+from __future__ import annotations
+
+import pytest
+
+from experiments.commands.diagnose import resting_pose
+from experiments.errors import ConfigError
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "x", ""])
+def test_a_resting_pose_is_of_finite_numbers(value):
+    with pytest.raises(ConfigError, match="--home joint_2=0.1,joint_1=.*: joint_1 at .*a number is wanted"):
+        resting_pose(f"joint_2=0.1,joint_1={value}")
+
+
+def test_a_joint_rests_at_one_place():
+    with pytest.raises(ConfigError, match="joint_1 is given twice"):
+        resting_pose("joint_1=0.1,joint_2=0.2,joint_1=0.1")
+    assert resting_pose("joint_1=0.1,gantry_x=-2e-1") == {"joint_1": 0.1, "gantry_x": -0.2}
