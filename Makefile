@@ -56,6 +56,7 @@ exam: $(READY)
 
 docs: $(READY)
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	$(BIN)/mjx-tt view --export docs/_static/view.html
 	$(BIN)/python -m sphinx -W --keep-going -q -E -a -b html docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
 

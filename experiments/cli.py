@@ -97,6 +97,7 @@ COMMANDS = (
     fit_human.app,
     fit_human.import_app,
     render.app,
+    render.view_app,
     render.curves_app,
     run.app,
     finetune.app,

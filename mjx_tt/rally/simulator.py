@@ -164,6 +164,10 @@ class RallySimulator:
         state, result, _ = self._shots(policy, player, without_nominal(model), state, key, box)
         return replace(state, dummy=jnp.zeros_like(state.dummy)), result
 
+    def episodes(self, key: PRNGKeyArray, model: SimModel, state: RallyState) -> Episodes:
+        """Episodes of the robot in the turn that ``shots`` plays with this key."""
+        return self._episodes(jax.random.split(key, 8)[0], without_nominal(model), state.ball, state.start)
+
     def play(
         self,
         policy: Policy,
@@ -270,16 +274,7 @@ class RallySimulator:
         self, key: PRNGKeyArray, policy: Policy, model: SimModel, ball: BallState, start: Float[Array, "8 L"]
     ) -> EpisodeState:
         """The robot's part of one episode: its last state."""
-        latency_key, seed_key = jax.random.split(key)
-        lanes = ball.position.shape[1:]
-        longest = jnp.array([self.config.max_observation_latency] * 3 + [self.config.max_action_latency] * 2)[:, None]
-        episodes = Episodes(
-            ball=ball,
-            latency=models.draw_latencies(latency_key, model.latency, lanes, longest),
-            seed=jax.random.bits(seed_key, lanes, jnp.uint32),
-            model=model,
-            start=start,
-        )
+        episodes = self._episodes(key, model, ball, start)
         task, controller = self.task, PolicyController.of(policy)
         prepared = task.prepare(episodes)
 
@@ -292,6 +287,18 @@ class RallySimulator:
             return tick + 1, task.control_step(tick, state, episodes, prepared, controller)
 
         return jax.lax.while_loop(running, advance, (jnp.int32(0), task.reset(episodes, controller)))[1]
+
+    def _episodes(self, key: PRNGKeyArray, model: SimModel, ball: BallState, start: Float[Array, "8 L"]) -> Episodes:
+        latency_key, seed_key = jax.random.split(key)
+        lanes = ball.position.shape[1:]
+        longest = jnp.array([self.config.max_observation_latency] * 3 + [self.config.max_action_latency] * 2)[:, None]
+        return Episodes(
+            ball=ball,
+            latency=models.draw_latencies(latency_key, model.latency, lanes, longest),
+            seed=jax.random.bits(seed_key, lanes, jnp.uint32),
+            model=model,
+            start=start,
+        )
 
     # -- sessions ------------------------------------------------------------------------------------------------------
 

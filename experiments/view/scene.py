@@ -1,0 +1,169 @@
+"""Tables side by side in a browser: robots, balls with their trails, and where they will come down."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from importlib import resources
+
+import mujoco
+import numpy as np
+import viser
+from mjviser import ViserMujocoScene
+
+from experiments.view.film import RATE, Film
+from mjx_tt.env.outgoing_ball import FLOOR
+from mjx_tt.robot.model import PADDLE_SITE
+from robot_io.contract import N_JOINTS
+
+SPACING = -3.2  # [m] from the middle of a table to the next one's, which stands to its right for the person
+BALL_TRAIL, PADDLE_TRAIL = 0.25, 0.35  # [s]
+STRIDE = 4  # frames from one point of a trail to the next
+SHOWN_RADIUS = 0.025  # [m]; the true ball, of 0.02 m, is hard to find on a small screen
+COLOURS = {
+    "ball": (255, 120, 0),
+    "measured": (255, 120, 0),
+    "simulated": (40, 90, 200),
+    "nominal": (200, 40, 60),
+    "extended": (20, 140, 70),
+}
+PADDLE_COLOUR, LANDING_COLOUR, MARK_COLOUR = (150, 60, 170), (20, 160, 80), (90, 60, 30)
+NOWHERE = np.full((1, 2, 3), -5.0)  # a segment below the floor
+
+
+def tables(count: int) -> mujoco.MjModel:
+    """The scene of the simulation ``count`` times, along x, without its floor and ball."""
+    with resources.as_file(resources.files("mjx_tt") / "assets" / "scene.xml") as path:
+        parts = [mujoco.MjSpec.from_file(str(path)) for _ in range(count)]
+    for i, part in enumerate(parts):
+        for name in ("floor", "ball"):
+            part.delete(part.geom(name))
+        if i:
+            parts[0].attach(part, prefix=f"{i}-", frame=parts[0].worldbody.add_frame(pos=[SPACING * i, 0.0, 0.0]))
+    return parts[0].compile()
+
+
+def segments(path: np.ndarray) -> np.ndarray:
+    """Pieces (n, 2, 3) of a path, without those that have an end which is not finite."""
+    pieces = np.stack([path[:-1], path[1:]], axis=1)
+    pieces = pieces[np.isfinite(pieces).all(axis=(1, 2))]
+    return pieces if len(pieces) else NOWHERE
+
+
+class Scene:
+    """Shows one film per table."""
+
+    def __init__(self, server: viser.ViserServer, count: int) -> None:
+        self.server, self.count = server, count
+        self._model = tables(count)
+        self._data = mujoco.MjData(self._model)
+        sites = [i for i in range(self._model.nsite) if self._model.site(i).name.endswith(PADDLE_SITE)]
+        self._paddles = sites
+        self._robots = ViserMujocoScene(server, self._model, num_envs=1)
+        self._robots.camera_tracking_enabled = False
+        server.scene.add_grid(
+            "/floor",
+            infinite_grid=True,
+            fade_distance=14.0,
+            cell_color=(228, 228, 228),
+            section_color=(205, 205, 205),
+            plane_color=(246, 246, 244),
+            plane_opacity=1.0,
+            position=(0.0, 0.0, FLOOR),
+        )
+        self._films: Sequence[Film] = ()
+        self._balls: dict[tuple[int, str], viser.IcosphereHandle] = {}
+        self._paddle_paths: list[np.ndarray] = []
+        add = server.scene
+        self._trail = add.add_line_segments("/trail/ball", NOWHERE, COLOURS["ball"], thickness=0.014)
+        self._paddle_trail = add.add_line_segments("/trail/paddle", NOWHERE, PADDLE_COLOUR, thickness=0.010)
+        self._ways = {
+            name: add.add_line_segments(f"/way/{name}", NOWHERE, colour, thickness=0.004)
+            for name, colour in COLOURS.items()
+        }
+        self._marks = add.add_point_cloud("/marks", NOWHERE[0], MARK_COLOUR, point_size=0.012, point_shape="circle")
+        self._landing = [
+            add.add_cylinder(f"/landing/{i}", 0.06, 0.004, color=LANDING_COLOUR, opacity=0.8) for i in range(count)
+        ]
+        self._labels = [
+            add.add_label(
+                f"/label/{i}", "", position=(self.offset(i), -1.0, 1.0), anchor="bottom-center", font_screen_scale=1.2
+            )
+            for i in range(count)
+        ]
+        middle, further = self.offset(count - 1) / 2, 1.9 * (count - 1)
+        camera = server.initial_camera
+        camera.look_at = (middle, -0.75, 0.05)
+        camera.position = (middle + (1.2 if count == 1 else 0.0), 2.75 + further, 1.35 + 0.4 * further)
+        camera.fov = math.radians(50.0)
+        server.on_client_connect(self._step_back)
+
+    def _step_back(self, client: viser.ClientHandle) -> None:
+        """Moves the camera of a narrow page away, until the tables' width fits, and its panel out of the way."""
+        further = 1.15 * (1.0 + 0.6 * (self.count > 1)) / max(client.camera.aspect, 0.1)
+        if further > 1.0:
+            start = self.server.initial_camera
+            at = np.asarray(start.look_at)
+            client.camera.position = at + (np.asarray(start.position) - at) * further
+            client.gui.main_panel.minimize()
+
+    @staticmethod
+    def offset(table: int) -> float:
+        """x [m] of a table's middle."""
+        return SPACING * table
+
+    def load(self, films: Sequence[Film]) -> None:
+        """Takes the films to show, one for each table."""
+        self._films = films
+        wanted = {(i, name) for i, film in enumerate(films) for name in film.balls}
+        for key in set(self._balls) - wanted:
+            self._balls.pop(key).remove()
+        for i, name in sorted(wanted - set(self._balls)):
+            self._balls[i, name] = self.server.scene.add_icosphere(f"/ball/{i}/{name}", SHOWN_RADIUS, COLOURS[name])
+        for name, way in self._ways.items():
+            paths = [segments(self._at(i, f.balls[name][::STRIDE])) for i, f in enumerate(films) if name in f.balls]
+            way.points = np.concatenate(paths or [NOWHERE]).astype(np.float32)
+        marks = [self._at(i, film.marks) for i, film in enumerate(films) if len(film.marks)]
+        self._marks.points = np.concatenate(marks or [NOWHERE[0]]).astype(np.float32)
+        self._paddle_paths = [self._paddle_path(i, film) for i, film in enumerate(films)]
+
+    def show(self, t: float) -> None:
+        """Draws the moment ``t`` [s] of every film."""
+        trails, paddles = [], []
+        frames = [film.frame(t) for film in self._films]
+        for i, (film, frame) in enumerate(zip(self._films, frames, strict=True)):
+            self._data.qpos[N_JOINTS * i : N_JOINTS * (i + 1)] = film.qpos[frame]
+            first = next(iter(film.balls.values()))
+            behind = [max(0, frame - round(seconds * RATE)) for seconds in (BALL_TRAIL, PADDLE_TRAIL)]
+            trails.append(segments(self._at(i, first[behind[0] : frame + 1 : STRIDE])))
+            paddles.append(segments(self._paddle_paths[i][behind[1] // STRIDE : frame // STRIDE + 1]))
+        mujoco.mj_kinematics(self._model, self._data)
+        self._robots.update_from_mjdata(self._data)
+        with self.server.atomic():
+            for i, (film, frame) in enumerate(zip(self._films, frames, strict=True)):
+                for name, path in film.balls.items():
+                    seen = bool(np.isfinite(path[frame]).all())
+                    self._balls[i, name].visible = seen
+                    if seen:
+                        self._balls[i, name].position = self._at(i, path[frame])
+                landing = film.landing[frame] if len(film.landing) else np.full(2, np.nan)
+                self._landing[i].visible = bool(np.isfinite(landing).all())
+                if self._landing[i].visible:
+                    self._landing[i].position = (self.offset(i) + landing[0], landing[1], 0.004)
+                text = f"{film.title}: {film.outcome}" if film.outcome and t >= film.decided else film.title
+                if self._labels[i].text != text:
+                    self._labels[i].text = text
+            self._trail.points = np.concatenate(trails).astype(np.float32)
+            self._paddle_trail.points = np.concatenate(paddles).astype(np.float32)
+        self.server.flush()
+
+    def _at(self, table: int, position: np.ndarray) -> np.ndarray:
+        return np.asarray(position) + np.array([self.offset(table), 0.0, 0.0])
+
+    def _paddle_path(self, table: int, film: Film) -> np.ndarray:
+        path = []
+        for qpos in film.qpos[::STRIDE]:
+            self._data.qpos[N_JOINTS * table : N_JOINTS * (table + 1)] = qpos
+            mujoco.mj_kinematics(self._model, self._data)
+            path.append(self._data.site_xpos[self._paddles[table]].copy())
+        return np.array(path)

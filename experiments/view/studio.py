@@ -1,0 +1,246 @@
+"""Films of simulated balls: whole episodes in one compiled call, with parameters that are traced.
+
+Moving a slider changes numbers and never the program. What is random in an episode belongs to the number of its ball,
+so the same ball meets the same latencies and noise under other parameters and another policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from ballmodel import flight
+from ballmodel.partial_params import without_nominal
+from ballmodel.state import BallState, where
+from experiments.view.film import RATE, Film, Series, next_landing, upsampled
+from mjx_tt.env import rewards
+from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes, TaskConfig
+from mjx_tt.env.outgoing_ball import fly_out
+from mjx_tt.env.policy import Policy, PolicyController
+from mjx_tt.env.reward_sums import reward_terms
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import LATENCIES, ModelFile, SimModel
+from robot_io.contract import JOINT_NAMES, N_JOINTS
+
+# Few episodes are computed: a program that is compiled in a third of the time is worth more than a fast one.
+QUICKLY = {
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_cpu_use_fusion_emitters": False,
+}
+LANES = 32  # episodes of one call, whatever the number of policies
+FLOOR = -0.72  # [m] of the ball's centre, where a film ends
+OUTCOMES = {MISSED: "missed", HIT: "hit, not returned", RETURNED: "returned"}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A slider: path in SimModel, label, range in the label's unit, and that unit in SI."""
+
+    path: str
+    label: str
+    low: float
+    high: float
+    step: float
+    unit: float = 1.0
+
+
+MILLI = 1e-3
+PARAMETERS: dict[str, tuple[Parameter, ...]] = {
+    "Latencies": (
+        Parameter("latency.ball_observation", "ball [ms]", 0.0, 100.0, 1.0, MILLI),
+        Parameter("latency.abb_observation", "arm's joints [ms]", 0.0, 100.0, 1.0, MILLI),
+        Parameter("latency.festo_observation", "axes [ms]", 0.0, 100.0, 1.0, MILLI),
+        Parameter("latency.abb_action", "arm's action [ms]", 0.0, 130.0, 1.0, MILLI),
+        Parameter("latency.festo_action", "axes' action [ms]", 0.0, 130.0, 1.0, MILLI),
+    ),
+    "Ball": (
+        Parameter("ball.table.restitution", "table's restitution", 0.5, 1.0, 0.01),
+        Parameter("ball.table.friction", "table's friction", 0.0, 0.6, 0.01),
+        Parameter("ball.paddle.restitution", "rubber's restitution", 0.3, 1.2, 0.01),
+        Parameter("ball.flight.magnus_coefficient", "lift of spin", 0.0, 2.5, 0.05),
+        Parameter("ball.flight.drag_coefficient", "drag", 0.0, 1.0, 0.01),
+    ),
+    "Noise": (
+        Parameter("sensing.ball_noise", "tracker [mm]", 0.0, 150.0, 1.0, MILLI),
+        Parameter("latency.ball_observation_std", "ball's latency [ms]", 0.0, 30.0, 0.5, MILLI),
+    ),
+    "Gains of the drives": tuple(
+        Parameter(f"drives.{joint}.velocity_gain", joint, 0.5, 1.5, 0.01) for joint in JOINT_NAMES
+    ),
+}
+
+
+def sliders() -> list[Parameter]:
+    """Every slider, in the order of the page."""
+    return [parameter for group in PARAMETERS.values() for parameter in group]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Draws:
+    """Balls (3, L) with the chance that belongs to them: standard normals (5, L) and (3, L), uniforms (k, L), seeds."""
+
+    ball: BallState
+    latency: Any
+    spin: Any
+    model: Any
+    seed: Any
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Watched:
+    """The policy, remembering its last input and output."""
+
+    policy: PolicyController
+
+    @property
+    def mean(self) -> Array:
+        return self.policy.mean
+
+    def start(self, observation: Array) -> Any:
+        return self.policy.start(observation), observation, jnp.zeros((N_JOINTS, *observation.shape[1:]))
+
+    def act(self, tick: Any, state: Any, observation: Array) -> tuple[Array, Any]:
+        action, inner = self.policy.act(tick, state[0], observation)
+        return action, (inner, observation, action)
+
+
+class Studio:
+    """Plays balls in one world; compiles once."""
+
+    def __init__(self, task: TaskConfig, world: ModelFile) -> None:
+        self.simulator, self.world = Simulator(task), world
+        self.episodes = jax.jit(self._episodes)
+        self._record = jax.jit(self._play, compiler_options=QUICKLY if jax.default_backend() == "cpu" else None)
+
+    def nominal(self) -> dict[str, float]:
+        """Values of the sliders in this world; NaN for a parameter that is drawn for every episode."""
+        known = models.paths(self.world.model)
+        drawn = {r.path for r in self.world.randomise}
+        return {p.path: float("nan") if p.path in drawn else float(known[p.path]) for p in sliders()}
+
+    def draws(self, state: np.ndarray, numbers: Sequence[int], seed: int) -> Draws:
+        """Balls with position, velocity and spin ``state`` (9, n), each with its number's chance."""
+        chance = [np.random.default_rng([seed, number]) for number in numbers]
+        normal = np.stack([r.standard_normal(8) for r in chance], axis=1).astype(np.float32)
+        uniform = np.stack([r.random(len(self.world.randomise)) for r in chance], axis=1).astype(np.float32)
+        seeds = np.array([r.integers(2**32, dtype=np.uint32) for r in chance], np.uint32)
+        state = state.astype(np.float32)
+        return Draws(BallState(state[:3], state[3:6], state[6:]), normal[:5], normal[5:], uniform, seeds)
+
+    def model(self, draws: Draws, values: Mapping[str, Any]) -> SimModel:
+        """The world's model with the sliders' values, each (L,)."""
+        drawn = {r.path: r.low + (r.high - r.low) * draws.model[i] for i, r in enumerate(self.world.randomise)}
+        for path, value in values.items():
+            moved = jnp.broadcast_to(jnp.asarray(value, jnp.float32), draws.seed.shape)
+            drawn[path] = jnp.where(jnp.isnan(moved), drawn[path], moved) if path in drawn else moved
+        model = without_nominal(models.with_values(self.world.model, drawn))
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), model)
+
+    def _episodes(self, draws: Draws, values: Mapping[str, Any]) -> Episodes:
+        config, model, shape = self.simulator.config, self.model(draws, values), draws.seed.shape
+        mean, std = (
+            jnp.stack([jnp.broadcast_to(getattr(model.latency, name + end), shape) for name in LATENCIES])
+            for end in ("", "_std")
+        )
+        longest = jnp.array([config.max_observation_latency] * 3 + [config.max_action_latency] * 2)[:, None]
+        mean_spin, std_spin = (
+            jnp.stack([jnp.broadcast_to(getattr(model.ball_spin, f"{kind}_{axis}"), shape) for axis in "xyz"])
+            for kind in ("mean", "std")
+        )
+        spin = draws.ball.spin + mean_spin + std_spin * draws.spin
+        home = jnp.broadcast_to(jnp.asarray(self.simulator.task.home, jnp.float32)[:, None], (N_JOINTS, *shape))
+        latency = jnp.clip(mean + std * draws.latency, 0.0, longest)
+        return Episodes(replace(draws.ball, spin=spin), latency, jnp.asarray(draws.seed), model, home)
+
+    def record(self, policies: Sequence[Policy], episodes: Episodes) -> dict[str, np.ndarray]:
+        """Everything about episodes (L,), each played by its policy; the episode is the last axis."""
+        missing = LANES - len(policies)
+
+        def padded(x: Any) -> Array:
+            x = jnp.asarray(x)
+            return jnp.concatenate([x, jnp.repeat(x[..., -1:], missing, axis=-1)], axis=-1) if x.ndim else x
+
+        stacked = jax.tree.map(lambda *x: np.stack(x, axis=-1), *policies)
+        policy, episodes = jax.tree.map(padded, (stacked, episodes))
+        recorded = self._record(policy, episodes)
+        return {name: np.asarray(x)[..., : len(policies)] for name, x in recorded.items()}
+
+    def _play(self, policy: Policy, episodes: Episodes) -> dict[str, Array]:
+        """The episodes tick by tick (max_steps, ..., L), then balls that are over flying on alone, and the result."""
+        task, config = self.simulator.task, self.simulator.config
+        controller = Watched(PolicyController.of(policy))
+        prepared, start = task.prepare(episodes), task.reset(episodes, controller)
+        alone = replace(episodes.model.ball, flight=replace(episodes.model.ball.flight, integrator="midpoint"))
+
+        def advance(carry: tuple, tick: Array) -> tuple[tuple, dict[str, Array]]:
+            state, ball = carry
+            new = task.control_step(tick, state, episodes, prepared, controller)
+            _, observation, action = new.controller
+            shown = {
+                "qpos": state.qpos,
+                "ball": ball.position,
+                "velocity": ball.velocity,
+                "live": state.live,
+                "observation": observation,
+                "action": action,
+            }
+            flown, _ = flight.step(alone, ball, config.period)
+            return (new, where(state.live, new.ball, flown)), shown
+
+        (state, _), shown = jax.lax.scan(advance, (start, start.ball), jnp.arange(config.max_steps))
+        back = fly_out(config, state.ball, state.hit & state.finite, episodes.model)
+        terms = reward_terms(state, back)
+        returned = state.hit & back.returned & state.finite
+        outcome = jnp.where(returned, RETURNED, jnp.where(state.hit & state.finite, HIT, MISSED))
+        return {**shown, "terms": terms, "outcome": outcome, "hit": state.hit, "landing": jnp.asarray(back.landing)}
+
+    def films(self, recorded: dict[str, np.ndarray], titles: Sequence[str]) -> list[Film]:
+        """A film of every episode."""
+        return [self._film({k: v[..., i] for k, v in recorded.items()}, title) for i, title in enumerate(titles)]
+
+    def _film(self, r: dict[str, np.ndarray], title: str) -> Film:
+        period = self.simulator.config.period
+        factor = round(RATE * period)
+        over = int(np.argmin(r["live"])) if not r["live"].all() else len(r["live"]) - 1
+        grounded = np.flatnonzero(r["ball"][over:, 2] < FLOOR)
+        last = min(over + int(grounded[0]) + 1 if grounded.size else len(r["ball"]), len(r["ball"])) - 1
+        ticks = np.arange(last + 1) * period
+        time = np.arange(factor * last + 1) / RATE
+        ball = upsampled(r["ball"][: last + 1], r["velocity"][: last + 1], period, factor)
+        qpos = np.stack([np.interp(time, ticks, q) for q in r["qpos"][: last + 1].T], axis=1)
+        played = slice(0, over + 1)
+        speeds = np.linalg.norm(r["velocity"], axis=1)
+        text = f"{OUTCOMES[int(r['outcome'])]}, {speeds[0]:.1f} m/s"
+        if r["hit"]:
+            text += f" in, {speeds[over]:.1f} m/s out"
+        weights = self.simulator.config.reward_weights
+        seen, joints = r["observation"][played], tuple(JOINT_NAMES)
+        return Film(
+            time=time,
+            qpos=qpos,
+            balls={"ball": ball},
+            title=title,
+            outcome=text,
+            decided=over * period,
+            contact=over * period if r["hit"] else float("nan"),
+            landing=next_landing(ball),
+            series={
+                "Input: ball as seen [m]": Series(("x", "y", "z"), ticks[played], seen[:, :3]),
+                "Input: joints as seen [m, rad]": Series(joints, ticks[played], seen[:, 3:]),
+                "Output: share of the joints' speed": Series(joints, ticks[played], r["action"][played]),
+            },
+            terms={
+                name: (float(value), float(weight))
+                for name, value, weight in zip(rewards.TERMS, r["terms"], weights, strict=True)
+            },
+        )
