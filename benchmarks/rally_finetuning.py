@@ -105,7 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     lengths = [rally.length for rally in robot.rallies if not rally.filtered]
     print(f"{len(entries)} balls in the journal, {wrong} credited wrongly, {unplayed} without an action")
     print(f"{replaced} replayed for a fault of the human; {len(others)} played by an earlier policy and not counted")
-    print(f"{len(lengths)} rallies of {np.mean(lengths):.2f} touches, longest {max(lengths)}")
+    print(f"{len(lengths)} rallies of {np.mean(lengths or [0]):.2f} touches, longest {max(lengths, default=0)}")
     print(json.dumps({} if found is None else found["difference"]))
     return int(wrong > 0)
 

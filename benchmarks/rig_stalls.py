@@ -22,7 +22,7 @@ from experiments.deploy.recovery import Recovery
 from experiments.deploy.rig import rig_for
 from experiments.deploy.session import Session
 from robot_io import log
-from robot_io.contract import LIMITS
+from robot_io.contract import LIMITS, N_JOINTS
 from robot_io.control.messages import Refused, Status
 from robot_io.control.process import ControlOptions
 from robot_io.emulator.processes import Rig
@@ -74,11 +74,12 @@ def main(arguments: list[str] | None = None) -> int:
         commands = log.read(Path(folder) / "stalls.mcap").commands
         timings = session.timings
     at = np.searchsorted(commands.time, [when for when, _ in looks]) - 1
-    away = np.abs(commands.reference[:, at].T - np.array([place for _, place in looks]))
+    away = np.abs(commands.reference[:, at].T - np.array([place for _, place in looks]).reshape(-1, N_JOINTS))
     for what, count in found.most_common():
         print(f"{count:6d}  {what}")
     print(
-        f"reference away from the arm at most {1e3 * away[:, :2].max():.1f} mm, {np.degrees(away[:, 2:].max()):.2f} deg"
+        f"reference away from the arm at most {1e3 * away[:, :2].max(initial=0.0):.1f} mm, "
+        f"{np.degrees(away[:, 2:].max(initial=0.0)):.2f} deg"
     )
     print(f"joints outside their ranges by at most {outside:.4f}; {timings}")
     return int(found["recovered"] < found["faults"])

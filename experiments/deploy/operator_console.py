@@ -34,7 +34,7 @@ KEYS = {
     "a": Key("arm: the robot goes to its home pose", messages.Arm()),
     " ": Key("stop", messages.Stop()),
     "r": Key("reset a fault", messages.Reset()),
-    RECOVER: Key("continue after a fault: switch on, reset and arm"),
+    RECOVER: Key("continue after a fault: switch on, home what lost its reference, reset and arm"),
     "d": Key("discard this ball", messages.Discard()),
     PAUSE: Key("pause: take no new balls, or resume"),
     QUIT: Key("stop and end"),

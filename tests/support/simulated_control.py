@@ -44,7 +44,7 @@ class FrameSocket(ArmSocket):
 class Simulated:
     """A control process in this one; ``script``: what happens at moments [s] of its clock."""
 
-    def __init__(self, artefact, monkeypatch):
+    def __init__(self, artefact, monkeypatch, **options):
         self.simulation = Simulation()
         self.script = []
         self.pipe, theirs = multiprocessing.Pipe()
@@ -57,7 +57,8 @@ class Simulated:
         monkeypatch.setattr(process, "time", clock)
         monkeypatch.setattr(process, "select", SimpleNamespace(select=self._select))
         config = RobotConfig(realtime=RealTimeConfig(spin=0.0))
-        self.control = Control(config, ControlOptions(str(artefact), "numpy"), theirs)
+        options = {"artefact": artefact and str(artefact), "backend": "numpy"} | options
+        self.control = Control(config, ControlOptions(**options), theirs)
         self.simulation.bridge = self.control.bridge
 
     def _sleep(self, seconds):

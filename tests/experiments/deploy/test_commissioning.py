@@ -18,7 +18,8 @@ from experiments.deploy import commissioning
 from experiments.deploy.commissioning import Jogger
 from robot_io import log
 from robot_io.calibrated import Calibration
-from robot_io.control import messages
+from robot_io.contract import JOINT_NAMES
+from robot_io.control import messages, process
 from robot_io.control.commissioning.mark import Stay
 from robot_io.control.config import ArmConfig, AxisConfig, RobotConfig
 from robot_io.control.messages import Marked
@@ -26,6 +27,8 @@ from robot_io.devices.egm.messages import encode_robot
 from robot_io.devices.tracker import BallSample, TrackerConfig, encode
 from robot_io.emulator.processes import HOST, free_ports
 from robot_io.history import History
+from robot_io.safety.clearance import BLADE
+from tests.support.simulated_control import Simulated
 
 ARM_HEARD = np.array([-1.4, 0.1, -0.5, 0.05, 0.9, 0.2])
 
@@ -92,6 +95,56 @@ def test_a_dry_run_hears_everything_notes_the_ball_and_sends_nothing(tmp_path, m
     assert session.ball.id.size > 100 and session.ticks.tick.size > 50
     (line,) = csv.DictReader(open(tmp_path / "points.csv", encoding="utf-8"))
     assert [float(line[f"ball_{axis}"]) for axis in "xyz"] == [0.1, 0.2, 0.3] and line["joint_1"] == ""
+
+
+def test_keys_move_the_blade_only_once_armed_and_note_where_it_is(tmp_path, monkeypatch):
+    """On the simulated clock, which has all seconds it needs."""
+    simulated, console = Simulated(None, monkeypatch, jog=True), Console(record=True, width=300)
+    bridge, simulation, said = simulated.control.bridge, simulated.simulation, []
+
+    def control():
+        with simulated.control:
+            simulated.control.run()
+
+    class View(commissioning.View):
+        def say(self, text):
+            said.append(text)
+
+    class Pressed(Keys):
+        def pressed(self):
+            """The next key as soon as what the one before asked for has been done."""
+            if not self._keys or not self._keys[0][0]():
+                return None
+            return self._keys.popleft()[1]
+
+    def raised():
+        moved = bridge.gate.geometry.middle(BLADE, bridge.measured) - before
+        return np.abs(moved - [0.0, 0.0, 0.005]).max() < 1e-3 and simulation.now > start + 20.0
+
+    thread = threading.Thread(target=control, daemon=True)
+    monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
+    (tmp_path / "robot.yaml").write_text("{}")
+    before = bridge.gate.geometry.middle(BLADE, bridge.gate.geometry.home)
+    start = simulation.now
+    keys = Pressed(
+        (lambda: simulation.now > start + 1.0, "z"),
+        (lambda: True, "+"),  # before it is armed
+        (lambda: any("arm it first" in text for text in said), "a"),
+        (lambda: bridge.state.value == "ready", "s"),
+        (lambda: True, "+"),
+        (raised, "m"),
+        (lambda: any("noted" in text for text in said), "q"),
+    )
+    monkeypatch.setattr(commissioning, "Keyboard", lambda: keys)
+    monkeypatch.setattr(commissioning, "View", View)
+    thread.start()
+    assert commissioning.jog(tmp_path / "robot.yaml", tmp_path, tmp_path / "points.csv", 60.0, console) == 0
+    thread.join(10.0)
+    assert not thread.is_alive() and not any("nan" in text for text in said)
+    (line,) = csv.DictReader(open(tmp_path / "points.csv", encoding="utf-8"))
+    place = bridge.gate.geometry.middle(BLADE, np.array([float(line[name]) for name in JOINT_NAMES]))
+    np.testing.assert_allclose(place - before, [0.0, 0.0, 0.005], atol=1e-3)
+    assert line["ball_x"] == "" and "no ball" in said[-1]
 
 
 FOUND = robots.fill(

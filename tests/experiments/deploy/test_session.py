@@ -28,7 +28,7 @@ from robot_io.control import process
 from robot_io.control.config import RobotConfig
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.processes import Rig, free_ports
-from robot_io.errors import DeviceError, RefusedError
+from robot_io.errors import DeviceError, JogFirstError, RefusedError
 from robot_io.policy import artefact, export
 from robot_io.policy.policy import Policy
 from tests.support.paths import ROOT
@@ -243,6 +243,30 @@ def test_arming_that_is_refused_after_a_reset_can_be_tried_again(policy, monkeyp
             session.recover(SimpleNamespace(switch_on=lambda: None))
             assert session.status.state == "ready" and session.status.at_home and not session.status.faults
     assert not thread.is_alive()
+
+
+def test_a_robot_that_was_left_where_it_cannot_be_armed_is_jogged(policy, monkeypatch):
+    simulated = Simulated(policy, monkeypatch)
+    arm, jogged = simulated.control.bridge.arm, []
+
+    def arm_there(now):
+        if not jogged:
+            raise JogFirstError("not armed: not from here")
+        arm(now)
+
+    def control():
+        with simulated.control:
+            simulated.control.run()
+
+    thread = threading.Thread(target=control, daemon=True)
+    monkeypatch.setattr(simulated.control.bridge, "arm", arm_there)
+    monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
+    monkeypatch.setattr(play, "SETTLE", 0.0)
+    thread.start()
+    with play.Session(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:
+        until(session, lambda status: not status.missing and not status.present)
+        session.recover(SimpleNamespace(switch_on=lambda: None, jog=lambda: jogged.append(True)))
+        assert len(jogged) == 1 and session.status.state == "ready"
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The arm behind its position correction runs beyond its reference: by gain x lag x way. It stays inside its range."""
+"""The arm behind its position correction: beyond its reference by gain x lag x way at most, and inside its range."""
 
 from __future__ import annotations
 
