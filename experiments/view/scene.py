@@ -11,6 +11,7 @@ import numpy as np
 import viser
 from mjviser import ViserMujocoScene
 
+from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from experiments.view.film import RATE, Film
 from mjx_tt.env.outgoing_ball import FLOOR
 from mjx_tt.robot.model import PADDLE_SITE
@@ -50,6 +51,11 @@ def segments(path: np.ndarray) -> np.ndarray:
     return pieces if len(pieces) else NOWHERE
 
 
+def first_ball(film: Film) -> np.ndarray:
+    """Path (T, 3) of the ball that leaves the bright trail."""
+    return next(iter(film.balls.values()))
+
+
 class Scene:
     """Shows one film per table."""
 
@@ -61,6 +67,10 @@ class Scene:
         self._paddles = sites
         self._robots = ViserMujocoScene(server, self._model, num_envs=1)
         self._robots.camera_tracking_enabled = False
+        # Without a graphics card, shadow maps and reflections take a hundred times as long as all the rest.
+        server.scene.configure_environment_map(None)
+        server.scene.configure_default_lights(cast_shadow=False)
+        server.scene.add_light_hemisphere("/light", ground_color=(225, 225, 220), intensity=3.0)
         server.scene.add_grid(
             "/floor",
             infinite_grid=True,
@@ -84,6 +94,9 @@ class Scene:
         self._marks = add.add_point_cloud("/marks", NOWHERE[0], MARK_COLOUR, point_size=0.012, point_shape="circle")
         self._landing = [
             add.add_cylinder(f"/landing/{i}", 0.06, 0.004, color=LANDING_COLOUR, opacity=0.8) for i in range(count)
+        ]
+        self._shadows = [
+            add.add_cylinder(f"/shadow/{i}", SHOWN_RADIUS, 0.002, color=(20, 25, 40), opacity=0.5) for i in range(count)
         ]
         self._labels = [
             add.add_label(
@@ -133,7 +146,7 @@ class Scene:
         frames = [film.frame(t) for film in self._films]
         for i, (film, frame) in enumerate(zip(self._films, frames, strict=True)):
             self._data.qpos[N_JOINTS * i : N_JOINTS * (i + 1)] = film.qpos[frame]
-            first = next(iter(film.balls.values()))
+            first = first_ball(film)
             behind = [max(0, frame - round(seconds * RATE)) for seconds in (BALL_TRAIL, PADDLE_TRAIL)]
             trails.append(segments(self._at(i, first[behind[0] : frame + 1 : STRIDE])))
             paddles.append(segments(self._paddle_paths[i][behind[1] // STRIDE : frame // STRIDE + 1]))
@@ -150,6 +163,11 @@ class Scene:
                 self._landing[i].visible = bool(np.isfinite(landing).all())
                 if self._landing[i].visible:
                     self._landing[i].position = (self.offset(i) + landing[0], landing[1], 0.004)
+                at = first_ball(film)[frame]
+                over = abs(at[0]) < TABLE_WIDTH / 2 and abs(at[1]) < TABLE_LENGTH / 2 and at[2] > 0.0
+                self._shadows[i].visible = bool(np.isfinite(at).all())
+                if self._shadows[i].visible:
+                    self._shadows[i].position = (self.offset(i) + at[0], at[1], 0.003 if over else FLOOR + 0.003)
                 text = f"{film.title}: {film.outcome}" if film.outcome and t >= film.decided else film.title
                 if self._labels[i].text != text:
                     self._labels[i].text = text

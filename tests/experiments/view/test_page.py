@@ -1,0 +1,272 @@
+"""The page in a real browser: what is drawn, what a hand at the page changes in the simulation, and the other sources.
+
+Drawn by a processor where there is no graphics card, a frame takes a while: everything is waited for.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ballmodel import registry
+from experiments import cli
+from experiments.commands.render import SHIPPED
+from experiments.runs import load_policy
+from experiments.view import show
+from experiments.view.guard import Server
+from experiments.view.programme import Play
+from experiments.view.studio import Studio
+from mjx_tt.env.task import TaskConfig
+from mjx_tt.robot.model import home_qpos, load_model
+from mjx_tt.sim.model import ModelFile, SimModel
+from robot_io import log
+from tests.support.paths import ROOT
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = (
+    "--no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
+    "--disable-background-networking --disable-component-update --disable-sync"
+).split()
+PATIENCE = 60.0  # [s]
+WIDE, NARROW = (900, 560), (430, 760)
+RESTITUTION = "ball.table.restitution"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
+]
+
+
+def until(condition: Callable[[], object], what: str):
+    """Waits for a condition and returns what it gave."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        if found := condition():
+            return found
+        time.sleep(0.1)
+    pytest.fail(f"after {PATIENCE:.0f} s: not yet {what}")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright  # not where the module is skipped
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def open_page(browser):
+    """Opens an address in a fresh profile; closed after the test."""
+    contexts = []
+
+    def opened(address: str, size: tuple[int, int] = WIDE):
+        context = browser.new_context(viewport={"width": size[0], "height": size[1]})
+        contexts.append(context)
+        page = context.new_page()
+        page.goto(address)
+        page.wait_for_selector("canvas", timeout=1000 * PATIENCE)
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+
+
+@pytest.fixture
+def shown():
+    """Serves a programme and returns its viewer and address; stopped after the test."""
+    running = []
+
+    def serve(programme):
+        server = Server("127.0.0.1", 0)
+        viewer = show.viewer(server, programme)
+        running.append((server, viewer, show.in_background(viewer)))
+        return viewer, f"http://127.0.0.1:{server.get_port()}/"
+
+    yield serve
+    for server, viewer, thread in running:
+        viewer.stop()
+        thread.join()
+        server.stop()
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return Studio(TaskConfig(sim_rate=150.0), ModelFile(SimModel()))
+
+
+@pytest.fixture
+def play(studio):
+    policy = load_policy.load(SHIPPED).policy
+    return Play(studio, ["quickstart"], [policy], registry.load("player3/M0"))
+
+
+def picture(page) -> np.ndarray:
+    """What the page shows now, (height, width, 3)."""
+    return np.asarray(Image.open(io.BytesIO(page.screenshot(timeout=1000 * PATIENCE))).convert("RGB"), float)
+
+
+def table_is_seen(image: np.ndarray) -> bool:
+    """True where a good part of the picture is as blue as the table's top."""
+    red, green, blue = np.moveaxis(image, -1, 0)
+    return float(((blue > red + 60) & (blue > green + 20) & (red < 130)).mean()) > 0.02
+
+
+def moving(page) -> None:
+    """Waits until the table is drawn, and something moves in the left part, where no panel is."""
+    until(lambda: table_is_seen(picture(page)), "the table drawn")
+    first = picture(page)
+    width = int(0.5 * first.shape[1])
+    until(lambda: (np.abs(picture(page) - first)[:, :width].max(axis=2) > 60).sum() > 40, "anything that moves")
+
+
+@pytest.mark.parametrize("size", [WIDE, NARROW], ids=["wide", "narrow"])
+def test_the_table_is_drawn_and_the_play_moves(shown, open_page, play, size):
+    viewer, address = shown(play)
+    page = open_page(address, size)
+    moving(page)
+    assert page.get_by_text("Ball 1 of player3/M0").or_(page.get_by_text("of player3/M0")).count() >= 1
+    until(lambda: viewer.number >= 1, "the second ball")
+
+
+def number(page, label: str):
+    """The number beside a slider."""
+    return page.get_by_text(label, exact=True).first.locator("xpath=following::input[not(@type='hidden')][1]")
+
+
+def thumb(page, label: str):
+    """The part of a slider that is moved."""
+    return page.get_by_text(label, exact=True).first.locator("xpath=following::*[@role='slider'][1]")
+
+
+def test_a_slider_moved_in_the_page_changes_what_the_simulation_does(shown, open_page, play):
+    viewer, address = shown(play)
+    page = open_page(address)
+    page.get_by_role("button", name="Pause").click()
+    until(lambda: not viewer.playing, "paused")
+    before = viewer.shown[0].balls["ball"]
+    page.get_by_role("tab", name="Physics").click()
+    box = number(page, "table's restitution")
+    assert float(box.input_value()) == pytest.approx(play.values[RESTITUTION], abs=0.01)
+    thumb(page, "table's restitution").press("Home")
+    until(lambda: play.values[RESTITUTION] == pytest.approx(0.5), "the slider's low end in the simulation")
+    assert float(box.input_value()) == pytest.approx(0.5)
+    until(lambda: viewer.shown[0].balls["ball"] is not before, "a new film")
+    after = viewer.shown[0].balls["ball"]
+    bounce = int(np.argmin(before[: len(before) // 2, 2]))
+    np.testing.assert_allclose(after[: bounce - 8], before[: bounce - 8], atol=1e-5)  # the same flight until then
+    rise = [np.diff(path[:, 2])[bounce + 5 : bounce + 20].mean() for path in (before, after)]
+    assert rise[1] < 0.75 * rise[0]
+    page.get_by_role("button", name="As the model has it").click()
+    until(lambda: play.values == play.studio.nominal(), "all values as before")
+    until(lambda: np.array_equal(viewer.shown[0].balls["ball"], before), "the film as before")
+
+
+def test_steps_balls_and_misses_are_chosen_in_the_page(shown, open_page, play):
+    viewer, address = shown(play)
+    page = open_page(address)
+    page.get_by_role("button", name="Pause").click()
+    until(lambda: not viewer.playing, "paused")
+    t = viewer.t
+    page.get_by_role("button", name="▶", exact=True).click()
+    until(lambda: viewer.t == pytest.approx(t + 1 / 75, abs=1e-6), "one control tick later")
+    shown_before = viewer.number
+    page.get_by_role("button", name="ball ▶").click()
+    until(lambda: viewer.number == shown_before + 1, "the next ball")
+    play.values["latency.ball_observation"] = 0.09
+    page.get_by_role("button", name="Give me the balls that it misses").click()
+    until(lambda: play.missed, "balls that are missed")
+    until(lambda: "Missed ball 1" in page.content(), "the caption")
+    assert not viewer.shown[0].outcome.startswith("returned")
+    box = number(page, "velocity y [m/s]")
+    box.fill("-4.5")
+    box.press("Enter")
+    until(lambda: play.balls is None and play.ball[4] == pytest.approx(-4.5), "one ball, thrown by hand")
+    until(lambda: "One ball, again and again" in page.content(), "its caption")
+
+
+def test_a_session_of_the_robot_is_replayed(shown, open_page, tmp_path):
+    start, home = 50.0, home_qpos(load_model())
+    path = tmp_path / "session.mcap"
+    with log.FileRecorder.start(tmp_path, "session", {}, {}, start, 0) as recorder:
+        recorder.put(log.episode_start(start + 0.2, 1))
+        for k in range(120):
+            now = start + k / 75
+            flown = np.array([0.2, 1.2 - 4.0 * k / 75, 0.3 + 1.0 * k / 75 - 4.905 * (k / 75) ** 2])
+            if flown[2] > 0.02:
+                recorder.put(log.Ball(now, now, flown, 1))
+            joints = home + np.eye(8)[2] * 0.2 * np.sin(2 * np.pi * k / 75)
+            recorder.put(log.Joints(now, joints, np.zeros(8), now))
+            recorder.put(log.Command(k, now, np.zeros(8), np.full(8, 0.1), joints))
+        recorder.put(log.Event(start + 0.7, log.Level.ERROR, "fault", "tracker: silent"))
+        recorder.put(log.episode_end(start + 1.2, 1, "missed", {"hit": 0.0}))
+    programme = show.recorded(path, None)
+    film = programme.films(0)[0]
+    np.testing.assert_allclose(film.qpos[:, 2], home[2] + 0.2 * np.sin(2 * np.pi * film.time), atol=1e-3)
+    measured, simulated = film.balls["measured"], film.balls["simulated"]
+    flying = np.isfinite(measured[:, 0]) & np.isfinite(simulated[:, 0])
+    np.testing.assert_allclose(measured[flying, 1], 1.2 - 4.0 * film.time[flying], atol=1e-3)
+    assert np.abs(measured - simulated)[flying].max() < 0.1  # the logged ball knows no air
+    viewer, address = shown(programme)
+    page = open_page(address)
+    moving(page)
+    assert page.get_by_text("session.mcap, episode 1 of 1").count() == 1
+    until(lambda: "FAULT: tracker: silent" in page.content(), "the fault")
+    assert page.get_by_role("tab", name="Physics").count() == 0
+
+
+TRAINING = """
+name: tiny
+balls: player5/M0
+task: {max_steps: 60, sim_rate: 75.0}
+optimiser: {num_directions: 2, repeats: 2}
+training: {updates: 100000, pool: 64, evaluate_every: 100000, evaluate_episodes: 8, devices: 1, checkpoint_seconds: 1}
+evaluation: {episodes: 8, reachable_balls: null}
+"""
+
+
+def test_a_training_is_followed_while_it_goes_on(shown, open_page, tmp_path, studio):
+    (tmp_path / "tiny.yaml").write_text(TRAINING)
+    command = [sys.executable, "-m", "experiments.cli", "train", str(tmp_path / "tiny.yaml"), "--out", str(tmp_path)]
+    training = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        folder = tmp_path / "tiny"
+        until(lambda: any((folder / "checkpoints").glob("*.npz")), "a checkpoint")
+        trained = load_policy.load(folder)
+        play = Play(studio, [show.title(trained)], [trained.policy], registry.load("player5/M0"))
+        viewer, address = shown(play)
+        show.Followed(folder, viewer, play)
+        page = open_page(address)
+        moving(page)
+        first = viewer.shown[0]
+        until(lambda: viewer.shown[0].title != first.title, "a newer checkpoint")
+        assert viewer.shown[0].title.startswith("tiny, update ")
+        assert not np.array_equal(play.policies[0].theta, trained.policy.theta)
+    finally:
+        training.terminate()
+        training.wait()
+
+
+def test_an_exported_page_plays_without_a_server(open_page, browser, tmp_path, play, capsys):
+    path = tmp_path / "page.html"
+    assert cli.main(["view", "--export", str(path), "--entries", "1"]) == 0
+    assert path.stat().st_size < 2_000_000
+    context = browser.new_context(viewport={"width": 700, "height": 500}, offline=True)
+    page, asked = context.new_page(), []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(path.as_uri())
+    page.wait_for_selector("canvas", timeout=1000 * PATIENCE)
+    moving(page)
+    assert not [url for url in asked if not url.startswith(("file:", "blob:", "data:"))]
+    context.close()
