@@ -25,7 +25,7 @@ FITTED = 0.2  # [s] of a measured flight from which its start is fitted; the res
 BEFORE, AFTER = 0.2, 0.6  # [s] shown around an episode
 GAP = 0.1  # [s] without a sample over which no ball is drawn
 MOST = 40  # flights of a diagnosis
-TOLD = ("state", "operator", "rally")  # events besides warnings and faults
+TOLD = ("state", "operator")  # events besides warnings and faults
 VERDICT, EXTENDED = "verdict.json", "extended.yaml"
 
 

@@ -15,7 +15,7 @@ from viser.uplot import Series as Line
 
 from experiments.view.film import Film, Series
 from experiments.view.programme import Programme
-from experiments.view.scene import Scene
+from experiments.view.scene import COLOURS, Scene
 
 FRAME = 1.0 / 60.0  # [s]
 REST = 0.6  # [s] on the last frame before the next ball
@@ -193,7 +193,11 @@ class Viewer:
         self._plotted = 0.0
 
     def _add_plot(self, heading: str, curves: Series) -> viser.GuiUplotHandle:
-        lines = (Line(label=name, stroke=LINES[i % len(LINES)], width=1.5) for i, name in enumerate(curves.names))
+        strokes = [
+            "#{:02x}{:02x}{:02x}".format(*COLOURS[name]) if name in COLOURS else LINES[i % len(LINES)]
+            for i, name in enumerate(curves.names)
+        ]
+        lines = (Line(label=name, stroke=s, width=1.5) for name, s in zip(curves.names, strokes, strict=True))
         return self.server.gui.add_uplot(_until(curves, 0.0), (Line(label="s"), *lines), title=heading, height=210)
 
     def _plot(self) -> None:

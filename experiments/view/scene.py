@@ -91,7 +91,7 @@ class Scene:
             name: add.add_line_segments(f"/way/{name}", NOWHERE, colour, thickness=0.004)
             for name, colour in COLOURS.items()
         }
-        self._marks = add.add_point_cloud("/marks", NOWHERE[0], MARK_COLOUR, point_size=0.012, point_shape="circle")
+        self._marks = add.add_point_cloud("/marks", NOWHERE[0], MARK_COLOUR, point_size=0.007, point_shape="circle")
         self._landing = [
             add.add_cylinder(f"/landing/{i}", 0.06, 0.004, color=LANDING_COLOUR, opacity=0.8) for i in range(count)
         ]

@@ -1,4 +1,4 @@
-"""The page in a real browser: what is drawn, what a hand at the page changes in the simulation, and the other sources.
+"""The page in a real browser: pictures that move, hands at the page that change the simulation, and the other sources.
 
 Drawn by a processor where there is no graphics card, a frame takes a while: everything is waited for.
 """
@@ -113,7 +113,7 @@ def play(studio):
 
 
 def picture(page) -> np.ndarray:
-    """What the page shows now, (height, width, 3)."""
+    """Screenshot of the page, (height, width, 3)."""
     return np.asarray(Image.open(io.BytesIO(page.screenshot(timeout=1000 * PATIENCE))).convert("RGB"), float)
 
 
