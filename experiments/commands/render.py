@@ -3,6 +3,7 @@ curves in one picture."""
 
 from __future__ import annotations
 
+import contextlib
 import re
 import secrets
 from importlib.util import find_spec
@@ -167,7 +168,9 @@ def view(
     gate = None if local else guard.Gate(host, port, token := token or secrets.token_urlsafe(16), server.get_port())
     address = f"http://{host}:{server.get_port() if gate is None else gate.port}/"
     screen.print(f"{address}{'' if gate is None else f'?token={token}'}  (Ctrl+C ends it)", highlight=False)
-    viewer.run()
+    with contextlib.suppress(KeyboardInterrupt):  # the way in which a page ends
+        viewer.run()
+    server.stop()
 
 
 def is_session(path: Path) -> bool:

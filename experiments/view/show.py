@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -104,10 +103,3 @@ def export(server: Server, programme: Programme, entries: int, path: Path) -> in
     page = recording.as_html()
     path.write_text(page, encoding="utf-8")
     return len(page.encode())
-
-
-def in_background(viewer: Viewer) -> threading.Thread:
-    """Plays in a thread of its own until ``viewer.stop``."""
-    thread = threading.Thread(target=viewer.run, daemon=True)
-    thread.start()
-    return thread

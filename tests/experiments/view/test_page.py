@@ -9,12 +9,14 @@ import io
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 from PIL import Image
+from viser.transforms import SO3
 
 from ballmodel import registry
 from experiments import cli
@@ -91,7 +93,8 @@ def shown():
     def serve(programme):
         server = Server("127.0.0.1", 0)
         viewer = show.viewer(server, programme)
-        running.append((server, viewer, show.in_background(viewer)))
+        running.append((server, viewer, threading.Thread(target=viewer.run, daemon=True)))
+        running[-1][2].start()
         return viewer, f"http://127.0.0.1:{server.get_port()}/"
 
     yield serve
@@ -194,6 +197,38 @@ def test_steps_balls_and_misses_are_chosen_in_the_page(shown, open_page, play):
     box.press("Enter")
     until(lambda: play.balls is None and play.ball[4] == pytest.approx(-4.5), "one ball, thrown by hand")
     until(lambda: "One ball, again and again" in page.content(), "its caption")
+    page.get_by_label("balls").or_(page.locator("input[value='one ball']")).first.click()
+    page.get_by_role("option", name="narrow", exact=True).click()
+    until(lambda: play.balls == "narrow" and "Ball 1 of narrow" in page.content(), "another distribution")
+
+
+def pixel(client, point: np.ndarray) -> np.ndarray:
+    """Place of a point [m] in the picture."""
+    camera = client.camera
+    x, y, z = SO3(camera.wxyz).as_matrix().T @ (point - camera.position)
+    focal = 0.5 * camera.image_height / np.tan(0.5 * camera.fov)
+    return np.array([0.5 * camera.image_width + focal * x / z, 0.5 * camera.image_height + focal * y / z])
+
+
+def test_the_start_of_the_ball_is_dragged(shown, open_page, play):
+    viewer, address = shown(play)
+    page = open_page(address)
+    page.get_by_role("button", name="Pause").click()
+    until(lambda: not viewer.playing, "paused")
+    until(lambda: table_is_seen(picture(page)), "the table drawn")
+    start = play.state(viewer.number).copy()
+    (client,) = viewer.server.get_clients().values()
+    along = np.array([viewer.controls.gizmo.scale, 0.0, 0.0])  # the arrow of x
+    held, target = pixel(client, start[:3] + 0.7 * along), pixel(client, start[:3] - 0.7 * along)
+    page.mouse.move(*held)
+    page.mouse.down()
+    page.mouse.move(*(0.5 * (held + target)), steps=4)
+    page.mouse.move(*target, steps=4)
+    page.mouse.up()
+    until(lambda: play.balls is None, "one ball, thrown from elsewhere")
+    until(lambda: abs(play.ball[0] - start[0] + 1.4 * along[0]) < 0.05, "its new start")
+    np.testing.assert_allclose(play.ball[1:], start[1:], atol=1e-3)
+    until(lambda: abs(viewer.shown[0].balls["ball"][0, 0] - play.ball[0]) < 1e-4, "its film")
 
 
 def test_a_session_of_the_robot_is_replayed(shown, open_page, tmp_path):
