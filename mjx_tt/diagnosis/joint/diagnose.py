@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from mjx_tt.diagnosis.joint import cross_validation, selection
+from mjx_tt.diagnosis.joint.coupling import coupling
 from mjx_tt.diagnosis.joint.effects import EFFECTS, NAMES, members
 from mjx_tt.diagnosis.joint.encoder_home import offset_at
 from mjx_tt.diagnosis.joint.experiment_design import separating, unseen
@@ -44,14 +45,26 @@ def diagnose_joints(
     home = home or {}
     _check([record.joint for record in records], nominal, without, home)
     streams = np.random.default_rng(seed).spawn(len(records))
-    found = []
-    for i, (record, rng) in enumerate(zip(records, streams, strict=True)):
+    found: dict[str, JointFindings] = {}
+    beside = coupling(records, nominal) if any(n.servo for n in nominal.values()) else {}
+
+    def diagnose(record: JointRecord, rng: np.random.Generator) -> None:
         joint = record.joint
         gone = {effect for at, _, effect in (name.rpartition(".") for name in without) if at in ("", joint)}
-        found.append(_of_joint(JointLog(record, nominal[joint]), gone, home.get(joint), rng))
+        found[joint] = _of_joint(JointLog(record, nominal[joint], beside.get(joint)), gone, home.get(joint), rng)
+
+    for i, (record, rng) in enumerate(zip(records, streams, strict=True)):
+        diagnose(record, rng)
         if progress is not None:
-            progress(joint, i + 1, len(records))
-    return merge(found)
+            progress(record.joint, i + 1, len(records))
+    responses = merge(tuple(found.values())).responses
+    if beside and any(part.causes for part in found.values()):
+        # What was named moves the servos otherwise: once more with the robot that has it.
+        beside = coupling(records, {**nominal, **responses})
+        for record, rng in zip(records, streams, strict=True):
+            if found[record.joint].causes or found[record.joint].unexplained:
+                diagnose(record, rng)
+    return merge(tuple(found.values()))
 
 
 def _check(joints: Sequence[str], nominal: Mapping, without: Sequence[str], home: Mapping) -> None:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjx_tt.diagnosis.description import Description
-from mjx_tt.diagnosis.joint.forward_model import JointResponse
 from mjx_tt.diagnosis.joint.log import JointLog
+from mjx_tt.sim.actuators import JointDrive
 
 SMALLEST_DELAY = 2e-3  # [s] below which neither a delay nor a lag is named
 
@@ -161,7 +161,7 @@ JOINT_OFFSET = Description(  # found by encoder_home
     reading="hold {joint} still at its home position before it moves",
 )
 DESCRIPTIONS: dict[str, Description] = {e.name: e for e in (*EFFECTS, OBSERVATION_DELAY, JOINT_OFFSET)}
-NAMES = tuple(field.name for field in dataclasses.fields(JointResponse))
+NAMES = tuple(field.name for field in dataclasses.fields(JointDrive))
 
 
 def members(effect: str) -> tuple[str, ...]:

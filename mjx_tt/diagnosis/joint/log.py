@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mjx_tt.diagnosis.joint.forward_model import JointResponse
+from mjx_tt.diagnosis.joint.forward_model import JointResponse, Motion
 from robot_io.contract import JOINT_NAMES, JOINT_UNITS, LIMITS
 
 WINDOW = 2.0  # [s] of a free offset and of one cluster of the errors, a tenth of a log of less than 20 s
@@ -183,8 +183,8 @@ class JointLog:
     starts, window: first samples of the windows (k,) and each sample's window (n,).
     """
 
-    def __init__(self, record: JointRecord, nominal: JointResponse):
-        self.record, self.nominal = record, nominal
+    def __init__(self, record: JointRecord, nominal: JointResponse, beside: Motion | None = None):
+        self.record, self.nominal, self.beside = record, nominal, beside
         self.base = {f.name: getattr(nominal, f.name) for f in dataclasses.fields(nominal)}
         self.base["action_delay"] += self.base.pop("observation_delay")
         del self.base["joint_offset"]
@@ -217,7 +217,7 @@ class JointLog:
     def simulate(self, values: Mapping[str, float], time: np.ndarray | None = None) -> np.ndarray:
         """Positions of a joint with these parameters, at ``time`` or at the samples."""
         time = self.time if time is None else time
-        return self.response(values).simulate(self.command_time, self.command_velocity, time)
+        return self.response(values).simulate(self.command_time, self.command_velocity, time, beside=self.beside)
 
     def centred(self, x: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
         """x (n, ...) less its mean in each window."""

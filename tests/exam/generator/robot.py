@@ -1,14 +1,18 @@
 """Eight joints that follow velocity commands, in fine steps: the reference for the robot-side cases.
 
 Order of one joint's response: hold and action delay, deadband, Coulomb friction, gain, velocity limit, first-order lag,
-acceleration limit, integration, backlash, observation delay, offset.
+acceleration limit, the robot's own servos and masses (MuJoCo C plays the published scene), backlash, observation delay,
+offset.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
+
+from tests.support.paths import SCENE
 
 JOINTS = ("gantry_x", "gantry_y", "joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6")
 PEAK = (1.4, 1.0, 2.5, 2.0, 2.5, 4.0, 5.0, 6.0)  # [m/s], [rad/s] of a stroke
@@ -68,8 +72,13 @@ def commands(rng: np.random.Generator, seconds: float, level: float = 1.0, gentl
 
 
 def respond(joint: Joint, time: np.ndarray, velocity: np.ndarray, query: np.ndarray) -> np.ndarray:
-    """Measured positions, without noise, at times ``query``, from rest at 0."""
+    """Measured positions, without noise, at times ``query``, from rest at 0, of a joint whose servo is ideal."""
     grid = np.arange(0.0, max(time[-1], query[-1]) + STEP, STEP)
+    return read(joint, grid, drive(joint, time, velocity, grid), query)
+
+
+def drive(joint: Joint, time: np.ndarray, velocity: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Integral of the velocity that the drive asks of the servo, on a grid of STEP."""
     # The command in the middle of each step: that at its start would be half a step late, which a diagnosis sees.
     index = np.searchsorted(time, grid + STEP / 2 - joint.action_delay, side="right") - 1
     u = np.where(index >= 0, velocity[np.maximum(index, 0)], 0.0)
@@ -79,10 +88,30 @@ def respond(joint: Joint, time: np.ndarray, velocity: np.ndarray, query: np.ndar
     if joint.lag > 0.0 or np.isfinite(joint.acceleration_limit):
         after = _follow(u, joint.lag, joint.acceleration_limit)
         u = (np.concatenate([[0.0], after[:-1]]) + after) / 2
-    q = np.concatenate([[0.0], np.cumsum(u[:-1]) * STEP])
+    return np.concatenate([[0.0], np.cumsum(u[:-1]) * STEP])
+
+
+def read(joint: Joint, grid: np.ndarray, q: np.ndarray, query: np.ndarray) -> np.ndarray:
+    """What is measured of a joint that is driven along q."""
     if joint.backlash > 0.0:
         q = _play(q, joint.backlash)
     return np.interp(query - joint.observation_delay, grid, q) + joint.joint_offset
+
+
+def play(driven: np.ndarray, grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times and positions (8, n), home at first, of MuJoCo's robot whose servos are asked for these ways."""
+    model = mujoco.MjModel.from_xml_path(str(SCENE))
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
+    step = model.opt.timestep
+    time = np.arange(0.0, grid[-1], step)
+    asked = np.diff(np.stack([np.interp(time, grid, q) for q in driven]), axis=1) / step
+    moved = np.repeat(data.qpos[:8, None], time.size, axis=1)
+    for k, velocity in enumerate(asked.T, start=1):
+        data.ctrl[:8] = velocity
+        mujoco.mj_step(model, data)
+        moved[:, k] = data.qpos[:8]
+    return time, moved
 
 
 def _follow(u, lag, limit):
@@ -102,14 +131,19 @@ def _play(q, width):
     return np.array(out)
 
 
-def logs(joints: dict[str, Joint], rng: np.random.Generator, seconds=60.0, level=1.0, gentle=False):
-    """Rows of command.csv (t, joint, velocity) and state.csv (t, joint, position)."""
+def logs(joints: dict[str, Joint], rng: np.random.Generator, seconds=60.0, level=1.0, gentle=False, rest=0.0):
+    """Rows of command.csv (t, joint, velocity) and state.csv (t, joint, position); ``rest`` seconds of it at home."""
     time, velocity = commands(rng, seconds, level, gentle)
+    velocity[:, time < rest] = 0.0
     command = [(t, name, v) for j, name in enumerate(JOINTS) for t, v in zip(time, velocity[j], strict=True)]
     state = []
+    grid = np.arange(0.0, seconds + STEP, STEP)
+    moment, moved = play(
+        np.stack([drive(joints[name], time, velocity[j], grid) for j, name in enumerate(JOINTS)]), grid
+    )
     for j, name in enumerate(JOINTS):
         rate = GANTRY_RATE if name.startswith("gantry") else ARM_RATE
         query = np.arange(int(seconds * rate)) / rate + rng.uniform(0.0, 1.0 / rate)
-        position = respond(joints[name], time, velocity[j], query) + rng.normal(0.0, ENCODER, query.size)
+        position = read(joints[name], moment, moved[j], query) + rng.normal(0.0, ENCODER, query.size)
         state += [(t, name, q) for t, q in zip(query, position, strict=True)]
     return sorted(command), sorted(state)

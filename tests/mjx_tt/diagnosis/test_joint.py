@@ -15,6 +15,8 @@ DT = 2e-4
 NOMINAL = JointResponse(action_delay=0.071, observation_delay=0.029)
 IDEAL = {
     "delay": 0.1,
+    "servo": 0.0,
+    "servo_gain": 1.0,
     "lag": 0.0,
     "velocity_gain": 1.0,
     "velocity_limit": 1e9,
@@ -46,7 +48,7 @@ def euler(times, commands, queries, truths, extra=None):
     u = np.where(np.abs(u) > p["coulomb_friction"], u - p["coulomb_friction"] * np.sign(u), 0.0) * p["velocity_gain"]
     u = np.clip(u, -p["velocity_limit"], p["velocity_limit"])
     v, q, out = np.zeros(n), np.zeros(n), np.zeros(n)
-    path = np.empty((steps, n))
+    path, followed, chase = np.empty((steps, n)), np.zeros(n), -np.expm1(-DT / np.maximum(p["servo"], 1e-9))
     instant = (p["lag"] == 0.0) & (p["acceleration_limit"] > 1e6)
     rate, most, half = -np.expm1(-DT / np.maximum(p["lag"], 1e-6)) / DT, p["acceleration_limit"], p["backlash"] / 2
     for k in range(steps):
@@ -56,9 +58,11 @@ def euler(times, commands, queries, truths, extra=None):
         np.maximum(a, -most, out=a)
         q = q + np.where(instant, u[k], v + 0.5 * a * DT) * DT
         v = v + a * DT
+        followed = followed + (q - followed) * chase
         if extra is not None:
             q = q + extra(k * DT, v, q, u[k], a) * DT
-        out = np.minimum(np.maximum(out, q - half), q + half)
+        led = np.where(chase < 1.0, p["servo_gain"] * followed, q)
+        out = np.minimum(np.maximum(out, led - half), led + half)
     return [np.interp(queries[i], grid, path[:, i]) + p["joint_offset"][i] for i in range(n)]
 
 
@@ -102,7 +106,7 @@ def measure(rng, clean, noise, size):
     return clean + e
 
 
-EFFECTS = tuple(name for name in IDEAL if name != "joint_offset")
+EFFECTS = tuple(name for name in IDEAL if name not in ("joint_offset", "servo", "servo_gain"))
 KINDS = ("steps", "sines", "chirp", "strokes")
 NOISES = ("white", "ar1", "outliers", "quantised")
 
@@ -156,9 +160,13 @@ def test_simulation_matches_fine_steps():
         {"lag": 0.05, "backlash": 0.02, "coulomb_friction": 0.1},
         {"acceleration_limit": 8.0, "backlash": 0.02, "velocity_gain": 0.9, "joint_offset": 0.1},
         {"lag": 0.03, "acceleration_limit": 10.0, "backlash": 0.02, "deadband": 0.2, "velocity_limit": 1.0},
+        {"servo": 0.02, "servo_gain": 0.97},
+        {"servo": 0.02, "lag": 0.02},
+        {"servo": 0.008, "lag": 0.05, "acceleration_limit": 8.0, "backlash": 0.02},
+        {"servo": 0.02, "acceleration_limit": 8.0, "backlash": 0.02},
     ]
     rng = np.random.default_rng(0)
-    times, commands = zip(*(command(rng, 8.0, KINDS[i], 2.0) for i in range(4)), strict=True)
+    times, commands = zip(*(command(rng, 8.0, KINDS[i % 4], 2.0) for i in range(len(truths))), strict=True)
     queries = [np.sort(rng.uniform(0.0, 8.0, 500)) for _ in truths]
     for t, u, q, truth, path in zip(
         times, commands, queries, truths, euler(times, commands, queries, truths), strict=True

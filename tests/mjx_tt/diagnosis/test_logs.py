@@ -208,21 +208,17 @@ def test_an_unknown_effect_cannot_be_left_out(tmp_path):
 
 
 def test_a_wrong_zero_of_an_encoder_is_named_where_the_pose_at_rest_is_given(tmp_path):
-    """The examiner's joints start at 0; two seconds at rest stand before their strokes."""
-    joints = {name: joints_of.nominal(name) for name in ("joint_1", "joint_2")}
+    """Two seconds at home stand before the examiner's strokes."""
+    joints = {name: joints_of.nominal(name) for name in joints_of.JOINTS}
     joints["joint_2"] = replace(joints["joint_2"], joint_offset=0.012)
-    rng = np.random.default_rng(3)
-    time, velocity = joints_of.commands(rng, 20.0)
-    command, state = ["t,joint,velocity"], ["t,joint,position"]
-    for name, joint in joints.items():
-        row = np.where(time < 2.0, 0.0, velocity[joints_of.JOINTS.index(name)])
-        seen = np.arange(5000) / joints_of.ARM_RATE
-        at = joints_of.respond(joint, time, row, seen) + rng.normal(0.0, joints_of.ENCODER, seen.size)
-        command += [f"{t},{name},{v}" for t, v in zip(time, row, strict=True)]
-        state += [f"{t},{name},{q}" for t, q in zip(seen, at, strict=True)]
+    rows = joints_of.logs(joints, np.random.default_rng(3), 20.0, rest=2.0)
+    command, state = (
+        [",".join(header), *(f"{t},{name},{x}" for t, name, x in part)]
+        for header, part in zip((("t", "joint", "velocity"), ("t", "joint", "position")), rows, strict=True)
+    )
     (tmp_path / "command.csv").write_text("\n".join(command))
     (tmp_path / "state.csv").write_text("\n".join(state))
-    request = diagnose.Request([str(tmp_path)], tmp_path / "out", home="joint_1=0,joint_2=0")
+    request = diagnose.Request([str(tmp_path)], tmp_path / "out", home="home")
     (cause,) = diagnose.diagnose(request, Console(quiet=True)).verdict.causes
     estimate = cause.parameters["joint_2.joint_offset"]
     assert cause.name == "joint_2.joint_offset" and estimate.low <= 0.012 <= estimate.high
