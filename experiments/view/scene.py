@@ -100,11 +100,15 @@ class Scene:
         ]
         self._labels = [
             add.add_label(
-                f"/label/{i}", "", position=(self.offset(i), -1.0, 1.0), anchor="bottom-center", font_screen_scale=1.2
+                f"/label/{i}",
+                "",
+                position=(self.offset(i), -1.0, 1.0 + 0.35 * (i % 2)),
+                anchor="bottom-center",
+                font_screen_scale=1.2,
             )
             for i in range(count)
         ]
-        middle, further = self.offset(count - 1) / 2, 1.9 * (count - 1)
+        middle, further = self.offset(count - 1) / 2, (1.9 if count < 3 else 2.3) * (count - 1)
         camera = server.initial_camera
         camera.look_at = (middle, -0.75, 0.05)
         camera.position = (middle + (1.2 if count == 1 else 0.0), 2.75 + further, 1.35 + 0.4 * further)
@@ -112,13 +116,13 @@ class Scene:
         server.on_client_connect(self._step_back)
 
     def _step_back(self, client: viser.ClientHandle) -> None:
-        """Moves the camera of a narrow page away, until the tables' width fits, and its panel out of the way."""
-        further = 1.15 * (1.0 + 0.6 * (self.count > 1)) / max(client.camera.aspect, 0.1)
-        if further > 1.0:
+        """Moves the camera of a narrow page away, until the tables fit above the panel, which stands at the bottom."""
+        further = 1.3 / max(client.camera.aspect, 0.1)
+        if further > 1.3:
             start = self.server.initial_camera
             at = np.asarray(start.look_at)
             client.camera.position = at + (np.asarray(start.position) - at) * further
-            client.gui.main_panel.minimize()
+            client.camera.look_at = at - np.array([0.0, 0.0, 0.75 * further])
 
     @staticmethod
     def offset(table: int) -> float:

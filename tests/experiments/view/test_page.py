@@ -123,7 +123,7 @@ def picture(page) -> np.ndarray:
 def table_is_seen(image: np.ndarray) -> bool:
     """True where a good part of the picture is as blue as the table's top."""
     red, green, blue = np.moveaxis(image, -1, 0)
-    return float(((blue > red + 60) & (blue > green + 20) & (red < 130)).mean()) > 0.02
+    return float(((blue > red + 60) & (blue > green + 20) & (red < 130)).mean()) > 0.008
 
 
 def moving(page) -> None:
