@@ -108,7 +108,7 @@ class Scene:
             )
             for i in range(count)
         ]
-        middle, further = self.offset(count - 1) / 2, (1.9 if count < 3 else 2.3) * (count - 1)
+        middle, further = self.offset(count - 1) / 2, 2.4 * (count - 1)
         camera = server.initial_camera
         camera.look_at = (middle, -0.75, 0.05)
         camera.position = (middle + (1.2 if count == 1 else 0.0), 2.75 + further, 1.35 + 0.4 * further)
