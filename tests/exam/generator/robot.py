@@ -92,7 +92,7 @@ def drive(joint: Joint, time: np.ndarray, velocity: np.ndarray, grid: np.ndarray
 
 
 def read(joint: Joint, grid: np.ndarray, q: np.ndarray, query: np.ndarray) -> np.ndarray:
-    """What is measured of a joint that is driven along q."""
+    """Measured positions of a joint that is driven along q."""
     if joint.backlash > 0.0:
         q = _play(q, joint.backlash)
     return np.interp(query - joint.observation_delay, grid, q) + joint.joint_offset
