@@ -15,6 +15,7 @@ import jsonschema
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.signal import lfilter
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt import diagnosis as gap
@@ -83,18 +84,21 @@ def joints() -> gap.Diagnosis:
     """Two joints, one of which answers 60 ms late on top of what is known."""
     rng = np.random.default_rng(4)
     records = []
-    for name, delay, lag in (("gantry_x", 0.0645, 0.033), ("joint_2", 0.071 + 0.06, 0.029)):
+    for name, delay, lag, servo in (("gantry_x", 0.0645, 0.033, 0.02), ("joint_2", 0.071 + 0.06, 0.029, 0.008)):
         time = np.arange(0.0, 20.0, 0.1)
         velocity = rng.uniform(-0.6, 0.6, time.size) * (rng.random(time.size) < 0.6)
         state = np.arange(0.0, 20.0, 0.01)
-        # A delayed, held command integrated on a fine grid.
-        fine = np.arange(-0.3, 20.0, 1e-3)
+        # A delayed, held command integrated on a fine grid and followed by a servo, whose numbers robot.xml tells.
+        step = 1e-4
+        fine = np.arange(-0.3, 20.0, step)
         held = np.where(
             fine - delay - lag >= 0.0,
             velocity[np.clip(((fine - delay - lag) / 0.1).astype(int), 0, time.size - 1)],
             0.0,
         )
-        position = np.interp(state, fine + 1e-3, np.cumsum(held) * 1e-3) + rng.normal(0.0, 1e-4, state.size)
+        share = -np.expm1(-step / servo)
+        followed = lfilter([0.9952 * share], [1.0, share - 1.0], np.cumsum(held) * step)
+        position = np.interp(state, fine + step, followed) + rng.normal(0.0, 1e-4, state.size)
         records.append(JointRecord(name, time, velocity, state, position))
     return gap.diagnose(Logs((), tuple(records), {"command.csv": "12" * 32, "state.csv": "34" * 32}))
 
