@@ -295,7 +295,7 @@ def _watch(
                     console.print(f"ball {len(played.episodes)}: {message.summary.outcome}", highlight=False)
             elif isinstance(message, RallyOver):
                 played.rallies.append(message.summary)
-                if not console.is_terminal:
+                if not console.is_terminal and balls is None:  # who counts balls may have a launcher
                     rally = message.summary
                     touches = f"{rally.length} touch{'es' * (rally.length != 1)}"
                     console.print(f"rally {rally.number}: {touches}: {rally.text}", highlight=False)
