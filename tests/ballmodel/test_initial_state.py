@@ -152,6 +152,7 @@ def test_refuses_what_cannot_be_fitted():
         fit_gauss_newton([], FlightParams())
 
 
+@pytest.mark.slow
 def test_trajectories_of_a_distribution_give_its_numbers_back():
     """Balls drawn from a box, measured with noise up to their bounce, fitted: the box returns from inside."""
     target = registry.load("medium")

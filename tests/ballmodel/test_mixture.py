@@ -39,6 +39,7 @@ def test_a_mixture_has_the_moments_of_what_made_it_and_reads_back(tmp_path):
     np.testing.assert_allclose(again.covariances, mixture.covariances, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_pool_holds_valid_balls_spin_as_the_mixture_has_it():
     """Against draws by NumPy, of which the full simulation keeps what it keeps."""
     mixture, _ = fit_mixture(strokes(900))

@@ -470,7 +470,7 @@ FIXED = [
         marks=SLOW,
     ),
     pytest.param(Case("human_none", (), 0.0, "ar1", 31, count=200), ("right",), marks=[SLOW, PEOPLE]),
-    pytest.param(Case("human_single", ("table_height",), 10.0, "iid", 32, count=100), ("right",), marks=PEOPLE),
+    pytest.param(Case("human_single", ("table_height",), 10.0, "iid", 32, count=100), ("right",), marks=[SLOW, PEOPLE]),
     pytest.param(Case("human_single", ("wind_z",), 20.0, "range", 33, count=200), ("right",), marks=[SLOW, PEOPLE]),
     pytest.param(
         Case("human_pair", ("drag_coefficient", "table_tilt_x"), 20.0, "ar1", 34, count=200),

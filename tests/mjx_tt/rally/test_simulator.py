@@ -194,6 +194,7 @@ def test_balls_out_of_distribution(simulator):
     assert set(first.end[(first.outcome != RETURNED) & ~first.fault]) == {End.FIRST_OUT_OF_DISTRIBUTION}
 
 
+@pytest.mark.slow
 def test_a_robot_that_hits_itself_faults_and_gets_a_dummy_ball(simulator):
     # Every action saturated: whatever the ball does, the arm runs into something or is stopped by its limits.
     theta = np.asarray(jax.random.normal(jax.random.key(1), (n_parameters(), LANES))) * 5.0
