@@ -194,7 +194,8 @@ class Answer:
 
 def fresh(shape: tuple[int, ...] = ()) -> PlayerState:
     """Rested players who have never met this robot and expect balls to the middle of their half."""
-    expected = jnp.stack([jnp.full(shape, value) for value in (0.0, 0.7, 3.5)])
+    # Not of a weak type, which an answer's result has not: everything would be compiled a second time, in mid-play.
+    expected = jnp.stack([jnp.zeros(shape) + value for value in (0.0, 0.7, 3.5)])
     return PlayerState(jnp.zeros(shape), jnp.zeros(shape), expected)
 
 

@@ -35,3 +35,17 @@ def test_it_plays_as_in_the_simulator_and_travels_by_name():
     tired = float(player._state.tiredness)
     player.rest()
     assert 0.0 < float(player._state.tiredness) < tired
+
+
+def test_nothing_is_compiled_in_mid_play(caplog):
+    player = VirtualPlayer("player3")
+    player.prepare()
+    ball = Stroke(np.array([0.1, 1.6, 0.25]), np.array([0.1, 3.0, -1.0]), np.zeros(3))
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        for _ in range(2):
+            player.serve()
+            for _ in range(2):
+                player.wish()
+                player.answer(ball, np.array([0.2, 0.8]), 0.4)
+            player.rest()
+    assert not [record.message for record in caplog.records if "Compiling" in record.message]
