@@ -24,7 +24,7 @@ from robot_io.emulator.axis_server import serve
 from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
-from robot_io.emulator.shared_state import Shared
+from robot_io.emulator.shared_state import Motion, Shared
 from robot_io.emulator.tracker import TrackerEmulator
 from robot_io.emulator.world import World
 from robot_io.errors import DeviceError
@@ -223,11 +223,8 @@ def _world(
 
     publish(time.monotonic())
     pipe.send("ready")
-    last = time.monotonic()
-    for _ in _paced(shared, pipe, WORLD_STEP):
-        now = time.monotonic()
-        world.advance(shared["setpoint"].copy(), min(now - last, 0.05))
-        last = now
+    for now in _paced(shared, pipe, WORLD_STEP):
+        world.advance(shared["setpoint"].copy(), WORLD_STEP)
         if shared.value("jog"):
             world.jog()
             shared["jog"][0] = 0.0
@@ -244,16 +241,15 @@ def _arm(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> N
         wire.bind((HOST, 0))
         wire.setblocking(False)
         pipe.send("ready")
-        rows, connected = list(ABB_JOINTS), True
-        for _ in _paced(shared, pipe, params.arm.cycle):
+        rows, connected, motion = list(ABB_JOINTS), True, Motion(shared)
+        for now in _paced(shared, pipe, params.arm.cycle):
             while pipe.poll():
                 request = pipe.recv()[0]
                 if request in ("reconnect", "disconnect"):
                     connected = request == "reconnect"
                 else:
                     _operate(controller, request)
-            now = time.monotonic()
-            qpos, qvel = shared.read("qpos", "qvel")
+            qpos, qvel = motion.at(now)
             setpoint, datagram = controller.step(now, params.hidden.counted(qpos[rows]), qvel[rows])
             shared["setpoint"][rows] = setpoint
             if datagram is not None and connected:
@@ -296,7 +292,8 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> 
     servers = [serve(emulator, HOST, port) for emulator, port in zip(emulators, ports.axes, strict=True)]
     try:
         pipe.send("ready")
-        for _ in _paced(shared, pipe, 0.004):
+        motion = Motion(shared)
+        for now in _paced(shared, pipe, 0.004):
             while pipe.poll():
                 kind, axis, *rest = pipe.recv()
                 {
@@ -304,8 +301,7 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> 
                     "reconnect": emulators[axis].reconnect,
                     "fault": emulators[axis].inject_fault,
                 }[kind](*rest)
-            now = time.monotonic()
-            qpos, qvel = shared.read("qpos", "qvel")
+            qpos, qvel = motion.at(now)
             for i, emulator in zip(FESTO_JOINTS, emulators, strict=True):
                 shared["setpoint"][i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
     finally:

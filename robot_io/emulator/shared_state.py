@@ -6,6 +6,7 @@ has read half of two states knows and reads again.
 
 from __future__ import annotations
 
+import time as clock
 from multiprocessing import shared_memory
 
 import numpy as np
@@ -29,6 +30,10 @@ _FIELDS = {
     "jog": 1,
     "silent_until": 1,
 }
+
+AHEAD = 0.004  # [s] by which positions are told ahead of the world's newest state: two of its steps
+LOOK = 0.0005  # [s] between looks at a late world
+PATIENCE = 0.4  # [s]; a world that is later was stopped
 
 
 class Shared:
@@ -90,6 +95,35 @@ class Shared:
         self._memory.close()
         if self._owner:
             self._memory.unlink()
+
+
+class Motion:
+    """The joints' motion as one emulator sees it, at the times of its own cycles.
+
+    Hardware moves on whatever a scheduler does. A world that is late is waited for, so that its catching up is no jump
+    of the joints from one cycle to the next; between two states that an emulator has slept through it interpolates.
+    """
+
+    def __init__(self, shared: Shared) -> None:
+        self._shared = shared
+        self._newest = self._before = self._look()
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities (8,) at ``time`` [s]; as they were last when the world is late by PATIENCE."""
+        if time > self._newest[0]:
+            self._before, self._newest = self._newest, self._look()
+        while self._newest[0] < time - AHEAD and clock.monotonic() < time + PATIENCE and not self._shared["finish"][0]:
+            clock.sleep(LOOK)
+            self._newest = self._look()
+        (start, qpos, qvel), (end, following, faster) = self._before, self._newest
+        if time >= end:
+            return following + faster * min(time - end, AHEAD), faster
+        share = min(max((time - start) / (end - start), 0.0), 1.0)
+        return qpos + share * (following - qpos), qvel + share * (faster - qvel)
+
+    def _look(self) -> tuple[float, np.ndarray, np.ndarray]:
+        taken, qpos, qvel = self._shared.read("time", "qpos", "qvel")
+        return float(taken[0]), qpos, qvel
 
 
 def _untracked(name: str | None) -> dict:

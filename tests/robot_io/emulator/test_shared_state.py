@@ -1,0 +1,121 @@
+"""The joints' motion as arm and axes see it while the processes of the rig are not on time."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from robot_io.contract import ABB_JOINTS, LIMITS, N_JOINTS
+from robot_io.devices.egm.session import EgmConfig, EgmSession, EgmSocket
+from robot_io.emulator import shared_state
+from robot_io.emulator.arm import ArmParams
+from robot_io.emulator.config import RigParams
+from robot_io.emulator.processes import HOST, Rig
+from robot_io.emulator.shared_state import PATIENCE, Motion, Shared
+from tests.support.lockstep_play import throws
+from tests.support.paths import SCENE
+
+STEP, CYCLE, SPEED = 0.002, 0.004, 3.0
+
+
+class World:
+    """A clock, and a world that publishes every 2 ms of it, all joints at ``SPEED``; asleep: until it wakes up."""
+
+    def __init__(self, shared):
+        self.shared, self.now, self.published, self.wakes = shared, 1.0, 1.0, 0.0
+        self.pass_by(0.01)
+
+    def pass_by(self, seconds):
+        self.now += seconds
+        while self.now >= self.wakes and self.published + STEP <= self.now:
+            self.published += STEP
+            each = np.full(N_JOINTS, SPEED)
+            self.shared.publish(self.published, each * self.published, each, np.zeros(3), 0, False, 0, 0)
+
+    def monotonic(self):
+        return self.now
+
+    sleep = pass_by
+
+
+@pytest.fixture
+def world(monkeypatch):
+    shared = Shared()
+    world = World(shared)
+    monkeypatch.setattr(shared_state, "clock", world)
+    yield world
+    shared.close()
+
+
+def follow(world, motion, cycles, start):
+    """Misses of the positions (n,) [rad] at the times of a device's cycles, each as soon as it can."""
+    missed = []
+    for n in range(1, cycles + 1):
+        due = start + n * CYCLE
+        world.pass_by(max(due - world.now, 0.0))
+        position, velocity = motion.at(due)
+        np.testing.assert_allclose(velocity, SPEED)
+        missed.append(np.abs(position - SPEED * due).max())
+    return np.array(missed)
+
+
+@pytest.mark.parametrize("seconds", (0.01, 0.05, 0.15))
+def test_a_world_that_catches_up_is_no_jump(world, seconds):
+    motion, start = Motion(world.shared), world.now
+    world.wakes = world.now + 0.02 + seconds
+    assert follow(world, motion, 80, start).max() < 1e-9
+
+
+@pytest.mark.parametrize("seconds", (0.01, 0.05, 0.15))
+def test_cycles_that_are_made_up_for_are_told_where_the_joints_were(world, seconds):
+    motion, start = Motion(world.shared), world.now
+    assert follow(world, motion, 10, start).max() < 1e-9
+    world.pass_by(seconds)
+    assert follow(world, motion, 60, start + 10 * CYCLE).max() < 1e-9
+
+
+def test_a_world_that_was_stopped_is_not_waited_for_for_ever(world):
+    motion = Motion(world.shared)
+    world.wakes, stood, due = np.inf, SPEED * world.published, world.now + 0.02
+    position, _ = motion.at(due)
+    assert world.now == pytest.approx(due + PATIENCE, abs=0.002)
+    np.testing.assert_allclose(position, stood, atol=SPEED * 0.0041)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("who", ("rig-world", "rig-arm"))
+def test_a_stopped_process_of_the_rig_is_no_fast_joint(who):
+    """The real rig: joint 1 sways while one of its processes stands still for 40 ms, every half second."""
+    with Rig(SCENE, throws(), RigParams(arm=ArmParams(comm_timeout=1.0))) as rig:
+        session, speeds, last, stopped = EgmSession(EgmConfig()), [], None, 0
+        [pid] = [process.pid for process in rig._processes.values() if process.name == who]
+        with EgmSocket(HOST, rig.robot.arm.port) as wire:
+            rig.switch_on()
+            start = None
+            while start is None or time.monotonic() < start + 3.0:
+                assert select.select([wire.fileno()], [], [], 2.0)[0], "no packet of the arm's controller"
+                now = time.monotonic()
+                if not wire.drain(session, now) or not session.feedback.egm_running:
+                    continue
+                seen = session.feedback
+                if start is None:
+                    start, home, last = now, seen.position, seen
+                wanted, speed = home.copy(), np.zeros(6)
+                phase = 2.0 * np.pi * (now - start)
+                wanted[0], speed[0] = home[0] + 0.4 * np.sin(phase), 0.8 * np.pi * np.cos(phase)
+                wire.send(session.reply(wanted, speed, now), session.endpoint)
+                if seen.time - last.time >= 0.04:
+                    speeds.append((seen.position - last.position) / (seen.time - last.time))
+                    last = seen
+                if now > start + 0.5 * (stopped + 1):
+                    stopped += 1
+                    os.kill(pid, signal.SIGSTOP)
+                    time.sleep(0.04)
+                    os.kill(pid, signal.SIGCONT)
+    fastest = np.abs(speeds).max(axis=0)
+    assert stopped >= 5 and 2.0 < fastest[0] < 3.3 < LIMITS.velocity[ABB_JOINTS[0]]
