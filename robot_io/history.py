@@ -64,11 +64,17 @@ class History:
         share = (time - times[i - 1]) / (times[i] - times[i - 1])
         return values[i - 1] + share * (values[i] - values[i - 1])
 
-    def slope(self, span: float) -> np.ndarray | None:
-        """Rate of change (n,) per second by least squares over the last ``span`` [s]; None with under three samples."""
-        times, values = self._times, self._values
+    def slope(self, span: float, at_least: int = 0) -> np.ndarray | None:
+        """Rate of change (n,) per second by least squares over the last ``span`` [s]; None with under three samples.
+
+        at_least: newest samples that count however old they are, so that a gap hides no motion.
+        """
+        return self._slope(self._times, span, at_least)
+
+    def _slope(self, times: deque[float], span: float, at_least: int) -> np.ndarray | None:
+        values = self._values
         n, first = 0, times[-1] - span if times else 0.0
-        while n < len(times) and times[-1 - n] >= first:
+        while n < len(times) and (n < at_least or times[-1 - n] >= first):
             n += 1
         if n < 3:
             return None

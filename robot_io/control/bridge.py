@@ -32,6 +32,7 @@ from robot_io.control.interfaces import Policy as Policy
 from robot_io.control.observation import Feedback, joints, observe
 from robot_io.control.play import Play
 from robot_io.control.rally import RallySummary
+from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.devices.egm.session import ArmFeedback, EgmSession
 from robot_io.devices.tracker import Tracker
 from robot_io.errors import RefusedError
@@ -87,7 +88,7 @@ class Bridge:
         self._policy, self.policy_version = policy, 0
         self._geometry: RobotGeometry = gate.geometry
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
-        self.feedback = Feedback(ball=self.play.strokes.track, axes=History(256), arm=History(256))  # a second
+        self.feedback = Feedback(ball=self.play.strokes.track, axes=History(256), arm=ArmHistory(256))  # a second
         self._state = BridgeState.DISARMED
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
@@ -221,7 +222,7 @@ class Bridge:
 
     def _arm_reference(self, feedback: ArmFeedback, now: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Position (6,) and velocity (6,) for the arm at ``now``; None: hold the measured place."""
-        if self.feedback.arm.add(feedback.received, feedback.position):
+        if self.feedback.arm.add(feedback.received, feedback.position, feedback.time):
             position, velocity = joints(self.feedback)
             self._log(Joints(feedback.received, position, velocity))
         # Where the old reference would lead a controller that was started anew, nobody has asked for.

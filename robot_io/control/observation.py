@@ -13,10 +13,13 @@ import numpy as np
 
 from robot_io.calibrated import Frame
 from robot_io.contract import N_JOINTS
+from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.history import History
 
 HERE = Frame()
 LONGEST_DELAY = 0.1  # [s]
+SPEED_SPAN = 0.04  # [s] of positions that a measured speed goes by
+SPEED_SAMPLES = 3  # newest ones that count after a gap, however long it was: no speed would pass for rest
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Feedback:
 
     ball: History
     axes: History
-    arm: History
+    arm: ArmHistory
 
 
 def observe(feedback: Feedback, delays: ObservationDelays, now: float, base: Frame = HERE) -> np.ndarray | None:
@@ -53,12 +56,12 @@ def observe(feedback: Feedback, delays: ObservationDelays, now: float, base: Fra
 
 
 def joints(feedback: Feedback) -> tuple[np.ndarray, np.ndarray]:
-    """Newest joint positions and velocities (8,); NaN and zero for what has not reported."""
+    """Newest joint positions and velocities (8,); NaN and zero for what has not reported, zero under three samples."""
     position, velocity = np.full(N_JOINTS, np.nan), np.zeros(N_JOINTS)
     for history, rows in ((feedback.axes, slice(0, 2)), (feedback.arm, slice(2, 8))):
         if history.newest is not None:
             position[rows] = history.newest[1]
-            slope = history.slope(0.04)
+            slope = history.slope(SPEED_SPAN, SPEED_SAMPLES)
             if slope is not None:
                 velocity[rows] = slope
     return position, velocity

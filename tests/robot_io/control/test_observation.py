@@ -14,6 +14,7 @@ from mjx_tt.sim.model import LATENCIES
 from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_JOINTS, N_OBSERVATION
 from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState
 from robot_io.control.observation import Feedback, ObservationDelays, joints, observe
+from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.devices.egm.messages import encode_robot
 from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, DirectLink, FestoAxes
@@ -165,7 +166,7 @@ def test_history_interpolates_holds_and_forgets():
 
 
 def test_nothing_is_observed_while_a_device_is_silent():
-    feedback = Feedback(ball=History(longest_hold=0.06), axes=History(), arm=History())
+    feedback = Feedback(ball=History(longest_hold=0.06), axes=History(), arm=ArmHistory())
     position, velocity = joints(feedback)
     assert np.isnan(position).all() and not velocity.any()
     feedback.ball.add(1.0, np.zeros(3))
