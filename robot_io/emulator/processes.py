@@ -224,6 +224,7 @@ def _world(
     publish(time.monotonic())
     pipe.send("ready")
     for now in _paced(shared, pipe, WORLD_STEP):
+        shared.await_drives(now)
         world.advance(shared["setpoint"].copy(), WORLD_STEP)
         if shared.value("jog"):
             world.jog()
@@ -252,6 +253,7 @@ def _arm(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> N
             qpos, qvel = motion.at(now)
             setpoint, datagram = controller.step(now, params.hidden.counted(qpos[rows]), qvel[rows])
             shared["setpoint"][rows] = setpoint
+            shared["driven"][0] = now
             if datagram is not None and connected:
                 out.send(datagram, now)
             for ready in out.due(now):
@@ -304,6 +306,7 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> 
             qpos, qvel = motion.at(now)
             for i, emulator in zip(FESTO_JOINTS, emulators, strict=True):
                 shared["setpoint"][i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
+            shared["driven"][1] = now
     finally:
         for server in servers:
             server.close()

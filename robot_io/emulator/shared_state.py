@@ -29,9 +29,11 @@ _FIELDS = {
     "estop": 1,
     "jog": 1,
     "silent_until": 1,
+    "driven": 2,  # time [s] up to which arm and axes have given their set-points
 }
 
 AHEAD = 0.004  # [s] by which positions are told ahead of the world's newest state: two of its steps
+LATE = 0.01  # [s] from which on a world catches up in step with arm and axes
 LOOK = 0.0005  # [s] between looks at a late world
 PATIENCE = 0.4  # [s]; a world that is later was stopped
 
@@ -88,6 +90,16 @@ class Shared:
             copies = [self.views[field].copy() for field in fields]
             if before % 2 == 0 and self.value("version") == before:
                 return copies
+
+    def await_drives(self, time: float) -> None:
+        """Wait, while the world is late, for the set-points of arm and axes: it must not run on at old ones.
+
+        time: [s] that the world is going to; after PATIENCE it goes on without them, as when they stand still.
+        """
+        while time + LATE < clock.monotonic() < time + PATIENCE and not self["finish"][0]:
+            if self["driven"].min() >= time - 2.0 * AHEAD:
+                return
+            clock.sleep(LOOK)
 
     def close(self) -> None:
         self.views.clear()

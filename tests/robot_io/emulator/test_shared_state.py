@@ -79,6 +79,20 @@ def test_cycles_that_are_made_up_for_are_told_where_the_joints_were(world, secon
     assert follow(world, motion, 60, start + 10 * CYCLE).max() < 1e-9
 
 
+def test_a_late_world_does_not_run_on_at_old_set_points(world):
+    """It is 0.1 s late: each of its steps waits until arm and axes have had their cycle, if they ever do."""
+    late, shared = 0.1, world.shared
+    for lag, waits in ((0.004, False), (0.008, False), (0.02, True)):
+        shared["driven"][:] = world.now - late, world.now - late - lag
+        before = world.now
+        shared.await_drives(before - late)
+        assert (world.now > before) == waits
+        assert not waits or world.now == pytest.approx(before - late + PATIENCE, abs=0.001)
+    before = world.now
+    shared.await_drives(before - 0.005)  # in time: the world goes on whatever the others do
+    assert world.now == before
+
+
 def test_a_world_that_was_stopped_is_not_waited_for_for_ever(world):
     motion = Motion(world.shared)
     world.wakes, stood, due = np.inf, SPEED * world.published, world.now + 0.02
