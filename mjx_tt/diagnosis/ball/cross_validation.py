@@ -15,7 +15,7 @@ from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.ball.flights.fit import fit_starts
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
-from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem
+from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, BallProblem
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE, SpinPrior
 from mjx_tt.diagnosis.verdict import HeldOut
 
@@ -70,6 +70,7 @@ def predictions(found: BallFindings, seed: int = 0) -> Prediction:
     if not choice.effects and not choice.spin:
         return Prediction(error0, error0.copy())
     start = found.situation.start.copy()
+    start[KICK] = 0.0
     prior = None
     if choice.prior is not None:
         start[SPIN] = mean

@@ -26,6 +26,7 @@ from mjx_tt.sim.model import SimModel
 
 FEWEST_SAMPLES = 15  # of a flight
 FEWEST_BALLS = 12
+SCATTER = np.full(3, 0.1)  # [m/s] of bounces, before anything is known of it
 TRACKERS = {"tracker_smoothing", "tracker_filter", "tracker_gate"}
 BLURRED, BLUR = 5.0, (0.04, 0.12)  # memories of a tracker's filter for which it settles behind a bounce; [s] of it
 
@@ -164,7 +165,8 @@ def _diagnose(
     if before is not None:
         prior, together = before.choice.prior, before.together
         own = prior is not None and prior.conditional
-        best = search(problem, replace(trial, spin="free") if own else trial, before.situation, prior, say)
+        treated = replace(trial, spin="free") if own else trial
+        best = search(problem, treated, before.situation, prior, say, scatter=before.noise.scatter)
         best = replace(best, trial=replace(best.trial, spin=trial.spin))
         if own and mode == "none" and evidence.shift_of_spins(best) < selection.FLOOR:
             best, together = _plain(problem, replace(trial, spin="never"), nominal, say)
@@ -184,6 +186,18 @@ def _diagnose(
         if gained > 0.0 and shift >= selection.FLOOR:
             best, together = replace(other, trial=replace(other.trial, spin="none")), theirs
             findings, survivors = find(best, g, sessions, age, names)
+    if before is None and findings:
+        say("trying bounces that differ from ball to ball")
+        chosen = best.choice
+        attempt = _spinning if chosen.prior is not None and chosen.prior.conditional else _plain
+        other, theirs = attempt(problem, trial, nominal, say, SCATTER)
+        gained = evidence.misfit(best, g) - evidence.misfit(other, g)
+        shift = evidence.shift_of_scatter(other, g)
+        left, holding = find(other, g, sessions, age, names)
+        spin_notes.append(_scattering(gained, shift, other.noise.scatter))
+        if gained > 0.0 and shift >= selection.FLOOR / 2:
+            best, together, findings, survivors = other, theirs, left, holding
+            best = replace(best, trial=replace(best.trial, spin=mode))
     seen = selection.visible(scores.under(best.projected, best.choice.prior), best.trial)
     seen[list(left_out)] = False
     return BallFindings(
@@ -209,11 +223,16 @@ def _diagnose(
 
 
 def _plain(
-    problem: BallProblem, trial: Trial, nominal: Situation, say: Callable[[str], None]
+    problem: BallProblem,
+    trial: Trial,
+    nominal: Situation,
+    say: Callable[[str], None],
+    scatter: Float[np.ndarray, 3] = posterior.ALIKE,
 ) -> tuple[Settled, Posterior]:
     """Choice of causes about balls that do not spin to begin with, and all effects at once."""
-    fitted_all = posterior.fit(problem, nominal, None, trial.left_out, say)
-    return search(problem, trial, fitted_all.at, None, say, fitted_all.linear), fitted_all
+    fitted_all = posterior.fit(problem, nominal, None, trial.left_out, say, scatter)
+    found = search(problem, trial, fitted_all.at, None, say, fitted_all.linear, fitted_all.noise.scatter)
+    return found, fitted_all
 
 
 def _tried(gained: float, shift: float) -> str:
@@ -228,19 +247,36 @@ def _tried(gained: float, shift: float) -> str:
     return f"spin was tried because something stayed open without it, and dropped: its evidence is {-gained:.0f} worse"
 
 
+def _scattering(gained: float, shift: float, scatter: Float[np.ndarray, 3]) -> str:
+    """Account of bounces that differ from ball to ball against bounces that are alike."""
+    across, against, up = scatter
+    text = (
+        "bounces that differ from ball to ball were tried because something stayed open without: by "
+        f"{across:.3f} m/s across the ball's way, {against:.3f} along it, {up:.3f} upwards, "
+        f"{1e3 * shift:.1f} mm at the end of a flight"
+    )
+    return f"{text}; {'kept' if gained > 0.0 and shift >= selection.FLOOR / 2 else 'dropped'}: evidence {gained:+.0f}"
+
+
 def _spinning(
-    problem: BallProblem, trial: Trial, nominal: Situation, say: Callable[[str], None]
+    problem: BallProblem,
+    trial: Trial,
+    nominal: Situation,
+    say: Callable[[str], None],
+    scatter: Float[np.ndarray, 3] = posterior.ALIKE,
 ) -> tuple[Settled, Posterior]:
     """Choice of causes where each ball has a spin of its own, about which derivatives are taken; and all at once."""
     say("fitting each ball's spin")
-    fitted_all = posterior.fit(problem, *own_spins(problem, nominal), trial.left_out, say)
+    fitted_all = posterior.fit(problem, *own_spins(problem, nominal), trial.left_out, say, scatter)
     prior = fitted_all.prior
     if prior is not None:
         say(
             f"spins of {prior.components} kind{'s' * (prior.components > 1)}: mean {np.round(prior.mean)}, "
             f"deviation {np.round(prior.std)} rad/s about x, y, z"
         )
-    return search(problem, replace(trial, spin="free"), fitted_all.at, prior, say, fitted_all.linear), fitted_all
+    spinning = replace(trial, spin="free")
+    found = search(problem, spinning, fitted_all.at, prior, say, fitted_all.linear, fitted_all.noise.scatter)
+    return found, fitted_all
 
 
 def _sessions(

@@ -6,6 +6,7 @@ import numpy as np
 
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
+from mjx_tt.diagnosis.ball.flights.linearization import KICK
 from mjx_tt.diagnosis.ball.selection import MAGNUS_KEPT, Choice, Settled, fitted_spins, left_over
 
 SPIN_COST = 3.0  # squared error by which three more numbers of a ball must pay at least
@@ -17,11 +18,11 @@ def misfit(settled: Settled, g: Grid) -> float:
     Each sample's whitened error is bounded: mis-tracked ones decide nothing.
     """
     n, p, choice = settled.noise, settled.projected, settled.choice
-    left = left_over(settled.linear, settled.at, p, choice, g)[0]
+    left, start = left_over(settled.linear, settled.at, p, choice, g)
     counts = g.mask & (p.weight.T > 0.0)
     error = np.minimum((noise.whiten(left, n, g) ** 2).sum(axis=0), 3.0 * noise.HUBER**2)
     spread = 2.0 * np.log(n.scale * np.sqrt(1.0 - n.memory[:, None] ** 2)).sum(axis=0)
-    own = _price_of_spins(settled, g.n)
+    own = _price_of_spins(settled, g.n) + _price_of_kicks(settled, start[KICK])
     # As if the samples left out were as usual: to leave out must not pay.
     share = g.mask.sum() / counts.sum()
     return float(share * np.where(counts, error + spread, 0.0).sum() + own + choice.threshold * len(choice.effects))
@@ -42,6 +43,21 @@ def _price_of_spins(settled: Settled, n: int) -> float:
     away = fitted_spins(p, settled.choice) - middle
     narrower = np.linalg.slogdet(np.eye(3) + np.linalg.solve(precision, p.spin_gram))[1]
     return float(np.einsum("an,nab,bn->", away, precision, away) + narrower.sum())
+
+
+def _price_of_kicks(settled: Settled, kick: np.ndarray) -> float:
+    """The same of the bounces' own kicks (3, n); nothing where all bounces are alike."""
+    scatter = settled.noise.scatter
+    if not scatter.any():
+        return 0.0
+    narrower = np.linalg.slogdet(np.eye(3) + scatter[:, None] * settled.projected.kick_gram * scatter)[1]
+    return float(((kick / scatter[:, None]) ** 2).sum() + narrower.sum())
+
+
+def shift_of_scatter(settled: Settled, g: Grid) -> float:
+    """Median shift [m] of a flight's last sample by a usual kick of its bounce; 0 where all bounces are alike."""
+    moved = settled.linear.starts[KICK][:, :, g.last, np.arange(g.n)] * settled.noise.scatter[:, None, None]
+    return float(np.median(np.sqrt((moved**2).sum(axis=(0, 1)))))
 
 
 def shift_of_spins(settled: Settled) -> float:

@@ -84,7 +84,7 @@ def _gram(found: BallFindings, throw: Throw) -> np.ndarray:
     flat = [Trajectory("", str(i), time, np.zeros((3, SAMPLES))) for i in range(BALLS)]
     g = grid(flat)
     problem = BallProblem(g, found.problem.model, found.problem.effects, velocity)
-    at = Situation(found.situation.theta, np.concatenate([position, velocity, spin]))
+    at = Situation(found.situation.theta, np.concatenate([position, velocity, spin, np.zeros_like(spin)]))
     linear = problem.linearise(at)
     frame = flight_frame(linear.base.velocity[:, :, 0])
     noise = Noise(
@@ -92,6 +92,7 @@ def _gram(found: BallFindings, throw: Throw) -> np.ndarray:
         np.repeat(np.median(found.noise.scale, axis=1, keepdims=True), BALLS, axis=1),
         found.noise.memory,
         found.noise.interval,
+        found.noise.scatter,
     )
     p = project(linear, at, noise, np.ones((BALLS, SAMPLES)), g, problem.coefficient)
     rated = scores.under(p, found.choice.prior)

@@ -10,7 +10,7 @@ a large one is not forbidden. Intervals take their spread from ball to ball.
 from __future__ import annotations
 
 from collections.abc import Callable, Container
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,7 @@ from jaxtyping import Float
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.fit import fit_starts, refit_worst
-from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Situation, project
+from mjx_tt.diagnosis.ball.flights.linearization import KICK, BallProblem, Linear, Situation, project
 from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior, learned
 
@@ -26,6 +26,7 @@ ROUNDS = 7
 SETTLED = 0.2  # of a standard deviation by which nothing moves any more
 MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
 LONGEST_MOVE = 3.0  # scales by which an effect may change in a round
+ALIKE = np.zeros(3)  # [m/s]: no bounce has a kick of its own
 FREEDOM = 4.0  # degrees of Student's distribution of an effect's size
 
 
@@ -54,8 +55,12 @@ def fit(
     prior: SpinPrior | None,
     left_out: Container[int],
     say: Callable[[str], None],
+    scatter: Float[np.ndarray, 3] = ALIKE,
 ) -> Posterior:
-    """Maximum of the posterior of all effects that are not left out, from a situation with or without spins."""
+    """Maximum of the posterior of all effects that are not left out, from a situation with or without spins.
+
+    scatter: [m/s] of the bounces from ball to ball, to start from; zero where they are alike.
+    """
     g, effects = problem.grid, problem.effects
     free = [
         i
@@ -71,7 +76,7 @@ def fit(
         linear = problem.linearise(at)
         frame = noise.flight_frame(linear.base.velocity[:, :, 0])
         own = noise.estimate(linear.residual, frame, g, 6 if prior is None else 9)
-        own = noise.without_memory(own, MEMORY[min(round_, len(MEMORY) - 1)])
+        own = replace(noise.without_memory(own, MEMORY[min(round_, len(MEMORY) - 1)]), scatter=scatter)
         p = project(linear, at, own, noise.robust_weights(linear.residual, own, g), g)
         if prior is not None:
             prior = learned(p.spin_gram, p.spin_right - p.spin_effect @ at.theta)
@@ -82,6 +87,7 @@ def fit(
         smooth = [i for i in free if effects[i].step is None]
         moved = float(np.max(np.abs(change[smooth]) / np.sqrt(np.diagonal(covariance))[smooth], initial=0.0))
         at = Situation(theta, fit_starts(problem, theta, at.start, g, own, prior, rounds=3))
+        scatter = noise.scattered(at.start[KICK], p.kick_gram, scatter)
         say(f"all effects at once, round {round_ + 1}: moved by {moved:.1f} deviations")
         if moved < SETTLED:
             converged = True

@@ -14,7 +14,7 @@ from mjx_tt.diagnosis.ball.effects import Effect
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.fit import fit_starts
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
-from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem, Linear, Projected, Situation, project, rows
+from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, BallProblem, Linear, Projected, Situation, project, rows
 from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE, SpinPrior, learned
 from mjx_tt.diagnosis.ball.scores import LARGEST_SUBSET, Scores, Subset
@@ -28,6 +28,7 @@ SETTLED = 0.2  # of an estimate's error by which it may still have moved in the 
 MAGNUS_KEPT = (0.2, 1.5)  # of the coefficient k about which derivatives are taken by balls of one spin
 CORNER = 5e-4  # [s] about the bounce of a spinning ball in which no sample counts
 WIDEST = 10.0  # scales of an effect beyond which it is no explanation: beside others it may be all but invisible
+ALIKE_BOUNCES = np.zeros(3)  # [m/s]
 LEAST_Z = 3.5  # estimate over its ball-to-ball standard error
 ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
 TIE = 10.0  # gain by which the chosen set must beat a substitute
@@ -258,16 +259,18 @@ def search(
     prior: SpinPrior | None,
     say: Callable[[str], None],
     linear: Linear | None = None,
+    scatter: np.ndarray = ALIKE_BOUNCES,
 ) -> Settled:
     """Chooses causes and linearises about them until the choice settles.
 
     prior: of the spins at the situation to start from, None where nothing spins. linear: the derivatives there.
+    scatter: (3,) [m/s] of the bounces from ball to ball, to start from.
     """
     g, bounces, chosen_before = problem.grid, None, None
     say("round 1: derivatives")
     linear = problem.linearise(at) if linear is None else linear
     frame = noise.flight_frame(linear.base.velocity[:, :, 0])
-    own_noise = noise.estimate(linear.residual, frame, g)
+    own_noise = replace(noise.estimate(linear.residual, frame, g), scatter=scatter)
     if np.any(at.start[SPIN]):  # effects that show on spinning balls alone have a size there
         shift, spin_shift = shifts(linear, g, trial.effects)
         trial = replace(trial, shift=shift, spin_shift=spin_shift)
@@ -281,7 +284,8 @@ def search(
             p = project(linear, at, own_noise, _weights(linear, own_noise, g, bounces), g, problem.coefficient)
             choice = choose(p, replace(trial, spinning=spins), prior)
             left, moved = left_over(linear, at, p, choice, g)
-            own_noise = noise.estimate(left, frame, g, 9 if choice.spin else 6)
+            scatter = noise.scattered(moved[KICK], p.kick_gram, scatter)
+            own_noise = replace(noise.estimate(left, frame, g, 9 if choice.spin else 6), scatter=scatter)
         theta = np.zeros(len(problem.effects))
         theta[list(choice.effects)] = choice.theta
         theta = np.maximum(theta, [e.low for e in problem.effects])
@@ -348,17 +352,22 @@ def fitted_spins(p: Projected, choice: Choice) -> Float[np.ndarray, "3 n"]:
 
 def left_over(
     linear: Linear, at: Situation, p: Projected, choice: Choice, g: Grid
-) -> tuple[Float[np.ndarray, "3 T n"], Float[np.ndarray, "9 n"]]:
+) -> tuple[Float[np.ndarray, "3 T n"], Float[np.ndarray, "12 n"]]:
     """Residual [m] of the linear model with the chosen effects and the best starts, and these."""
     left = linear.residual - np.tensordot(_theta(p, choice) - at.theta, linear.effects, 1)
     start = at.start.copy()
     start[SPIN] = fitted_spins(p, choice)
     left = left - (linear.starts[SPIN] * (start[SPIN] - at.start[SPIN])[:, None, None]).sum(axis=0)
-    white = rows(linear.starts[:6], p.noise, p.weight, g)
+    own, precision = np.arange(6), np.full(6, 1e-9)
+    if p.noise.scatter.any():
+        own, precision = np.r_[own, 9:12], np.r_[precision, np.maximum(p.noise.scatter, noise.LEAST_SCATTER) ** -2.0]
+    white = rows(linear.starts[own], p.noise, p.weight, g)
     target = rows(left[None], p.noise, p.weight, g)
-    nu = np.linalg.solve(white.swapaxes(1, 2) @ white + 1e-9 * np.eye(6), white.swapaxes(1, 2) @ target)[..., 0]
-    start[:6] += nu.T
-    return np.where(g.mask, left - (linear.starts[:6] * nu.T[:, None, None]).sum(axis=0), 0.0), start
+    known = np.where(own < 6, 0.0, precision)[:, None] * start[own]
+    right = (white.swapaxes(1, 2) @ target)[..., 0] - known.T
+    nu = np.linalg.solve(white.swapaxes(1, 2) @ white + np.diag(precision), right[..., None])[..., 0]
+    start[own] += nu.T
+    return np.where(g.mask, left - (linear.starts[own] * nu.T[:, None, None]).sum(axis=0), 0.0), start
 
 
 def _move(

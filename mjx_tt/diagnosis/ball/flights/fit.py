@@ -9,8 +9,8 @@ import numpy as np
 
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid, picked, predict
-from mjx_tt.diagnosis.ball.flights.linearization import SPIN, START_STEPS, BallProblem, Situation, project, rows
-from mjx_tt.diagnosis.ball.flights.noise import HUBER, Noise, nominal_noise, robust_weights, whiten
+from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, START_STEPS, BallProblem, Situation, project, rows
+from mjx_tt.diagnosis.ball.flights.noise import HUBER, LEAST_SCATTER, Noise, nominal_noise, robust_weights, whiten
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, SpinPrior, learned
 
 WINDOWS = (0.1, 0.2, 0.3, 0.4)  # [s] of a flight that the first fit takes in turn
@@ -31,7 +31,7 @@ def fit_starts(
     rounds: int = 4,
     keep: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Starts (9, n) of all balls for given changes theta, (K,) or (K, n), by damped Gauss-Newton with robust weights.
+    """Starts (12, n) of all balls for given changes theta, (K,) or (K, n), by damped Gauss-Newton with robust weights.
 
     prior: distribution of the spins; without it the balls do not spin (or keep the spin given).
     keep: (T, n) samples that count, all by default.
@@ -49,22 +49,27 @@ def fit_with_cost(
     rounds: int = 4,
     keep: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Starts (9, n) as of ``fit_starts``, and the cost (n,) of each ball's fit: whitened squares, the prior's pull."""
+    """Starts (12, n) as of ``fit_starts``, and the cost (n,) of each ball's fit: whitened squares, the prior's pull."""
     noise = nominal_noise(g) if noise is None else noise
     mask = g.mask if keep is None else g.mask & keep
     g = replace(g, mask=mask)
-    size = 6 if prior is None else 9
+    active = [*range(6), *([] if prior is None else range(6, 9)), *(range(9, 12) if noise.scatter.any() else [])]
+    size = len(active)
     damping = np.full(g.n, LEAST_DAMPING)
     theta_v = np.repeat(theta[:, None], 1 + size, axis=1) if theta.ndim == 1 else theta[:, None]
     if theta.ndim == 1:
         theta_v = theta_v[:, :, None]
     best_cost, best = np.full(g.n, np.inf), start
     normal, right = np.zeros((g.n, size, size)), np.zeros((g.n, size))  # at the best place
-    middle, precision = prior.of_balls(g.n) if prior is not None else (np.zeros((3, g.n)), np.zeros((g.n, 3, 3)))
+    middle, precision = np.zeros((12, g.n)), np.zeros((g.n, 12, 12))  # of what is known of a start beforehand
+    if prior is not None:
+        middle[SPIN], precision[:, SPIN, SPIN] = prior.of_balls(g.n)
+    if noise.scatter.any():
+        precision[:, KICK, KICK] = np.diag(np.maximum(noise.scatter, LEAST_SCATTER) ** -2.0)
     for _ in range(rounds + 1):
         variants = np.repeat(start[:, None], 1 + size, axis=1)
-        for i in range(size):
-            variants[i, 1 + i] += START_STEPS[i]
+        for k, i in enumerate(active):
+            variants[i, 1 + k] += START_STEPS[i]
         flown = predict(
             problem.model,
             problem.values(np.broadcast_to(theta_v, (len(theta_v), 1 + size, g.n))),
@@ -73,21 +78,19 @@ def fit_with_cost(
             problem.axes,
         )
         base = flown.measured[:, :, 0]
-        columns = np.moveaxis(flown.measured[:, :, 1:] - base[:, :, None], 2, 0) / START_STEPS[:size, None, None, None]
+        columns = np.moveaxis(flown.measured[:, :, 1:] - base[:, :, None], 2, 0) / START_STEPS[active, None, None, None]
         residual = np.where(mask, g.measured - base, 0.0)
         distance = np.sqrt((whiten(residual, noise, g) ** 2).sum(axis=0))
         # Huber's own cost: with weights that follow the residual a step away from outliers would look like a gain.
         cost = np.where(distance <= HUBER, distance**2, 2.0 * HUBER * distance - HUBER**2).sum(axis=0)
-        if prior is not None:
-            pull = start[SPIN] - middle
-            cost = cost + np.einsum("an,nab,bn->n", pull, precision, pull)
+        pull = np.einsum("nab,bn->na", precision, start - middle)
+        cost = cost + ((start - middle) * pull.T).sum(axis=0)
         better = cost <= best_cost * (1.0 + 1e-9)
         weight = robust_weights(residual, noise, g)
         white, j = rows(residual[None], noise, weight, g)[..., 0], rows(columns, noise, weight, g)
         here, slope = j.swapaxes(1, 2) @ j, (j.swapaxes(1, 2) @ white[..., None])[..., 0]
-        if prior is not None:
-            here[:, SPIN, SPIN] += precision
-            slope[:, SPIN] -= np.einsum("nab,bn->na", precision, start[SPIN] - middle)
+        here += precision[:, active][:, :, active]
+        slope -= pull[:, active]
         normal, right = np.where(better[:, None, None], here, normal), np.where(better[:, None], slope, right)
         best_cost, best = np.where(better, cost, best_cost), np.where(better, start, best)
         damping = np.where(better, np.maximum(damping * 0.1, LEAST_DAMPING), np.maximum(damping * 30.0, 1e-3))
@@ -95,7 +98,7 @@ def fit_with_cost(
         damped = normal / scale[:, :, None] / scale[:, None, :] + damping[:, None, None] * np.eye(size)
         change = np.linalg.solve(damped + 1e-12 * np.eye(size), (right / scale)[..., None])[..., 0] / scale
         start = best.copy()
-        start[:size] += change.T
+        start[active] += change.T
     return best, best_cost
 
 
@@ -108,7 +111,7 @@ def fit_spins(
     prior: SpinPrior = BROAD,
     tries: Sequence[tuple[float, float, float]] = SPINS_TO_TRY,
 ) -> np.ndarray:
-    """Starts (9, n) with a spin of each ball's own, of any size: the best of fits from several spins.
+    """Starts (12, n) with a spin of each ball's own, of any size: the best of fits from several spins.
 
     A ball may slide or roll at the bounce, and each is a valley of its own: from balls that do not spin the other one
     is not always found. prior: wide, so that only what the flight does not show is drawn to it.
@@ -124,13 +127,13 @@ def fit_spins(
         tiled = replace(noise, frame=np.tile(noise.frame, count), scale=np.tile(noise.scale, count))
     fitted, cost = fit_with_cost(tried, changes, begin, many, tiled, prior, rounds=8)
     best = np.argmin(np.where(np.isfinite(cost), cost, np.inf).reshape(count, g.n), axis=0)
-    return fitted.reshape(9, count, g.n)[:, best, np.arange(g.n)]
+    return fitted.reshape(12, count, g.n)[:, best, np.arange(g.n)]
 
 
 def refit_worst(
     problem: BallProblem, theta: np.ndarray, start: np.ndarray, g: Grid, noise: Noise, prior: SpinPrior
 ) -> np.ndarray:
-    """Starts (9, n) with those of the balls that fit worst tried again from other spins, and kept where that is better.
+    """Starts (12, n) with those of the balls that fit worst tried again from other spins, and kept where that is better.
 
     A ball whose fit ended in the wrong valley would look like one that flies unlike the others.
     """
@@ -161,7 +164,7 @@ def first_fit(
     spin: np.ndarray | None = None,
     part: np.ndarray | None = None,
 ) -> np.ndarray:
-    """(9, n) starts: a parabola through the first samples, then ever longer parts of the flight.
+    """(12, n) starts: a parabola through the first samples, then ever longer parts of the flight.
 
     A flight that bounces has other minima for a start that is far off; growing windows keep the bounce where it is.
     theta: (K,) or (K, n) changes of the effects, none by default. spin: (3,) or (3, n) [rad/s] of the balls, in
@@ -171,7 +174,7 @@ def first_fit(
     theta = np.zeros(len(problem.effects)) if theta is None else theta
     early = g.mask & (g.time <= WINDOWS[0])
     early[:8] |= g.mask[:8]
-    start = np.zeros((9, g.n))
+    start = np.zeros((12, g.n))
     for i in range(g.n):
         time, place = g.time[early[:, i], i], g.measured[:, early[:, i], i]
         fall = np.array([0.0, 0.0, -4.9])[:, None] * time**2

@@ -104,20 +104,21 @@ def heading_axes(velocity: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 3 n
 def predict(
     model: SimModel,
     values: Mapping[str, np.ndarray],
-    start: Float[np.ndarray, "9 v n"],
+    start: Float[np.ndarray, "12 v n"],
     g: Grid,
     axes: Float[np.ndarray, "3 3 n"],
 ) -> Flown:
     """Flies every ball under every variant.
 
     values: leaves of ``model`` to replace, each broadcastable to (v, n). start: position, velocity, spin at the
-    first sample, the spin in ``axes``: component, axis, ball.
+    first sample, and what its first bounce adds to its velocity; these two in ``axes``: component, axis, ball.
     """
-    start = np.concatenate([start[:6], np.einsum("can,avn->cvn", axes, start[6:])])
+    own = [np.einsum("can,avn->cvn", axes, part) for part in (start[6:9], start[9:])]
+    start = np.concatenate([start[:6], *own])
     v, n = start.shape[1:]
     ball = np.tile(np.arange(n), v)  # column -> ball
     flat = {k: np.broadcast_to(np.asarray(values[k], np.float64), (v, n)).ravel() for k in sorted(values)}
-    columns = start.reshape(9, -1)
+    columns = start.reshape(len(start), -1)
     parts = []
     with jax.enable_x64(True):
         for first in range(0, v * n, WIDTH):
@@ -143,7 +144,7 @@ def predict(
 def _fly(
     model: SimModel, values: dict[str, Array], start: Array, steps: Array, index: Array, paddle: PaddlePose | None
 ) -> tuple[Array, ...]:
-    """Fields of Flown for columns (9, c) of starts; values (c,), steps (L, c), index (T, c), paddle (L + 1, 3, c)."""
+    """Fields of Flown for columns (12, c) of starts; values (c,), steps (L, c), index (T, c), paddle (L + 1, 3, c)."""
     nominal_latency = model.latency.ball_observation
     model = with_values(without_nominal(model), values)
     # What was measured flew on: a trial start that grazes the net must not be stopped by it.
@@ -181,6 +182,9 @@ def _fly(
         landed = events.table & moving
         hit = landed | (events.paddle & moving)
         t = jnp.where(hit, events.time, dt)
+        first = landed & (bounced == jnp.inf)
+        extra = jnp.where(first, start[9:], 0.0)
+        new = replace(new, position=new.position + (dt - t) * extra, velocity=new.velocity + extra)
         corner = jnp.where(hit, events.position, new.position)
         filtered = follow(follow(filtered, state.position, corner, t), corner, new.position, dt - t)
         kick = jnp.where(hit, jump(state.velocity, new.velocity, dt), 0.0)
@@ -188,7 +192,6 @@ def _fly(
         met = lag.corrected(unmeasured, memory, gate)
         lag = jax.tree.map(lambda a, b: jnp.where(sampled, a, b), met, lag)
         unmeasured = jnp.where(sampled, 0.0, unmeasured)
-        first = landed & (bounced == jnp.inf)
         bounced = jnp.where(first, (elapsed + t) * rate, bounced)
         at = jnp.where(first, events.position, at)
         incoming = jnp.where(first, state.velocity, incoming)
@@ -196,7 +199,7 @@ def _fly(
         carry = (new, filtered, (lag, unmeasured), elapsed + dt, bounced, at, incoming, struck)
         return carry, (new.position, new.velocity, filtered, lag.position)
 
-    state = BallState(start[:3], start[3:6], start[6:])
+    state = BallState(start[:3], start[3:6], start[6:9])
     zero = jnp.zeros_like(start[0])
     # In steady motion the filter trails by tau v: it was running before the first sample.
     filtered = start[:3] - smoothing * start[3:6]

@@ -17,9 +17,9 @@ from mjx_tt.diagnosis.ball.flights.forward_model import Flown, Grid, heading_axe
 from mjx_tt.diagnosis.ball.flights.noise import Noise, whiten
 from mjx_tt.sim.model import SimModel
 
-SPIN = slice(6, 9)
+SPIN, KICK = slice(6, 9), slice(9, 12)
 MAGNUS = FLIGHT + "magnus_coefficient"
-START_STEPS = np.array([1e-6] * 3 + [1e-5] * 3 + [0.1] * 3)  # [m], [m/s], [rad/s] of the differences
+START_STEPS = np.array([1e-6] * 3 + [1e-5] * 3 + [0.1] * 3 + [1e-5] * 3)  # [m], [m/s], [rad/s], [m/s]
 REFERENCE_MAGNUS = 0.6  # k used where the nominal model has none: in flight only k omega shows (PHYSICS: 0.3 to 1.5)
 
 
@@ -28,7 +28,7 @@ class Situation:
     """Point at which the model is linearised."""
 
     theta: np.ndarray  # (K,) changes of the effects
-    start: np.ndarray  # (9, n)
+    start: np.ndarray  # (12, n) each ball's own: position, velocity, spin, and what its bounce adds to its velocity
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Linear:
     """The linearised model in measured units."""
 
     residual: np.ndarray  # (3, T, n) [m] measured - predicted
-    starts: np.ndarray  # (9, 3, T, n) derivative by start position, velocity, spin
+    starts: np.ndarray  # (12, 3, T, n) derivative by start position, velocity, spin, and the bounce's own kick
     effects: np.ndarray  # (K, 3, T, n) derivative by the effects' changes
     base: Flown  # with v = 1
     transition: np.ndarray  # (n, T, 6, 6) derivative of true position and velocity by those at the start
@@ -65,7 +65,7 @@ class BallProblem:
         return out
 
     def fly(self, theta: np.ndarray, start: np.ndarray, g: Grid | None = None) -> Flown:
-        """Predictions for changes (K,) or (K, n) and starts (9, n)."""
+        """Predictions for changes (K,) or (K, n) and starts (12, n)."""
         g = self.grid if g is None else g
         theta = theta[:, None, None] if theta.ndim == 1 else theta[:, None]
         return predict(self.model, self.values(theta), start[:, None], g, self.axes)
@@ -77,18 +77,18 @@ class BallProblem:
         moves = np.array([e.step if e.step is not None else 1e-3 * e.scale for e in self.effects])
         # A step of its own is for an effect without a derivative at zero; elsewhere it would only blur.
         moves = np.where(at.theta != 0.0, np.minimum(moves, np.maximum(0.1 * np.abs(at.theta), 1e-6)), moves)
-        # Variants: as it is; start moved (6); effects changed (k); and with a ball that air can bend: as it is, spun
-        # (3).
-        theta = np.repeat(at.theta[:, None], 11 + k, axis=1)
+        # Variants: as it is; start moved (6); effects changed (k); with a ball that air can bend: as it is, spun (3);
+        # and kicked at the bounce (3).
+        theta = np.repeat(at.theta[:, None], 14 + k, axis=1)
         theta[np.arange(k), 7 + np.arange(k)] += moves
-        start = np.repeat(at.start[:, None], 11 + k, axis=1)
+        start = np.repeat(at.start[:, None], 14 + k, axis=1)
         for i in range(6):
             start[i, 1 + i] += START_STEPS[i]
-        for i in range(6, 9):
+        for i in range(6, 12):
             start[i, 2 + k + i] += START_STEPS[i]
         values = self.values(theta[:, :, None])
         values[MAGNUS] = values[MAGNUS].copy()
-        values[MAGNUS][7 + k :] = np.where(np.abs(values[MAGNUS][0]) > 0.05, values[MAGNUS][0], REFERENCE_MAGNUS)
+        values[MAGNUS][7 + k : 11 + k] = np.where(np.abs(values[MAGNUS][0]) > 0.05, values[MAGNUS][0], REFERENCE_MAGNUS)
         flown = predict(self.model, values, start, g, self.axes)
         base, bent = flown.measured[:, :, 0], flown.measured[:, :, 7 + k]
 
@@ -96,7 +96,8 @@ class BallProblem:
             return np.moveaxis(flown.measured[:, :, variants] - before[:, :, None], 2, 0) / steps[:, None, None, None]
 
         starts = slopes(slice(1, 7), base, START_STEPS[:6])
-        starts = np.concatenate([starts, slopes(slice(8 + k, 11 + k), bent, START_STEPS[6:])])
+        spun = slopes(slice(8 + k, 11 + k), bent, START_STEPS[SPIN])
+        starts = np.concatenate([starts, spun, slopes(slice(11 + k, 14 + k), base, START_STEPS[KICK])])
         effects = slopes(slice(7, 7 + k), base, moves)
         state = np.concatenate([flown.position, flown.velocity])[:, :, :7]
         transition = (state[:, :, 1:] - state[:, :, :1]) / START_STEPS[None, None, :6, None]
@@ -129,6 +130,7 @@ class Projected:
     spin_gram: np.ndarray  # (n, 3, 3)
     spin_effect: np.ndarray  # (n, 3, K)
     spin_right: np.ndarray  # (n, 3)
+    kick_gram: np.ndarray  # (n, 3, 3) of the bounces' own kicks
     coefficient: int | None  # the effect that comes along with spin
 
 
@@ -149,21 +151,37 @@ def project(
 class StartsOut:
     """Flights whitened, starts projected out of spins and target: what any set of columns is judged against.
 
-    target: (3, T, n) [m], to which the spins of the starts (9, n) are added: it is that of balls without spin.
+    target: (3, T, n) [m], to which the spins and kicks of the starts (12, n) are added: it is that of balls without.
+    Where bounces scatter, each one's own kick goes out as well, as far as its distribution lets it: as an unknown
+    about which rows of its own say that it is small.
     """
 
     def __init__(
         self, linear: Linear, target: np.ndarray, start: np.ndarray, noise: Noise, weight: np.ndarray, g: Grid
     ) -> None:
         self._noise, self._weight, self._grid = noise, weight, g
-        self._basis, _ = np.linalg.qr(rows(linear.starts[:6], noise, weight, g))
-        self._spins = remove(self._basis, rows(linear.starts[SPIN], noise, weight, g))
-        absolute = target + (linear.starts[SPIN] * start[SPIN][:, None, None]).sum(axis=0)
-        self._target = remove(self._basis, rows(np.where(g.mask, absolute, 0.0)[None], noise, weight, g))
+        free, kicks = (rows(linear.starts[part], noise, weight, g) for part in (slice(6), KICK))
+        self._kick_gram = kicks.swapaxes(1, 2) @ remove(np.linalg.qr(free)[0], kicks)
+        self._scatters = bool(noise.scatter.any())
+        if self._scatters:
+            known = np.broadcast_to(np.eye(3), (g.n, 3, 3))
+            lower = np.concatenate([np.zeros((g.n, 3, 6)), known], axis=2)
+            free = np.concatenate([np.concatenate([free, kicks * noise.scatter], axis=2), lower], axis=1)
+        self._basis, _ = np.linalg.qr(free)
+        self._spins = self._left(linear.starts[SPIN])
+        own = linear.starts[6:] * start[6:, None, None]
+        self._target = self._left(np.where(g.mask, target + own.sum(axis=0), 0.0)[None])
+
+    def _left(self, columns: np.ndarray) -> np.ndarray:
+        """Rows of columns (k, 3, T, n) without what the balls' own unknowns explain."""
+        whitened = rows(columns, self._noise, self._weight, self._grid)
+        if self._scatters:
+            whitened = np.concatenate([whitened, np.zeros((self._grid.n, 3, whitened.shape[2]))], axis=1)
+        return remove(self._basis, whitened)
 
     def project(self, columns: np.ndarray, coefficient: int | None = None) -> Projected:
         """The products of columns (K, 3, T, n) [m per unit]; coefficient: the one that comes along with spin."""
-        effects = remove(self._basis, rows(columns, self._noise, self._weight, self._grid))
+        effects = self._left(columns)
         et, st = effects.swapaxes(1, 2), self._spins.swapaxes(1, 2)
         return Projected(
             self._weight,
@@ -173,6 +191,7 @@ class StartsOut:
             st @ self._spins,
             st @ effects,
             (st @ self._target)[..., 0],
+            self._kick_gram,
             coefficient,
         )
 

@@ -8,7 +8,7 @@ outliers are weighted down by Huber's rule, and every test downstream takes its 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ OUTLIER = 30.0  # times the median square beyond which a sample counts no more: 
 LEAST_SHARE = 0.7  # of the noise along the flight beyond that across it which must grow with the speed's square
 NOMINAL_SCALE = 0.003  # [m] before anything is known
 LARGEST_MEMORY = 0.97
+LEAST_SCATTER = 1e-4  # [m/s] of bounces, where they scatter at all
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,9 @@ class Noise:
     scale: np.ndarray  # (3, n) [m] standard deviation of a sample along each axis
     memory: np.ndarray  # (3,) correlation of neighbouring samples
     interval: float  # [s] usual time between neighbours
+    # (3,) [m/s] deviation of what a bounce adds to a ball's velocity beside the model, along the axes of its spin:
+    # across its way, against it, up. Zero where all bounces are alike.
+    scatter: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 def nominal_noise(g: Grid) -> Noise:
@@ -87,6 +91,18 @@ def estimate(residual: np.ndarray, frame: np.ndarray, g: Grid, unknowns: int = 6
         r = r + (1.0 + 4.0 * max(r, 0.0)) * (unknowns / 3.0) / max(float(samples.mean()), 1.0) * 0.5
         memory[a] = np.clip(r, 0.0, LARGEST_MEMORY)
     return Noise(frame, scale, memory, interval)
+
+
+def scattered(kick: np.ndarray, information: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """(3,) deviation [m/s] of the bounces' kicks (3, n), of which each flight tells as much as ``information`` (n, 3, 3).
+
+    One step of expectation-maximisation from the deviation before; kicks far beyond it count as if at four deviations.
+    """
+    if not before.any():
+        return before
+    uncertain = np.linalg.inv(information + np.diag(np.maximum(before, LEAST_SCATTER) ** -2.0))
+    square = np.minimum(kick**2, 16.0 * before[:, None] ** 2) + np.diagonal(uncertain, axis1=1, axis2=2).T
+    return np.maximum(np.sqrt(square.mean(axis=1)), LEAST_SCATTER)
 
 
 def without_memory(noise: Noise, most: float = 0.0) -> Noise:
