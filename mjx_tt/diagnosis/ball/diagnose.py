@@ -27,6 +27,7 @@ from mjx_tt.sim.model import SimModel
 FEWEST_SAMPLES = 15  # of a flight
 FEWEST_BALLS = 12
 SCATTER = np.full(3, 0.1)  # [m/s] of bounces, before anything is known of it
+LEAST_SHIFT = selection.FLOOR / 2  # [m] of a flight's end, for bounces that differ from ball to ball
 TRACKERS = {"tracker_smoothing", "tracker_filter", "tracker_gate"}
 BLURRED, BLUR = 5.0, (0.04, 0.12)  # memories of a tracker's filter for which it settles behind a bounce; [s] of it
 
@@ -187,17 +188,18 @@ def _diagnose(
             best, together = replace(other, trial=replace(other.trial, spin="none")), theirs
             findings, survivors = find(best, g, sessions, age, names)
     if before is None and findings:
-        say("trying bounces that differ from ball to ball")
-        chosen = best.choice
-        attempt = _spinning if chosen.prior is not None and chosen.prior.conditional else _plain
-        other, theirs = attempt(problem, trial, nominal, say, SCATTER)
-        gained = evidence.misfit(best, g) - evidence.misfit(other, g)
-        shift = evidence.shift_of_scatter(other, g)
-        left, holding = find(other, g, sessions, age, names)
-        spin_notes.append(_scattering(gained, shift, other.noise.scatter))
-        if gained > 0.0 and shift >= selection.FLOOR / 2:
-            best, together, findings, survivors = other, theirs, left, holding
-            best = replace(best, trial=replace(best.trial, spin=mode))
+        for attempt in _of_scattering(best.choice, mode):
+            say("trying bounces that differ from ball to ball")
+            other, theirs = attempt(problem, trial, nominal, say, SCATTER)
+            gained = evidence.misfit(best, g) - evidence.misfit(other, g)
+            shift = evidence.shift_of_scatter(other, g)
+            left, holding = find(other, g, sessions, age, names)
+            kept_so = gained > 0.0 and shift >= LEAST_SHIFT and not left
+            spin_notes.append(_scattering(gained, shift, other.noise.scatter, kept_so))
+            if kept_so:
+                best, together, findings, survivors = other, theirs, left, holding
+                best = replace(best, trial=replace(best.trial, spin=mode))
+                break
     seen = selection.visible(scores.under(best.projected, best.choice.prior), best.trial)
     seen[list(left_out)] = False
     return BallFindings(
@@ -247,7 +249,13 @@ def _tried(gained: float, shift: float) -> str:
     return f"spin was tried because something stayed open without it, and dropped: its evidence is {-gained:.0f} worse"
 
 
-def _scattering(gained: float, shift: float, scatter: Float[np.ndarray, 3]) -> str:
+def _of_scattering(choice: selection.Choice, mode: str) -> tuple[Callable[..., tuple[Settled, Posterior]], ...]:
+    """Searches that bounces of many kinds are tried with: kicks at the bounce may have been taken for spin."""
+    spins = choice.prior is not None and choice.prior.conditional
+    return (_spinning,) if mode == "free" else (_plain, _spinning) if spins else (_plain,)
+
+
+def _scattering(gained: float, shift: float, scatter: Float[np.ndarray, 3], kept: bool) -> str:
     """Account of bounces that differ from ball to ball against bounces that are alike."""
     across, against, up = scatter
     text = (
@@ -255,7 +263,8 @@ def _scattering(gained: float, shift: float, scatter: Float[np.ndarray, 3]) -> s
         f"{across:.3f} m/s across the ball's way, {against:.3f} along it, {up:.3f} upwards, "
         f"{1e3 * shift:.1f} mm at the end of a flight"
     )
-    return f"{text}; {'kept' if gained > 0.0 and shift >= selection.FLOOR / 2 else 'dropped'}: evidence {gained:+.0f}"
+    why = "something stays open with them as well, " if gained > 0.0 and not kept else ""
+    return f"{text}; {'kept' if kept else 'dropped'}: {why}evidence {gained:+.0f}"
 
 
 def _spinning(

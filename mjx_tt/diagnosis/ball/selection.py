@@ -14,7 +14,16 @@ from mjx_tt.diagnosis.ball.effects import Effect
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.fit import fit_starts
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
-from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, BallProblem, Linear, Projected, Situation, project, rows
+from mjx_tt.diagnosis.ball.flights.linearization import (
+    KICK,
+    SPIN,
+    BallProblem,
+    Linear,
+    Projected,
+    Situation,
+    project,
+    rows,
+)
 from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE, SpinPrior, learned
 from mjx_tt.diagnosis.ball.scores import LARGEST_SUBSET, Scores, Subset
