@@ -133,7 +133,7 @@ def fit_spins(
 def refit_worst(
     problem: BallProblem, theta: np.ndarray, start: np.ndarray, g: Grid, noise: Noise, prior: SpinPrior
 ) -> np.ndarray:
-    """Starts (12, n) with those of the balls that fit worst tried again from other spins, and kept where that is better.
+    """Starts (12, n); those of balls that fit worst are tried again from other spins, and kept where that is better.
 
     A ball whose fit ended in the wrong valley would look like one that flies unlike the others.
     """

@@ -94,7 +94,7 @@ def estimate(residual: np.ndarray, frame: np.ndarray, g: Grid, unknowns: int = 6
 
 
 def scattered(kick: np.ndarray, information: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """(3,) deviation [m/s] of the bounces' kicks (3, n), of which each flight tells as much as ``information`` (n, 3, 3).
+    """(3,) deviation [m/s] of the bounces' kicks (3, n), of which a flight tells as much as ``information`` (n, 3, 3).
 
     One step of expectation-maximisation from the deviation before; kicks far beyond it count as if at four deviations.
     """
