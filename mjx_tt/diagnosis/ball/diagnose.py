@@ -251,8 +251,9 @@ def _tried(gained: float, shift: float) -> str:
 
 def _of_scattering(choice: selection.Choice, mode: str) -> tuple[Callable[..., tuple[Settled, Posterior]], ...]:
     """Searches that bounces of many kinds are tried with: kicks at the bounce may have been taken for spin."""
-    spins = choice.prior is not None and choice.prior.conditional
-    return (_spinning,) if mode == "free" else (_plain, _spinning) if spins else (_plain,)
+    if mode == "free":
+        return (_spinning,)
+    return (_plain, _spinning) if choice.prior is not None and choice.prior.conditional else (_plain,)
 
 
 def _scattering(gained: float, shift: float, scatter: Float[np.ndarray, 3], kept: bool) -> str:
