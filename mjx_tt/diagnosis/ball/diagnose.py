@@ -200,7 +200,9 @@ def _diagnose(
                 best, together, findings, survivors = other, theirs, left, holding
                 best = replace(best, trial=replace(best.trial, spin=mode))
                 break
-    seen = selection.visible(scores.under(best.projected, best.choice.prior), best.trial)
+    seen = selection.visible(
+        scores.under(best.projected, best.choice.prior), best.trial, bool(best.noise.scatter.any())
+    )
     seen[list(left_out)] = False
     return BallFindings(
         problem,

@@ -81,15 +81,19 @@ class Trial:
     spinning: bool = False  # linearised about spinning balls: effects that need spin mean nothing without it
 
 
-def visible(rated: Scores, trial: Trial) -> Bool[np.ndarray, " K"]:
-    """True where the data could show the effect: twice FLOOR would bring LEAST_GAIN."""
+def visible(rated: Scores, trial: Trial, scatters: bool = False) -> Bool[np.ndarray, " K"]:
+    """True where the data could show the effect: twice FLOOR would bring LEAST_GAIN, four times where bounces scatter.
+
+    There each ball's own bounce is worth several FLOOR and hides small effects, but no large one's rival.
+    """
     k = len(trial.effects)
     gram = np.diagonal(rated.gram)[:k].copy()
     if rated.always:
         a = list(rated.always)
         cross = rated.gram[np.ix_(range(k), a)]
         gram -= np.einsum("ka,ab,kb->k", cross, np.linalg.pinv(rated.gram[np.ix_(a, a)]), cross)
-    size = np.where(trial.shift > 1e-9, 2.0 * FLOOR / np.maximum(trial.shift, 1e-9), 0.0)
+    size = (4.0 if scatters else 2.0) * FLOOR
+    size = np.where(trial.shift > 1e-9, size / np.maximum(trial.shift, 1e-9), 0.0)
     return gram * size**2 > LEAST_GAIN
 
 
@@ -179,7 +183,11 @@ def refined(choice: Choice, p: Projected) -> Choice:
 def _candidates(rated: Scores, p: Projected, trial: Trial, spin: bool) -> Subset:
     out = set(trial.left_out)
     bent = {p.coefficient} if spin else {i for i, e in enumerate(trial.effects) if e.needs_spin and trial.spinning}
-    return tuple(int(i) for i in np.flatnonzero(visible(rated, trial)) if i not in bent and i not in out)
+    return tuple(
+        int(i)
+        for i in np.flatnonzero(visible(rated, trial, bool(p.noise.scatter.any())))
+        if i not in bent and i not in out
+    )
 
 
 def _holds(t: _Treatment, subset: Subset, gain: float, trial: Trial, top: float, plain: float) -> bool:
