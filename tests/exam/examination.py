@@ -55,6 +55,7 @@ BARS: dict[str, tuple[tuple[str, float | None, float], ...]] = {
     "16": (("human_deleted", None, 0.5), ("human_invented", None, 0.5)),
     "17": (("many", None, 1.0),),
     "18": (("kalman", None, 1.0),),
+    "19": (("scattered", 20.0, 1.0),),
     "extra": (("rare", None, 0.5), ("invisible", None, 0.1)),
 }
 PEOPLES_BARS = ("13", "14", "15", "16")

@@ -168,7 +168,8 @@ class Case:
     """One hidden case; everything follows from these numbers.
 
     kind: none, noise (nothing but the noise is wrong), invisible, single, pair, triple, gauge, deleted, invented, rare,
-        many (2 to 8 causes of ordinary sizes), robot, unexcited, robot_none; human_none, human_single ... where people
+        many (2 to 8 causes of ordinary sizes), scattered (nothing or one cause, and a table of another restitution and
+        friction at every bounce), robot, unexcited, robot_none; human_none, human_single ... where people
         play
     causes: catalogue names, a name of INVENTED, or <joint>.<effect>
     without: names that the diagnosis may not use
@@ -265,10 +266,23 @@ def build(case: Case, balls: Balls | None = None) -> BallCase:
             mean, std = (amount * s for s in _spin_shape(case))
     if case.kind == "rare":
         world, spinning = _only_some(case, world, spinning, balls)
+    if case.kind == "scattered":
+        world = _scattered(case, world, balls)
     kalman = _kalman(case, few) if case.kind == "kalman" else None
     if kalman is not None:
         amounts["tracker_filter"] = kalman[0]
     return BallCase(case, world, spinning, amounts, mean, std, kalman and kalman[1:])
+
+
+def _scattered(case: Case, world: World, balls: Balls) -> World:
+    """A table that is another one at every bounce: by some per cent of a speed, not by the same kick for all balls."""
+    rng = _generator(case, f"bounces {len(balls)}")
+    restitution, friction = rng.uniform(0.008, 0.025), rng.uniform(0.05, 0.2)
+    return replace(
+        world,
+        restitution=world.restitution + rng.normal(0.0, restitution, len(balls)),
+        friction=world.friction * (1.0 + rng.normal(0.0, friction, len(balls))),
+    )
 
 
 def _kalman(case: Case, balls: Balls) -> tuple[float, float, float]:
@@ -416,6 +430,7 @@ KINDS = (
     "invented",
     "rare",
     "many",
+    "scattered",
     "robot",
     "unexcited",
     "robot_none",
@@ -484,6 +499,8 @@ def _round(
     """One round of causes of a kind, shuffled."""
     if kind in ("none", "noise", "robot_none", "kalman"):
         return [()]
+    if kind == "scattered":
+        return [(), (str(rng.choice([name for name in singles if name != "magnus"])),)]
     if kind == "invisible":
         return [(name,) for name in INVISIBLE]
     if kind in ("single", "deleted"):

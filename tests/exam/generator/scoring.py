@@ -64,6 +64,8 @@ def _outcome(kind: str, accepted: dict[str, set[str]], named: list[set[str]], ve
     if verdict in ABSTAINED:
         return "flagged"
     if not named:
+        if kind == "scattered" and not accepted:
+            return "right"
         return "missed" if kind not in ("none", "noise", "robot_none", "unexcited", "invisible") else "right"
     hit = [cause for cause, names in accepted.items() if any(names & group for group in named)]
     false = [group for group in named if not any(names & group for names in accepted.values())]
@@ -216,6 +218,8 @@ def table(records: list[dict]) -> list[Row]:
         *_many_rows(by["many"]),
         _share("18", "a tracker's Kalman filter: named", ">= 90 %", ended("kalman", right)),
         _share("18", "a tracker's Kalman filter: wrong name", "<= 2 %", ended("kalman", wrong)),
+        _share("19", "another table at every bounce: right", "-", ended("scattered", right)),
+        _share("19", "another table at every bounce: wrong name", "<= 2 %", ended("scattered", wrong)),
         _share("-", "in 5 % of the balls only: flagged or right", "-", ended("rare", flagged, right)),
         _share("-", "in 5 % of the balls only: wrong name", "-", ended("rare", wrong)),
         _share("-", "invisible in a ball log: named", "-", named("invisible")),
