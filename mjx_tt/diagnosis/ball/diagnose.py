@@ -219,7 +219,7 @@ def _diagnose(
         sessions,
         age,
         seen,
-        selection.imitated(best.projected, best.trial, best.choice),
+        evidence.imitated(best.projected, best.trial, best.choice),
         together,
         estimate(problem, best, kept),
         tuple(spin_notes) if before is None else before.spin_notes,
@@ -231,7 +231,7 @@ def _plain(
     trial: Trial,
     nominal: Situation,
     say: Callable[[str], None],
-    scatter: Float[np.ndarray, 3] = posterior.ALIKE,
+    scatter: Float[np.ndarray, 3] = noise.ALIKE,
 ) -> tuple[Settled, Posterior]:
     """Choice of causes about balls that do not spin to begin with, and all effects at once."""
     fitted_all = posterior.fit(problem, nominal, None, trial.left_out, say, scatter)
@@ -275,7 +275,7 @@ def _spinning(
     trial: Trial,
     nominal: Situation,
     say: Callable[[str], None],
-    scatter: Float[np.ndarray, 3] = posterior.ALIKE,
+    scatter: Float[np.ndarray, 3] = noise.ALIKE,
 ) -> tuple[Settled, Posterior]:
     """Choice of causes where each ball has a spin of its own, about which derivatives are taken; and all at once."""
     say("fitting each ball's spin")

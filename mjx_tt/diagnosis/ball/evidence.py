@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 
+from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
-from mjx_tt.diagnosis.ball.flights.linearization import KICK
-from mjx_tt.diagnosis.ball.selection import MAGNUS_KEPT, Choice, Settled, fitted_spins, left_over
+from mjx_tt.diagnosis.ball.flights.linearization import KICK, Projected
+from mjx_tt.diagnosis.ball.selection import MAGNUS_KEPT, TIE, Choice, Settled, Trial, fitted_spins, left_over
 
 SPIN_COST = 3.0  # squared error by which three more numbers of a ball must pay at least
 
@@ -71,3 +74,22 @@ def shift_of_spins(settled: Settled) -> float:
 def bent_too_far(choice: Choice) -> bool:
     """True if spin was chosen with a Magnus coefficient that no ball has: a line bent too far."""
     return choice.magnus is not None and not MAGNUS_KEPT[0] <= choice.magnus <= MAGNUS_KEPT[1]
+
+
+def imitated(p: Projected, trial: Trial, choice: Choice) -> tuple[str, ...]:
+    """Effects that were left out and would explain the data as well as two of the chosen ones together.
+
+    A camera that is turned tilts gravity and the table alike; one of another scale changes gravity and drag. Two causes
+    whose sizes happen to stand in such a ratio are a coincidence that has to be told.
+    """
+    if not trial.left_out or len(choice.effects) < 2:
+        return ()
+    rated = scores.under(p, choice.prior)
+    whole = scores.gain(rated, choice.effects)
+    names = []
+    for r in trial.left_out:
+        for i, j in combinations(choice.effects, 2):
+            rest = tuple(e for e in choice.effects if e not in (i, j))
+            if whole - scores.gain(rated, tuple(sorted((*rest, r)))) < TIE + choice.threshold:  # one number less
+                names.append(trial.effects[r].name)
+    return tuple(dict.fromkeys(names))

@@ -26,7 +26,6 @@ ROUNDS = 7
 SETTLED = 0.2  # of a standard deviation by which nothing moves any more
 MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
 LONGEST_MOVE = 3.0  # scales by which an effect may change in a round
-ALIKE = np.zeros(3)  # [m/s]: no bounce has a kick of its own
 FREEDOM = 4.0  # degrees of Student's distribution of an effect's size
 
 
@@ -55,7 +54,7 @@ def fit(
     prior: SpinPrior | None,
     left_out: Container[int],
     say: Callable[[str], None],
-    scatter: Float[np.ndarray, 3] = ALIKE,
+    scatter: Float[np.ndarray, 3] = noise.ALIKE,
 ) -> Posterior:
     """Maximum of the posterior of all effects that are not left out, from a situation with or without spins.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -37,7 +36,6 @@ SETTLED = 0.2  # of an estimate's error by which it may still have moved in the 
 MAGNUS_KEPT = (0.2, 1.5)  # of the coefficient k about which derivatives are taken by balls of one spin
 CORNER = 5e-4  # [s] about the bounce of a spinning ball in which no sample counts
 WIDEST = 10.0  # scales of an effect beyond which it is no explanation: beside others it may be all but invisible
-ALIKE_BOUNCES = np.zeros(3)  # [m/s]
 LEAST_Z = 3.5  # estimate over its ball-to-ball standard error
 ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
 TIE = 10.0  # gain by which the chosen set must beat a substitute
@@ -92,8 +90,8 @@ def visible(rated: Scores, trial: Trial, scatters: bool = False) -> Bool[np.ndar
         a = list(rated.always)
         cross = rated.gram[np.ix_(range(k), a)]
         gram -= np.einsum("ka,ab,kb->k", cross, np.linalg.pinv(rated.gram[np.ix_(a, a)]), cross)
-    size = (4.0 if scatters else 2.0) * FLOOR
-    size = np.where(trial.shift > 1e-9, size / np.maximum(trial.shift, 1e-9), 0.0)
+    least = (4.0 if scatters else 2.0) * FLOOR
+    size = np.where(trial.shift > 1e-9, least / np.maximum(trial.shift, 1e-9), 0.0)
     return gram * size**2 > LEAST_GAIN
 
 
@@ -238,25 +236,6 @@ def _group(t: _Treatment, subset: Subset, i: int, gain: float, trial: Trial) -> 
     return (member, *(c for _, c in sorted(alike)))
 
 
-def imitated(p: Projected, trial: Trial, choice: Choice) -> tuple[str, ...]:
-    """Effects that were left out and would explain the data as well as two of the chosen ones together.
-
-    A camera that is turned tilts gravity and the table alike; one of another scale changes gravity and drag. Two causes
-    whose sizes happen to stand in such a ratio are a coincidence that has to be told.
-    """
-    if not trial.left_out or len(choice.effects) < 2:
-        return ()
-    rated = scores.under(p, choice.prior)
-    whole = scores.gain(rated, choice.effects)
-    names = []
-    for r in trial.left_out:
-        for i, j in combinations(choice.effects, 2):
-            rest = tuple(e for e in choice.effects if e not in (i, j))
-            if whole - scores.gain(rated, tuple(sorted((*rest, r)))) < TIE + choice.threshold:  # one number less
-                names.append(trial.effects[r].name)
-    return tuple(dict.fromkeys(names))
-
-
 @dataclass(frozen=True)
 class Settled:
     """A choice of causes and the situation about which it was made."""
@@ -276,7 +255,7 @@ def search(
     prior: SpinPrior | None,
     say: Callable[[str], None],
     linear: Linear | None = None,
-    scatter: np.ndarray = ALIKE_BOUNCES,
+    scatter: np.ndarray = noise.ALIKE,
 ) -> Settled:
     """Chooses causes and linearises about them until the choice settles.
 

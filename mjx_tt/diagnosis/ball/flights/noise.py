@@ -21,6 +21,7 @@ OUTLIER = 30.0  # times the median square beyond which a sample counts no more: 
 LEAST_SHARE = 0.7  # of the noise along the flight beyond that across it which must grow with the speed's square
 NOMINAL_SCALE = 0.003  # [m] before anything is known
 LARGEST_MEMORY = 0.97
+ALIKE = np.zeros(3)  # [m/s]: no bounce has a kick of its own
 LEAST_SCATTER = 1e-4  # [m/s] of bounces, where they scatter at all
 
 
@@ -37,7 +38,7 @@ class Noise:
     interval: float  # [s] usual time between neighbours
     # (3,) [m/s] deviation of what a bounce adds to a ball's velocity beside the model, along the axes of its spin:
     # across its way, against it, up. Zero where all bounces are alike.
-    scatter: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    scatter: np.ndarray = field(default_factory=ALIKE.copy)
 
 
 def nominal_noise(g: Grid) -> Noise:
