@@ -31,13 +31,15 @@ PYTEST   := $(BIN)/python -m pytest
 PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 
 # Where arrays are computed: every annotation is checked, types and ranks of arrays change only where the code says so.
-STRICT   := tests/ballmodel tests/bgs $(addprefix tests/mjx_tt/,robot sim env rally viz)
-ALL_ELSE := tests $(addprefix --ignore=,$(STRICT))
+# The longest come first, so that neither process waits for the other at the end.
+STRICT   := $(addprefix tests/mjx_tt/,rally env) tests/ballmodel tests/bgs $(addprefix tests/mjx_tt/,sim robot viz)
+ALL_ELSE := tests/robot_io/safety tests $(addprefix --ignore=,$(STRICT))
+REALTIME  = $(shell grep -rl --include="test_*.py" "mark.realtime" tests)
 
 test: $(READY)
 	STRICT_ARRAYS=1 $(PYTEST) $(PARALLEL) $(STRICT) -m "not slow and not realtime"
 	$(PYTEST) $(PARALLEL) $(ALL_ELSE) -m "not slow and not realtime"
-	$(PYTEST) tests/examples tests/experiments tests/robot_io -m "not slow and realtime"
+	$(PYTEST) $(REALTIME) -m "not slow and realtime"
 
 test-slow: $(READY)
 	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -15,6 +16,8 @@ UNOPTIMISED = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1") == "1
 # get, which unoptimised is too slow for MJX.
 if UNOPTIMISED and os.environ.get("USERS_FUSION", "0") != "1":
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
+# The tests run beside each other on every core: what XLA spreads over threads to compile would only cost more.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_parallel_codegen_split_count=1".strip()
 CACHE = Path(__file__).parent.parent / ".cache" / "jax"
 # Compiled programs are kept between runs and shared with the other workers and with started processes.
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(CACHE)
@@ -35,9 +38,18 @@ from mjx_tt import platform  # noqa: E402
 # Two host devices, so that splitting over devices is tested everywhere.
 platform.configure(devices=2, cache=CACHE)
 jax.devices()  # from here on no command in this process can change their number
+
+from mjx_tt.env import evaluator  # noqa: E402
+
+# Evaluations of a few episodes are padded to an eighth of what users get.
+evaluator.COLUMNS = 32
 if STRICT:
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()  # what was imported stays: garbage is sought among what the tests make
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -16,6 +16,8 @@ from ballmodel.flight import ball_params
 from ballmodel.sampling import KEPT, OUTCOMES, UNDECIDED, coarse_outcome, sample_pool, throw
 from ballmodel.state import BallState, ball_state
 
+pytestmark = pytest.mark.optimised
+
 BOX = BallDistribution(
     (0.0, 1.2, 0.2), (0.3, 1.5, 0.5), (-0.8, -6.5, 0.0), (0.8, -4.0, 1.8), (-0.3, -1.2), (0.5, -0.4), "box"
 )

@@ -16,8 +16,6 @@ from ballmodel.sampling import sample_pool
 from ballmodel.trajectory import Dataset, Trajectory, free_flight
 from tests.support.paths import MEASURED
 
-pytestmark = pytest.mark.optimised
-
 K_D = 0.47 * 1.29 * 1.256e-3 / (2 * 0.0027)
 
 

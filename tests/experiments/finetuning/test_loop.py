@@ -472,6 +472,7 @@ def test_intervals_are_those_of_student_and_welch():
     assert t_interval([2.0, 2.0]) == (2.0, 2.0, 2.0) and welch_interval([1.0, 1.0], [3.0, 3.0]) == (2.0, 2.0, 2.0)
 
 
+@pytest.mark.slow
 def test_the_emulated_robots_balls_make_a_human_distribution(tmp_path):
     """fit-human finds what was thrown, from the noisy samples of the emulated tracker."""
     robot, thrown, played = LockStepRobot(throws()), throws(), []

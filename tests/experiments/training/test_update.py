@@ -170,6 +170,7 @@ def test_mistakes_are_named(pool):
         Trainer(Simulator(TASK), BGS, pool, SimModel(), repeats=0)
 
 
+@pytest.mark.slow
 def test_later_weights_take_over_after_their_update(trainer, run, pool):
     """Before it nothing changes; from then on the step is that of a task with these weights."""
     weights = tuple(0.0 if name == "state_transition" else weight for name, weight in rewards.SIM_WEIGHTS.items())

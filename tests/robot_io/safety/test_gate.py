@@ -705,7 +705,7 @@ class Offset(Ideal):
         return sent
 
 
-@pytest.mark.parametrize("offset", [0.03, 0.08, 0.15])
+@pytest.mark.parametrize("offset", [0.03, pytest.param(0.08, marks=pytest.mark.slow), 0.15])
 def test_a_robot_beside_its_reference_does_not_come_into_the_table(offset):
     """Its joints 2 and 5 lead it down: the margin of the reference alone would let the measured blade through."""
     deepest = np.inf

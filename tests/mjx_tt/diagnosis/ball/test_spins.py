@@ -101,7 +101,8 @@ def _log(tmp_path, world, balls, rng):
     return load_logs([path])
 
 
-@pytest.mark.parametrize("restitution, friction", [(0.88, 0.18), pytest.param(0.80, 0.11, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("restitution, friction", [(0.88, 0.18), (0.80, 0.11)])
 def test_two_ordinary_causes_far_from_nominal_are_both_found(tmp_path, restitution, friction):
     """The straight line from the nominal model leads to a spin that is not there."""
     rng = np.random.default_rng(4)
