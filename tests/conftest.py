@@ -41,8 +41,7 @@ jax.devices()  # from here on no command in this process can change their number
 
 from mjx_tt.env import evaluator  # noqa: E402
 
-# Evaluations of a few episodes are padded to an eighth of what users get.
-evaluator.COLUMNS = 32
+USERS_COLUMNS = evaluator.COLUMNS
 if STRICT:
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -56,3 +55,6 @@ def pytest_collection_finish() -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     optimised = item.get_closest_marker("optimised") is not None
     jax.config.update("jax_disable_most_optimizations", UNOPTIMISED and not optimised)
+    # Evaluations of a few episodes are padded to an eighth of what users get; slow tests compare them with those of
+    # other processes.
+    evaluator.COLUMNS = USERS_COLUMNS if item.get_closest_marker("slow") else USERS_COLUMNS // 8

@@ -12,8 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import mjx_tt.env.gymnasium as table_tennis
-from mjx_tt.env import make, rewards
-from mjx_tt.env.evaluator import COLUMNS, ROWS
+from mjx_tt.env import evaluator, make, rewards
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import ModelFile, SimModel
@@ -21,7 +20,6 @@ from robot_io.policy import export
 from tests.support.paths import ROOT
 
 QUICK = TaskConfig(sim_rate=75.0)
-CALL = ROWS * COLUMNS  # episodes that are played at once
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +51,8 @@ def test_arrays_have_the_episode_first(played):
 
 def test_another_number_of_episodes_compiles_nothing(play, policy, played):
     programs = play._evaluator._traced._cache_size()
-    for episodes in (1, 40, CALL + 1):
+    at_once = evaluator.ROWS * evaluator.COLUMNS
+    for episodes in (1, 40, at_once + 1):
         assert play(policy, episodes, seed=1).returns.shape == (episodes,)
     assert play._evaluator._traced._cache_size() == programs == 1
     again = play(policy, 300, seed=3)
@@ -64,13 +63,14 @@ def test_another_number_of_episodes_compiles_nothing(play, policy, played):
 def test_padding_changes_no_episode(play, policy):
     """An episode does not know how many others are played with it: the first balls of a longer stream, at the same
     places of the same call, give the same returns."""
-    few, many = play(policy, CALL - 1, seed=5), play(policy, CALL, seed=5)
+    at_once = evaluator.ROWS * evaluator.COLUMNS
+    few, many = play(policy, at_once - 1, seed=5), play(policy, at_once, seed=5)
     same = (few.ball[:, None] == many.ball[None]).all(axis=-1)
     assert same.any(axis=1).all()  # the pool of the longer one begins with the shorter one's
     at = same.argmax(axis=1)
-    before = at == np.arange(CALL - 1)  # in front of the ball that is only in the longer one
+    before = at == np.arange(at_once - 1)  # in front of the ball that is only in the longer one
     assert before.any()
-    np.testing.assert_array_equal(few.returns[before], many.returns[: CALL - 1][before])
+    np.testing.assert_array_equal(few.returns[before], many.returns[: at_once - 1][before])
 
 
 def test_bad_requests_are_refused(play, policy, tmp_path):
