@@ -77,7 +77,7 @@ def test_predicts_what_other_code_flies(paths):
     truth = flown(replace(World(), **{CHANGED[p][0]: CHANGED[p][1] for p in paths}), start)
     g = grid(trajectories(np.nan_to_num(truth)))
     axes = heading_axes(start[3:6])
-    local = np.concatenate([start[:6], np.einsum("can,cn->an", axes, start[6:]), np.zeros((3, 40))])
+    local = np.concatenate([start[:6], np.einsum("can,cn->an", axes, start[6:])])
     nominal = leaves(SimModel())
     values = {p: np.array([[CHANGED[p][1] if p in paths else nominal[p]]]) for p in CHANGED}
     ours = predict(SimModel(), values, local[:, None], g, axes)

@@ -104,15 +104,18 @@ def heading_axes(velocity: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 3 n
 def predict(
     model: SimModel,
     values: Mapping[str, np.ndarray],
-    start: Float[np.ndarray, "12 v n"],
+    start: Float[np.ndarray, "k v n"],
     g: Grid,
     axes: Float[np.ndarray, "3 3 n"],
 ) -> Flown:
     """Flies every ball under every variant.
 
     values: leaves of ``model`` to replace, each broadcastable to (v, n). start: position, velocity, spin at the
-    first sample, and what its first bounce adds to its velocity; these two in ``axes``: component, axis, ball.
+    first sample, and, where there are twelve rows, what its first bounce adds to its velocity; these two in ``axes``:
+    component, axis, ball.
     """
+    if len(start) == 9:
+        start = np.concatenate([start, np.zeros_like(start[:3])])
     own = [np.einsum("can,avn->cvn", axes, part) for part in (start[6:9], start[9:])]
     start = np.concatenate([start[:6], *own])
     v, n = start.shape[1:]
