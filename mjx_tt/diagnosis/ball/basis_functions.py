@@ -122,6 +122,9 @@ def build(
         vin = np.linalg.norm(linear.base.bounce_velocity[:, 0], axis=0)
         vz = -linear.base.bounce_velocity[2, 0]
         bounced = np.isfinite(linear.base.bounce_time[0])
+        # What slows a ball along its way is no kick along y where balls come from both ends.
+        ends = np.sign(linear.base.bounce_velocity[1, 0, bounced])
+        axes = (0, 1, 2) if np.all(ends == ends[0]) else (0, 1, 2, 3)
 
         def over(name: str, value: np.ndarray, unit: str) -> None:
             basis, places = hats(np.where(bounced, value, np.nan_to_num(value[bounced].mean())), bounced)
@@ -131,6 +134,7 @@ def build(
                 basis,
                 [f"{name} near {p:.2f} {unit}" for p in places],
                 kicked,
+                axes,
             )
 
         over("x", bx, "m")
@@ -215,7 +219,10 @@ def _propagators(linear: Linear, g: Grid) -> tuple[Respond, Respond]:
 
     since = g.time - np.where(np.isfinite(bounce), bounce, 0.0)[None]
     first = after & (np.cumsum(after, axis=0) == 1)
+    impact = linear.base.bounce_velocity[:2, 0]
+    along = impact / np.maximum(np.linalg.norm(impact, axis=0), 1e-9)  # over the table
     kicks = [carried(np.where(first, inverse[:, 3 + d] + since * inverse[:, d], 0.0)) for d in range(3)]
+    kicks.append(along[0] * kicks[0] + along[1] * kicks[1])
 
     def kicked(size: np.ndarray, d: int) -> np.ndarray:
         return kicks[d] * size

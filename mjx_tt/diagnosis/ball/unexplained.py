@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import chdtri, fdtrc
 
 from mjx_tt.diagnosis.ball import basis_functions, scores, selection
+from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.ball.flights.linearization import Linear, Projected, StartsOut
 from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial
@@ -47,6 +48,11 @@ def find(
     effects = linear.effects[chosen]
     # The chosen effects' own values are in the situation: what is left is scored at it (spins are kept absolute).
     flights = StartsOut(linear, linear.residual, settled.at.start, p.noise, p.weight, g)
+    # Kicks imitate on each ball what all bounces share; it is as visible as if they were alike.
+    alike = flights
+    if p.noise.scatter.any():
+        unkicked = replace(p.noise, scatter=noise.ALIKE)
+        alike = StartsOut(linear, linear.residual, settled.at.start, unkicked, p.weight, g)
     named = len(choice.effects)  # the coefficient that comes along with spin is no name of its own
     for block in basis_functions.build(linear, g, sessions, age, called):
         columns = np.concatenate([effects, block.columns])
@@ -61,7 +67,8 @@ def find(
         pattern = np.tensordot(beta, block.columns, 1)
         worst = np.linalg.norm(np.where(g.mask, pattern, 0.0), axis=0).max(axis=0)
         size = float(np.percentile(worst, 90))
-        if size < BLOCK_FLOOR or _visible(rated.ball_gram[:, extra][:, :, extra], beta, p, g) < VISIBLE_FLOOR:
+        shown = rated if alike is flights else scores.under(alike.project(columns), choice.prior)
+        if size < BLOCK_FLOOR or _visible(shown.ball_gram[:, extra][:, :, extra], beta, p, g) < VISIBLE_FLOOR:
             continue
         axis = int(
             np.argmax([np.percentile(np.abs(np.where(g.mask, pattern[a], 0.0)).max(axis=0), 90) for a in range(3)])
