@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import socket
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
+import viser
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from experiments import cli
 from experiments.commands import render
@@ -95,12 +99,74 @@ def test_a_port_that_is_taken_is_named():
             guard.check_free("127.0.0.1", port)
 
 
-def test_the_tunnel_of_the_pages_library_stays_shut():
+@pytest.fixture(scope="module")
+def server():
     server = guard.Server("127.0.0.1", 0)
+    yield server
+    server.stop()
+
+
+def test_the_tunnel_of_the_pages_library_stays_shut(server):
+    assert server.request_share_url() is None
+
+
+def answers(port: int, origin: str | None, **headers: str) -> bool:
+    """True where the page's websocket speaks to a page of that origin, False where it refuses the connection."""
+    version = [f"viser-v{viser.__version__}"]
     try:
-        assert server.request_share_url() is None
+        address = f"ws://127.0.0.1:{port}/"
+        with connect(address, origin=origin, subprotocols=version, additional_headers=headers) as page:
+            return len(page.recv(5)) > 0
+    except InvalidStatus as refused:
+        assert refused.response.status_code == 403 and b"answers to itself only" in refused.response.body
+        return False
+
+
+def test_a_websocket_answers_pages_of_this_machine_at_its_port_and_programs_without_a_page(server):
+    port = server.get_port()
+    for name in ("127.0.0.1", "localhost", "[::1]"):
+        assert answers(port, f"http://{name}:{port}")
+    assert answers(port, None)
+
+
+def test_a_websocket_refuses_pages_of_others(server):
+    port = server.get_port()
+    for origin in (
+        "http://example.org",
+        f"http://example.org:{port}",  # a name that its owner points to this machine: Host would be the same
+        f"http://localhost.example.org:{port}",
+        f"http://127.0.0.1:{port + 1}",  # another program of this machine
+        "http://localhost",
+        f"http://[::1:{port}",
+        f"http://localhost:{port}x",
+        "null",  # a file, or a frame without rights
+    ):
+        assert not answers(port, origin), origin
+
+
+def test_a_forwarded_port_is_a_page_of_this_machine_too():
+    """``ssh -L 9000:127.0.0.1:8080``: the browser knows 9000 only."""
+    assert guard.is_own("http://localhost:9000", "localhost:9000", 8080)
+    assert not guard.is_own("http://localhost:9000", "localhost:8080", 8080)
+    assert not guard.is_own("http://example.org:9000", "example.org:9000", 8080)
+
+
+def test_the_gate_answers_pages_of_the_address_that_was_asked_for(server):
+    gate = guard.Gate("127.0.0.1", 0, TOKEN, server.get_port())
+    cookie = {"Cookie": f"{guard.COOKIE}={TOKEN}"}
+    try:
+        assert answers(gate.port, f"http://127.0.0.1:{gate.port}", **cookie)
+        assert answers(gate.port, None, **cookie)
+        for origin in ("http://example.org", f"http://127.0.0.1:{gate.port + 1}", f"http://localhost:{gate.port}"):
+            assert not answers(gate.port, origin, **cookie)
     finally:
-        server.stop()
+        gate.stop()
+
+
+def test_a_page_library_that_starts_its_server_in_another_way_is_refused(monkeypatch):
+    monkeypatch.setattr(guard, "_guarded", lambda: contextlib.nullcontext([]))
+    with pytest.raises(ConfigError, match="cannot be guarded"):
+        guard.Server("127.0.0.1", 0)
 
 
 def test_what_cannot_be_shown_is_refused_before_anything_heavy(tmp_path, capsys, monkeypatch):
