@@ -94,6 +94,8 @@ COMMANDS = (
     train.app,
     evaluate.app,
     evaluate.export_app,
+    evaluate.pack_app,
+    evaluate.unpack_app,
     fit_human.app,
     fit_human.import_app,
     render.app,

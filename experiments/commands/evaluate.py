@@ -1,4 +1,5 @@
-"""``mjx-tt evaluate``: a policy on fresh balls; ``mjx-tt export``: a run's policy as an artefact."""
+"""``mjx-tt evaluate``: a policy on fresh balls; ``mjx-tt export``: a run's policy as an artefact; ``mjx-tt pack`` and
+``mjx-tt unpack``: a policy as one file to pass on."""
 
 from __future__ import annotations
 
@@ -20,9 +21,10 @@ from experiments.commands.options import (
     experiment_of,
     option,
     start_jax,
+    suffix,
     writable,
 )
-from experiments.runs.locate import find_policy, run_of
+from experiments.runs.locate import find_policy, is_unpacked, run_of
 from experiments.runs.run_dir import CONFIG, Run
 
 app = command(
@@ -42,6 +44,23 @@ export_app = command(
     """\
   mjx-tt export runs/quickstart
   mjx-tt export runs/quickstart --out artefacts/anna
+""",
+)
+pack_app = command(
+    "pack",
+    "make one file of a policy, to pass on: artefact, configuration, evaluation, a card",
+    """\
+  mjx-tt pack runs/quickstart
+  mjx-tt pack runs/quickstart --out anna.mjxtt.zip --licence CC-BY-4.0
+""",
+)
+unpack_app = command(
+    "unpack",
+    "check a packed policy and put it into a folder, which stands for a run",
+    """\
+  mjx-tt unpack quickstart.mjxtt.zip
+  mjx-tt unpack quickstart.mjxtt.zip --out runs/anna
+  mjx-tt view runs/anna
 """,
 )
 
@@ -93,9 +112,11 @@ def evaluate(
 def _folder(policy: Path, *others: str | None) -> Path:
     """Default folder of an evaluation; ``others``: balls and model that are not the policy's own."""
     changed = [Path(text).with_suffix("").as_posix().replace("/", "-") for text in others if text]
-    if (policy / CONFIG).exists():
+    if (policy / CONFIG).exists() and not is_unpacked(policy):
         return policy / f"evaluation-{'-'.join(changed)}" if changed else policy
-    return policy.with_name("-".join([f"{policy.name}-evaluation", *changed]))  # an artefact holds its own files only
+    # An artefact holds its own files only, a run that was passed on those that it came with.
+    policy = policy if policy.name else policy.absolute()
+    return policy.with_name("-".join([f"{policy.name}-evaluation", *changed]))
 
 
 @export_app.default
@@ -120,3 +141,42 @@ def export(
     if written:
         screen.print(f"artefact: {artefact}", highlight=False)
     return 0 if written else 1
+
+
+@pack_app.default
+def pack(
+    policy: PolicyFolder,
+    /,
+    *,
+    out: Annotated[str | None, option("FILE", "default: the run's name with .mjxtt.zip, in the current folder")] = None,
+    licence: Annotated[str | None, option("NAME", "for the card, such as CC-BY-4.0")] = None,
+) -> None:
+    """Writes the file and prints its SHA-256."""
+    folder = run_of(policy)
+    from experiments.sharing import packed
+
+    path = Path(out or f"{folder.absolute().name}{packed.SUFFIX}")
+    suffix(path, ".zip")
+    writable(path.parent)
+    digest = packed.pack(folder, path, licence)
+    console().print(f"{path}: {path.stat().st_size:,} bytes, SHA-256 {digest}", highlight=False, soft_wrap=True)
+
+
+@unpack_app.default
+def unpack(
+    file: Annotated[str, Parameter("FILE", help="a packed policy")],
+    /,
+    *,
+    out: Annotated[str | None, option("FOLDER", "default: the file's name, in the current folder")] = None,
+) -> None:
+    """Checks every byte before anything is written."""
+    existing(file)
+    from experiments.sharing import card, packed
+
+    path = Path(file)
+    folder = Path(out or path.name.removesuffix(".zip").removesuffix(".mjxtt"))
+    rates = card.rates(packed.unpack(path, folder))
+    value, low, high, count, _ = rates["returned"]
+    screen = console()
+    said = f"{value:.1%} of {count:,} balls returned (95 % interval {low:.1%} to {high:.1%})"
+    screen.print(f"{folder}: {said}; {folder}/README.md says where", highlight=False, soft_wrap=True)

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from experiments.errors import RunError
-from experiments.runs.run_dir import CONFIG
+from experiments.runs.run_dir import CONFIG, Run
 from robot_io.policy.artefact import MANIFEST
 
 SELECTION = "selection.json"  # beside several trainings of one model: which was chosen
@@ -53,6 +53,13 @@ def artefact_of(folder: str | Path) -> Path:
     if not (folder / "artefact" / MANIFEST).is_file():
         raise RunError(f"{folder}: a run that was not exported yet: `mjx-tt export {folder}`")
     return folder / "artefact"
+
+
+def is_unpacked(folder: str | Path) -> bool:
+    """True for a folder that was passed on: a run's configuration and artefact, without the states of its training."""
+    folder = Path(folder)
+    whole = (folder / CONFIG).is_file() and (folder / "artefact" / MANIFEST).is_file()
+    return whole and not any(Run(folder).checkpoints.glob("[0-9]*.npz"))
 
 
 def _inside(folder: Path) -> str:

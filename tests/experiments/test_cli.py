@@ -83,7 +83,7 @@ def test_help_and_refusals_do_not_wait_for_jax(tmp_path):
         1: """train nowhere.yaml; train quickstart.yaml --out file; evaluate nowhere; export nowhere; render nowhere
         --out a.png; render . --out a.txt; fit-human a.csv --out a.txt; fit-human a.csv --out a.yaml; import a.csv
         --out a.csv; run nowhere --robot rig; finetune nowhere --robot rig; is2r nowhere.yaml; compare nowhere.yaml;
-        study-report nowhere; evaluate . --model nowhere.yaml; curves nowhere""",
+        study-report nowhere; evaluate . --model nowhere.yaml; curves nowhere; pack nowhere; unpack nowhere.zip""",
         2: "trian; train; evaluate . --episodes 0; rig --ports 1; log close a.mcap; run . --robot rig --backend tpu",
         0: "--version; --help",
     }
@@ -184,6 +184,20 @@ def test_evaluate_artefact_on_other_balls_leaves_the_artefact_alone(trained):
 
 
 @pytest.mark.slow
+def test_a_packed_policy_plays_as_its_run_does(trained, tmp_path):
+    run, file, folder = trained[1] / "tiny", tmp_path / "tiny.zip", tmp_path / "tiny"
+    for arguments in (("pack", run, "--out", file), ("unpack", file, "--out", folder)):
+        done = mjx_tt(*arguments)
+        assert done.returncode == 0, done.stderr
+    done = mjx_tt("evaluate", folder, "--devices", 1)
+    assert done.returncode == 0, done.stderr
+    found, expected = (
+        json.loads((place / "evaluation.json").read_text()) for place in (tmp_path / "tiny-evaluation", run)
+    )
+    assert found["outcomes"] == expected["outcomes"] and found["terms"] == expected["terms"]
+    assert (folder / "evaluation.json").read_bytes() == (run / "evaluation.json").read_bytes()
+
+
 def test_seeds_get_folders_of_their_own_and_the_best_is_selected(trained, tmp_path):
     yaml, _, _ = trained
     done = mjx_tt("train", yaml, "--out", tmp_path, "--seeds", "7", "--select", "--devices", 1)

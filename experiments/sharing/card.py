@@ -1,0 +1,59 @@
+"""The card of a policy: what it is, how well it plays and where that was measured, how to run it. Markdown."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, UndefinedError
+
+from experiments.errors import RunError
+from experiments.stats import wilson
+from robot_io.policy.artefact import Artefact
+
+# Name -> value, lower and upper end of its 95 % interval, count and unit of what it was measured on.
+Rates = dict[str, tuple[float, float, float, int, str]]
+
+
+def write(artefact: Artefact, evaluation: dict[str, Any], licence: str | None = None) -> str:
+    """The card's text. Raises RunError for an artefact or an evaluation that does not say what the card has to."""
+    manifest = artefact.manifest
+    config = manifest["provenance"]["config"]
+    balls = config["balls"] if isinstance(config["balls"], str) else config["balls"].get("name", "of `config.yaml`")
+    loader = PackageLoader("experiments.sharing")
+    templates = Environment(
+        loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+    )
+    try:
+        return templates.get_template("card.md").render(
+            manifest,
+            config=config,
+            balls=balls,
+            evaluation=evaluation,
+            rates=rates(evaluation),
+            percent=_percent,
+            digest=artefact.digest,
+            licence=licence,
+        )
+    except (LookupError, TypeError, UndefinedError) as error:
+        raise RunError(f"{artefact.folder}: its evaluation or manifest lacks what a card says: {error}") from None
+
+
+def rates(evaluation: dict[str, Any]) -> Rates:
+    """Shares with their intervals, of a simulated evaluation or of one after fine-tuning on a robot."""
+    if "after" in evaluation:
+        after = evaluation["after"]
+        returned = (after["return_rate"], after["return_rate_low"], after["return_rate_high"], after["balls"], "balls")
+        return {"returned": returned}
+    episodes, bound = evaluation["episodes"], evaluation["reachable"]
+    hits = episodes - evaluation["outcomes"]["missed"]
+    found: Rates = {
+        "returned": (evaluation["return_rate"], evaluation["low"], evaluation["high"], episodes, "balls"),
+        "hit": (hits / episodes, *wilson(hits, episodes), episodes, "balls"),
+    }
+    if bound is not None:
+        found["in reach, at least"] = (bound["return_rate"], bound["low"], bound["high"], bound["balls"], "of them")
+    return found
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"

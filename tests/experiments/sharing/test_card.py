@@ -1,0 +1,69 @@
+"""The card says what was measured, with intervals worked out independently, and of which kind of evaluation it is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import pytest
+
+from experiments.commands.render import SHIPPED
+from experiments.errors import RunError
+from experiments.sharing import card
+from robot_io.policy import artefact as artefacts
+
+
+def wilson(k: int, n: int) -> tuple[float, float]:
+    """Wilson 1927, written out."""
+    z, p = 1.959963984540054, k / n
+    middle, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
+
+
+@pytest.fixture(scope="module")
+def artefact():
+    return artefacts.load(SHIPPED)
+
+
+def row(text: str, name: str) -> list[str]:
+    (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
+    return [cell.strip() for cell in line.strip("|").split("|")][1:]
+
+
+def test_figures_come_with_their_intervals_and_conditions(artefact):
+    evaluation = artefact.manifest["provenance"]["evaluation"]
+    text = card.write(artefact, evaluation)
+    n, counts = evaluation["episodes"], evaluation["outcomes"]
+    for name, k in (("returned", counts["returned"]), ("hit", counts["returned"] + counts["hit"])):
+        low, high = wilson(k, n)
+        expected = [f"{100 * k / n:.1f} %", f"{100 * low:.1f} % to {100 * high:.1f} %", f"{n:,} balls"]
+        assert row(text, name) == expected
+    assert row(text, "in reach, at least")[2] == "256 of them"
+    for words in ("balls of player3/M0", "seed 1000", "engine fused, 300 Hz", "nominal model", "without randomisation"):
+        assert words in " ".join(text.split())
+    assert artefact.digest in text and "not stated" in text and "license:" not in text
+
+
+def test_the_contract_is_the_artefacts(artefact):
+    text = card.write(artefact, artefact.manifest["provenance"]["evaluation"])
+    for part in artefact.manifest["contract"]["observation"][:3]:
+        assert row(text, part["name"]) == [part["unit"]]
+    assert "| joint_6 | rad/s | 10.47 |" in text and "75 times a second" in text
+
+
+def test_an_evaluation_after_fine_tuning_names_the_robot(artefact):
+    after = {"return_rate": 0.5, "return_rate_low": 0.4, "return_rate_high": 0.6, "balls": 80, "mean_return": 1.0}
+    text = card.write(artefact, {"after": after, "updates": 12, "robot": {"kind": "rig"}, "training_seconds": None})
+    assert row(text, "returned") == ["50.0 %", "40.0 % to 60.0 %", "80 balls"]
+    assert 'Played on {"kind": "rig"}: 80 balls after 12 updates' in text and "on no robot" not in text
+
+
+def test_without_a_bound_it_is_left_out_and_an_evaluation_of_another_kind_is_refused(artefact):
+    evaluation = artefact.manifest["provenance"]["evaluation"]
+    assert "in reach" not in card.write(artefact, evaluation | {"reachable": None})
+    with pytest.raises(RunError, match="lacks what a card says"):
+        card.write(artefact, {"episodes": 3})
+    manifest = json.loads(json.dumps(artefact.manifest))
+    manifest["provenance"]["config"]["balls"] = {"name": "mine"}
+    assert "balls of mine" in card.write(dataclasses.replace(artefact, manifest=manifest), evaluation)
