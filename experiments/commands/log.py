@@ -1,13 +1,15 @@
-"""``mjx-tt log``: logs of sessions at the robot, to list, check, salvage and export."""
+"""``mjx-tt log``: logs of sessions at the robot, to list, check, salvage and export, for LeRobot too."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from experiments.commands.options import command, console, option
+from experiments.commands.options import command, console, existing, option
 from experiments.errors import ConfigError, checked
 
 if TYPE_CHECKING:
@@ -21,16 +23,18 @@ app = command(
   mjx-tt log check runs/robot/20261121-153000.mcap
   mjx-tt log salvage runs/robot/20261121-153000.mcap.part
   mjx-tt log export runs/robot/20261121-153000.mcap --out tables/
+  mjx-tt log lerobot runs/robot/monday.mcap runs/robot/tuesday.mcap --out dataset/     a LeRobot data set
+  mjx-tt log lerobot balls.csv --out dataset/                                          of measured balls alone
 """,
 )
 
 
 @app.default
 def log(
-    action: Annotated[Literal["list", "check", "salvage", "export"], Parameter("ACTION")],
+    action: Annotated[Literal["list", "check", "salvage", "export", "lerobot"], Parameter("ACTION")],
     /,
     *paths: Annotated[str, Parameter("LOG", help="an .mcap or .mcap.part; for list a folder", required=True)],
-    out: Annotated[str | None, option("PATH", "of salvage: the file; of export: the folder")] = None,
+    out: Annotated[str | None, option("PATH", "of salvage: the file; of export and lerobot: the folder")] = None,
 ) -> int:
     """Returns 1 where a checked log is not sound."""
     screen, target = console(), Path(out) if out else None
@@ -38,6 +42,8 @@ def log(
         list_logs(Path(paths[0]), screen)
     elif action == "check":
         return 1 if check([Path(path) for path in paths], screen) else 0
+    elif action == "lerobot":
+        lerobot(paths, target, screen)
     else:
         for path in paths:
             (salvage if action == "salvage" else export)(Path(path), target, screen)
@@ -115,6 +121,24 @@ def export(path: Path, out: Path | None, console: Console) -> list[Path]:
     balls = len(log.trajectories(session.ball))
     console.print(f"{balls:,} balls; mjx-tt fit-human {written[0]} makes a distribution of them", highlight=False)
     return written
+
+
+def lerobot(paths: Sequence[str], out: Path | None, console: Console) -> None:
+    """Writes sessions, or measured balls, as one LeRobot data set, and says what is not in it. Raises ConfigError."""
+    if find_spec("pyarrow") is None:
+        raise ConfigError("log lerobot needs pyarrow: pip install 'mjx-tt[lerobot]'")
+    if out is None:
+        raise ConfigError("log lerobot needs --out: the folder of the data set")
+    existing(*paths)
+    from experiments.sharing import lerobot as data_sets
+    from experiments.sharing import recordings
+
+    recording = recordings.read(paths)
+    data_sets.write(recording, out)
+    frames = sum(len(episode.columns["next.done"]) for episode in recording.episodes)
+    lines = (f"{out}: {len(recording.episodes):,} episodes, {frames:,} frames at 75 Hz", *recording.notes)
+    for line in lines:
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 def _logs_in(folder: Path) -> list[Path]:

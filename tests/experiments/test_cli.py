@@ -83,7 +83,8 @@ def test_help_and_refusals_do_not_wait_for_jax(tmp_path):
         1: """train nowhere.yaml; train quickstart.yaml --out file; evaluate nowhere; export nowhere; render nowhere
         --out a.png; render . --out a.txt; fit-human a.csv --out a.txt; fit-human a.csv --out a.yaml; import a.csv
         --out a.csv; run nowhere --robot rig; finetune nowhere --robot rig; is2r nowhere.yaml; compare nowhere.yaml;
-        study-report nowhere; evaluate . --model nowhere.yaml; curves nowhere; pack nowhere; unpack nowhere.zip""",
+        study-report nowhere; evaluate . --model nowhere.yaml; curves nowhere; pack nowhere; unpack nowhere.zip;
+        log lerobot nowhere --out a""",
         2: "trian; train; evaluate . --episodes 0; rig --ports 1; log close a.mcap; run . --robot rig --backend tpu",
         0: "--version; --help",
     }
