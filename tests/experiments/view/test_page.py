@@ -13,9 +13,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
+import viser
 from PIL import Image
 from viser.transforms import SO3
 
@@ -309,3 +311,24 @@ def test_an_exported_page_plays_without_a_server(open_page, browser, tmp_path, p
     moving(page)
     assert not [url for url in asked if not url.startswith(("file:", "blob:", "data:"))]
     context.close()
+
+
+def test_other_pages_in_the_same_browser_do_not_reach_it(browser):
+    """Browsers let any page open a websocket to this machine; only the server can refuse it."""
+    server, elsewhere = Server("127.0.0.1", 0), ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler)
+    threading.Thread(target=elsewhere.serve_forever, daemon=True).start()
+    asked = """([port, version]) => new Promise(done => {
+        const socket = new WebSocket(`ws://127.0.0.1:${port}/`, [`viser-v${version}`]);
+        socket.onmessage = () => done("answered");
+        socket.onerror = () => done("refused");
+    })"""
+    context = browser.new_context()
+    try:
+        for port, expected in ((elsewhere.server_port, "refused"), (server.get_port(), "answered")):
+            page = context.new_page()
+            page.goto(f"http://127.0.0.1:{port}/")
+            assert page.evaluate(asked, [server.get_port(), viser.__version__]) == expected
+    finally:
+        context.close()
+        server.stop()
+        elsewhere.shutdown()
