@@ -13,19 +13,23 @@ from robot_io.policy.artefact import Artefact
 # Name -> value, lower and upper end of its 95 % interval, count and unit of what it was measured on.
 Rates = dict[str, tuple[float, float, float, int, str]]
 
+_TEMPLATES = Environment(
+    loader=PackageLoader("experiments.sharing"),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
 
-def write(artefact: Artefact, evaluation: dict[str, Any], licence: str | None = None) -> str:
+
+def write(artefact: Artefact, config: dict[str, Any], evaluation: dict[str, Any], licence: str | None = None) -> str:
     """The card's text. Raises RunError for an artefact or an evaluation that does not say what the card has to."""
     manifest = artefact.manifest
-    config = manifest["provenance"]["config"]
     balls = config["balls"] if isinstance(config["balls"], str) else config["balls"].get("name", "of `config.yaml`")
-    loader = PackageLoader("experiments.sharing")
-    templates = Environment(
-        loader=loader, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
-    )
     try:
-        return templates.get_template("card.md").render(
-            manifest,
+        return filled(
+            "card.md",
+            **manifest,
             config=config,
             balls=balls,
             evaluation=evaluation,
@@ -36,6 +40,11 @@ def write(artefact: Artefact, evaluation: dict[str, Any], licence: str | None = 
         )
     except (LookupError, TypeError, UndefinedError) as error:
         raise RunError(f"{artefact.folder}: its evaluation or manifest lacks what a card says: {error}") from None
+
+
+def filled(template: str, **values: Any) -> str:
+    """One of this folder's templates with its values. Raises UndefinedError where one is missing."""
+    return _TEMPLATES.get_template(template).render(values)
 
 
 def rates(evaluation: dict[str, Any]) -> Rates:

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ballmodel.io.atomic_files import placing
+from experiments.sharing.card import filled
 from experiments.sharing.recordings import Feature, Recording
 from robot_io.contract import CONTROL_RATE
 
@@ -49,11 +49,8 @@ def write(recording: Recording, folder: Path) -> None:
         }
         for name, data in meta.items():
             (staging / "meta" / f"{name}.json").write_text(json.dumps(data, indent=4) + "\n", encoding="utf-8")
-        loader = Environment(
-            loader=PackageLoader("experiments.sharing"), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-        )
-        card = loader.get_template("dataset.md").render(recording=recording, frames=len(joined["index"]))
-        (staging / "README.md").write_text(card + "\n", encoding="utf-8")
+        card = filled("dataset.md", recording=recording, frames=len(joined["index"]))
+        (staging / "README.md").write_text(card, encoding="utf-8")
 
 
 def statistics(values: np.ndarray) -> dict[str, list]:

@@ -114,9 +114,10 @@ def _members(policy: Path, licence: str | None) -> dict[str, bytes]:
     provenance = artefact.manifest["provenance"]
     if not isinstance(provenance, dict) or not isinstance(provenance.get("config"), dict):
         raise RunError(f"{artefact.folder}: does not say how it was trained; pack the run that it came from")
-    evaluation = provenance.get("evaluation")
+    config, evaluation = provenance["config"], provenance.get("evaluation")
     if (place / CONFIG).is_file():
         run = Run(place)
+        config = run.config().to_dict()
         evaluation = run.read_evaluation() if run.evaluation.is_file() else None
         newest = max((int(path.stem) for path in run.checkpoints.glob("[0-9]*.npz")), default=provenance.get("update"))
         updates = {newest, provenance.get("update"), (evaluation or {}).get("update", newest)}
@@ -129,8 +130,8 @@ def _members(policy: Path, licence: str | None) -> dict[str, bytes]:
         raise RunError(f"{place}: was not evaluated yet: `mjx-tt evaluate {place}`")
     files = {f"artefact/{file}": (artefact.folder / file).read_bytes() for file in artefacts.FILES}
     return {
-        CARD: card.write(artefact, evaluation, licence).encode(),
-        CONFIG: yaml.safe_dump(provenance["config"], sort_keys=False).encode(),
+        CARD: card.write(artefact, config, evaluation, licence).encode(),
+        CONFIG: yaml.safe_dump(config, sort_keys=False).encode(),
         EVALUATION: (json.dumps(evaluation, indent=2) + "\n").encode(),
         **files,
     }

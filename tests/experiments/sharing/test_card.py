@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 
 import pytest
@@ -26,6 +24,10 @@ def artefact():
     return artefacts.load(SHIPPED)
 
 
+def write(artefact, evaluation) -> str:
+    return card.write(artefact, artefact.manifest["provenance"]["config"], evaluation)
+
+
 def row(text: str, name: str) -> list[str]:
     (line,) = [line for line in text.splitlines() if line.startswith(f"| {name} |")]
     return [cell.strip() for cell in line.strip("|").split("|")][1:]
@@ -33,7 +35,7 @@ def row(text: str, name: str) -> list[str]:
 
 def test_figures_come_with_their_intervals_and_conditions(artefact):
     evaluation = artefact.manifest["provenance"]["evaluation"]
-    text = card.write(artefact, evaluation)
+    text = write(artefact, evaluation)
     n, counts = evaluation["episodes"], evaluation["outcomes"]
     for name, k in (("returned", counts["returned"]), ("hit", counts["returned"] + counts["hit"])):
         low, high = wilson(k, n)
@@ -46,7 +48,7 @@ def test_figures_come_with_their_intervals_and_conditions(artefact):
 
 
 def test_the_contract_is_the_artefacts(artefact):
-    text = card.write(artefact, artefact.manifest["provenance"]["evaluation"])
+    text = write(artefact, artefact.manifest["provenance"]["evaluation"])
     for part in artefact.manifest["contract"]["observation"][:3]:
         assert row(text, part["name"]) == [part["unit"]]
     assert "| joint_6 | rad/s | 10.47 |" in text and "75 times a second" in text
@@ -54,16 +56,19 @@ def test_the_contract_is_the_artefacts(artefact):
 
 def test_an_evaluation_after_fine_tuning_names_the_robot(artefact):
     after = {"return_rate": 0.5, "return_rate_low": 0.4, "return_rate_high": 0.6, "balls": 80, "mean_return": 1.0}
-    text = card.write(artefact, {"after": after, "updates": 12, "robot": {"kind": "rig"}, "training_seconds": None})
+    text = write(artefact, {"after": after, "updates": 12, "robot": {"robot": "the rig", "balls": 3}})
     assert row(text, "returned") == ["50.0 %", "40.0 % to 60.0 %", "80 balls"]
-    assert 'Played on {"kind": "rig"}: 80 balls after 12 updates' in text and "on no robot" not in text
+    assert "fine-tuned for 12 updates on the rig" in text and "Played there" in text
+    assert "on no robot" not in text and "2,600 updates" not in text
 
 
 def test_without_a_bound_it_is_left_out_and_an_evaluation_of_another_kind_is_refused(artefact):
     evaluation = artefact.manifest["provenance"]["evaluation"]
-    assert "in reach" not in card.write(artefact, evaluation | {"reachable": None})
+    assert "in reach" not in write(artefact, evaluation | {"reachable": None})
     with pytest.raises(RunError, match="lacks what a card says"):
-        card.write(artefact, {"episodes": 3})
-    manifest = json.loads(json.dumps(artefact.manifest))
-    manifest["provenance"]["config"]["balls"] = {"name": "mine"}
-    assert "balls of mine" in card.write(dataclasses.replace(artefact, manifest=manifest), evaluation)
+        write(artefact, {"episodes": 3})
+    with pytest.raises(RunError, match="lacks what a card says"):
+        write(artefact, {key: value for key, value in evaluation.items() if key != "engine"})
+    assert "on the balls mine" in card.write(
+        artefact, {"name": "a", "balls": {"name": "mine"}, "model": {}}, evaluation
+    )
