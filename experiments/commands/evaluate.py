@@ -24,7 +24,7 @@ from experiments.commands.options import (
     suffix,
     writable,
 )
-from experiments.runs.locate import find_policy, is_unpacked, run_of
+from experiments.runs.locate import find_policy, is_exported, run_of
 from experiments.runs.run_dir import CONFIG, Run
 
 app = command(
@@ -112,7 +112,7 @@ def evaluate(
 def _folder(policy: Path, *others: str | None) -> Path:
     """Default folder of an evaluation; ``others``: balls and model that are not the policy's own."""
     changed = [Path(text).with_suffix("").as_posix().replace("/", "-") for text in others if text]
-    if (policy / CONFIG).exists() and not is_unpacked(policy):
+    if (policy / CONFIG).exists() and not is_exported(policy):
         return policy / f"evaluation-{'-'.join(changed)}" if changed else policy
     # An artefact holds its own files only, a run that was passed on those that it came with.
     policy = policy if policy.name else policy.absolute()
@@ -171,12 +171,11 @@ def unpack(
 ) -> None:
     """Checks every byte before anything is written."""
     existing(file)
-    from experiments.sharing import card, packed
+    from experiments.sharing import packed
 
     path = Path(file)
     folder = Path(out or path.name.removesuffix(".zip").removesuffix(".mjxtt"))
-    rates = card.rates(packed.unpack(path, folder))
-    value, low, high, count, _ = rates["returned"]
+    value, low, high, count, _ = packed.unpack(path, folder)["returned"]
     screen = console()
     said = f"{value:.1%} of {count:,} balls returned (95 % interval {low:.1%} to {high:.1%})"
     screen.print(f"{folder}: {said}; {folder}/README.md says where", highlight=False, soft_wrap=True)

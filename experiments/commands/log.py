@@ -23,8 +23,8 @@ app = command(
   mjx-tt log check runs/robot/20261121-153000.mcap
   mjx-tt log salvage runs/robot/20261121-153000.mcap.part
   mjx-tt log export runs/robot/20261121-153000.mcap --out tables/
-  mjx-tt log lerobot runs/robot/monday.mcap runs/robot/tuesday.mcap --out dataset/     a LeRobot data set
-  mjx-tt log lerobot balls.csv --out dataset/                                          of measured balls alone
+  mjx-tt log lerobot runs/robot --out dataset/         a LeRobot data set of sessions
+  mjx-tt log lerobot balls.csv --out dataset/          or of measured balls alone
 """,
 )
 
@@ -33,7 +33,14 @@ app = command(
 def log(
     action: Annotated[Literal["list", "check", "salvage", "export", "lerobot"], Parameter("ACTION")],
     /,
-    *paths: Annotated[str, Parameter("LOG", help="an .mcap or .mcap.part; for list a folder", required=True)],
+    *paths: Annotated[
+        str,
+        Parameter(
+            "LOG",
+            help="an .mcap or .mcap.part; for list a folder; for lerobot .mcap, balls, or a folder",
+            required=True,
+        ),
+    ],
     out: Annotated[str | None, option("PATH", "of salvage: the file; of export and lerobot: the folder")] = None,
 ) -> int:
     """Returns 1 where a checked log is not sound."""

@@ -27,7 +27,7 @@ from experiments.commands.options import (
     suffix,
 )
 from experiments.errors import ConfigError, checked
-from experiments.runs.locate import find_policy
+from experiments.runs.locate import find_policy, is_exported
 from experiments.runs.run_dir import Run
 
 SHIPPED = Path(__file__).parents[1] / "shipped" / "policies" / "quickstart"
@@ -139,7 +139,7 @@ def view(
             find_policy(folder)
     if len(what) > MOST:
         raise ConfigError(f"{len(what)} policies: {MOST} are the most that are shown side by side")
-    if follow and (session or diagnosis or len(what) != 1):
+    if follow and (session or diagnosis or len(what) != 1 or is_exported(what[0])):
         raise ConfigError("--follow needs one run")
     start_jax(1)
     from experiments.runs import load_policy

@@ -14,7 +14,7 @@ from bgs.normalizer import ObservationStatistics
 from experiments.config.experiment import Config, parse
 from experiments.errors import RunError
 from experiments.runs import checkpoint
-from experiments.runs.locate import artefact_of, find_policy, is_unpacked
+from experiments.runs.locate import artefact_of, find_policy, is_exported
 from experiments.runs.run_dir import CONFIG, Run
 from mjx_tt.env.policy import Policy
 from robot_io.policy import artefact as artefacts
@@ -44,7 +44,7 @@ def load(folder: str | Path) -> TrainedPolicy:
     Raises RunError for a folder that is neither, CheckpointError or ArtefactError for a damaged one.
     """
     folder = find_policy(folder)
-    return _from_run(folder) if _has_states(folder) else _from_artefact(artefact_of(folder))
+    return _from_artefact(artefact_of(folder)) if is_exported(folder) else _from_run(folder)
 
 
 def load_statistics(folder: str | Path) -> tuple[np.ndarray, ObservationStatistics]:
@@ -54,17 +54,13 @@ def load_statistics(folder: str | Path) -> tuple[np.ndarray, ObservationStatisti
     so that training soon replaces them by its own. Raises as ``load`` does.
     """
     folder = Path(folder)
-    if _has_states(folder):
+    if (folder / CONFIG).is_file() and not is_exported(folder):
         arrays, _ = _read(folder)
         return arrays["bgs.average"], _statistics(arrays)
     policy = load(folder).policy
     std = np.where(policy.inv_std > 0, 1 / np.where(policy.inv_std > 0, policy.inv_std, 1), 0)
     count, m2 = jnp.array([0, 2], jnp.int32), jnp.asarray(std**2, jnp.float32)
     return policy.theta, ObservationStatistics(count, jnp.asarray(policy.mean, jnp.float32), m2)
-
-
-def _has_states(folder: Path) -> bool:
-    return (folder / CONFIG).is_file() and not is_unpacked(folder)
 
 
 def _from_run(folder: Path) -> TrainedPolicy:

@@ -55,11 +55,12 @@ def artefact_of(folder: str | Path) -> Path:
     return folder / "artefact"
 
 
-def is_unpacked(folder: str | Path) -> bool:
-    """True for a folder that was passed on: a run's configuration and artefact, without the states of its training."""
+def is_exported(folder: str | Path) -> bool:
+    """True for an artefact, and for a run's folder that was passed on: with an artefact, without states of training."""
     folder = Path(folder)
-    whole = (folder / CONFIG).is_file() and (folder / "artefact" / MANIFEST).is_file()
-    return whole and not any(Run(folder).checkpoints.glob("[0-9]*.npz"))
+    if (folder / CONFIG).is_file() and any(Run(folder).checkpoints.glob("[0-9]*.npz")):
+        return False
+    return any((folder / place / MANIFEST).is_file() for place in ("", "artefact"))
 
 
 def _inside(folder: Path) -> str:

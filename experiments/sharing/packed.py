@@ -12,12 +12,11 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from ballmodel.io.atomic_files import placing, replacing
-from experiments.errors import ExperimentError, RunError
+from experiments.errors import ConfigError, ExperimentError, RunError
 from experiments.runs.locate import artefact_of, find_policy
 from experiments.runs.run_dir import CONFIG, Run
 from experiments.sharing import card
@@ -50,8 +49,8 @@ def pack(policy: str | Path, path: Path, licence: str | None = None) -> str:
     return sha256(content)
 
 
-def unpack(path: Path, folder: Path) -> dict[str, Any]:
-    """Checks a packed file, plays its artefact's golden vectors, and puts its members into ``folder``; its evaluation.
+def unpack(path: Path, folder: Path) -> card.Rates:
+    """Checks a packed file, plays its artefact's golden vectors, and puts its members into ``folder``; its figures.
 
     Raises PackError for a file in which anything is not as it was packed, FileExistsError for a folder that is not
     empty, OSError when the disk refuses. The folder is whole or absent.
@@ -63,9 +62,13 @@ def unpack(path: Path, folder: Path) -> dict[str, Any]:
             (staging / name).write_bytes(content)
         try:
             artefacts.load(staging / "artefact")
-        except ArtefactError as error:
+            Run(staging).config()
+            figures = card.rates(Run(staging).read_evaluation())
+        except (ArtefactError, ConfigError) as error:
             raise PackError(str(error).replace(f"{staging}/", f"{path}: ")) from None
-    return json.loads(contents[EVALUATION])
+        except (LookupError, TypeError, ValueError) as error:
+            raise PackError(f"{path}: {EVALUATION}: no evaluation of this program ({error!r}); update mjx-tt") from None
+    return figures
 
 
 def read(path: Path) -> dict[str, bytes]:

@@ -74,7 +74,12 @@ REWARD = {"next.reward": Feature("float32")}
 
 
 def read(paths: Sequence[str]) -> Recording:
-    """Sessions, or balls in whatever ``mjx-tt diagnose`` reads. Raises ConfigError, LogError naming the file."""
+    """Sessions, or folders of them, or balls in whatever ``mjx-tt diagnose`` reads.
+
+    Raises ConfigError naming the file that is neither, is damaged, or does not go with the others.
+    """
+    folders = {path: [str(f) for f in sorted(Path(path).glob("*.mcap")) if is_session(f)] for path in paths}
+    paths = [file for path, found in folders.items() for file in found or [path]]
     kinds = {path: is_session(Path(path)) for path in paths}
     if len(set(kinds.values())) > 1:
         others = ", ".join(path for path, session in kinds.items() if not session)

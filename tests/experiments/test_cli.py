@@ -184,7 +184,6 @@ def test_evaluate_artefact_on_other_balls_leaves_the_artefact_alone(trained):
     artefact.load(folder)
 
 
-@pytest.mark.slow
 def test_a_packed_policy_plays_as_its_run_does(trained, tmp_path):
     run, file, folder = trained[1] / "tiny", tmp_path / "tiny.zip", tmp_path / "tiny"
     for arguments in (("pack", run, "--out", file), ("unpack", file, "--out", folder)):
@@ -199,6 +198,7 @@ def test_a_packed_policy_plays_as_its_run_does(trained, tmp_path):
     assert (folder / "evaluation.json").read_bytes() == (run / "evaluation.json").read_bytes()
 
 
+@pytest.mark.slow
 def test_seeds_get_folders_of_their_own_and_the_best_is_selected(trained, tmp_path):
     yaml, _, _ = trained
     done = mjx_tt("train", yaml, "--out", tmp_path, "--seeds", "7", "--select", "--devices", 1)

@@ -232,6 +232,13 @@ def test_command(session, balls, tmp_path, capsys, monkeypatch):
     assert "pip install 'mjx-tt[lerobot]'" in capsys.readouterr().err
 
 
+def test_a_folder_stands_for_its_sessions(tmp_path):
+    for name in ("tuesday", "monday"):
+        record(tmp_path, name, reward=False)
+    episodes = recordings.read([str(tmp_path)]).episodes
+    assert [e.source for e in episodes] == [f"{d}.mcap, episode {n}" for d in ("monday", "tuesday") for n in (1, 4)]
+
+
 def test_a_session_without_episodes_is_refused(tmp_path):
     with log.FileRecorder.start(tmp_path, "idle", {}, {}, START, EPOCH) as recorder:
         recorder.put(log.episode_start(START, 1))

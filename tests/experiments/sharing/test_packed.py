@@ -64,13 +64,15 @@ def test_the_bytes_do_not_depend_on_this_python():
 
 
 def test_unpacked_files_are_those_of_the_run_and_check_without_the_program(run, file, tmp_path):
-    evaluation = unpack(file, tmp_path / "deep" / "anna")
+    figures = unpack(file, tmp_path / "deep" / "anna")
     folder = tmp_path / "deep" / "anna"
     found = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     assert found == set(MEMBERS) and [p.name for p in folder.parent.iterdir()] == ["anna"]
     for name in artefacts.FILES:
         assert (folder / "artefact" / name).read_bytes() == (run / "artefact" / name).read_bytes()
-    assert evaluation == json.loads((run / "evaluation.json").read_text())
+    assert figures["returned"][0] == pytest.approx(0.972, abs=5e-4)
+    evaluation = json.loads((run / "evaluation.json").read_text())
+    assert json.loads((folder / "evaluation.json").read_text()) == evaluation
     assert yaml.safe_load((folder / "config.yaml").read_text()) == yaml.safe_load((run / "config.yaml").read_text())
     rows = [line.split("  ") for line in (folder / SUMS).read_text().splitlines()[1:]]
     assert {n: hashlib.sha256((folder / n).read_bytes()).hexdigest() for n in MEMBERS[:-1]} == {n: h for h, n in rows}
@@ -192,6 +194,26 @@ def test_a_policy_whose_golden_vectors_do_not_come_out_is_refused(file, tmp_path
     path = tmp_path / "other.zip"
     path.write_bytes(zipped(contents))
     with pytest.raises(PackError, match=r"other.zip: artefact/golden.npz: .* differs from the golden outputs by 0.001"):
+        unpack(path, tmp_path / "out")
+    assert [p.name for p in tmp_path.iterdir()] == ["other.zip"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("config.yaml", b"name: [", "config.yaml"),
+        ("config.yaml", b"name: a\nballs: player3/M0\nfuture: 1\n", "config.yaml: future"),
+        ("evaluation.json", b"{}", "evaluation.json: no evaluation of this program"),
+        ("evaluation.json", b"[", "evaluation.json: no evaluation of this program"),
+    ],
+)
+def test_members_that_this_program_cannot_use_are_refused_though_their_hashes_agree(
+    file, name, content, words, tmp_path
+):
+    contents = {n: c for n, c in read(file).items() if n != SUMS} | {name: content}
+    path = tmp_path / "other.zip"
+    path.write_bytes(zipped(contents))
+    with pytest.raises(PackError, match=f"other.zip: {words}"):
         unpack(path, tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["other.zip"]
 

@@ -175,6 +175,7 @@ def test_what_cannot_be_shown_is_refused_before_anything_heavy(tmp_path, capsys,
         (["nowhere"], "neither a run"),
         ([policy] * 5, "4 are the most"),
         (["--follow"], "--follow needs one run"),
+        ([policy, "--follow"], "--follow needs one run"),  # an artefact is trained no further
         (["--token", "a b"], "at least 8 letters"),
         (["--export", "page.pdf"], "allowed: .html"),
         (["--model", str(tmp_path / "none.yaml")], "no such file"),
