@@ -43,7 +43,7 @@ def wheel(tmp_path_factory) -> Path:
 def test_the_wheel_holds_what_the_packages_read_and_nothing_else(wheel):
     found = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert {Path(name).parts[0] for name in found} == set(PACKAGES)
-    read = {".yaml", ".xml", ".json", ".html", ".css", ".pyi", ".typed"}
+    read = {".yaml", ".xml", ".json", ".html", ".css", ".md", ".pyi", ".typed"}
     ours = subprocess.run(["git", "ls-files", *PACKAGES], cwd=ROOT, capture_output=True, text=True).stdout.split()
     missing = {name for name in ours if Path(name).suffix in read or Path(name).name == "py.typed"} - found
     assert not missing

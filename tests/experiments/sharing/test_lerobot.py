@@ -29,7 +29,10 @@ import sys
 import numpy as np
 import lerobot
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import dataset_to_policy_features
+try:  # lerobot 0.6
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+except ImportError:  # 0.4
+    from lerobot.datasets.utils import dataset_to_policy_features
 from torch.utils.data import DataLoader
 
 folder, out = sys.argv[1:]
