@@ -12,8 +12,11 @@ from experiments.commands.options import (
     Balls,
     BallSeed,
     Devices,
+    Distributed,
     Model,
     PolicyFolder,
+    Process,
+    Processes,
     command,
     console,
     count,
@@ -77,24 +80,31 @@ def evaluate(
     no_reachable: Annotated[bool, Parameter(help="skip the minute that the bound on what is in reach takes")] = False,
     out: Annotated[str | None, option("FOLDER", "for evaluation.json and plots/")] = None,
     devices: Devices = None,
+    distributed: Distributed = None,
+    processes: Processes = None,
+    process: Process = None,
 ) -> None:
     """Writes evaluation.json and plots, and prints the report."""
     find_policy(policy)
     existing(model, key="--model")
     folder = Path(out) if out else _folder(Path(policy), balls, model)
     writable(folder)
-    start_jax(devices)
+    start_jax(devices or (1 if distributed else None))
+    import jax
+
     from experiments.evaluation import evaluate as evaluation
     from experiments.runs import load_policy
     from experiments.stages import interruptible, printed
-    from experiments.training import finalize
+    from experiments.training import finalize, ranks
 
     screen = console()
+    together = ranks.join(distributed, processes, process) if distributed else ranks.ALONE
+    screen.quiet = not together.first
     trained = load_policy.load(policy)
     experiment = experiment_of(trained, balls, model)
     settings = experiment.config.evaluation
     stage = printed(screen, str(trained.source))
-    with interruptible():
+    with interruptible(), together.together():
         played = evaluation.evaluate(
             experiment,
             trained,
@@ -102,7 +112,11 @@ def evaluate(
             settings.seed if seed is None else seed,
             None if no_reachable else settings.reachable_balls,
             stage,
+            jax.device_count(),
         )
+        together.part()
+        if not together.first:
+            return
         with stage("drawing pictures"):
             finalize.save_evaluation(folder, played, experiment.task.reward_weights)
     finalize.print_report(screen, played.report, str(trained.source))

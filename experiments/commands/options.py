@@ -54,6 +54,12 @@ def changes(text: str) -> Parameter:
 
 
 Devices = Annotated[int | None, count("host devices to make (default: one per processor core)")]
+Distributed = Annotated[
+    str | None,
+    option("auto|HOST:PORT", "share the work with other processes, on any hosts: as the cluster says, or by address"),
+]
+Processes = Annotated[int | None, count("how many processes take part (with HOST:PORT)")]
+Process = Annotated[int | None, option("I", "which of them this one is, from 0 (with HOST:PORT)")]
 PolicyFolder = Annotated[str, Parameter("RUN_OR_ARTEFACT", help="folder of a run or of an exported policy")]
 Balls = Annotated[str | None, option("NAME_OR_YAML", "other balls, such as player1/M1")]
 Model = Annotated[str | None, option("YAML", "another simulation model")]

@@ -12,6 +12,9 @@ from cyclopts import Parameter, Token
 from experiments.commands.options import (
     SHIPPED_HINT,
     Devices,
+    Distributed,
+    Process,
+    Processes,
     changes,
     command,
     console,
@@ -30,6 +33,7 @@ app = command(
   mjx-tt train narrow.yaml medium.yaml --seeds 0,1,2        six runs: runs/narrow/seed0/ ... runs/medium/seed2/
   mjx-tt train player3_m2.yaml --seeds 0,1,2 --select       and name the best seed, as the paper does
   mjx-tt train my.yaml --set training.updates=500 --set balls=player1/M0
+  srun mjx-tt train my.yaml --distributed auto               one training by all processes of a SLURM job
 
 Run the same command again after an interruption: finished runs are skipped, others continue from their last
 checkpoint, bit for bit. Ctrl-C saves a checkpoint first.
@@ -65,10 +69,15 @@ def train(
     out: Annotated[str, option("FOLDER", "where runs go (default: runs)")] = "runs",
     overrides: Annotated[tuple[str, ...], changes("change one key of every file")] = (),
     devices: Devices = None,
+    distributed: Distributed = None,
+    processes: Processes = None,
+    process: Process = None,
 ) -> int:
     """Returns the exit status."""
     from experiments.config import experiment as config
 
+    if distributed and (len(experiments) > 1 or seeds):
+        raise ConfigError(f"--distributed {distributed}: trains one experiment; start a job for each file and seed")
     if select and not seeds:
         raise ConfigError("--select chooses among seeds: give them with --seeds, such as --seeds 0,1,2")
     paths = [shipped_or_own(name, config.shipped()) for name in experiments]
@@ -76,12 +85,19 @@ def train(
     writable(out)
     # As many as the experiment with the most needs; where all leave it open, as many as there are cores.
     most = max((c.training.devices for _, c in configs if c.training.devices != "auto"), default=None)
-    start_jax(devices or most)
+    # Several processes of several host devices each hang on queued collectives.
+    start_jax(devices or (1 if distributed else most))
     from experiments.stages import interruptible
-    from experiments.training import sweep
+    from experiments.training import ranks, sweep
 
     screen = console()
     planned = sweep.plan(configs, seeds, Path(out))
+    if distributed:
+        together = ranks.join(distributed, processes, process)
+        screen.quiet = not together.first
+        with interruptible(), together.together():
+            sweep.run_together(planned[0], screen, together)
+        return 0
     with interruptible():
         ok = sweep.run_all(planned, screen)
         if select and ok:

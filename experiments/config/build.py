@@ -109,9 +109,24 @@ def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:
 def device_count(config: Config) -> int:
     """Devices to train on: the number asked for, or the most of those present that divide the perturbations evenly."""
     asked, members = config.training.devices, 2 * config.optimiser.num_directions
+    if jax.process_count() > 1:
+        return _all_devices(asked, members)
     if asked != "auto":
         return asked
-    return max(n for n in range(1, len(jax.devices()) + 1) if members % n == 0)
+    return max(n for n in range(1, jax.local_device_count() + 1) if members % n == 0)
+
+
+def _all_devices(asked: int | str, members: int) -> int:
+    """Those of all processes, which have to share the perturbations evenly. Raises ConfigError."""
+    there = jax.device_count()
+    if asked not in ("auto", there):
+        raise ConfigError(f"training.devices: {asked}; {jax.process_count()} processes have {there}; allowed: auto")
+    if members % there:
+        raise ConfigError(
+            f"optimiser.num_directions: {members // 2} pairs cannot be split evenly over {there} devices "
+            f"of {jax.process_count()} processes; take a number of processes that divides {members}"
+        )
+    return there
 
 
 def key(seed: int, purpose: int) -> jax.Array:

@@ -59,15 +59,17 @@ def evaluate(
     seed: int,
     reachable_balls: int | None = None,
     stage: Stage = silent,
+    devices: int | None = None,
 ) -> Played:
     """Plays the policy on at least ``episodes`` balls that training has not seen.
 
     reachable_balls: on how many of the balls to seek a lower bound of the return rate in reach; None: no bound. stage:
-    shows what is being done.
+    shows what is being done. devices: this process' own by default, or all of several processes, each of which calls
+    this.
     """
     config = experiment.config
     task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
-    simulator = Simulator(task, len(jax.devices()))
+    simulator = Simulator(task, devices or jax.local_device_count())
     key = build.key(seed, build.EVALUATION_EPISODES)
     with stage("compiling the evaluation"):
         balls = draw_balls(experiment, simulator, episodes, build.key(seed, build.EVALUATION_BALLS))

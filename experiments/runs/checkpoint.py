@@ -18,6 +18,7 @@ import numpy as np
 
 from ballmodel.io.atomic_files import replacing, sync_folder
 from experiments.errors import CheckpointError
+from mjx_tt.env.rollout import held_here
 
 NOTES = "notes"
 KEPT = 2
@@ -31,7 +32,7 @@ def save(folder: Path, update: int, tree: Any, notes: dict[str, Any]) -> Path:
     """
     path = folder / f"{update:08d}.npz"
     # Any: a keyword of savez may also be one of its options.
-    arrays: dict[str, Any] = {name: np.asarray(_data(leaf)) for name, leaf in _named_leaves(tree)}
+    arrays: dict[str, Any] = {name: np.asarray(_data(leaf)) for name, leaf in _named_leaves(held_here(tree))}
     arrays[NOTES] = np.array(json.dumps(notes | {"update": update}))
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -61,6 +62,7 @@ def load_latest(folder: Path, template: Tree) -> tuple[Tree, dict[str, Any]] | N
     if found is None:
         return None
     arrays, notes = found
+    template = held_here(template)
     names = [name for name, _ in _named_leaves(template)]
     if set(names) != set(arrays):
         raise CheckpointError(f"{folder}: holds {sorted(arrays)}, this program's state is {sorted(names)}")
@@ -91,6 +93,11 @@ def read_latest(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]] | 
     if complaints:
         raise CheckpointError(f"no checkpoint can be read: {'; '.join(complaints)}")
     return None
+
+
+def newest(folder: Path) -> int:
+    """Updates after which the last checkpoint was made, 0 without one."""
+    return max((int(path.stem) for path in _paths(folder)), default=0)
 
 
 def _paths(folder: Path) -> list[Path]:

@@ -6,11 +6,12 @@ import json
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.stages import Compiled
 from numpy.typing import ArrayLike
@@ -21,30 +22,35 @@ from experiments import stages
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
-from experiments.errors import RunError
+from experiments.errors import CheckpointError, RunError
 from experiments.evaluation.evaluate import draw_balls, return_rate
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import Run
 from experiments.training.progress import TrainingProgress
+from experiments.training.ranks import ALONE, Ranks, Watch
 from experiments.training.update import Trainer, TrainState, trainer
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
+from mjx_tt.env.rollout import held_here
 
 _programs: dict[str, Compiled] = {}  # compiled updates by what decides them
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
+QUEUED = 16  # updates between fetches where several devices take part: hundreds of queued collectives may hang
 
 
-def train(experiment: Experiment, run: Run, console: Console) -> str:
+def train(experiment: Experiment, run: Run, console: Console, ranks: Ranks = ALONE) -> str:
     """Trains until the configuration says stop, continuing from the last checkpoint; returns the setting that ended it.
 
-    Ctrl-C or SIGTERM saves a checkpoint first and then raises KeyboardInterrupt. Raises RunError, ConfigError or
-    CheckpointError with a message for the person at the terminal.
+    ranks: the processes that train it together; only the first one touches the run's folder. Ctrl-C or SIGTERM saves a
+    checkpoint first and then raises KeyboardInterrupt. Raises RunError, ConfigError or CheckpointError with a message
+    for the person at the terminal.
     """
-    run.open(experiment.config)
-    with run.locked():
+    if ranks.first:
+        run.open(experiment.config)
+    with run.locked() if ranks.first else nullcontext():
         try:
-            return Session(experiment, run, console).train()
+            return Session(experiment, run, console, ranks).train()
         except OSError as error:  # of the measurements; checkpoints raise their own
             raise RunError(
                 f"{error.filename or run.metrics}: cannot be written: {error.strerror or error}; "
@@ -61,43 +67,79 @@ class Session:
     return_rate  of the last evaluation during training, None before the first
     """
 
-    def __init__(self, experiment: Experiment, run: Run, console: Console) -> None:
-        self._config, self._run, self._console = experiment.config, run, console
+    def __init__(self, experiment: Experiment, run: Run, console: Console, ranks: Ranks = ALONE) -> None:
+        self._config, self._run, self._console, self._ranks = experiment.config, run, console, ranks
         self._trainer = trainer(experiment)
-        self.state, notes = _start(self._config, run, self._trainer)
+        self.state, notes = _start(self._config, run, self._trainer, ranks)
         self.update, self.seconds, self.return_rate = notes["update"], notes["seconds"], notes["return_rate"]
         self._saved = (self.update, time.monotonic())
+        self._done = (self.state, self._notes())  # of the last update that is known to have ended
         self._batch = 1  # updates between fetches, from the measured rate
         self._evaluator = self._make_evaluator(experiment)
 
     def train(self) -> str:
-        name, training = str(self._run.folder), self._config.training
-        log = MetricsLog(self._run.metrics, self._run.tensorboard, self.update)
+        name, training, first = str(self._run.folder), self._config.training, self._ranks.first
+        log = MetricsLog(self._run.metrics, self._run.tensorboard, self.update) if first else None
         progress = TrainingProgress(
             self._console, name, training.updates, self.update, self._trainer.episodes_per_update
         )
         try:
-            with progress, _stop_requests() as stop_wanted:
+            with progress, _stop_requests() as stop_wanted, self._ranks.watched(self._others_are_silent) as watch:
                 if self.update:
                     progress.note(f"continues after update {self.update}")
                 began = time.monotonic()
                 compiled = _compiled(self._config, self._trainer, self.state)
                 progress.note(f"compiled in {time.monotonic() - began:.1f} s")
-                while (reason := self._ended()) is None and not stop_wanted():
-                    self._advance(compiled, log, progress, stop_wanted)
+                while True:
+                    stopped = self._agree(stop_wanted())
+                    reason = self._ended()
+                    if stopped or reason is not None:
+                        break
+                    self._advance(compiled, log, progress, stop_wanted, watch)
                 self._save(log)
+        except (RuntimeError, ValueError) as error:  # as which JAX raises what gloo says differs
+            if self._ranks.alone or "Gloo" not in str(error):
+                raise
+            self._end_without(f"another process is lost ({str(error).splitlines()[0]})")
         finally:
-            log.close()
+            if log is not None:
+                log.close()
         if reason is None:
             raise KeyboardInterrupt(f"{name}: stopped after update {self.update}; the same command continues it")
-        run_dir.write_json(self._run.status, {"reason": reason, **self._notes()})
+        if first:
+            run_dir.write_json(self._run.status, {"reason": reason, **self._notes()})
         return reason
+
+    def _agree(self, stop: bool) -> bool:
+        """True where a process was asked to stop; all go on with the first one's seconds and pace."""
+        every = self._ranks.agree(stop, self.seconds, self._batch)
+        self.seconds, self._batch = float(every[0, 1]), int(every[0, 2])
+        return bool(every[:, 0].any())
+
+    def _others_are_silent(self, seconds: float) -> NoReturn:
+        self._end_without(f"another process is stuck: no update for {seconds:.0f} s")
+
+    def _end_without(self, text: str) -> NoReturn:
+        """Ends this process after the others: whoever reaches the run's folder saves what is complete."""
+        state, notes = self._done
+        try:
+            if self._run.checkpoints.parent.is_dir() and checkpoint.newest(self._run.checkpoints) < notes["update"]:
+                checkpoint.save(self._run.checkpoints, notes["update"], state, notes)
+            text += f"; the checkpoint after update {checkpoint.newest(self._run.checkpoints)} is kept"
+        except (OSError, CheckpointError) as error:
+            text += f"; no checkpoint: {error}"
+        self._ranks.leave(f"{text}. The same command continues, with as many processes as you like")
 
     def _ended(self) -> str | None:
         return run_dir.training_ended(self._config, self.update, self.seconds, self.return_rate)
 
     def _advance(
-        self, compiled: Compiled, log: MetricsLog, progress: TrainingProgress, stop_wanted: Callable[[], bool]
+        self,
+        compiled: Compiled,
+        log: MetricsLog | None,
+        progress: TrainingProgress,
+        stop_wanted: Callable[[], bool],
+        watch: Watch,
     ) -> None:
         """Updates until it is time to look at them; then measurements, evaluation and checkpoint as they are due."""
         training, every = self._config.training, self._config.training.evaluate_every
@@ -107,7 +149,8 @@ class Session:
             waiting.append(measured)
             self.update += 1
             evaluation_due = every is not None and self.update % every == 0
-            if evaluation_due or self.update == training.updates or len(waiting) >= self._batch or stop_wanted():
+            stopped = self._ranks.alone and stop_wanted()  # several would stop at different updates
+            if evaluation_due or self.update == training.updates or len(waiting) >= self._batch or stopped:
                 break
         fetched = jax.device_get(waiting)
         took = time.monotonic() - began
@@ -119,8 +162,15 @@ class Session:
         ]
         self.seconds += took
         self._batch = max(1, round(FETCH_SECONDS / share))
+        if self._trainer.simulator.devices > 1:
+            self._batch = min(self._batch, QUEUED)
+        self._done = (self.state, self._notes())
+        watch.alive()
         if evaluation_due and self._evaluator is not None:
+            watch.pause()
             rows[-1] |= self._evaluate(self._evaluator)
+        if log is None:
+            return
         log.write(rows)
         progress.show(self.update, len(rows), took, rows[-1]["return_rate"])
         if time.monotonic() - self._saved[1] >= training.checkpoint_seconds:
@@ -138,7 +188,8 @@ class Session:
     def _evaluate(self, evaluator: Evaluator) -> dict[str, float]:
         """The averaged parameters on the run's own set of fresh balls."""
         key = build.key(self._config.training.seed, build.PROGRESS_EPISODES)
-        policy = Policy(self.state.bgs.average, *normalizer.normaliser(self.state.statistics))
+        state = held_here(self.state)
+        policy = Policy(state.bgs.average, *normalizer.normaliser(state.statistics))
         result = evaluator.play(policy, key)
         rate = return_rate(result)
         self.return_rate = rate.value
@@ -147,8 +198,8 @@ class Session:
     def _notes(self) -> dict[str, Any]:
         return {"update": self.update, "seconds": round(self.seconds, 4), "return_rate": self.return_rate}
 
-    def _save(self, log: MetricsLog) -> None:
-        if self._saved[0] != self.update or not self.update:
+    def _save(self, log: MetricsLog | None) -> None:
+        if log is not None and (self._saved[0] != self.update or not self.update):
             log.sync()
             checkpoint.save(self._run.checkpoints, self.update, self.state, self._notes())
         self._saved = (self.update, time.monotonic())
@@ -165,16 +216,36 @@ def _compiled(config: Config, trainer: Trainer, state: TrainState) -> Compiled:
     return _programs[decides]
 
 
-def _start(config: Config, run: Run, trainer: Trainer) -> tuple[TrainState, dict[str, Any]]:
+def _start(config: Config, run: Run, trainer: Trainer, ranks: Ranks) -> tuple[TrainState, dict[str, Any]]:
     """The last checkpoint's state and notes, or the first ones."""
     theta = statistics = None
     if config.initial_policy is not None:
         theta, statistics = load_policy.load_statistics(config.initial_policy)
     state = trainer.init(build.key(config.training.seed, build.INITIAL_STATE), theta, statistics)
     notes: dict[str, Any] = {"update": 0, "seconds": 0.0, "return_rate": None}
-    state, notes = checkpoint.load_latest(run.checkpoints, state) or (state, notes)
+    if ranks.first:
+        state, notes = checkpoint.load_latest(run.checkpoints, state) or (state, notes)
+    state, notes = _of_first(ranks, state, notes)
     # Where the update leaves its results: compiled for this placement, it can be fed what it returns.
     return trainer.simulator.replicate(state), notes
+
+
+def _of_first(ranks: Ranks, state: TrainState, notes: dict[str, Any]) -> tuple[TrainState, dict[str, Any]]:
+    """The first process' state and notes, which alone reads the run's folder."""
+    if ranks.alone:
+        return state, notes
+    leaves, tree = jax.tree.flatten(held_here(state))
+    keys = [jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in leaves]
+    arrays = [np.asarray(jax.random.key_data(x) if is_key else x) for x, is_key in zip(leaves, keys, strict=True)]
+    rate = np.nan if notes["return_rate"] is None else notes["return_rate"]
+    *arrays, numbers = ranks.of_first([*arrays, np.array([notes["update"], notes["seconds"], rate])])
+    whole = [
+        jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(leaf)) if is_key else jnp.asarray(x)
+        for x, leaf, is_key in zip(arrays, leaves, keys, strict=True)
+    ]
+    update, seconds, rate = numbers
+    found = {"update": int(update), "seconds": float(seconds), "return_rate": None if np.isnan(rate) else float(rate)}
+    return jax.tree.unflatten(tree, whole), found
 
 
 def _short(value: ArrayLike) -> float | None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -18,6 +21,7 @@ from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
 from experiments.training.finalize import finish
 from experiments.training.loop import train
+from experiments.training.ranks import Ranks
 
 SELECTION_EPISODES = 50  # Abeyruwan et al. 2022, appendix "Seed Selection for Rounds of Simulated Training"
 
@@ -70,6 +74,33 @@ def run_all(jobs: list[Job], console: Console) -> bool:
     if len(jobs) > 1:
         _print_outcomes(outcomes, console)
     return all(state == "done" for _, state, _ in outcomes)
+
+
+def run_together(job: Job, console: Console, ranks: Ranks) -> None:
+    """One run by several processes; the first one evaluates, draws and exports alone when training has ended.
+
+    Raises ConfigError where the processes do not read the same, and what a run alone raises.
+    """
+    experiment = build.experiment(job.config, job.where)
+    run, config = job.run, experiment.config
+    read = hashlib.sha256(json.dumps(config.to_dict(), sort_keys=True).encode()).digest()
+    every = ranks.agree(int.from_bytes(read[:6], "big"))[:, 0]
+    if (every != every[0]).any():
+        other = int(np.argmax(every != every[0]))
+        raise ConfigError(f"{job.where}: process {other} reads something else than process 0; all need the same files")
+    if ranks.first:
+        run.check(config)
+    trained = bool(ranks.agree(ranks.first and run.trained(config))[0, 0])
+    if not trained:
+        reason = train(experiment, run, console, ranks)
+        console.print(f"{run.folder}: trained by {ranks.count} processes, ended by {reason}", highlight=False)
+    ranks.part()
+    if not ranks.first:
+        return
+    if run.done(config):
+        console.print(f"{run.folder}: done before, skipped", highlight=False)
+    else:
+        finish(experiment, run, console)
 
 
 def select(folder: Path, jobs: list[Job], console: Console) -> None:

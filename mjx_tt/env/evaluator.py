@@ -43,7 +43,7 @@ class Evaluator:
 
         self._traced = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
         self._spread: Callable[..., RolloutResult] = self._traced
-        self._replicate = simulator.replicate
+        self._replicate, self._gather = simulator.replicate, simulator.gather
         self._set(balls)
 
     def on(self, balls: BallPool) -> Evaluator:
@@ -81,7 +81,7 @@ class Evaluator:
             found.append(self._spread(*arguments))
         per_episode: dict[str, Any] = {
             field.name: np.concatenate(
-                [np.asarray(x).reshape(*x.shape[:-2], -1) for x in (getattr(f, field.name) for f in found)], axis=-1
+                [self._gather(x).reshape(*x.shape[:-2], -1) for x in (getattr(f, field.name) for f in found)], axis=-1
             )[..., : self.count]
             for field in fields(RolloutResult)
             if not field.name.startswith("observation")

@@ -96,7 +96,7 @@ def reachable(
     for start in range(0, missed.size, batch):
         chosen = np.resize(missed[start : start + batch], batch)
         some = jax.tree.map(partial(_taken, chosen), episodes)
-        found[chosen] = np.asarray(search(*simulator.replicate((jax.random.fold_in(search_key, start), some))))
+        found[chosen] = simulator.gather(search(*simulator.replicate((jax.random.fold_in(search_key, start), some))))
     return Reachable(int(found.sum()), balls, by_policy)
 
 
@@ -113,7 +113,7 @@ def _played(simulator: Simulator, policy: Policy, episodes: Episodes) -> np.ndar
         return simulator.rollout(replace(policy, theta=copies), mine)
 
     spread = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS))
-    return np.array(spread(*simulator.replicate((policy, episodes))).outcome[0] == RETURNED)
+    return simulator.gather(spread(*simulator.replicate((policy, episodes))).outcome)[0] == RETURNED
 
 
 def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Bool[Array, " P"]:

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
@@ -69,13 +70,16 @@ RESULT_SPECS = jax.tree.map(lambda rank: PartitionSpec(*[None] * (rank - 1), AXI
 
 
 class Simulator:
-    """Draws and runs episodes of one task on ``devices`` devices.
+    """Draws and runs episodes of one task on ``devices`` devices: this process' own, or all of several processes'.
 
     Raises ValueError when fewer devices exist or a number of perturbations cannot be split evenly.
     """
 
     def __init__(self, config: TaskConfig, devices: int = 1) -> None:
-        available = jax.devices()
+        available = jax.local_devices()
+        self._own = devices <= len(available)
+        if devices == jax.device_count():
+            available = jax.devices()
         if not 1 <= devices <= len(available):
             raise ValueError(f"{devices} devices wanted, this process has {len(available)}: {available}")
         self.config = config
@@ -126,7 +130,14 @@ class Simulator:
 
     def replicate(self, tree: T) -> T:
         """The arrays of ``tree`` on every device: the layout that ``on_devices`` takes and returns."""
-        return jax.device_put(tree, NamedSharding(self._mesh, PartitionSpec()))
+        everywhere = NamedSharding(self._mesh, PartitionSpec())
+        if self._own:
+            return jax.device_put(tree, everywhere)
+        return jax.tree.map(lambda x: _put(x, everywhere), held_here(tree))
+
+    def gather(self, x: Array) -> np.ndarray:
+        """All of an array that ``on_devices`` left on the devices, or a copy of it, for the host to read and write."""
+        return np.array(x if x.is_fully_addressable else multihost_utils.process_allgather(x, tiled=True))
 
     def local(self, tree: T) -> T:
         """This device's share of arrays (..., P) along the last axis; only inside ``on_devices``. Scalars are
@@ -242,3 +253,20 @@ class Simulator:
         start = (state, state.ball, grounded, outcome, jnp.zeros(grounded.shape, jnp.int32))
         (*_, length), (qpos, ball) = jax.lax.scan(advance, start, jnp.arange(self.config.max_steps))
         return qpos, ball, jnp.minimum(length[..., 0], self.config.max_steps)
+
+
+def held_here(tree: T) -> T:
+    """The arrays as this process holds them, where each of several processes holds a copy; others as they are."""
+    return jax.tree.map(_held_here, tree)
+
+
+def _held_here(x: Any) -> Any:
+    spread = isinstance(x, jax.Array) and not x.is_fully_addressable
+    return x.addressable_shards[0].data if spread else x
+
+
+def _put(x: Any, where: NamedSharding) -> Array:
+    """A host's copy on the devices of all processes, each of which has the same: JAX takes it as NumPy array only."""
+    if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_put(jax.random.key_data(x), where), impl=jax.random.key_impl(x))
+    return jax.device_put(np.asarray(x), where)

@@ -1,0 +1,182 @@
+"""Several processes train one policy: the same bits as one process, and an end with a checkpoint when one is lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.errors import ConfigError
+from experiments.runs import checkpoint
+from experiments.runs.metrics import read
+from experiments.training import ranks
+from tests.support import one_node_slurm
+from tests.support.one_node_slurm import free_ports
+from tests.support.paths import ROOT
+
+UPDATES = 120
+EXPERIMENT = f"""
+name: tiny
+balls: player5/M0
+task: {{max_steps: 60, sim_rate: 75.0}}
+optimiser: {{num_directions: 2, repeats: 2}}
+training: {{updates: {UPDATES}, pool: 64, evaluate_every: 40, evaluate_episodes: 16, checkpoint_seconds: 1000}}
+evaluation: {{episodes: 16, sim_rate: 75.0, reachable_balls: null}}
+"""
+PROGRAM = [sys.executable, "-c", "from experiments.cli import program; program()", "train"]
+# The training itself without the evaluation, pictures and export that follow it.
+DRIVER = """
+import sys
+from mjx_tt import platform
+platform.configure(int(sys.argv[3]))
+from rich.console import Console
+from experiments.config import build, experiment as config
+from experiments.runs.run_dir import Run
+from experiments.training import loop, ranks
+numbers = map(int, sys.argv[5:]) if sys.argv[5:] else (None, None)
+together = ranks.join(sys.argv[4], *numbers) if sys.argv[4:] else ranks.ALONE
+with together.together():
+    experiment = build.experiment(config.load(sys.argv[1]), sys.argv[1])
+    loop.train(experiment, Run(sys.argv[2]), Console(), together)
+    together.part()
+"""
+TRAINING = [sys.executable, "-c", DRIVER]
+
+
+@pytest.fixture(scope="module")
+def yaml(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("experiment") / "tiny.yaml"
+    path.write_text(EXPERIMENT)
+    return path
+
+
+def pair(*command: str) -> list[subprocess.Popen]:
+    """Two processes, whose numbers end the command."""
+    to_pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return [subprocess.Popen([*command, str(i)], cwd=ROOT, **to_pipes) for i in range(2)]
+
+
+def address() -> str:
+    return f"127.0.0.1:{free_ports(1)[0]}"
+
+
+def state(run: Path) -> dict[str, np.ndarray]:
+    found = checkpoint.read_latest(run / "checkpoints")
+    assert found is not None and found[1]["update"] == UPDATES
+    return found[0]
+
+
+def assert_equal(run: Path, reference: Path) -> None:
+    ours, theirs = state(run), state(reference)
+    assert ours.keys() == theirs.keys()
+    assert all(ours[name].tobytes() == theirs[name].tobytes() for name in theirs)
+    rows, expected = ([row | {"seconds": 0} for row in read(f / "metrics.jsonl")] for f in (run, reference))
+    assert len(rows) == UPDATES and rows == expected, "evaluations on the way are in them"
+
+
+@pytest.fixture(scope="module")
+def alone(yaml, tmp_path_factory) -> Path:
+    """One process with two devices."""
+    run = tmp_path_factory.mktemp("alone") / "tiny"
+    done = subprocess.run([*TRAINING, str(yaml), str(run), "2"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return run
+
+
+@pytest.mark.slow
+def test_two_processes_are_one_with_two_devices(yaml, alone, tmp_path):
+    together = ["--distributed", address(), "--processes", "2", "--process"]
+    first, second = pair(*PROGRAM, str(yaml), "--out", str(tmp_path), *together)
+    (said, errors), (silent, _) = first.communicate(timeout=300), second.communicate(timeout=300)
+    assert (first.returncode, second.returncode) == (0, 0), errors
+    assert "trained by 2 processes, ended by updates" in said and silent == ""
+    assert_equal(tmp_path / "tiny", alone)
+    assert (tmp_path / "tiny" / "artefact" / "manifest.json").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("victim, number", [(1, signal.SIGKILL), (0, signal.SIGKILL), (1, signal.SIGSTOP)])
+def test_a_lost_process_ends_the_other_with_a_checkpoint(victim, number, yaml, alone, tmp_path):
+    run = tmp_path / "tiny"
+    processes = pair(*TRAINING, str(yaml), str(run), "1", address(), "2")
+    try:
+        until = time.monotonic() + 240.0
+        while not read(run / "metrics.jsonl"):
+            assert time.monotonic() < until and processes[0].poll() is None
+            time.sleep(0.01)
+        processes[victim].send_signal(number)
+        lost = time.monotonic()
+        _, errors = processes[1 - victim].communicate(timeout=60)
+        assert time.monotonic() - lost < 30.0
+        assert processes[1 - victim].returncode == 1
+        assert "another process is" in errors and "The same command continues" in errors
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+    kept = checkpoint.newest(run / "checkpoints")
+    assert 0 < kept < UPDATES and f"checkpoint after update {kept} is kept" in errors
+    resumed = subprocess.run([*TRAINING, str(yaml), str(run), "2"], cwd=ROOT, capture_output=True, text=True)
+    assert resumed.returncode == 0 and f"continues after update {kept}" in resumed.stdout, resumed.stderr
+    assert_equal(run, alone)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(one_node_slurm.missing() != "", reason=one_node_slurm.missing())
+def test_slurm_starts_the_processes(yaml, alone, tmp_path):
+    with one_node_slurm.slurm(tmp_path / "slurm") as environment:
+        command = ["srun", "-n", "2", *TRAINING, str(yaml), str(tmp_path / "tiny"), "1", "auto"]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert_equal(tmp_path / "tiny", alone)
+
+
+@pytest.mark.parametrize(
+    "given, text",
+    [
+        (("10.0.0.1:7000", None, 0), "needs --processes N and --process I"),
+        (("10.0.0.1:7000", 2, 2), "--process 2: allowed are 0 to 1"),
+        (("10.0.0.1", 2, 0), "HOST:PORT"),
+        (("auto", 2, 0), "come with HOST:PORT"),
+    ],
+)
+def test_refusals(given, text):
+    with pytest.raises(ConfigError, match=text):
+        ranks.join(*given)
+
+
+def test_without_a_cluster_auto_says_so():
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("SLURM", "OMPI", "JAX_"))}
+    command = [*PROGRAM, "quickstart.yaml", "--distributed", "auto"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2 or done.returncode == 1
+    assert "no SLURM, Open MPI or Kubernetes was found here" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_alone_there_is_nothing_to_agree_on():
+    assert ranks.ALONE.agree(1.0, 2.5).tolist() == [[1.0, 2.5]]
+    assert ranks.ALONE.of_first([np.arange(3)])[0].tolist() == [0, 1, 2]
+
+
+def test_the_watch_calls_once_signs_stop(monkeypatch):
+    monkeypatch.setattr(ranks, "SILENCE", 0.6)
+    called: list[float] = []
+    with ranks.Ranks(2, 0).watched(called.append) as watch:  # type: ignore[arg-type] - it returns here
+        time.sleep(1.2)
+        assert not called, "before the first sign, which waits for compilations"
+        for _ in range(8):
+            watch.alive()
+            time.sleep(0.2)
+        assert not called
+        watch.pause()
+        time.sleep(1.2)
+        assert not called, "nor in a pause"
+        watch.alive()
+        time.sleep(1.6)
+        assert called and called[0] > 0.6
