@@ -479,6 +479,8 @@ FIXED = [
         ("right",),
         marks=[SLOW, PEOPLE],
     ),
+    # It changes drag and lift alike: one cause, not two.
+    pytest.param(Case("human_single", ("ball_mass",), 20.0, "iid", 35, count=200), ("right",), marks=[SLOW, PEOPLE]),
     pytest.param(Case("kalman", (), 0.0, "iid", 41, count=200), ("right",), marks=SLOW),
     (Case("robot", ("joint_2.lag",), 0.0, "iid", 19), ("right",)),
     pytest.param(Case("unexcited", ("joint_3.acceleration_limit",), 0.0, "iid", 22), ("right",), marks=SLOW),

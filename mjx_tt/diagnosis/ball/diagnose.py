@@ -148,7 +148,7 @@ def _diagnose(
     gone = set(without)
     if "magnus" in gone and model.ball.flight.magnus_coefficient == 0.0:
         # Without the force the nominal model has no use for either.
-        gone |= {"magnus_coefficient", "lift_saturation", "spin_decay"}
+        gone |= {"magnus_coefficient", "air_density", "lift_saturation", "spin_decay"}
     fitted = tuple(e for e in EFFECTS if e.fit and not e.at_paddle and not (e.needs_spin and e.name in gone))
     left_out = tuple(i for i, e in enumerate(fitted) if e.gone(gone))
     mode = "never" if spin == "none" and "magnus" in gone else spin

@@ -43,6 +43,7 @@ class Effect(Description):
     low: float = -np.inf  # smallest change that makes sense
     at_paddle: bool = False  # only a hit shows it, with the joints' log beside the ball's
     needs_spin: bool = False  # shows only on balls that spin
+    made_of: tuple[str, ...] = ()  # effects that it changes together: beside all of them it is no unknown of its own
     fades: bool = False  # shows for a moment only and is gone at the flight's end
     fit: bool = True  # False: not a shift of the path, found by other means
     invisible: str = ""  # reason for which no log of the ball's positions shows it
@@ -120,6 +121,30 @@ EFFECTS: tuple[Effect, ...] = (
         unit="1",
         reading="a marked ball filmed from the side",
         needs_spin=True,
+    ),
+    # Without spin a twin of the drag; with it drag and lift change alike, which is one cause and not two.
+    Effect(
+        name="air_density",
+        meaning="thinner or denser air",
+        claim="The air is {way:denser|thinner} than the model says, {instead}",
+        path=FLIGHT + "air_density",
+        scale=0.05,
+        express=_times(FLIGHT + "air_density"),
+        unit="1",
+        path_unit="kg/m^3",
+        reading="a barometer and a thermometer",
+        needs_spin=True,
+        made_of=("drag_coefficient", "magnus_coefficient"),
+        twins=(
+            Twin(
+                name="ball_mass",
+                meaning="another mass of the ball",
+                path=FLIGHT + "mass",
+                of=lambda nominal, ratio: nominal / ratio,
+                unit="kg",
+                reading="scales",
+            ),
+        ),
     ),
     Effect(
         name="lift_saturation",
@@ -419,4 +444,4 @@ EFFECTS: tuple[Effect, ...] = (
 )
 BY_NAME = {effect.name: effect for effect in EFFECTS}
 INVISIBLE = {effect.name: effect.invisible for effect in EFFECTS if effect.invisible}
-DESCRIPTIONS: dict[str, Description] = BY_NAME | {twin.name: twin for effect in EFFECTS for twin in effect.twins}
+DESCRIPTIONS: dict[str, Description] = {**{t.name: t for effect in EFFECTS for t in effect.twins}, **BY_NAME}

@@ -64,7 +64,7 @@ def fit(
     free = [
         i
         for i, e in enumerate(effects)
-        if i not in left_out and not (prior is None and (e.needs_spin or i == problem.coefficient))
+        if i not in left_out and not e.made_of and not (prior is None and (e.needs_spin or i == problem.coefficient))
     ]
     mean, scale = np.zeros(len(effects)), np.array([e.scale for e in effects])
     if problem.coefficient is not None:

@@ -181,6 +181,8 @@ def refined(choice: Choice, p: Projected) -> Choice:
 def _candidates(rated: Scores, p: Projected, trial: Trial, spin: bool) -> Subset:
     out = set(trial.left_out)
     bent = {p.coefficient} if spin else {i for i, e in enumerate(trial.effects) if e.needs_spin and trial.spinning}
+    if p.coefficient is not None or not spin:  # where the lift is free anyway, drag and lift together are drag alone
+        bent |= {i for i, e in enumerate(trial.effects) if e.made_of}
     return tuple(
         int(i)
         for i in np.flatnonzero(visible(rated, trial, bool(p.noise.scatter.any())))
