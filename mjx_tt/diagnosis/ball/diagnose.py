@@ -183,8 +183,9 @@ def _diagnose(
         other, theirs = _spinning(problem, trial, nominal, say)
         gained = evidence.misfit(best, g) - evidence.misfit(other, g)
         shift = evidence.shift_of_spins(other)
-        spin_notes.append(_tried(gained, shift))
-        if gained > 0.0 and shift >= selection.FLOOR:
+        bends = evidence.lifts(other)
+        spin_notes.append(_tried(gained, shift, bends))
+        if gained > 0.0 and shift >= selection.FLOOR and bends:
             best, together = replace(other, trial=replace(other.trial, spin="none")), theirs
             findings, survivors = find(best, g, sessions, age, names)
     if before is None and findings:
@@ -239,12 +240,16 @@ def _plain(
     return found, fitted_all
 
 
-def _tried(gained: float, shift: float) -> str:
+def _tried(gained: float, shift: float, bends: bool) -> str:
     """Account of balls with spins of their own, which shift [m] flights, against balls without, by twice the log
-    evidence gained."""
+    evidence gained. bends: the air bends such balls as it does real ones."""
     if gained > 0.0 and shift < selection.FLOOR:
         return (
             f"spin was tried because something stayed open without it, and dropped: it moves balls {1e3 * shift:.1f} mm"
+        )
+    if gained > 0.0 and not bends:
+        return (
+            "spin was tried because something stayed open without it, and dropped: no air bends balls so much or little"
         )
     if gained > 0.0:
         return f"spin was tried because something stayed open without it, and kept: its evidence is {gained:.0f} better"

@@ -10,6 +10,7 @@ from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.ball.flights.linearization import KICK, Projected
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE
 from mjx_tt.diagnosis.ball.selection import MAGNUS_KEPT, TIE, Choice, Settled, Trial, fitted_spins, left_over
 
 SPIN_COST = 3.0  # squared error by which three more numbers of a ball must pay at least
@@ -69,6 +70,12 @@ def shift_of_spins(settled: Settled) -> float:
     if prior is None:
         return 0.0
     return float(np.sqrt(np.sum(prior.std**2 + prior.mean**2))) * settled.trial.spin_shift
+
+
+def lifts(settled: Settled) -> bool:
+    """True where the Magnus coefficient that goes with the spins is not held at an end of what balls have."""
+    j = settled.projected.coefficient
+    return j is None or bool(MAGNUS_RANGE[0] < settled.at.theta[j] < MAGNUS_RANGE[1])
 
 
 def bent_too_far(choice: Choice) -> bool:
