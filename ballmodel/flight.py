@@ -207,19 +207,25 @@ def _paddle_time(
 
 
 def step(
-    params: BallParams, state: BallState, dt: Scalars, paddle: tuple[PaddlePose, PaddlePose] | None = None
+    params: BallParams,
+    state: BallState,
+    dt: Scalars,
+    paddle: tuple[PaddlePose, PaddlePose] | None = None,
+    with_net: bool = True,
 ) -> tuple[BallState, Events]:
     """Advances the ball by ``dt`` [s] with at most one impact, on table, net or paddle.
 
-    ``paddle`` is None or a pair (pose at the step's start, pose at its end). Batch axes last throughout.
+    ``paddle`` is None or a pair (pose at the step's start, pose at its end). with_net: False where the ball is known
+    to have passed the net. Batch axes last throughout.
     """
     flight, radius = params.flight, params.flight.radius
     ball = _ball(state)
     a = _step_acceleration(flight, ball, dt)
     free = _move(ball, a, flight, dt)
     t_table = _box_time(TABLE, params.table, ball, a, free.position, radius, dt)
-    t_net = _box_time(NET, params.net, ball, a, free.position, radius, dt)
-    t_first = jnp.minimum(t_table, t_net)
+    t_first = t_table
+    if with_net:
+        t_first = jnp.minimum(t_table, _box_time(NET, params.net, ball, a, free.position, radius, dt))
     if paddle is not None:
         start, end = (_mounted(params.paddle, _blade(pose)) for pose in paddle)
         t_paddle, side = _paddle_time(params.paddle, radius, ball, free.position, start, end, dt)
@@ -235,11 +241,14 @@ def step(
 
     # One evaluation of the Coulomb impact serves table and net: only the surface and the normal differ.
     gap_table, distance_table = surface_gap(TABLE, params.table, at.position)
-    gap_net, distance_net = surface_gap(NET, params.net, at.position)
-    normal = stored(select(hit_table, gap_table / distance_table, gap_net / distance_net))
-    chosen = ("restitution", "restitution_slope", "friction")  # what the impact itself depends on
-    of_surface = {name: jnp.where(hit_table, getattr(params.table, name), getattr(params.net, name)) for name in chosen}
-    surface = replace(params.table, **of_surface)
+    surface, normal = params.table, gap_table / distance_table
+    if with_net:
+        gap_net, distance_net = surface_gap(NET, params.net, at.position)
+        normal = select(hit_table, normal, gap_net / distance_net)
+        chosen = ("restitution", "restitution_slope", "friction")  # what the impact itself depends on
+        either = {name: jnp.where(hit_table, getattr(params.table, name), getattr(params.net, name)) for name in chosen}
+        surface = replace(params.table, **either)
+    normal = stored(normal)
     velocity, spin = contact.surface_impact(surface, at.velocity, at.spin, normal, radius)
     if paddle is not None:
         w = t / dt

@@ -253,7 +253,7 @@ def fly_on(fitted: Fitted, time: Float[np.ndarray, "T n"]) -> tuple[Flown, Float
     start = np.repeat(fitted.state[:, None], 10, axis=1)
     for i in range(9):
         start[i, 1 + i] += STEP[i]
-    flown = fly(fitted.model, {}, start, g, fitted.axes)
+    flown = fly(fitted.model, {}, start, g, fitted.axes, states=start.shape[1])
     derivative = (flown.position[:, 1:, 1:] - flown.position[:, 1:, :1]) / STEP[None, None, :, None]
     return flown, derivative
 

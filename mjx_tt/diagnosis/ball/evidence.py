@@ -24,7 +24,7 @@ def misfit(settled: Settled, g: Grid) -> float:
     n, p, choice = settled.noise, settled.projected, settled.choice
     left, start = left_over(settled.linear, settled.at, p, choice, g)
     counts = g.mask & (p.weight.T > 0.0)
-    error = np.minimum((noise.whiten(left, n, g) ** 2).sum(axis=0), 3.0 * noise.HUBER**2)
+    error = np.minimum(noise.Whitening(n, g).distance(left) ** 2, 3.0 * noise.HUBER**2)
     spread = 2.0 * np.log(n.scale * np.sqrt(1.0 - n.memory[:, None] ** 2)).sum(axis=0)
     own = _price_of_spins(settled, g.n) + _price_of_kicks(settled, start[KICK])
     # As if the samples left out were as usual: to leave out must not pay.

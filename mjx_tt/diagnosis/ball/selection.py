@@ -21,7 +21,6 @@ from mjx_tt.diagnosis.ball.flights.linearization import (
     Projected,
     Situation,
     project,
-    rows,
 )
 from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE, SpinPrior, learned
@@ -359,8 +358,8 @@ def left_over(
     own, precision = np.arange(6), np.full(6, 1e-9)
     if p.noise.scatter.any():
         own, precision = np.r_[own, 9:12], np.r_[precision, np.maximum(p.noise.scatter, noise.LEAST_SCATTER) ** -2.0]
-    white = rows(linear.starts[own], p.noise, p.weight, g)
-    target = rows(left[None], p.noise, p.weight, g)
+    whitening = noise.Whitening(p.noise, g)
+    white, target = (whitening.rows(x, p.weight) for x in (linear.starts[own], left[None]))
     known = np.where(own < 6, 0.0, precision)[:, None] * start[own]
     right = (white.swapaxes(1, 2) @ target)[..., 0] - known.T
     nu = np.linalg.solve(white.swapaxes(1, 2) @ white + np.diag(precision), right[..., None])[..., 0]

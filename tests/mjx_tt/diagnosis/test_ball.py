@@ -137,7 +137,7 @@ def test_noise_is_found_with_its_memory(memory):
     found = noise.estimate(0.004 * e, noise.nominal_noise(g).frame, g)
     assert np.median(found.scale) == pytest.approx(0.004, rel=0.05)
     assert found.memory == pytest.approx(np.full(3, memory), abs=0.04)
-    white = noise.whiten(0.004 * e, found, g)
+    white = noise.Whitening(found, g)(0.004 * e)
     assert np.abs(np.mean(white[:, 2:] * white[:, 1:-1])) < 0.05 and white.std() == pytest.approx(1.0, rel=0.06)
 
 

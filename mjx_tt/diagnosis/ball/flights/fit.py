@@ -9,8 +9,16 @@ import numpy as np
 
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid, picked, predict
-from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, START_STEPS, BallProblem, Situation, project, rows
-from mjx_tt.diagnosis.ball.flights.noise import HUBER, LEAST_SCATTER, Noise, nominal_noise, robust_weights, whiten
+from mjx_tt.diagnosis.ball.flights.linearization import KICK, SPIN, START_STEPS, BallProblem, Situation, project
+from mjx_tt.diagnosis.ball.flights.noise import (
+    HUBER,
+    LEAST_SCATTER,
+    Noise,
+    Whitening,
+    nominal_noise,
+    robust_weights,
+    weights_at,
+)
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, SpinPrior, learned
 
 WINDOWS = (0.1, 0.2, 0.3, 0.4)  # [s] of a flight that the first fit takes in turn
@@ -53,6 +61,7 @@ def fit_with_cost(
     noise = nominal_noise(g) if noise is None else noise
     mask = g.mask if keep is None else g.mask & keep
     g = replace(g, mask=mask)
+    whitening = Whitening(noise, g)
     active = [*range(6), *([] if prior is None else range(6, 9)), *(range(9, 12) if noise.scatter.any() else [])]
     size = len(active)
     damping = np.full(g.n, LEAST_DAMPING)
@@ -80,14 +89,14 @@ def fit_with_cost(
         base = flown.measured[:, :, 0]
         columns = np.moveaxis(flown.measured[:, :, 1:] - base[:, :, None], 2, 0) / START_STEPS[active, None, None, None]
         residual = np.where(mask, g.measured - base, 0.0)
-        distance = np.sqrt((whiten(residual, noise, g) ** 2).sum(axis=0))
+        distance = whitening.distance(residual)
         # Huber's own cost: with weights that follow the residual a step away from outliers would look like a gain.
         cost = np.where(distance <= HUBER, distance**2, 2.0 * HUBER * distance - HUBER**2).sum(axis=0)
         pull = np.einsum("nab,bn->na", precision, start - middle)
         cost = cost + ((start - middle) * pull.T).sum(axis=0)
         better = cost <= best_cost * (1.0 + 1e-9)
-        weight = robust_weights(residual, noise, g)
-        white, j = rows(residual[None], noise, weight, g)[..., 0], rows(columns, noise, weight, g)
+        weight = weights_at(distance)
+        white, j = whitening.rows(residual[None], weight)[..., 0], whitening.rows(columns, weight)
         here, slope = j.swapaxes(1, 2) @ j, (j.swapaxes(1, 2) @ white[..., None])[..., 0]
         here += precision[:, active][:, :, active]
         slope -= pull[:, active]

@@ -8,7 +8,9 @@ float64, which also serve effects that start at a threshold.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import jax
@@ -27,7 +29,8 @@ from mjx_tt.sim.sensors import FILTER_GATE, Lag, jump
 
 LONGEST_STEP = 0.01  # [s]; second order: 0.05 mm over a flight
 PAD = 16  # numbers of steps are rounded up to it, so that similar logs share one compiled program
-WIDTH = 2048  # columns, balls x variants, of one call: always the same, for the same reason
+WIDTH = 256  # columns, balls x variants, of one call: always the same, for the same reason; few enough to stay in cache
+_FLOWN: set[tuple] = set()  # shapes of programs that were compiled
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,8 @@ class Flown:
     """Predictions for n balls under v variants."""
 
     measured: Float[np.ndarray, "3 T v n"]  # [m] report of the tracker
-    position: Float[np.ndarray, "3 T v n"]  # [m] true
-    velocity: Float[np.ndarray, "3 T v n"]  # [m/s] true
+    position: Float[np.ndarray, "3 T s n"]  # [m] true, of the first s variants
+    velocity: Float[np.ndarray, "3 T s n"]  # [m/s] true
     bounce_time: Float[np.ndarray, "v n"]  # [s] of the first bounce since the first sample; inf without one
     bounce: Float[np.ndarray, "3 v n"]  # [m] place of the bounce
     bounce_velocity: Float[np.ndarray, "3 v n"]  # [m/s] before it
@@ -107,12 +110,13 @@ def predict(
     start: Float[np.ndarray, "k v n"],
     g: Grid,
     axes: Float[np.ndarray, "3 3 n"],
+    states: int = 1,
 ) -> Flown:
     """Flies every ball under every variant.
 
     values: leaves of ``model`` to replace, each broadcastable to (v, n). start: position, velocity, spin at the
     first sample, and, where there are twelve rows, what its first bounce adds to its velocity; these two in ``axes``:
-    component, axis, ball.
+    component, axis, ball. states: number of variants of which position and velocity are given.
     """
     if len(start) == 9:
         start = np.concatenate([start, np.zeros_like(start[:3])])
@@ -122,13 +126,13 @@ def predict(
     ball = np.tile(np.arange(n), v)  # column -> ball
     flat = {k: np.broadcast_to(np.asarray(values[k], np.float64), (v, n)).ravel() for k in sorted(values)}
     columns = start.reshape(len(start), -1)
-    parts = []
-    with jax.enable_x64(True):
-        for first in range(0, v * n, WIDTH):
-            # The last call is filled up with its last column: one shape, one compiled program.
-            mine = np.minimum(np.arange(first, first + WIDTH), v * n - 1)
-            some = ball[mine]
-            paddle = g.paddle and jax.tree.map(lambda x, some=some: np.moveaxis(x[..., some], 1, 0), g.paddle)
+
+    def part(first: int) -> list[np.ndarray]:
+        # The last part is filled up with its last column: one shape, one compiled program.
+        mine = np.minimum(np.arange(first, first + WIDTH), v * n - 1)
+        some = ball[mine]
+        paddle = g.paddle and jax.tree.map(lambda x: np.moveaxis(x[..., some], 1, 0), g.paddle)
+        with jax.enable_x64(True):
             flown = _fly(
                 model,
                 {k: x[mine] for k, x in flat.items()},
@@ -137,10 +141,21 @@ def predict(
                 g.index[:, some],
                 paddle,
             )
-            keep = min(WIDTH, v * n - first)
-            parts.append([np.asarray(x)[..., :keep] for x in flown])
-    joined = (np.concatenate(x, axis=-1) for x in zip(*parts, strict=True))
-    return Flown(*(x.reshape(*x.shape[:-1], v, n) for x in joined))
+            return [np.asarray(x)[..., : v * n - first] for x in flown]
+
+    begins = [*range(0, v * n, WIDTH)]
+    shape = (len(g.steps), len(g.index), g.paddle is None, *flat)
+    parts = [] if shape in _FLOWN else [part(begins.pop(0))]  # alone: it may have to be compiled
+    _FLOWN.add(shape)
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as cores:
+        parts += cores.map(part, begins)
+
+    def joined(some: Sequence[np.ndarray], variants: int) -> np.ndarray:
+        x = np.concatenate(some[: -(-variants * n // WIDTH)], axis=-1)[..., : variants * n]
+        return x.reshape(*x.shape[:-1], variants, n)
+
+    counts = (v, states, states, v, v, v, v)
+    return Flown(*(joined(some, count) for some, count in zip(zip(*parts, strict=True), counts, strict=True)))
 
 
 @jax.jit
@@ -150,9 +165,7 @@ def _fly(
     """Fields of Flown for columns (12, c) of starts; values (c,), steps (L, c), index (T, c), paddle (L + 1, 3, c)."""
     nominal_latency = model.latency.ball_observation
     model = with_values(without_nominal(model), values)
-    # What was measured flew on: a trial start that grazes the net must not be stopped by it.
-    net = replace(model.ball.net, height=-1.0)
-    ball = replace(model.ball, flight=replace(model.ball.flight, integrator="midpoint"), net=net)
+    ball = replace(model.ball, flight=replace(model.ball.flight, integrator="midpoint"))
     sensing = model.sensing
     shape = start.shape[1:]
     rate = jnp.broadcast_to(jnp.asarray(value_or(sensing.clock_rate, 1.0), start.dtype), shape)
@@ -179,7 +192,8 @@ def _fly(
         dt, sampled, *blade = inputs
         dt = dt / rate
         pair = tuple(jax.tree.map(lambda x: jnp.broadcast_to(x, (3, *shape)), moved(pose)) for pose in blade) or None
-        new, events = flight.step(ball, state, dt, pair)
+        # What was measured flew on: a trial start that grazes the net must not be stopped by it.
+        new, events = flight.step(ball, state, dt, pair, with_net=False)
         moving = dt > 0.0
         new = jax.tree.map(lambda a, b: jnp.where(moving, a, b), new, state)
         landed = events.table & moving

@@ -14,7 +14,7 @@ import numpy as np
 
 from mjx_tt.diagnosis.ball.effects import FLIGHT, Effect
 from mjx_tt.diagnosis.ball.flights.forward_model import Flown, Grid, heading_axes, leaves, predict
-from mjx_tt.diagnosis.ball.flights.noise import Noise, whiten
+from mjx_tt.diagnosis.ball.flights.noise import Noise, Whitening
 from mjx_tt.sim.model import SimModel
 
 SPIN, KICK = slice(6, 9), slice(9, 12)
@@ -89,7 +89,7 @@ class BallProblem:
         values = self.values(theta[:, :, None])
         values[MAGNUS] = values[MAGNUS].copy()
         values[MAGNUS][7 + k : 11 + k] = np.where(np.abs(values[MAGNUS][0]) > 0.05, values[MAGNUS][0], REFERENCE_MAGNUS)
-        flown = predict(self.model, values, start, g, self.axes)
+        flown = predict(self.model, values, start, g, self.axes, states=7)
         base, bent = flown.measured[:, :, 0], flown.measured[:, :, 7 + k]
 
         def slopes(variants: slice, before: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -99,7 +99,7 @@ class BallProblem:
         spun = slopes(slice(8 + k, 11 + k), bent, START_STEPS[SPIN])
         starts = np.concatenate([starts, spun, slopes(slice(11 + k, 14 + k), base, START_STEPS[KICK])])
         effects = slopes(slice(7, 7 + k), base, moves)
-        state = np.concatenate([flown.position, flown.velocity])[:, :, :7]
+        state = np.concatenate([flown.position, flown.velocity])
         transition = (state[:, :, 1:] - state[:, :, :1]) / START_STEPS[None, None, :6, None]
         residual = np.where(g.mask, g.measured - base, 0.0)
         one = Flown(
@@ -134,12 +134,6 @@ class Projected:
     coefficient: int | None  # the effect that comes along with spin
 
 
-def rows(x: np.ndarray, noise: Noise, weight: np.ndarray, g: Grid) -> np.ndarray:
-    """Whitened and weighted rows (n, 3 T, k) of columns (k, 3, T, n)."""
-    w = whiten(x, noise, g) * weight.T
-    return np.moveaxis(w, -1, 0).reshape(g.n, x.shape[0], -1).swapaxes(1, 2)
-
-
 def project(
     linear: Linear, at: Situation, noise: Noise, weight: np.ndarray, g: Grid, coefficient: int | None = None
 ) -> Projected:
@@ -159,8 +153,8 @@ class StartsOut:
     def __init__(
         self, linear: Linear, target: np.ndarray, start: np.ndarray, noise: Noise, weight: np.ndarray, g: Grid
     ) -> None:
-        self._noise, self._weight, self._grid = noise, weight, g
-        free, kicks = (rows(linear.starts[part], noise, weight, g) for part in (slice(6), KICK))
+        self._noise, self._weight, self._white = noise, weight, Whitening(noise, g)
+        free, kicks = (self._white.rows(linear.starts[part], weight) for part in (slice(6), KICK))
         self._kick_gram = kicks.swapaxes(1, 2) @ remove(np.linalg.qr(free)[0], kicks)
         self._scatters = bool(noise.scatter.any())
         if self._scatters:
@@ -174,9 +168,9 @@ class StartsOut:
 
     def _left(self, columns: np.ndarray) -> np.ndarray:
         """Rows of columns (k, 3, T, n) without what the balls' own unknowns explain."""
-        whitened = rows(columns, self._noise, self._weight, self._grid)
+        whitened = self._white.rows(columns, self._weight)
         if self._scatters:
-            whitened = np.concatenate([whitened, np.zeros((self._grid.n, 3, whitened.shape[2]))], axis=1)
+            whitened = np.concatenate([whitened, np.zeros((len(whitened), 3, whitened.shape[2]))], axis=1)
         return remove(self._basis, whitened)
 
     def project(self, columns: np.ndarray, coefficient: int | None = None) -> Projected:

@@ -115,27 +115,50 @@ def without_memory(noise: Noise, most: float = 0.0) -> Noise:
     return replace(noise, memory=np.minimum(noise.memory, most))
 
 
-def whiten(x: np.ndarray, noise: Noise, g: Grid) -> np.ndarray:
-    """Columns (..., 3, T, n) in units of independent noise; zero where there is no sample."""
-    x = np.where(g.mask, x, 0.0)
-    turn = noise.frame / noise.scale[:, None, None]
-    out = np.empty_like(x)
-    for a in range(3):  # written out: several times as fast as einsum, and this is called on every column of every fit
-        np.multiply(turn[a, 0], x[..., 0, :, :], out=out[..., a, :, :])
+class Whitening:
+    """Turns columns (3, T, n) into units of independent noise, one at a time: so that each stays in the cache."""
+
+    def __init__(self, noise: Noise, g: Grid) -> None:
+        self._mask = g.mask
+        self._turn = noise.frame / noise.scale[:, None, None]
+        gap = np.zeros_like(g.time)
+        gap[1:] = np.diff(g.time, axis=0) / noise.interval
+        decay = np.where(g.mask, noise.memory[:, None, None] ** gap[None], 0.0)
+        decay[:, 0] = 0.0
+        self._decay = decay[:, 1:] if noise.memory.any() else None
+        self._unit = np.where(g.mask, 1.0 / np.sqrt(1.0 - decay**2), 0.0)
+
+    def __call__(self, column: np.ndarray) -> np.ndarray:
+        """The column whitened; zero where there is no sample."""
+        x = np.where(self._mask, column, 0.0)
+        out = self._turn[:, 0] * x[0]
         for c in (1, 2):
-            out[..., a, :, :] += turn[a, c] * x[..., c, :, :]
-    gap = np.zeros_like(g.time)
-    gap[1:] = np.diff(g.time, axis=0) / noise.interval
-    decay = np.where(g.mask, noise.memory[:, None, None] ** gap[None], 0.0)
-    decay[:, 0] = 0.0
-    out[..., 1:, :] -= decay[:, 1:] * out[..., :-1, :]
-    out *= np.where(g.mask, 1.0 / np.sqrt(1.0 - decay**2), 0.0)
-    return out
+            out += self._turn[:, c] * x[c]
+        if self._decay is not None:
+            out[:, 1:] -= self._decay * out[:, :-1]
+        out *= self._unit
+        return out
+
+    def distance(self, residual: np.ndarray) -> np.ndarray:
+        """(T, n) of each sample, in standard deviations."""
+        return np.sqrt((self(residual) ** 2).sum(axis=0))
+
+    def rows(self, x: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Whitened and weighted rows (n, 3 T, k) of columns (k, 3, T, n); weight: (n, T)."""
+        balls, weight = self._mask.shape[1], weight.T
+        out = np.empty((balls, len(x), 3 * len(self._mask)))
+        for k, column in enumerate(x):
+            out[:, k] = (self(column) * weight).reshape(-1, balls).T
+        return out.swapaxes(1, 2)
 
 
 def robust_weights(residual: np.ndarray, noise: Noise, g: Grid) -> np.ndarray:
     """Square roots (n, T) of Huber's weights of the samples."""
-    distance = np.sqrt((whiten(residual, noise, g) ** 2).sum(axis=0))
+    return weights_at(Whitening(noise, g).distance(residual))
+
+
+def weights_at(distance: np.ndarray) -> np.ndarray:
+    """The same (n, T) at distances (T, n) in standard deviations."""
     return np.sqrt(huber_weights(distance, HUBER)).T
 
 

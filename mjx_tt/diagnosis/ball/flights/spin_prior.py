@@ -99,15 +99,21 @@ def _posteriors(
     mixture: _Mixture, information: np.ndarray, score: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log evidence (n, c) of balls under components, and mean (n, c, 3), covariance (n, c, 3, 3) of their spins."""
-    precision = np.linalg.inv(mixture.covariance)
-    inner = information[:, None] + precision
+    precision, size = _inverse(mixture.covariance)
     pull = np.einsum("cab,cb->ca", precision, mixture.mean)
     right = score[:, None] + pull
-    covariance = np.linalg.inv(inner)
-    mean = np.einsum("ncab,ncb->nca", covariance, right)
-    spread = np.linalg.slogdet(np.eye(3) + mixture.covariance @ information[:, None])[1]
+    covariance, inner_size = _inverse(information[:, None] + precision)
+    mean = (covariance @ right[..., None])[..., 0]
+    spread = np.log(inner_size * size)  # of 1 + C L, which is C (C^-1 + L)
     evidence = 0.5 * ((right * mean).sum(axis=-1) - (pull * mixture.mean).sum(axis=-1) - spread)
     return np.log(mixture.share) + evidence, mean, covariance
+
+
+def _inverse(m: Float[np.ndarray, "*batch 3 3"]) -> tuple[Float[np.ndarray, "*batch 3 3"], Float[np.ndarray, "*batch"]]:
+    """Inverses of small matrices by their cofactors, many times as fast as LAPACK one by one; and determinants."""
+    rows = np.cross(np.roll(m, -1, axis=-2), np.roll(m, -2, axis=-2))  # cofactors, row by row
+    determinant = (m[..., 0, :] * rows[..., 0, :]).sum(axis=-1)
+    return rows.swapaxes(-1, -2) / determinant[..., None, None], determinant
 
 
 def _maximised(mixture: _Mixture, information: np.ndarray, score: np.ndarray) -> tuple[_Mixture, float]:
