@@ -184,9 +184,17 @@ class _Ball:
 
 def _joined(session: str, name: str, parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> Trajectory:
     time, position = np.concatenate([t for t, _ in parts]), np.concatenate([p for _, p in parts], axis=1)
-    # Of two ids, stamps may cross where one takes over from the other.
-    later = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0.0])
+    later = _later(parts)
     return Trajectory(session, name, time[later], position[:, later])
+
+
+def _later(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> Bool[np.ndarray, " n"]:
+    """Samples of all parts that come after those before them.
+
+    Stamps may cross where one part takes over from the other: of two ids, or where stamps shake.
+    """
+    time = np.concatenate([t for t, _ in parts])
+    return np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0.0])
 
 
 def _balls(tracks: Sequence[Track], entries: list[Entry]) -> list[list[_Ball]]:
@@ -296,7 +304,7 @@ def _strokes(ball: _Ball, track: Track, entries: list[Entry], rallies: bool) -> 
             entries.append(Entry("racket", label, at, text, samples))
             continue
         stroke = _joined(ball.session, track.trajectory.name, group)
-        flown = _in_flight(group, track.noise)
+        flown = _in_flight(group, track.noise)[_later(group)]
         if flown.sum() < len(stroke):
             text = f"{int((~flown).sum())} samples of a ball that does not fly (in a hand, rolling, at rest)"
             gone = stroke.position[:, ~flown]

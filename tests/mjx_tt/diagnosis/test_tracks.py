@@ -304,6 +304,18 @@ def test_rallies_are_left_out_where_spin_is_not_known():
     assert [len(t) for t in record.tracks] == [len(t) for t in made.tracks]  # the hits and their returns, whole
 
 
+def test_stamps_that_shake_past_each_other_in_a_held_ball():
+    """Where an arc takes over from another both may hold samples of one moment; once this was an IndexError."""
+    rng, shaken = np.random.default_rng(21), []
+    for t in in_the_hand(rng).tracks:
+        stamp = t.time + 0.005 * rng.standard_normal(len(t))
+        order = np.argsort(stamp)
+        shaken.append(_with(t, t.position[:, order], stamp[order]))
+    strokes, record = clean(shaken)
+    assert all(np.all(np.diff(t.time) > 0.0) for t in strokes)
+    assert {e.kind for e in record.entries} >= {"not in flight"}
+
+
 def test_fast_balls_are_no_swapped_axes():
     """At 11 m/s drag is 17 m/s^2."""
     time = np.arange(40) / 180
