@@ -12,7 +12,7 @@ from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import evidence, posterior, scores, selection
 from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.flights import noise
-from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading, own_spins
+from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Projected, Situation
 from mjx_tt.diagnosis.ball.flights.noise import Jitter, Noise
@@ -102,8 +102,8 @@ def diagnose_balls(
 def _blurred(found: BallFindings) -> Bool[np.ndarray, "T n"] | None:
     """Samples behind the bounce that a predicting filter blurs, but the first, which shows the filter; None without it.
 
-    A filter that starts afresh settles in a way of its own, which no catalogue holds: it may also show in sets that
-    explain more than the chosen one, but with a size that no filter has.
+    A filter that starts afresh settles in a way of its own, which no catalogue holds: it may also show in
+    sets that explain more than the chosen one, but with a size that no filter has.
     """
     choice, names = found.choice, [e.name for e in found.trial.effects]
     filters = [t for j, t in zip(choice.effects, choice.theta, strict=True) if names[j] == "tracker_filter"]
@@ -114,7 +114,8 @@ def _blurred(found: BallFindings) -> Bool[np.ndarray, "T n"] | None:
     g = found.problem.grid
     behind = g.time - found.linear.base.bounce_time[0]
     first = (behind > 0.0) & (np.cumsum(behind > 0.0, axis=0) == 1)
-    return (behind > 0.0) & (behind < np.clip(BLURRED * filters[0], *BLUR)) & ~first
+    settling = np.clip(BLURRED * filters[0], *BLUR)
+    return (behind > 0.0) & (behind < settling) & ~first
 
 
 def shaking(found: BallFindings) -> Jitter | None:
@@ -158,8 +159,9 @@ def _diagnose(
         g = replace(g, mask=g.mask & ~hidden)
     problem = BallProblem(g, model, fitted, heading(g))
     say(f"fitting {g.n} flights under the nominal model")
-    start = first_fit(problem)
-    nominal = Situation(np.zeros(len(fitted)), start)
+    none = np.zeros(len(fitted))
+    start = first_fit(problem) if before is None else fit_starts(problem, none, before.start0, g)
+    nominal = Situation(none, start)
     linear = problem.linearise(nominal)
     trial = Trial(fitted, *selection.shifts(linear, g, fitted), mode, seed, left_out=left_out)
     spin_notes: list[str] = []

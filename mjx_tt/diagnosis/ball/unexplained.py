@@ -18,6 +18,7 @@ from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial
 BLOCK_LEVEL = 2e-5  # chance of one block's false alarm
 BLOCK_FLOOR = 0.0025  # [m] shift that a block must cause on the balls it concerns
 VISIBLE_FLOOR = 2e-4  # [m] rms of what of it no other start of the ball could imitate, on one ball in twenty
+FILTERED_FLOOR = 8e-4  # [m] the same behind a tracker's filter, which is never quite the catalogue's
 ODD_LEVEL = 1e-5  # chance with which one ball is called odd
 ODD_SHARE = 0.01  # of the balls that may be odd (mis-tracked) before they are a finding
 
@@ -54,6 +55,8 @@ def find(
         unkicked = replace(p.noise, scatter=noise.ALIKE)
         alike = StartsOut(linear, linear.residual, settled.at.start, unkicked, p.weight, g)
     named = len(choice.effects)  # the coefficient that comes along with spin is no name of its own
+    filtered = any(trial.effects[j].name == "tracker_filter" for j in choice.effects)
+    least = FILTERED_FLOOR if filtered else VISIBLE_FLOOR
     for block in basis_functions.build(linear, g, sessions, age, called):
         columns = np.concatenate([effects, block.columns])
         both = flights.project(columns)
@@ -68,7 +71,7 @@ def find(
         worst = np.linalg.norm(np.where(g.mask, pattern, 0.0), axis=0).max(axis=0)
         size = float(np.percentile(worst, 90))
         shown = rated if alike is flights else scores.under(alike.project(columns), choice.prior)
-        if size < BLOCK_FLOOR or _visible(shown.ball_gram[:, extra][:, :, extra], beta, p, g) < VISIBLE_FLOOR:
+        if size < BLOCK_FLOOR or _visible(shown.ball_gram[:, extra][:, :, extra], beta, p, g) < least:
             continue
         axis = int(
             np.argmax([np.percentile(np.abs(np.where(g.mask, pattern[a], 0.0)).max(axis=0), 90) for a in range(3)])

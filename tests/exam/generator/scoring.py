@@ -28,7 +28,7 @@ def score(truth: dict, verdict: dict) -> dict:
     named = [{c["name"], *c.get("group", ())} for c in given]
     answer = "+".join(sorted(c["name"] for c in verdict["causes"])) if named else verdict["verdict"]
     record = {"verdict": verdict["verdict"], "answer": answer, "groups": [sorted(g) for g in named]}
-    accepted = {c: {c} for c in (("tracker_filter",) if kind == "kalman" else causes)}
+    accepted = {c: {c} for c in ((*causes, "tracker_filter") if kind == "kalman" else causes)}
     if "magnus" in accepted:  # spins, and a k that is not the nominal one: both are true
         accepted["magnus"].add("magnus_coefficient")
     if kind == "deleted":
