@@ -305,7 +305,7 @@ def test_rallies_are_left_out_where_spin_is_not_known():
 
 
 def test_stamps_that_shake_past_each_other_in_a_held_ball():
-    """Where an arc takes over from another both may hold samples of one moment; once this was an IndexError."""
+    """An arc that takes over from another may hold a sample of the same moment; once that was an IndexError."""
     rng, shaken = np.random.default_rng(21), []
     for t in in_the_hand(rng).tracks:
         stamp = t.time + 0.005 * rng.standard_normal(len(t))
