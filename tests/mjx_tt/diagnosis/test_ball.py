@@ -250,10 +250,14 @@ def test_the_size_of_a_filter_is_no_more_off_than_its_interval_says():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("session", "spins"), [("mn5008_topspin", True), ("no_spin_robot_simple", False)])
-def test_a_launchers_topspin_is_named_and_its_straight_balls_are_not(session, spins):
+def test_a_launchers_topspin_is_named_and_nothing_of_its_straight_balls_is_adopted(session, spins):
     path = MEASURED / "aimy_launcher" / f"{session}.hdf5"
     if not path.exists():
         pytest.skip(f"{path} is not there: measured balls of a launcher")
-    verdict = diagnosis.diagnose(diagnosis.load_logs([path])).verdict
-    assert ("magnus" in [c.name for c in verdict.causes]) == spins
-    assert verdict.held_out.low > 0.0
+    found = diagnosis.diagnose(diagnosis.load_logs([path]))
+    assert found.verdict.held_out.low > 0.0
+    if spins:
+        assert "magnus" in [c.name for c in found.verdict.causes]
+    else:
+        # What is listed beside the unexplained changes with the last digits of a flight: nothing of it may be adopted.
+        assert found.verdict.verdict == "unexplained" and found.extended.model == SimModel()
