@@ -84,7 +84,7 @@ def diagnose(
         found, prediction = _balls(strokes, model, spin, of_ball, seed, say)
         say("judging the robot's hits")
         hits = diagnose_hits(found, record.tracks, joint_path(logs.joints, model), without)
-        notes += [*record.lines(), *found.spin_notes]
+        notes += [*record.lines(), *found.spin_notes, *found.small_notes]
     if logs.joints:
         nominal = {r.joint: nominal_response(model, r.joint) for r in logs.joints}
         robot = diagnose_joints(

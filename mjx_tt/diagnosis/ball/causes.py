@@ -6,9 +6,10 @@ from collections.abc import Callable, Container, Iterable
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 from scipy.special import stdtrit
 
-from mjx_tt.diagnosis.ball import cross_validation, experiment_design, scores, selection
+from mjx_tt.diagnosis.ball import cross_validation, experiment_design, model_averaging, scores, selection
 from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, shaking
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
@@ -17,11 +18,12 @@ from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Part, Together,
 
 BOOTSTRAP = 100
 LEVEL = 0.90  # of intervals
+LEAST_FREEDOM = 5  # of Student's distribution
 
 
 def quantile(freedom: int) -> float:
     """Standard errors of half an interval, by Student's distribution."""
-    return float(stdtrit(max(freedom, 5), 0.5 + LEVEL / 2))
+    return float(stdtrit(max(freedom, LEAST_FREEDOM), 0.5 + LEVEL / 2))
 
 
 def part(
@@ -90,12 +92,12 @@ def _causes(found: BallFindings, without: Container[str], seed: int) -> tuple[li
     """Named causes, and the values of what was fitted beside them without being named."""
     choice, nominal = found.choice, found.problem.nominal
     confidence, wide = _confidence(found, seed), quantile(found.problem.grid.n - 10)
-    matters = selection.named(choice, found.trial)
+    matters, ends = selection.named(choice, found.trial), _ends(found, seed)
     named: list[Expressed] = []
     beside: dict[str, float] = {}
     for i, j in enumerate(choice.effects):
         if matters[i]:
-            named.append(_effect_cause(found, i, confidence[i], wide, without))
+            named.append(_effect_cause(found, i, confidence[i], (ends[0, i], ends[1, i]), without))
         elif any(matters) and choice.theta[i] >= found.trial.effects[j].low:
             # Too small to be named, but the others' sizes were fitted beside it.
             change = found.trial.effects[j].values(nominal, choice.theta[i])
@@ -115,12 +117,26 @@ def _causes(found: BallFindings, without: Container[str], seed: int) -> tuple[li
     return named, beside
 
 
-def _effect_cause(found: BallFindings, i: int, confidence: float, wide: float, without: Container[str]) -> Expressed:
-    """The chosen effect number i, with what looks like it. wide: half of the interval in standard errors."""
+def _ends(found: BallFindings, seed: int) -> Float[np.ndarray, "2 c"]:
+    """Ends of the chosen changes' intervals, the changes within: what else may be wrong beside them is not settled."""
+    choice, effects, rated = found.choice, found.trial.effects, found.scores()
+    barred = {*rated.always, *found.trial.left_out, *(i for i, e in enumerate(effects) if e.made_of)}
+    able = [i for i in range(len(effects)) if i in choice.effects or (found.seen[i] and i not in barred)]
+    freedom = max(found.problem.grid.n - 10, LEAST_FREEDOM)
+    scale = np.array([e.scale for e in effects])
+    rng = np.random.default_rng(seed)
+    low, high = model_averaging.intervals(rated, able, choice.effects, scale, LEVEL, freedom, rng)
+    low = np.maximum(low, [effects[j].low for j in choice.effects])
+    return np.stack([np.minimum(low, choice.theta), np.maximum(high, choice.theta)])
+
+
+def _effect_cause(
+    found: BallFindings, i: int, confidence: float, ends: tuple[float, float], without: Container[str]
+) -> Expressed:
+    """The chosen effect number i, with what looks like it. ends: of its interval."""
     choice, effects, nominal = found.choice, found.trial.effects, found.problem.nominal
-    j, theta, error = choice.effects[i], choice.theta[i], choice.error[i]
+    j, theta, (low, high) = choice.effects[i], choice.theta[i], ends
     effect, rivals = effects[j], [effects[k] for k in choice.groups[i][1:]]
-    low, high = theta - wide * error, theta + wide * error
     twins = [t for t in effect.twins if t.name not in without]
     alike = [name for r in rivals for name in (r.name, *(t.name for t in r.twins)) if name not in without]
     parameters = estimates(effect, nominal, theta, low, high)

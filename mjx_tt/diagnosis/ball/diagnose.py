@@ -20,7 +20,7 @@ from mjx_tt.diagnosis.ball.posterior import Posterior
 from mjx_tt.diagnosis.ball.scores import Scores
 from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial, search
 from mjx_tt.diagnosis.ball.spins import Spins, estimate
-from mjx_tt.diagnosis.ball.unexplained import Finding, find
+from mjx_tt.diagnosis.ball.unexplained import Finding, Left, find
 from mjx_tt.diagnosis.logs import before_racket
 from mjx_tt.sim.model import SimModel
 
@@ -54,6 +54,7 @@ class BallFindings:
     together: Posterior  # all effects fitted at once, before any was chosen
     spins: Spins | None  # of every ball, where balls spin
     spin_notes: tuple[str, ...]  # what was tried about spin, and what it brought
+    small_notes: tuple[str, ...]  # what causes too small to be named explain
 
     def scores(self) -> Scores:
         """Scores of the effects under the chosen treatment of spin."""
@@ -178,8 +179,8 @@ def _diagnose(
     else:
         best, together = _plain(problem, trial, nominal, say)
     say("looking for what no entry explains")
-    findings, survivors = find(best, g, sessions, age, names)
-    if mode == "none" and before is None and (findings or evidence.bent_too_far(best.choice)):
+    left = find(best, g, sessions, age, names)
+    if mode == "none" and before is None and (left.findings or evidence.bent_too_far(best.choice)):
         # Strong spin is out of reach of derivatives taken about balls that do not spin.
         say("trying balls that spin fast, each in its own way")
         other, theirs = _spinning(problem, trial, nominal, say)
@@ -189,18 +190,18 @@ def _diagnose(
         spin_notes.append(_tried(gained, shift, bends))
         if gained > 0.0 and shift >= selection.FLOOR and bends:
             best, together = replace(other, trial=replace(other.trial, spin="none")), theirs
-            findings, survivors = find(best, g, sessions, age, names)
-    if before is None and findings:
+            left = find(best, g, sessions, age, names)
+    if before is None and left.findings:
         for attempt in _of_scattering(best.choice, mode):
             say("trying bounces that differ from ball to ball")
             other, theirs = attempt(problem, trial, nominal, say, SCATTER)
             gained = evidence.misfit(best, g) - evidence.misfit(other, g)
             shift = evidence.shift_of_scatter(other, g)
-            left, holding = find(other, g, sessions, age, names)
-            kept_so = gained > 0.0 and shift >= LEAST_SHIFT and not left
+            beside = find(other, g, sessions, age, names)
+            kept_so = gained > 0.0 and shift >= LEAST_SHIFT and not beside.findings
             spin_notes.append(_scattering(gained, shift, other.noise.scatter, kept_so))
             if kept_so:
-                best, together, findings, survivors = other, theirs, left, holding
+                best, together, left = other, theirs, beside
                 best = replace(best, trial=replace(best.trial, spin=mode))
                 break
     seen = selection.visible(
@@ -215,8 +216,8 @@ def _diagnose(
         best.trial,
         best.noise,
         best.projected,
-        findings,
-        survivors,
+        left.findings,
+        left.holding,
         start,
         linear.residual,
         sessions,
@@ -226,6 +227,7 @@ def _diagnose(
         together,
         estimate(problem, best, kept),
         tuple(spin_notes) if before is None else before.spin_notes,
+        _of_small(left),
     )
 
 
@@ -256,6 +258,17 @@ def _tried(gained: float, shift: float, bends: bool) -> str:
     if gained > 0.0:
         return f"spin was tried because something stayed open without it, and kept: its evidence is {gained:.0f} better"
     return f"spin was tried because something stayed open without it, and dropped: its evidence is {-gained:.0f} worse"
+
+
+def _of_small(left: Left) -> tuple[str, ...]:
+    """Account of what stays beside the named causes and has an explanation."""
+    if left.findings or not left.small:
+        return ()
+    most = left.small[0]
+    return (
+        f"small causes beside: {most.block}, {most.where}, up to {1e3 * most.size:.1f} mm, is what effects of the "
+        "catalogue explain together that are each too small to be named",
+    )
 
 
 def _of_scattering(choice: selection.Choice, mode: str) -> tuple[Callable[..., tuple[Settled, Posterior]], ...]:

@@ -211,14 +211,22 @@ def sandwich(scores: Scores, chosen: Sequence[int]) -> Float[np.ndarray, "c c"]:
 
 
 def unexplained_scores(
-    scores: Scores, chosen: Sequence[int], extra: Sequence[int]
+    scores: Scores, chosen: Sequence[int], extra: Sequence[int], pull: Float[np.ndarray, " C"] | None = None
 ) -> tuple[Float[np.ndarray, "n E"], Float[np.ndarray, "E E"]]:
-    """Ball-by-ball scores (n, E) of extra columns beside the chosen ones, and their Gram matrix (E, E)."""
+    """Ball-by-ball scores (n, E) of extra columns beside the chosen ones, and their Gram matrix (E, E).
+
+    pull: precision of each chosen column's prior about zero; without, they are free.
+    """
     chosen, extra = list(chosen), list(extra)
     if not chosen:
         return scores.ball_right[:, extra], scores.gram[np.ix_(extra, extra)]
-    theta = solve(scores, chosen)
-    mix = np.linalg.pinv(scores.gram[np.ix_(chosen, chosen)]) @ scores.gram[np.ix_(chosen, extra)]  # (C, E)
+    known = scores.gram[np.ix_(chosen, chosen)]
+    if pull is None:
+        theta = solve(scores, chosen)
+    else:
+        known = known + np.diag(pull)
+        theta = np.linalg.lstsq(known, scores.right[chosen], rcond=1e-12)[0]
+    mix = np.linalg.pinv(known) @ scores.gram[np.ix_(chosen, extra)]  # (C, E)
     left = scores.ball_right[:, chosen] - scores.ball_gram[:, chosen][:, :, chosen] @ theta
     own = scores.ball_right[:, extra] - scores.ball_gram[:, extra][:, :, chosen] @ theta
     gram = scores.gram[np.ix_(extra, extra)] - scores.gram[np.ix_(extra, chosen)] @ mix

@@ -34,15 +34,24 @@ class Finding:
     gain: float  # squared error that it explains
 
 
+@dataclass(frozen=True)
+class Left:
+    """What stays significant beside the chosen causes."""
+
+    findings: tuple[Finding, ...]  # that no entry explains, the most important first
+    holding: tuple[str, ...]  # names that hold beside the first; all of them where nothing is found
+    small: tuple[Finding, ...]  # that entries explain which are too small to be named
+
+
 def find(
     settled: Settled, g: Grid, sessions: Int[np.ndarray, " n"], age: Float[np.ndarray, " n"], called: Sequence[str]
-) -> tuple[tuple[Finding, ...], tuple[str, ...]]:
-    """Blocks that stay significant beside the chosen causes, the most important first; names that hold beside it.
+) -> Left:
+    """Blocks that stay significant beside the chosen causes.
 
     sessions: number of each ball's session; age: 0 to 1, its place in its session; called: the sessions' names.
     """
     linear, p, choice, trial = settled.linear, settled.projected, settled.choice, settled.trial
-    out, holding = [], []
+    out, holding, small = [], [], []
     chosen = list(choice.effects)
     if choice.magnus is not None and p.coefficient is not None:
         chosen.append(p.coefficient)
@@ -78,29 +87,62 @@ def find(
         )
         importance = np.abs(beta) * np.sqrt(np.maximum(np.diagonal(gram), 0.0))
         best = int(np.argmax(importance))
+        finding = Finding(
+            block.name, block.labels[best], block.directions[best] or "xyz"[axis], size, _explained(own, gram)
+        )
+        if not _stays(flights, linear, choice, trial, chosen, block.columns, g):
+            small.append(finding)
+            continue
         change = scores.solve(rated, (*base, *extra))
         error = np.sqrt(np.maximum(np.diagonal(scores.sandwich(rated, (*base, *extra))), 0.0))
         mean = change[len(chosen) : len(chosen) + len(rated.always)]
         holding.append(
             _holding(choice, trial, change[:named], error[:named]) | _spin_holding(choice, trial, mean, size)
         )
-        out.append(
-            Finding(
-                block.name,
-                block.labels[best],
-                block.directions[best] or "xyz"[axis],
-                size,
-                _explained(own, gram),
-            )
-        )
+        out.append(finding)
     odd = _odd_balls(linear, flights, choice, g)
     if odd is not None:
         out.append(odd)
         holding.append({trial.effects[j].name for j in choice.effects} | ({"magnus"} if choice.spin else set()))
+    small = sorted(small, key=lambda finding: -finding.gain)
     if not out:
-        return (), tuple(e.name for e in trial.effects) + ("magnus", "latency_jitter")
+        return Left((), tuple(e.name for e in trial.effects) + ("magnus", "latency_jitter"), tuple(small))
     order = np.argsort([-f.gain for f in out])
-    return tuple(out[i] for i in order), tuple(holding[order[0]])
+    return Left(tuple(out[i] for i in order), tuple(holding[order[0]]), tuple(small))
+
+
+def _stays(
+    flights: StartsOut,
+    linear: Linear,
+    choice: Choice,
+    trial: Trial,
+    chosen: Sequence[int],
+    columns: Float[np.ndarray, "E 3 T n"],
+    g: Grid,
+) -> bool:
+    """True if a block stays significant beside effects of the catalogue that are too small to be named, each of FLOOR.
+
+    Real set-ups are wrong in many places by a little, and a dozen effects of a millimetre together are a pattern.
+    """
+    small = [
+        i
+        for i, e in enumerate(trial.effects)
+        if i not in chosen
+        and i not in trial.left_out
+        and not e.made_of
+        and not (e.needs_spin and choice.prior is None)
+        and trial.shift[i] > 0.0
+    ]
+    both = flights.project(np.concatenate([linear.effects[[*chosen, *small]], columns]))
+    rated = scores.under(both, choice.prior)
+    known, count = len(chosen) + len(small), len(both.gram[0])
+    base = [*range(known), *rated.always]
+    pull = np.zeros(len(base))
+    pull[len(chosen) : known] = (trial.shift[small] / selection.FLOOR) ** 2
+    own, gram = scores.unexplained_scores(rated, base, range(known, count), pull)
+    p_value, beta = _joint_test(own, gram)
+    worst = np.linalg.norm(np.where(g.mask, np.tensordot(beta, columns, 1), 0.0), axis=0).max(axis=0)
+    return p_value <= BLOCK_LEVEL and float(np.percentile(worst, 90)) >= BLOCK_FLOOR
 
 
 def _holding(choice: Choice, trial: Trial, change: np.ndarray, error: np.ndarray) -> set[str]:
