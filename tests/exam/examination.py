@@ -53,7 +53,7 @@ BARS: dict[str, tuple[tuple[str, float | None, float], ...]] = {
     "14": (("human_single", 10.0, 1.0), ("human_single", 20.0, 1.0)),
     "15": (("human_pair", None, 1.0),),
     "16": (("human_deleted", None, 0.5), ("human_invented", None, 0.5)),
-    "17": (("many", None, 1.0),),
+    "17": (("many", None, 1.0), ("bounce", None, 0.5)),
     "18": (("kalman", None, 1.0),),
     "19": (("scattered", 20.0, 1.0),),
     "extra": (("rare", None, 0.5), ("invisible", None, 0.1)),

@@ -447,6 +447,13 @@ def test_people_play_as_they_were_measured():
     assert all("magnus" not in c.causes for c in cases.draw("human_single", 40, 1, 10.0))
 
 
+def test_bounces_far_off_stay_in_their_ranges():
+    worlds = [cases.build(case).world for case in cases.draw("bounce", 40, 5)]
+    restitution, friction = (np.array([getattr(w, name) for w in worlds]) for name in ("restitution", "friction"))
+    assert 0.75 <= restitution.min() < 0.78 and 0.88 < restitution.max() <= 0.91
+    assert 0.08 <= friction.min() < 0.13 and 0.37 < friction.max() <= 0.42 and np.all(abs(friction - 0.25) >= 0.03)
+
+
 # --- a small examination, fixed in time: the command line answers, then the seal is opened ----------------------------
 
 

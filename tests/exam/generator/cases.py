@@ -168,9 +168,9 @@ class Case:
     """One hidden case; everything follows from these numbers.
 
     kind: none, noise (nothing but the noise is wrong), invisible, single, pair, triple, gauge, deleted, invented, rare,
-        many (2 to 8 causes of ordinary sizes), scattered (nothing or one cause, and a table of another restitution and
-        friction at every bounce), robot, unexcited, robot_none; human_none, human_single ... where people
-        play
+        many (2 to 8 causes of ordinary sizes), bounce (60 balls on a table of another restitution and friction, far
+        off), scattered (nothing or one cause, and a table of another restitution and friction at every bounce), robot,
+        unexcited, robot_none; human_none, human_single ... where people play
     causes: catalogue names, a name of INVENTED, or <joint>.<effect>
     without: names that the diagnosis may not use
     """
@@ -251,7 +251,9 @@ def build(case: Case, balls: Balls | None = None) -> BallCase:
     for cause in case.causes:
         signs = EFFECTS[cause].signs if cause in EFFECTS else (-1, 1)
         sign = float(_generator(case, f"sign {cause}").choice(signs))
-        if case.kind == "many":
+        if case.kind == "bounce":
+            amounts[cause] = sign * float(_generator(case, f"size {cause}").uniform(*BOUNCES[cause]))
+        elif case.kind == "many":
             amounts[cause] = sign * EFFECTS[cause].amount * abs(_generator(case, f"size {cause}").standard_normal())
         else:
             amounts[cause] = sign * (INVISIBLE.get(cause) or _scaled(case, cause, sign, few, target))
@@ -430,6 +432,7 @@ KINDS = (
     "invented",
     "rare",
     "many",
+    "bounce",
     "scattered",
     "robot",
     "unexcited",
@@ -441,6 +444,9 @@ KINDS = (
     "human_deleted",
     "human_invented",
 )
+# Restitution from 0.75 to 0.91 and friction from 0.08 to 0.42 beside 0.93 and 0.25: far from a straight line.
+BOUNCES = {"table_restitution": (0.02, 0.18), "table_friction": (0.03, 0.17)}
+BOUNCE_BALLS = 60
 # Of which a log with many causes has 2 to 8.
 MANY = (
     "drag_coefficient",
@@ -479,7 +485,7 @@ def draw(kind: str, count: int, seed: int, size_mm: float | None = None) -> list
     cases = []
     for i, causes in enumerate(names[:count]):
         size = size_mm or float(rng.choice(SIZES if kind == "single" else SIZES[1:]))
-        if kind in ("none", "noise", "many", "robot", "unexcited", "robot_none", "kalman"):
+        if kind in ("none", "noise", "many", "bounce", "robot", "unexcited", "robot_none", "kalman"):
             size = 0.0
         without: tuple[str, ...] = ()
         if kind == "deleted":
@@ -487,9 +493,9 @@ def draw(kind: str, count: int, seed: int, size_mm: float | None = None) -> list
             effect = EFFECTS[causes[0]]
             radius = tuple(k for k in effect.kin if k == "ball_radius")
             without = causes if i % 2 else (*causes, *effect.twins, *radius)
-        cases.append(
-            Case(human or kind, tuple(causes), size, str(noises[i % len(noises)]), int(rng.integers(2**31)), without)
-        )
+        noise, seed_ = str(noises[i % len(noises)]), int(rng.integers(2**31))
+        balls = BOUNCE_BALLS if kind == "bounce" else None
+        cases.append(Case(human or kind, tuple(causes), size, noise, seed_, without, balls))
     return cases
 
 
@@ -499,6 +505,8 @@ def _round(
     """One round of causes of a kind, shuffled."""
     if kind in ("none", "noise", "robot_none", "kalman"):
         return [()]
+    if kind == "bounce":
+        return [tuple(BOUNCES)]
     if kind == "scattered":
         return [(), (str(rng.choice([name for name in singles if name != "magnus"])),)]
     if kind == "invisible":

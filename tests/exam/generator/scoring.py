@@ -36,7 +36,7 @@ def score(truth: dict, verdict: dict) -> dict:
     elif kind in ("invented", "invisible", "unexcited"):
         accepted = {}
     record["outcome"] = _outcome(kind, accepted, named, verdict["verdict"])
-    if record["outcome"] == "right" and kind in ("single", "pair", "triple", "gauge"):
+    if record["outcome"] == "right" and kind in ("single", "pair", "triple", "gauge", "bounce"):
         record["twins_reported"] = all(
             any({c, *truth["twins"].get(c, ())} <= g for g in named) for c in causes if truth["twins"].get(c)
         )
@@ -216,6 +216,8 @@ def table(records: list[dict]) -> list[Row]:
         _share("16", "people play, cause deleted: flagged or its twin", "-", ended("human_deleted", flagged, right)),
         _share("14-16", "people play: wrong name", "<= 2 %", ended(PEOPLE, wrong)),
         *_many_rows(by["many"]),
+        _share("17", "restitution and friction far off, 60 balls: both named", ">= 95 %", ended("bounce", right)),
+        _share("17", "restitution and friction far off, 60 balls: wrong name", "<= 2 %", ended("bounce", wrong)),
         _share("18", "a tracker's Kalman filter: named", ">= 90 %", ended("kalman", right)),
         _share("18", "a tracker's Kalman filter: wrong name", "<= 2 %", ended("kalman", wrong)),
         _share("19", "another table at every bounce: right", "-", ended("scattered", right)),
