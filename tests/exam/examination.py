@@ -24,6 +24,11 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
 import numpy as np
 
 from tests.exam.generator import cases as drawing
@@ -229,6 +234,11 @@ def summarise(records: list[dict], alone: dict[str, dict], baselines: list[dict]
         from tests.exam.baselines import side_by_side
 
         lines += ["", *side_by_side(records, baselines)]
+    lines += ["", "| confidence of a name | names | true | 95 % interval |", "|---|---|---|---|"]
+    bins = scoring.reliability(records)
+    lines += [f"| {b.confidence:.3f} | {b.count} | {b.true:.3f} | {b.low:.3f} to {b.high:.3f} |" for b in bins]
+    if bins:
+        _draw_reliability(bins, folder / "reliability.png")
     lines += ["", "| true | answers |", "|---|---|"]
     matrix = scoring.confusion(records)
     lines += [f"| {t} | {', '.join(f'{a} {n}' for a, n in answers.items())} |" for t, answers in matrix.items()]
@@ -243,6 +253,20 @@ def summarise(records: list[dict], alone: dict[str, dict], baselines: list[dict]
         temporary.write_text(content)
         os.replace(temporary, folder / name)
     return text
+
+
+def _draw_reliability(bins: list[scoring.Reliability], path: Path) -> None:
+    figure, axes = plt.subplots(figsize=(4.5, 4.0), layout="constrained")
+    axes.plot([0, 1], [0, 1], color="0.7", label="calibrated")
+    said, true = np.array([b.confidence for b in bins]), np.array([b.true for b in bins])
+    errors = np.clip([true - [b.low for b in bins], [b.high for b in bins] - true], 0.0, None)
+    axes.errorbar(said, true, errors, fmt="o", capsize=3, label="named causes, 95 %")
+    for b in bins:
+        axes.annotate(f"{b.count}", (b.confidence, b.true), (6, -12), textcoords="offset points", fontsize=8)
+    axes.set(xlabel="confidence", ylabel="share that was true", xlim=(0, 1.03), ylim=(0, 1.03))
+    axes.legend(loc="lower right")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
 
 
 def run_all(cases: list[Case], folder: Path, keep: bool, part: tuple[int, int] = (1, 1)) -> list[dict]:

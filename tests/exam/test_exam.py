@@ -348,7 +348,7 @@ def test_lookalikes_look_alike():
 
 
 def verdict(*groups, **rest):
-    causes = [{"name": g[0], "group": list(g), "parameters": {}} for g in groups]
+    causes = [{"name": g[0], "group": list(g), "parameters": {}, "confidence": 0.9} for g in groups]
     return {"verdict": "named" if groups else "none", "causes": causes} | rest
 
 
@@ -381,6 +381,23 @@ def test_scoring_of_answers():
     assert outcome("single", ("wind_x",), verdict(("gravity_tilt_x",))) == "wrong"
     # A verdict that abstains names nothing, whatever it lists besides.
     assert outcome("single", ("wind_x",), verdict(("wind_y",)) | {"verdict": "undetermined"}) == "flagged"
+
+
+def test_reliability_counts_names_by_their_confidence(tmp_path):
+    def record(*confidences):
+        case = {"kind": "single", "causes": ["wind_x"], "size_mm": 10.0}
+        said = {"outcome": "right", "verdict": "named", "answer": "x", "twins": {}, "confidences": confidences}
+        return {"case": case, "seconds": 1.0} | said
+
+    records = [record([1.0, True])] * 9 + [record([0.9, True], [0.86, False]), record([1.0, False]), record()]
+    middle, sure = scoring.reliability(records)
+    assert (middle.confidence, middle.count, middle.true) == (pytest.approx(0.88), 2, 0.5)
+    assert (sure.count, sure.true) == (10, 0.9) and sure.low < 0.9 < sure.high
+    assert "| 1.000 | 10 | 0.900 |" in examination.summarise(records, {}, [], tmp_path)
+    assert (tmp_path / "reliability.png").read_bytes().startswith(b"\x89PNG")
+    truth = {"case": {"kind": "pair", "causes": ["wind_x", "magnus"]}, "twins": {}, "lookalikes": {}, "parameters": {}}
+    scored = scoring.score(truth | {"spin": None}, verdict(("wind_x",), ("wind_y",)))
+    assert scored["confidences"] == [[0.9, True], [0.9, False]]
 
 
 def test_scoring_of_parameters():

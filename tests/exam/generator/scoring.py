@@ -6,6 +6,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.stats import beta, binom
@@ -36,6 +37,10 @@ def score(truth: dict, verdict: dict) -> dict:
     elif kind in ("invented", "invisible", "unexcited"):
         accepted = {}
     record["outcome"] = _outcome(kind, accepted, named, verdict["verdict"])
+    record["confidences"] = [
+        [c["confidence"], any(names & group for names in accepted.values())]
+        for c, group in zip(given, named, strict=True)
+    ]
     if record["outcome"] == "right" and kind in ("single", "pair", "triple", "gauge", "bounce"):
         record["twins_reported"] = all(
             any({c, *truth["twins"].get(c, ())} <= g for g in named) for c in causes if truth["twins"].get(c)
@@ -116,6 +121,34 @@ def _spin_error(spin: dict, reported: dict) -> dict[str, dict]:
     estimate = k * math.hypot(values.get("mean_x", 0.0), values["std_x"])
     true = spin["k"] * math.hypot(spin["mean"][0], spin["std"][0])
     return {"k x rms spin": {"error": abs(estimate - true) / true, "absolute": abs(estimate - true), "covered": None}}
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """Named causes of about one confidence, and the share of them that was true, with its 95 % interval."""
+
+    confidence: float  # mean
+    count: int
+    true: float
+    low: float
+    high: float
+
+
+CONFIDENCES = (0.0, 0.5, 0.8, 0.95, 0.995, 1.01)  # edges of the bins
+
+
+def reliability(records: list[dict]) -> list[Reliability]:
+    """How often a cause named with some confidence is true, from low confidence to high."""
+    said = np.array([pair for r in records for pair in r.get("confidences", ())], float).reshape(-1, 2)
+    out = []
+    for low, high in pairwise(CONFIDENCES):
+        own = said[(said[:, 0] >= low) & (said[:, 0] < high)]
+        if len(own):
+            hits = int(own[:, 1].sum())
+            out.append(
+                Reliability(float(own[:, 0].mean()), len(own), hits / len(own), *clopper_pearson(hits, len(own)))
+            )
+    return out
 
 
 def clopper_pearson(hits: int, total: int, level: float = 0.95) -> tuple[float, float]:
