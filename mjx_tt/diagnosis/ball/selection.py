@@ -29,10 +29,11 @@ from mjx_tt.diagnosis.ball.scores import LARGEST_SUBSET, Scores, Subset
 FLOOR = 0.003  # [m] shift of the last sample below which an effect is of no practical interest
 LEAST_GAIN = 14.0  # evidence that one more effect must bring at least
 SPIN_GAIN = 30.0  # and a spread of spins, which has six numbers
-LEAST_SHARE = 0.003  # of the whole gain that a member must bring: linearisation errors of a large effect are no cause
+LEAST_SHARE = 0.003  # of the gain of the way from where derivatives were taken: a line's error is no cause
 ROUNDS = 4  # of choosing and linearising again
 SETTLED = 0.2  # of an estimate's error by which it may still have moved in the last round
 MAGNUS_KEPT = (0.2, 1.5)  # of the coefficient k about which derivatives are taken by balls of one spin
+NEAR = np.repeat([0.5, 5.0, 1000.0, 5.0], 3)  # [m], [m/s], [rad/s], [m/s] by which a ball's start may move at once
 CORNER = 5e-4  # [s] about the bounce of a spinning ball in which no sample counts
 WIDEST = 10.0  # scales of an effect beyond which it is no explanation: beside others it may be all but invisible
 LEAST_Z = 3.5  # estimate over its ball-to-ball standard error
@@ -119,8 +120,11 @@ def _treated(p: Projected, trial: Trial, prior: SpinPrior | None, rng: np.random
     return _Treatment(rated, prior, candidates, gains, threshold)
 
 
-def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
-    """The smallest set that explains what can be explained. hint: distribution of the spins, fitted without it."""
+def choose(p: Projected, trial: Trial, about: Float[np.ndarray, " K"], hint: SpinPrior | None = None) -> Choice:
+    """The smallest set that explains what can be explained.
+
+    about: changes at which derivatives were taken. hint: distribution of the spins, fitted without it.
+    """
     rng = np.random.default_rng(trial.seed)
     treatments: dict[bool, _Treatment] = {}
     if trial.spin != "free":
@@ -141,7 +145,7 @@ def choose(p: Projected, trial: Trial, hint: SpinPrior | None = None) -> Choice:
 
     def holds(subset: Subset, spin: bool, gain: float) -> bool:
         plain = without.get(tuple(sorted({*subset, *bent}))[:LARGEST_SUBSET], -np.inf)
-        return _holds(treatments[spin], subset, gain, trial, found[0][3], plain)
+        return _holds(treatments[spin], subset, gain, trial, about, plain)
 
     _, subset, spin, gain = next((f for f in found if holds(*f[1:])), found[-1])
     t = treatments[spin]
@@ -189,10 +193,12 @@ def _candidates(rated: Scores, p: Projected, trial: Trial, spin: bool) -> Subset
     )
 
 
-def _holds(t: _Treatment, subset: Subset, gain: float, trial: Trial, top: float, plain: float) -> bool:
+def _holds(
+    t: _Treatment, subset: Subset, gain: float, trial: Trial, about: Float[np.ndarray, " K"], plain: float
+) -> bool:
     """True if every member passes the gate of evidence. (Those too small to matter stay without being named.)
 
-    top: gain of the first set; plain: that of this one without spin.
+    about: changes at which derivatives were taken; plain: gain of this set without spin.
     """
     as_cause = t.prior is not None and trial.spin == "none"
     if t.prior is not None and as_cause:
@@ -205,11 +211,15 @@ def _holds(t: _Treatment, subset: Subset, gain: float, trial: Trial, top: float,
         k, wide = theta[-1], 2.0 * error[-1]
         if k + wide < MAGNUS_RANGE[0] or k - wide > MAGNUS_RANGE[1]:
             return False
+    way = -about
+    way[list(subset)] += theta[: len(subset)]
+    way[[j for j in t.rated.always if j < len(way)]] = 0.0
+    far = LEAST_SHARE * float(way @ t.rated.gram[: len(way), : len(way)] @ way)
     for i, j in enumerate(subset):
         brought = gain - scores.gain(t.rated, subset[:i] + subset[i + 1 :])
         if abs(theta[i]) < LEAST_Z * error[i]:
             return False
-        if brought < max(t.threshold, LEAST_SHARE * top):
+        if brought < max(t.threshold, far):
             return False
         # A size that cannot be is no cause, but a small one may stand for how the true cause differs from its entry.
         if theta[i] < trial.effects[j].low and abs(theta[i]) * trial.shift[j] >= FLOOR:
@@ -279,7 +289,7 @@ def search(
         say(f"round {round_ + 1}: choosing")
         for _ in range(2 if round_ else 3):
             p = project(linear, at, own_noise, _weights(linear, own_noise, g, bounces), g, problem.coefficient)
-            choice = choose(p, replace(trial, spinning=spins), prior)
+            choice = choose(p, replace(trial, spinning=spins), at.theta, prior)
             left, moved = left_over(linear, at, p, choice, g)
             scatter = noise.scattered(moved[KICK], p.kick_gram, scatter)
             own_noise = replace(noise.estimate(left, frame, g, 9 if choice.spin else 6), scatter=scatter)
@@ -292,7 +302,9 @@ def search(
             theta[problem.coefficient] = np.clip(choice.magnus, *(MAGNUS_RANGE if own else MAGNUS_KEPT))
         settled = chosen_before == (choice.effects, choice.spin) and _close(theta, at.theta, choice)
         chosen_before, prior = (choice.effects, choice.spin), choice.prior
-        at, bounces = _move(problem, moved, theta, choice, own_noise, g)
+        # The line's best start of a ball of which few samples count can be anywhere.
+        near = np.all(np.abs(moved - at.start) < NEAR[:, None], axis=0)
+        at, bounces = _move(problem, np.where(near, moved, at.start), theta, choice, own_noise, g)
         if settled:
             break
     linear = problem.linearise(at)

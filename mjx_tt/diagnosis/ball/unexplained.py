@@ -19,6 +19,7 @@ BLOCK_LEVEL = 2e-5  # chance of one block's false alarm
 BLOCK_FLOOR = 0.0025  # [m] shift that a block must cause on the balls it concerns
 VISIBLE_FLOOR = 2e-4  # [m] rms of what of it no other start of the ball could imitate, on one ball in twenty
 FILTERED_FLOOR = 8e-4  # [m] the same behind a tracker's filter, which is never quite the catalogue's
+NOT_SMALL = 0.01  # chance of effects of FLOOR each to be as large together
 ODD_LEVEL = 1e-5  # chance with which one ball is called odd
 ODD_SHARE = 0.01  # of the balls that may be odd (mis-tracked) before they are a finding
 
@@ -90,7 +91,7 @@ def find(
         finding = Finding(
             block.name, block.labels[best], block.directions[best] or "xyz"[axis], size, _explained(own, gram)
         )
-        if not _stays(flights, linear, choice, trial, chosen, block.columns, g):
+        if not _stays(flights, linear, choice, trial, chosen, block.columns, size, g):
             small.append(finding)
             continue
         change = scores.solve(rated, (*base, *extra))
@@ -118,11 +119,13 @@ def _stays(
     trial: Trial,
     chosen: Sequence[int],
     columns: Float[np.ndarray, "E 3 T n"],
+    size: float,
     g: Grid,
 ) -> bool:
-    """True if a block stays significant beside effects of the catalogue that are too small to be named, each of FLOOR.
+    """True if a block of this size [m] stays significant beside what the catalogue may hold without a name.
 
-    Real set-ups are wrong in many places by a little, and a dozen effects of a millimetre together are a pattern.
+    Those are effects of FLOOR each: real set-ups are wrong in many places by a little, and a dozen effects of a
+    millimetre together are a pattern. What is larger than they can be together is none of them.
     """
     small = [
         i
@@ -133,12 +136,18 @@ def _stays(
         and not (e.needs_spin and choice.prior is None)
         and trial.shift[i] > 0.0
     ]
+    if size > selection.FLOOR * len(small) ** 0.5:
+        return True
     both = flights.project(np.concatenate([linear.effects[[*chosen, *small]], columns]))
     rated = scores.under(both, choice.prior)
     known, count = len(chosen) + len(small), len(both.gram[0])
     base = [*range(known), *rated.always]
     pull = np.zeros(len(base))
     pull[len(chosen) : known] = (trial.shift[small] / selection.FLOOR) ** 2
+    total = rated.gram[np.ix_(base, base)] + np.diag(pull)
+    fitted = np.linalg.lstsq(total, rated.right[base], rcond=1e-12)[0]
+    if float(pull @ fitted**2) > chdtri(len(small), NOT_SMALL):
+        return True
     own, gram = scores.unexplained_scores(rated, base, range(known, count), pull)
     p_value, beta = _joint_test(own, gram)
     worst = np.linalg.norm(np.where(g.mask, np.tensordot(beta, columns, 1), 0.0), axis=0).max(axis=0)
