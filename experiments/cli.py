@@ -68,7 +68,7 @@ def diagnose(
         str,
         options.option("POSE", "where joints truly rest at first: home, or joint_1=0.52,gantry_x=0 [rad, m]"),
     ] = "",
-    randomise: Annotated[bool, Parameter(help="extended.yaml draws what was fitted from its intervals")] = False,
+    randomise: Annotated[bool, Parameter(help="extended.yaml draws what the logs leave open")] = False,
     seed: Annotated[int, Parameter(help="of the bootstraps (0)")] = 0,
     policy: Annotated[
         str | None, options.option("POLICY", "a run or artefact: what the defect costs it in play")

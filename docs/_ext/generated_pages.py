@@ -200,12 +200,17 @@ def model_page() -> str:
         "",
         "The YAML of `model` in an experiment, and of `--model`: any of these parameters, nested by",
     ]
-    lines += ["section, and `randomise` with ranges `[low, high]` by dotted path, drawn uniformly per episode.", ""]
+    lines += ["section, and `randomise`: what is drawn anew for every episode.", ""]
     lines += [
         "```yaml",
         "ball: {table: {restitution: 0.90}}",
-        "randomise: {ball.paddle.restitution: [0.8, 0.95]}",
+        "randomise:",
+        "  ball.paddle.restitution: [0.8, 0.95]    # uniform between the ends",
+        "  samples: posterior.csv                  # a row of parameters that belong together",
         "```",
+        "",
+        "The file of the samples has a column for each parameter, named by its dotted path, and a column `weight`",
+        "where rows are not equally likely. In place of the name its content may stand, a list for each column.",
     ]
     joints = [section for section in sections if section.startswith("drives.")]
     for section, values in sections.items():

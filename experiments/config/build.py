@@ -19,6 +19,7 @@ from experiments.errors import ConfigError, checked
 from mjx_tt.env import rewards
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim import model as models
+from mjx_tt.sim import randomisation
 from mjx_tt.sim.model import ModelFile
 
 # What a seed is used for; each purpose has its own key.
@@ -147,6 +148,6 @@ def _shared(section: Section, settings: type) -> dict[str, Any]:
 def _mapping(model: str | dict[str, Any], where: str) -> dict[str, Any]:
     """The content of a model YAML, plain data as it stands there."""
     if isinstance(model, dict):
-        return model
-    data = checked(where, yaml.read, model)
+        return checked(where, randomisation.with_content, model, "")
+    data = checked(where, randomisation.with_content, checked(where, yaml.read, model), Path(model).parent)
     return {} if data is None else data

@@ -277,6 +277,14 @@ def _absolute(data: dict[str, Any], folder: Path) -> None:
         value = data.get(key)
         if isinstance(value, str) and (key != "balls" or Path(value).suffix in (".yaml", ".yml")):
             data[key] = str((folder / value).resolve())
+    absolute_samples(data.get("model"), folder)
+
+
+def absolute_samples(model: Any, folder: Path) -> None:
+    """Makes the path of the samples in a model's plain data absolute."""
+    drawn = model.get("randomise") if isinstance(model, dict) else None
+    if isinstance(drawn, dict) and isinstance(drawn.get("samples"), str):
+        drawn["samples"] = str((folder / drawn["samples"]).resolve())
 
 
 def parse(data: dict[str, Any], where: str) -> Config:

@@ -184,6 +184,8 @@ def _absolute(data: dict[str, Any], folder: Path) -> None:
         data["robot"] = str((folder / data["robot"]).resolve())
     if isinstance(data.get("recordings"), dict):
         data["recordings"] = {k: str((folder / str(v)).resolve()) for k, v in data["recordings"].items()}
+    if isinstance(data.get("simulation"), dict):
+        experiment.absolute_samples(data["simulation"].get("model"), folder)
 
 
 def parse(data: dict[str, Any], where: str) -> Study:

@@ -19,6 +19,7 @@ from mjx_tt.env.evaluator import COLUMNS, Evaluator
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import RolloutResult, Simulator
 from mjx_tt.env.task import HIT, MISSED, RETURNED
+from mjx_tt.sim import randomisation
 
 OUTCOMES = {"missed": MISSED, "hit": HIT, "returned": RETURNED}
 
@@ -82,7 +83,7 @@ def evaluate(
         "acceptance": float(balls.acceptance),
         "engine": task.engine,
         "sim_rate": task.sim_rate,
-        "randomise": {r.path: [r.low, r.high] for r in experiment.model.randomise},
+        "randomise": randomisation.ends(experiment.model.randomise),
         "seed": seed,
         "policy": str(trained.source),
         "update": trained.notes.get("update"),

@@ -25,7 +25,8 @@ from mjx_tt.env import rewards
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
 from mjx_tt.env.task import MISSED, RETURNED
-from mjx_tt.sim.model import Range, SimModel
+from mjx_tt.sim.model import SimModel
+from mjx_tt.sim.randomisation import Randomised
 from robot_io.contract import N_OBSERVATION
 
 
@@ -54,7 +55,7 @@ class Trainer:
         bgs_config: BGSConfig,
         pool: BallPool,
         model: SimModel,
-        randomise: tuple[Range, ...] = (),
+        randomise: tuple[Randomised, ...] = (),
         repeats: int = 15,
         common_random_numbers: bool = False,
         initial_scale: float = 0.1,

@@ -125,7 +125,7 @@ class Studio:
     def nominal(self) -> dict[str, float]:
         """Values of the sliders in this world; NaN for a parameter that is drawn for every episode."""
         known = models.paths(self.world.model)
-        drawn = {r.path for r in self.world.randomise}
+        drawn = {path for one in self.world.randomise for path in one.paths}
         return {p.path: float("nan") if p.path in drawn else float(known[p.path]) for p in sliders()}
 
     def draws(self, state: np.ndarray, numbers: Sequence[int], seed: int) -> Draws:
@@ -139,7 +139,7 @@ class Studio:
 
     def model(self, draws: Draws, values: Mapping[str, Any]) -> SimModel:
         """The world's model with the sliders' values, each (L,)."""
-        drawn = {r.path: r.low + (r.high - r.low) * draws.model[i] for i, r in enumerate(self.world.randomise)}
+        drawn = {p: v for i, one in enumerate(self.world.randomise) for p, v in one.at(draws.model[i]).items()}
         for path, value in values.items():
             moved = jnp.broadcast_to(jnp.asarray(value, jnp.float32), draws.seed.shape)
             drawn[path] = jnp.where(jnp.isnan(moved), drawn[path], moved) if path in drawn else moved

@@ -61,7 +61,7 @@ def diagnose(
 
     spin: "none" where the nominal ball does not spin, so that spin is a cause; "free" where every ball has a spin of
     its own; "auto" for "free" where the model has a Magnus force and "none" where it has none. without: effects of the
-    catalogue to omit. randomise: the extended model draws the fitted parameters from their intervals in training.
+    catalogue to omit. randomise: training under the extended model draws what the logs leave open.
     home: true positions [rad], [m] in which joints rest before their first motion; joints that are not logged are not
     looked at.
     Raises ValueError for unknown names, too few balls, or logs without anything to diagnose.

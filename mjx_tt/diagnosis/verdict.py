@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 
 from ballmodel.io.atomic_files import replacing
-from mjx_tt.sim.model import Range
+from mjx_tt.sim.randomisation import Randomised, Range, Samples
 
 NOT_ADOPTED = (
     "causes are named beside something that no entry explains, which they may stand for: the extended model does not "
@@ -146,10 +146,13 @@ class Part:
     runners_up: tuple[dict, ...] = ()
     warnings: tuple[str, ...] = ()
     together: tuple[Together, ...] = ()
+    samples: tuple[Samples, ...] = ()  # of what is open in the model, in place of the named causes' ranges
 
 
-def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict, dict[str, float], tuple[Range, ...]]:
-    """Verdict of all parts, and values and ranges of the extended model.
+def combined(
+    parts: Sequence[Part], notes: Sequence[str] = ()
+) -> tuple[Verdict, dict[str, float], tuple[Randomised, ...]]:
+    """Verdict of all parts, and values of the extended model with what training may draw around them.
 
     Of what one part alone can say, the unexplained and the held-out error, the first part's counts. A part that leaves
     something unexplained changes nothing, and causes that others could replace only if they predict better. notes:
@@ -191,4 +194,7 @@ def combined(parts: Sequence[Part], notes: Sequence[str] = ()) -> tuple[Verdict,
     sound = [p for p in parts if p.unexplained is None]
     values = {path: value for p in sound for path, value in p.beside.items()}
     values |= {path: value for p in sound for n in p.named for path, value in n.values.items()}
-    return verdict, values, tuple(r for p in sound for n in p.named for r in n.ranges)
+    samples = tuple(s for p in sound for s in p.samples)
+    known = {path for s in samples for path in s.paths}
+    ranges = tuple(r for p in sound for n in p.named for r in n.ranges if r.path not in known)
+    return verdict, values, (*samples, *ranges)

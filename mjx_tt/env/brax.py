@@ -29,7 +29,8 @@ from mjx_tt.env.outgoing_ball import fly_out
 from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import Episodes, EpisodeState, Return, Tick
-from mjx_tt.sim.model import Range, SimModel
+from mjx_tt.sim.model import SimModel
+from mjx_tt.sim.randomisation import Randomised
 from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that Warp, an optional engine, is not installed
@@ -80,7 +81,7 @@ class TableTennis(Env):
     """
 
     def __init__(
-        self, simulator: Simulator, pool: BallPool, model: SimModel, randomise: tuple[Range, ...] = ()
+        self, simulator: Simulator, pool: BallPool, model: SimModel, randomise: tuple[Randomised, ...] = ()
     ) -> None:
         self._simulator, self._pool, self._model, self._randomise = simulator, pool, model, randomise
         self._task = simulator.task

@@ -16,7 +16,8 @@ from ballmodel.sampling import BallPool
 from ballmodel.state import BallState
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import RESULT_SPECS, RolloutResult, Simulator
-from mjx_tt.sim.model import Range, SimModel
+from mjx_tt.sim.model import SimModel
+from mjx_tt.sim.randomisation import Randomised
 
 ROWS, COLUMNS = 8, 256  # episodes of one call: fewer are padded, more take several calls
 
@@ -31,7 +32,9 @@ class Evaluator:
     Drawing every ball once keeps the episodes independent, which the interval of a rate relies on.
     """
 
-    def __init__(self, simulator: Simulator, balls: BallPool, model: SimModel, randomise: tuple[Range, ...]) -> None:
+    def __init__(
+        self, simulator: Simulator, balls: BallPool, model: SimModel, randomise: tuple[Randomised, ...]
+    ) -> None:
         columns = self._columns = -(-COLUMNS // simulator.devices) * simulator.devices
 
         def play(policy: Policy, key: PRNGKeyArray, pool: BallPool, thrown: BallState) -> RolloutResult:

@@ -28,7 +28,8 @@ from mjx_tt.env.policy import PolicyController
 from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, EpisodeState, Task, TaskConfig
 from mjx_tt.sim import model as models
-from mjx_tt.sim.model import Range, SimModel
+from mjx_tt.sim.model import SimModel
+from mjx_tt.sim.randomisation import Randomised
 from robot_io.policy.policy import Policy
 
 T = TypeVar("T")
@@ -93,7 +94,7 @@ class Simulator:
         key: PRNGKeyArray,
         pool: BallPool,
         model: SimModel,
-        randomise: tuple[Range, ...],
+        randomise: tuple[Randomised, ...],
         repeats: int,
         columns: int,
     ) -> Episodes:

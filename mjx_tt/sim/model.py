@@ -4,8 +4,8 @@ A diagnosis extends it, training consumes it. Fields are scalars, or arrays of t
 ``randomise`` has drawn them per episode. The robot's rigid-body constants are the MJCF's and live in ``chain.Chain``.
 
 YAML: the tree of field names, all of them optional, plus
-    randomise: {"ball.table.restitution": [0.85, 0.95], ...}   uniform ranges, drawn anew for every episode
-               (a range of a drive, "drives.joint_2.lag", gives the model drives)
+    randomise: {"ball.table.restitution": [0.85, 0.95], ...}   drawn anew for every episode (``randomisation``); a
+               range of a drive, "drives.joint_2.lag", gives the model drives
     provenance: {...}                                          free text, kept as it is
 """
 
@@ -30,8 +30,11 @@ from ballmodel.aerodynamics import INTEGRATORS
 from ballmodel.flight import BallParams, ball_params
 from ballmodel.io import yaml as yaml_file
 from ballmodel.io.atomic_files import replacing
-from mjx_tt.sim import bounds
+from mjx_tt.sim import bounds, randomisation
 from mjx_tt.sim.actuators import DriveParams
+from mjx_tt.sim.randomisation import Randomised
+from mjx_tt.sim.randomisation import Range as Range
+from mjx_tt.sim.randomisation import Samples as Samples
 from mjx_tt.sim.sensors import SensingParams as SensingParams
 
 
@@ -105,13 +108,11 @@ class SimModel:
     drives: DriveParams | None = None
 
 
-@dataclass(frozen=True)
-class Range:
-    """A parameter that is drawn uniformly per episode, by its dotted path in SimModel."""
+class _Dumper(yaml.SafeDumper):
+    """Lists of numbers along the line, mappings one below the other."""
 
-    path: str
-    low: float
-    high: float
+
+_Dumper.add_representer(list, lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, True))
 
 
 @dataclass(frozen=True)
@@ -119,13 +120,13 @@ class ModelFile:
     """Content of a model YAML."""
 
     model: SimModel
-    randomise: tuple[Range, ...] = ()
+    randomise: tuple[Randomised, ...] = ()
     provenance: dict = field(default_factory=dict)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> ModelFile:
         """Reads a model YAML. Raises ValueError naming file, key, what was given and what is allowed."""
-        data = yaml_file.read(path)
+        data = randomisation.with_content(yaml_file.read(path), Path(path).parent)
         return from_dict(data or {}, str(path))
 
     def save(self, path: str | os.PathLike) -> None:
@@ -139,10 +140,10 @@ class ModelFile:
             for group in groups:
                 node = node.setdefault(group, {})
             node[leaf] = value if isinstance(value, str) else float(value)
-        tree["randomise"] = {r.path: [r.low, r.high] for r in self.randomise}
+        tree["randomise"] = randomisation.to_dict(self.randomise)
         tree["provenance"] = self.provenance
         with replacing(Path(path)) as temporary:
-            temporary.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
+            temporary.write_text(yaml.dump(tree, Dumper=_Dumper, sort_keys=False, width=120), encoding="utf-8")
 
 
 def paths(node: Any = None, prefix: str = "") -> dict[str, Any]:
@@ -185,13 +186,9 @@ def _with_values(node: Any, values: Mapping[str, Any]) -> Any:
     return dataclasses.replace(node, **changed)
 
 
-def draw(key: Key[Array, ""], model: SimModel, randomise: tuple[Range, ...], shape: tuple[int, ...]) -> SimModel:
-    """The model with every range drawn uniformly for a batch of ``shape`` episodes."""
-    keys = jax.random.split(key, max(len(randomise), 1))  # one is left over where nothing is randomised
-    drawn = {
-        r.path: jax.random.uniform(k, shape, minval=r.low, maxval=r.high) for r, k in zip(randomise, keys, strict=False)
-    }
-    return with_values(model, drawn)
+def draw(key: Key[Array, ""], model: SimModel, randomise: tuple[Randomised, ...], shape: tuple[int, ...]) -> SimModel:
+    """The model with all that is randomised drawn for a batch of ``shape`` episodes."""
+    return with_values(model, randomisation.drawn(key, randomise, shape))
 
 
 def draw_latencies(
@@ -233,17 +230,14 @@ def from_dict(data: Any, where: str) -> ModelFile:
         else:
             value = _number(value, f"{where}: {path}", path)
         values[path] = value
-    parsed = []
-    for path, ends in ranges.items():
+
+    def parameter(path: Any, where: str) -> str:
         if path not in known or isinstance(known[path], str):
-            raise ValueError(f"{where}: randomise.{path}: unknown parameter{nearest(str(path), known)}")
-        if not isinstance(ends, list | tuple) or len(ends) != 2:
-            raise ValueError(f"{where}: randomise.{path} = {ends!r}, a range is [low, high]")
-        low, high = (_number(b, f"{where}: randomise.{path}", path) for b in ends)
-        if low > high:
-            raise ValueError(f"{where}: randomise.{path} = {ends!r}, low must not exceed high")
-        parsed.append(Range(path, low, high))
-    return ModelFile(with_values(SimModel(), values), tuple(parsed), provenance)
+            raise ValueError(f"{where}: unknown parameter{nearest(str(path), known)}")
+        return str(path)
+
+    parsed = randomisation.parse(ranges, f"{where}: randomise", parameter, _number)
+    return ModelFile(with_values(SimModel(), values), parsed, provenance)
 
 
 def _flatten(data: dict, where: str, known: Collection[str], prefix: str = "") -> Iterator[tuple[str, Any]]:

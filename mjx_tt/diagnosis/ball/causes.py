@@ -9,15 +9,19 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from mjx_tt.diagnosis.ball import cross_validation, experiment_design, model_averaging, scores, selection
+from mjx_tt.diagnosis.ball import cross_validation, experiment_design, scores, selection
 from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, shaking
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, REFERENCE_MAGNUS
+from mjx_tt.diagnosis.ball.model_averaging import Averaged, averaged
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Part, Together, Unexplained
+from mjx_tt.sim import bounds
+from mjx_tt.sim.randomisation import Samples
 
 BOOTSTRAP = 100
 LEVEL = 0.90  # of intervals
+DRAWS = 256  # of what may be wrong, for training
 LEAST_FREEDOM = 5  # of Student's distribution
 
 
@@ -36,7 +40,8 @@ def part(
 ) -> Part:
     """The flights' part of the verdict. hits: the robot's hits are judged, which show the ball's latency."""
     say("confidence and intervals")
-    named, beside = _causes(found, without, seed)
+    sets = _averaged(found, seed)
+    named, beside = _causes(found, sets, without, seed)
     unexplained = None
     if found.findings:
         # A name that does not outlive the block beside it was a stand-in for what has none.
@@ -68,6 +73,7 @@ def part(
             for name in found.imitated
         ),
         _together(found),
+        _samples(found, sets, seed) if named else (),
     )
 
 
@@ -88,11 +94,13 @@ def _together(found: BallFindings) -> tuple[Together, ...]:
     )
 
 
-def _causes(found: BallFindings, without: Container[str], seed: int) -> tuple[list[Expressed], dict[str, float]]:
+def _causes(
+    found: BallFindings, sets: Averaged, without: Container[str], seed: int
+) -> tuple[list[Expressed], dict[str, float]]:
     """Named causes, and the values of what was fitted beside them without being named."""
     choice, nominal = found.choice, found.problem.nominal
     confidence, wide = _confidence(found, seed), quantile(found.problem.grid.n - 10)
-    matters, ends = selection.named(choice, found.trial), _ends(found, seed)
+    matters, ends = selection.named(choice, found.trial), _ends(found, sets, seed)
     named: list[Expressed] = []
     beside: dict[str, float] = {}
     for i, j in enumerate(choice.effects):
@@ -117,17 +125,35 @@ def _causes(found: BallFindings, without: Container[str], seed: int) -> tuple[li
     return named, beside
 
 
-def _ends(found: BallFindings, seed: int) -> Float[np.ndarray, "2 c"]:
-    """Ends of the chosen changes' intervals, the changes within: what else may be wrong beside them is not settled."""
+def _averaged(found: BallFindings, seed: int) -> Averaged:
+    """Sets of effects that could be true: what else may be wrong beside the chosen ones is not settled."""
     choice, effects, rated = found.choice, found.trial.effects, found.scores()
     barred = {*rated.always, *found.trial.left_out, *(i for i, e in enumerate(effects) if e.made_of)}
     able = [i for i in range(len(effects)) if i in choice.effects or (found.seen[i] and i not in barred)]
-    freedom = max(found.problem.grid.n - 10, LEAST_FREEDOM)
-    scale = np.array([e.scale for e in effects])
-    rng = np.random.default_rng(seed)
-    low, high = model_averaging.intervals(rated, able, choice.effects, scale, LEVEL, freedom, rng)
+    freedom, scale = max(found.problem.grid.n - 10, LEAST_FREEDOM), np.array([e.scale for e in effects])
+    return averaged(rated, able, choice.effects, scale, freedom, np.random.default_rng(seed))
+
+
+def _ends(found: BallFindings, sets: Averaged, seed: int) -> Float[np.ndarray, "2 c"]:
+    """Ends of the chosen changes' intervals, the changes within."""
+    choice, effects = found.choice, found.trial.effects
+    low, high = sets.intervals(choice.effects, LEVEL, np.random.default_rng(seed))
     low = np.maximum(low, [effects[j].low for j in choice.effects])
     return np.stack([np.minimum(low, choice.theta), np.maximum(high, choice.theta)])
+
+
+def _samples(found: BallFindings, sets: Averaged, seed: int) -> tuple[Samples, ...]:
+    """What the flights leave open of the model, drawn together; nothing where nothing in it is."""
+    effects, nominal = found.trial.effects, found.problem.nominal
+    changes = sets.draws(DRAWS, np.random.default_rng([seed, 1]))
+    changes = np.maximum(changes, [e.low for e in effects])
+    if found.choice.magnus is not None and found.problem.coefficient is not None:
+        changes[:, found.problem.coefficient] = found.situation.theta[found.problem.coefficient]
+    values = {path: np.clip(v, *bounds.of(path)) for path, v in found.problem.values(changes.T).items()}
+    open_ = {path: v for path, v in values.items() if np.ptp(v) > 0.0 or v[0] != nominal[path]}
+    if not open_:
+        return ()
+    return (Samples(tuple(open_), np.stack(list(open_.values()), axis=1), np.ones(DRAWS)),)
 
 
 def _effect_cause(

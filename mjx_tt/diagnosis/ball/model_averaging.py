@@ -121,30 +121,58 @@ def visited(
     return counts
 
 
-def intervals(
+@dataclass(frozen=True)
+class Averaged:
+    """Sets of effects with the number of times that each was drawn, and the sizes within them."""
+
+    columns: tuple[int, ...]  # of the scores, that the sets' columns stand for
+    effects: int  # how many there are: changes of those that no set holds are zero
+    sets: Sets
+    counts: dict[Subset, int]
+    freedom: float  # of Student's distribution, by the number of balls
+
+    def intervals(
+        self, chosen: Subset, level: float, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+        """Lower and upper ends of the interval of each chosen effect over all sets that hold it."""
+        at = tuple(self.columns.index(j) for j in chosen)
+        ends = []
+        for i in at:
+            holding = {s: n for s, n in self.counts.items() if i in s}
+            if sum(holding.values()) < (SWEEPS - SETTLING) // 4:
+                holding = visited(self.sets, at, rng, (i,))
+            sizes = [self.sets.drawn(s, 20 * n, rng, self.freedom)[:, i] for s, n in holding.items()]
+            ends.append(np.quantile(np.concatenate(sizes), [0.5 - level / 2, 0.5 + level / 2]))
+        low, high = np.array(ends).reshape(-1, 2).T
+        return low, high
+
+    def draws(self, count: int, rng: np.random.Generator) -> Float[np.ndarray, "count K"]:
+        """Changes of all effects together, each row from a set drawn by its probability."""
+        every = list(self.counts)
+        share = np.array([self.counts[s] for s in every]) / sum(self.counts.values())
+        drawn = np.zeros((count, max(self.effects, max(self.columns, default=-1) + 1)))
+        row = 0
+        for subset, number in zip(every, rng.multinomial(count, share), strict=True):
+            drawn[row : row + number, self.columns] = self.sets.drawn(subset, number, rng, self.freedom)
+            row += number
+        return drawn[:, : self.effects]
+
+
+def averaged(
     rated: Scores,
     candidates: Sequence[int],
     chosen: Subset,
     scale: Float[np.ndarray, " K"],
-    level: float,
     freedom: float,
     rng: np.random.Generator,
-) -> Float[np.ndarray, "2 c"]:
-    """Ends of the interval of each chosen effect over all sets that hold it.
+) -> Averaged:
+    """Sets drawn by their probability, from the chosen one on.
 
-    candidates: effects that a set may hold, the chosen ones among them. scale: of every effect. level: of
-    the interval. freedom: of Student's distribution, by the number of balls.
+    candidates: effects that a set may hold, the chosen ones among them. scale: of every effect. freedom: of Student's
+    distribution, by the number of balls.
     """
-    columns = [*candidates, *rated.always]
+    columns = (*candidates, *rated.always)
     width = np.concatenate([scale[list(candidates)], np.full(len(rated.always), np.inf)])
     sets = Sets(*adjusted(rated, columns), width, tuple(range(len(candidates))))
-    at = tuple(columns.index(j) for j in chosen)
-    draws: dict[int, np.ndarray] = {}
-    counts = visited(sets, at, rng)
-    for i in at:
-        holding = {s: n for s, n in counts.items() if i in s}
-        if sum(holding.values()) < (SWEEPS - SETTLING) // 4:
-            holding = visited(sets, at, rng, (i,))
-        draws[i] = np.concatenate([sets.drawn(s, 20 * n, rng, freedom)[:, i] for s, n in holding.items()])
-    tails = [0.5 - level / 2, 0.5 + level / 2]
-    return np.array([np.quantile(draws[i], tails) for i in at]).reshape(-1, 2).T
+    counts = visited(sets, tuple(columns.index(j) for j in chosen), rng)
+    return Averaged(columns, len(scale), sets, counts, freedom)

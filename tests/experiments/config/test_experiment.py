@@ -200,6 +200,24 @@ def test_a_looked_up_experiment_stands_alone(tmp_path):
     assert again.config == first.config
 
 
+def test_samples_of_a_model_are_taken_in(tmp_path):
+    """Beside the experiment or beside the model that it names, each relative to its own folder."""
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "s.csv").write_text("ball.table.height\n0.001\n0.002\n")
+    (tmp_path / "models" / "m.yaml").write_text("randomise: {samples: s.csv}\n")
+    for name, model in (("a", "models/m.yaml"), ("b", "{randomise: {samples: models/s.csv}}")):
+        file = tmp_path / f"{name}.yaml"
+        file.write_text(f"name: a\nballs: narrow\nmodel: {model}\n")
+        first = build.experiment(config.load(file), str(file))
+        copy = config.parse(yaml.safe_load(yaml.safe_dump(first.config.to_dict())), "copy")
+        for one in (first, build.experiment(copy, "copy")):
+            (samples,) = one.model.randomise
+            assert samples.paths == ("ball.table.height",) and samples.values[:, 0].tolist() == [0.001, 0.002]
+        file.write_text("name: a\nballs: narrow\nmodel: {randomise: {samples: none.csv}}\n")
+        with pytest.raises((ConfigError, OSError), match="none.csv"):
+            build.experiment(config.load(file), str(file))
+
+
 def test_defaults_are_those_of_the_task_and_weights_follow_the_terms():
     experiment = build.experiment(config.parse(SMALLEST, "a"), "a")
     assert experiment.task == TaskConfig()

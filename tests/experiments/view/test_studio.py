@@ -14,7 +14,7 @@ from experiments.view.programme import Play
 from experiments.view.studio import Studio, sliders
 from mjx_tt.env.task import MISSED, RETURNED, TaskConfig
 from mjx_tt.rally.end_reasons import End
-from mjx_tt.sim.model import ModelFile, Range, SimModel, with_values
+from mjx_tt.sim.model import ModelFile, Range, Samples, SimModel, with_values
 from robot_io.contract import JOINT_NAMES
 
 CHANGED = {"ball.table.restitution": 0.7, "latency.abb_action": 0.1, "drives.joint_2.velocity_gain": 0.8}
@@ -93,6 +93,15 @@ def test_a_randomised_parameter_is_drawn_until_its_slider_is_moved():
     assert len(set(drawn)) == 6 and (drawn >= 0.8).all() and (drawn <= 0.9).all()
     moved = studio.model(draws, studio.nominal() | {path: 0.5})
     np.testing.assert_allclose(moved.ball.table.restitution, 0.5)
+
+
+def test_samples_are_shown_row_by_row():
+    paths, values = ("ball.table.restitution", "ball.table.height"), np.array([[0.8, 0.001], [0.9, 0.002]])
+    studio = Studio(TaskConfig(), ModelFile(SimModel(), (Samples(paths, values, np.array([1.0, 3.0])),)))
+    table = studio.model(studio.draws(np.zeros((9, 40)), range(40), 0), studio.nominal()).ball.table
+    rows = set(zip(np.round(table.restitution, 6).tolist(), np.round(table.height, 6).tolist(), strict=True))
+    assert len(rows) == 2 and np.mean(np.asarray(table.restitution) > 0.85) > 0.5
+    assert np.isnan(studio.nominal()["ball.table.restitution"])
 
 
 def test_every_slider_is_a_parameter_of_the_model():

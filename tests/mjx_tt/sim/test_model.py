@@ -8,7 +8,7 @@ import pytest
 import yaml
 from scipy import stats
 
-from mjx_tt.sim import bounds, model
+from mjx_tt.sim import bounds, model, randomisation
 from mjx_tt.sim.actuators import JointDrive
 from mjx_tt.sim.model import LATENCIES, BallSpinParams, LatencyParams, ModelFile, Range, SimModel
 
@@ -122,6 +122,20 @@ def test_spin_is_gaussian_about_its_mean(mean):
         ("randomise: {ball.flight.integrator: [0, 1]}", "randomise.ball.flight.integrator: unknown parameter"),
         ("randomise: [1]", r"randomise = \[1\], a mapping is needed"),
         ("randomise: {1: [0, 1]}", "randomise.1: unknown parameter"),
+        ("randomise: {samples: {ball.table.restitutio: [0.9]}}", r"samples.ball.table.restitutio: .* 'ball.table.rest"),
+        ("randomise: {samples: {ball.table.height: [0.0, 99]}}", r"samples.ball.table.height\[1\] = 99, allowed is"),
+        ("randomise: {samples: {ball.table.height: [0], weight: [1, 2]}}", r"the lists have \[1, 2\] numbers"),
+        (
+            "randomise: {samples: {ball.table.height: [0.01], weight: [-1]}}",
+            r"weight\[0\] = -1, a number of at least 0",
+        ),
+        ("randomise: {samples: {ball.table.height: [0.01], weight: [0]}}", "all weights are 0"),
+        ("randomise: {samples: {weight: [1]}}", "randomise.samples: no parameter is in it"),
+        ("randomise: {samples: 3}", "randomise.samples = '3', the name of a CSV or a list"),
+        (
+            "randomise: {ball.table.height: [0, 0.01], samples: {ball.table.height: [0.01]}}",
+            "randomise: ball.table.height is drawn twice",
+        ),
         ("provenance: hello", "provenance = 'hello', a mapping is needed"),
     ],
 )
@@ -148,6 +162,48 @@ def test_ranges_are_drawn_uniformly_and_apart():
     assert abs(np.corrcoef(restitution.ravel(), offset.ravel())[0, 1]) < 4.5 / np.sqrt(2000)
     untouched = model.paths() | {"ball.table.restitution": None, "sensing.ball_offset_x": None}
     assert {k: None if np.ndim(v) else v for k, v in model.paths(drawn).items()} == untouched
+
+
+def test_samples_are_drawn_row_by_row_and_by_weight(tmp_path):
+    """From a file beside the model; frequencies against the weights, rows as they stand in the file."""
+    rows = ["ball.table.restitution, drives.joint_2.lag, weight", "0.9, 0.01, 1", "0.92, 0.03, 3", "0.94, 0.02, 0"]
+    (tmp_path / "posterior.csv").write_text("\n".join(rows) + "\n")
+    (tmp_path / "a.yaml").write_text("randomise: {samples: posterior.csv, ball.table.height: [0.0, 0.01]}\n")
+    file = ModelFile.load(tmp_path / "a.yaml")
+    drawn = model.draw(jax.random.key(0), file.model, file.randomise, (40, 100))
+    restitution, lag = np.asarray(drawn.ball.table.restitution), np.asarray(drawn.drives.joint_2.lag)
+    pairs, counts = np.unique(np.stack([restitution.ravel(), lag.ravel()]), axis=1, return_counts=True)
+    np.testing.assert_allclose(pairs, [[0.9, 0.92], [0.01, 0.03]], rtol=1e-6)
+    assert stats.chisquare(counts, [1000, 3000]).pvalue > 1e-3
+    assert stats.kstest(np.asarray(drawn.ball.table.height).ravel(), "uniform", (0.0, 0.01)).pvalue > 1e-3
+    # It stands alone once it is saved, wherever that is.
+    (tmp_path / "b").mkdir()
+    file.save(tmp_path / "b" / "a.yaml")
+    again = ModelFile.load(tmp_path / "b" / "a.yaml")
+    same = model.draw(jax.random.key(0), again.model, again.randomise, (40, 100))
+    np.testing.assert_array_equal(same.ball.table.restitution, restitution)
+    assert randomisation.ends(file.randomise) == {
+        "ball.table.restitution": [pytest.approx(0.9), pytest.approx(0.92)],
+        "drives.joint_2.lag": [pytest.approx(0.01), pytest.approx(0.03)],
+        "ball.table.height": [0.0, 0.01],
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("ball.table.height\n0.01\nhigh\n", r"row 3: ball.table.height = 'high' is not a number"),
+        ("ball.table.height,weight\n0.01\n", r"row 2: 1 columns, the header has 2"),
+        ("ball.table.height\n", "needs a header of different names and a row"),
+        ("", "needs a header of different names and a row"),
+    ],
+)
+def test_mistakes_in_a_file_of_samples_are_named(tmp_path, text, message):
+    (tmp_path / "s.csv").write_text(text)
+    (tmp_path / "a.yaml").write_text("randomise: {samples: s.csv}\n")
+    with pytest.raises(ValueError, match=message) as error:
+        ModelFile.load(tmp_path / "a.yaml")
+    assert str(error.value).startswith(str(tmp_path / "s.csv"))
 
 
 def test_latencies_are_gaussian_in_seconds_and_cut():

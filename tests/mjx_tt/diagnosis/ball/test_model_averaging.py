@@ -7,6 +7,7 @@ from scipy.special import betaln
 from scipy.stats import multivariate_normal
 
 from mjx_tt.diagnosis.ball import model_averaging, scores
+from mjx_tt.diagnosis.ball.model_averaging import averaged
 from mjx_tt.diagnosis.ball.scores import Scores
 
 BALLS, ROWS = 150, 6
@@ -82,7 +83,7 @@ def test_intervals_cover_where_a_chosen_set_is_too_small():
         rated, theta = world(rng)
         gains = scores.widened(rated, scores.all_gains(rated, tuple(range(12)), 2), tuple(range(12)), 14.0, 12)
         chosen = max(gains, key=lambda s: gains[s] - 14.0 * len(s))
-        low, high = model_averaging.intervals(rated, range(12), chosen, scale, 0.9, 140.0, rng)
+        low, high = averaged(rated, range(12), chosen, scale, 140.0, rng).intervals(chosen, 0.9, rng)
         size, error = scores.solve(rated, chosen), np.sqrt(np.diagonal(scores.sandwich(rated, chosen)))
         true = theta[list(chosen)]
         hits += int(((low <= true) & (true <= high)).sum())
@@ -100,6 +101,25 @@ def test_an_effect_that_others_replace_gets_an_interval_of_its_own():
     columns[..., 1] = columns[..., 0] + 0.01 * columns[..., 1]
     target = columns[..., 0] * 0.5 + rng.standard_normal((BALLS, ROWS))
     rated = measured(columns, target)
-    low, high = model_averaging.intervals(rated, (0, 1, 2), (1,), np.full(3, 0.5), 0.9, 100.0, rng)
+    low, high = averaged(rated, (0, 1, 2), (1,), np.full(3, 0.5), 100.0, rng).intervals((1,), 0.9, rng)
     assert low[0] < scores.solve(rated, (1,))[0] < high[0]
     assert np.all(np.isfinite([low, high]))
+
+
+def test_draws_keep_what_is_known_of_effects_together():
+    """Two columns that are nearly one: their sum is known, neither is; moments against the exact mixture's."""
+    rng = np.random.default_rng(11)
+    columns = rng.standard_normal((BALLS, ROWS, 3))
+    columns[..., 1] = columns[..., 0] + 0.05 * columns[..., 1]
+    target = 0.3 * columns[..., 0] + 0.3 * columns[..., 1] + rng.standard_normal((BALLS, ROWS))
+    rated = measured(columns, target)
+    sets = averaged(rated, (0, 1), (0, 1), np.full(4, 0.5), np.inf, rng)
+    draws = sets.draws(20000, rng)
+    assert draws.shape == (20000, 4) and not draws[:, 2:].any()
+    assert draws[:, 0].std() > 4.0 * (draws[:, 0] + draws[:, 1]).std()
+    share = {s: n / sum(sets.counts.values()) for s, n in sets.counts.items()}
+    exact = np.zeros(2)
+    for subset, probability in share.items():
+        precision = sets.sets.gram[np.ix_(subset, subset)] + np.diag(np.full(len(subset), 4.0))
+        exact[list(subset)] += probability * np.linalg.solve(precision, sets.sets.right[list(subset)])
+    np.testing.assert_allclose(draws[:, :2].mean(axis=0), exact, atol=0.02)
