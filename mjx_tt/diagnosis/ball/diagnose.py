@@ -14,7 +14,7 @@ from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import grid
-from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Projected, Situation
+from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Projected, Situation, shifts
 from mjx_tt.diagnosis.ball.flights.noise import Jitter, Noise
 from mjx_tt.diagnosis.ball.posterior import Posterior
 from mjx_tt.diagnosis.ball.scores import Scores
@@ -164,7 +164,7 @@ def _diagnose(
     start = first_fit(problem) if before is None else fit_starts(problem, none, before.start0, g)
     nominal = Situation(none, start)
     linear = problem.linearise(nominal)
-    trial = Trial(fitted, *selection.shifts(linear, g, fitted), mode, seed, left_out=left_out)
+    trial = Trial(fitted, *shifts(linear, g, fitted), mode, seed, left_out=left_out)
     spin_notes: list[str] = []
     if before is not None:
         prior, together = before.choice.prior, before.together

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.effects import Effect
 from mjx_tt.diagnosis.ball.flights import noise
-from mjx_tt.diagnosis.ball.flights.fit import fit_starts
+from mjx_tt.diagnosis.ball.flights.fit import fit_starts, refit_worst
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.ball.flights.linearization import (
     KICK,
@@ -21,6 +21,7 @@ from mjx_tt.diagnosis.ball.flights.linearization import (
     Projected,
     Situation,
     project,
+    shifts,
 )
 from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE, SpinPrior, learned
@@ -307,6 +308,9 @@ def search(
         at, bounces = _move(problem, np.where(near, moved, at.start), theta, choice, own_noise, g)
         if settled:
             break
+    if prior is not None and prior.conditional:
+        # Elsewhere in theta another valley of a ball's spin may be the deeper one.
+        at = replace(at, start=refit_worst(problem, at.theta, at.start, g, own_noise, prior))
     linear = problem.linearise(at)
     p = project(linear, at, own_noise, _weights(linear, own_noise, g, bounces), g, problem.coefficient)
     return Settled(at, linear, refined(choice, p), own_noise, p, trial)
@@ -316,28 +320,6 @@ def _close(theta: np.ndarray, before: np.ndarray, choice: Choice) -> bool:
     """True if the chosen effects moved by little of their errors."""
     chosen = list(choice.effects)
     return bool(np.all(np.abs(theta - before)[chosen] <= SETTLED * choice.error))
-
-
-def shifts(linear: Linear, g: Grid, effects: Sequence[Effect]) -> tuple[np.ndarray, float]:
-    """Median shift [m] of the last sample of the balls concerned, per unit of each effect and per rad/s of spin.
-
-    Against a nominal flight from the same measured start: what the effect does to the first samples is carried along.
-    Of an effect that fades the largest shift of a flight counts.
-    """
-    last = g.last
-    balls = np.arange(g.n)
-    dt = np.maximum(g.time[2] - g.time[0], 1e-9)
-    early = np.concatenate([linear.effects[:, :, 0], (linear.effects[:, :, 2] - linear.effects[:, :, 0]) / dt], axis=1)
-    carried = np.einsum("kjn,jcn->kcn", early, linear.starts[:6][:, :, last, balls])
-    end = linear.effects[:, :, last, balls] - carried
-    spin = linear.starts[SPIN][:, :, last, balls]
-    size = np.linalg.norm(end, axis=1)
-    for i in (i for i, e in enumerate(effects) if e.fades):
-        size[i] = np.linalg.norm(np.where(g.mask, linear.effects[i], 0.0), axis=0).max(axis=0)
-    concerned = [s[s > 1e-3 * s.max()] for s in size]
-    return np.array([np.median(s) if s.size else 0.0 for s in concerned]), float(
-        np.median(np.linalg.norm(spin, axis=1))
-    )
 
 
 def _theta(p: Projected, choice: Choice) -> Float[np.ndarray, " K"]:

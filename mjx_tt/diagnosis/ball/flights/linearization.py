@@ -119,6 +119,28 @@ class BallProblem:
         return Linear(residual, starts, effects, one, np.moveaxis(transition, (3, 1), (0, 1)))
 
 
+def shifts(linear: Linear, g: Grid, effects: Sequence[Effect]) -> tuple[np.ndarray, float]:
+    """Median shift [m] of the last sample of the balls concerned, per unit of each effect and per rad/s of spin.
+
+    Against a nominal flight from the same measured start: what the effect does to the first samples is carried along.
+    Of an effect that fades the largest shift of a flight counts.
+    """
+    last = g.last
+    balls = np.arange(g.n)
+    dt = np.maximum(g.time[2] - g.time[0], 1e-9)
+    early = np.concatenate([linear.effects[:, :, 0], (linear.effects[:, :, 2] - linear.effects[:, :, 0]) / dt], axis=1)
+    carried = np.einsum("kjn,jcn->kcn", early, linear.starts[:6][:, :, last, balls])
+    end = linear.effects[:, :, last, balls] - carried
+    spin = linear.starts[SPIN][:, :, last, balls]
+    size = np.linalg.norm(end, axis=1)
+    for i in (i for i, e in enumerate(effects) if e.fades):
+        size[i] = np.linalg.norm(np.where(g.mask, linear.effects[i], 0.0), axis=0).max(axis=0)
+    concerned = [s[s > 1e-3 * s.max()] for s in size]
+    return np.array([np.median(s) if s.size else 0.0 for s in concerned]), float(
+        np.median(np.linalg.norm(spin, axis=1))
+    )
+
+
 @dataclass(frozen=True)
 class Projected:
     """Whitened quantities ball by ball, starts projected out. K effects and their sums with the measured target."""
