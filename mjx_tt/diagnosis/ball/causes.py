@@ -129,6 +129,7 @@ def _averaged(found: BallFindings, seed: int) -> Averaged:
     """Sets of effects that could be true: what else may be wrong beside the chosen ones is not settled."""
     choice, effects, rated = found.choice, found.trial.effects, found.scores()
     barred = {*rated.always, *found.trial.left_out, *(i for i, e in enumerate(effects) if e.made_of)}
+    barred |= {one for one, other in found.trial.bound if other not in choice.effects}
     able = [i for i in range(len(effects)) if i in choice.effects or (found.seen[i] and i not in barred)]
     freedom, scale = max(found.problem.grid.n - 10, LEAST_FREEDOM), np.array([e.scale for e in effects])
     return averaged(rated, able, choice.effects, scale, freedom, np.random.default_rng(seed))

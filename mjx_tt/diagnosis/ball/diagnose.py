@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import evidence, posterior, scores, selection
-from mjx_tt.diagnosis.ball.effects import EFFECTS
+from mjx_tt.diagnosis.ball.effects import BY_NAME, EFFECTS
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import grid
@@ -164,7 +164,13 @@ def _diagnose(
     start = first_fit(problem) if before is None else fit_starts(problem, none, before.start0, g)
     nominal = Situation(none, start)
     linear = problem.linearise(nominal)
-    trial = Trial(fitted, *shifts(linear, g, fitted), mode, seed, left_out=left_out)
+    called = [e.name for e in fitted]
+    bound = tuple(
+        (i, called.index(e.beside))
+        for i, e in enumerate(fitted)
+        if e.beside and problem.nominal[BY_NAME[e.beside].path] == 0.0
+    )
+    trial = Trial(fitted, *shifts(linear, g, fitted), mode, seed, left_out, bound)
     spin_notes: list[str] = []
     if before is not None:
         prior, together = before.choice.prior, before.together

@@ -63,8 +63,13 @@ class Choice:
 
 
 def named(choice: Choice, trial: Trial) -> tuple[bool, ...]:
-    """For each chosen effect: True if it passes the second gate too, a size that matters."""
-    return tuple(bool(abs(t) * trial.shift[j] >= FLOOR) for t, j in zip(choice.theta, choice.effects, strict=True))
+    """For each chosen effect: True if it passes the second gate too, a size that matters.
+
+    What means nothing without another effect is not named without it.
+    """
+    matter = {j for t, j in zip(choice.theta, choice.effects, strict=True) if abs(t) * trial.shift[j] >= FLOOR}
+    alone = {one for one, other in trial.bound if other not in matter}
+    return tuple(j in matter - alone for j in choice.effects)
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,7 @@ class Trial:
     spin: str  # "none": spin is a cause; "free": every ball may spin; "never": neither
     seed: int = 0
     left_out: tuple[int, ...] = ()  # effects that may not be chosen
+    bound: tuple[tuple[int, int], ...] = ()  # effects that mean nothing without another: (effect, the other)
     spinning: bool = False  # linearised about spinning balls: effects that need spin mean nothing without it
 
 
@@ -201,6 +207,8 @@ def _holds(
 
     about: changes at which derivatives were taken; plain: gain of this set without spin.
     """
+    if any(one in subset and other not in subset for one, other in trial.bound):
+        return False
     as_cause = t.prior is not None and trial.spin == "none"
     if t.prior is not None and as_cause:
         rms = float(np.sqrt(np.mean(t.prior.std**2 + t.prior.mean**2))) * np.sqrt(3.0)
