@@ -13,7 +13,7 @@ from mjx_tt.diagnosis.ball import evidence, posterior, scores, selection
 from mjx_tt.diagnosis.ball.effects import BY_NAME, EFFECTS
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading, own_spins
-from mjx_tt.diagnosis.ball.flights.forward_model import grid
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Projected, Situation, shifts
 from mjx_tt.diagnosis.ball.flights.noise import Jitter, Noise
 from mjx_tt.diagnosis.ball.posterior import Posterior
@@ -29,6 +29,8 @@ FEWEST_BALLS = 12
 SCATTER = np.full(3, 0.1)  # [m/s] of bounces, before anything is known of it
 LEAST_SHIFT = selection.FLOOR / 2  # [m] of a flight's end, for bounces that differ from ball to ball
 TRACKERS = {"tracker_smoothing", "tracker_filter", "tracker_gate"}
+FILTERED = "the tracker filters: once more without most of the samples behind the bounce"
+MORE = 1.2  # times the samples left out, for another try with more
 BLURRED, BLUR = 5.0, (0.04, 0.12)  # memories of a tracker's filter for which it settles behind a bounce; [s] of it
 
 
@@ -55,6 +57,7 @@ class BallFindings:
     spins: Spins | None  # of every ball, where balls spin
     spin_notes: tuple[str, ...]  # what was tried about spin, and what it brought
     small_notes: tuple[str, ...]  # what causes too small to be named explain
+    untried: bool  # spins and bounces that differ were not tried, because of a tracker's filter
 
     def scores(self) -> Scores:
         """Scores of the effects under the chosen treatment of spin."""
@@ -88,10 +91,23 @@ def diagnose_balls(
     """
     say = progress or (lambda text: None)
     found = _diagnose(trajectories, model, spin, without, seed, progress)
-    near = _blurred(found)
+    near = _blurred(found, found.problem.grid)
     if near is not None:
-        say("the tracker filters: once more without most of the samples behind the bounce")
-        found = _diagnose(trajectories, model, spin, without, seed, progress, near, found)
+        say(FILTERED)
+        clear = _diagnose(trajectories, model, spin, without, seed, progress, near, found)
+        more = _blurred(clear, found.problem.grid) if clear.findings else None
+        if more is not None and more.sum() > MORE * near.sum():
+            say("it filters for longer than it seemed: once more without these samples as well")
+            near = near | more
+            clear = _diagnose(trajectories, model, spin, without, seed, progress, near, found)
+        if clear.findings and found.untried:
+            say("something stays open: it is not the filter's doing alone")
+            found = _diagnose(trajectories, model, spin, without, seed, progress, patient=False)
+            near = _blurred(found, found.problem.grid)
+            if near is not None:
+                say(FILTERED)
+                clear = _diagnose(trajectories, model, spin, without, seed, progress, near, found)
+        found = found if near is None else clear
     shaken = None if "latency_jitter" in without else shaking(found)
     if shaken is None:
         return found
@@ -100,7 +116,7 @@ def diagnose_balls(
     return _diagnose(trajectories, model, spin, without, seed, progress, shaky if near is None else near | shaky, found)
 
 
-def _blurred(found: BallFindings) -> Bool[np.ndarray, "T n"] | None:
+def _blurred(found: BallFindings | Settled, g: Grid) -> Bool[np.ndarray, "T n"] | None:
     """Samples behind the bounce that a predicting filter blurs, but the first, which shows the filter; None without it.
 
     A filter that starts afresh settles in a way of its own, which no catalogue holds: it may also show in
@@ -112,7 +128,6 @@ def _blurred(found: BallFindings) -> Bool[np.ndarray, "T n"] | None:
     if not filters and (not better & TRACKERS or TRACKERS & {names[j] for j in choice.effects}):
         return None
     filters = filters or [0.0]
-    g = found.problem.grid
     behind = g.time - found.linear.base.bounce_time[0]
     first = (behind > 0.0) & (np.cumsum(behind > 0.0, axis=0) == 1)
     settling = np.clip(BLURRED * filters[0], *BLUR)
@@ -135,10 +150,13 @@ def _diagnose(
     progress: Callable[[str], None] | None,
     hidden: Bool[np.ndarray, "T n"] | None = None,
     before: BallFindings | None = None,
+    patient: bool = True,
 ) -> BallFindings:
     """Chooses the causes.
 
     hidden: samples that do not count. before: findings with these samples, at whose spins the search starts.
+    patient: where a tracker's filter may be what stays open, spins and bounces that differ are not tried: a filter
+    looks like either.
     """
     say = progress or (lambda text: None)
     kept = flights(trajectories)
@@ -172,7 +190,7 @@ def _diagnose(
     )
     trial = Trial(fitted, *shifts(linear, g, fitted), mode, seed, left_out, bound)
     spin_notes: list[str] = []
-    if before is not None:
+    if before is not None and not (before.untried and mode == "none"):
         prior, together = before.choice.prior, before.together
         own = prior is not None and prior.conditional
         treated = replace(trial, spin="free") if own else trial
@@ -186,7 +204,10 @@ def _diagnose(
         best, together = _plain(problem, trial, nominal, say)
     say("looking for what no entry explains")
     left = find(best, g, sessions, age, names)
-    if mode == "none" and before is None and (left.findings or evidence.bent_too_far(best.choice)):
+    first = before is None
+    untried = first and patient and bool(left.findings) and _blurred(best, g) is not None
+    tries = first and not untried
+    if mode == "none" and tries and (left.findings or evidence.bent_too_far(best.choice)):
         # Strong spin is out of reach of derivatives taken about balls that do not spin.
         say("trying balls that spin fast, each in its own way")
         other, theirs = _spinning(problem, trial, nominal, say)
@@ -197,7 +218,7 @@ def _diagnose(
         if gained > 0.0 and shift >= selection.FLOOR and bends:
             best, together = replace(other, trial=replace(other.trial, spin="none")), theirs
             left = find(best, g, sessions, age, names)
-    if before is None and left.findings:
+    if tries and left.findings:
         for attempt in _of_scattering(best.choice, mode):
             say("trying bounces that differ from ball to ball")
             other, theirs = attempt(problem, trial, nominal, say, SCATTER)
@@ -234,6 +255,7 @@ def _diagnose(
         estimate(problem, best, kept),
         tuple(spin_notes) if before is None else before.spin_notes,
         _of_small(left),
+        untried,
     )
 
 

@@ -123,7 +123,7 @@ def shifts(linear: Linear, g: Grid, effects: Sequence[Effect]) -> tuple[np.ndarr
     """Median shift [m] of the last sample of the balls concerned, per unit of each effect and per rad/s of spin.
 
     Against a nominal flight from the same measured start: what the effect does to the first samples is carried along.
-    Of an effect that fades the largest shift of a flight counts.
+    Of an effect that fades the largest shift of a flight counts, of a sample that is left out as well.
     """
     last = g.last
     balls = np.arange(g.n)
@@ -134,7 +134,8 @@ def shifts(linear: Linear, g: Grid, effects: Sequence[Effect]) -> tuple[np.ndarr
     spin = linear.starts[SPIN][:, :, last, balls]
     size = np.linalg.norm(end, axis=1)
     for i in (i for i, e in enumerate(effects) if e.fades):
-        size[i] = np.linalg.norm(np.where(g.mask, linear.effects[i], 0.0), axis=0).max(axis=0)
+        flown = np.arange(len(g.time))[:, None] <= last
+        size[i] = np.linalg.norm(np.where(flown, linear.effects[i], 0.0), axis=0).max(axis=0)
     concerned = [s[s > 1e-3 * s.max()] for s in size]
     return np.array([np.median(s) if s.size else 0.0 for s in concerned]), float(
         np.median(np.linalg.norm(spin, axis=1))
