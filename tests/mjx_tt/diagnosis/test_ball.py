@@ -10,12 +10,13 @@ import pytest
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt import diagnosis
-from mjx_tt.diagnosis.ball import basis_functions, scores
+from mjx_tt.diagnosis.ball import basis_functions, scores, selection
 from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.fit import first_fit
 from mjx_tt.diagnosis.ball.flights.forward_model import grid, heading_axes, leaves, predict
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Projected, Situation
+from mjx_tt.diagnosis.ball.selection import Choice, Trial
 from mjx_tt.sim import model
 from mjx_tt.sim.model import SimModel
 from tests.exam.generator.world import World, camera, fly, seen
@@ -191,6 +192,16 @@ def test_time_stamps_shake_only_if_their_noise_grows_with_speed(grows):
     assert (found is not None) == grows
     if grows:
         assert found.seconds == pytest.approx(0.002, rel=0.1)
+
+
+@pytest.mark.parametrize(("size", "names"), [(1.0, ()), (4.0, ("tracker_filter", "tracker_gate"))])
+def test_a_gate_is_not_named_without_its_filter(size, names):
+    """Sizes in mm; the gate's alone would do."""
+    effects = tuple(e for e in EFFECTS if e.name in ("tracker_filter", "tracker_gate"))
+    trial = Trial(effects, np.full(2, 1e-3), 0.0, "never", bound=((1, 0),))
+    choice = Choice((0, 1), np.array([size, 5.0]), np.ones(2), 0.0, None, None, 14.0, ((0,), (1,)), ())
+    matters = selection.named(choice, trial)
+    assert tuple(e.name for e, m in zip(effects, matters, strict=True) if m) == names
 
 
 def test_the_extended_model_is_one_that_training_loads(tmp_path):
