@@ -32,6 +32,8 @@ def adjusted(rated: Scores, columns: Sequence[int]) -> tuple[Float[np.ndarray, "
     """Gram matrix and right side of the columns, as if the estimates' covariance were that from ball to ball."""
     columns = list(columns)
     gram, right = rated.gram[np.ix_(columns, columns)], rated.right[columns]
+    if not columns:
+        return gram, right
     size = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
     values, vectors = np.linalg.eigh(gram * size[:, None] * size)
     shown = values > RANK * values.max()

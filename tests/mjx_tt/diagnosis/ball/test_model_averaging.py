@@ -106,6 +106,14 @@ def test_an_effect_that_others_replace_gets_an_interval_of_its_own():
     assert np.all(np.isfinite([low, high]))
 
 
+def test_a_log_that_shows_no_effect_has_one_set():
+    rng = np.random.default_rng(0)
+    rated = measured(rng.standard_normal((BALLS, ROWS, 2)), rng.standard_normal((BALLS, ROWS)))
+    sets = averaged(rated, (), (), np.full(2, 0.5), 100.0, rng)
+    assert set(sets.counts) == {()} and not sets.draws(5, rng).any()
+    assert sets.intervals((), 0.9, rng)[0].shape == (0,)
+
+
 def test_draws_keep_what_is_known_of_effects_together():
     """Two columns that are nearly one: their sum is known, neither is; moments against the exact mixture's."""
     rng = np.random.default_rng(11)
