@@ -20,6 +20,7 @@ from mjx_tt.diagnosis.ball.flights.linearization import (
     Linear,
     Projected,
     Situation,
+    faded,
     project,
     shifts,
 )
@@ -321,7 +322,7 @@ def search(
         at = replace(at, start=refit_worst(problem, at.theta, at.start, g, own_noise, prior))
     linear = problem.linearise(at)
     p = project(linear, at, own_noise, _weights(linear, own_noise, g, bounces), g, problem.coefficient)
-    return Settled(at, linear, refined(choice, p), own_noise, p, trial)
+    return Settled(at, linear, refined(choice, p), own_noise, p, replace(trial, shift=faded(problem, at, trial.shift)))
 
 
 def _close(theta: np.ndarray, before: np.ndarray, choice: Choice) -> bool:

@@ -11,6 +11,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import beta, binom
 
+from tests.exam.generator.cases import EFFECTS
+
 PEOPLE = "human_single human_pair human_deleted human_invented"
 ABSTAINED = ("unexplained", "undetermined")
 
@@ -309,9 +311,12 @@ def _gain_rows(records: list[dict]) -> list[Row]:
 
 
 def _many_rows(records: list[dict]) -> list[Row]:
-    covered = [
-        bool(p["covered"]) for r in records for p in r.get("parameters", {}).values() if p["covered"] is not None
-    ]
+    covered = []
+    for r in records:
+        for cause in r["case"]["causes"]:
+            # A cause and its twins are one number.
+            found = [r["parameters"][p] for p in EFFECTS[cause].truth(0.01) if p in r.get("parameters", {})]
+            covered += [bool(p["covered"]) for p in found[:1] if p["covered"] is not None]
     shares = [
         (g["nominal"] - g["extended"]) / (g["nominal"] - g["true"])
         for g in (r["gain"] for r in records if r.get("gain"))
