@@ -1,4 +1,4 @@
-"""What of a model is drawn anew for every episode: parameters by their ranges, or many together from samples.
+"""Parameters of a model that are drawn anew for every episode: each from its range, or many together from samples.
 
 In a model YAML:
     randomise:
@@ -117,7 +117,7 @@ def to_dict(randomise: Sequence[Randomised]) -> dict[str, Any]:
 
 
 def parse(data: Mapping[Any, Any], where: str, parameter: Callable[[Any, str], str], number: Number) -> tuple:
-    """What a mapping ``randomise`` says. Raises ValueError naming ``where`` and the key.
+    """Ranges and samples of a mapping ``randomise``. Raises ValueError naming ``where`` and the key.
 
     parameter: (path, where) -> the dotted path of a number of the model, or ValueError. Samples stand as content.
     """

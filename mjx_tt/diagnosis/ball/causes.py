@@ -144,7 +144,7 @@ def _ends(found: BallFindings, sets: Averaged, seed: int) -> Float[np.ndarray, "
 
 
 def _samples(found: BallFindings, sets: Averaged, seed: int) -> tuple[Samples, ...]:
-    """What the flights leave open of the model, drawn together; nothing where nothing in it is."""
+    """Draws of all that the flights leave open of the model; none where nothing is open."""
     effects, nominal = found.trial.effects, found.problem.nominal
     changes = sets.draws(DRAWS, np.random.default_rng([seed, 1]))
     changes = np.maximum(changes, [e.low for e in effects])

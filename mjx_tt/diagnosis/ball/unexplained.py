@@ -37,7 +37,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Left:
-    """What stays significant beside the chosen causes."""
+    """Patterns that stay significant beside the chosen causes."""
 
     findings: tuple[Finding, ...]  # that no entry explains, the most important first
     holding: tuple[str, ...]  # names that hold beside the first; all of them where nothing is found

@@ -140,7 +140,7 @@ CONFIDENCES = (0.0, 0.5, 0.8, 0.95, 0.995, 1.01)  # edges of the bins
 
 
 def reliability(records: list[dict]) -> list[Reliability]:
-    """How often a cause named with some confidence is true, from low confidence to high."""
+    """Shares of the named causes that are true, from low confidence to high."""
     said = np.array([pair for r in records for pair in r.get("confidences", ())], float).reshape(-1, 2)
     out = []
     for low, high in pairwise(CONFIDENCES):

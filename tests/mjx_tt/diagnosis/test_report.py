@@ -435,8 +435,8 @@ def test_a_failed_write_leaves_the_old_report(joints, tmp_path, monkeypatch):
 
 def test_an_effect_below_the_floor_is_mentioned_but_not_named(windy):
     choice = windy.balls.choice
-    (j,) = choice.effects
-    tiny = replace(choice, theta=np.array([0.0012 / windy.balls.trial.shift[j]]))
+    j = choice.effects[0]
+    tiny = replace(choice, theta=np.array([0.0012 / windy.balls.trial.shift[j], *choice.theta[1:]]))
     found = replace(
         windy, balls=replace(windy.balls, choice=tiny), verdict=replace(windy.verdict, verdict="none", causes=())
     )

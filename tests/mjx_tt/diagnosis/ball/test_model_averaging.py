@@ -45,7 +45,7 @@ def test_sets_are_visited_as_often_as_their_exact_probability():
 
 
 def test_the_adjusted_curvature_is_that_from_ball_to_ball():
-    """Where balls differ by more than their noise says, as the bootstrap over balls sees it."""
+    """Balls that differ by more than their noise says, as the bootstrap over balls sees it."""
     rng = np.random.default_rng(5)
     n = 400
     columns = rng.standard_normal((n, ROWS, 2))
