@@ -20,7 +20,6 @@ from mjx_tt.diagnosis.ball.flights.linearization import (
     Linear,
     Projected,
     Situation,
-    faded,
     project,
     shifts,
 )
@@ -322,7 +321,7 @@ def search(
         at = replace(at, start=refit_worst(problem, at.theta, at.start, g, own_noise, prior))
     linear = problem.linearise(at)
     p = project(linear, at, own_noise, _weights(linear, own_noise, g, bounces), g, problem.coefficient)
-    return Settled(at, linear, refined(choice, p), own_noise, p, replace(trial, shift=faded(problem, at, trial.shift)))
+    return Settled(at, linear, refined(choice, p), own_noise, p, trial)
 
 
 def _close(theta: np.ndarray, before: np.ndarray, choice: Choice) -> bool:

@@ -142,18 +142,6 @@ def shifts(linear: Linear, g: Grid, effects: Sequence[Effect]) -> tuple[np.ndarr
     )
 
 
-def faded(problem: BallProblem, at: Situation, shift: np.ndarray) -> np.ndarray:
-    """The shifts, of effects that fade as the flights have them: a filter is far from a straight line."""
-    g, out = problem.grid, shift.copy()
-    flown = np.arange(len(g.time))[:, None] <= g.last
-    for i in (i for i, e in enumerate(problem.effects) if e.fades and at.theta[i] != 0.0):
-        without = np.where(np.arange(len(shift)) == i, 0.0, at.theta)
-        moved = problem.fly(at.theta, at.start).measured[:, :, 0] - problem.fly(without, at.start).measured[:, :, 0]
-        largest = np.linalg.norm(np.where(flown, moved, 0.0), axis=0).max(axis=0)
-        out[i] = float(np.median(largest)) / abs(at.theta[i])
-    return out
-
-
 @dataclass(frozen=True)
 class Projected:
     """Whitened quantities ball by ball, starts projected out. K effects and their sums with the measured target."""
