@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -90,30 +91,31 @@ def diagnose_balls(
     without: effects to omit from the catalogue. Raises ValueError when there are too few flights.
     """
     say = progress or (lambda text: None)
-    found = _diagnose(trajectories, model, spin, without, seed, progress)
+    choose = partial(_diagnose, trajectories, model, spin, without, seed, progress)
+    found = choose()
     near = _blurred(found, found.problem.grid)
     if near is not None:
         say(FILTERED)
-        clear = _diagnose(trajectories, model, spin, without, seed, progress, near, found)
+        clear = choose(near, found)
         more = _blurred(clear, found.problem.grid) if clear.findings else None
         if more is not None and more.sum() > MORE * near.sum():
             say("it filters for longer than it seemed: once more without these samples as well")
             near = near | more
-            clear = _diagnose(trajectories, model, spin, without, seed, progress, near, found)
+            clear = choose(near, found)
         if clear.findings and found.untried:
             say("something stays open: it is not the filter's doing alone")
-            found = _diagnose(trajectories, model, spin, without, seed, progress, patient=False)
+            found = choose(patient=False)
             near = _blurred(found, found.problem.grid)
             if near is not None:
                 say(FILTERED)
-                clear = _diagnose(trajectories, model, spin, without, seed, progress, near, found)
+                clear = choose(near, found)
         found = found if near is None else clear
     shaken = None if "latency_jitter" in without else shaking(found)
     if shaken is None:
         return found
     say(f"time stamps shake by {1e3 * shaken.seconds:.1f} ms: once more without the bounce's samples")
     shaky = np.abs(found.problem.grid.time - found.linear.base.bounce_time[0]) < 3.0 * shaken.seconds
-    return _diagnose(trajectories, model, spin, without, seed, progress, shaky if near is None else near | shaky, found)
+    return choose(shaky if near is None else near | shaky, found)
 
 
 def _blurred(found: BallFindings | Settled, g: Grid) -> Bool[np.ndarray, "T n"] | None:
