@@ -40,6 +40,7 @@ JAX_ALLOWED = {
     "robot_io/policy/export.py": JAX,
     "robot_io/policy/pytree.py": ("jax",),
     "robot_io/policy/jax_policy.py": ("jax", "jaxlib"),
+    "robot_io/policy/jax_network.py": ("jax",),
     "robot_io/emulator/world.py": ("mujoco",),
 }
 

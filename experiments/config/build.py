@@ -16,7 +16,9 @@ from bgs import optimizers
 from bgs.strategy import BGSConfig
 from experiments.config.experiment import Config, Optimiser, Rewards, Section, Task, Training
 from experiments.errors import ConfigError, checked
+from mjx_tt.env import own as user_file
 from mjx_tt.env import rewards
+from mjx_tt.env.own import Definitions, Network
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim import randomisation
@@ -34,6 +36,7 @@ class Experiment:
     distribution  of the balls: a box or a mixture
     model         nominal parameters and what is randomised around them
     task, bgs     settings of simulator and optimiser
+    network       one of the user's own; None: the paper's
     """
 
     config: Config
@@ -41,6 +44,7 @@ class Experiment:
     model: ModelFile
     task: TaskConfig
     bgs: BGSConfig
+    network: Network | None = None
 
 
 def experiment(config: Config, where: str) -> Experiment:
@@ -56,14 +60,47 @@ def experiment(config: Config, where: str) -> Experiment:
             f"{where}: initial_policy: {config.initial_policy} is no folder; allowed: a run or an artefact"
         )
     named = isinstance(config.balls, str) and config.balls in registry.names()
-    alone = config.model_copy(update={"balls": config.balls if named else balls.to_dict(), "model": model_data})
+    own, text = definitions(config, where)
+    alone = config.model_copy(
+        update={"balls": config.balls if named else balls.to_dict(), "model": model_data, "definitions": text}
+    )
+    if config.training.later_rewards is not None:
+        checked(f"{where}: training.later_rewards", reward_weights, config.training.later_rewards.rewards, own)
     return Experiment(
         config=alone,
         distribution=balls,
         model=model,
-        task=checked(f"{where}: task", task_config, config.task),
+        task=checked(f"{where}: task", task_config, config.task, own),
         bgs=checked(f"{where}: optimiser", bgs_config, config.optimiser, config.training.updates),
+        network=network(config, where),
     )
+
+
+def definitions(config: Config, where: str) -> tuple[Definitions, str | None]:
+    """The definitions of the experiment's Python file, and its text. Runs the file. Raises ConfigError."""
+    given = config.definitions
+    if given is None:
+        return Definitions(), None
+    if "\n" in given:
+        return checked(f"{where}: definitions", user_file.load, given, f"definitions of {config.name}"), given
+    if not given.endswith(".py"):
+        raise ConfigError(f"{where}: definitions: {given}: a Python file is wanted, such as my_task.py")
+    try:
+        text = Path(given).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{where}: definitions: {given}: cannot be read: {error}") from None
+    return checked(f"{where}: definitions", user_file.load, text, given), text
+
+
+def network(config: Config, where: str) -> Network | None:
+    """The experiment's own network; None: the paper's. Raises ConfigError."""
+    if config.network is None:
+        return None
+    known = definitions(config, where)[0].networks
+    if config.network not in known:
+        allowed = ", ".join(known) or "none is defined; name a file of yours under the key definitions"
+        raise ConfigError(f"{where}: network: {config.network} is not defined; allowed: {allowed}")
+    return known[config.network]
 
 
 def distribution(balls: str | dict[str, Any], where: str) -> Balls:
@@ -73,23 +110,33 @@ def distribution(balls: str | dict[str, Any], where: str) -> Balls:
     return checked(where, registry.resolve, balls)
 
 
-def task_config(task: Task) -> TaskConfig:
+def task_config(task: Task, own: Definitions = Definitions()) -> TaskConfig:  # noqa: B008, it is never changed
     """Raises ValueError where the numbers do not fit together."""
-    return TaskConfig(**_shared(task, TaskConfig), reward_weights=reward_weights(task.rewards))
+    weights = reward_weights(task.rewards, own)
+    return TaskConfig(**_shared(task, TaskConfig), reward_weights=weights, own_terms=tuple(own.terms.values()))
 
 
-def reward_weights(chosen: str | Rewards) -> tuple[float, ...]:
-    """Eleven weights in the order of ``rewards.TERMS``."""
+def reward_weights(chosen: str | Rewards, own: Definitions = Definitions()) -> tuple[float, ...]:  # noqa: B008
+    """Weights in the order of ``rewards.TERMS``, then of the user's own terms. Raises ValueError for an unknown one."""
     base = chosen if isinstance(chosen, str) else chosen.base
     weights = {"sim": rewards.SIM_WEIGHTS, "real": rewards.REAL_WEIGHTS}[base]
-    changed = {} if isinstance(chosen, str) else chosen.model_dump(exclude={"base"}, exclude_none=True)
-    return tuple(float(changed.get(name, weights[name])) for name in rewards.TERMS)
+    changed = {} if isinstance(chosen, str) else chosen.model_dump(exclude={"base", "own"}, exclude_none=True)
+    wanted = {} if isinstance(chosen, str) else chosen.own
+    for name in wanted:
+        if name not in own.terms:
+            allowed = ", ".join(own.terms) or "none is defined; name a file of yours under the key definitions"
+            raise ValueError(f"rewards.own: {name} is not defined; allowed: {allowed}")
+    eleven = (float(changed.get(name, weights[name])) for name in rewards.TERMS)
+    return (*eleven, *(float(wanted.get(name, 0.0)) for name in own.terms))
 
 
-def later_weights(training: Training) -> tuple[int, tuple[float, ...]] | None:
+def later_weights(
+    training: Training,
+    own: Definitions = Definitions(),  # noqa: B008
+) -> tuple[int, tuple[float, ...]] | None:
     """The number of updates after which the reward weights change, and those weights."""
     later = training.later_rewards
-    return None if later is None else (round(later.after * training.updates), reward_weights(later.rewards))
+    return None if later is None else (round(later.after * training.updates), reward_weights(later.rewards, own))
 
 
 def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:

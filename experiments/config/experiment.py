@@ -74,6 +74,8 @@ class Rewards(Section):
     """Weight of steps with a low paddle, which count -1 each."""
     style: Finite | None = None
     """Weight of steps with a paddle that faces backwards, which count -1 each."""
+    own: dict[str, Finite] = {}
+    """Weights of terms that the file of the key definitions has, by their names; 0 for those left out."""
 
 
 class Task(Section):
@@ -259,6 +261,10 @@ class Config(Section):
     """Length of a training, and what to keep of it."""
     evaluation: Evaluation = Evaluation()
     """The evaluation after training."""
+    definitions: str | None = None
+    """A Python file of your own with reward terms and networks (docs/how-to/define-a-task.md), or its content."""
+    network: str | None = None
+    """One of the networks in definitions; null: the paper's gated dilated CNN of 976 parameters."""
     initial_policy: str | None = None
     """A run folder or an exported artefact whose policy training starts from."""
 
@@ -273,8 +279,10 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
 
 
 def _absolute(data: dict[str, Any], folder: Path) -> None:
-    for key in ("balls", "model", "initial_policy"):
+    for key in ("balls", "model", "initial_policy", "definitions"):
         value = data.get(key)
+        if key == "definitions" and "\n" in str(value):  # the file's content
+            continue
         if isinstance(value, str) and (key != "balls" or Path(value).suffix in (".yaml", ".yml")):
             data[key] = str((folder / value).resolve())
     absolute_samples(data.get("model"), folder)

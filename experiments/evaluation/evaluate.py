@@ -93,7 +93,7 @@ def evaluate(
     if reachable_balls is not None:
         with stage(f"finding what is in reach of {reachable_balls} of them"):
             reachable = _reachable(experiment, simulator, balls, key, reachable_balls, trained.policy)
-    return Played(summary(result) | {"reachable": reachable} | conditions, result, incoming)
+    return Played(summary(result, task.terms) | {"reachable": reachable} | conditions, result, incoming)
 
 
 def _reachable(
@@ -105,7 +105,7 @@ def _reachable(
     return {"return_rate": found.rate, "low": low, "high": high, "balls": found.balls, "by_policy": found.by_policy}
 
 
-def summary(result: RolloutResult) -> dict[str, Any]:
+def summary(result: RolloutResult, terms: tuple[str, ...] = rewards.TERMS) -> dict[str, Any]:
     """Rates over all episodes, a non-finite one counting as missed; means of return and terms over the finite ones."""
     rate = return_rate(result)
     counts = {name: int(np.sum(result.outcome == outcome)) for name, outcome in OUTCOMES.items()}
@@ -120,9 +120,7 @@ def summary(result: RolloutResult) -> dict[str, Any]:
         "outcomes": counts,
         "non_finite": int(np.sum(~finite)),
         "mean_return": float(result.returns[finite].mean()) if some else None,
-        "terms": {
-            name: float(result.terms[i][finite].mean()) if some else None for i, name in enumerate(rewards.TERMS)
-        },
+        "terms": {name: float(result.terms[i][finite].mean()) if some else None for i, name in enumerate(terms)},
     }
 
 

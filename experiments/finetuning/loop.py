@@ -36,8 +36,10 @@ from experiments.runs.run_dir import CONFIG, Run
 from experiments.training import finalize
 from experiments.training.update import TrainState
 from mjx_tt.env import rewards
+from mjx_tt.env.own import Network
 from robot_io.control.episode import HIT, RETURNED, EpisodeSummary
 from robot_io.emulator.config import RigParams
+from robot_io.policy import jax_network
 from robot_io.policy.policy import Policy
 
 SETTINGS = "finetuning.yaml"
@@ -68,6 +70,7 @@ def finetune(
     """
     experiment = experiment or experiment_of(source)
     theta, statistics = load_policy.load_statistics(source)
+    network = load_policy.load(source).policy.network
     first = TrainState(
         strategy.init(theta.astype(np.float32), build.bgs_config(settings.optimiser(), settings.updates)),
         statistics,
@@ -76,7 +79,7 @@ def finetune(
     run.folder.mkdir(parents=True, exist_ok=True)
     with run.locked():
         _open(run, experiment, settings, robot, first, str(source))
-        session = Session(settings, run, robot, operator or NoOperator(), console, first)
+        session = Session(settings, run, robot, operator or NoOperator(), console, first, network)
         try:
             finished = session.run()
         except OSError as error:
@@ -131,8 +134,16 @@ class Session:
     """
 
     def __init__(
-        self, settings: FineTuning, run: Run, robot: Robot, operator: Operator, console: Console, first: TrainState
+        self,
+        settings: FineTuning,
+        run: Run,
+        robot: Robot,
+        operator: Operator,
+        console: Console,
+        first: TrainState,
+        network: Network | None = None,
     ) -> None:
+        self._network = None if network is None else jax_network.exported(network)
         self._settings, self._run, self._robot, self._operator = settings, run, robot, operator
         self._bgs = build.bgs_config(settings.optimiser(), settings.updates)
         self._weights = dict(zip(rewards.TERMS, build.reward_weights(settings.rewards), strict=True))
@@ -223,7 +234,8 @@ class Session:
                     "are done; restore the file or start a new run"
                 )
             number = self._next_number(*place[:2])
-            played = self._robot.play(Policy(np.ascontiguousarray(theta), *self._normaliser), number)
+            mean, inv_std = self._normaliser
+            played = self._robot.play(Policy(np.ascontiguousarray(theta), mean, inv_std, self._network), number)
             entry = self._entry(place, number, played)
             self.journal.append(entry)
             if not entry.discarded:

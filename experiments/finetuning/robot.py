@@ -22,7 +22,7 @@ from robot_io.emulator.world import World
 from robot_io.errors import RefusedError
 from robot_io.log.messages import Ball, Record
 from robot_io.log.recorder import NullRecorder, SessionRecorder
-from robot_io.policy.numpy_policy import StreamingPolicy
+from robot_io.policy.backends import make_policy
 from robot_io.policy.policy import Policy
 
 SCENE = Path(mjx_tt.__file__).parent / "assets" / "scene.xml"
@@ -102,7 +102,7 @@ class LockStepRobot:
         rig = LockStep(
             self._scene,
             self._throws,
-            StreamingPolicy(policy),
+            make_policy("numpy" if policy.network is None else "jit", policy),
             self._params,
             recorder=balls,
             first=episode_number,
@@ -150,7 +150,7 @@ class LockStepRallies:
     def play(self, policy: Policy, episode_number: int) -> PlayedBall:
         """Play the next ball of the session, whatever ``episode_number`` is."""
         if self._rig is None:
-            self._rig = self._made(policy=StreamingPolicy(policy))
+            self._rig = self._made(policy=make_policy("numpy" if policy.network is None else "jit", policy))
             self._rig.start()
             self._rig.throwing = True
         rig, bridge = self._rig, self._rig.bridge
@@ -174,7 +174,7 @@ class LockStepRallies:
         rig = self._rig
         while rig is not None:
             try:
-                rig.bridge.set_policy(StreamingPolicy(policy), self._version)
+                rig.bridge.set_policy(make_policy("numpy" if policy.network is None else "jit", policy), self._version)
                 rig.bridge.paused = False
                 return
             except RefusedError:

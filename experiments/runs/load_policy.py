@@ -11,11 +11,13 @@ import numpy as np
 
 from bgs import normalizer
 from bgs.normalizer import ObservationStatistics
+from experiments.config import build
 from experiments.config.experiment import Config, parse
 from experiments.errors import RunError
 from experiments.runs import checkpoint
 from experiments.runs.locate import artefact_of, find_policy, is_exported
 from experiments.runs.run_dir import CONFIG, Run
+from mjx_tt.env import own
 from mjx_tt.env.policy import Policy
 from robot_io.policy import artefact as artefacts
 
@@ -65,8 +67,10 @@ def load_statistics(folder: str | Path) -> tuple[np.ndarray, ObservationStatisti
 
 def _from_run(folder: Path) -> TrainedPolicy:
     arrays, notes = _read(folder)
-    normaliser = (np.asarray(a) for a in normalizer.normaliser(_statistics(arrays)))
-    return TrainedPolicy(Policy(arrays["bgs.average"], *normaliser), folder, Run(folder).config(), notes)
+    mean, inv_std = (np.asarray(a) for a in normalizer.normaliser(_statistics(arrays)))
+    config = Run(folder).config()
+    policy = Policy(arrays["bgs.average"], mean, inv_std, build.network(config, str(folder)))
+    return TrainedPolicy(policy, folder, config, notes)
 
 
 def _from_artefact(folder: Path) -> TrainedPolicy:
@@ -74,7 +78,8 @@ def _from_artefact(folder: Path) -> TrainedPolicy:
     provenance = artefact.manifest["provenance"]
     recorded = provenance.get("config") if isinstance(provenance, dict) else None
     config = parse(recorded, f"{folder}: provenance.config") if recorded else None
-    return TrainedPolicy(artefact.policy.astype(np.float32), folder, config, provenance)
+    policy = own.simulated(artefact.policy, str(folder)).astype(np.float32)
+    return TrainedPolicy(policy, folder, config, provenance)
 
 
 def _read(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

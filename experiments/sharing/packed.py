@@ -12,6 +12,7 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -62,7 +63,7 @@ def unpack(path: Path, folder: Path) -> card.Rates:
             (staging / name).write_bytes(content)
         try:
             artefacts.load(staging / "artefact")
-            Run(staging).config()
+            _without_code(Run(staging).config().to_dict(), path)
             figures = card.rates(Run(staging).read_evaluation())
         except (ArtefactError, ConfigError) as error:
             raise PackError(str(error).replace(f"{staging}/", f"{path}: ")) from None
@@ -98,6 +99,15 @@ def read(path: Path) -> dict[str, bytes]:
     return contents
 
 
+def _without_code(config: dict[str, Any], where: Path) -> None:
+    """Raises PackError for a policy whose configuration holds Python, which whoever evaluates it would run."""
+    if config.get("definitions"):
+        raise PackError(
+            f"{where}: its configuration holds Python of its own (the key definitions), which evaluating it would run; "
+            "such policies are not packed. Pass on the YAML with its .py file, which people read before they run it"
+        )
+
+
 def zipped(contents: dict[str, bytes]) -> bytes:
     """The file of members in their order, with SUMS as the last; the same members give the same bytes everywhere."""
     sums = HEADER + "".join(f"{sha256(content)}  {name}\n" for name, content in contents.items())
@@ -129,6 +139,7 @@ def _members(policy: Path, licence: str | None) -> dict[str, bytes]:
                 f"{place}: checkpoint, artefact and evaluation are of different updates ({sorted(map(str, updates))}); "
                 f"`mjx-tt evaluate {place}`, then `mjx-tt export {place}`"
             )
+    _without_code(config, place)
     if not isinstance(evaluation, dict):
         raise RunError(f"{place}: was not evaluated yet: `mjx-tt evaluate {place}`")
     files = {f"artefact/{file}": (artefact.folder / file).read_bytes() for file in artefacts.FILES}

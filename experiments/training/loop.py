@@ -22,7 +22,7 @@ from experiments import stages
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
-from experiments.errors import CheckpointError, RunError
+from experiments.errors import CheckpointError, RunError, checked
 from experiments.evaluation.evaluate import draw_balls, return_rate
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.metrics import MetricsLog
@@ -189,7 +189,7 @@ class Session:
         """The averaged parameters on the run's own set of fresh balls."""
         key = build.key(self._config.training.seed, build.PROGRESS_EPISODES)
         state = held_here(self.state)
-        policy = Policy(state.bgs.average, *normalizer.normaliser(state.statistics))
+        policy = Policy(state.bgs.average, *normalizer.normaliser(state.statistics), self._trainer.network)
         result = evaluator.play(policy, key)
         rate = return_rate(result)
         self.return_rate = rate.value
@@ -209,7 +209,9 @@ def _compiled(config: Config, trainer: Trainer, state: TrainState) -> Compiled:
     """The update's program: one for all runs of this process that differ in balls, seed and first policy only."""
     sections, training = [config.to_dict()[name] for name in ("task", "model", "optimiser")], config.training
     length = training.updates if config.optimiser.step.schedule.kind == "cosine" else None
-    rest = [length, build.later_weights(training), training.pool, trainer.simulator.devices]
+    rest: list[Any] = [length, training.pool, trainer.simulator.devices, config.definitions, config.network]
+    if training.later_rewards is not None:
+        rest.append(training.later_rewards.to_dict())
     decides = json.dumps([*sections, *rest], sort_keys=True)
     if decides not in _programs:
         _programs[decides] = trainer.lower(state).compile()
@@ -221,7 +223,8 @@ def _start(config: Config, run: Run, trainer: Trainer, ranks: Ranks) -> tuple[Tr
     theta = statistics = None
     if config.initial_policy is not None:
         theta, statistics = load_policy.load_statistics(config.initial_policy)
-    state = trainer.init(build.key(config.training.seed, build.INITIAL_STATE), theta, statistics)
+    key = build.key(config.training.seed, build.INITIAL_STATE)
+    state = checked(f"initial_policy: {config.initial_policy}", trainer.init, key, theta, statistics)
     notes: dict[str, Any] = {"update": 0, "seconds": 0.0, "return_rate": None}
     if ranks.first:
         state, notes = checkpoint.load_latest(run.checkpoints, state) or (state, notes)

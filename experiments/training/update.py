@@ -21,13 +21,13 @@ from bgs.strategy import BGSConfig, BGSState
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.errors import checked
-from mjx_tt.env import rewards
+from mjx_tt.env.own import Network
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
 from mjx_tt.env.task import MISSED, RETURNED
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
-from robot_io.contract import N_OBSERVATION
+from robot_io.contract import N_OBSERVATION, n_parameters
 
 
 @jax.tree_util.register_dataclass
@@ -46,7 +46,8 @@ class Trainer:
     repeats                episodes per perturbation
     common_random_numbers  both members of a pair meet the same balls, latencies and noise
     initial_scale          standard deviation of the random first weights
-    later_weights          after how many updates the rewards get other weights, and these (11,); None: never
+    later_weights          after how many updates the rewards get other weights, and these; None: never
+    network                one of the user's own; None: the paper's
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class Trainer:
         common_random_numbers: bool = False,
         initial_scale: float = 0.1,
         later_weights: tuple[int, tuple[float, ...]] | None = None,
+        network: Network | None = None,
     ) -> None:
         if repeats < 1:
             raise ValueError(f"repeats is {repeats}, at least 1 is needed")
@@ -67,6 +69,7 @@ class Trainer:
         self._model, self._randomise = model, randomise
         self._repeats, self._crn, self._initial_scale = repeats, common_random_numbers, initial_scale
         self._later = later_weights
+        self.network = network
         self._update = jax.jit(simulator.on_devices(self._update_local, out_specs=PartitionSpec()))
 
     @property
@@ -79,9 +82,15 @@ class Trainer:
         theta: ArrayLike | None = None,
         statistics: normalizer.ObservationStatistics | None = None,
     ) -> TrainState:
-        """State before the first update, from random weights or from ``theta`` (976,) and its statistics."""
+        """State before the first update, from random weights or from ``theta`` (976,) and its statistics.
+
+        Raises ValueError where theta is not this network's.
+        """
         theta_key, run_key = jax.random.split(key)
-        theta = initial_theta(theta_key, self._initial_scale) if theta is None else jnp.asarray(theta)
+        size = n_parameters() if self.network is None else self.network.size
+        theta = initial_theta(theta_key, self._initial_scale, size) if theta is None else jnp.asarray(theta)
+        if theta.shape != (size,):
+            raise ValueError(f"the first policy has {theta.shape[0]} parameters, the network has {size}")
         statistics = normalizer.empty(N_OBSERVATION) if statistics is None else statistics
         return self.simulator.replicate(TrainState(strategy.init(theta, self.bgs_config), statistics, run_key))
 
@@ -104,7 +113,7 @@ class Trainer:
         mean, inv_std = normalizer.normaliser(state.statistics)
         simulator = self.simulator
         result = simulator.rollout(
-            Policy(simulator.local(population.members), mean, inv_std), simulator.local(episodes)
+            Policy(simulator.local(population.members), mean, inv_std, self.network), simulator.local(episodes)
         )
         result = self._weighed(result, state.bgs.updates)
         # Everything that the devices have to share, in one sum: each fills in its own members.
@@ -125,7 +134,7 @@ class Trainer:
         seen = normalizer.from_sums(counts.astype(jnp.int32), mean, sums[0], sums[1])
         metrics = {
             **{name: getattr(info, name) for name in ("gradient_norm", "update_norm", "failed_pairs", "elite_std")},
-            **means(total),
+            **means(total, self.simulator.config.terms),
         }
         return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
 
@@ -156,11 +165,11 @@ def totals(result: RolloutResult) -> dict:
     }
 
 
-def means(total: dict) -> dict:
-    """Metrics of finite episodes (scalars) from ``totals``; the reward terms are unweighted."""
+def means(total: dict, names: tuple[str, ...]) -> dict:
+    """Metrics of finite episodes (scalars) from ``totals``; the reward terms, by these names, are unweighted."""
     count = jnp.maximum(total["episodes"], 1.0)
     over = {k: total[k] / count for k in ("mean_return", "return_rate", "hit_rate", "steps")}
-    terms = {f"reward/{name}": total["terms"][i] / count for i, name in enumerate(rewards.TERMS)}
+    terms = {f"reward/{name}": total["terms"][i] / count for i, name in enumerate(names)}
     return {**over, "non_finite": total["non_finite"], **terms}
 
 
@@ -177,5 +186,6 @@ def trainer(experiment: Experiment) -> Trainer:
         config.optimiser.repeats,
         config.optimiser.common_random_numbers,
         config.optimiser.initial_scale,
-        build.later_weights(config.training),
+        build.later_weights(config.training, build.definitions(config, config.name)[0]),
+        experiment.network,
     )

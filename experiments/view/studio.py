@@ -19,10 +19,10 @@ from ballmodel import flight
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, where
 from experiments.view.film import RATE, Film, Series, next_landing, upsampled
-from mjx_tt.env import rewards
 from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes, TaskConfig
 from mjx_tt.env.outgoing_ball import fly_out
-from mjx_tt.env.policy import Policy, PolicyController
+from mjx_tt.env.policy import NetworkController, Policy, PolicyController
+from mjx_tt.env.policy import controller as controller_of
 from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.sim import model as models
@@ -100,7 +100,7 @@ class Draws:
 class Watched:
     """The policy, remembering its last input and output."""
 
-    policy: PolicyController
+    policy: PolicyController | NetworkController
 
     @property
     def mean(self) -> Array:
@@ -178,7 +178,7 @@ class Studio:
     def _play(self, policy: Policy, episodes: Episodes) -> dict[str, Array]:
         """The episodes tick by tick (max_steps, ..., L), then balls that are over flying on alone, and the result."""
         task, config = self.simulator.task, self.simulator.config
-        controller = Watched(PolicyController.of(policy))
+        controller = Watched(controller_of(policy))
         prepared, start = task.prepare(episodes), task.reset(episodes, controller)
         alone = replace(episodes.model.ball, flight=replace(episodes.model.ball.flight, integrator="midpoint"))
 
@@ -199,7 +199,7 @@ class Studio:
 
         (state, _), shown = jax.lax.scan(advance, (start, start.ball), jnp.arange(config.max_steps))
         back = fly_out(config, state.ball, state.hit & state.finite, episodes.model)
-        terms = reward_terms(state, back)
+        terms = reward_terms(state, back, self.simulator.config.own_terms)
         returned = state.hit & back.returned & state.finite
         outcome = jnp.where(returned, RETURNED, jnp.where(state.hit & state.finite, HIT, MISSED))
         return {**shown, "terms": terms, "outcome": outcome, "hit": state.hit, "landing": jnp.asarray(back.landing)}
@@ -241,6 +241,6 @@ class Studio:
             },
             terms={
                 name: (float(value), float(weight))
-                for name, value, weight in zip(rewards.TERMS, r["terms"], weights, strict=True)
+                for name, value, weight in zip(self.simulator.config.terms, r["terms"], weights, strict=True)
             },
         )

@@ -129,7 +129,7 @@ class TableTennis(Env):
         after = task.control_step(playing.tick, before, episodes, task.prepare(episodes), controller)
         done = ~after.live | (after.sums.steps >= task.config.max_steps)
         back = self._fly_out(after, done & after.hit & after.finite, episodes)
-        terms = reward_terms(after, back)
+        terms = reward_terms(after, back, task.config.own_terms)
         earned = sum(w * terms[i] for i, w in enumerate(task.config.reward_weights))
         finite = after.finite & jnp.isfinite(earned)
         reward = jnp.where(finite, earned - playing.earned, 0.0)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt32
 from ballmodel.flight import PaddlePose
 from ballmodel.state import BallState
 from mjx_tt.env import rewards
+from mjx_tt.env.own import Term
 from mjx_tt.sim.actuators import Drives, DriveState
 from mjx_tt.sim.latency import Delay
 from mjx_tt.sim.model import SimModel
@@ -36,7 +37,8 @@ class TaskConfig:
     max_steps: int = 200  # control steps, both phases together
     max_observation_latency: float = 0.1  # longer draws are cut: mean + 7 deviations of the ball's
     max_action_latency: float = 0.13
-    reward_weights: tuple[float, ...] = field(default=tuple(rewards.SIM_WEIGHTS.values()))
+    reward_weights: tuple[float, ...] = field(default=tuple(rewards.SIM_WEIGHTS.values()))  # of ``terms``
+    own_terms: tuple[Term, ...] = ()  # the user's, after the eleven
 
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:
@@ -48,8 +50,13 @@ class TaskConfig:
             )
         if self.max_steps < 1:
             raise ValueError(f"max_steps is {self.max_steps}, at least 1 is needed")
-        if len(self.reward_weights) != len(rewards.TERMS):
-            raise ValueError(f"reward_weights has {len(self.reward_weights)} numbers, the terms are {rewards.TERMS}")
+        if len(self.reward_weights) != len(self.terms):
+            raise ValueError(f"reward_weights has {len(self.reward_weights)} numbers, the terms are {self.terms}")
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of the reward terms: the eleven and the user's."""
+        return (*rewards.TERMS, *(term.name for term in self.own_terms))
 
     @property
     def substeps(self) -> int:
@@ -122,6 +129,7 @@ class Sums:
     peak_velocity: Float[Array, "8 *batch"]  # [m/s], [rad/s] highest commanded speed
     observation: Float[Array, "11 *batch"]  # sum of (x - shift)
     observation_sq: Float[Array, "11 *batch"]  # sum of (x - shift)^2
+    own: tuple[Float[Array, "*batch"], ...] = ()  # sums of the user's terms per control step
 
 
 @jax.tree_util.register_dataclass

@@ -13,7 +13,7 @@ from ballmodel import registry
 from ballmodel.distribution import BallDistribution
 from ballmodel.mixture import BallMixture
 from ballmodel.sampling import sample_pool
-from mjx_tt.env import rewards
+from mjx_tt.env import own
 from mjx_tt.env.brax import TableTennis, register_environment
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
@@ -32,7 +32,7 @@ OUTCOMES = {MISSED: "missed", HIT: "hit", RETURNED: "returned"}
 class PlayedEpisodes:
     """Results of n episodes: NumPy arrays with the episode as first axis, in the order of the balls' arrival.
 
-    terms          reward term by name, (n,) each, unweighted (``rewards.TERMS``)
+    terms          reward term by name, (n,) each, unweighted (``TaskConfig.terms``)
     returns        (n,) weighted sum; NaN where the episode was not finite
     outcome        (n,) "missed", "hit" (touched after the bounce, but not returned) or "returned"
     landing        (n, 2) [m] x, y where the outgoing ball came down to the table's height
@@ -74,7 +74,7 @@ class Rollout:
         result, order = self._evaluator.play(policy, key), self._evaluator.order
         start = np.concatenate([np.asarray(balls.state.position), np.asarray(balls.state.velocity)])
         return PlayedEpisodes(
-            terms=dict(zip(rewards.TERMS, result.terms, strict=True)),
+            terms=dict(zip(self.simulator.config.terms, result.terms, strict=True)),
             returns=np.asarray(result.returns),
             outcome=np.array([OUTCOMES[i] for i in sorted(OUTCOMES)])[result.outcome],
             landing=np.asarray(result.landing).T,
@@ -112,9 +112,12 @@ def make(
 def load_policy(path: str | os.PathLike) -> Policy:
     """The policy in an artefact's folder, or in a file written by ``Policy.save``, as float32.
 
+    Runs the Python that an artefact holds where its network is not the paper's.
     Raises ArtefactError, OSError or ValueError saying what is wrong with it.
     """
-    return artefact.load(Path(path)).policy.astype(np.float32) if os.path.isdir(path) else Policy.load(path)
+    if not os.path.isdir(path):
+        return Policy.load(path)
+    return own.simulated(artefact.load(Path(path)).policy, str(path)).astype(np.float32)
 
 
 def _distribution(balls: Balls) -> registry.Balls:

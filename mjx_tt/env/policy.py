@@ -11,9 +11,9 @@ layer is one vector loop over the batch.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import TypeAlias
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,9 @@ from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
 from mjx_tt.env.episode import Tick
+from mjx_tt.env.own import Network
 from mjx_tt.robot.scalar_algebra import materialise
-from robot_io.contract import DILATIONS, FILTERS, GATED, N_OBSERVATION
+from robot_io.contract import DILATIONS, GATED, N_JOINTS, n_parameters
 from robot_io.policy.pytree import Policy as Policy
 
 Parameters: TypeAlias = Mapping[str, Array]  # of ``Policy.parameters``
@@ -39,17 +40,9 @@ class PolicyState:
     layer2: Float[Array, "4 12 *batch"]
 
 
-def initial_theta(key: PRNGKeyArray, scale: float = 0.1) -> Float[Array, "976"]:
+def initial_theta(key: PRNGKeyArray, scale: float = 0.1, size: int = n_parameters()) -> Float[Array, " size"]:
     """Random parameters (976,), normal with standard deviation ``scale``; biases are drawn as well."""
-    return scale * jax.random.normal(key, (sum(_sizes()),))
-
-
-def _sizes() -> Iterator[int]:
-    inputs = N_OBSERVATION
-    for filters, gated in zip(FILTERS, GATED, strict=True):
-        outputs = filters * (2 if gated else 1)
-        yield 2 * inputs * outputs + outputs
-        inputs = filters
+    return scale * jax.random.normal(key, (size,))
 
 
 def _layer(layer: Layer, older: Float[Array, "inputs *batch"], newer: Float[Array, "inputs *batch"]) -> Array:
@@ -114,16 +107,65 @@ class PolicyController:
 
     @classmethod
     def of(cls, policy: Policy) -> PolicyController:
+        """Raises ValueError for a policy of another network than the paper's."""
+        if policy.network is not None:
+            raise ValueError(f"the policy's network is {policy.network.name!r}; here only the paper's is computed")
         return cls(policy.parameters, policy.mean, policy.inv_std)
 
     def start(self, observation: Float[Array, "11 *batch"]) -> PolicyState:
-        return start(self.parameters, self._normalised(observation))
+        return start(self.parameters, normalised(observation, self.mean, self.inv_std))
 
     def act(
         self, tick: Tick, state: PolicyState, observation: Float[Array, "11 *batch"]
     ) -> tuple[Float[Array, "8 *batch"], PolicyState]:
-        return stream(self.parameters, state, self._normalised(observation))
+        return stream(self.parameters, state, normalised(observation, self.mean, self.inv_std))
 
-    def _normalised(self, x: Array) -> Array:
-        column = self.mean.shape + (1,) * (x.ndim - self.mean.ndim)
-        return (x - self.mean.reshape(column)) * self.inv_std.reshape(column)
+
+def normalised(x: Float[Array, "11 *batch"], mean: Array, inv_std: Array) -> Float[Array, "11 *batch"]:
+    """Observations less their mean, over their deviation, both (11,) or (11, P)."""
+    column = mean.shape + (1,) * (x.ndim - mean.ndim)
+    return (x - mean.reshape(column)) * inv_std.reshape(column)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class NetworkController:
+    """A user's network as a ``task.Controller``: theta (size, P), its functions mapped over P and R repeats.
+
+    mean, inv_std: (11,), or (11, P) where every episode has parameters of its own (one repeat).
+    """
+
+    network: Network = field(metadata={"static": True})
+    theta: Float[Array, "size P"]
+    mean: Float[Array, "11 *#batch"]
+    inv_std: Float[Array, "11 *#batch"]
+
+    def start(self, observation: Float[Array, "11 *batch"]) -> Any:
+        def one(theta: Array, x: Array) -> Any:
+            return jax.tree.map(jnp.asarray, self.network.start(self.network.unflatten(theta), x))
+
+        return self._mapped(one, observation)
+
+    def act(
+        self, tick: Tick, state: Any, observation: Float[Array, "11 *batch"]
+    ) -> tuple[Float[Array, "8 *batch"], Any]:
+        def one(theta: Array, x: Array, state: Any) -> tuple[Array, Any]:
+            action, after = self.network.step(self.network.unflatten(theta), state, x)
+            return jnp.clip(jnp.asarray(action), -1.0, 1.0), jax.tree.map(jnp.asarray, after)
+
+        action, after = self._mapped(one, observation, state)
+        return action.reshape(N_JOINTS, *observation.shape[1:]), after
+
+    def _mapped(self, one: Callable, observation: Array, *state: Any) -> Any:
+        """The function of one policy and one episode for all of them; states have the axes (..., R, P)."""
+        x = normalised(observation, self.mean, self.inv_std)
+        x = x.reshape(x.shape[0], -1, self.theta.shape[-1])
+        repeats = jax.vmap(one, in_axes=(None, *[-1] * (1 + len(state))), out_axes=-1)
+        return jax.vmap(repeats, in_axes=-1, out_axes=-1)(self.theta, x, *state)
+
+
+def controller(policy: Policy) -> PolicyController | NetworkController:
+    """The controller that plays a policy's network, the paper's or a user's: theta (size, P), a normaliser as there."""
+    if policy.network is None:
+        return PolicyController.of(policy)
+    return NetworkController(policy.network, policy.theta, policy.mean, policy.inv_std)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ballmodel.flight import PaddlePose
+from ballmodel.state import BallState
 from mjx_tt.env import rewards
 from mjx_tt.env.episode import EpisodeState, Return, Sums
+from mjx_tt.env.own import ControlStep, PlayedBall, Term
 from mjx_tt.robot.clearance import Clearances
 from robot_io.contract import LIMITS, N_JOINTS
 
@@ -25,10 +27,14 @@ def accumulate(
     pose: PaddlePose,
     gaps: Clearances,
     closest: Float[Array, "*batch"],
+    own: tuple[Term, ...] = (),
+    ball: BallState | None = None,
+    bounced: Bool[Array, "*batch"] | None = None,
 ) -> Sums:
     """The sums after one more control period [s].
 
-    shift: value about which observations are summed; qpos, pose, gaps: of the robot at the period's end.
+    shift: value about which observations are summed; qpos, pose, gaps: of the robot at the period's end. own: the
+    user's terms, for which ball and bounced say how it flies then.
     """
     sums, alive = s.sums, s.live.astype(command.dtype)
 
@@ -58,11 +64,37 @@ def accumulate(
         peak_velocity=jnp.maximum(sums.peak_velocity, alive[None] * jnp.abs(command)),
         observation=sums.observation + alive[None] * centred,
         observation_sq=sums.observation_sq + alive[None] * centred * centred,
+        own=_own_sums(s, own, observation, command, command_acceleration, qpos, pose, gaps, ball, bounced),
     )
 
 
-def reward_terms(s: EpisodeState, back: Return) -> Float[Array, "11 *batch"]:
-    """The eleven unweighted terms in the order of ``rewards.TERMS``."""
+def _own_sums(
+    s: EpisodeState,
+    own: tuple[Term, ...],
+    observation: Array,
+    command: Array,
+    acceleration: Array,
+    qpos: Array,
+    pose: PaddlePose,
+    gaps: Clearances,
+    ball: BallState | None,
+    bounced: Array | None,
+) -> tuple[Array, ...]:
+    """The sums of the user's terms per control step, those of others untouched."""
+    if not any(term.per == "step" for term in own):
+        return s.sums.own
+    assert ball is not None and bounced is not None
+    position, velocity = jnp.asarray(ball.position), jnp.asarray(ball.velocity)
+    step = ControlStep(
+        observation, command, acceleration, qpos, pose, position, velocity, bounced, gaps.table, gaps.own
+    )
+    # What a term says of a ball that is over, perhaps no number, must not reach the sum.
+    values = [jnp.where(s.live, jnp.asarray(term.function(step)), 0.0) for term in own if term.per == "step"]
+    return tuple(before + value.astype(before.dtype) for before, value in zip(s.sums.own, values, strict=True))
+
+
+def reward_terms(s: EpisodeState, back: Return, own: tuple[Term, ...] = ()) -> Float[Array, "terms *batch"]:
+    """The eleven unweighted terms in the order of ``rewards.TERMS``, and the user's after them."""
     sums, steps = s.sums, jnp.maximum(s.sums.steps, 1.0)
     returned = back.returned & s.hit
     values = {
@@ -78,4 +110,13 @@ def reward_terms(s: EpisodeState, back: Return) -> Float[Array, "11 *batch"]:
         "paddle_height": -sums.low_paddle,
         "style": -sums.bad_style,
     }
-    return jnp.stack([values[name] for name in rewards.TERMS])
+    defined = []
+    if own:
+        sums_per_step = iter(sums.own)
+        ball = PlayedBall(
+            s.hit, back.crossed, returned, back.net_height, back.landing, sums.closest, sums.steps, sums.peak_velocity
+        )
+        for term in own:
+            number = next(sums_per_step) / steps if term.per == "step" else jnp.asarray(term.function(ball))
+            defined.append(jnp.broadcast_to(number.astype(steps.dtype), steps.shape))
+    return jnp.stack([*(values[name] for name in rewards.TERMS), *defined])

@@ -24,7 +24,7 @@ from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import BallPool
 from ballmodel.state import BallState, where
 from mjx_tt.env.outgoing_ball import fly_out, fly_out_step
-from mjx_tt.env.policy import PolicyController
+from mjx_tt.env.policy import controller
 from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, EpisodeState, Task, TaskConfig
 from mjx_tt.sim import model as models
@@ -43,7 +43,7 @@ CPU_BLOCK = 768  # episodes per block that keep the state inside a core's cache
 class RolloutResult:
     """Results of a batch of episodes."""
 
-    terms: Float[Array, "11 R P"]  # unweighted, order of rewards.TERMS
+    terms: Float[Array, "terms R P"]  # unweighted, order of TaskConfig.terms
     returns: Float[Array, "R P"]  # weighted sum; NaN where the episode was not finite
     outcome: Int[Array, "R P"]  # task.MISSED, HIT, RETURNED
     landing: Float[Array, "2 R P"]  # [m] where the outgoing ball came down to the table's height
@@ -159,7 +159,7 @@ class Simulator:
         columns = policy.theta.shape[-1]
         if columns != episodes.seed.shape[-1]:
             raise ValueError(f"theta has {columns} columns, the episodes {episodes.seed.shape[-1]}")
-        return self.play(PolicyController.of(policy), episodes)
+        return self.play(controller(policy), episodes)
 
     def play(self, controller: Controller, episodes: Episodes) -> RolloutResult:
         """Runs any controller on episodes (R, P), in blocks of whole rows."""
@@ -206,7 +206,7 @@ class Simulator:
         state = task.reset(episodes, controller)
         _, state = jax.lax.while_loop(running, advance, (jnp.int32(0), state))
         back = fly_out(config, state.ball, state.hit & state.finite, episodes.model)
-        terms = reward_terms(state, back)
+        terms = reward_terms(state, back, config.own_terms)
         weights = np.asarray(config.reward_weights, terms.dtype)
         returns = sum(w * terms[i] for i, w in enumerate(weights))
         finite = state.finite & jnp.isfinite(returns)
@@ -234,9 +234,9 @@ class Simulator:
         of ticks (R,) until the ball came down.
         """
         task = self.task
-        controller = PolicyController.of(replace(policy, theta=policy.theta[:, None]))
+        plays = controller(replace(policy, theta=policy.theta[:, None]))
         prepared = task.prepare(episodes)
-        state = task.reset(episodes, controller)
+        state = task.reset(episodes, plays)
         grounded = jnp.zeros_like(state.live)
         outcome = fly_out(self.config, state.ball, grounded, episodes.model)
         flight = replace(episodes.model.ball.flight, integrator="midpoint")
@@ -245,7 +245,7 @@ class Simulator:
         def advance(carry: tuple, tick: Array) -> tuple[tuple, tuple[Array, Array]]:
             state, ball, flying, outcome, length = carry
             shown = (state.qpos[..., 0], ball.position[..., 0])
-            new = task.control_step(tick, state, episodes, prepared, controller)
+            new = task.control_step(tick, state, episodes, prepared, plays)
             out, outcome, still = fly_out_step(self.config, params, ball, flying, outcome)
             ball = where(state.hit, out, new.ball)
             flying = still | (new.hit & ~state.hit)

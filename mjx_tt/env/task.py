@@ -145,6 +145,7 @@ class Task:
                 peak_velocity=zeros,
                 observation=full(0.0, N_OBSERVATION),
                 observation_sq=full(0.0, N_OBSERVATION),
+                own=tuple(zero for term in self.config.own_terms if term.per == "step"),
             ),
         )
 
@@ -170,7 +171,21 @@ class Task:
         command_acceleration = (command - s.command) / period
         carried = qpos if drive.output is None else drive.output
         gaps = materialise(self.clearance(materialise(self.kinematics.links(carried)), carried[0]))
-        sums = accumulate(s, period, seen, controller.mean, command, command_acceleration, carried, pose, gaps, closest)
+        sums = accumulate(
+            s,
+            period,
+            seen,
+            controller.mean,
+            command,
+            command_acceleration,
+            carried,
+            pose,
+            gaps,
+            closest,
+            self.config.own_terms,
+            ball,
+            bounced,
+        )
         ok = jnp.isfinite(sum(qpos[i] for i in range(N_JOINTS)) + sum(ball.position[i] for i in range(3)))
         return EpisodeState(
             qpos,

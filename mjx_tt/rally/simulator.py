@@ -25,7 +25,8 @@ from ballmodel.registry import Balls, box_of
 from ballmodel.state import BallState, where
 from mjx_tt.env import rewards
 from mjx_tt.env.outgoing_ball import fly_out
-from mjx_tt.env.policy import Policy, PolicyController
+from mjx_tt.env.policy import Policy
+from mjx_tt.env.policy import controller as controller_of
 from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Episodes, EpisodeState, Task, TaskConfig
 from mjx_tt.rally import ball_flights, human_player
@@ -275,7 +276,7 @@ class RallySimulator:
     ) -> EpisodeState:
         """The robot's part of one episode: its last state."""
         episodes = self._episodes(key, model, ball, start)
-        task, controller = self.task, PolicyController.of(policy)
+        task, controller = self.task, controller_of(policy)
         prepared = task.prepare(episodes)
 
         def running(carry: tuple[Array, EpisodeState]) -> Array:

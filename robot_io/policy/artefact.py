@@ -11,13 +11,17 @@ import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from robot_io import contract
 from robot_io.policy.numpy_policy import StreamingPolicy
+from robot_io.policy.own_network import ExportedNetwork
 from robot_io.policy.policy import Policy
+
+if TYPE_CHECKING:
+    from robot_io.policy.jax_network import ExportedPolicy
 
 SCHEMA_VERSION = 1
 NORMALISER_FORMULA = "(observation - mean) * inverse_scale"
@@ -29,9 +33,14 @@ PARAMETERS = "params.npz"
 GOLDEN = "golden.npz"
 ONNX = "policy.onnx"
 JAX_EXPORT = "policy.jaxexport"
+NETWORK = "network.py"  # of a user's own network: the file that defines it, which the robot does not run
 HASHED_FILES = (PARAMETERS, GOLDEN, ONNX, JAX_EXPORT)  # by the manifest, which has a digest of its own
 FILES = (MANIFEST, MANIFEST_DIGEST, *HASHED_FILES)
+OWN_HASHED_FILES = (PARAMETERS, GOLDEN, NETWORK, JAX_EXPORT)  # where the network is a user's own
+OWN_FILES = (MANIFEST, MANIFEST_DIGEST, *OWN_HASHED_FILES)
+OWN_TOLERANCE = 1e-5  # of the exported step in float32 on another machine
 
+OWN_ARCHITECTURE = ("network", "parameters", "n_parameters", "step")  # keys that describe a user's own network
 MANIFEST_KEYS = (
     "schema_version",
     "contract",
@@ -58,9 +67,9 @@ class Artefact:
     folder          where it was loaded from
     digest          SHA-256 of manifest.json: identifies the policy and everything about it
     manifest        the manifest as plain data
-    policy          theta float32, normaliser float64
-    golden_history  (8, 11, G) float32
-    golden_action   (8, G) float64: the reference's answer to ``golden_history``
+    policy          theta float32, normaliser float64; its ``network`` is None for the paper's
+    golden_history  (8, 11, G) float32; of a user's own network one episode's observations (G, 11)
+    golden_action   (8, G) float64: the reference's answer to ``golden_history``; (G, 8) of a user's own network
     """
 
     folder: Path
@@ -70,9 +79,13 @@ class Artefact:
     golden_history: np.ndarray
     golden_action: np.ndarray
 
-    def streaming(self) -> StreamingPolicy:
+    def streaming(self) -> StreamingPolicy | ExportedPolicy:
         """The policy for the control loop, at the start of an episode."""
-        return StreamingPolicy(self.policy)
+        if self.policy.network is None:
+            return StreamingPolicy(self.policy)
+        from robot_io.policy.jax_network import ExportedPolicy  # imports JAX
+
+        return ExportedPolicy(self.policy)
 
 
 def load(folder: str | Path) -> Artefact:
@@ -83,15 +96,15 @@ def load(folder: str | Path) -> Artefact:
     folder = Path(folder)
     contents = _read_files(folder)
     manifest = _verified_manifest(folder, contents)
-    for name in HASHED_FILES:
+    for name in contents:
+        if name in (MANIFEST, MANIFEST_DIGEST):
+            continue
         found, expected = sha256(contents[name]), manifest["files"].get(name)
         if found != expected:
             raise ArtefactError(f"{folder / name}: SHA-256 is {found}, the manifest says {expected}; {_RECOPY}")
-    parameters = _arrays(
-        folder / PARAMETERS,
-        contents[PARAMETERS],
-        {name: (shape, "float32") for name, shape in contract.parameter_shapes().items()},
-    )
+    if NETWORK in contents:
+        return _own(folder, contents, manifest)
+    parameters = _parameters(folder, contents, contract.parameter_shapes())
     golden_count = manifest["golden"].get("count")
     golden = _arrays(
         folder / GOLDEN,
@@ -106,9 +119,7 @@ def load(folder: str | Path) -> Artefact:
         folder=folder,
         digest=sha256(contents[MANIFEST]),
         manifest=manifest,
-        policy=Policy(
-            np.concatenate([parameters[name].ravel() for name in contract.parameter_shapes()]), mean, inv_std
-        ),
+        policy=Policy(parameters, mean, inv_std),
         golden_history=golden["history"],
         golden_action=golden["action"],
     )
@@ -122,6 +133,46 @@ def load(folder: str | Path) -> Artefact:
 
 
 load_artefact = load  # its name in ``robot_io``
+
+
+def _own(folder: Path, contents: dict[str, bytes], manifest: dict[str, Any]) -> Artefact:
+    """The artefact of a user's own network. Raises ArtefactError."""
+    described = manifest["architecture"]
+    shapes = {name: tuple(shape) for name, shape in described["parameters"].items()}
+    network = ExportedNetwork(
+        described["network"], tuple(shapes.items()), contents[JAX_EXPORT], contents[NETWORK].decode()
+    )
+    count = manifest["golden"].get("count")
+    wanted: dict[str, tuple[tuple[int, ...], str]] = {
+        "observation": ((count, contract.N_OBSERVATION), "float32"),
+        "action": ((count, contract.N_JOINTS), "float64"),
+    }
+    golden = _arrays(folder / GOLDEN, contents[GOLDEN], wanted)
+    mean, inv_std = _normaliser(folder / MANIFEST, manifest["normaliser"])
+    policy = Policy(_parameters(folder, contents, shapes), mean, inv_std, network)
+    try:
+        from robot_io.policy.jax_network import ExportedPolicy
+
+        action = ExportedPolicy(policy).episode(golden["observation"])
+    except Exception as error:  # JAX absent, or of a version that reads the export no more
+        raise ArtefactError(
+            f"{folder / JAX_EXPORT}: the network {network.name!r} cannot be run here ({type(error).__name__}: "
+            f"{error}); it takes a JAX at most six months from {manifest['written_with']}; {_REEXPORT}"
+        ) from error
+    difference = float(np.max(np.abs(action - golden["action"])))
+    if not difference <= OWN_TOLERANCE:
+        raise ArtefactError(
+            f"{folder / GOLDEN}: this machine's policy differs from the golden outputs by {difference:.3g}, allowed is "
+            f"{OWN_TOLERANCE:g}; do not run it: JAX changed since the export, so {_REEXPORT}"
+        )
+    return Artefact(folder, sha256(contents[MANIFEST]), manifest, policy, golden["observation"], golden["action"])
+
+
+def _parameters(folder: Path, contents: dict[str, bytes], shapes: dict[str, tuple[int, ...]]) -> np.ndarray:
+    """theta from params.npz. Raises ArtefactError."""
+    wanted = {name: (shape, "float32") for name, shape in shapes.items()}
+    arrays = _arrays(folder / PARAMETERS, contents[PARAMETERS], wanted)
+    return np.concatenate([arrays[name].ravel() for name in shapes])
 
 
 def sha256(content: bytes) -> str:
@@ -173,14 +224,15 @@ def _read_files(folder: Path) -> dict[str, bytes]:
     if not folder.is_dir():
         raise ArtefactError(f"{folder}: no such folder; an artefact is a folder holding {', '.join(FILES)}")
     present = {entry.name for entry in folder.iterdir()}
-    missing, extra = sorted(set(FILES) - present), sorted(present - set(FILES))
+    files = OWN_FILES if NETWORK in present else FILES
+    missing, extra = sorted(set(files) - present), sorted(present - set(files))
     if missing:
-        raise ArtefactError(f"{folder}: {', '.join(missing)} missing, an artefact holds {', '.join(FILES)}; {_RECOPY}")
+        raise ArtefactError(f"{folder}: {', '.join(missing)} missing, an artefact holds {', '.join(files)}; {_RECOPY}")
     if extra:
         raise ArtefactError(f"{folder}: holds {', '.join(extra)}, which no artefact does; remove it or {_RECOPY}")
     try:
         # Read once: what is hashed is what is used.
-        return {name: (folder / name).read_bytes() for name in FILES}
+        return {name: (folder / name).read_bytes() for name in files}
     except OSError as error:
         raise ArtefactError(f"{error.filename}: cannot be read ({error.strerror}); {_RECOPY}") from error
 
@@ -202,7 +254,13 @@ def _verified_manifest(folder: Path, contents: dict[str, bytes]) -> dict[str, An
     for key in ("normaliser", "golden", "files"):
         if not isinstance(manifest[key], dict):
             raise ArtefactError(f"{path}: {key}: found {manifest[key]!r}, expected an object; {_REEXPORT}")
-    for key, expected in (("contract", contract.describe()), ("architecture", architecture())):
+    expectations = [("contract", contract.describe()), ("architecture", architecture())]
+    if NETWORK in contents:
+        described = manifest["architecture"]
+        if not isinstance(described, dict) or set(described) != set(OWN_ARCHITECTURE):
+            raise ArtefactError(f"{path}: architecture: found {described!r}, expected {OWN_ARCHITECTURE}; {_REEXPORT}")
+        expectations.pop()
+    for key, expected in expectations:
         lines = differences(manifest[key], json.loads(json.dumps(expected)), key)
         if lines:
             raise ArtefactError(f"{path}: made for another robot interface: {'; '.join(lines)}; {_REEXPORT}")

@@ -12,14 +12,21 @@ from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.policy.policy import Policy
 
 if TYPE_CHECKING:
+    from robot_io.policy.jax_network import ExportedPolicy
     from robot_io.policy.jax_policy import JitPolicy
 
 TRIALS = 300  # steps of each that are timed, after as many that are not
 SLOWER = 0.2e-3  # [s] by which nine of ten of JAX's steps may take longer than NumPy's: 1.5 % of a control period
 
 
-def make_policy(backend: str, policy: Policy) -> StreamingPolicy | JitPolicy:
+def make_policy(backend: str, policy: Policy) -> StreamingPolicy | JitPolicy | ExportedPolicy:
     """A policy for the loop, by "numpy" or "jit". Raises ValueError for another backend."""
+    if policy.network is not None:
+        if backend != "jit":
+            raise ValueError(f"policy backend {backend!r}: the network {policy.network.name!r} is computed by jit only")
+        from robot_io.policy.jax_network import ExportedPolicy  # imports JAX
+
+        return ExportedPolicy(policy)
     if backend == "numpy":
         return StreamingPolicy(policy)
     if backend == "jit":
@@ -34,6 +41,8 @@ def choose(backend: str, policy: Policy) -> tuple[str, str]:
 
     "auto" takes JAX unless it cannot be used here or is slower (``SLOWER``). Takes some seconds for JAX to start.
     """
+    if backend == "auto" and policy.network is not None:
+        return "jit", f"policy compiled by JAX: its network is {policy.network.name!r}"
     if backend != "auto":
         return backend, f"policy computed by {backend}, as chosen"
     try:
@@ -47,7 +56,7 @@ def choose(backend: str, policy: Policy) -> tuple[str, str]:
     return "jit", f"policy compiled by JAX ({times})"
 
 
-def _slow_step(policy: StreamingPolicy | JitPolicy) -> float:
+def _slow_step(policy: StreamingPolicy | JitPolicy | ExportedPolicy) -> float:
     """Time [s] within which 90 % of the steps are done; what is slower is the machine's load."""
     observations = np.random.default_rng(0).normal(0.0, 0.5, (2 * TRIALS, contract.N_OBSERVATION))
     seconds = []

@@ -27,7 +27,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from robot_io import contract
 from robot_io.policy import artefact as artefacts
+from robot_io.policy import jax_network
 from robot_io.policy.artefact import ArtefactError
+from robot_io.policy.jax_network import ExportedPolicy
 from robot_io.policy.policy import forward
 from robot_io.policy.pytree import Policy
 
@@ -55,12 +57,14 @@ def write(
     """
     folder = Path(folder).resolve()
     _check_target(folder, overwrite)
+    given, network = policy.network, None if policy.network is None else jax_network.exported(policy.network)
     policy = Policy(
-        _finite(policy.theta, "theta", (contract.n_parameters(),)),
+        _finite(policy.theta, "theta", (contract.n_parameters() if network is None else network.size,)),
         _finite(policy.mean, "mean", (contract.N_OBSERVATION,)),
         _finite(policy.inv_std, "inv_std", (contract.N_OBSERVATION,)),
+        network,
     )
-    contents = _contents(policy, provenance)
+    contents = _contents(policy, provenance, given)
 
     folder.parent.mkdir(parents=True, exist_ok=True)
     staging = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}")
@@ -85,6 +89,8 @@ def verify(folder: str | Path, histories: int = 1000, seed: int = 0) -> dict[str
     form against the NumPy reference)}. Raises ArtefactError when the artefact does not load or its forms disagree.
     """
     artefact = artefacts.load(folder)
+    if artefact.policy.network is not None:
+        return _verify_own(artefact, histories, seed)
     history = random_histories(artefact.policy, histories, seed)
     session = onnxruntime.InferenceSession(
         (artefact.folder / artefacts.ONNX).read_bytes(), providers=["CPUExecutionProvider"]
@@ -114,6 +120,29 @@ def verify(folder: str | Path, histories: int = 1000, seed: int = 0) -> dict[str
             f"reference: {from_reference}), allowed is {AGREEMENT:g}; do not run it, export the policy again"
         )
     return report
+
+
+def _verify_own(artefact: artefacts.Artefact, ticks: int, seed: int) -> dict[str, Any]:
+    """The exported step of a user's network against itself from another start: it must remember nothing of before.
+
+    Its other form, the user's Python, is not run here; ``golden.npz`` is what this wrote.
+    """
+    runner = ExportedPolicy(artefact.policy)
+    episode = random_histories(artefact.policy, ticks, seed)[0].T
+    first, again = runner.episode(episode), runner.episode(episode)
+    difference = float(np.max(np.abs(first - again)))
+    if difference > 0.0 or not np.isfinite(first).all():
+        raise ArtefactError(
+            f"{artefact.folder}: the network {artefact.policy.network.name!r} answers the same episode differently the "
+            f"second time, by {difference:.3g}, or with numbers that are not finite; do not run it"
+        )
+    return {
+        "digest": artefact.digest,
+        "histories": ticks,
+        "tolerance": artefacts.OWN_TOLERANCE,
+        "largest_difference": difference,
+        "from_reference": {"jax_export": difference},
+    }
 
 
 def _forward(policy: Policy, history: jax.Array) -> jax.Array:
@@ -189,25 +218,44 @@ def jax_export(policy: Policy) -> bytes:
     return bytes(exported.serialize())
 
 
-def _contents(policy: Policy, provenance: dict[str, Any]) -> dict[str, bytes]:
+def _contents(policy: Policy, provenance: dict[str, Any], given: Any) -> dict[str, bytes]:
+    """Files of the artefact by name. given: the user's own network as it was before its export, or None."""
     history = random_histories(policy, GOLDEN_COUNT, seed=1)
-    action = policy.apply(history)
-    contents = {
-        artefacts.PARAMETERS: _npz(policy.parameters),
-        artefacts.GOLDEN: _npz({"history": history, "action": action}),
-        artefacts.ONNX: onnx_model(policy).SerializeToString(),
-        artefacts.JAX_EXPORT: jax_export(policy),
-    }
+    if policy.network is None:
+        action = policy.apply(history)
+        contents = {
+            artefacts.PARAMETERS: _npz(policy.parameters),
+            artefacts.GOLDEN: _npz({"history": history, "action": action}),
+            artefacts.ONNX: onnx_model(policy).SerializeToString(),
+            artefacts.JAX_EXPORT: jax_export(policy),
+        }
+        architecture, tolerance = artefacts.architecture(), artefacts.GOLDEN_TOLERANCE
+    else:
+        network, episode = policy.network, np.ascontiguousarray(history[0].T)
+        action = jax_network.reference(given, policy, episode).astype(np.float64)
+        contents = {
+            artefacts.PARAMETERS: _npz(network.unflatten(policy.theta)),
+            artefacts.GOLDEN: _npz({"observation": episode, "action": action}),
+            artefacts.NETWORK: network.source.encode(),
+            artefacts.JAX_EXPORT: network.exported,
+        }
+        architecture = {
+            "network": network.name,
+            "parameters": {name: list(shape) for name, shape in network.shapes},
+            "n_parameters": network.size,
+            "step": f"{artefacts.JAX_EXPORT}: theta, mean, inverse_scale, first, state, observation -> action, state",
+        }
+        tolerance = artefacts.OWN_TOLERANCE
     manifest = {
         "schema_version": artefacts.SCHEMA_VERSION,
         "contract": contract.describe(),
-        "architecture": artefacts.architecture(),
+        "architecture": architecture,
         "normaliser": {
             "formula": artefacts.NORMALISER_FORMULA,
             "mean": [float(v) for v in policy.mean],
             "inverse_scale": [float(v) for v in policy.inv_std],
         },
-        "golden": {"file": artefacts.GOLDEN, "count": GOLDEN_COUNT, "tolerance": artefacts.GOLDEN_TOLERANCE},
+        "golden": {"file": artefacts.GOLDEN, "count": GOLDEN_COUNT, "tolerance": tolerance},
         "files": {name: artefacts.sha256(content) for name, content in contents.items()},
         "provenance": provenance,
         "written_with": {
@@ -252,7 +300,7 @@ def _check_target(folder: Path, overwrite: bool) -> None:
         raise ArtefactError(f"{folder}: already exists; choose another name or overwrite it explicitly")
     if not folder.is_dir():
         raise ArtefactError(f"{folder}: is a file, an artefact is a folder; choose another name")
-    foreign = sorted({entry.name for entry in folder.iterdir()} - set(artefacts.FILES))
+    foreign = sorted({entry.name for entry in folder.iterdir()} - {*artefacts.FILES, *artefacts.OWN_FILES})
     if foreign:
         raise ArtefactError(
             f"{folder}: holds {', '.join(foreign)}, which no artefact does; not overwritten, choose another name"

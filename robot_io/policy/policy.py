@@ -29,11 +29,13 @@ class Policy:
     theta    (976,) or (976, P) parameters in the order of ``contract.parameter_shapes``
     mean     (11,) or (11, P) in the observation's units
     inv_std  (11,) or (11, P) reciprocal standard deviations; 0 for a component that never varied
+    network  what theta parameterises where it is not this network: then only what knows such networks computes it
     """
 
     theta: Any
     mean: Any
     inv_std: Any
+    network: Any = None
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Policy:
@@ -59,7 +61,8 @@ class Policy:
 
     def astype(self, dtype: type) -> Policy:
         """The policy with NumPy arrays of that type."""
-        return Policy(*(np.asarray(array, dtype) for array in (self.theta, self.mean, self.inv_std)))
+        arrays: list[np.ndarray] = [np.asarray(array, dtype) for array in (self.theta, self.mean, self.inv_std)]
+        return Policy(arrays[0], arrays[1], arrays[2], self.network)
 
     def apply(self, history: np.ndarray) -> np.ndarray:
         """Action (8,) in [-1, 1] for a history (8, 11), oldest observation first; or (8, B) for (8, 11, B).

@@ -6,4 +6,4 @@ import jax
 
 from robot_io.policy.policy import Policy as Policy
 
-jax.tree_util.register_dataclass(Policy, data_fields=["theta", "mean", "inv_std"], meta_fields=[])
+jax.tree_util.register_dataclass(Policy, data_fields=["theta", "mean", "inv_std"], meta_fields=["network"])

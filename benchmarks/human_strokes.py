@@ -1,0 +1,107 @@
+"""Policies on people's measured strokes, spin included: ``python -m benchmarks.human_strokes STATES --out FOLDER``.
+
+STATES is DeepMind's rallies.json (D'Ambrosio et al. 2025, CC-BY-4.0), read where it lies. The first call fits a box and
+a mixture to three quarters of the strokes (all but 1,500) and writes their YAMLs with the model whose lift the authors
+estimated the spins by; ``mjx-tt train`` takes them. A call with ``--policies RUN...`` throws the strokes that were held
+out, each once, with the spin it had, and ``--reachable N`` seeks motions for N of them ball by ball.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ballmodel.distribution import save_distribution
+from ballmodel.fit_distribution import fit_human
+from ballmodel.io import read
+from ballmodel.io.deepmind import MeasuredStates
+from ballmodel.mixture import fit_mixture, save_mixture, start_states
+from ballmodel.sampling import KEPT, ROBOT_SIDE, BallPool, throw
+from ballmodel.state import BallState
+from experiments.evaluation.evaluate import return_rate
+from experiments.runs import load_policy
+from experiments.stats import wilson
+from mjx_tt import platform
+from mjx_tt.env import reachability
+from mjx_tt.env.evaluator import Evaluator
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import TaskConfig
+from mjx_tt.sim.model import ModelFile, SimModel
+
+HELD_OUT = 1500
+LIFT = 1.33  # Magnus coefficient by which the authors estimated the spins (ballmodel data's README)
+SIM_RATE = 300.0  # Hz
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Fits, or plays and prints; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("states", type=Path)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the fitted distributions")
+    parser.add_argument("--policies", nargs="+", default=[], help="runs or artefacts")
+    parser.add_argument("--reachable", type=int, default=0, metavar="N", help="seek motions for N of the strokes")
+    parser.add_argument("--seed", type=int, default=0, help="of the strokes that are held out")
+    chosen = parser.parse_args(arguments)
+    platform.configure()
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    world = chosen.out / "lift.yaml"
+    world.write_text(f"ball: {{flight: {{magnus_coefficient: {LIFT}}}}}\n")
+    model = ModelFile.load(world).model
+    _, report = fit_human(read(chosen.states), model.ball)
+    rows = start_states(report.landed)
+    order = np.random.default_rng(chosen.seed).permutation(len(rows))
+    held, known = rows[order[:HELD_OUT]], rows[order[HELD_OUT:]]
+    if not chosen.policies and not chosen.reachable:
+        fit(known, chosen.out, model)
+        return 0
+    simulator = Simulator(TaskConfig(sim_rate=SIM_RATE), jax.local_device_count())
+    balls = pool(held, model)
+    count = balls.arrival.size
+    print(
+        f"{len(held):,} held-out strokes that land; {len(held) - count} of them would bounce twice and are not thrown"
+    )
+    key = jax.random.key(chosen.seed)
+    policy = None
+    for path in chosen.policies:
+        policy = load_policy.load(path).policy
+        rate = return_rate(Evaluator(simulator, balls, model, ()).play(policy, key))
+        print(f"{path}: {rate.value:.1%} ({rate.low:.1%} to {rate.high:.1%}) of {count:,} strokes returned")
+    if chosen.reachable:
+        found = reachability.reachable(simulator, balls, model, key, chosen.reachable, policy)
+        low, high = wilson(found.returned, found.balls)
+        print(f"in reach, at least: {found.rate:.1%} ({low:.1%} to {high:.1%}) of {found.balls}")
+    return 0
+
+
+def fit(known: np.ndarray, out: Path, model: SimModel) -> None:
+    """Writes box.yaml and mixture.yaml of strokes (n, 9)."""
+    state = BallState(known[:, :3].T, known[:, 3:6].T, known[:, 6:].T)
+    strokes = MeasuredStates(np.arange(len(known)), state, f"{len(known):,} measured strokes")
+    box, _ = fit_human(strokes, model.ball, name="box")
+    save_distribution(out / "box.yaml", box)
+    mixture, choice = fit_mixture(state, "mixture", strokes.source)
+    save_mixture(out / "mixture.yaml", mixture)
+    print(f"{out}: lift.yaml, box.yaml and mixture.yaml ({choice.chosen} components) of {len(known):,} strokes")
+
+
+def as_state(rows: np.ndarray) -> BallState:
+    """Start states (n, 9) as the simulator takes them, (3, n) each."""
+    return BallState(*(jnp.asarray(rows[:, i : i + 3].T, jnp.float32) for i in (0, 3, 6)))
+
+
+def pool(rows: np.ndarray, model: SimModel) -> BallPool:
+    """Those of the strokes (n, 9) as balls to be thrown that bounce once before they pass the robot."""
+    state = as_state(rows)
+    thrown = throw(model.ball, state, *ROBOT_SIDE)
+    kept = np.asarray(thrown.outcome) == KEPT
+    state, thrown = jax.tree.map(lambda a: a[..., kept] if a.ndim else a, (state, thrown))
+    return BallPool(state, thrown.arrival, thrown.landing, jnp.ones(()), jnp.ones(1))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

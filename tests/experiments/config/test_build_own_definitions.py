@@ -1,0 +1,159 @@
+"""The page "Define your own rewards and network", followed as it stands, to the robot's policy and back."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from experiments import cli
+from experiments.config import build
+from experiments.config import experiment as config
+from experiments.errors import ConfigError
+from experiments.runs import load_policy
+from robot_io.policy import artefact, export
+from robot_io.policy.artefact import ArtefactError
+from robot_io.policy.backends import choose, make_policy
+from tests.support.paths import ROOT
+
+PAGE = (ROOT / "docs" / "how-to" / "define-a-task.md").read_text(encoding="utf-8")
+SMALL = {
+    "task.sim_rate": 75,
+    "task.max_steps": 90,
+    "optimiser.num_directions": 4,
+    "optimiser.repeats": 2,
+    "training.updates": 3,
+    "training.pool": 256,
+    "training.evaluate_every": "null",
+    "training.devices": 1,
+    "evaluation.episodes": 16,
+    "evaluation.reachable_balls": "null",
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The page's two files."""
+    place = tmp_path_factory.mktemp("mine")
+    for language, name in (("python", "my_task.py"), ("yaml", "my_task.yaml")):
+        (place / name).write_text(re.search(rf"```{language}\n(.*?)```", PAGE, re.S).group(1))
+    return place
+
+
+@pytest.fixture(scope="module")
+def trained(folder):
+    """The folder after a short training as they describe it."""
+    sets = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
+    assert cli.main(["train", str(folder / "my_task.yaml"), "--out", str(folder / "runs"), *sets]) == 0
+    return folder
+
+
+@pytest.mark.slow
+def test_its_terms_are_measured_and_weigh(trained):
+    rows = [json.loads(line) for line in (trained / "runs/mine/metrics.jsonl").read_text().splitlines()]
+    assert len(rows) == 3 and all(row["reward/calm_wrist"] < 0.0 <= row["reward/deep"] for row in rows)
+    report = json.loads((trained / "runs/mine/evaluation.json").read_text())
+    assert list(report["terms"])[-2:] == ["calm_wrist", "deep"]
+    experiment = build.experiment(config.load(trained / "my_task.yaml"), "my_task.yaml")
+    assert experiment.task.reward_weights[-2:] == (0.2, 0.5)
+    own = build.definitions(experiment.config, "")[0]
+    assert build.later_weights(experiment.config.training, own)[1][-2:] == (0.0, 2.0)
+
+
+@pytest.mark.slow
+def test_the_run_stands_alone(trained):
+    """Its configuration holds the file's content, and the same text is the same network to the compiler."""
+    saved = load_policy.load(trained / "runs/mine")
+    assert saved.config.definitions == (trained / "my_task.py").read_text()
+    assert saved.policy.theta.shape == (968,) and saved.policy.network.size == 968
+    assert load_policy.load(trained / "runs/mine").policy.network is saved.policy.network
+
+
+def gru_by_hand(p, observations, mean, inv_std):
+    """The page's network in NumPy and float64: actions (T, 8) of one episode."""
+    h, actions = np.zeros(12), []
+    for x in (observations - mean) * inv_std:
+        a, b = p["w"] @ x + p["b"], p["u"] @ h
+        z, r = np.split(1.0 / (1.0 + np.exp(-(a[:24] + b[:24]))), 2)
+        h = z * h + (1.0 - z) * np.tanh(a[24:] + r * b[24:])
+        actions.append(np.tanh(p["out"] @ h + p["bias"]))
+    return np.array(actions)
+
+
+@pytest.mark.slow
+def test_the_robots_policy_is_the_network_by_hand(trained):
+    loaded = artefact.load(trained / "runs/mine/artefact")
+    observations = np.random.default_rng(2).normal(0.0, 1.0, (150, 11))
+    arrays = np.load(trained / "runs/mine/artefact/params.npz")
+    wanted = gru_by_hand(arrays, observations, loaded.policy.mean, loaded.policy.inv_std)
+    backend, said = choose("auto", loaded.policy)
+    policy = make_policy(backend, loaded.policy)
+    np.testing.assert_allclose(policy.episode(observations), wanted, atol=1e-5)
+    assert backend == "jit" and "'gru'" in said
+    np.testing.assert_allclose(loaded.streaming().step(observations[0]), wanted[0], atol=1e-5)
+    policy.reset()  # forgets the episode
+    np.testing.assert_allclose(policy.step(observations[0]), wanted[0], atol=1e-5)
+    with pytest.raises(ValueError, match="finite"):
+        policy.step(np.full(11, np.nan))
+    with pytest.raises(ValueError, match="'gru' is computed by jit only"):
+        make_policy("numpy", loaded.policy)
+    # What fine-tuning writes has the exported form only; it is the same policy.
+    export.write(trained / "again", loaded.policy, {})
+    np.testing.assert_array_equal(artefact.load(trained / "again").golden_action.shape, (64, 8))
+
+
+@pytest.mark.slow
+def test_the_artefact_plays_in_the_simulator(trained):
+    places = ["runs/mine", "runs/mine/artefact"]
+    for place in places:
+        arguments = ["evaluate", str(trained / place), "--episodes", "16", "--no-reachable", "--devices", "1"]
+        assert cli.main([*arguments, "--out", str(trained / "evaluated" / place)]) == 0
+    reports = [json.loads((trained / "evaluated" / place / "evaluation.json").read_text()) for place in places]
+    assert reports[0]["terms"] == pytest.approx(reports[1]["terms"], abs=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["network.py", "policy.jaxexport", "golden.npz"])
+def test_a_damaged_artefact_is_refused(trained, tmp_path, name):
+    copy = tmp_path / "artefact"
+    copy.mkdir()
+    for file in (trained / "runs/mine/artefact").iterdir():
+        content = bytearray(file.read_bytes())
+        if file.name == name:
+            content[len(content) // 2] ^= 1
+        (copy / file.name).write_bytes(bytes(content))
+    with pytest.raises(ArtefactError, match=f"{name}: SHA-256"):
+        artefact.load(copy)
+
+
+@pytest.mark.slow
+def test_code_is_not_packed(trained, capsys):
+    assert cli.main(["pack", str(trained / "runs/mine"), "--out", str(trained / "mine.zip")]) == 1
+    assert "Python of its own" in capsys.readouterr().err and not (trained / "mine.zip").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"network": "cnn"}, "network: cnn is not defined; allowed: gru"),
+        ({"definitions": "other.py"}, "definitions: .*other.py: cannot be read"),
+        ({"definitions": "my_task.txt"}, "a Python file is wanted"),
+        ({"task.rewards": "{own: {calm: 1}}"}, "task: rewards.own: calm is not defined; allowed: calm_wrist, deep"),
+        ({"training.later_rewards.rewards": "{own: {x: 1}}"}, "later_rewards: rewards.own: x is not defined"),
+        ({"definitions": "null"}, "rewards.own: deep is not defined; allowed: none is defined; name a file"),
+    ],
+)
+def test_mistakes_in_the_yaml_are_named(folder, changes, says):
+    overrides = tuple(f"{key}={value}" for key, value in changes.items())
+    with pytest.raises(ConfigError, match=says):
+        build.experiment(config.load(folder / "my_task.yaml", overrides), "my_task.yaml")
+
+
+def test_another_networks_policy_is_no_start(folder, capsys):
+    shipped = ROOT / "experiments/shipped/policies/quickstart"
+    sets = [part for key, value in SMALL.items() for part in ("--set", f"{key}={value}")]
+    arguments = ["train", str(folder / "my_task.yaml"), "--out", str(folder / "other"), *sets]
+    assert cli.main([*arguments, "--set", f"initial_policy={shipped}"]) == 1
+    assert "the first policy has 976 parameters, the network has 968" in capsys.readouterr().out

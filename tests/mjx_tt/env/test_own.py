@@ -1,0 +1,174 @@
+"""A user's reward terms against the package's own, the paper's network as a user would write it, and mistakes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from mjx_tt.env import make, own, rewards
+from mjx_tt.env.policy import Policy, initial_theta
+from mjx_tt.env.task import TaskConfig
+from robot_io import contract
+
+TERMS = """
+import jax.numpy as jnp
+from mjx_tt.env.own import reward_term
+from robot_io.contract import LIMITS
+
+@reward_term("slow")
+def slow(step):  # the package's term "velocity", written by hand
+    limit = jnp.array(LIMITS.velocity).reshape((8,) + (1,) * (step.command.ndim - 1))
+    return 1.0 - jnp.minimum(jnp.abs(step.command) / limit, 1.0).mean(axis=0)
+
+@reward_term("clear_of_the_table")
+def clear(step):
+    return -((step.table_gap <= 0.0) | (step.own_gap <= 0.0)).astype(float)
+
+@reward_term("near", per="ball")
+def near(ball):
+    return ball.closest
+
+@reward_term("seconds", per="ball")
+def seconds(ball):
+    return ball.steps / 75.0
+
+@reward_term("always", per="ball")
+def always(ball):
+    return 2.0
+"""
+NETWORKS = '''
+import jax.numpy as jnp
+from jax.nn import sigmoid
+from mjx_tt.env.own import network
+
+SHAPES = {"conv1/kernel": (2, 11, 16), "conv1/bias": (16,), "conv2/kernel": (2, 8, 24), "conv2/bias": (24,),
+          "conv3/kernel": (2, 12, 8), "conv3/bias": (8,)}
+
+@network("paper", shapes=SHAPES)
+class Paper:
+    """The gated dilated CNN over a window of eight observations, all of it anew at every tick."""
+
+    @staticmethod
+    def start(p, x):
+        return jnp.stack([x] * 7)
+
+    @staticmethod
+    def step(p, past, x):
+        window = h = jnp.concatenate([past, x[None]])
+        for i, dilation in ((1, 1), (2, 2), (3, 4)):
+            older, newer = p[f"conv{i}/kernel"]
+            z = h[:-dilation] @ older + h[dilation:] @ newer + p[f"conv{i}/bias"][None]
+            n = z.shape[1] // 2
+            h = jnp.tanh(z) if i == 3 else jnp.tanh(z[:, :n]) * sigmoid(z[:, n:])
+        return h[0], window[1:]
+'''
+
+
+def played(config: TaskConfig, policy: Policy) -> make.PlayedEpisodes:
+    return make.make_rollout("narrow", task=config, devices=1)(policy, 200, seed=5)
+
+
+@pytest.fixture(scope="module")
+def policy():
+    theta = np.asarray(initial_theta(jax.random.key(3), 1.0))
+    rng = np.random.default_rng(0)
+    return Policy(theta, rng.normal(0, 0.1, 11).astype(np.float32), rng.uniform(0.5, 2, 11).astype(np.float32))
+
+
+def test_a_users_terms_are_the_packages_written_by_hand(policy):
+    terms = tuple(own.load(TERMS, "terms.py").terms.values())
+    weights = (*rewards.SIM_WEIGHTS.values(), 0.5, 0.0, 2.0, 0.0, 1.0)
+    with_terms = TaskConfig(sim_rate=75.0, reward_weights=weights, own_terms=terms)
+    found, plain = played(with_terms, policy), played(TaskConfig(sim_rate=75.0), policy)
+    assert tuple(found.terms) == (*rewards.TERMS, "slow", "clear_of_the_table", "near", "seconds", "always")
+    for name in rewards.TERMS:
+        np.testing.assert_array_equal(found.terms[name], plain.terms[name])
+    np.testing.assert_allclose(found.terms["slow"], found.terms["velocity"], atol=1e-5)
+    steps = np.round(found.seconds * 75.0)
+    assert (found.terms["collision"] < 0).any()  # the untrained robot hits something
+    np.testing.assert_allclose(found.terms["clear_of_the_table"] * steps, found.terms["collision"], atol=1e-3)
+    np.testing.assert_allclose(found.terms["seconds"], found.seconds, rtol=1e-6)
+    missed = found.outcome == "missed"
+    approached = 3.0 * np.exp(-found.terms["near"] / rewards.APPROACH_RANGE)
+    np.testing.assert_allclose(approached[missed], found.terms["state_transition"][missed], rtol=1e-4)
+    added = 0.5 * found.terms["slow"] + 2.0 * found.terms["near"] + 2.0
+    np.testing.assert_allclose(found.returns, plain.returns + added, rtol=1e-4, atol=1e-4)
+
+
+def test_a_term_that_is_no_number_is_masked_and_counted(policy):
+    text = TERMS + '\n@reward_term("bad", per="ball")\ndef bad(ball):\n    return jnp.where(ball.hit, 0.0, jnp.nan)\n'
+    terms = tuple(own.load(text, "bad.py").terms.values())
+    weights = (*rewards.SIM_WEIGHTS.values(), *[0.0] * (len(terms) - 1), 1.0)
+    found = played(TaskConfig(sim_rate=75.0, reward_weights=weights, own_terms=terms), policy)
+    plain = played(TaskConfig(sim_rate=75.0), policy)
+    np.testing.assert_array_equal(found.finite, plain.outcome != "missed")
+    assert np.isnan(found.returns[~found.finite]).all()
+
+
+def test_the_papers_network_as_a_users_plays_as_the_packages(policy):
+    mine = own.load(NETWORKS, "networks.py").networks["paper"]
+    assert mine.size == contract.n_parameters()
+    config = TaskConfig(sim_rate=75.0, max_steps=60)
+    found, wanted = played(config, replace(policy, network=mine)), played(config, policy)
+    assert len(set(wanted.outcome)) > 1 or np.ptp(wanted.terms["state_transition"]) > 0.1
+    same = np.isclose(found.returns, wanted.returns, rtol=1e-3, atol=1e-3)
+    assert same.mean() > 0.98  # a contact turns rounding into another bounce
+    np.testing.assert_allclose(found.peak_velocity[same], wanted.peak_velocity[same], rtol=1e-3, atol=1e-3)
+
+
+def test_the_same_text_gives_the_same_objects():
+    assert own.load(TERMS, "terms.py") is own.load(TERMS, "terms.py")
+
+
+GOOD = "import jax.numpy as jnp\nfrom mjx_tt.env.own import network, reward_term\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("def f(:\n", r"my.py: line 1: invalid syntax"),
+        (GOOD + "import nothing_of_that_name\n", r"my.py: line 3: ModuleNotFoundError: No module named 'nothing_of"),
+        (GOOD, "defines nothing"),
+        (GOOD + "@reward_term('style')\ndef f(step):\n    return 0.0\n", "'style': this is one of the package's own"),
+        (GOOD + "@reward_term('a b')\ndef f(step):\n    return 0.0\n", "must be letters, digits"),
+        (GOOD + "@reward_term('x', per='day')\ndef f(step):\n    return 0.0\n", "per is 'day', allowed: step, ball"),
+        (GOOD + 2 * "@reward_term('x')\ndef f(step):\n    return 0.0\n", "'x': defined twice"),
+        (GOOD + "@reward_term('x')\ndef f(step):\n    return step.comand\n", "line 5: AttributeError: .*comand"),
+        (GOOD + "@reward_term('x')\ndef f(step):\n    return step.command\n", r"returns an array \(8, 2, 3\)"),
+        (
+            GOOD + "@reward_term('x')\ndef f(step):\n    return 1 if step.bounced else 0\n",
+            "line 5: The truth value",
+        ),
+        (GOOD + "@network('n', shapes={'w': (8, 11)})\nclass N:\n    pass\n", "has no start and no step"),
+        (
+            GOOD
+            + "@network('n', shapes={'w': (7, 11)})\nclass N:\n    start = staticmethod(lambda p, x: ())\n"
+            + "    step = staticmethod(lambda p, s, x: (p['w'] @ x, s))\n",
+            r"returns an action \(7,\), \(8,\) is wanted",
+        ),
+        (
+            GOOD
+            + "@network('n', shapes={'w': (8, 11)})\nclass N:\n    start = staticmethod(lambda p, x: ())\n"
+            + "    step = staticmethod(lambda p, s, x: (p['w'] @ x, x))\n",
+            "another kind of state",
+        ),
+        (
+            GOOD
+            + "@network('n', shapes={'w': (8, 0)})\nclass N:\n    start = staticmethod(lambda p, x: ())\n"
+            + "    step = staticmethod(lambda p, s, x: (x, s))\n",
+            "positive whole numbers",
+        ),
+    ],
+)
+def test_a_mistake_in_the_file_is_named(text, says):
+    with pytest.raises(ValueError, match=f"(?s)my.py.*{says}|{says}"):
+        own.load(text, "my.py")
+
+
+def test_theta_of_another_network_is_refused():
+    mine = own.load(NETWORKS, "networks.py").networks["paper"]
+    with pytest.raises(ValueError, match="theta has 5 parameters, the network 'paper' has 976"):
+        mine.unflatten(np.zeros(5))
