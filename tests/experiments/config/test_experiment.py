@@ -169,7 +169,10 @@ def test_keys_and_choices_are_those_of_the_optimiser_and_the_task():
         for key, allowed in (choices | {"scale": directions.SCALES}).items():
             assert get_args(section.model_fields[key].annotation) == allowed
     limits = {"max_observation_latency", "max_action_latency"}  # of memory, which no experiment sets
-    assert {field.name for field in fields(TaskConfig)} - limits - {"reward_weights"} <= config.Task.model_fields.keys()
+    assert {field.name for field in fields(TaskConfig)} - limits - {
+        "reward_weights",
+        "own_terms",
+    } <= config.Task.model_fields.keys()
 
 
 def test_overrides(tmp_path):
@@ -221,7 +224,7 @@ def test_samples_of_a_model_are_taken_in(tmp_path):
 def test_defaults_are_those_of_the_task_and_weights_follow_the_terms():
     experiment = build.experiment(config.parse(SMALLEST, "a"), "a")
     assert experiment.task == TaskConfig()
-    assert tuple(config.Rewards.model_fields)[1:] == rewards.TERMS
+    assert tuple(config.Rewards.model_fields)[1:] == (*rewards.TERMS, "own")
     changed = build.reward_weights(config.Rewards(base="real", style=2.5))
     assert dict(zip(rewards.TERMS, changed, strict=True)) == rewards.REAL_WEIGHTS | {"style": 2.5}
 

@@ -19,6 +19,7 @@ import yaml
 from experiments import cli
 from experiments.commands.evaluate import _folder
 from experiments.commands.render import SHIPPED
+from experiments.config.experiment import parse
 from experiments.errors import RunError
 from experiments.runs import load_policy
 from experiments.runs.locate import artefact_of
@@ -73,7 +74,9 @@ def test_unpacked_files_are_those_of_the_run_and_check_without_the_program(run, 
     assert figures["returned"][0] == pytest.approx(0.972, abs=5e-4)
     evaluation = json.loads((run / "evaluation.json").read_text())
     assert json.loads((folder / "evaluation.json").read_text()) == evaluation
-    assert yaml.safe_load((folder / "config.yaml").read_text()) == yaml.safe_load((run / "config.yaml").read_text())
+    # The shipped policy's configuration is older than some keys; written anew it says their defaults.
+    configurations = [yaml.safe_load((place / "config.yaml").read_text()) for place in (folder, run)]
+    assert configurations[0] == parse(configurations[1], "config.yaml").to_dict()
     rows = [line.split("  ") for line in (folder / SUMS).read_text().splitlines()[1:]]
     assert {n: hashlib.sha256((folder / n).read_bytes()).hexdigest() for n in MEMBERS[:-1]} == {n: h for h, n in rows}
 
