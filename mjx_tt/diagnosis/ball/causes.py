@@ -15,13 +15,14 @@ from mjx_tt.diagnosis.ball.diagnose import BallFindings, shaking
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, REFERENCE_MAGNUS
 from mjx_tt.diagnosis.ball.model_averaging import Averaged, averaged
-from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, Part, Together, Unexplained
+from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, HeldOut, Part, Together, Unexplained
 from mjx_tt.sim import bounds
 from mjx_tt.sim.randomisation import Samples
 
 BOOTSTRAP = 100
 LEVEL = 0.90  # of intervals
 DRAWS = 256  # of what may be wrong, for training
+LEAST_GAIN = 0.01  # share of the error on unseen balls that causes larger than it have to be able to take away
 LEAST_FREEDOM = 5  # of Student's distribution
 
 
@@ -48,10 +49,13 @@ def part(
         named, beside = [n for n in named if n.cause.name in found.survivors], {}
         top = found.findings[0]
         unexplained = Unexplained(top.block, top.where, top.direction, f"{1e3 * top.size:.1f} mm")
+    held_out = cross_validation.held_out(prediction, seed)
+    if unexplained is None and refuted([n.cause.effect_mm for n in named], held_out):
+        size = f"{held_out.before:.1f} mm"
+        unexplained = Unexplained("unseen balls", "which the causes found predict no better", "all axes", size)
     hidden, quiet = _unseen(found, without, hits)
     names = [e.name for e in found.trial.effects]
     spin = ["magnus"] if found.trial.spin == "none" else []
-    held_out = cross_validation.held_out(prediction, seed)
     say("the next experiment")
     pairs = [(group[0], rival) for group in found.choice.groups for rival in group[1:]]
     dark = [i for i, name in enumerate(names) if not found.seen[i] and name in quiet]
@@ -75,6 +79,15 @@ def part(
         _together(found),
         _samples(found, sets, seed) if named else (),
     )
+
+
+def refuted(sizes: list[float], held_out: HeldOut) -> bool:
+    """True where causes are said to move balls by more [mm] than unseen ones are missed by, and gain nothing there.
+
+    Such causes undo each other: together they follow the flights that they were fitted to.
+    """
+    said = float(np.sqrt(np.sum(np.square(sizes)))) if sizes else 0.0
+    return said > held_out.before and held_out.high < LEAST_GAIN * held_out.before
 
 
 def _together(found: BallFindings) -> tuple[Together, ...]:

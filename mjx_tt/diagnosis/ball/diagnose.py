@@ -198,12 +198,19 @@ def _diagnose(
         treated = replace(trial, spin="free") if own else trial
         best = search(problem, treated, before.situation, prior, say, scatter=before.noise.scatter)
         best = replace(best, trial=replace(best.trial, spin=trial.spin))
-        if own and mode == "none" and evidence.shift_of_spins(best) < selection.FLOOR:
+        if (
+            own
+            and mode == "none"
+            and (evidence.shift_of_spins(best) < selection.FLOOR or evidence.spins_without_lift(best))
+        ):
             best, together = _plain(problem, replace(trial, spin="never"), nominal, say)
     elif mode == "free":
         best, together = _spinning(problem, trial, nominal, say)
     else:
         best, together = _plain(problem, trial, nominal, say)
+        if mode == "none" and evidence.spins_without_lift(best):
+            best, together = _plain(problem, replace(trial, spin="never"), nominal, say)
+            best = replace(best, trial=replace(best.trial, spin="none"))
     say("looking for what no entry explains")
     left = find(best, g, sessions, age, names)
     first = before is None

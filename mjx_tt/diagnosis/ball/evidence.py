@@ -78,6 +78,12 @@ def lifts(settled: Settled) -> bool:
     return j is None or bool(MAGNUS_RANGE[0] < settled.at.theta[j] < MAGNUS_RANGE[1])
 
 
+def spins_without_lift(settled: Settled) -> bool:
+    """True where spins of the balls' own were chosen with a Magnus coefficient that is held at an end."""
+    prior = settled.choice.prior
+    return prior is not None and prior.conditional and not lifts(settled)
+
+
 def bent_too_far(choice: Choice) -> bool:
     """True if spin was chosen with a Magnus coefficient that no ball has: a line bent too far."""
     return choice.magnus is not None and not MAGNUS_KEPT[0] <= choice.magnus <= MAGNUS_KEPT[1]
