@@ -336,6 +336,27 @@ def test_baselines_find_a_plain_effect_in_plain_noise():
     assert baselines.best_single(linear) == baselines.bic(linear) == ()
 
 
+def test_nonlinear_baselines_fly_what_the_columns_say():
+    drawn = cases.build(Case("single", ("wind_x",), 20.0, "iid", 3, count=60))
+    linear, flights = baselines.both(drawn.log(), drawn.balls.human)
+    np.testing.assert_allclose(flights.residual(("wind_x",), np.zeros(1)), linear.residual, atol=1e-12)
+    little = 1e-4  # [m] of shift
+    moved = flights.residual(("wind_x",), np.array([little])) - linear.residual
+    column = -little * linear.columns[:, linear.names.index("wind_x")]
+    assert np.corrcoef(moved, column)[0, 1] > 0.999 and moved.std() == pytest.approx(column.std(), rel=0.02)
+
+
+@pytest.mark.slow
+def test_nonlinear_baselines_find_a_plain_effect(monkeypatch):
+    monkeypatch.setattr(baselines, "ITERATIONS", 4)
+    monkeypatch.setattr(baselines, "NAMES", ("wind_x", "drag_coefficient", "table_height"))
+    drawn = cases.build(Case("single", ("wind_x",), 20.0, "iid", 3, count=60))
+    linear, flights = baselines.both(drawn.log(), drawn.balls.human)
+    assert "wind_x" in baselines.mujoco(linear, flights)
+    monkeypatch.setattr(baselines, "EVALUATIONS", 120)
+    assert "wind_x" in baselines.cma_es(linear, flights)
+
+
 def test_lookalikes_look_alike():
     drawn = cases.build(Case("none", (), 0.0, "iid", 1, count=60))
     linear = baselines.linearise(drawn.log(), drawn.balls.human)
