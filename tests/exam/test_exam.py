@@ -346,6 +346,12 @@ def test_nonlinear_baselines_fly_what_the_columns_say():
     assert np.corrcoef(moved, column)[0, 1] > 0.999 and moved.std() == pytest.approx(column.std(), rel=0.02)
 
 
+def test_baselines_are_scored_as_the_diagnosis_is(monkeypatch):
+    monkeypatch.setattr(baselines, "NONLINEAR", {"nobody": lambda linear, flights: ()})
+    found = baselines.examine(Case("single", ("wind_x",), 20.0, "iid", 3, count=60))["outcomes"]
+    assert found["best single"] == "right" and found["nobody"] == "missed"
+
+
 @pytest.mark.slow
 def test_nonlinear_baselines_find_a_plain_effect(monkeypatch):
     monkeypatch.setattr(baselines, "ITERATIONS", 4)

@@ -42,6 +42,7 @@ def score(truth: dict, verdict: dict) -> dict:
     record["confidences"] = [
         [c["confidence"], any(names & group for names in accepted.values())]
         for c, group in zip(given, named, strict=True)
+        if "confidence" in c  # a baseline's answer has none
     ]
     if record["outcome"] == "right" and kind in ("single", "pair", "triple", "gauge", "bounce"):
         record["twins_reported"] = all(
