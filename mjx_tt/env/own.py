@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import Any, Literal, TypeAlias, TypeVar
 
 import jax
@@ -125,6 +124,7 @@ class Definitions:
 
 
 _open: ContextVar[Definitions | None] = ContextVar("definitions", default=None)
+_loaded: dict[str, Definitions] = {}  # by the file's text
 
 
 def reward_term(name: str, per: Literal["step", "ball"] = "step") -> Callable[[F], F]:
@@ -165,13 +165,14 @@ def _add(name: str, what: str, place: Callable[[Definitions], dict], value: Any,
     place(collecting)[name] = value
 
 
-@lru_cache(maxsize=16)
 def load(text: str, where: str) -> Definitions:
     """The definitions in the text of a Python file; runs it. ``where`` names it in errors and tracebacks.
 
     The same text gives the same objects, so that what was compiled with them is found again. Raises ValueError naming
     the file, the line and what is wrong: with the file itself, or with what a function returns in a trial call.
     """
+    if text in _loaded:
+        return _loaded[text]
     linecache.cache[where] = (len(text), None, text.splitlines(keepends=True), where)
     found = Definitions()
     with _collecting(found), _blamed(where, where):
@@ -185,6 +186,7 @@ def load(text: str, where: str) -> Definitions:
         one = found.networks[name] = replace(one, source=text)
         with _blamed(f"{where}: network {one.name!r}", where):
             _check_network(one)
+    _loaded[text] = found
     return found
 
 

@@ -105,6 +105,17 @@ def test_the_robots_policy_is_the_network_by_hand(trained):
 
 
 @pytest.mark.slow
+def test_it_is_not_shown_beside_the_papers_network(trained, capsys):
+    shipped = ROOT / "experiments/shipped/policies/quickstart"
+    assert cli.main(["view", str(trained / "runs/mine"), str(shipped), "--export", str(trained / "page.html")]) == 1
+    assert "different networks" in capsys.readouterr().err
+    assert (
+        cli.main(["view", str(trained / "runs/mine"), "--export", str(trained / "page.html"), "--balls", "narrow"]) == 0
+    )
+    assert (trained / "page.html").stat().st_size > 100_000
+
+
+@pytest.mark.slow
 def test_the_artefact_plays_in_the_simulator(trained):
     places = ["runs/mine", "runs/mine/artefact"]
     for place in places:

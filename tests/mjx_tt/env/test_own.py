@@ -120,7 +120,7 @@ def test_the_papers_network_as_a_users_plays_as_the_packages(policy):
 
 
 def test_the_same_text_gives_the_same_objects():
-    assert own.load(TERMS, "terms.py") is own.load(TERMS, "terms.py")
+    assert own.load(TERMS, "terms.py") is own.load(TERMS, "a run's configuration")
 
 
 GOOD = "import jax.numpy as jnp\nfrom mjx_tt.env.own import network, reward_term\n"
