@@ -83,6 +83,10 @@ class BallPool:
     acceptance: Float[Array, ""]  # fraction of proposals kept
     rejected: Float[Array, " outcomes"]  # by OUTCOMES: fraction of proposals by outcome; the kept ones first
 
+    def without_spin(self) -> BallPool:
+        """The same balls, none of which spins: what is drawn with them spins as the model alone says."""
+        return replace(self, state=replace(self.state, spin=jnp.zeros_like(self.state.spin)))
+
 
 def _bad_start(position: Vector, params: BallParams) -> Bool[Array, " n"]:
     radius = params.flight.radius

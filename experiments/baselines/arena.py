@@ -62,8 +62,8 @@ class Arena:
         return float(self._restless(controller, _chunks(balls)[0], key))
 
     def _draw(self, balls: BallPool, key: jax.Array) -> Episodes:
-        """The chunk's balls in their order, with the spin that the world gives them."""
-        drawn = self._simulator.draw(key, balls, self._world.model, self._world.randomise, ROWS, COLUMNS)
+        """The chunk's balls in their order, with their own spin and the one that the world gives them."""
+        drawn = self._simulator.draw(key, balls.without_spin(), self._world.model, self._world.randomise, ROWS, COLUMNS)
         thrown = jax.tree.map(lambda x: x.reshape(-1, ROWS, COLUMNS), balls.state)
         return replace(drawn, ball=replace(thrown, spin=thrown.spin + drawn.ball.spin))
 

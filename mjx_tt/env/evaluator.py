@@ -38,9 +38,9 @@ class Evaluator:
         columns = self._columns = -(-COLUMNS // simulator.devices) * simulator.devices
 
         def play(policy: Policy, key: PRNGKeyArray, pool: BallPool, thrown: BallState) -> RolloutResult:
-            drawn = simulator.draw(key, pool, model, randomise, ROWS, columns)
+            # Each thrown ball has the spin that it was drawn with, and one of the model beside it, not another ball's.
+            drawn = simulator.draw(key, pool.without_spin(), model, randomise, ROWS, columns)
             copies = jnp.repeat(policy.theta[:, None], columns // simulator.devices, axis=1)
-            # Balls of a distribution do not spin: the spin of the drawn ones is the model's.
             spinning = replace(thrown, spin=thrown.spin + drawn.ball.spin)
             return simulator.rollout(replace(policy, theta=copies), simulator.local(replace(drawn, ball=spinning)))
 

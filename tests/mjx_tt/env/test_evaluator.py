@@ -1,0 +1,72 @@
+"""Every ball of a pool is played as it was thrown, spin included, whatever balls are beside it."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ballmodel import registry
+from ballmodel.sampling import sample_pool
+from experiments.baselines.arena import COLUMNS, ROWS, Arena
+from mjx_tt.env.evaluator import Evaluator
+from mjx_tt.env.make import load_policy
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import TaskConfig
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import LatencyParams, ModelFile, SimModel
+from tests.support.paths import ROOT
+
+TASK = TaskConfig(sim_rate=150.0)
+N = 120
+
+
+@pytest.fixture(scope="module")
+def world():
+    """Lift, and nothing that is drawn anew for each episode."""
+    certain = {f"latency.{f.name}": 0.0 for f in fields(LatencyParams) if f.name.endswith("_std")}
+    return models.with_values(SimModel(), certain | {"sensing.ball_noise": 0.0, "ball.flight.magnus_coefficient": 1.0})
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return load_policy(ROOT / "experiments/shipped/policies/quickstart")
+
+
+@pytest.fixture(scope="module")
+def pools(world):
+    """Balls that spin one way in the first half of their order and another way in the second; and the first half."""
+    balls = sample_pool(jax.random.key(2), registry.resolve("player3/M0"), world.ball, N)
+    spin = jnp.where(jnp.arange(N) < N // 2, 40.0, -40.0) * jnp.array([[1.0], [0.3], [0.0]])
+    mixed = replace(balls, state=replace(balls.state, spin=spin))
+
+    def first(x):
+        return x[..., : N // 2] if x.ndim and x.shape[-1] == N else x
+
+    return mixed, jax.tree.map(first, mixed)
+
+
+def test_a_ball_keeps_its_spin_beside_others(world, policy, pools):
+    mixed, half = pools
+    one = Evaluator(Simulator(TASK), mixed, world, ())
+    other = one.on(half)
+    key = jax.random.key(0)
+    together, alone = one.play(policy, key), other.play(policy, key)
+    place = np.argsort(one.order)[: N // 2]  # of the first half's balls among all
+    for name in ("outcome", "landing", "returns"):
+        found, wanted = getattr(together, name)[..., place], getattr(alone, name)[..., np.argsort(other.order)]
+        np.testing.assert_array_equal(found, wanted, err_msg=name)
+    straight = one.on(mixed.without_spin()).play(policy, key)
+    assert np.abs(together.landing - straight.landing).max() > 0.05  # spin matters here
+
+
+def test_the_arena_throws_the_balls_as_they_are(world, pools):
+    arena = Arena(TASK, ModelFile(world))
+    many = ROWS * COLUMNS
+    wide = jax.tree.map(lambda x: jnp.resize(x, (*x.shape[:-1], many)) if x.shape[-1:] == (N,) else x, pools[0])
+    drawn = arena._draw(wide, jax.random.key(1)).ball
+    np.testing.assert_array_equal(np.asarray(drawn.spin).reshape(3, -1), np.asarray(wide.state.spin))
+    np.testing.assert_array_equal(np.asarray(drawn.position).reshape(3, -1), np.asarray(wide.state.position))
