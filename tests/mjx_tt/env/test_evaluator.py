@@ -40,8 +40,8 @@ def policy():
 def pools(world):
     """Balls that spin one way in the first half of their order and another way in the second; and the first half."""
     balls = sample_pool(jax.random.key(2), registry.resolve("player3/M0"), world.ball, N)
-    spin = jnp.where(jnp.arange(N) < N // 2, 40.0, -40.0) * jnp.array([[1.0], [0.3], [0.0]])
-    mixed = replace(balls, state=replace(balls.state, spin=spin))
+    spin = np.outer([1.0, 0.3, 0.0], np.where(np.arange(N) < N // 2, 40.0, -40.0))
+    mixed = replace(balls, state=replace(balls.state, spin=jnp.asarray(spin, jnp.float32)))
 
     def first(x):
         return x[..., : N // 2] if x.ndim and x.shape[-1] == N else x
