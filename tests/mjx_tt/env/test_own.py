@@ -98,6 +98,7 @@ def test_a_users_terms_are_the_packages_written_by_hand(policy):
     np.testing.assert_allclose(found.returns, plain.returns + added, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_term_that_is_no_number_is_masked_and_counted(policy):
     text = TERMS + '\n@reward_term("bad", per="ball")\ndef bad(ball):\n    return jnp.where(ball.hit, 0.0, jnp.nan)\n'
     terms = tuple(own.load(text, "bad.py").terms.values())
@@ -108,6 +109,7 @@ def test_a_term_that_is_no_number_is_masked_and_counted(policy):
     assert np.isnan(found.returns[~found.finite]).all()
 
 
+@pytest.mark.slow
 def test_the_papers_network_as_a_users_plays_as_the_packages(policy):
     mine = own.load(NETWORKS, "networks.py").networks["paper"]
     assert mine.size == contract.n_parameters()
