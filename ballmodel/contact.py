@@ -3,7 +3,9 @@
 Tangential part, with the slip velocity v_s of the contact point and a thin shell, I = 2/3 m r^2:
     dv_t = -alpha v_s,   d omega = -3 / (2 r) n x dv_t
 so the slip after the impact is (1 - 5/2 alpha) v_s.
-    table and net: alpha = min(mu (1 + e) |v_n| / |v_s|, 2/5): sliding by Coulomb friction, or sticking (Nakashima)
+    table and net: alpha = min(mu (1 + e) |v_n| / |v_s|, 2/5 (1 + e_t)): sliding by Coulomb friction, or gripping; at
+                   e_t = 0 the contact point sticks (Nakashima), beyond it springs back and its slip ends at -e_t v_s
+                   (Cross, American Journal of Physics 70, 482, 2002)
     rubber:        alpha = k_v, tangential impulse proportional to slip; k_v > 2/5 reverses the slip, which Coulomb
                    friction cannot (numbers: github.com/gossardt/tt_rackets)
 Normal part: v_n' = -e v_n, e = restitution - slope |v_n| kept within [0, 1].
@@ -38,6 +40,8 @@ class SurfaceParams:
     # slope dz/dx of the surface, about the table's centre
     tilt_x: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
     tilt_y: Float[jax.Array, "*#batch"] | float | None = optional(0.0)  # slope dz/dy
+    # e_t, slip that a gripped contact point springs back with over the slip that it came with
+    tangential_restitution: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
 
 
 @jax.tree_util.register_dataclass
@@ -101,8 +105,11 @@ def surface_impact(
     velocity [m/s], spin [rad/s] and the unit normal pointing to the ball are Vecs or (3, ...) arrays; radius [m].
     """
 
+    e_t = params.tangential_restitution
+    gripping = STICKING if e_t is None else STICKING * (1.0 + e_t)
+
     def alpha_of(e: Scalars, normal_speed: Scalars, slip_speed: Scalars) -> jax.Array:
-        return jnp.minimum(params.friction * (1.0 + e) * jnp.abs(normal_speed) / (slip_speed + TINY), STICKING)
+        return jnp.minimum(params.friction * (1.0 + e) * jnp.abs(normal_speed) / (slip_speed + TINY), gripping)
 
     return _apply(velocity, spin, normal, (0.0, 0.0, 0.0), radius, lambda s: restitution_at(params, s), alpha_of)
 

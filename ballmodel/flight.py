@@ -247,6 +247,9 @@ def step(
         normal = select(hit_table, normal, gap_net / distance_net)
         chosen = ("restitution", "restitution_slope", "friction")  # what the impact itself depends on
         either = {name: jnp.where(hit_table, getattr(params.table, name), getattr(params.net, name)) for name in chosen}
+        grips = (params.table.tangential_restitution, params.net.tangential_restitution)
+        if grips != (None, None):
+            either["tangential_restitution"] = jnp.where(hit_table, value_or(grips[0], 0.0), value_or(grips[1], 0.0))
         surface = replace(params.table, **either)
     normal = stored(normal)
     velocity, spin = contact.surface_impact(surface, at.velocity, at.spin, normal, radius)

@@ -24,6 +24,7 @@ BOUNDS: tuple[tuple[str, tuple[float, float]], ...] = (
     ("ball.flight.wind_*", (-50.0, 50.0)),  # [m/s]
     ("ball.*.restitution", (0.0, 1.5)),
     ("ball.*.restitution_slope", (-1.0, 1.0)),  # [s/m]
+    ("ball.*.tangential_restitution", (-1.0, 1.0)),
     ("ball.*.friction", (0.0, 5.0)),
     ("ball.*.tangential_gain", (-2.0, 2.0)),
     ("ball.paddle.radius", (0.01, 0.5)),  # [m]

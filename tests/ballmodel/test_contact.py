@@ -68,13 +68,26 @@ def test_sticking_bounce_rolls_away():
     np.testing.assert_allclose(slip(velocity, spin), 0.0, atol=1e-9)
 
 
-def test_angular_momentum_about_the_contact_point_is_conserved():
-    params = SurfaceParams(0.9, 0.01, 0.2, 0.0)
-    for velocity, spin, normal in random_impacts():
+def test_a_table_that_springs_back_reverses_the_slip_that_it_grips():
+    params = SurfaceParams(0.93, 0.0, 1e3, 0.0, tangential_restitution=0.15)  # so rough that every ball is gripped
+    for velocity, spin, normal in random_impacts(50):
         v, w = impact(params, velocity, spin, normal)
-        before = INERTIA * spin + M * np.cross(R * normal, velocity)
-        after = INERTIA * w + M * np.cross(R * normal, v)
-        np.testing.assert_allclose(after, before, atol=1e-12)
+        np.testing.assert_allclose(slip(v, w, normal), -0.15 * slip(velocity, spin, normal), atol=1e-9)
+
+
+def test_a_sliding_ball_knows_nothing_of_the_spring():
+    flat = [0.1, -8.0, -2.0], [0.0, 0.0, 0.0]
+    rigid, springy = (SurfaceParams(0.93, 0.0, 0.25, 0.0, tangential_restitution=e) for e in (0.0, 0.3))
+    np.testing.assert_array_equal(np.array(impact(rigid, *flat)), np.array(impact(springy, *flat)))
+
+
+def test_angular_momentum_about_the_contact_point_is_conserved():
+    for params in (SurfaceParams(0.9, 0.01, 0.2, 0.0), SurfaceParams(0.9, 0.01, 0.8, 0.0, tangential_restitution=0.3)):
+        for velocity, spin, normal in random_impacts():
+            v, w = impact(params, velocity, spin, normal)
+            before = INERTIA * spin + M * np.cross(R * normal, velocity)
+            after = INERTIA * w + M * np.cross(R * normal, v)
+            np.testing.assert_allclose(after, before, atol=1e-12)
 
 
 def test_no_impact_on_a_resting_body_adds_energy():
@@ -83,8 +96,9 @@ def test_no_impact_on_a_resting_body_adds_energy():
 
     for velocity, spin, normal in random_impacts():
         table = impact(SurfaceParams(1.0, 0.0, 0.3, 0.0), velocity, spin, normal)
+        springy = impact(SurfaceParams(1.0, 0.0, 5.0, 0.0, tangential_restitution=1.0), velocity, spin, normal)
         rubber = paddle_impact(PaddleParams(1.0, 0.0), velocity, spin, normal, np.zeros(3), R)
-        for v, w in (table, rubber):
+        for v, w in (table, springy, rubber):
             assert energy(np.array(v), np.array(w)) <= energy(velocity, spin) * (1 + 1e-12)
 
 

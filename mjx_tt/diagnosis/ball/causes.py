@@ -271,7 +271,7 @@ def _spin_cause(found: BallFindings, confidence: float, wide: float) -> Expresse
 def _confidence(found: BallFindings, seed: int) -> list[float]:
     """Share of bootstrap draws of the balls in which each cause (or one of its group) is chosen; spin last."""
     choice, rng = found.choice, np.random.default_rng(seed)
-    n, rated = found.problem.grid.n, found.scores()
+    n, rated = found.problem.grid.n, scores.priced(found.scores(), found.trial.effects)
     useful = [i for i in np.flatnonzero(found.seen).tolist() if not (choice.spin and i == found.problem.coefficient)]
     hits = np.zeros(len(choice.effects))
     for _ in range(BOOTSTRAP):

@@ -274,6 +274,16 @@ EFFECTS: tuple[Effect, ...] = (
         reading="flat and fast balls, or a sled on the table",
     ),
     Effect(
+        name="table_grip",
+        meaning="a table that springs back sideways",
+        claim="A ball that the table grips springs back sideways, tangential restitution {instead}",
+        path=TABLE + "tangential_restitution",
+        scale=0.1,
+        unit="1",
+        reading="a marked ball without spin that lands steeply, filmed from the side",
+        low=0.0,
+    ),
+    Effect(
         name="table_height",
         meaning="height of the table",
         claim="The table's surface lies {size} {way:higher|lower} than the model says",

@@ -26,7 +26,6 @@ ROUNDS = 7
 SETTLED = 0.2  # of a standard deviation by which nothing moves any more
 MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
 LONGEST_MOVE = 3.0  # scales by which an effect may change in a round
-FREEDOM = 4.0  # degrees of Student's distribution of an effect's size
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ def _solved(
     """Changes of all effects from the scores, and their covariance by the sandwich over balls."""
     count, low = len(scale), np.array([e.low for e in problem.effects])
     away = (before - mean) / scale
-    precision = (FREEDOM + 1.0) / (FREEDOM + away**2) / scale**2
+    precision = (scores.FREEDOM + 1.0) / (scores.FREEDOM + away**2) / scale**2
     held: list[int] = []
     while True:
         chosen = [i for i in free if i not in held]

@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
+from mjx_tt.diagnosis.ball.effects import Effect
 from mjx_tt.diagnosis.ball.flights.linearization import Projected
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, SpinPrior, learned
 
@@ -21,6 +22,7 @@ LARGEST_SUBSET = 3  # of which every set is tried
 MOST_CAUSES = 8
 SPIN_ROUNDS = 8
 TINY = 1e-3  # [rad/s] spread of balls that do not spin
+FREEDOM = 4.0  # degrees of Student's distribution of an effect's size
 Subset = tuple[int, ...]  # columns of a Gram matrix, of effects or of all
 
 
@@ -34,6 +36,7 @@ class Scores:
     ball_right: Float[np.ndarray, "n K"]
     base: float  # gain of the random spread alone
     always: Subset  # columns that every subset holds: the mean spin, and the Magnus coefficient
+    scale: Float[np.ndarray, " K"] | None = None  # ordinary sizes of the effects, infinite for what has none
 
     def weighted(self, weight: Float[np.ndarray, " n"]) -> Scores:
         """The same with each ball counted ``weight`` times; a prior, which no ball brings, stays as it is."""
@@ -115,6 +118,14 @@ def under(p: Projected, prior: SpinPrior | None) -> Scores:
     return with_own_spins(p, prior) if prior.conditional else with_spin(p, prior)
 
 
+def priced(rated: Scores, effects: Sequence[Effect]) -> Scores:
+    """The same scores where the size of each effect has a price, but of those that every set holds."""
+    scale = np.full(len(rated.gram), np.inf)
+    scale[: len(effects)] = [e.scale for e in effects]
+    scale[list(rated.always)] = np.inf
+    return replace(rated, scale=scale)
+
+
 def fit_spin(p: Projected, effects: Subset, prior: SpinPrior | None = None) -> SpinPrior:
     """Maximum likelihood distribution of the spins beside the given effects. prior: to start from."""
     effects = tuple(e for e in effects if e != p.coefficient)
@@ -142,10 +153,22 @@ def solve(scores: Scores, chosen: Sequence[int]) -> Float[np.ndarray, " c"]:
     return np.linalg.lstsq(gram / scale[:, None] / scale, right / scale, rcond=1e-10)[0] / scale
 
 
+def _price(theta: Float[np.ndarray, "*sets c"], scale: Float[np.ndarray, "*sets c"]) -> Float[np.ndarray, "*sets"]:
+    """Evidence that sizes cost which would surprise: -2 times Student's log density of each.
+
+    Two effects that undo each other fit as well at any size; without a price the largest would win by a digit.
+    """
+    return (FREEDOM + 1.0) * np.log1p((theta / scale) ** 2 / FREEDOM).sum(axis=-1)
+
+
 def gain(scores: Scores, subset: Sequence[int]) -> float:
-    """Reduction of the squared error by a subset of effects."""
-    chosen = (*subset, *scores.always)
-    return scores.base + (float(_sub(scores, chosen)[1] @ solve(scores, chosen)) if chosen else 0.0)
+    """Reduction of the squared error by a subset of effects, less the price of their sizes where they have one."""
+    chosen = [*subset, *scores.always]
+    if not chosen:
+        return scores.base
+    theta = solve(scores, chosen)
+    cost = 0.0 if scores.scale is None else float(_price(theta, scores.scale[chosen]))
+    return scores.base + float(_sub(scores, chosen)[1] @ theta) - cost
 
 
 def all_gains(scores: Scores, candidates: Subset, largest: int = LARGEST_SUBSET) -> dict[Subset, float]:
@@ -163,8 +186,11 @@ def _gains(scores: Scores, subsets: Sequence[Subset]) -> dict[Subset, float]:
     right = scores.right[index]
     scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 1e-300))
     unit = gram / scale[:, :, None] / scale[:, None, :] + 1e-9 * np.eye(index.shape[1])
-    x = np.linalg.solve(unit, (right / scale)[..., None])[..., 0]
-    return dict(zip(subsets, (scores.base + (x * right / scale).sum(axis=1)).tolist(), strict=True))
+    x = np.linalg.solve(unit, (right / scale)[..., None])[..., 0] / scale
+    gains = scores.base + (x * right).sum(axis=1)
+    if scores.scale is not None:
+        gains = gains - _price(x, scores.scale[index])
+    return dict(zip(subsets, gains.tolist(), strict=True))
 
 
 def neighbours(scores: Scores, subset: Subset, candidates: Subset) -> dict[Subset, float]:
@@ -231,6 +257,22 @@ def unexplained_scores(
     own = scores.ball_right[:, extra] - scores.ball_gram[:, extra][:, :, chosen] @ theta
     gram = scores.gram[np.ix_(extra, extra)] - scores.gram[np.ix_(extra, chosen)] @ mix
     return own - left @ mix, gram
+
+
+def undo(scores: Scores, subset: Subset, theta: Float[np.ndarray, " C"], alike: float) -> bool:
+    """True if two members with one pattern, beyond a cosine of ``alike``, take away what the other adds.
+
+    theta: sizes of the members and of what every set holds. Of such a pair flights show the small difference alone,
+    which a law of either that is slightly wrong imitates: balls that all fly one way at one speed cannot tell more drag
+    and a wind from behind from the drag of a spinning ball.
+    """
+    for i, j in combinations(range(len(subset)), 2):
+        rest = [subset[k] for k in range(len(subset)) if k not in (i, j)]
+        _, gram = unexplained_scores(scores, [*rest, *scores.always], [subset[i], subset[j]])
+        together = np.sign(theta[i] * theta[j]) * gram[0, 1]
+        if together < -alike * np.sqrt(gram[0, 0] * gram[1, 1]):
+            return True
+    return False
 
 
 def flip_threshold(

@@ -114,7 +114,7 @@ class _Treatment:
 
 
 def _treated(p: Projected, trial: Trial, prior: SpinPrior | None, rng: np.random.Generator) -> _Treatment:
-    rated = scores.under(p, prior)
+    rated = scores.priced(scores.under(p, prior), trial.effects)
     candidates = _candidates(rated, p, trial, prior is not None)
     gains = scores.all_gains(rated, candidates)
     # What chance reaches beside the best set: with a cause omitted, its own signal would count as noise.
@@ -189,15 +189,11 @@ def refined(choice: Choice, p: Projected) -> Choice:
 
 
 def _candidates(rated: Scores, p: Projected, trial: Trial, spin: bool) -> Subset:
-    out = set(trial.left_out)
     bent = {p.coefficient} if spin else {i for i, e in enumerate(trial.effects) if e.needs_spin and trial.spinning}
     if p.coefficient is not None or not spin:  # where the lift is free anyway, drag and lift together are drag alone
         bent |= {i for i, e in enumerate(trial.effects) if e.made_of}
-    return tuple(
-        int(i)
-        for i in np.flatnonzero(visible(rated, trial, bool(p.noise.scatter.any())))
-        if i not in bent and i not in out
-    )
+    shown = np.flatnonzero(visible(rated, trial, bool(p.noise.scatter.any()))).tolist()
+    return tuple(i for i in shown if i not in bent and i not in trial.left_out)
 
 
 def _holds(
@@ -220,6 +216,8 @@ def _holds(
         k, wide = theta[-1], 2.0 * error[-1]
         if k + wide < MAGNUS_RANGE[0] or k - wide > MAGNUS_RANGE[1]:
             return False
+    if scores.undo(t.rated, subset, theta, ALIKE):
+        return False
     way = -about
     way[list(subset)] += theta[: len(subset)]
     way[[j for j in t.rated.always if j < len(way)]] = 0.0

@@ -24,6 +24,7 @@ PATHS = {
     "ball.table.restitution": "restitution",
     "ball.table.restitution_slope": "restitution_slope",
     "ball.table.friction": "friction",
+    "ball.table.tangential_restitution": "grip",
     "ball.table.height": "height",
     "ball.table.tilt_x": "tilt_x",
     "ball.table.tilt_y": "tilt_y",

@@ -41,6 +41,7 @@ class World:
     restitution: float | np.ndarray = 0.93
     restitution_slope: float | np.ndarray = 0.0  # [s/m]
     friction: float | np.ndarray = 0.25
+    grip: float | np.ndarray = 0.0  # slip that a gripped contact point springs back with, over the slip before
     height: float | np.ndarray = 0.0  # [m]
     tilt_x: float | np.ndarray = 0.0  # dz/dx of the table's surface
     tilt_y: float | np.ndarray = 0.0
@@ -142,7 +143,7 @@ def bounce(world: World, state: np.ndarray) -> np.ndarray:
         e = e + world.restitution_map(x, y)
     e = np.clip(e, 0.0, 1.0)
     speed = np.sqrt(np.sum(slip**2, axis=0)) + 1e-15
-    alpha = np.minimum(world.friction * (1.0 + e) * np.abs(v_n) / speed, 0.4)
+    alpha = np.minimum(world.friction * (1.0 + e) * np.abs(v_n) / speed, 0.4 * (1.0 + world.grip))
     change = -alpha * slip
     after = velocity - (1.0 + e) * v_n * normal + change
     return np.concatenate([position, after, spin - 1.5 / world.radius * _cross(normal, change)])

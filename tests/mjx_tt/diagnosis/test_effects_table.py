@@ -15,6 +15,7 @@ NOT_EXAMINED = {
     "magnus_coefficient",  # named as magnus, the nominal ball does not spin
     "spin_decay",
     "lift_saturation",  # ball/test_spins
+    "table_grip",  # test_ball: most balls of people and of the exam slide
     "tracker_filter",  # cases of their own: Kalman filters
     "tracker_gate",
     "paddle_restitution",  # hits: test_hits
