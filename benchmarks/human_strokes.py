@@ -1,8 +1,8 @@
 """Policies on people's measured strokes, spin included: ``python -m benchmarks.human_strokes STATES --out FOLDER``.
 
 STATES is DeepMind's rallies.json (D'Ambrosio et al. 2025, CC-BY-4.0), read where it lies. The first call fits a box and
-a mixture to three quarters of the strokes (all but 1,500) and writes their YAMLs with the model whose lift the authors
-estimated the spins by; ``mjx-tt train`` takes them. A call with ``--policies RUN...`` throws the strokes that were held
+a mixture to all but 1,500 of the strokes and writes their YAMLs with the model whose lift the authors estimated the
+spins by; ``mjx-tt train`` takes them. A call with ``--policies RUN...`` throws the strokes that were held
 out, each once, with the spin it had, and ``--reachable N`` seeks motions for N of them ball by ball.
 """
 
@@ -34,7 +34,7 @@ from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import ModelFile, SimModel
 
 HELD_OUT = 1500
-LIFT = 1.33  # Magnus coefficient by which the authors estimated the spins (ballmodel data's README)
+LIFT = 1.33  # Magnus coefficient by which the authors estimated the spins (D'Ambrosio et al. 2025)
 SIM_RATE = 300.0  # Hz
 
 

@@ -22,7 +22,7 @@ from experiments import stages
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
-from experiments.errors import CheckpointError, RunError, checked
+from experiments.errors import CheckpointError, ConfigError, RunError, checked
 from experiments.evaluation.evaluate import draw_balls, return_rate
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.metrics import MetricsLog
@@ -222,6 +222,7 @@ def _start(config: Config, run: Run, trainer: Trainer, ranks: Ranks) -> tuple[Tr
     """The last checkpoint's state and notes, or the first ones."""
     theta = statistics = None
     if config.initial_policy is not None:
+        _check_network(config, trainer, str(run.folder))
         theta, statistics = load_policy.load_statistics(config.initial_policy)
     key = build.key(config.training.seed, build.INITIAL_STATE)
     state = checked(f"initial_policy: {config.initial_policy}", trainer.init, key, theta, statistics)
@@ -231,6 +232,21 @@ def _start(config: Config, run: Run, trainer: Trainer, ranks: Ranks) -> tuple[Tr
     state, notes = _of_first(ranks, state, notes)
     # Where the update leaves its results: compiled for this placement, it can be fed what it returns.
     return trainer.simulator.replicate(state), notes
+
+
+def _check_network(config: Config, trainer: Trainer, where: str) -> None:
+    """Raises ConfigError where the policy to start from is another network's: its numbers would mean something else.
+
+    The file may have changed since: terms come and go, and of a network the name and the shapes are what it is told by.
+    """
+    networks = load_policy.load(str(config.initial_policy)).policy.network, trainer.network
+    given, wanted = (None if n is None else (n.name, n.shapes) for n in networks)
+    if given != wanted:
+        called = ["the paper's" if n is None else f"{n[0]} {n[1]}" for n in (given, wanted)]
+        raise ConfigError(
+            f"{where}: initial_policy: {config.initial_policy}: its network is {called[0]}, the experiment's is "
+            f"{called[1]}"
+        )
 
 
 def _of_first(ranks: Ranks, state: TrainState, notes: dict[str, Any]) -> tuple[TrainState, dict[str, Any]]:

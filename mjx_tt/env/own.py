@@ -57,6 +57,7 @@ class ControlStep:
     bounced: Bool[Array, "*batch"]  # the ball has bounced on the robot's side
     table_gap: Float[Array, "*batch"]  # [m] least distance of arm or paddle to the table; not above 0: contact
     own_gap: Float[Array, "*batch"]  # [m] of the robot to itself
+    blade_gap: Float[Array, "*batch"]  # [m] of the blade to the table
 
 
 @jax.tree_util.register_dataclass
@@ -228,7 +229,8 @@ def _check_term(term: Term) -> None:
     flag: Any = jax.ShapeDtypeStruct(BATCH, bool)
     joints, vector = number(N_JOINTS), number(3)
     blade = PaddlePose(vector, vector, vector, vector)
-    step = ControlStep(number(N_OBSERVATION), joints, joints, joints, blade, vector, vector, flag, number(), number())
+    gaps = number(), number(), number()
+    step = ControlStep(number(N_OBSERVATION), joints, joints, joints, blade, vector, vector, flag, *gaps)
     ball = PlayedBall(flag, flag, flag, number(), number(2), number(), number(), joints)
     found = jax.eval_shape(lambda given: jnp.asarray(term.function(given)), step if term.per == "step" else ball)
     if found.shape not in (BATCH, ()):

@@ -29,6 +29,7 @@ from mjx_tt.env.episode import Return as Return
 from mjx_tt.env.episode import Sums as Sums
 from mjx_tt.env.episode import TaskConfig as TaskConfig
 from mjx_tt.env.episode import Tick as Tick
+from mjx_tt.env.own import ControlStep
 from mjx_tt.env.reward_sums import accumulate
 from mjx_tt.robot import model as robot
 from mjx_tt.robot.clearance import CapsuleClearance
@@ -171,21 +172,20 @@ class Task:
         command_acceleration = (command - s.command) / period
         carried = qpos if drive.output is None else drive.output
         gaps = materialise(self.clearance(materialise(self.kinematics.links(carried)), carried[0]))
-        sums = accumulate(
-            s,
-            period,
-            seen,
-            controller.mean,
-            command,
-            command_acceleration,
-            carried,
-            pose,
-            gaps,
-            closest,
-            self.config.own_terms,
-            ball,
-            bounced,
+        step = ControlStep(
+            observation=seen,
+            command=command,
+            acceleration=command_acceleration,
+            joints=carried,
+            blade=pose,
+            ball_position=jnp.asarray(ball.position),
+            ball_velocity=jnp.asarray(ball.velocity),
+            bounced=bounced,
+            table_gap=gaps.table,
+            own_gap=gaps.own,
+            blade_gap=gaps.blade,
         )
+        sums = accumulate(s, step, period, controller.mean, closest, self.config.own_terms)
         ok = jnp.isfinite(sum(qpos[i] for i in range(N_JOINTS)) + sum(ball.position[i] for i in range(3)))
         return EpisodeState(
             qpos,
