@@ -27,6 +27,7 @@ from experiments.config.experiment import (
 )
 from experiments.config.finetuning import FineTuning
 from experiments.config.finetuning import parse as parse_fine_tuning
+from robot_io.contract import JOINT_NAMES
 
 Player = Literal["player1", "player2", "player3", "player4", "player5"]
 PLAYERS: tuple[Player, ...] = get_args(Player)
@@ -106,6 +107,42 @@ class Evaluation(Section):
     """Also in the virtual reality with one hidden effect left out at a time."""
 
 
+_LAGS = {name: (0.0, 0.04 if name.startswith("gantry") else 0.025) for name in JOINT_NAMES}  # [s]
+_ZEROS = {name: 0.006 if name.startswith("gantry") else 0.012 for name in JOINT_NAMES}  # [m], [rad]
+PRIOR: dict[str, Any] = {
+    # Rubbers of several makes, new and worn; glass tables and worn ones; lift as published (k 0.4 to 1.2).
+    "ball.paddle.restitution": [0.78, 0.95],
+    "ball.paddle.tangential_gain": [0.45, 0.8],
+    "ball.table.restitution": [0.87, 0.95],
+    "ball.table.friction": [0.12, 0.38],
+    "ball.flight.magnus_coefficient": [0.0, 1.2],
+    # Calibration within a centimetre, half a degree and half a per cent.
+    **{f"sensing.ball_offset_{axis}": [-0.012, 0.012] for axis in "xyz"},
+    **{f"sensing.camera_rotation_{axis}": [-0.008, 0.008] for axis in "xyz"},
+    "sensing.camera_scale": [0.995, 1.005],
+    # The paper's means of latency, give or take two of its deviations.
+    "latency.ball_observation": [0.024, 0.056],
+    "latency.abb_observation": [0.013, 0.045],
+    "latency.festo_observation": [0.015, 0.051],
+    "latency.abb_action": [0.060, 0.088],
+    "latency.festo_action": [0.042, 0.088],
+    **{f"drives.{name}.lag": list(ends) for name, ends in _LAGS.items()},
+    **{f"drives.{name}.velocity_gain": [0.92, 1.05] for name in JOINT_NAMES},
+    **{f"drives.{name}.joint_offset": [-size, size] for name, size in _ZEROS.items()},
+}
+
+
+class Identification(Section):
+    """Before each training in simulation: what the balls and joints measured so far say of the simulation."""
+
+    seconds: Annotated[float, Field(ge=10.0)] = 60.0
+    """[s] of joint motion that is recorded before the first ball."""
+    balls: Annotated[int, Field(ge=20)] = 400
+    """Balls of all rounds so far that are looked at, drawn evenly, if there are more."""
+    prior: dict[str, Any] = PRIOR
+    """Ranges, as under randomise of a model YAML, of what may be wrong; used where the logs say nothing."""
+
+
 class Study(Section):
     """One study."""
 
@@ -125,6 +162,8 @@ class Study(Section):
     """Effects of the virtual reality that training does not know."""
     fresh: bool = True
     """Also the variant whose weights are not carried back from reality to simulation."""
+    identification: Identification | None = None
+    """Also the variant that learns its simulation from what each round measures; null: none. Virtual reality only."""
     ablation: Ablation | None = Ablation()
     """Hand-made ball distributions against the oracle's; null: none."""
     evaluation: Evaluation = Evaluation()
@@ -155,6 +194,11 @@ class Study(Section):
             raise ValueError(
                 f"evaluation.rallies {rallies} is no multiple of its lanes {lanes} (evaluation.lanes); "
                 f"the nearest that is allowed: {near}"
+            )
+        if self.robot is not None and self.identification is not None:
+            raise ValueError(
+                "identification: on a robot its measurements are not collected by a study; leave it null, and use "
+                "`mjx-tt diagnose SESSION --retrain` between the rounds"
             )
         missing = [player for player in self.players if player not in self.recordings]
         if self.robot is not None and missing:

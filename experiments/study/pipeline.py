@@ -26,20 +26,33 @@ from experiments.config.study import Study
 from experiments.errors import RunError, checked
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
-from experiments.study import evaluation, training
+from experiments.study import evaluation, identification, training
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis import study_folder as study_data
 from experiments.study.blind import protocol
-from experiments.study.schedule import ORACLE, Human, Item, Real, Simulated, items, pairings, updates
+from experiments.study.schedule import (
+    ORACLE,
+    Human,
+    Identified,
+    Item,
+    Real,
+    Simulated,
+    items,
+    pairings,
+    updates,
+)
 from experiments.study.target_domain import hidden_effects as realities
 from experiments.study.target_domain import on_robot
 from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.world import VirtualWorld, World
 from experiments.study.training import POLICY
 from experiments.study.workflow import Step
+from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.env.policy import Policy
+from mjx_tt.sim import model as models
 
 CONVERGENCE = "convergence.json"
+JOINTS = "joints"
 REPORT = Path("report") / "index.html"
 
 
@@ -70,6 +83,10 @@ class Loop:
 
     def human(self, seed: int, player: str, name: str) -> Path:
         return self.seed_folder(seed) / player / "balls" / f"human_{name}.yaml"
+
+    def world(self, seed: int, player: str, name: str) -> Path:
+        """A world that was identified, as a model YAML."""
+        return self.seed_folder(seed) / player / "identified" / f"{name}.yaml"
 
     def run_of(self, seed: int, player: str, model: str) -> Path:
         """The run that holds a model's policy: of several trainings the chosen one."""
@@ -103,6 +120,8 @@ class Loop:
         for seed in self.study.seeds:
             if self.study.robot is None:
                 found.append(self._seal(seed))
+                if self.study.identification is not None:
+                    found.append(self._joints(seed, self.study.identification.seconds))
             for player in self.study.players:
                 found.append(self._first_balls(seed, player))
                 for item in items(self.study, player):
@@ -157,6 +176,8 @@ class Loop:
     def _step(self, seed: int, player: str, item: Item) -> Step:
         if isinstance(item, Human):
             return self._fit(seed, player, item)
+        if isinstance(item, Identified):
+            return self._identified(seed, player, item)
         return self._simulated(seed, player, item) if isinstance(item, Simulated) else self._real(seed, player, item)
 
     def _fit(self, seed: int, player: str, item: Human) -> Step:
@@ -172,17 +193,47 @@ class Loop:
 
         return Step(f"seed{seed}/{player}/{item.name}", "human model", len(sources), sources, (path,), run)
 
+    def _joints(self, seed: int, seconds: float) -> Step:
+        folder, name = self.seed_folder(seed) / JOINTS, f"seed{seed}/{JOINTS}"
+
+        def run() -> str:
+            records = self._virtual[seed].joint_log(seconds, name)
+            identification.write_joints(folder, records)
+            return f"{seconds:g} s of {len(records)} joints"
+
+        return Step(name, "joints", 1, (), tuple(folder / file for file in ROBOT_FILES), run)
+
+    def _identified(self, seed: int, player: str, item: Identified) -> Step:
+        settings = self.study.identification
+        assert settings is not None  # its items are made with it alone
+        path, name = self.world(seed, player, item.name), f"seed{seed}/{player}/{item.name}"
+        data, joints = tuple(self.data(seed, player, d) for d in item.data), self.seed_folder(seed) / JOINTS
+
+        def run() -> str:
+            believed = models.from_dict(self.study.simulation.model, "simulation.model")
+            before = identification.prior(settings.prior, "identification.prior")
+            world, found = checked(name, identification.identify, [*data, joints], settings.balls, believed, before)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            found.verdict.save(path.with_suffix(".verdict.json"))
+            world.save(path)
+            named = ", ".join(cause.name for cause in found.verdict.causes if "." not in cause.name) or "nothing"
+            return f"{found.verdict.verdict}: {named}; {len(identification.estimates(world))} parameters moved or drawn"
+
+        inputs = (*data, *(joints / file for file in ROBOT_FILES))
+        return Step(name, "identification", len(data), inputs, (path,), run)
+
     def _simulated(self, seed: int, player: str, item: Simulated) -> Step:
         folder, name = self.model_folder(seed, player, item.key), f"seed{seed}/{player}/{item.key}"
         human = self.human(seed, player, item.balls) if item.balls.startswith("M") else None
-        inputs: tuple[Path, ...] = () if human is None else (human,)
+        world = None if item.world is None else self.world(seed, player, item.world)
+        inputs: tuple[Path, ...] = tuple(path for path in (human, world) if path is not None)
         if item.source is not None:
             inputs += (self.model_folder(seed, player, item.source) / POLICY,)
 
         def run() -> str:
             source = None if item.source is None else self.run_of(seed, player, item.source)
             score = self._world[seed].score(player, name)
-            return training.simulate(self.study, item, folder, human, source, name, self.console, score)
+            return training.simulate(self.study, item, folder, human, source, name, self.console, score, world)
 
         optimiser = self.study.simulation.optimiser
         work = updates(self.study, item) * optimiser.num_directions * optimiser.repeats * self.study.simulation.seeds
@@ -267,7 +318,7 @@ class Loop:
 
     def _box(self, seed: int, trainer: str, model: str) -> Balls:
         """The balls that a policy was last trained on in simulation."""
-        made = {item.key: item for item in items(self.study, trainer) if not isinstance(item, Human)}
+        made = {item.key: item for item in items(self.study, trainer) if isinstance(item, Simulated | Real)}
         item = made["oracle-sim" if model == ORACLE else model]
         while isinstance(item, Real):
             item = made[item.source]

@@ -20,18 +20,28 @@ class Human:
 
 
 @dataclass(frozen=True)
+class Identified:
+    """A world to train in: what data sets together, and the joints' log, say of the simulation."""
+
+    name: str
+    data: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Simulated:
     """A policy trained in simulation.
 
     balls   a human model, or a distribution's name
     source  model whose weights it starts from; None: from scratch
     round   whose updates and recipe it has; None: the first round's recipe with the updates of all rounds
+    world   that was identified; None: the study's model
     """
 
     key: str
     balls: str
     source: str | None
     round: int | None
+    world: str | None = None
 
 
 @dataclass(frozen=True)
@@ -44,7 +54,7 @@ class Real:
     data: str | None = None
 
 
-Item = Human | Simulated | Real
+Item = Human | Identified | Simulated | Real
 
 LOOP: tuple[Item, ...] = (
     Human("M0", ("D0",)),
@@ -67,6 +77,19 @@ FRESH: tuple[Item, ...] = (
     Human("M2-fresh", ("D0", "D1", "D2-fresh")),
     Simulated("fresh-sim3", "M2-fresh", "fresh-sim2", 2),
     Real("fresh-ft100", "fresh-sim3", 2),
+)
+IDENTIFIED: tuple[Item, ...] = (
+    Identified("world0", ("D0",)),
+    Simulated("id-sim1", "M0", None, 0, "world0"),
+    Real("id-ft35", "id-sim1", 0, "D1-id"),
+    Human("M1-id", ("D0", "D1-id")),
+    Identified("world1", ("D0", "D1-id")),
+    Simulated("id-sim2", "M1-id", "id-ft35", 1, "world1"),
+    Real("id-ft65", "id-sim2", 1, "D2-id"),
+    Human("M2-id", ("D0", "D1-id", "D2-id")),
+    Identified("world2", ("D0", "D1-id", "D2-id")),
+    Simulated("id-sim3", "M2-id", "id-ft65", 2, "world2"),
+    Real("id-ft100", "id-sim3", 2),
 )
 MODELS = (
     "is2r-sim1",
@@ -93,7 +116,7 @@ ORACLE = "oracle"  # the oracle's simulated policy under its name in the ablatio
 
 def items(study: Study, player: str) -> tuple[Item, ...]:
     """Items made for a player, in an order in which everything comes after what it needs."""
-    chosen = LOOP + (FRESH if study.fresh else ())
+    chosen = LOOP + (FRESH if study.fresh else ()) + (IDENTIFIED if study.identification else ())
     if study.ablation and study.ablation.player == player:
         chosen += tuple(Simulated(balls, balls, None, None) for balls in study.ablation.balls)
     return chosen
@@ -111,7 +134,7 @@ def pairings(study: Study) -> list[tuple[str, str, str]]:
     """Trainer, evaluator and model of every evaluation."""
     found: list[tuple[str, str, str]] = []
     for trainer in study.players:
-        own = [item.key for item in items(study, trainer) if not isinstance(item, Human)]
+        own = [item.key for item in items(study, trainer) if isinstance(item, Simulated | Real)]
         if study.ablation and study.ablation.player == trainer:
             own.append(ORACLE)
         found += [(trainer, trainer, key) for key in own]

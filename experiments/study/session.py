@@ -13,7 +13,7 @@ from experiments.config.study import Study, parse
 from experiments.errors import RunError, checked
 from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
-from experiments.study import training
+from experiments.study import identification, training
 from experiments.study.pipeline import REPORT, Loop
 from experiments.study.schedule import Simulated, items
 from experiments.study.target_domain import on_robot
@@ -66,6 +66,8 @@ def look_up(study: Study) -> None:
     for item in items(study, study.players[0]):
         if isinstance(item, Simulated) and item.source is None:
             build.experiment(training.configuration(study, item, "narrow", None, 0), "simulation")
+    if study.identification is not None:
+        checked("identification", identification.prior, study.identification.prior, "prior")
     if study.robot is not None:
         on_robot.look_up(study, study.robot)
 

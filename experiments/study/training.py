@@ -10,7 +10,7 @@ from rich.console import Console
 
 from ballmodel.distribution import load_distribution
 from experiments.config import build
-from experiments.config.experiment import Config, Evaluation, Training
+from experiments.config.experiment import Config, Evaluation, Training, read_yaml
 from experiments.config.study import Study
 from experiments.runs import load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
@@ -22,8 +22,13 @@ from experiments.training.loop import train
 POLICY = "policy.npz"
 
 
-def configuration(study: Study, item: Simulated, balls: str | dict, source: Path | None, seed: int) -> Config:
-    """The training YAML of a model: balls by name or content, initial policy from ``source``, the round's recipe."""
+def configuration(
+    study: Study, item: Simulated, balls: str | dict, source: Path | None, seed: int, world: Path | None = None
+) -> Config:
+    """The training YAML of a model: balls by name or content, initial policy from ``source``, the round's recipe.
+
+    world: model YAML that was identified; None: the study's.
+    """
     simulation = study.simulation
     recipe = simulation.rounds[item.round or 0]
     optimiser = simulation.optimiser
@@ -41,7 +46,7 @@ def configuration(study: Study, item: Simulated, balls: str | dict, source: Path
     return Config(
         name=item.key,
         balls=balls,
-        model=simulation.model,
+        model=simulation.model if world is None else read_yaml(world.read_text(encoding="utf-8"), str(world)),
         task=simulation.task,
         optimiser=optimiser,
         training=training,
@@ -59,17 +64,19 @@ def simulate(
     name: str,
     console: Console,
     score: Callable[[TrainedPolicy], float] | None,
+    world: Path | None = None,
 ) -> str:
     """Trains every seed of a model in ``folder``/training, or goes on with them, and writes the chosen policy.
 
     human: YAML of the human model; None: the distribution that the item names. source: run to start from. name: of the
-    step, which decides the seeds. score: what a policy is worth in reality, needed to choose among seeds.
+    step, which decides the seeds. score: what a policy is worth in reality, needed to choose among seeds. world: as in
+    ``configuration``.
     """
     balls = item.balls if human is None else load_distribution(human).to_dict()
     scores: dict[str, float] = {}
     for k in range(study.simulation.seeds):
         seed = zlib.crc32(f"{name}/{k}".encode()) >> 1  # another one for every player, model and study seed
-        config = configuration(study, item, balls, source, seed)
+        config = configuration(study, item, balls, source, seed, world)
         experiment, run = build.experiment(config, name), Run(folder / "training" / f"seed{k}")
         run.check(experiment.config)
         if not run.trained(experiment.config):

@@ -101,7 +101,7 @@ def diagnose(
             paddle.part(found, hits, without),
         ]
     if robot is not None:
-        parts.append(joint.part(robot))
+        parts += joint.parts(robot)
     verdict, values, ranges = combined(parts, notes)
     provenance = {
         **(provenance or {}),

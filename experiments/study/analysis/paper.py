@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from ballmodel import registry
 
 IS2R, S2R, ORACLE, FRESH, ABLATION = "i-S2R", "S2R", "S2R-Oracle", "i-S2R, weights not carried back", "ablation"
+IDENTIFIED = "i-S2R with identification"
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,18 @@ VARIANT = (
     Model("fresh-ft100", "fine-tuned 100 %, weights not carried back", FRESH, 1.0, True),
 )
 """The variant that the paper leaves to future work: simulation goes on from its own weights."""
+LEARNED = (
+    Model("id-sim1", "sim 1, identified", IDENTIFIED, 0.0, False),
+    Model("id-ft35", "fine-tuned 35 %, identified", IDENTIFIED, 0.35, True),
+    Model("id-sim2", "sim 2, identified", IDENTIFIED, 0.35, False),
+    Model("id-ft65", "fine-tuned 65 %, identified", IDENTIFIED, 0.65, True),
+    Model("id-sim3", "sim 3, identified", IDENTIFIED, 0.65, False),
+    Model("id-ft100", "fine-tuned 100 %, identified", IDENTIFIED, 1.0, True),
+)
+"""The variant that learns its simulation from what each round measures, which the paper does by hand."""
 ABLATED = tuple(Model(key, key.capitalize(), ABLATION, 0.0, False) for key in ("large", "medium", "narrow", "oracle"))
 """Zero-shot policies of the ablation of the ball distribution, one player."""
-BY_KEY = {model.key: model for model in (*MODELS, *VARIANT, *ABLATED)}
+BY_KEY = {model.key: model for model in (*MODELS, *VARIANT, *LEARNED, *ABLATED)}
 TEN = tuple(model.key for model in MODELS)
 FINAL = ("is2r-ft100", "s2r-ft100", "oracle-ft")
 """The methods' final policies, in the order of the paper's figures; these are cross-evaluated."""

@@ -19,6 +19,7 @@ from experiments.study.analysis.paper import (
     CROSS,
     FINAL,
     FRESH,
+    IDENTIFIED,
     IS2R,
     LEVELS,
     ORACLE,
@@ -55,6 +56,7 @@ NAMES = {
     S2R: "S2R (+FT)",
     ORACLE: "S2R-Oracle (+FT)",
     FRESH: "weights not carried back",
+    IDENTIFIED: "i-S2R with identification",
     ABLATION: "ablation",
 }
 STAGES = ("sim 1", "fine-tuned\n35 %", "sim 2", "fine-tuned\n65 %", "sim 3", "fine-tuned\n100 %")

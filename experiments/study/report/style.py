@@ -19,7 +19,18 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from experiments.study.analysis.paper import ABLATION, BY_KEY, FRESH, IS2R, ORACLE, S2R, SHORT, level, of_level
+from experiments.study.analysis.paper import (
+    ABLATION,
+    BY_KEY,
+    FRESH,
+    IDENTIFIED,
+    IS2R,
+    ORACLE,
+    S2R,
+    SHORT,
+    level,
+    of_level,
+)
 from experiments.study.analysis.statistics import Bootstrap, Estimate, Interval
 from mjx_tt.viz.html import FAINT, INK
 from mjx_tt.viz.html import STYLE as PAGE_STYLE
@@ -28,7 +39,14 @@ P = ParamSpec("P")
 T = TypeVar("T")
 Shade = str | tuple[float, float, float]  # a colour
 
-COLOUR = {IS2R: "#0072b2", S2R: "#d55e00", ORACLE: "#009e73", FRESH: "#cc79a7", ABLATION: "#e69f00"}
+COLOUR = {
+    IS2R: "#0072b2",
+    S2R: "#d55e00",
+    ORACLE: "#009e73",
+    FRESH: "#cc79a7",
+    ABLATION: "#e69f00",
+    IDENTIFIED: "#56b4e9",
+}
 STYLE = PAGE_STYLE | {"figure.constrained_layout.use": True, "axes.titleweight": "bold", "font.size": 9.5}
 PAPER_MARK = Line2D([], [], color=INK, marker="D", markerfacecolor="white", linestyle="", label="paper")
 

@@ -20,6 +20,7 @@ from experiments.study.analysis.paper import (
     CROSS,
     FINAL,
     GROUPS,
+    LEARNED,
     MODELS,
     SHORT,
     TEN,
@@ -29,7 +30,9 @@ from experiments.study.analysis.paper import (
 )
 from experiments.study.analysis.statistics import t_mean
 from experiments.study.analysis.study_folder import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
+from experiments.study.identification import estimates
 from mjx_tt.rally.end_reasons import ROWS, End
+from mjx_tt.sim.model import ModelFile
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ def models(study: Study, m: Measurements) -> Table:
     fixed = Measurements(study, over_seeds=False)
     rows = []
     for group in GROUPS:
-        for model in (*MODELS, *VARIANT, *ABLATED):
+        for model in (*MODELS, *VARIANT, *LEARNED, *ABLATED):
             by_rallies, by_seeds = (b.raw.mean(model.key, of_level(group)) for b in (fixed, m))
             if by_rallies is None or by_seeds is None:
                 continue
@@ -239,6 +242,22 @@ def ends(study: Study) -> Table:
         )
     head = ("row", "how the rally ended", "ended by", "ten models", "i-S2R", "S2R+FT", "cross-evaluations")
     return Table(head, rows, (3, 4, 5, 6))
+
+
+def identified(study: Study) -> Table:
+    """What was identified, by seed, player and round: 90 % of what training draws, beside the opened reality."""
+    rows = []
+    for path in sorted(study.folder.glob("seed*/player*/identified/world*.yaml")):
+        seed, player = int(path.parents[2].name[4:]), path.parents[1].name
+        opened = study.realities.get(seed)
+        truth = None if opened is None else opened["reality"]
+        for row in estimates(ModelFile.load(path), truth):
+            low, high, known = row["low"], row["high"], row.get("truth")
+            held = "" if known is None else "yes" if low <= known <= high else "no"
+            values = (f"{x:.4g}" if x is not None else "sealed" for x in (row["believed"], low, high, known))
+            rows.append((str(seed), player, path.stem, row["parameter"], *values, held))
+    head = ("seed", "player", "round", "parameter", "believed", "from", "to", "truth", "holds it")
+    return Table(head, rows, (4, 5, 6, 7))
 
 
 def cross(study: Study, m: Measurements) -> Table:

@@ -18,7 +18,9 @@ from experiments.config.study import Study
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import CONFIG, Run
+from experiments.study.target_domain import joint_log
 from experiments.study.target_domain.finetuning import VirtualReality
+from mjx_tt.diagnosis.joint import JointRecord
 
 STUDY = 6  # purpose of a key, beside those of experiments.config.build
 
@@ -49,6 +51,10 @@ class VirtualWorld:
         return self.reality.first_balls(
             self.reality.player(player), self._study.first_balls, self._key(name), Path(name).name
         )
+
+    def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
+        """Commands and measured positions of all joints in so many seconds of motion without a ball."""
+        return joint_log.record(self.reality.simulator.task, self.reality.known, self._key(name), seconds)
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         theta, statistics = load_policy.load_statistics(source)

@@ -145,24 +145,31 @@ def _predictions(fitter: Fitter, choice: Choice, rng: np.random.Generator) -> Jo
     return JointFindings(held_out=(gain,), residuals=(cross_validation.residuals(fitter.log, values),))
 
 
-def part(found: JointFindings) -> Part:
-    """The joints' part of the verdict."""
-    unexplained = held_out = None
-    if found.unexplained is not None:
-        u = found.unexplained
-        unexplained = Unexplained(f"{u.joint}: {u.block}", u.where, u.direction, f"{u.size:.2f} mrad or mm")
+def parts(found: JointFindings) -> tuple[Part, ...]:
+    """The joints' parts of the verdict, one for each: what one joint leaves unexplained says nothing against another's
+    causes. The first, with what all say together, is that of the joint that leaves most."""
+    held_out = None
     if found.held_out:
         means = (1e3 * np.mean([getattr(g, n) for g in found.held_out]) for n in ("before", "after", "low", "high"))
         metric = "rms of joint positions on windows not used, mean over joints [mrad], [mm]"
         held_out = HeldOut(metric, *map(float, means))
-    return Part(
-        tuple(Expressed(cause, _drive_values(cause)) for cause in found.causes),
-        unexplained=unexplained,
+    together = Part(
         held_out=held_out,
         not_identifiable=tuple(f"{u.name}: {u.why}" for u in found.not_identifiable),
         not_excited=tuple(f"{u.name}: {u.why}" for u in found.not_excited),
         next_experiment=tuple(Experiment(text, (), 0.0) for text in found.next_experiment),
     )
+    open_ = {u.joint: u for u in found.unexplained_by_joint}
+    every = dict.fromkeys([*open_, *(cause.name.partition(".")[0] for cause in found.causes)])
+    return together, *(_part_of(joint, found, open_.get(joint)) for joint in every)
+
+
+def _part_of(joint: str, found: JointFindings, left: JointFinding | None) -> Part:
+    named = tuple(Expressed(c, _drive_values(c)) for c in found.causes if c.name.partition(".")[0] == joint)
+    if left is None:
+        return Part(named)
+    size = f"{left.size:.2f} mrad or mm"
+    return Part(named, unexplained=Unexplained(f"{left.joint}: {left.block}", left.where, left.direction, size))
 
 
 def _drive_values(cause: Cause) -> dict[str, float]:

@@ -1,0 +1,114 @@
+"""A study's world as it is identified: from logs of other code, beside a prior, without the reality."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from ballmodel.partial_params import without_nominal
+from ballmodel.trajectory import Dataset, Trajectory
+from experiments import measurements
+from experiments.config.study import PRIOR
+from experiments.study import identification
+from experiments.study.target_domain import joint_log
+from mjx_tt import diagnosis
+from mjx_tt.env.task import Task, TaskConfig
+from mjx_tt.robot import model as robot
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import ModelFile, SimModel
+from robot_io.contract import JOINT_NAMES, LIMITS
+from tests.exam.generator.world import World, fly
+
+pytestmark = pytest.mark.optimised
+
+
+@pytest.fixture(scope="module")
+def task():
+    return Task(TaskConfig(sim_rate=300.0))
+
+
+def swept(task, model: SimModel, seed: int = 0):
+    return joint_log.record(task, without_nominal(model), jax.random.key(seed), 30.0)
+
+
+def balls(world: World, n: int = 120) -> Dataset:
+    """Balls of one speed range over the table by the exam's physics, with 3 mm of noise."""
+    rng = np.random.default_rng(7)
+    position = rng.uniform([[-0.4], [1.0], [0.2]], [[0.4], [1.6], [0.4]], (3, n))
+    velocity = rng.uniform([[-0.6], [-6.0], [0.5]], [[0.6], [-4.5], [1.5]], (3, n))
+    time = np.arange(56) / 125.0
+    path = fly(world, np.concatenate([position, velocity, np.zeros((3, n))]), time[-1] + 0.01)
+    seen = path.at(np.repeat(time[:, None], n, axis=1)) + rng.normal(0.0, 0.003, (3, time.size, n))
+    return Dataset(tuple(Trajectory("day", str(i), time, seen[:, :, i]) for i in range(n)), "test")
+
+
+def test_sweeps_stay_within_the_limits_and_near_home():
+    rng, period = np.random.default_rng(1), 1.0 / 75.0
+    actions = joint_log.multisine(rng, 4500, period)
+    assert np.abs(actions).max() <= 1.0 and not actions[:37].any()
+    moved = np.cumsum(actions * LIMITS.policy_velocity, axis=0) * period
+    home = np.asarray(robot.home_qpos(robot.load_model()))
+    assert np.all(home + moved < LIMITS.upper) and np.all(home + moved > LIMITS.lower)
+    assert np.all(np.ptp(moved, axis=0) > 0.03 * (np.array(LIMITS.upper) - LIMITS.lower))
+
+
+@pytest.mark.slow
+def test_the_nominal_robots_own_log_shows_nothing(task):
+    found = diagnosis.diagnose(diagnosis.Logs((), swept(task, SimModel()), {}))
+    assert found.verdict.verdict == "none"
+
+
+@pytest.mark.slow
+def test_a_world_is_what_the_logs_say_and_the_prior_for_the_rest(task, tmp_path):
+    slow = {"drives.joint_2.lag": 0.018, "drives.gantry_x.velocity_gain": 0.95}
+    truth = {**slow, "ball.table.friction": 0.19, identification.SEEN_HIGH: 0.006}
+    model = models.with_values(SimModel(), slow)
+    identification.write_joints(tmp_path / "joints", swept(task, model))
+    measured = balls(World(friction=0.19, height=0.006))  # on a table 6 mm high, or 6 mm too high to the camera
+    measurements.write_csv(tmp_path / "D0.csv", measured)
+    before = identification.prior(PRIOR, "prior")
+    logs = [tmp_path / "D0.csv", tmp_path / "joints"]
+    world, found = identification.identify(logs, 100, ModelFile(SimModel()), before)
+    assert found.balls.problem.grid.n <= 100
+    values, drawn = models.paths(world.model), {path for one in world.randomise for path in one.paths}
+    for path, value in truth.items():
+        assert values[path] == pytest.approx(value, rel=0.08), path
+    assert values["ball.table.height"] == 0.0 and "ball.table.height" not in drawn
+    # What no log of this kind shows is drawn as before, what the logs settled is not.
+    hidden = {
+        "ball.paddle.restitution",
+        "latency.ball_observation",
+        "sensing.ball_offset_x",
+        "drives.joint_1.joint_offset",
+    }
+    assert hidden <= drawn
+    settled = {"latency.abb_action", *(f"drives.{joint}.lag" for joint in JOINT_NAMES)}
+    assert not settled & drawn
+    rows = {row["parameter"]: row for row in identification.estimates(world, truth)}
+    friction = rows["ball.table.friction"]
+    assert friction["low"] < 0.19 < friction["high"] < friction["low"] + 0.02 and friction["truth"] == 0.19
+    # Training takes it as it stands, with all that is drawn.
+    world.save(tmp_path / "world.yaml")
+    loaded = ModelFile.load(tmp_path / "world.yaml")
+    shape = (7,)
+    one = models.draw(jax.random.key(0), loaded.model, loaded.randomise, shape)
+    assert np.ptp(np.asarray(one.ball.paddle.restitution)) > 0.0 and one.ball.table.friction.shape == shape
+
+
+def test_a_prior_with_an_unknown_path_is_refused():
+    with pytest.raises(ValueError, match="identification.prior.*did you mean 'ball.table.friction'"):
+        identification.prior({"ball.table.fricton": [0.1, 0.2]}, "identification.prior")
+
+
+def test_rows_of_a_world_name_what_moved_or_is_drawn():
+    world = ModelFile(
+        models.with_values(SimModel(), {"ball.table.friction": 0.2}),
+        identification.prior({"ball.paddle.restitution": [0.8, 0.9]}, "prior"),
+    )
+    rows = {row["parameter"]: (row["low"], row["high"]) for row in identification.estimates(world)}
+    assert rows == {"ball.table.friction": (0.2, 0.2), "ball.paddle.restitution": (0.8, 0.9)}
+    nothing = replace(world, model=SimModel(), randomise=())
+    assert identification.estimates(nothing) == []
