@@ -1,4 +1,4 @@
-"""What a round's measurements say of the simulation, and the world that the next training believes in.
+"""The simulation as a round's measurements have it: the world that the next training believes in.
 
 Balls across the table and a minute of joint motion go through the diagnosis. Its extended model, with all that the logs
 leave open of it as samples, becomes the simulation; what no such log shows (the rubber, delays of the ball, encoder
@@ -85,25 +85,6 @@ def _settled(found: Diagnosis) -> set[str]:
         if set(sound) == set(JOINT_NAMES):
             settled |= {path for path in models.paths() if path.startswith(OF_ALL_JOINTS)}
     return settled
-
-
-def estimates(world: ModelFile, truth: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
-    """A row for each parameter that the world moved or draws: its value, 90 % of what is drawn, and the truth if known.
-
-    truth: values that differ from the nominal model, by dotted path.
-    """
-    nominal, values = models.paths(), models.paths(world.model)
-    drawn = {path: ends for one in world.randomise for path, ends in one.ends().items()}
-    rows = []
-    for path, value in values.items():
-        low, high = drawn.get(path, (value, value))
-        if low == high == nominal[path] and (truth is None or path not in truth):
-            continue
-        row: dict[str, Any] = {"parameter": path, "believed": nominal[path], "low": low, "high": high}
-        if truth is not None:
-            row["truth"] = truth.get(path, nominal[path])
-        rows.append(row)
-    return rows
 
 
 def write_joints(folder: Path, records: Collection[JointRecord]) -> None:

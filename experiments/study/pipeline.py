@@ -29,6 +29,7 @@ from experiments.runs.locate import SELECTION
 from experiments.study import evaluation, identification, training
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis import study_folder as study_data
+from experiments.study.analysis.identified import estimates
 from experiments.study.blind import protocol
 from experiments.study.schedule import (
     ORACLE,
@@ -217,7 +218,7 @@ class Loop:
             found.verdict.save(path.with_suffix(".verdict.json"))
             world.save(path)
             named = ", ".join(cause.name for cause in found.verdict.causes if "." not in cause.name) or "nothing"
-            return f"{found.verdict.verdict}: {named}; {len(identification.estimates(world))} parameters moved or drawn"
+            return f"{found.verdict.verdict}: {named}; {len(estimates(world))} parameters moved or drawn"
 
         inputs = (*data, *(joints / file for file in ROBOT_FILES))
         return Step(name, "identification", len(data), inputs, (path,), run)

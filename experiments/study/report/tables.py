@@ -14,6 +14,7 @@ from ballmodel.io.atomic_files import replacing
 from experiments.stats import holm
 from experiments.study.analysis import effect_costs
 from experiments.study.analysis.claims import Finding, Measurements, paper_changes, show, span
+from experiments.study.analysis.identified import estimates
 from experiments.study.analysis.paper import (
     ABLATED,
     BY_KEY,
@@ -30,7 +31,6 @@ from experiments.study.analysis.paper import (
 )
 from experiments.study.analysis.statistics import t_mean
 from experiments.study.analysis.study_folder import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
-from experiments.study.identification import estimates
 from mjx_tt.rally.end_reasons import ROWS, End
 from mjx_tt.sim.model import ModelFile
 

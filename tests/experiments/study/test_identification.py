@@ -13,6 +13,7 @@ from ballmodel.trajectory import Dataset, Trajectory
 from experiments import measurements
 from experiments.config.study import PRIOR
 from experiments.study import identification
+from experiments.study.analysis.identified import estimates
 from experiments.study.target_domain import joint_log
 from mjx_tt import diagnosis
 from mjx_tt.env.task import Task, TaskConfig
@@ -87,7 +88,7 @@ def test_a_world_is_what_the_logs_say_and_the_prior_for_the_rest(task, tmp_path)
     assert hidden <= drawn
     settled = {"latency.abb_action", *(f"drives.{joint}.lag" for joint in JOINT_NAMES)}
     assert not settled & drawn
-    rows = {row["parameter"]: row for row in identification.estimates(world, truth)}
+    rows = {row["parameter"]: row for row in estimates(world, truth)}
     friction = rows["ball.table.friction"]
     assert friction["low"] < 0.19 < friction["high"] < friction["low"] + 0.02 and friction["truth"] == 0.19
     # Training takes it as it stands, with all that is drawn.
@@ -108,7 +109,7 @@ def test_rows_of_a_world_name_what_moved_or_is_drawn():
         models.with_values(SimModel(), {"ball.table.friction": 0.2}),
         identification.prior({"ball.paddle.restitution": [0.8, 0.9]}, "prior"),
     )
-    rows = {row["parameter"]: (row["low"], row["high"]) for row in identification.estimates(world)}
+    rows = {row["parameter"]: (row["low"], row["high"]) for row in estimates(world)}
     assert rows == {"ball.table.friction": (0.2, 0.2), "ball.paddle.restitution": (0.8, 0.9)}
     nothing = replace(world, model=SimModel(), randomise=())
-    assert identification.estimates(nothing) == []
+    assert estimates(nothing) == []

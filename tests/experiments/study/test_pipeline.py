@@ -34,7 +34,7 @@ from experiments.study import evaluation, schedule, session, training, workers
 from experiments.study import pipeline as is2r
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.blind import protocol
-from experiments.study.schedule import Human, Real, Simulated
+from experiments.study.schedule import Human, Identified, Real, Simulated
 from experiments.study.target_domain import hidden_effects
 from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.on_robot import blind_steps
@@ -114,6 +114,8 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
         ({"ablation": {"player": "player4"}}, "ablation.player 'player4'"),
         ({"evaluation": {"rallies": 50, "lanes": 7}}, "multiple of its lanes 7"),
         ({"robot": "lockstep"}, "recordings of the first balls of player3"),
+        ({"robot": "lockstep", "identification": {}}, "not collected by a study; leave it null"),
+        ({"identification": {"second": 5}}, "identification.second: unknown key; did you mean 'seconds'"),
         ({"fine_tuning": {"rewards": "sim"}}, "not measure"),
     ],
 )
@@ -180,17 +182,23 @@ def test_a_start_that_came_to_no_step_does_not_block_another(tmp_path):
 
 
 def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_there():
-    whole = study_config.load(study_config.shipped()["study_full"])
+    whole = study_config.load(study_config.shipped()["study_full"], ("identification={}",))
+    needs = {
+        Human: lambda i: i.data,
+        Identified: lambda i: i.data,
+        Simulated: lambda i: (i.balls, i.source, i.world),
+        Real: lambda i: (i.source,),
+    }
     for player in whole.players:
         made: set[str] = {"D0", "large", "medium", "narrow"}
         for item in schedule.items(whole, player):
-            needs = {Human: lambda i: i.data, Simulated: lambda i: (i.balls, i.source), Real: lambda i: (i.source,)}
             assert {n for n in needs[type(item)](item) if n is not None} <= made, item
             made |= (
                 {item.name}
-                if isinstance(item, Human)
+                if isinstance(item, Human | Identified)
                 else {item.key} | ({item.data} if isinstance(item, Real) else set())
             )
+        assert {"world2", "id-ft100"} <= made
         assert set(schedule.MODELS) <= made
     # "fine-tuned for 70 updates per cycle for the last two cycles and 60 for the first": 200, oracle 35 %.
     by_key = {item.key: item for item in schedule.LOOP if not isinstance(item, Human)}
