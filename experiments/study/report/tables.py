@@ -245,7 +245,7 @@ def ends(study: Study) -> Table:
 
 
 def identified(study: Study) -> Table:
-    """What was identified, by seed, player and round: 90 % of what training draws, beside the opened reality."""
+    """Parameters that were identified, round by round: 90 % of what training draws, and the opened reality."""
     rows = []
     for path in sorted(study.folder.glob("seed*/player*/identified/world*.yaml")):
         seed, player = int(path.parents[2].name[4:]), path.parents[1].name
