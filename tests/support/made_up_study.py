@@ -16,9 +16,10 @@ from ballmodel import constants as c
 from ballmodel import registry
 from ballmodel.distribution import save_distribution
 from experiments.study.analysis import effect_costs, scoring
-from experiments.study.analysis.paper import ABLATED, BY_SKILL, CROSS, FINAL, MODELS, VARIANT
+from experiments.study.analysis.paper import ABLATED, BY_SKILL, CROSS, FINAL, LEARNED, MODELS, VARIANT
 from experiments.study.blind import protocol
 from mjx_tt.rally.end_reasons import End
+from mjx_tt.sim.model import ModelFile, Range, SimModel
 
 MEANS = {
     "is2r-sim1": 3.0,
@@ -35,6 +36,12 @@ MEANS = {
     "fresh-ft65": 7.0,
     "fresh-sim3": 6.0,
     "fresh-ft100": 8.0,
+    "id-sim1": 7.0,
+    "id-ft35": 8.0,
+    "id-sim2": 9.0,
+    "id-ft65": 10.0,
+    "id-sim3": 11.0,
+    "id-ft100": 12.0,
     "large": 3.5,
     "medium": 5.8,
     "narrow": 3.0,
@@ -44,6 +51,7 @@ SKILL = {"player3": 1.0, "player5": 1.4, "player4": 2.0, "player2": 2.4, "player
 KEPT = {"is2r-ft100": 0.7, "s2r-ft100": 0.35, "oracle-ft": 0.65}
 RALLIES = 80
 WITHOUT = {"magnus": 1.2, "drives": 0.9, "all": 1.5}  # how many times as long the rallies are without an effect
+REALITY = {"ball.table.friction": 0.2, "ball.paddle.restitution": 0.97}
 ROBOT_SHARE = 0.85  # of the counted rallies
 FILTERED_SHARE = 0.08
 ABLATION_PLAYER = "player4"
@@ -71,9 +79,10 @@ def make(folder: Path, seeds=(0,), names=BY_SKILL, balls: int = 60, rallies: int
             pools = _balls(folder / f"seed{seed}" / player / "balls", player, balls, rng)
             for key in ("is2r-ft35", "is2r-ft65", "is2r-ft100", "s2r-ft65", "s2r-ft100", "oracle-ft"):
                 _metrics(folder / f"seed{seed}" / player / key, 60 if key == "is2r-ft35" else 70, rng)
-            wanted = [(player, m.key) for m in (*MODELS, *VARIANT)]
+            wanted = [(player, m.key) for m in (*MODELS, *VARIANT, *LEARNED)]
             wanted += [(other, key) for other in CROSS[player] for key in FINAL] if cross else []
             wanted += [(player, m.key) for m in ABLATED] if player == ABLATION_PLAYER else []
+            _world(folder / f"seed{seed}" / player / "identified" / "world0.yaml")
             codes = protocol.draw([f"{e}/{m}" for e, m in wanted], rng)
             for evaluator, model in wanted:
                 one = _play(seed, player, evaluator, model, codes[f"{evaluator}/{model}"], rallies, rng)
@@ -91,7 +100,7 @@ def make(folder: Path, seeds=(0,), names=BY_SKILL, balls: int = 60, rallies: int
                 for world in effect_costs.WORLDS
             ],
         )
-        (folder / f"seed{seed}" / "reality.yaml").write_text("ball: {flight: {magnus: 0.00037}}\n")
+        (folder / f"seed{seed}" / "reality.yaml").write_text(json.dumps({"seed": seed, "reality": REALITY}))
     scoring.write(folder / "evaluations.csv", scoring.join(parts))
     return folder
 
@@ -105,6 +114,13 @@ def _play(seed, trainer, evaluator, model, code, rallies, rng) -> scoring.Rallie
     dropped = rng.random(rallies) < FILTERED_SHARE
     end = np.where(dropped, rng.choice([End.FIRST_NET, End.SERVICE, End.DUMMY_BY_HAND], rallies), end)
     return scoring.scored(seed, trainer, evaluator, model, code, np.where(dropped, 1, length), end)
+
+
+def _world(path: Path) -> None:
+    """An identified world that holds the table's friction, and not the paddle's restitution."""
+    path.parent.mkdir(parents=True)
+    drawn = (Range("ball.table.friction", 0.19, 0.21), Range("ball.paddle.restitution", 0.8, 0.95))
+    ModelFile(SimModel(), drawn).save(path)
 
 
 def _metrics(folder: Path, updates: int, rng) -> None:

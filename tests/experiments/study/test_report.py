@@ -323,6 +323,18 @@ def test_the_report_is_one_page_that_needs_nothing_else(whole):
     assert paper[0] == ["player3 (beginner)", "paper", "2", "3", "7", "5.9", "9", "52", "500"]
 
 
+def test_identified_worlds_stand_beside_the_opened_reality(whole):
+    with open(whole / "report" / "identified.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    held = {(row["parameter"], row["truth"], row["holds it"]) for row in rows}
+    assert held == {("ball.table.friction", "0.2", "yes"), ("ball.paddle.restitution", "0.97", "no")}
+    assert len(rows) == 2 * 2 * 2 and {row["round"] for row in rows} == {"world0"}  # seeds, players, parameters
+    m = claims.Measurements(study_data.load(whole))
+    ratio, known = m.ratio("id-sim1", "is2r-sim1", "all").interval, made_up_study.MEANS["id-sim1"] / 3.0
+    assert ratio.low < known < ratio.high
+    assert (whole / "report" / "identification.png").stat().st_size > 10_000
+
+
 def test_a_study_that_has_just_begun_has_a_report(tmp_path):
     folder = made_up_study.make(tmp_path, names=("player5",), balls=6, cross=False)
     for path in (folder / "evaluations").iterdir():
