@@ -146,8 +146,10 @@ def _predictions(fitter: Fitter, choice: Choice, rng: np.random.Generator) -> Jo
 
 
 def parts(found: JointFindings) -> tuple[Part, ...]:
-    """The joints' parts of the verdict, one for each: what one joint leaves unexplained says nothing against another's
-    causes. The first, with what all say together, is that of the joint that leaves most."""
+    """The joints' parts of the verdict: one for all together, and one for each that has a cause or something open.
+
+    What one joint leaves unexplained says nothing against another's causes. Those that leave most come first.
+    """
     held_out = None
     if found.held_out:
         means = (1e3 * np.mean([getattr(g, n) for g in found.held_out]) for n in ("before", "after", "low", "high"))

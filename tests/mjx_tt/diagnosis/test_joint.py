@@ -9,7 +9,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mjx_tt.diagnosis.joint import JointRecord, JointResponse, diagnose_joints, read_robot_csv
+from mjx_tt.diagnosis.joint import (
+    JointFinding,
+    JointFindings,
+    JointRecord,
+    JointResponse,
+    diagnose_joints,
+    read_robot_csv,
+)
+from mjx_tt.diagnosis.joint.diagnose import parts
+from mjx_tt.diagnosis.verdict import NOT_ADOPTED, Cause, Estimate, combined
 
 DT = 2e-4
 NOMINAL = JointResponse(action_delay=0.071, observation_delay=0.029)
@@ -352,3 +361,16 @@ def test_reads_a_pair_of_files_and_names_what_is_wrong(tmp_path):
     write(tmp_path, commands, states, "time,joint,velocity")
     with pytest.raises(ValueError, match=r"no column \['t'\]"):
         read_robot_csv(*files)
+
+
+def test_a_joint_that_stays_open_takes_no_others_cause_with_it():
+    def cause(joint, lag):
+        name = f"{joint}.lag"
+        return Cause(name, (name,), 1.0, {name: Estimate(0.0, lag, lag, lag, "s")}, 3.0, "")
+
+    left = (JointFinding("joint_3", "dynamics", "after 0.04 s", "-", 0.6), JointFinding("joint_5", "x", "y", "-", 0.9))
+    found = JointFindings(causes=(cause("joint_2", 0.02), cause("joint_3", 0.01)), unexplained_by_joint=left)
+    verdict, values, _ = combined(parts(found))
+    assert verdict.verdict == "unexplained" and values == {"drives.joint_2.lag": 0.02}
+    assert {c.name for c in verdict.causes} == {"joint_2.lag", "joint_3.lag"}
+    assert verdict.unexplained.block.startswith("joint_3") and NOT_ADOPTED in verdict.warnings
