@@ -20,6 +20,7 @@ from ballmodel.io.atomic_files import replacing
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis import Diagnosis
 from mjx_tt.diagnosis.ball.effects import EFFECTS
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR
 from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.sim import model as models
@@ -27,6 +28,7 @@ from mjx_tt.sim.model import ModelFile
 from mjx_tt.sim.randomisation import Randomised, Samples
 from robot_io.contract import JOINT_NAMES
 
+LIFT = "ball.flight.magnus_coefficient"
 # The frame is the table's: bounces that lie too high are a camera that sees high, not a table that stands there.
 HEIGHT, SEEN_HIGH = "ball.table.height", "sensing.ball_offset_z"
 OF_ALL_JOINTS = ("latency.abb_", "latency.festo_")  # delays that a sound log of every joint settles
@@ -49,7 +51,11 @@ def identify(
     if len(read.balls) > most:
         chosen = np.sort(np.random.default_rng(0).permutation(len(read.balls))[:most])
         read = replace(read, balls=tuple(read.balls[i] for i in chosen))
-    found = diagnosis.diagnose(read, believed.model, randomise=True)
+    # People's balls spin, and the table spins those that do not: a lift is believed, and every ball has its own spin.
+    model = believed.model
+    if model.ball.flight.magnus_coefficient == 0.0:
+        model = models.with_values(model, {LIFT: MAGNUS_PRIOR[0]})
+    found = diagnosis.diagnose(read, model, spin="free", randomise=True)
     extended, settled = _in_the_tables_frame(found.extended), _settled(found)
     settled |= {SEEN_HIGH} if HEIGHT in settled else set()
     left = tuple(one for one in before if not set(one.paths) <= settled)
@@ -73,7 +79,8 @@ def _renamed(drawn: Samples) -> Samples:
 def _settled(found: Diagnosis) -> set[str]:
     """Parameters that the logs have settled, whether they moved or not."""
     settled = {path for one in found.extended.randomise for path in one.paths}
-    if found.verdict.verdict == "undetermined":
+    gained = found.verdict.held_out is not None and found.verdict.held_out.low > 0.0
+    if found.verdict.verdict == "undetermined" and not gained:  # nothing of it was adopted
         return settled
     if found.balls is not None and not found.balls.findings:
         seen = {e.name: e.path for e, s in zip(found.balls.trial.effects, found.balls.seen, strict=True) if s}

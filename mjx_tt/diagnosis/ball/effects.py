@@ -167,6 +167,7 @@ EFFECTS: tuple[Effect, ...] = (
         unit="1/s",
         reading="a marked ball over a long flight",
         needs_spin=True,
+        low=0.0,
     ),
     Effect(
         name="wind_x",
