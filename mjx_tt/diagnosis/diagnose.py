@@ -17,6 +17,7 @@ from mjx_tt.diagnosis.ball import causes, cross_validation
 from mjx_tt.diagnosis.ball import effects as ball_effects
 from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, diagnose_balls
+from mjx_tt.diagnosis.ball.leading import Leading, leading
 from mjx_tt.diagnosis.hits import diagnose as paddle
 from mjx_tt.diagnosis.hits.diagnose import HitFindings, diagnose_hits
 from mjx_tt.diagnosis.hits.paddle_path import joint_path
@@ -72,7 +73,7 @@ def diagnose(
     of_ball = [name for name in without if name in ball_effects.DESCRIPTIONS]
     of_joints = [name for name in without if name not in of_ball]
     parts: list[Part] = []
-    found = prediction = hits = robot = None
+    found = prediction = hits = robot = lead = None
     notes = list(logs.notes)
     record = None
     if logs.balls:
@@ -81,7 +82,7 @@ def diagnose(
         say("parting tracks into strokes")
         # A ball off a racket spins: where spin is not modelled what follows a hit inside a track is not used.
         strokes, record = clean(logs.balls, spin == "free")
-        found, prediction = _balls(strokes, model, spin, of_ball, seed, say)
+        found, prediction, lead = _balls(strokes, model, spin, of_ball, seed, say)
         say("judging the robot's hits")
         hits = diagnose_hits(found, record.tracks, joint_path(logs.joints, model), without)
         notes += [*record.lines(), *found.spin_notes, *found.small_notes]
@@ -97,7 +98,7 @@ def diagnose(
         )
     if found is not None and prediction is not None:
         parts += [
-            causes.part(found, prediction, without, hits is not None, seed, say),
+            causes.part(found, prediction, without, hits is not None, seed, say, lead),
             paddle.part(found, hits, without),
         ]
     if robot is not None:
@@ -131,8 +132,24 @@ def _balls(
     without: list[str],
     seed: int,
     say: Callable[[str], None],
+) -> tuple[BallFindings, Prediction, Leading | None]:
+    """Findings of the flights, their held-out errors, and what leads where something stays open.
+
+    Without spin where it predicts unseen balls worse.
+    """
+    found, prediction = _judged(balls, model, spin, without, seed, say)
+    lead = leading(found, say, seed) if found.findings else None
+    return found, (prediction if lead is None else lead.prediction), lead
+
+
+def _judged(
+    balls: Sequence[Trajectory],
+    model: SimModel,
+    spin: str,
+    without: list[str],
+    seed: int,
+    say: Callable[[str], None],
 ) -> tuple[BallFindings, Prediction]:
-    """Findings of the flights and their held-out errors; without spin where it predicts unseen balls worse."""
     found = diagnose_balls(balls, model, spin, without, seed, say)
     say("predicting balls that were not used")
     prediction = cross_validation.predictions(found, seed)

@@ -147,6 +147,7 @@ class Part:
     warnings: tuple[str, ...] = ()
     together: tuple[Together, ...] = ()
     samples: tuple[Samples, ...] = ()  # of what is open in the model, in place of the named causes' ranges
+    adopted: bool = False  # beside what is unexplained a cause leads that accounts for nearly all
 
 
 def combined(
@@ -155,7 +156,8 @@ def combined(
     """Verdict of all parts, and values of the extended model with what training may draw around them.
 
     Of what one part alone can say, the unexplained and the held-out error, the first part's counts. A part that leaves
-    something unexplained changes nothing, and causes that others could replace only if they predict better. notes:
+    something unexplained changes nothing unless a cause leads that was adopted; causes that others could replace do
+    only if they predict better. notes:
     warnings that stand before the parts' own.
     """
 
@@ -174,7 +176,7 @@ def combined(
     else:
         kind = "named" if named else "none"
     warnings = [*notes, *every("warnings")]
-    if any(p.unexplained is not None and p.named for p in parts):
+    if any(p.unexplained is not None and p.named and not p.adopted for p in parts):
         warnings.append(NOT_ADOPTED)
     verdict = Verdict(
         kind,
@@ -191,7 +193,7 @@ def combined(
     if kind == "undetermined" and not (held_out and held_out.low > 0.0):
         return verdict, {}, ()
     # Beside what no entry explains a name may stand for just that, however well it predicts: nothing to train on.
-    sound = [p for p in parts if p.unexplained is None]
+    sound = [p for p in parts if p.unexplained is None or p.adopted]
     values = {path: value for p in sound for path, value in p.beside.items()}
     values |= {path: value for p in sound for n in p.named for path, value in n.values.items()}
     samples = tuple(s for p in sound for s in p.samples)

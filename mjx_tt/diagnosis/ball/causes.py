@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import stdtrit
 
-from mjx_tt.diagnosis.ball import cross_validation, experiment_design, scores, selection
+from mjx_tt.diagnosis.ball import cross_validation, experiment_design, leading, scores, selection
 from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, shaking
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, REFERENCE_MAGNUS
+from mjx_tt.diagnosis.ball.leading import Leading
 from mjx_tt.diagnosis.ball.model_averaging import Averaged, averaged
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, HeldOut, Part, Together, Unexplained
 from mjx_tt.sim import bounds
@@ -38,8 +39,12 @@ def part(
     hits: bool,
     seed: int,
     say: Callable[[str], None],
+    lead: Leading | None = None,
 ) -> Part:
-    """The flights' part of the verdict. hits: the robot's hits are judged, which show the ball's latency."""
+    """The flights' part of the verdict. hits: the robot's hits are judged, which show the ball's latency.
+
+    lead: the cause that accounts for nearly all of flights of which something stays open.
+    """
     say("confidence and intervals")
     sets = _averaged(found, seed)
     named, beside = _causes(found, sets, without, seed)
@@ -49,6 +54,9 @@ def part(
         named, beside = [n for n in named if n.cause.name in found.survivors], {}
         top = found.findings[0]
         unexplained = Unexplained(top.block, top.where, top.direction, f"{1e3 * top.size:.1f} mm")
+        if lead is not None:
+            named, beside = [_leading_cause(lead, without)], leading.beside(lead)
+            prediction = lead.prediction
     held_out = cross_validation.held_out(prediction, seed)
     # A tracker's filter shows for a moment behind the bounce, of which a whole flight's error says little.
     sizes = [n.cause.effect_mm for n in named if not n.cause.name.startswith("tracker_")]
@@ -77,9 +85,29 @@ def part(
         tuple(
             f"two of the causes together are just what {name} alone would look like, which was left out"
             for name in found.imitated
-        ),
+        )
+        + (() if lead is None else (_led(lead, without),)),
         _together(found),
-        _samples(found, sets, seed) if named else (),
+        _samples(found, sets, seed) if named and lead is None else (),
+        lead is not None,
+    )
+
+
+def _leading_cause(lead: Leading, without: Container[str]) -> Expressed:
+    """The leading cause with its rivals; its interval holds what stays open."""
+    choice, wide = lead.found.choice, quantile(lead.found.problem.grid.n - 10)
+    theta, half = float(choice.theta[lead.place]), float(choice.error[lead.place]) * wide
+    low = max(theta - half, lead.found.trial.effects[choice.effects[lead.place]].low)
+    return _effect_cause(lead.found, lead.place, lead.confidence, (low, theta + half), without)
+
+
+def _led(lead: Leading, without: Container[str]) -> str:
+    name, *rivals = (lead.found.trial.effects[i].name for i in lead.found.choice.groups[lead.place])
+    others = f" (or {' or '.join(r for r in rivals if r not in without)}, alike on these balls)" if rivals else ""
+    spins = ", with lift and spins of the balls' own," if lead.found.choice.spin else ""
+    return (
+        f"{name}{others}{spins} accounts for {100 * lead.share:.0f} % of what is wrong: the extended model holds it, "
+        "although something small stays open beside it, which its interval allows for"
     )
 
 

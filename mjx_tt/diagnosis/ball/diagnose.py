@@ -203,13 +203,13 @@ def _diagnose(
             and mode == "none"
             and (evidence.shift_of_spins(best) < selection.FLOOR or evidence.spins_without_lift(best))
         ):
-            best, together = _plain(problem, replace(trial, spin="never"), nominal, say)
+            best, together = plain(problem, replace(trial, spin="never"), nominal, say)
     elif mode == "free":
-        best, together = _spinning(problem, trial, nominal, say)
+        best, together = spinning(problem, trial, nominal, say)
     else:
-        best, together = _plain(problem, trial, nominal, say)
+        best, together = plain(problem, trial, nominal, say)
         if mode == "none" and evidence.spins_without_lift(best):
-            best, together = _plain(problem, replace(trial, spin="never"), nominal, say)
+            best, together = plain(problem, replace(trial, spin="never"), nominal, say)
             best = replace(best, trial=replace(best.trial, spin="none"))
     say("looking for what no entry explains")
     left = find(best, g, sessions, age, names)
@@ -219,7 +219,7 @@ def _diagnose(
     if mode == "none" and tries and (left.findings or evidence.bent_too_far(best.choice)):
         # Strong spin is out of reach of derivatives taken about balls that do not spin.
         say("trying balls that spin fast, each in its own way")
-        other, theirs = _spinning(problem, trial, nominal, say)
+        other, theirs = spinning(problem, trial, nominal, say)
         gained = evidence.misfit(best, g) - evidence.misfit(other, g)
         shift = evidence.shift_of_spins(other)
         bends = evidence.lifts(other)
@@ -268,7 +268,7 @@ def _diagnose(
     )
 
 
-def _plain(
+def plain(
     problem: BallProblem,
     trial: Trial,
     nominal: Situation,
@@ -311,8 +311,8 @@ def _of_small(left: Left) -> tuple[str, ...]:
 def _of_scattering(choice: selection.Choice, mode: str) -> tuple[Callable[..., tuple[Settled, Posterior]], ...]:
     """Searches that bounces of many kinds are tried with: kicks at the bounce may have been taken for spin."""
     if mode == "free":
-        return (_spinning,)
-    return (_plain, _spinning) if choice.prior is not None and choice.prior.conditional else (_plain,)
+        return (spinning,)
+    return (plain, spinning) if choice.prior is not None and choice.prior.conditional else (plain,)
 
 
 def _scattering(gained: float, shift: float, scatter: Float[np.ndarray, 3], kept: bool) -> str:
@@ -327,7 +327,7 @@ def _scattering(gained: float, shift: float, scatter: Float[np.ndarray, 3], kept
     return f"{text}; {'kept' if kept else 'dropped'}: {why}evidence {gained:+.0f}"
 
 
-def _spinning(
+def spinning(
     problem: BallProblem,
     trial: Trial,
     nominal: Situation,

@@ -285,6 +285,44 @@ def test_names_a_table_that_springs_back_sideways():
     assert fitted.low < 0.15 < fitted.high and fitted.high - fitted.low < 0.05
 
 
+def ripple(measured: np.ndarray) -> np.ndarray:
+    """What a tracker makes of positions whose calibration ripples along the table, by three millimetres."""
+    error = np.zeros_like(measured)
+    error[2] = 0.003 * np.sin(2.0 * np.pi * measured[1] / 1.4)
+    error[0] = 0.002 * np.cos(2.0 * np.pi * measured[1] / 1.1)
+    return measured + error
+
+
+@pytest.mark.slow
+def test_a_cause_leads_where_a_tracker_ripples_beside_it():
+    start = starts(60, seed=5)
+    start[6:] = 0.0
+    measured = ripple(flown(World(drag_coefficient=0.37), start, 70))
+    measured = measured + np.random.default_rng(6).normal(0.0, 0.0005, measured.shape)
+    found = diagnosis.diagnose(diagnosis.Logs(tuple(trajectories(measured)), (), {}), SimModel())
+    (cause,) = found.verdict.causes
+    drag = cause.parameters["ball.flight.drag_coefficient"]
+    assert found.verdict.verdict == "unexplained" and cause.name == "drag_coefficient"
+    assert drag.low < 0.37 < drag.high < 0.45
+    assert found.extended.model.ball.flight.drag_coefficient == drag.estimate
+    assert found.verdict.held_out.after < 0.5 * found.verdict.held_out.before
+
+
+@pytest.mark.slow
+def test_nothing_leads_where_air_blows_in_one_place():
+    start = starts(60, seed=5)
+    start[6:] = 0.0
+
+    def jet(position, velocity):
+        push = 4.0 * np.exp(-(((position[1] + 0.2) / 0.15) ** 2))
+        return np.stack([push, 0.0 * push, 0.7 * push])
+
+    measured = flown(World(field=jet), start, 70)
+    measured = measured + np.random.default_rng(6).normal(0.0, 0.0005, measured.shape)
+    found = diagnosis.diagnose(diagnosis.Logs(tuple(trajectories(measured)), (), {}), SimModel())
+    assert found.verdict.verdict == "unexplained" and found.extended.model == SimModel()
+
+
 def launcher(session: str) -> Path:
     path = MEASURED / "aimy_launcher" / f"{session}.hdf5"
     if not path.exists():
@@ -306,8 +344,16 @@ def test_a_launchers_topspin_is_named_and_predicts_as_well_as_a_spin_per_ball():
 
 
 @pytest.mark.slow
-def test_nothing_of_a_launchers_straight_balls_is_adopted():
-    found = diagnosis.diagnose(diagnosis.load_logs([launcher("no_spin_robot_simple")]))
-    assert found.verdict.held_out.low > 0.0
-    # What is listed beside the unexplained changes with the last digits of a flight: nothing of it may be adopted.
-    assert found.verdict.verdict == "unexplained" and found.extended.model == SimModel()
+def test_drag_leads_on_a_launchers_straight_balls_and_predicts_as_well_as_a_spin_per_ball():
+    path = launcher("no_spin_robot_simple")
+    found = diagnosis.diagnose(diagnosis.load_logs([path]))
+    (cause,) = found.verdict.causes
+    drag = cause.parameters["ball.flight.drag_coefficient"]
+    # Seen when flights before the bounce alone are fitted: 0.30 to 0.33, not 0.47. The balls fly one way at one speed.
+    assert found.verdict.verdict == "unexplained" and cause.name == "drag_coefficient" and "wind_y" in cause.group
+    assert drag.low < 0.30 < 0.33 < drag.high < 0.36 and found.verdict.held_out.low > 0.0
+    # No camera is turned by 34 mrad and no table is 25 mm lower: both were named and adopted once.
+    assert found.extended.model.sensing == SimModel().sensing and found.extended.model.ball.table.height == 0.0
+    scored = benchmark("straight", read(path).trajectories, {"extended": found.extended.model})
+    ours, theirs = (scored.score(method, 0.3).rms[0] for method in ("extended", "drag and lift, a spin per ball"))
+    assert ours < 1.1 * theirs
