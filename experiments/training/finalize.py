@@ -62,7 +62,7 @@ def show_episodes(
     with stage(f"drawing {' and '.join(path.name for path in paths)}"):
         for path in paths:
             try:
-                drawn.append(video.draw(path, played, experiment.task.control_rate))
+                drawn.append(video.draw(path, played))
             except RuntimeError as error:
                 failed[path] = error
     for path, reason in failed.items():
