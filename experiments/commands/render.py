@@ -104,10 +104,10 @@ def curves(
     """Draws them."""
     for folder in runs:
         Run(folder).config()
-    from experiments.evaluation import figures
+    from experiments.evaluation import learning_curves
 
-    found = [figures.read_curve(folder) for folder in runs]
-    console().print(str(checked("", figures.draw_curves, Path(out), found)), highlight=False, soft_wrap=True)
+    found = [learning_curves.read_curve(folder) for folder in runs]
+    console().print(str(checked("", learning_curves.draw_curves, Path(out), found)), highlight=False, soft_wrap=True)
 
 
 @view_app.default
