@@ -8,6 +8,7 @@ from importlib import resources
 
 import mujoco
 import numpy as np
+import trimesh
 import viser
 from mjviser import ViserMujocoScene
 
@@ -22,12 +23,14 @@ BALL_TRAIL, PADDLE_TRAIL = 0.25, 0.35  # [s]
 STRIDE = 4  # frames from one point of a trail to the next
 SHOWN_RADIUS = 0.025  # [m]; the true ball, of 0.02 m, is hard to find on a small screen
 COLOURS = {
-    "ball": (255, 120, 0),
-    "measured": (255, 120, 0),
+    "ball": (255, 240, 25),
+    "measured": (255, 240, 25),
     "simulated": (40, 90, 200),
     "nominal": (200, 40, 60),
     "extended": (20, 140, 70),
 }
+EDGE = (5, 8, 18)  # around the ball and behind its trail: one of the two stands out from whatever lies behind
+RING_RADIUS = 0.037  # [m]
 PADDLE_COLOUR, LANDING_COLOUR, MARK_COLOUR = (150, 60, 170), (20, 160, 80), (90, 60, 30)
 NOWHERE = np.full((1, 2, 3), -5.0)  # a segment below the floor
 
@@ -82,9 +85,10 @@ class Scene:
             position=(0.0, 0.0, FLOOR),
         )
         self._films: Sequence[Film] = ()
-        self._balls: dict[tuple[int, str], viser.IcosphereHandle] = {}
+        self._balls: dict[tuple[int, str], tuple[viser.IcosphereHandle, viser.MeshHandle]] = {}
         self._paddle_paths: list[np.ndarray] = []
         add = server.scene
+        self._trail_edge = add.add_line_segments("/trail/edge", NOWHERE, EDGE, thickness=0.026)
         self._trail = add.add_line_segments("/trail/ball", NOWHERE, COLOURS["ball"], thickness=0.014)
         self._paddle_trail = add.add_line_segments("/trail/paddle", NOWHERE, PADDLE_COLOUR, thickness=0.010)
         self._ways = {
@@ -134,9 +138,15 @@ class Scene:
         self._films = films
         wanted = {(i, name) for i, film in enumerate(films) for name in film.balls}
         for key in set(self._balls) - wanted:
-            self._balls.pop(key).remove()
+            for part in self._balls.pop(key):
+                part.remove()
         for i, name in sorted(wanted - set(self._balls)):
-            self._balls[i, name] = self.server.scene.add_icosphere(f"/ball/{i}/{name}", SHOWN_RADIUS, COLOURS[name])
+            add = self.server.scene
+            ball = add.add_icosphere(f"/ball/{i}/{name}", SHOWN_RADIUS, COLOURS[name])
+            # Of the larger sphere only the far side is drawn, which shows as a ring around the ball.
+            shape = trimesh.creation.icosphere(subdivisions=2, radius=RING_RADIUS)
+            ring = add.add_mesh_simple(f"/ring/{i}/{name}", shape.vertices, shape.faces, color=EDGE, side="back")
+            self._balls[i, name] = ball, ring
         for name, way in self._ways.items():
             paths = [segments(self._at(i, f.balls[name][::STRIDE])) for i, f in enumerate(films) if name in f.balls]
             way.points = np.concatenate(paths or [NOWHERE]).astype(np.float32)
@@ -160,9 +170,10 @@ class Scene:
             for i, (film, frame) in enumerate(zip(self._films, frames, strict=True)):
                 for name, path in film.balls.items():
                     seen = bool(np.isfinite(path[frame]).all())
-                    self._balls[i, name].visible = seen
-                    if seen:
-                        self._balls[i, name].position = self._at(i, path[frame])
+                    for part in self._balls[i, name]:
+                        part.visible = seen
+                        if seen:
+                            part.position = self._at(i, path[frame])
                 landing = film.landing[frame] if len(film.landing) else np.full(2, np.nan)
                 self._landing[i].visible = bool(np.isfinite(landing).all())
                 if self._landing[i].visible:
@@ -176,6 +187,8 @@ class Scene:
                 if self._labels[i].text != text:
                     self._labels[i].text = text
             self._trail.points = np.concatenate(trails).astype(np.float32)
+            # A little lower: from above, where people look from, it lies behind.
+            self._trail_edge.points = self._trail.points - np.array([0.0, 0.0, 0.01], np.float32)
             self._paddle_trail.points = np.concatenate(paddles).astype(np.float32)
         self.server.flush()
 
