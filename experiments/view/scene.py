@@ -29,18 +29,22 @@ COLOURS = {
     "nominal": (200, 40, 60),
     "extended": (20, 140, 70),
 }
+WAY_COLOURS = {"ball": (120, 90, 0), "measured": (120, 90, 0)}  # of thin lines, on white and on blue
 EDGE = (5, 8, 18)  # around the ball and behind its trail: one of the two stands out from whatever lies behind
 RING_RADIUS = 0.037  # [m]
+BEHIND = np.array([-0.006, -0.02, -0.008], np.float32)  # [m] away from where people look from
 PADDLE_COLOUR, LANDING_COLOUR, MARK_COLOUR = (150, 60, 170), (20, 160, 80), (90, 60, 30)
 NOWHERE = np.full((1, 2, 3), -5.0)  # a segment below the floor
 
 
 def tables(count: int) -> mujoco.MjModel:
-    """The scene of the simulation ``count`` times, along x, without its floor and ball."""
+    """The scene ``count`` times, along x, without its floor and ball; the person's place is a disc."""
     with resources.as_file(resources.files("mjx_tt") / "assets" / "scene.xml") as path:
         parts = [mujoco.MjSpec.from_file(str(path)) for _ in range(count)]
     for i, part in enumerate(parts):
-        for name in ("floor", "ball"):
+        # What is seen through is not here, and would hide the ball.
+        figure = [geom.name for geom in part.geoms if geom.name.startswith("person") and geom.name != "person_place"]
+        for name in ("floor", "ball", *figure):
             part.delete(part.geom(name))
         if i:
             parts[0].attach(part, prefix=f"{i}-", frame=parts[0].worldbody.add_frame(pos=[SPACING * i, 0.0, 0.0]))
@@ -92,7 +96,7 @@ class Scene:
         self._trail = add.add_line_segments("/trail/ball", NOWHERE, COLOURS["ball"], thickness=0.014)
         self._paddle_trail = add.add_line_segments("/trail/paddle", NOWHERE, PADDLE_COLOUR, thickness=0.010)
         self._ways = {
-            name: add.add_line_segments(f"/way/{name}", NOWHERE, colour, thickness=0.004)
+            name: add.add_line_segments(f"/way/{name}", NOWHERE, WAY_COLOURS.get(name, colour), thickness=0.004)
             for name, colour in COLOURS.items()
         }
         self._marks = add.add_point_cloud("/marks", NOWHERE[0], MARK_COLOUR, point_size=0.007, point_shape="circle")
@@ -187,8 +191,7 @@ class Scene:
                 if self._labels[i].text != text:
                     self._labels[i].text = text
             self._trail.points = np.concatenate(trails).astype(np.float32)
-            # A little lower: from above, where people look from, it lies behind.
-            self._trail_edge.points = self._trail.points - np.array([0.0, 0.0, 0.01], np.float32)
+            self._trail_edge.points = self._trail.points + BEHIND
             self._paddle_trail.points = np.concatenate(paddles).astype(np.float32)
         self.server.flush()
 
