@@ -60,7 +60,8 @@ ROOMS = {
         "viz diagnosis/report env rally"
     ),
     "experiments": (
-        "errors . config runs evaluation training baselines deploy finetuning study/workflow study/analysis "
+        "errors . config runs view/film view/studio view/programme "
+        "evaluation training baselines deploy finetuning study/workflow study/analysis "
         "study/blind study/target_domain study/report study view sharing commands cli"
     ),
 }

@@ -39,8 +39,9 @@ app = command(
     "render",
     "a picture or a video of a policy at play, without a display",
     """\
+  mjx-tt render --out play.gif                     a policy that comes with the program
   mjx-tt render runs/quickstart --out episode.png --out episode.mp4
-  mjx-tt render runs/quickstart --out rally.gif --episodes 4 --camera human
+  mjx-tt render runs/quickstart --out balls.mp4 --episodes 4 --camera side
 """,
 )
 view_app = command(
@@ -67,14 +68,14 @@ curves_app = command(
 
 @app.default
 def render(
-    policy: PolicyFolder,
+    policy: PolicyFolder = str(SHIPPED),
     /,
     *,
     balls: Balls = None,
     model: Model = None,
     out: Annotated[tuple[str, ...], option("FILE", ".png, .mp4 or .gif; may be repeated")],
-    episodes: Annotated[int, count("episodes in a video (default: 2)")] = 2,
-    camera: Annotated[str, Parameter(help="side, robot_back, human or top (default: side)")] = "side",
+    episodes: Annotated[int, count("balls in a video (default: 2)")] = 2,
+    camera: Annotated[str, Parameter(help="human, side, robot_back or top (default: human)")] = "human",
     seed: BallSeed = None,
 ) -> None:
     """Writes every file of ``out``."""
@@ -91,7 +92,7 @@ def render(
     experiment = experiment_of(trained, balls, model)
     played = video.replay(experiment, trained, episodes, experiment.config.evaluation.seed if seed is None else seed)
     for path in out:
-        checked("", video.draw, Path(path), played, experiment.task.control_rate, camera)
+        checked("", video.draw, Path(path), played, camera)
         screen.print(path, highlight=False)
 
 
@@ -103,10 +104,10 @@ def curves(
     """Draws them."""
     for folder in runs:
         Run(folder).config()
-    from experiments.evaluation import figures
+    from experiments.evaluation import learning_curves
 
-    found = [figures.read_curve(folder) for folder in runs]
-    console().print(str(checked("", figures.draw_curves, Path(out), found)), highlight=False, soft_wrap=True)
+    found = [learning_curves.read_curve(folder) for folder in runs]
+    console().print(str(checked("", learning_curves.draw_curves, Path(out), found)), highlight=False, soft_wrap=True)
 
 
 @view_app.default

@@ -114,7 +114,7 @@ def _figure(b: Benchmark) -> Figure:
     horizons = list(dict.fromkeys(s.horizon for s in b.scores if s.across == "all"))
     rows = [h for h in range(len(horizons)) if any(np.isfinite(e[h]).any() for e in b.errors.values())]
     with matplotlib.rc_context(html.STYLE):
-        figure = Figure(figsize=(4.0 * len(rows), 3.4), layout="constrained")
+        figure = Figure(figsize=(html.WIDTH, 3.8), layout="constrained")
         axes = np.atleast_1d(figure.subplots(1, len(rows), sharey=True))
     for ax, h in zip(axes, rows, strict=True):
         for method, errors in b.errors.items():
@@ -122,5 +122,5 @@ def _figure(b: Benchmark) -> Figure:
             ax.step(1e3 * kept, np.arange(1, kept.size + 1) / kept.size, where="post", label=method, lw=1.4)
         ax.set(title=f"{horizons[h]:.2g} s ahead", xlabel="error [mm]", xscale="log")
     axes[0].set_ylabel("share of flights")
-    axes[0].legend(fontsize=7)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3, fontsize=9, frameon=False)
     return figure

@@ -1,8 +1,7 @@
-"""Pictures of an evaluation and of a training run, as PNG."""
+"""Pictures of an evaluation, as PNG."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +18,7 @@ from matplotlib.patches import Rectangle
 
 from ballmodel import constants as c
 from ballmodel.io.atomic_files import replacing
-from experiments.errors import RunError
 from experiments.evaluation.evaluate import Played
-from experiments.runs import metrics
-from experiments.runs.run_dir import Run
 from mjx_tt.env.task import HIT, MISSED, RETURNED
 from robot_io.contract import JOINT_NAMES, JOINT_UNITS, LIMITS
 
@@ -30,7 +26,6 @@ RETURNED_COLOUR, HIT_COLOUR, MISSED_COLOUR = "#1b7837", "#e08214", "#b2182b"
 TABLE_COLOUR, INK = "#e9eff7", "#303030"
 LANDING_FRAME = (-1.5, 1.5), (-1.45, 2.3)  # [m] x and y shown
 FEWEST_BALLS = 5  # in a cell whose rate is shown
-SMOOTHING = 25  # updates
 
 STYLE = RcParams(
     {
@@ -54,47 +49,11 @@ def draw_evaluation(folder: Path, played: Played, weights: tuple[float, ...]) ->
     folder.mkdir(parents=True, exist_ok=True)
     with plt.rc_context(STYLE):
         return [
-            _save(folder / "landing_map.png", _landing_map(played)),
-            _save(folder / "return_rate_map.png", _return_rate_map(played)),
-            _save(folder / "rewards.png", _rewards(played.report["terms"], weights)),
-            _save(folder / "joint_speeds.png", _joint_speeds(played)),
+            save(folder / "landing_map.png", _landing_map(played)),
+            save(folder / "return_rate_map.png", _return_rate_map(played)),
+            save(folder / "rewards.png", _rewards(played.report["terms"], weights)),
+            save(folder / "joint_speeds.png", _joint_speeds(played)),
         ]
-
-
-def draw_training(path: Path, rows: list[dict[str, Any]], title: str) -> Path:
-    """Writes the training curve from the rows of metrics.jsonl."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with plt.rc_context(STYLE):
-        return _save(path, _training(rows, title))
-
-
-@dataclass(frozen=True)
-class Curve:
-    """A training for ``draw_curves``: rows of its metrics.jsonl, and how many balls an update plays."""
-
-    name: str
-    rows: list[dict[str, Any]]
-    balls: int
-
-
-def read_curve(folder: str | Path) -> Curve:
-    """The curve of a training in simulation. Raises RunError for a folder that holds none."""
-    run = Run(folder)
-    optimiser, rows = run.config().optimiser, metrics.read(run.metrics)
-    if not rows:
-        raise RunError(f"{run.metrics}: holds no update yet")
-    if "fault_rate" in rows[0]:
-        raise RunError(
-            f"{folder}: is a fine-tuning, with another count of balls and time; wanted is a training in simulation"
-        )
-    return Curve(str(folder), rows, 2 * optimiser.num_directions * optimiser.repeats)
-
-
-def draw_curves(path: Path, curves: list[Curve]) -> Path:
-    """Writes the shares of balls that several trainings' policies return, over time and over balls."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with plt.rc_context(STYLE):
-        return _save(path, _curves(curves))
 
 
 def _landing_map(played: Played) -> Figure:
@@ -106,20 +65,11 @@ def _landing_map(played: Played) -> Figure:
         x, y = (np.clip(v, *frame) for v, frame in zip(result.landing[:, chosen], LANDING_FRAME, strict=True))
         axes.scatter(x, y, s=9, color=colour, alpha=0.55, linewidth=0, label=f"{label} ({chosen.sum():,})")
     missed = int(np.sum(result.outcome == MISSED))
+    axes.plot([], [], "x", color=MISSED_COLOUR, label=f"not touched, without a place ({missed:,})")
     axes.set_xlim(*LANDING_FRAME[0])
     axes.set_ylim(*LANDING_FRAME[1])
     axes.set_title(f"Where {report['episodes']:,} balls come down\n{_rate(report)}")
-    axes.legend(loc="upper left", markerscale=2, title=f"not touched ({missed:,})", title_fontsize=10, alignment="left")
-    axes.text(
-        0.99,
-        0.98,
-        "dots on the frame: beyond it",
-        transform=axes.transAxes,
-        ha="right",
-        va="top",
-        fontsize=8,
-        color=INK,
-    )
+    figure.legend(loc="outside lower left", markerscale=2, title="dots on the frame lie beyond it", alignment="left")
     return figure
 
 
@@ -187,82 +137,6 @@ def _joint_speeds(played: Played) -> Figure:
     return figure
 
 
-def _training(rows: list[dict[str, Any]], title: str) -> Figure:
-    figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.2, 5.6), sharex=True, height_ratios=(2, 1))
-    minutes = np.array([row["seconds"] for row in rows]) / 60
-    upper.plot(minutes, _smooth(rows, "hit_rate"), color=HIT_COLOUR, label="perturbed policies: touched")
-    upper.plot(minutes, _smooth(rows, "return_rate"), color=RETURNED_COLOUR, label="perturbed policies: returned")
-    evaluated = [row for row in rows if "evaluation/return_rate" in row]
-    if evaluated:
-        at = [row["seconds"] / 60 for row in evaluated]
-        rate, low, high = (
-            np.array([row[f"evaluation/{k}"] for row in evaluated]) for k in ("return_rate", "low", "high")
-        )
-        upper.errorbar(
-            at,
-            rate,
-            (rate - low, high - rate),
-            color=INK,
-            fmt="o-",
-            markersize=4,
-            linewidth=1,
-            capsize=2,
-            label="evaluated policy: returned, 95 %",
-        )
-    upper.set_ylim(0, 1.02)
-    upper.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
-    upper.grid(axis="y", alpha=0.25)
-    upper.legend(loc="lower right")
-    upper.set_title(title)
-    mean_return = _smooth(rows, "mean_return")
-    lower.plot(minutes, mean_return, color="#4575b4")
-    if np.isfinite(mean_return).any():  # the first, random policies would take all the room
-        bottom, top = np.nanpercentile(mean_return, (5, 100))
-        lower.set_ylim(bottom - 0.1, top + 0.1)
-    lower.grid(axis="y", alpha=0.25)
-    lower.set_ylabel("mean return")
-    lower.set_xlabel("training time [min]")
-    return figure
-
-
-def _curves(curves: list[Curve]) -> Figure:
-    figure, panels = plt.subplots(1, 2, figsize=(9.6, 4.2), sharey=True)
-    for i, curve in enumerate(curves):
-        colour = f"C{i % 10}"
-        minutes = np.array([row["seconds"] for row in curve.rows]) / 60
-        played = curve.balls * np.array([row["update"] for row in curve.rows])
-        rate = _smooth(curve.rows, "return_rate")
-        evaluated = np.array(["evaluation/return_rate" in row for row in curve.rows])
-        at = [row["evaluation/return_rate"] for row, there in zip(curve.rows, evaluated, strict=True) if there]
-        for axes, x in zip(panels, (minutes, played), strict=True):
-            axes.plot(x, rate, color=colour, label=f"{curve.name}, perturbed")
-            if at:
-                axes.plot(
-                    x[evaluated], at, "o--", color=colour, markersize=4, linewidth=1, label=f"{curve.name}, evaluated"
-                )
-    for axes, label in zip(panels, ("training time [min]", "balls"), strict=True):
-        axes.set_xscale("log")
-        axes.set_xlim(left=max(line.get_xdata()[-1] for line in axes.lines) / 1000)  # the first updates say nothing
-        axes.xaxis.set_major_formatter(lambda v, _: f"{v:,g}" if v < 1e6 else f"{v / 1e6:g} million")
-        axes.set_xlabel(label)
-        axes.grid(alpha=0.25)
-    panels[0].set_ylim(-0.02, 1.02)
-    panels[0].yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
-    panels[0].set_title("returned balls")
-    panels[0].legend(loc="upper left")
-    return figure
-
-
-def _smooth(rows: list[dict[str, Any]], name: str) -> np.ndarray:
-    """Trailing mean over up to SMOOTHING updates; what was not finite is left out."""
-    values = np.array([np.nan if row[name] is None else row[name] for row in rows], float)
-    known = np.isfinite(values)
-    sums, counts = np.cumsum(np.where(known, values, 0.0)), np.cumsum(known)
-    sums[SMOOTHING:] -= sums[:-SMOOTHING].copy()
-    counts[SMOOTHING:] -= counts[:-SMOOTHING].copy()
-    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
-
-
 def _table(axes: Axes) -> None:
     """The table from above, the robot at the bottom."""
     width, length = c.TABLE_WIDTH, c.TABLE_LENGTH
@@ -279,7 +153,8 @@ def _rate(report: dict[str, Any]) -> str:
     return f"{report['return_rate']:.1%} returned (95 % interval {report['low']:.1%} to {report['high']:.1%})"
 
 
-def _save(path: Path, figure: Figure) -> Path:
+def save(path: Path, figure: Figure) -> Path:
+    """Writes a figure as PNG and closes it."""
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png")
     plt.close(figure)

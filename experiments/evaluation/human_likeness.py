@@ -121,6 +121,13 @@ def _draw(rows: np.ndarray, drawn: dict[str, np.ndarray], path: Path) -> None:
                 ax.set_xlabel(LABELS[i])
             ax.set_ylabel(LABELS[j])
         line[0].set_title(name)
+    for ax, panel in zip(axes[0], PANELS, strict=True):
+        # One wild ball does not set the scale.
+        for k, limits in zip(panel, (ax.set_xlim, ax.set_ylim), strict=True):
+            low, high = np.percentile(
+                np.concatenate([points[:DRAWN, k] for points in (rows, *drawn.values())]), (1, 99)
+            )
+            limits(low - 0.12 * (high - low), high + 0.12 * (high - low))
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         temporary.write_bytes(html.png(figure))

@@ -2,60 +2,104 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 
-from ballmodel.sampling import BallPool
-from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.runs.load_policy import TrainedPolicy
-from mjx_tt.env.policy import Policy
-from mjx_tt.env.rollout import Simulator
+from experiments.view.film import Film
+from experiments.view.programme import Play
+from experiments.view.studio import Studio
 from mjx_tt.viz import rendering
+from mjx_tt.viz.caption import GOOD, POOR, Caption
+from mjx_tt.viz.rendering import Moment
 
-SIZE = (640, 360)
-FRAME_RATE = 40.0  # [Hz] at most: without a graphics card a frame takes a quarter of a second to draw
-PAUSE = 0.3  # [s] the last frame of an episode stays
-
-
-def replay(
-    experiment: Experiment, trained: TrainedPolicy, count: int, seed: int
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The first ``count`` episodes of a seed as they come: joint positions (T, 8) and ball positions (T, 3) [m]."""
-    simulator = Simulator(experiment.task)
-    balls = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), count)
-    model = experiment.model
-
-    def play(policy: Policy, key: jax.Array, balls: BallPool) -> tuple[jax.Array, jax.Array, jax.Array]:
-        drawn = simulator.draw(key, balls, model.model, model.randomise, count, 1)
-        return simulator.replay(policy, drawn)
-
-    key = build.key(seed, build.EVALUATION_EPISODES)
-    played = jax.jit(play)(trained.policy, key, balls)
-    qpos, ball, length = (np.asarray(a) for a in played)
-    return [(qpos[: length[i], :, i], ball[: length[i], :, i]) for i in range(count)]
+PICTURE_SIZE, VIDEO_SIZE = (1280, 720), (640, 360)
+# [Hz] without a graphics card a frame takes a quarter of a second to draw; a GIF counts in hundredths of a second.
+FRAME_RATE = {".mp4": 30.0, ".gif": 25.0}
+NEAR_CONTACT = 0.07  # [s] around the paddle's contact
+SLOWER = 8  # times, there
+REST = 0.3  # [s] the last frame of a ball stays
+TRAIL = 0.35  # [s] of the ball's way in a video
+PIECE, DOTS_APART = 1.0 / 75.0, 1.0 / 30.0  # [s] of a picture's trail; of the places that are still to come
+RETURNED = "returned"
 
 
-def draw(path: Path, episodes: list[tuple[np.ndarray, np.ndarray]], rate: float, camera: str = "side") -> Path:
-    """Writes a picture (.png) of the first episode's moment of contact, or a video (.mp4, .gif) of all in real time.
+def replay(experiment: Experiment, trained: TrainedPolicy, count: int, seed: int) -> list[Film]:
+    """The first ``count`` balls of a seed, as ``mjx-tt view`` shows them."""
+    studio = Studio(experiment.task, experiment.model)
+    play = Play(studio, [""], [trained.policy], experiment.distribution, seed)
+    return [play.films(number)[0] for number in range(count)]
 
-    rate: control rate [Hz]. Raises ValueError for a wrong suffix or camera, RuntimeError without OpenGL.
+
+def draw(path: Path, films: Sequence[Film], camera: str = rendering.CAMERA) -> Path:
+    """Writes a picture (.png) of the first ball's moment of contact, or a video (.mp4, .gif) of all.
+
+    A video is in real time but for the contact, and the caption says so.
+    Raises ValueError for a wrong suffix or camera, RuntimeError without OpenGL.
     """
     allowed = (".png", *rendering.VIDEO_SUFFIXES)
     if path.suffix not in allowed:
         raise ValueError(f"{path}: suffix {path.suffix!r}; allowed: {', '.join(allowed)}")
     if path.suffix == ".png":
-        qpos, ball = episodes[0]
-        at = int(np.argmin(ball[:, 1]))  # the ball turns where it meets the paddle
-        rendering.render_png(path, qpos[at], ball[at], camera)
-        return path
-    stride = math.ceil(rate / FRAME_RATE)
-    rate, episodes = rate / stride, [(qpos[::stride], ball[::stride]) for qpos, ball in episodes]
-    pause = round(PAUSE * rate)
-    parts = [tuple(np.concatenate([a, np.repeat(a[-1:], pause, axis=0)]) for a in episode) for episode in episodes]
-    qpos, ball = (np.concatenate(part) for part in zip(*parts, strict=True))
-    rendering.render_video(path, qpos, ball, rate, camera, SIZE)
+        rendering.render_png(path, at_contact(films[0]), camera, PICTURE_SIZE)
+    else:
+        rate = FRAME_RATE[path.suffix]
+        moments = [moment for number, film in enumerate(films, 1) for moment in video_moments(film, number, rate)]
+        rendering.render_video(path, moments, rate, camera, VIDEO_SIZE)
     return path
+
+
+def at_contact(film: Film) -> Moment:
+    """The paddle's contact, or where a missed ball is nearest to the robot's end; all of the ball's way.
+
+    The way up to here is a line, the rest, down to the table's height, is dots.
+    """
+    ball = film.balls["ball"]
+    at = film.frame(film.contact) if np.isfinite(film.contact) else int(np.nanargmin(ball[:, 1]))
+    before, after = ball[: at + 1], ball[at:]
+    low = np.flatnonzero(after[:, 2] < 0.0)
+    after = after[: low[0] if low.size else len(after)]
+    every, apart = _frames(film, PIECE), _frames(film, DOTS_APART)
+    trail = np.concatenate([before[:-1:every], before[-1:]])
+    return Moment(film.qpos[at], ball[at], trail, after[apart::apart], _caption(film, 1, decided=True))
+
+
+def video_moments(film: Film, number: int, rate: float) -> Iterator[Moment]:
+    """Moments of one ball for a video of ``rate`` frames per second."""
+    ball, t = film.balls["ball"], 0.0
+    every = _frames(film, PIECE)
+    while True:
+        at, slow = film.frame(t), abs(t - film.contact) < NEAR_CONTACT
+        behind = ball[max(0, at - _frames(film, TRAIL)) : at + 1]
+        now = _between(ball, film, t)
+        trail = np.concatenate([behind[::every], now[None]])
+        caption = _caption(film, number, t >= film.decided, f"1/{SLOWER} speed" if slow else "")
+        moment = Moment(_between(film.qpos, film, t), now, trail, caption=caption)
+        yield moment
+        if t >= film.seconds:
+            break
+        t = min(t + (1.0 / SLOWER if slow else 1.0) / rate, film.seconds)
+    for _ in range(round(REST * rate)):
+        yield moment
+
+
+def _between(values: np.ndarray, film: Film, t: float) -> np.ndarray:
+    """Values (T, k) of a film's frames at a time [s] between two of them, (k,)."""
+    at = film.frame(t)
+    share = (t - film.time[at]) / (film.time[1] - film.time[0])
+    return values[at] + share * (values[min(at + 1, len(values) - 1)] - values[at])
+
+
+def _frames(film: Film, seconds: float) -> int:
+    """Number of a film's frames that last so long, one at least."""
+    return max(1, round(seconds / (film.time[1] - film.time[0])))
+
+
+def _caption(film: Film, number: int, decided: bool, note: str = "") -> Caption:
+    if decided:
+        return Caption(f"Ball {number}", film.outcome, note, GOOD if film.outcome.startswith(RETURNED) else POOR)
+    start, ball = film.time[1] - film.time[0], film.balls["ball"]
+    return Caption(f"Ball {number}", f"{np.linalg.norm(ball[1] - ball[0]) / start:.1f} m/s in", note)

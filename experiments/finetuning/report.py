@@ -154,7 +154,7 @@ def _figure(entries: list[Entry], result: dict[str, Any], title: str) -> Figure:
             by_update.setdefault(entry.update, []).append(entry)
     updates = np.array(sorted(by_update))
     rows = [update_row(by_update[u]) for u in updates]
-    figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.2, 5.8), sharex=True, height_ratios=(2, 1))
+    figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(2, 1))
     column = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
     if rows:
         count = len(by_update[updates[0]])
@@ -190,13 +190,13 @@ def _figure(entries: list[Entry], result: dict[str, Any], title: str) -> Figure:
     upper.axhline(result["before"]["mean_return"], color=INK, linewidth=0.8, linestyle=":", zorder=1)
     upper.set_ylabel("mean return")
     upper.set_title(f"{title}\n{_headline(result)}")
-    upper.legend(loc="lower right", fontsize=9)
     lower.set_ylim(-0.02, 1.02)
     lower.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
     lower.set_ylabel(f"balls, mean of {SMOOTHING}")
     lower.set_xlabel("update")
-    if rows:
-        lower.legend(loc="center right", fontsize=9)
+    lines = [pair for axes in (upper, lower) for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+    if lines:
+        figure.legend(*zip(*lines, strict=True), loc="outside lower left", fontsize=9, ncols=2)
     for axes in (upper, lower):
         axes.grid(axis="y", alpha=0.25)
     return figure

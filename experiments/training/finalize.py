@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.config.build import Experiment
-from experiments.evaluation import evaluate, figures, video
+from experiments.evaluation import evaluate, figures, learning_curves, video
 from experiments.evaluation.evaluate import Played
 from experiments.runs import load_policy, metrics, run_dir
 from experiments.runs.load_policy import TrainedPolicy
@@ -34,7 +34,8 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
     with stage("drawing pictures"):
         pictures = figures.draw_evaluation(run.plots, played, experiment.task.reward_weights)
         title = f"{experiment.config.name}: training on {experiment.distribution.name}"
-        pictures.append(figures.draw_training(run.plots / "training.png", metrics.read(run.metrics), title))
+        rows, marks = metrics.read(run.metrics), learning_curves.changes(experiment)
+        pictures.append(learning_curves.draw_training(run.plots / "training.png", rows, title, marks))
     shown = show_episodes(experiment, trained, [run.folder / "episode.png", run.folder / "episode.mp4"], console, stage)
     with stage("exporting and checking the artefact"):
         exported = export_policy(run.artefact, trained, experiment, played.report, console)
@@ -62,7 +63,7 @@ def show_episodes(
     with stage(f"drawing {' and '.join(path.name for path in paths)}"):
         for path in paths:
             try:
-                drawn.append(video.draw(path, played, experiment.task.control_rate))
+                drawn.append(video.draw(path, played))
             except RuntimeError as error:
                 failed[path] = error
     for path, reason in failed.items():

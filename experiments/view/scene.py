@@ -8,6 +8,7 @@ from importlib import resources
 
 import mujoco
 import numpy as np
+import trimesh
 import viser
 from mjviser import ViserMujocoScene
 
@@ -22,22 +23,28 @@ BALL_TRAIL, PADDLE_TRAIL = 0.25, 0.35  # [s]
 STRIDE = 4  # frames from one point of a trail to the next
 SHOWN_RADIUS = 0.025  # [m]; the true ball, of 0.02 m, is hard to find on a small screen
 COLOURS = {
-    "ball": (255, 120, 0),
-    "measured": (255, 120, 0),
+    "ball": (255, 240, 25),
+    "measured": (255, 240, 25),
     "simulated": (40, 90, 200),
     "nominal": (200, 40, 60),
     "extended": (20, 140, 70),
 }
+WAY_COLOURS = {"ball": (120, 90, 0), "measured": (120, 90, 0)}  # of thin lines, on white and on blue
+EDGE = (5, 8, 18)  # around the ball and behind its trail: one of the two stands out from whatever lies behind
+RING_RADIUS = 0.037  # [m]
+BEHIND = np.array([-0.006, -0.02, -0.008], np.float32)  # [m] away from where people look from
 PADDLE_COLOUR, LANDING_COLOUR, MARK_COLOUR = (150, 60, 170), (20, 160, 80), (90, 60, 30)
 NOWHERE = np.full((1, 2, 3), -5.0)  # a segment below the floor
 
 
 def tables(count: int) -> mujoco.MjModel:
-    """The scene of the simulation ``count`` times, along x, without its floor and ball."""
+    """The scene ``count`` times, along x, without its floor and ball; the person's place is a disc."""
     with resources.as_file(resources.files("mjx_tt") / "assets" / "scene.xml") as path:
         parts = [mujoco.MjSpec.from_file(str(path)) for _ in range(count)]
     for i, part in enumerate(parts):
-        for name in ("floor", "ball"):
+        # What is seen through is not here, and would hide the ball.
+        figure = [geom.name for geom in part.geoms if geom.name.startswith("person") and geom.name != "person_place"]
+        for name in ("floor", "ball", *figure):
             part.delete(part.geom(name))
         if i:
             parts[0].attach(part, prefix=f"{i}-", frame=parts[0].worldbody.add_frame(pos=[SPACING * i, 0.0, 0.0]))
@@ -82,13 +89,14 @@ class Scene:
             position=(0.0, 0.0, FLOOR),
         )
         self._films: Sequence[Film] = ()
-        self._balls: dict[tuple[int, str], viser.IcosphereHandle] = {}
+        self._balls: dict[tuple[int, str], tuple[viser.IcosphereHandle, viser.MeshHandle]] = {}
         self._paddle_paths: list[np.ndarray] = []
         add = server.scene
+        self._trail_edge = add.add_line_segments("/trail/edge", NOWHERE, EDGE, thickness=0.026)
         self._trail = add.add_line_segments("/trail/ball", NOWHERE, COLOURS["ball"], thickness=0.014)
         self._paddle_trail = add.add_line_segments("/trail/paddle", NOWHERE, PADDLE_COLOUR, thickness=0.010)
         self._ways = {
-            name: add.add_line_segments(f"/way/{name}", NOWHERE, colour, thickness=0.004)
+            name: add.add_line_segments(f"/way/{name}", NOWHERE, WAY_COLOURS.get(name, colour), thickness=0.004)
             for name, colour in COLOURS.items()
         }
         self._marks = add.add_point_cloud("/marks", NOWHERE[0], MARK_COLOUR, point_size=0.007, point_shape="circle")
@@ -134,9 +142,15 @@ class Scene:
         self._films = films
         wanted = {(i, name) for i, film in enumerate(films) for name in film.balls}
         for key in set(self._balls) - wanted:
-            self._balls.pop(key).remove()
+            for part in self._balls.pop(key):
+                part.remove()
         for i, name in sorted(wanted - set(self._balls)):
-            self._balls[i, name] = self.server.scene.add_icosphere(f"/ball/{i}/{name}", SHOWN_RADIUS, COLOURS[name])
+            add = self.server.scene
+            ball = add.add_icosphere(f"/ball/{i}/{name}", SHOWN_RADIUS, COLOURS[name])
+            # Of the larger sphere only the far side is drawn, which shows as a ring around the ball.
+            shape = trimesh.creation.icosphere(subdivisions=2, radius=RING_RADIUS)
+            ring = add.add_mesh_simple(f"/ring/{i}/{name}", shape.vertices, shape.faces, color=EDGE, side="back")
+            self._balls[i, name] = ball, ring
         for name, way in self._ways.items():
             paths = [segments(self._at(i, f.balls[name][::STRIDE])) for i, f in enumerate(films) if name in f.balls]
             way.points = np.concatenate(paths or [NOWHERE]).astype(np.float32)
@@ -160,9 +174,10 @@ class Scene:
             for i, (film, frame) in enumerate(zip(self._films, frames, strict=True)):
                 for name, path in film.balls.items():
                     seen = bool(np.isfinite(path[frame]).all())
-                    self._balls[i, name].visible = seen
-                    if seen:
-                        self._balls[i, name].position = self._at(i, path[frame])
+                    for part in self._balls[i, name]:
+                        part.visible = seen
+                        if seen:
+                            part.position = self._at(i, path[frame])
                 landing = film.landing[frame] if len(film.landing) else np.full(2, np.nan)
                 self._landing[i].visible = bool(np.isfinite(landing).all())
                 if self._landing[i].visible:
@@ -176,6 +191,7 @@ class Scene:
                 if self._labels[i].text != text:
                     self._labels[i].text = text
             self._trail.points = np.concatenate(trails).astype(np.float32)
+            self._trail_edge.points = self._trail.points + BEHIND
             self._paddle_trail.points = np.concatenate(paddles).astype(np.float32)
         self.server.flush()
 

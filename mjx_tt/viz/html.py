@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from ballmodel.io.atomic_files import replacing
 
 INK, FAINT = "#22272e", "#9aa3ad"
+WIDTH = 7.6  # [inch] of a figure: its letters stay legible where a phone shows it 350 pixels wide
 LINK = "#0b62a4"
 STYLE = RcParams(
     {
@@ -52,7 +53,7 @@ def png(figure: Figure) -> bytes:
         if engine is not None:  # laid out once; saving would draw all of it another time to do that
             engine.execute(figure)
             figure.set_layout_engine("none")
-        figure.savefig(stream, format="png", dpi=130, facecolor="white")
+        figure.savefig(stream, format="png", dpi=160, facecolor="white")
     return stream.getvalue()
 
 

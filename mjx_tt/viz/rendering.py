@@ -1,20 +1,15 @@
-"""Pictures and videos of the table, the robot and the ball, made without a display.
+"""Pictures and videos of the table, the robot, the ball and the person's place, made without a display.
 
-The OpenGL back end is the one that MUJOCO_GL names (egl, osmesa, glfw or cgl), or else the first that works of those
-usual on this system. It is chosen when the first picture is made, so it does not matter when MuJoCo was imported.
+Ball and trail are two colours, bright within dark, so that one of them stands out from whatever lies behind: both
+rubbers, table, net, floor, sky. The ball is drawn larger than it is.
 """
 
 from __future__ import annotations
 
-import importlib
-import math
 import os
-import platform
-import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -23,85 +18,89 @@ import numpy as np
 from PIL import Image
 
 from mjx_tt.robot.model import load_model
+from mjx_tt.viz.caption import Caption
+from mjx_tt.viz.opengl import offscreen
 
 VIDEO_SUFFIXES = (".mp4", ".gif")
+CAMERA = "human"
+SIZE = (960, 540)
 
-_BACKENDS = {"Linux": ("egl", "osmesa"), "Darwin": ("cgl",), "Windows": ("glfw",)}
-_KNOWN_BACKENDS = ("egl", "osmesa", "glfw", "cgl")
+BRIGHT, DARK = (1.0, 0.94, 0.1), (0.02, 0.03, 0.07)
+SHOWN_RADIUS, RING_RADIUS = 0.03, 0.042  # [m]; the true ball, of 0.02 m, is a few pixels wide
+TRAIL_RADIUS, EDGE = 0.011, 0.007  # [m] at the trail's new end; of the dark edge
+_THINNEST = 0.35  # share of that at its old end
+_DOT_RADIUS = 0.009  # [m]
+_FLAT = 2e-4  # [m], half the thickness of what is flat
 _BALL_GROUP = 0  # the ball's geom group in scene.xml, which holds nothing else
-_TRAIL_RADIUS = 0.008  # [m]
-_TRAIL_RGB = (1.0, 0.55, 0.1)
 _GIF_TICK = 0.01  # [s], the format's unit of time
 _GIF_MIN_DELAY = 0.02  # [s], viewers slow down frames that are shorter than this
+_GIF_COLOURS = 128
+
+NO_PATH = np.empty((0, 3))
 
 
-def render_png(
-    path: str | os.PathLike,
-    qpos: np.ndarray,
-    ball_position: np.ndarray | None = None,
-    camera: str = "side",
-    size: tuple[int, int] = (960, 540),
-) -> None:
+@dataclass(frozen=True)
+class Moment:
+    """Content of one picture.
+
+    qpos     joint positions (n,) [m], [rad]
+    ball     (3,) [m] in the world frame; not finite: left out
+    trail    path (k, 3) [m] that the ball has flown, oldest first; pieces that are not finite are left out
+    dots     places (m, 3) [m] that are marked, for instance where the ball is going to be
+    caption  written below the scene
+    """
+
+    qpos: np.ndarray
+    ball: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
+    trail: np.ndarray = field(default_factory=lambda: NO_PATH)
+    dots: np.ndarray = field(default_factory=lambda: NO_PATH)
+    caption: Caption | None = None
+
+
+def render_png(path: str | os.PathLike, moment: Moment, camera: str = CAMERA, size: tuple[int, int] = SIZE) -> None:
     """Writes one picture.
 
-    qpos (8,) [m], [rad]; ball_position (3,) [m] in the world frame, None to leave the ball out; camera: one of
-    ``camera_names()``; size: (width, height) in pixels.
+    camera: one of ``camera_names()``; size: (width, height) in pixels.
     Raises ValueError for a wrong shape, camera or suffix, RuntimeError when no OpenGL back end works.
     """
     path = _checked_path(path, (".png",))
-    qpos = _checked_array("qpos", qpos, (None,))[None]
-    ball = None if ball_position is None else _checked_array("ball_position", ball_position, (3,))[None]
-    (frame,) = render_frames(qpos, ball, camera, size)
+    (frame,) = render_frames([moment], camera, size)
     with _replacing(path) as temporary:
         Image.fromarray(frame).save(temporary)
 
 
 def render_video(
     path: str | os.PathLike,
-    qpos: np.ndarray,
-    ball: np.ndarray | None = None,
-    fps: float = 75.0,
-    camera: str = "side",
-    size: tuple[int, int] = (960, 540),
-    trail: float = 0.3,
-) -> int:
-    """Writes a video in real time and returns the number of its frames.
+    moments: Sequence[Moment],
+    fps: float,
+    camera: str = CAMERA,
+    size: tuple[int, int] = SIZE,
+) -> None:
+    """Writes a video of moments ``1 / fps`` apart. The suffix chooses the format: .mp4 (H.264) or .gif.
 
-    qpos (T, 8) [m], [rad] and ball (T, 3) [m] sampled at fps; the ball is left out where it is not finite. trail: how
-    long the ball's path stays visible [s]. The suffix chooses the format: .mp4 (H.264), or .gif, where frames are left
-    out so that each lasts the 0.02 s that viewers honour.
-    Raises ValueError for a wrong shape, camera or suffix, RuntimeError when no OpenGL back end works.
+    Raises ValueError for a wrong shape, camera, suffix or rate, RuntimeError when no OpenGL back end works.
     """
     path = _checked_path(path, VIDEO_SUFFIXES)
-    if not len(qpos) or not fps > 0:
-        raise ValueError(f"a video needs at least one frame and a positive fps, got {len(qpos)} frames at fps {fps}")
+    if not len(moments) or not fps > 0:
+        raise ValueError(f"a video needs at least one frame and a positive fps, got {len(moments)} frames at fps {fps}")
     if path.suffix == ".mp4" and (size[0] % 2 or size[1] % 2):
         raise ValueError(f"H.264 needs an even width and height, got {size}")
-    stride = max(1, math.ceil(_GIF_MIN_DELAY * fps - 1e-9)) if path.suffix == ".gif" else 1
-    frames = render_frames(qpos, ball, camera, size, round(trail * fps), stride)
+    if path.suffix == ".gif" and fps * _GIF_MIN_DELAY > 1.0 + 1e-9:
+        raise ValueError(f"viewers show a GIF at {1.0 / _GIF_MIN_DELAY:.0f} frames per second at most, got fps {fps}")
+    frames = render_frames(moments, camera, size)
     with _replacing(path) as temporary:
-        write = _write_gif if path.suffix == ".gif" else _write_mp4
-        return write(temporary, frames, fps / stride)
+        (_write_gif if path.suffix == ".gif" else _write_mp4)(temporary, frames, fps)
 
 
 def render_frames(
-    qpos: np.ndarray,
-    ball: np.ndarray | None = None,
-    camera: str = "side",
-    size: tuple[int, int] = (960, 540),
-    trail_frames: int = 0,
-    stride: int = 1,
+    moments: Iterable[Moment], camera: str = CAMERA, size: tuple[int, int] = SIZE
 ) -> Iterator[np.ndarray]:
-    """Every stride-th frame of a motion, each (height, width, 3) uint8.
+    """Pictures (height, width, 3) uint8 of moments.
 
-    qpos (T, 8) [m], [rad]; ball (T, 3) [m], left out where not finite; its last trail_frames positions are marked.
     Raises ValueError for a wrong shape or camera, RuntimeError when no OpenGL back end works.
     """
-    qpos = _checked_array("qpos", qpos, (None, None))
-    ball = None if ball is None else _checked_array("ball", ball, (len(qpos), 3))
     model = load_model()
-    if qpos.shape[1] != model.nq:
-        raise ValueError(f"qpos needs {model.nq} joint positions, got {qpos.shape[1]}")
+    checked = [_checked_moment(moment, model.nq) for moment in moments]
     if camera not in (names := camera_names(model)):
         raise ValueError(f"the scene has no camera {camera!r}; it has {names}")
     width, height = size
@@ -109,24 +108,22 @@ def render_frames(
         raise ValueError(f"size must be positive, got {size}")
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     data = mujoco.MjData(model)
-    scene = mujoco.MjvScene(model, maxgeom=model.ngeom + trail_frames + 10)
+    drawn = max((2 * len(m.trail) + 2 * len(m.dots) for m in checked), default=0)
+    scene = mujoco.MjvScene(model, maxgeom=model.ngeom + drawn + 10)
     option, view, perturb = mujoco.MjvOption(), mujoco.MjvCamera(), mujoco.MjvPerturb()
+    option.geomgroup[_BALL_GROUP] = False
     view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
     viewport, pixels = mujoco.MjrRect(0, 0, width, height), np.empty((height, width, 3), np.uint8)
-    with _offscreen(model, size) as context:
-        for t in range(0, len(qpos), stride):
-            data.qpos[:] = qpos[t]
-            shown = ball is not None and np.isfinite(ball[t]).all()
-            option.geomgroup[_BALL_GROUP] = shown
-            if ball is not None and shown:
-                data.mocap_pos[0] = ball[t]
+    with offscreen(model, size) as context:
+        for moment in checked:
+            data.qpos[:] = moment.qpos
             mujoco.mj_forward(model, data)
             mujoco.mjv_updateScene(model, data, option, perturb, view, mujoco.mjtCatBit.mjCAT_ALL, scene)
-            if ball is not None:
-                _add_trail(scene, ball[max(0, t - trail_frames) : t])
+            _add_ball(scene, data.cam_xpos[view.fixedcamid], moment)
             mujoco.mjr_render(viewport, scene, context)
             mujoco.mjr_readPixels(pixels, None, viewport, context)
-            yield pixels[::-1].copy()
+            frame = pixels[::-1].copy()
+            yield frame if moment.caption is None else moment.caption.written_on(frame)
 
 
 def camera_names(model: mujoco.MjModel | None = None) -> list[str]:
@@ -135,83 +132,105 @@ def camera_names(model: mujoco.MjModel | None = None) -> list[str]:
     return [model.camera(i).name for i in range(model.ncam)]
 
 
-def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
-    count = 0
+def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     with imageio.get_writer(path, fps=fps, codec="libx264", quality=8, macro_block_size=2) as writer:
         for frame in frames:
             writer.append_data(frame)  # type: ignore[attr-defined]  # annotated as the base of readers and writers
-            count += 1
-    return count
 
 
-def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> int:
-    images = [Image.fromarray(frame).quantize(128, dither=Image.Dither.NONE) for frame in frames]
+def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
+    images = [Image.fromarray(frame) for frame in frames]
+    # One palette for all: what does not move stays the same in every frame and costs nothing.
+    some = images[:: max(1, len(images) // 8)]
+    sheet = Image.new("RGB", (some[0].width, some[0].height * len(some)))
+    for i, image in enumerate(some):
+        sheet.paste(image, (0, i * image.height))
+    palette = sheet.quantize(_GIF_COLOURS, dither=Image.Dither.NONE)
+    images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     # Rounding the time of each frame, not its duration, keeps the video in real time.
     times = np.round(np.arange(len(images) + 1) / fps / _GIF_TICK)
     durations = [int(d) for d in np.diff(times) * _GIF_TICK * 1000]
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
-    return len(images)
 
 
-def _add_trail(scene: mujoco.MjvScene, past: np.ndarray) -> None:
-    """Appends a small sphere for every past ball position (N, 3), oldest first and faintest."""
-    for age, position in enumerate(past, start=1):
-        if np.isfinite(position).all():
-            geom = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(
-                geom,
-                mujoco.mjtGeom.mjGEOM_SPHERE,
-                np.full(3, _TRAIL_RADIUS),
-                np.asarray(position, float),
-                np.eye(3).ravel(),
-                np.array([*_TRAIL_RGB, 0.7 * age / len(past)], np.float32),
-            )
-            geom.category = mujoco.mjtCatBit.mjCAT_DECOR  # casts no shadow
-            scene.ngeom += 1
+def _add_ball(scene: mujoco.MjvScene, eye: np.ndarray, moment: Moment) -> None:
+    """Appends trail, dots and ball to a scene seen from ``eye`` (3,) [m].
 
-
-@contextmanager
-def _offscreen(model: mujoco.MjModel, size: tuple[int, int]) -> Iterator[mujoco.MjrContext]:
-    """A current OpenGL context of this size with the model's meshes and textures; freed on exit."""
-    backend = _backend()
-    try:
-        gl = importlib.import_module(f"mujoco.{backend}").GLContext(*size)
-        gl.make_current()
-    except Exception as error:  # PyOpenGL raises whatever its failed look-up happens to hit
-        raise RuntimeError(_no_backend((backend,))) from error
-    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-    try:
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-        yield context
-    finally:
-        context.free()
-        gl.free()
-
-
-@cache
-def _backend() -> str:
-    """MUJOCO_GL, or else the first of this system's back ends that makes a context.
-
-    A back end is tried in a process of its own: PyOpenGL binds to one for the life of a process, even when it fails.
+    All but the ball is flat and faces the eye; the dark edge is the same a little wider, a little farther away on the
+    same lines of sight, so that it shows around the bright part from everywhere.
     """
-    asked = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if asked in _KNOWN_BACKENDS:
-        return asked
-    if asked:
-        raise RuntimeError(f"MUJOCO_GL={asked!r} cannot render without a display; use one of {_KNOWN_BACKENDS}")
-    candidates = _BACKENDS.get(platform.system(), ("glfw",))
-    for backend in candidates:
-        attempt = f"from mujoco.{backend} import GLContext; GLContext(8, 8).make_current()"
-        if len(candidates) == 1 or not subprocess.run([sys.executable, "-c", attempt], capture_output=True).returncode:
-            return backend
-    raise RuntimeError(_no_backend(candidates))
+    trail = moment.trail
+    for k, (start, end) in enumerate(zip(trail[:-1], trail[1:], strict=True), start=1):
+        if np.isfinite([start, end]).all():
+            width = TRAIL_RADIUS * (_THINNEST + (1.0 - _THINNEST) * k / (len(trail) - 1))
+            _add_ribbon(scene, eye, start, end, width, BRIGHT)
+            _add_ribbon(scene, eye, _behind(eye, start), _behind(eye, end), width + EDGE, DARK)
+    for dot in moment.dots[np.isfinite(moment.dots).all(axis=1)]:
+        _add_disc(scene, eye, dot, _DOT_RADIUS, BRIGHT)
+        _add_disc(scene, eye, _behind(eye, dot), _DOT_RADIUS + EDGE, DARK)
+    if np.isfinite(moment.ball).all():
+        _add_disc(scene, eye, moment.ball, RING_RADIUS, DARK)
+        sphere = np.full(3, SHOWN_RADIUS)
+        ball = _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, sphere, moment.ball, np.eye(3), BRIGHT)
+        ball.category = mujoco.mjtCatBit.mjCAT_DYNAMIC  # casts a shadow
 
 
-def _no_backend(tried: tuple[str, ...]) -> str:
-    return (
-        f"no OpenGL back end for rendering without a display: tried {', '.join(tried)}. On Debian or Ubuntu install "
-        "EGL (apt-get install libegl1 libgl1 libgl1-mesa-dri) or OSMesa (apt-get install libosmesa6)"
-    )
+def _behind(eye: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """A place a little farther along the line of sight."""
+    return place + 0.01 * _unit(place - eye)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def _add_disc(
+    scene: mujoco.MjvScene, eye: np.ndarray, place: np.ndarray, radius: float, rgb: tuple[float, float, float]
+) -> None:
+    towards = _unit(eye - place)
+    across = _unit(np.cross(towards, [0.0, 0.0, 1.0]))
+    frame = np.stack([across, np.cross(towards, across), towards], axis=1)
+    _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([radius, _FLAT, 0.0]), place, frame, rgb)
+
+
+def _add_ribbon(
+    scene: mujoco.MjvScene,
+    eye: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+    half_width: float,
+    rgb: tuple[float, float, float],
+) -> None:
+    middle, along = 0.5 * (start + end), _unit(end - start)
+    across = _unit(np.cross(along, eye - middle))
+    frame = np.stack([along, across, np.cross(along, across)], axis=1)
+    length = 0.5 * float(np.linalg.norm(end - start)) + 0.5 * half_width  # no gaps where the path bends
+    _add(scene, mujoco.mjtGeom.mjGEOM_BOX, np.array([length, half_width, _FLAT]), middle, frame, rgb)
+
+
+def _add(
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    size: np.ndarray,
+    place: np.ndarray,
+    frame: np.ndarray,
+    rgb: tuple[float, float, float],
+) -> mujoco.MjvGeom:
+    """Appends a geom that shines in its colour whatever the light, and casts no shadow."""
+    geom = scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(geom, kind, size, place, frame.ravel(), np.array([*rgb, 1.0], np.float32))
+    geom.category, geom.emission, geom.specular = mujoco.mjtCatBit.mjCAT_DECOR, 0.8, 0.0
+    scene.ngeom += 1
+    return geom
+
+
+def _checked_moment(moment: Moment, joints: int) -> Moment:
+    qpos = _checked_array("qpos", moment.qpos, (None,))
+    if len(qpos) != joints:
+        raise ValueError(f"qpos needs {joints} joint positions, got {len(qpos)}")
+    ball = _checked_array("ball", moment.ball, (3,))
+    trail, dots = (_checked_array(name, getattr(moment, name), (None, 3)) for name in ("trail", "dots"))
+    return Moment(qpos, ball, trail, dots, moment.caption)
 
 
 def _checked_path(path: str | os.PathLike, suffixes: tuple[str, ...]) -> Path:

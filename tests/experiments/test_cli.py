@@ -54,7 +54,7 @@ def short_videos():
     """Of one episode and small: without a graphics card, pictures take longer than everything else."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finalize, "EPISODES_SHOWN", 1)
-        patch.setattr(video, "SIZE", (160, 90))
+        patch.setattr(video, "VIDEO_SIZE", (160, 90))
         yield
 
 
@@ -236,7 +236,7 @@ def test_render(trained, tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     assert imageio.imread(tmp_path / "a.png").std() > 10
     with imageio.get_reader(runs / "tiny" / "episode.mp4") as film:
-        assert film.get_meta_data()["fps"] == 37.5 and film.get_meta_data()["duration"] > 0.8
+        assert film.get_meta_data()["fps"] == 30.0 and film.get_meta_data()["duration"] > 0.8
         assert sum(1 for _ in film) > 30
     refused = mjx_tt("render", runs / "tiny", "--out", tmp_path / "a.png", "--camera", "nowhere")
     assert refused.returncode == 1 and "robot_back" in refused.stderr

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from mjx_tt.diagnosis.tracks import Record
 from mjx_tt.diagnosis.tracks.clean import KINDS, MEANINGS
-from mjx_tt.viz.html import FAINT, STYLE
+from mjx_tt.viz.html import FAINT, STYLE, WIDTH
 
 MOST_TRACKS = 150  # drawn behind, spread over the log
 COLOURS = matplotlib.colormaps["tab10"]
@@ -16,7 +16,7 @@ COLOURS = matplotlib.colormaps["tab10"]
 def taken_out(record: Record) -> Figure:
     """Samples that were taken out, over the tracks they came from."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
         views = figure.subplots(1, 2)
     for ax, (i, j), labels in zip(views, ((1, 2), (1, 0)), (("y [m]", "z [m]"), ("y [m]", "x [m]")), strict=True):
         for t in record.tracks[:: max(len(record.tracks) // MOST_TRACKS, 1)]:
@@ -29,5 +29,5 @@ def taken_out(record: Record) -> Figure:
                 ax.plot(entry.position[i], entry.position[j], ".", ms=3.5, color=colour, label=label)
         ax.set(xlabel=labels[0], ylabel=labels[1])
     if any(e.samples for e in record.entries):
-        views[0].legend(fontsize=7, loc="best")
+        figure.legend(*views[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
     return figure

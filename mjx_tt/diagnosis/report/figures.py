@@ -16,9 +16,11 @@ from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.hits.diagnose import HitFindings
 from mjx_tt.diagnosis.joint import JointFindings
-from mjx_tt.diagnosis.report.residuals import AFTER, AXES, BEFORE, MEANING, UNCHANGED
+from mjx_tt.diagnosis.report.residuals import AFTER, AXES, BEFORE, MEANING, UNCHANGED, usual
 from mjx_tt.diagnosis.verdict import Cause
-from mjx_tt.viz.html import FAINT, INK, STYLE
+from mjx_tt.viz.html import FAINT, INK, STYLE, WIDTH
+
+FAR = 12.0  # times the smallest, beyond which the largest of several sizes makes the scale logarithmic
 
 
 def median_interval(values: np.ndarray) -> tuple[float, float, float]:
@@ -34,7 +36,7 @@ def hits(found: HitFindings) -> Figure:
     kinds = ((found.before, UNCHANGED),) if same else ((found.before, BEFORE), (found.after, AFTER))
     jitter = 0.5 * np.random.default_rng(0).uniform(-1.0, 1.0, found.hits)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 3.6 if same else 4.6), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 3.6 if same else 4.6), layout="constrained")
         for ax, first, factor, what in zip(
             figure.subplots(1, 2),
             (0, 3),
@@ -42,10 +44,9 @@ def hits(found: HitFindings) -> Figure:
             ("place at the hit [mm]", "velocity behind the paddle [m/s]"),
             strict=True,
         ):
-            both = factor * np.concatenate([values[first : first + 3] for values, _ in kinds], axis=1)
+            ends = np.array([usual(factor * row) for values, _ in kinds for row in values[first : first + 3]])
             # A few wild hits stay on the edge and do not flatten the rest.
-            low = min(float(np.percentile(both, 2, axis=1).min()), 0.0)
-            high = max(float(np.percentile(both, 98, axis=1).max()), 0.0)
+            low, high = min(float(ends[:, 0].min()), 0.0), max(float(ends[:, 1].max()), 0.0)
             margin = max(0.08 * (high - low), 1e-3)
             low, high = low - margin, high + margin
             for a in range(3):
@@ -57,8 +58,8 @@ def hits(found: HitFindings) -> Figure:
                     ax.scatter(mine[~wild], at[~wild], s=13, color=colour, alpha=0.5, linewidth=0)
                     for edge, out, marker in ((low, mine < low, "<"), (high, mine > high, ">")):
                         ax.scatter(np.full(out.sum(), edge), at[out], s=18, marker=marker, color=colour, linewidth=0)
-                    middle, *ends = median_interval(mine)
-                    ax.plot(ends, [row, row], color=INK, linewidth=1.6, marker="|", markersize=11, zorder=4)
+                    middle, *interval = median_interval(mine)
+                    ax.plot(interval, [row, row], color=INK, linewidth=1.6, marker="|", markersize=11, zorder=4)
                     ax.plot([middle], [row], "D", color=colour, markersize=6, markeredgecolor="white", zorder=5)
             ax.axvline(0.0, color=INK, linewidth=0.9, zorder=1)
             for border in (0.5, 1.5):
@@ -75,30 +76,6 @@ def hits(found: HitFindings) -> Figure:
             labels = ["before: nominal paddle", "after: with what the hits name"]
         dots = [ax.plot([], [], "D", color=colour, markersize=6)[0] for _, colour in kinds]
         figure.legend(dots, labels, loc="outside upper left", ncols=2)
-    return figure
-
-
-def runners(names: Sequence[str], behind: Sequence[float], chosen: str) -> Figure:
-    """Cost of other sets of causes: gain less what their size has to pay, against the chosen set's."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 1.1 + 0.36 * (len(names) + 1)), layout="constrained")
-        ax = figure.subplots()
-        labels, values = [chosen, *names], [0.0, *behind]
-        colours = [AFTER] + [FAINT] * len(names)
-        at = np.arange(len(labels))
-        ax.barh(at, values, color=colours, height=0.62)
-        span = max(max(values), 1.0)
-        for k, value in zip(at, values, strict=True):
-            text = "chosen" if k == 0 else f"{value:,.0f}" if value > 0.0 else "ruled out, see below"
-            ax.annotate(text, (value, k), (5, 0), textcoords="offset points", va="center", fontsize=9.5)
-        ax.set_yticks(at, labels)
-        ax.invert_yaxis()
-        if span > 500.0:
-            ax.set_xscale("symlog", linthresh=50.0)
-            ax.xaxis.set_major_formatter(matplotlib.ticker.StrMethodFormatter("{x:,.0f}"))
-        ax.set_xlim(0.0, 1.12 * span if span <= 500.0 else 3.0 * span)
-        ax.tick_params(axis="y", length=0)
-        ax.set_xlabel("worse by" + (", logarithmic from 50 on" if span > 500.0 else ""))
     return figure
 
 
@@ -139,7 +116,7 @@ def forest_rows(causes: Sequence[Cause], found: BallFindings | None) -> list[Row
 def forest(rows: Sequence[Row]) -> Figure:
     """Estimates with 90 % intervals as shifts."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 1.0 + 0.42 * len(rows)), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 1.0 + 0.42 * len(rows)), layout="constrained")
         ax = figure.subplots()
         at = np.arange(len(rows))
         ax.axvline(0.0, color=INK, linewidth=0.9)
@@ -147,6 +124,11 @@ def forest(rows: Sequence[Row]) -> Figure:
         for k, r in zip(at, rows, strict=True):
             ax.plot([r.low, r.high], [k, k], color=AFTER, linewidth=5.0, alpha=0.35, solid_capstyle="butt")
             ax.plot([r.estimate], [k], "o", color=AFTER, markersize=7)
+        sizes = sorted(max(abs(r.low), abs(r.high)) for r in rows)
+        if len(sizes) > 1 and sizes[-1] > FAR * sizes[0]:
+            # The largest would press all others onto zero.
+            ax.set_xscale("symlog", linthresh=max(sizes[0], 1e-3), linscale=0.6)
+            ax.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
         ax.set_yticks(at, [r.label for r in rows])
         ax.set_ylim(len(rows) - 0.4, -0.6)
         ax.margins(x=0.12)
@@ -154,7 +136,8 @@ def forest(rows: Sequence[Row]) -> Figure:
         joints = any("." in r.label for r in rows)
         units = sorted({r.unit for r in rows}, reverse=True)
         what = "rms movement that it makes" if joints else "shift of a flight's last sample"
-        ax.set_xlabel(f"deviation from the nominal model as the {what} [{' or '.join(units)}]; 0: nothing wrong")
+        scale = "" if ax.get_xscale() == "linear" else "; logarithmic"
+        ax.set_xlabel(f"deviation from nominal, as the {what} [{' or '.join(units)}]{scale}")
     return figure
 
 
@@ -163,10 +146,10 @@ def held_out(prediction: Prediction) -> Figure:
     good = np.isfinite(prediction.before) & np.isfinite(prediction.after)
     before, after = 1e3 * prediction.before[good], 1e3 * prediction.after[good]
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 4.4), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 3.9), layout="constrained")
         left, right = figure.subplots(1, 2)
-        low, high = np.percentile(np.concatenate([before, after]), (0.5, 99.5)) * (0.9, 1.1)
-        low = max(low, 1e-2)
+        lows, highs = zip(usual(before), usual(after), strict=True)
+        low, high = max(0.85 * min(lows), 1e-2), 1.15 * max(highs)
         left.plot([low, high], [low, high], color=INK, linewidth=0.9)
         left.scatter(np.clip(before, low, high), np.clip(after, low, high), s=13, color=AFTER, alpha=0.5, linewidth=0)
         left.set(xscale="log", yscale="log", xlim=(low, high), ylim=(low, high), aspect="equal")
@@ -176,19 +159,20 @@ def held_out(prediction: Prediction) -> Figure:
             axis.set_minor_formatter(matplotlib.ticker.NullFormatter())
         left.set_xlabel("error before [mm]", color=BEFORE)
         left.set_ylabel("error after [mm]", color=AFTER)
-        left.set_title("one dot a ball; below the line: better after")
+        left.set_title("one dot a ball; below the line:\nbetter after")
         _gains(right, before - after)
     return figure
 
 
 def _gains(ax: Axes, gain: np.ndarray) -> None:
-    low, high = np.percentile(gain, (1, 99))
-    span = max(-low, high, 0.1)
-    ax.hist(np.clip(gain, -span, span), np.linspace(-span, span, 33).tolist(), color=FAINT)
+    """Histogram of gains (n,) [mm] from the smallest to the largest that are usual, with zero; the rest at its ends."""
+    low, high = usual(gain)
+    low, high = min(low, -0.05 * high, -0.05), max(high, -0.05 * low, 0.05)
+    ax.hist(np.clip(gain, low, high), np.linspace(low, high, 33).tolist(), color=FAINT)
     middle = float(np.median(gain))
     ax.axvline(0.0, color=INK, linewidth=0.9)
     ax.axvline(middle, color=AFTER, linewidth=2.0)
-    ax.set_title(f"median {middle:+.2f} mm; {100 * np.mean(gain > 0.0):.0f} % of the balls gain")
+    ax.set_title(f"median {middle:+.2f} mm;\n{100 * np.mean(gain > 0.0):.0f} % of the balls gain")
     ax.set_xlabel("error before $-$ error after [mm]")
     ax.set_ylabel("balls")
 
@@ -197,7 +181,7 @@ def joint_gains(robot: JointFindings) -> Figure:
     """Prediction errors of joint positions on windows that were not used."""
     rows = robot.held_out
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 1.2 + 0.46 * len(rows)), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 1.2 + 0.46 * len(rows)), layout="constrained")
         ax = figure.subplots()
         at = np.arange(len(rows))
         for shift, values, colour, name in (
@@ -205,15 +189,19 @@ def joint_gains(robot: JointFindings) -> Figure:
             (0.19, [1e3 * g.after for g in rows], AFTER, "after"),
         ):
             ax.barh(at + shift, values, height=0.36, color=colour, label=name)
-        ax.set_xscale("log")
+        sizes = np.array([1e3 * e for g in rows for e in (g.before, g.after)])
+        wide = sizes.max() > FAR * max(sizes.min(), 1e-9)
+        if wide:
+            ax.set_xscale("log")
         ax.set_yticks(at, [f"{g.joint} [{'mm' if g.joint.startswith('gantry') else 'mrad'}]" for g in rows])
         ax.invert_yaxis()
         ax.tick_params(axis="y", length=0)
         ax.grid(axis="x", color="#e6e9ed", linewidth=0.7)
-        ax.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
-        ax.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
-        ax.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
-        ax.set_xlabel("rms error of the predicted position [mm], [mrad]; logarithmic")
+        if wide:
+            ax.xaxis.set_major_locator(matplotlib.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+            ax.xaxis.set_major_formatter(matplotlib.ticker.FormatStrFormatter("%g"))
+            ax.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
+        ax.set_xlabel(f"rms error of the predicted position [mm], [mrad]{'; logarithmic' if wide else ''}")
         figure.legend(loc="outside upper left", ncols=2)
     return figure
 
@@ -221,7 +209,7 @@ def joint_gains(robot: JointFindings) -> Figure:
 def play(rates: Sequence[tuple[str, float, float, float]]) -> Figure:
     """Return rates in play: label, rate, low and high (0 to 1)."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 0.9 + 0.5 * len(rates)), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 0.9 + 0.5 * len(rates)), layout="constrained")
         ax = figure.subplots()
         at = np.arange(len(rates))
         for k, (_, rate, low, high) in zip(at, rates, strict=True):
@@ -231,7 +219,8 @@ def play(rates: Sequence[tuple[str, float, float, float]]) -> Figure:
         ax.grid(axis="x", color="#e6e9ed", linewidth=0.7)
         ax.set_yticks(at, [label for label, *_ in rates])
         ax.set_ylim(len(rates) - 0.4, -0.6)
-        ax.set_xlim(0.0, 100.0)
+        every = 100.0 * np.array([ends for _, *ends in rates])
+        ax.set_xlim(max(0.0, every.min() - 5.0), min(100.5, every.max() + 5.0))
         ax.tick_params(axis="y", length=0)
         ax.set_xlabel("balls returned [%]")
     return figure

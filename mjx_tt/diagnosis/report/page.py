@@ -1,8 +1,8 @@
 """Report of a diagnosis: one HTML page that needs no other file, and its figures as PNG.
 
-The order is that of a reader's questions: what does the simulation get wrong, what is the cause, why not another one,
-what stays open, how much, what does it bring, what to measure next. Its HTML is that of ``templates``, its sentences
-are those of ``text``; a section is left away where its function gives no context.
+The verdict comes first, in one sentence and one picture. The order is then that of a reader's questions: where does it
+show, why not another cause, what stays open, how much, what does it bring, what to measure next. Its HTML is that of
+``templates``, its sentences are those of ``text``; a section is left away where its function gives no context.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mjx_tt.diagnosis.ball import selection
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE
 from mjx_tt.diagnosis.diagnose import Diagnosis
 from mjx_tt.diagnosis.hits.diagnose import LEAST_SHIFT, RETURN
-from mjx_tt.diagnosis.report import cleaning, figures, residuals, spins, text
+from mjx_tt.diagnosis.report import cleaning, figures, headline, residuals, spins, text
 from mjx_tt.diagnosis.report.rivals import rivals
 from mjx_tt.diagnosis.verdict import Cause
 from mjx_tt.viz.html import Page, environment
@@ -76,8 +76,8 @@ def _page(d: Diagnosis, title: str, play: Play | None) -> Page:
     css = _environment.get_template("report.css").render()
     page = Page("Measured against simulated", f"{title} · {_amount(d)}", badge, css)
     sections: tuple[tuple[str, str, Callable[[Diagnosis, Page], Context]], ...] = (
-        ("What the simulation gets wrong", "residuals", _residuals),
         ("Verdict", "verdict", _verdict),
+        ("What the simulation gets wrong", "residuals", _residuals),
         ("The robot's hits", "hits", _hits),
         ("Other explanations, and why they lost", "rivals", _rivals),
         ("What these logs cannot tell", "open_questions", _open_questions),
@@ -127,8 +127,13 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
     causes, found = d.verdict.causes, d.balls
     units = {"mrad" if c.name.startswith("joint_") else "mm" for c in causes}
     context: dict[str, object] = {
-        "sentence": text.sentence(d),
-        "causes": [(_code(c.name), text.claim(c), _confidence(c.confidence), _effect(c)) for c in causes],
+        "headline": text.headline(d),
+        "picture": None,
+        "sentence": text.sentence(d) if d.verdict.verdict == "none" else "",
+        "causes": [
+            (_code(c.name), text.claim(c) + text.alike(c), _confidence(c.confidence), _effect(c)) for c in causes
+        ],
+        "warnings": [w for w in d.verdict.warnings if w not in _told_elsewhere(d)],
         "effect_head": f"effect [{units.pop()}]" if len(units) == 1 else "effect",
         "return_time": f"{RETURN:g}",
         "floor": f"{1e3 * selection.FLOOR:.0f}",
@@ -136,6 +141,9 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
         "small": text.below_floor(found) if found is not None else "",
         "bounce_map": "",
     }
+    shown = headline.picture(d)
+    if shown is not None:
+        context |= {"picture": page.embed("verdict", shown[0]), "caption": shown[1]}
     if d.robot is not None:
         left = d.robot.unexplained_by_joint
         context["joint_findings"] = [(u.joint, u.block, u.where, u.direction, f"{u.size:.2f}") for u in left]
@@ -154,6 +162,12 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
             if name not in INVISIBLE
         ]
     return context
+
+
+def _told_elsewhere(d: Diagnosis) -> set[str]:
+    """Warnings that a section of their own holds."""
+    spins = d.balls.spin_notes if d.balls is not None else ()
+    return {*spins, *(d.record.lines() if d.record is not None else ())}
 
 
 def _confidence(share: float) -> str:
@@ -204,14 +218,20 @@ def _rivals(d: Diagnosis, page: Page) -> Context:
     if d.balls is None:
         return None
     chosen, others = rivals(d.balls)
-    picture = (
-        figures.runners([r.name for r in others], [max(r.behind, 0.0) for r in others], chosen) if others else None
-    )
+    most = max([math.log1p(max(r.behind, 0.0)) for r in others], default=1.0)
     return {
-        "picture": page.embed("runners_up", picture) if picture else "",
+        "chosen": Markup(" + ").join(map(_code, chosen.split(" + "))),
         "threshold": d.balls.choice.threshold,
-        "rows": [(r.name, r.why) for r in others],
+        "rows": [(Markup(" + ").join(map(_code, r.name.split(" + "))), _behind(r.behind, most), r.why) for r in others],
     }
+
+
+def _behind(behind: float, most: float) -> Markup:
+    """Bar, of logarithmic length, and number; nothing to draw where a set fits better and a gate stopped it."""
+    if behind <= 0.0:
+        return Markup("stopped")
+    width = 100.0 * math.log1p(behind) / max(most, 1e-9)
+    return Markup('<span class="bar" style="width:{:.0f}px"></span> {:,.0f}').format(width, behind)
 
 
 def _open_questions(d: Diagnosis, page: Page) -> Context:
@@ -318,9 +338,16 @@ def _play(play: Play | None, page: Page) -> Context:
 
 
 def _next(d: Diagnosis, page: Page) -> Context:
-    causes = [c for c in d.verdict.causes if len(c.group) > 1]
-    readings = dict.fromkeys(r for c in causes for r in c.separating_measurement.split("; ") if r)
-    return {"steps": d.verdict.next_experiment, "few": FEW, "readings": list(readings)}
+    steps = d.verdict.next_experiment
+    told = [step.separates for step in steps if step.separates]
+    common = [line for line in told[0] if all(line in other for other in told)] if len(told) > 1 else []
+    rows = []
+    for step in steps:
+        own = [line for line in step.separates if line not in common]
+        gain = f"{step.gain:.0f}" if step.gain > 0.0 else ""
+        rows.append((step.what, gain, text.told(own) if own else ""))
+    readings = any(len(c.group) > 1 and c.separating_measurement for c in d.verdict.causes)
+    return {"rows": rows, "few": FEW, "common": text.told(common) if common else "", "readings": readings}
 
 
 def _spins(d: Diagnosis, page: Page) -> Context:

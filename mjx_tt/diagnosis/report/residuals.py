@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.ball.selection import fitted_spins
 from mjx_tt.diagnosis.joint import JointFindings, JointResidual
-from mjx_tt.viz.html import FAINT, INK, STYLE
+from mjx_tt.viz.html import FAINT, INK, STYLE, WIDTH
 
 BEFORE, AFTER = "#c2410c", "#0b62a4"
 UNCHANGED = "#5c6670"
@@ -92,20 +92,20 @@ def flight(found: BallFindings) -> tuple[Figure, str]:
     curves = [[curve(time, r[a], mask, 30) for a in range(3)] for r in both]
     words = "; ".join(_largest(name, row, origin) for name, row in zip(("before", "after"), curves, strict=True))
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 8.2), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
         axes = figure.subplots(3, 2, sharex=True, sharey="row")
         for a, name in enumerate(AXES):
             for k, colour in enumerate((BEFORE, AFTER)):
                 ax = axes[a, k]
-                _zero(ax)
+                zero_line(ax)
                 if origin == "bounce":
                     ax.axvline(0.0, color=FAINT, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
-                _bands(ax, curves[k][a], colour)
+                bands(ax, curves[k][a], colour)
                 if k:
                     ax.plot(curves[0][a].place, curves[0][a].quantiles[2], color=BEFORE, linewidth=1.0, linestyle="--")
             axes[a, 0].set_ylabel(f"{name}, {MEANING[name]}\nmeasured $-$ predicted [mm]")
         axes[0, 0].set_title("before: nominal model", color=BEFORE, fontweight="bold")
-        axes[0, 1].set_title("after: extended model  (dashed: median before)", color=AFTER, fontweight="bold")
+        axes[0, 1].set_title("after: extended model", color=AFTER, fontweight="bold")
         for ax in axes[2]:
             ax.set_xlabel("time since the bounce [s]" if origin == "bounce" else "time since the first sample [s]")
     return figure, words
@@ -115,11 +115,28 @@ def _largest(name: str, row: Sequence[Curve], origin: str) -> str:
     places = [c.largest() if c.place.size else (0.0, 0.0) for c in row]
     a = int(np.argmax([abs(value) for _, value in places]))
     at, value = places[a]
+    return f"largest median {name}: {value:+.1f} mm in {AXES[a]}, {moment(at, origin)}"
+
+
+def moment(at: float, origin: str) -> str:
+    """A time of ``flight_time`` in words."""
     if origin == "bounce":
-        when = f"{abs(at):.2f} s {'after' if at >= 0.0 else 'before'} the bounce"
-    else:
-        when = f"{at:.2f} s after the first sample"
-    return f"largest median {name}: {value:+.1f} mm in {AXES[a]}, {when}"
+        return f"{abs(at):.2f} s {'after' if at >= 0.0 else 'before'} the bounce"
+    return f"{at:.2f} s after the first sample"
+
+
+def usual(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Range of values without the fiftieth at each end, one value at least: what may set a scale."""
+    low = np.percentile(values, 2, method="higher")
+    return float(low), float(np.percentile(values, 98, method="lower"))
+
+
+def set_limits(ax: Axes, curves: Sequence[Curve]) -> None:
+    """Scale from the middle half and the usual width of the outer lines: a few wild balls do not flatten the rest."""
+    every = np.concatenate([c.quantiles for c in curves], axis=1)
+    if every.size:
+        limit = max(1.25 * float(np.abs(every[1:4]).max()), 1.5 * float(np.median(np.abs(every[[0, 4]]))))
+        ax.set_ylim(-limit, limit)
 
 
 def quantities(found: BallFindings) -> Figure:
@@ -128,45 +145,46 @@ def quantities(found: BallFindings) -> Figure:
     speed = np.linalg.norm(base.velocity[:, :, 0], axis=0)
     height, along = grid.measured[2], grid.measured[1]
     whole = FEWEST_BALLS * int(np.median(grid.mask.sum(axis=0)))
-    columns = [
+    rows = [
         (speed, "speed [m/s]", FEWEST),
         (height, "height z [m]", FEWEST),
-        (along, "place y [m]\n(human > 0, robot < 0)", FEWEST),
-        (np.broadcast_to(found.age, grid.mask.shape), "time in the session\n(0 start, 1 end)", whole),
+        (along, "place y [m] (human > 0, robot < 0)", FEWEST),
+        (np.broadcast_to(found.age, grid.mask.shape), "time in the session (0 start, 1 end)", whole),
     ]
     if found.choice.spin:
         spin = fitted_spins(found.projected, found.choice)
         a = int(np.argmax(spin.std(axis=1) + np.abs(spin.mean(axis=1))))
-        columns.append((np.broadcast_to(spin[a], grid.mask.shape), f"fitted spin\nabout {AXES[a]} [rad/s]", whole))
+        rows.append((np.broadcast_to(spin[a], grid.mask.shape), f"fitted spin about {AXES[a]} [rad/s]", whole))
     both = residuals(found)
+    curves = [[[curve(q, r[a], grid.mask, 14, least) for r in both] for a in range(3)] for q, _, least in rows]
+    # A quantity that too few balls have in a bin has nothing to show.
+    shown = [
+        (row, of) for (_, row, _), of in zip(rows, curves, strict=True) if any(c.place.size > 1 for p in of for c in p)
+    ]
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 7.4), layout="constrained")
-        axes = figure.subplots(3, len(columns), sharex="col", sharey="row")
-        for a, name in enumerate(AXES):
-            curves = [[curve(q, r[a], grid.mask, 14, least) for r in both] for q, _, least in columns]
-            for ax, (_, label, _), pair in zip(axes[a], columns, curves, strict=True):
-                _zero(ax)
+        figure = Figure(figsize=(WIDTH, 0.5 + 2.1 * len(shown)), layout="constrained")
+        axes = figure.subplots(len(shown), 3, sharex="row", sharey="col", squeeze=False)
+        for across, (label, of) in zip(axes, shown, strict=True):
+            for ax, pair in zip(across, of, strict=True):
+                zero_line(ax)
                 for c, colour in zip(pair, (BEFORE, AFTER), strict=True):
-                    _bands(ax, c, colour, light=True)
-                if a == 2:
-                    ax.set_xlabel(label)
-            every = np.concatenate([c.quantiles for pair in curves for c in pair], axis=1)
-            if every.size:
-                # The middle half and the usual width of the outer lines: a few wild balls do not flatten the rest.
-                limit = max(1.25 * float(np.abs(every[1:4]).max()), 1.5 * float(np.median(np.abs(every[[0, 4]]))))
-                axes[a, 0].set_ylim(-limit, limit)
-            axes[a, 0].set_ylabel(f"{name}, {MEANING[name]} [mm]")
+                    bands(ax, c, colour, light=True)
+            across[1].set_xlabel(label)
+        for a, name in enumerate(AXES):
+            set_limits(axes[0, a], [c for _, of in shown for c in of[a]])
+            axes[0, a].set_title(f"{name}, {MEANING[name]} [mm]")
         lines = [axes[0, 0].plot([], [], color=c, linewidth=2.2)[0] for c in (BEFORE, AFTER)]
         figure.legend(lines, ["before: nominal model", "after: extended model"], loc="outside upper left", ncols=2)
     return figure
 
 
-def _zero(ax: Axes) -> None:
+def zero_line(ax: Axes) -> None:
+    """Line at zero, and a faint grid."""
     ax.axhline(0.0, color=INK, linewidth=0.8, zorder=1)
     ax.grid(axis="y", color="#e6e9ed", linewidth=0.7)
 
 
-def _bands(ax: Axes, c: Curve, colour: str, light: bool = False) -> None:
+def bands(ax: Axes, c: Curve, colour: str, light: bool = False) -> None:
     """Median as a line, middle 50 % as a band, middle 90 % as a fainter one (dotted lines where it is light)."""
     if not c.place.size:
         return
@@ -189,7 +207,7 @@ def bounce_map(found: BallFindings) -> Figure:
     heights = [np.array([np.median(r[2, late[:, i], i]) for i in bounced]) for r in residuals(found)]
     limit = max(float(np.percentile(np.abs(heights[0]), 97)), 1e-3) if bounced.size else 1.0
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 6.6), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 6.6), layout="constrained")
         axes = figure.subplots(1, 2, sharex=True, sharey=True)
         for ax, height, title, colour in zip(
             axes, heights, ("before: nominal model", "after: extended model"), (BEFORE, AFTER), strict=True
@@ -210,7 +228,7 @@ def joints(robot: JointFindings) -> Figure:
     """Measured minus predicted positions of each joint over time and against its velocity, before and after."""
     rows = robot.residuals
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 0.8 + 1.55 * len(rows)), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 0.8 + 1.55 * len(rows)), layout="constrained")
         axes = figure.subplots(len(rows), 2, squeeze=False, width_ratios=(2.0, 1.0), sharey="row")
         for r, (left, right) in zip(rows, axes, strict=True):
             unit = "mm" if r.joint.startswith("gantry") else "mrad"
@@ -232,11 +250,11 @@ def _joint(left: Axes, right: Axes, r: JointResidual) -> None:
     usual = np.abs(velocity) <= 1.2 * np.percentile(np.abs(velocity), 99.5)
     largest = max(float(np.percentile(np.abs(before), 99.5)), float(np.percentile(np.abs(after), 99.5)), 1e-3)
     for ax in (left, right):
-        _zero(ax)
+        zero_line(ax)
         ax.set_ylim(-1.15 * largest, 1.15 * largest)
     same = np.array_equal(before, after)
     kinds = ((before, UNCHANGED),) if same else ((before, BEFORE), (after, AFTER))
     for values, colour in kinds:
         left.plot(time, values, color=colour, linewidth=0.7)
-        _bands(right, curve(velocity, values, usual, 17), colour, light=True)
+        bands(right, curve(velocity, values, usual, 17), colour, light=True)
     left.set_xlim(0.0, time[-1])

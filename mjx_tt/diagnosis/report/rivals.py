@@ -20,7 +20,7 @@ class Rival:
     """Another set of causes."""
 
     name: str
-    behind: float  # price and gain against the chosen set's
+    behind: float  # price and gain against the chosen set's; negative where a gate stopped a set that fits better
     why: str  # it lost
 
 
@@ -46,7 +46,8 @@ def rivals(found: BallFindings) -> tuple[str, list[Rival]]:
     for key, gain in sets.items():
         if key[0] or key[1] or choice.effects:
             theirs, behind = names(*key), best - gain + price(*key)
-            why = _why(chosen, theirs, gain - choice.gain, behind, choice.threshold, key in alike)
+            stopped = fault(found, *key, gain) if behind <= 0.0 and key not in alike else ""
+            why = _why(chosen, theirs, gain - choice.gain, stopped, choice.threshold, key in alike)
             out.append(Rival(" + ".join(theirs) or NOTHING, behind, why))
     return " + ".join(chosen) or NOTHING, sorted(out, key=lambda r: r.behind)
 
@@ -71,16 +72,46 @@ def _asked_for(found: BallFindings) -> list[tuple[Subset, bool, float]]:
             subset = tuple(sorted((*rest, other)))
             out.append((subset, choice.spin, scores.gain(rated, subset)))
         best(rated, (k for k in useful if k not in group), choice.spin)
-    if choice.spin and found.trial.spin == "none":
+    # Gains about spins of their own count from another base than those of balls that do not spin.
+    own = choice.prior is not None and choice.prior.conditional
+    if choice.spin and found.trial.spin == "none" and not own:
         plain = scores.without_spin(found.projected)
         best(plain, (k for k in useful if not found.trial.effects[k].needs_spin), False)
     return out
 
 
-def _why(chosen: list[str], rival: list[str], gain: float, behind: float, threshold: float, alike: bool) -> str:
+def fault(found: BallFindings, subset: Subset, spin: bool, gain: float) -> str:
+    """Gate of ``selection`` that stops a set of causes, in words; "" where all that can be seen from here hold."""
+    choice, trial = found.choice, found.trial
+    rated = found.scores() if spin == choice.spin else scores.without_spin(found.projected)
+    rated = scores.priced(rated, trial.effects)
+    columns = (*subset, *rated.always)
+    theta = scores.solve(rated, columns)
+    error = np.sqrt(np.diagonal(scores.sandwich(rated, columns)))
+    for one, other in trial.bound:
+        if one in subset and other not in subset:
+            return f"{trial.effects[one].name} means nothing without {trial.effects[other].name}"
+    for i, j in enumerate(subset):
+        effect, name = trial.effects[j], trial.effects[j].name
+        if abs(theta[i]) > selection.WIDEST * effect.scale:
+            return f"{name} would be {abs(theta[i]) / effect.scale:,.0f} times as large as is usual"
+        if theta[i] < effect.low and abs(theta[i]) * trial.shift[j] >= selection.FLOOR:
+            return f"{name} would have a size that cannot be"
+        if abs(theta[i]) < selection.LEAST_Z * error[i]:
+            return f"{name} is uncertain, {abs(theta[i]) / error[i]:.1f} standard errors of {selection.LEAST_Z:g}"
+        brought = gain - scores.gain(rated, subset[:i] + subset[i + 1 :])
+        if brought < choice.threshold:
+            return f"{name} brings {max(brought, 0.0):,.0f} of the {choice.threshold:.0f} that chance reaches"
+    if scores.undo(rated, subset, theta, selection.ALIKE):
+        return "two of its causes take away what the other adds"
+    return ""
+
+
+def _why(chosen: list[str], rival: list[str], gain: float, stopped: str, threshold: float, alike: bool) -> str:
     """Reason for which a rival set lost.
 
     gain: squared error, in units of the noise, that it explains beyond the chosen set.
+    stopped: the gate that stops it.
     alike: it is the chosen set with one cause replaced by one that the diagnosis groups with it.
     """
     fit = "fits no better" if abs(gain) < 0.5 else f"fits {'worse' if gain < 0 else 'better'} by {abs(gain):,.0f}"
@@ -89,10 +120,12 @@ def _why(chosen: list[str], rival: list[str], gain: float, behind: float, thresh
         return f"{fit}, but its pattern is too much like that of the chosen one to tell the two apart"
     if more == 0 and abs(gain) < selection.TIE:
         return f"{fit}: less than {selection.TIE:.0f}, so these logs do not tell the two apart"
-    if behind <= 0.0:
-        return f"{fit}, but one of its causes is too small or too uncertain to be named"
+    if stopped:
+        return f"{fit}, but {stopped}"
     if more > 0:
         count = "one more effect" if more == 1 else f"{more} more effects"
         bring = "" if "magnus" in set(rival) - set(chosen) else f", and each must bring {threshold:.0f}"
         return f"{fit}; needs {count}{bring}"
+    if gain > selection.TIE and more <= 0:
+        return f"{fit}, but only where effects are taken as straight lines: one of its causes does not hold beyond that"
     return fit + ("" if more == 0 else " with one effect less" if more == -1 else f" with {-more} effects less")

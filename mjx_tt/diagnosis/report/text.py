@@ -31,6 +31,49 @@ def description(name: str) -> Description:
     return (joint_effects.DESCRIPTIONS if dot else ball_effects.DESCRIPTIONS)[effect]
 
 
+def headline(diagnosis: Diagnosis) -> str:
+    """The verdict in one sentence."""
+    v = diagnosis.verdict
+    if v.verdict == "none":
+        parts = []
+        if diagnosis.balls is not None:
+            parts.append(f"{diagnosis.balls.problem.grid.n} balls")
+        if diagnosis.robot is not None:
+            count = len(diagnosis.robot.residuals)
+            parts.append(f"{count} joint{'s' if count > 1 else ''}")
+        return f"The simulation agrees with {' and '.join(parts)} to within the noise: nothing is named."
+    if v.unexplained is not None:
+        return f"Something is wrong that no entry of the catalogue explains: {_odd(v.unexplained)}."
+    if len(v.causes) == 1 and v.verdict == "named":
+        return f"{claim(v.causes[0])}."
+    names = _and([_noun(c.name) for c in v.causes])
+    if v.verdict == "undetermined":
+        return f"Several sets of causes explain these logs equally well, the best of them: {names}."
+    better = ""
+    if v.held_out is not None and v.held_out.low > 0.0 and v.held_out.metric.endswith("[mm]"):
+        better = f"; with them unused data are missed by {v.held_out.after:.1f} instead of {v.held_out.before:.1f} mm"
+    return f"{len(v.causes)} things are wrong: {names}{better}."
+
+
+def _noun(name: str) -> str:
+    joint, dot, _ = name.rpartition(".")
+    return f"{joint}'s {description(name).meaning}" if dot else description(name).meaning
+
+
+def told(separates: Sequence[str]) -> str:
+    """Lines "a from b" and "whether there is c" as one, each first word once."""
+    pairs: dict[str, list[str]] = {}
+    for line in separates:
+        for word in (" from ", "whether there is "):
+            head, found, tail = line.partition(word)
+            if found:
+                pairs.setdefault(head + found, []).append(tail)
+                break
+        else:
+            pairs.setdefault(line, [])
+    return _and([head + _or(tails) if tails else head for head, tails in pairs.items()])
+
+
 def sentence(diagnosis: Diagnosis) -> str:
     """The verdict in plain words."""
     v = diagnosis.verdict
@@ -40,7 +83,7 @@ def sentence(diagnosis: Diagnosis) -> str:
         text = f"Something is wrong that no entry of the catalogue explains: {_odd(v.unexplained)}."
         names = ", ".join(c.name for c in v.causes)
         return text + (f" Beside it, to be taken with caution until it is understood: {names}." if names else "")
-    named = " ".join(f"{claim(c)}: named {c.name}{_alike(c)}." for c in v.causes)
+    named = " ".join(f"{claim(c)}: named {c.name}{alike(c)}." for c in v.causes)
     if v.verdict == "undetermined":
         return f"Several sets of causes explain these logs equally well; the best of them: {named}"
     return named if len(v.causes) < 2 else f"{len(v.causes)} things are wrong. {named}"
@@ -150,7 +193,8 @@ def _spin_claim(cause: Cause) -> str:
     )
 
 
-def _alike(cause: Cause) -> str:
+def alike(cause: Cause) -> str:
+    """Other causes of the same log, in words; "" without one."""
     if len(cause.group) < 2:
         return ""
     names = [f"{name} ({description(name).meaning})" for name in cause.group[1:]]
@@ -159,6 +203,10 @@ def _alike(cause: Cause) -> str:
 
 def _or(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " or " + names[-1]
+
+
+def _and(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
 def _odd(u: Unexplained) -> str:
