@@ -91,7 +91,7 @@ def render(
     experiment = experiment_of(trained, balls, model)
     played = video.replay(experiment, trained, episodes, experiment.config.evaluation.seed if seed is None else seed)
     for path in out:
-        checked("", video.draw, Path(path), played, experiment.task.control_rate, camera)
+        checked("", video.draw, Path(path), played, experiment.task.control_rate, camera, experiment.task.robot)
         screen.print(path, highlight=False)
 
 

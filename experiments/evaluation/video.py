@@ -14,6 +14,7 @@ from experiments.config.build import Experiment
 from experiments.runs.load_policy import TrainedPolicy
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
+from mjx_tt.robot.robot import Robot
 from mjx_tt.viz import rendering
 
 SIZE = (640, 360)
@@ -39,23 +40,31 @@ def replay(
     return [(qpos[: length[i], :, i], ball[: length[i], :, i]) for i in range(count)]
 
 
-def draw(path: Path, episodes: list[tuple[np.ndarray, np.ndarray]], rate: float, camera: str = "side") -> Path:
+def draw(
+    path: Path,
+    episodes: list[tuple[np.ndarray, np.ndarray]],
+    rate: float,
+    camera: str = "side",
+    robot: Robot | None = None,
+) -> Path:
     """Writes a picture (.png) of the first episode's moment of contact, or a video (.mp4, .gif) of all in real time.
 
-    rate: control rate [Hz]. Raises ValueError for a wrong suffix or camera, RuntimeError without OpenGL.
+    rate: control rate [Hz]; robot: None: the paper's. Raises ValueError for a wrong suffix or camera, RuntimeError
+    without OpenGL.
     """
+    model = None if robot is None else robot.model()
     allowed = (".png", *rendering.VIDEO_SUFFIXES)
     if path.suffix not in allowed:
         raise ValueError(f"{path}: suffix {path.suffix!r}; allowed: {', '.join(allowed)}")
     if path.suffix == ".png":
         qpos, ball = episodes[0]
         at = int(np.argmin(ball[:, 1]))  # the ball turns where it meets the paddle
-        rendering.render_png(path, qpos[at], ball[at], camera)
+        rendering.render_png(path, qpos[at], ball[at], camera, model=model)
         return path
     stride = math.ceil(rate / FRAME_RATE)
     rate, episodes = rate / stride, [(qpos[::stride], ball[::stride]) for qpos, ball in episodes]
     pause = round(PAUSE * rate)
     parts = [tuple(np.concatenate([a, np.repeat(a[-1:], pause, axis=0)]) for a in episode) for episode in episodes]
     qpos, ball = (np.concatenate(part) for part in zip(*parts, strict=True))
-    rendering.render_video(path, qpos, ball, rate, camera, SIZE)
+    rendering.render_video(path, qpos, ball, rate, camera, SIZE, model=model)
     return path

@@ -32,7 +32,9 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
         experiment, trained, evaluation.episodes, evaluation.seed, evaluation.reachable_balls, stage
     )
     with stage("drawing pictures"):
-        pictures = figures.draw_evaluation(run.plots, played, experiment.task.reward_weights)
+        pictures = figures.draw_evaluation(
+            run.plots, played, experiment.task.reward_weights, experiment.task.robot.contract
+        )
         title = f"{experiment.config.name}: training on {experiment.distribution.name}"
         pictures.append(figures.draw_training(run.plots / "training.png", metrics.read(run.metrics), title))
     shown = show_episodes(experiment, trained, [run.folder / "episode.png", run.folder / "episode.mp4"], console, stage)
@@ -62,7 +64,7 @@ def show_episodes(
     with stage(f"drawing {' and '.join(path.name for path in paths)}"):
         for path in paths:
             try:
-                drawn.append(video.draw(path, played, experiment.task.control_rate))
+                drawn.append(video.draw(path, played, experiment.task.control_rate, robot=experiment.task.robot))
             except RuntimeError as error:
                 failed[path] = error
     for path, reason in failed.items():
@@ -88,7 +90,7 @@ def export_policy(
         "update": trained.notes.get("update"),
         "evaluation": report,
     }
-    export.write(folder, trained.policy, provenance, overwrite=True)
+    export.write(folder, trained.policy, provenance, overwrite=True, robot=experiment.task.robot.contract)
     return True
 
 
@@ -113,8 +115,8 @@ def print_report(console: Console, report: dict[str, Any], title: str) -> None:
     console.print(table)
 
 
-def save_evaluation(folder: Path, played: Played, weights: tuple[float, ...]) -> None:
+def save_evaluation(folder: Path, played: Played, experiment: Experiment) -> None:
     """evaluation.json and its pictures, in a folder of their own."""
     folder.mkdir(parents=True, exist_ok=True)
-    figures.draw_evaluation(folder / "plots", played, weights)
+    figures.draw_evaluation(folder / "plots", played, experiment.task.reward_weights, experiment.task.robot.contract)
     run_dir.write_json(folder / "evaluation.json", played.report)

@@ -41,6 +41,7 @@ def render_png(
     ball_position: np.ndarray | None = None,
     camera: str = "side",
     size: tuple[int, int] = (960, 540),
+    model: mujoco.MjModel | None = None,
 ) -> None:
     """Writes one picture.
 
@@ -51,7 +52,7 @@ def render_png(
     path = _checked_path(path, (".png",))
     qpos = _checked_array("qpos", qpos, (None,))[None]
     ball = None if ball_position is None else _checked_array("ball_position", ball_position, (3,))[None]
-    (frame,) = render_frames(qpos, ball, camera, size)
+    (frame,) = render_frames(qpos, ball, camera, size, model=model)
     with _replacing(path) as temporary:
         Image.fromarray(frame).save(temporary)
 
@@ -64,6 +65,7 @@ def render_video(
     camera: str = "side",
     size: tuple[int, int] = (960, 540),
     trail: float = 0.3,
+    model: mujoco.MjModel | None = None,
 ) -> int:
     """Writes a video in real time and returns the number of its frames.
 
@@ -78,7 +80,7 @@ def render_video(
     if path.suffix == ".mp4" and (size[0] % 2 or size[1] % 2):
         raise ValueError(f"H.264 needs an even width and height, got {size}")
     stride = max(1, math.ceil(_GIF_MIN_DELAY * fps - 1e-9)) if path.suffix == ".gif" else 1
-    frames = render_frames(qpos, ball, camera, size, round(trail * fps), stride)
+    frames = render_frames(qpos, ball, camera, size, round(trail * fps), stride, model)
     with _replacing(path) as temporary:
         write = _write_gif if path.suffix == ".gif" else _write_mp4
         return write(temporary, frames, fps / stride)
@@ -91,15 +93,17 @@ def render_frames(
     size: tuple[int, int] = (960, 540),
     trail_frames: int = 0,
     stride: int = 1,
+    model: mujoco.MjModel | None = None,
 ) -> Iterator[np.ndarray]:
     """Every stride-th frame of a motion, each (height, width, 3) uint8.
 
     qpos (T, 8) [m], [rad]; ball (T, 3) [m], left out where not finite; its last trail_frames positions are marked.
+    model: a robot at the table; None: the paper's.
     Raises ValueError for a wrong shape or camera, RuntimeError when no OpenGL back end works.
     """
     qpos = _checked_array("qpos", qpos, (None, None))
     ball = None if ball is None else _checked_array("ball", ball, (len(qpos), 3))
-    model = load_model()
+    model = load_model() if model is None else model
     if qpos.shape[1] != model.nq:
         raise ValueError(f"qpos needs {model.nq} joint positions, got {qpos.shape[1]}")
     if camera not in (names := camera_names(model)):
