@@ -30,6 +30,7 @@ ALLOWED = {
         "robot_io.limits",
         "robot_io.policy",
         "robot_io.rally_ends",
+        "robot_io.robot_file",
         "robot_io.safety.clearance",
     ),
     "experiments": PACKAGES,

@@ -1,4 +1,4 @@
-"""What the robot's side has to know of an MJCF to compute clearances: joints, capsules, table, floor, as plain data."""
+"""A robot's geometry as plain data: joints, capsules, table and floor, from which its own side computes clearances."""
 
 from __future__ import annotations
 

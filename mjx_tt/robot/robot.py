@@ -63,7 +63,7 @@ class Robot:
 
     @property
     def contract(self) -> Contract:
-        """What a policy for this robot sees and does, with the geometry that its safety gate watches."""
+        """Contract of policies for this robot, with the geometry that its safety gate watches."""
         return _contract(self)
 
     def own_spec(self) -> mujoco.MjSpec:

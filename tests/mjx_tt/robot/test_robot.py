@@ -95,7 +95,7 @@ def test_the_gates_geometry_is_the_simulations_and_mujocos(name):
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_contract_survives_its_description(name):
-    """What an artefact's manifest holds is the contract again, without the MJCF."""
+    """The contract in an artefact's manifest is read again without the MJCF."""
     own = robots.load_shipped(name).contract
     again = contract.from_description(json.loads(json.dumps(contract.describe(own))))
     assert again == own and hash(again) == hash(own)
