@@ -21,6 +21,7 @@ from experiments.commands import (
     is2r,
     log,
     options,
+    own_robot,
     predict,
     render,
     run,
@@ -125,6 +126,8 @@ app = App(
     version=lambda: metadata.version("mjx-tt"),
     default_parameter=Parameter(negative=(), show_default=False),
 )
+for _command in (own_robot.new_app, own_robot.place_app, own_robot.list_app):
+    run.robot_app.command(_command)
 for _place, _command in enumerate(COMMANDS):
     _command.sort_key = _place
     app.command(_command)

@@ -151,7 +151,7 @@ def parse(data: Any, where: str) -> RobotFile:
     columns, home = _joints(reader, joints, carrying)
     position, yaw = _mount(reader, keys.get("mount", {}))
     model = (
-        *_latencies(reader, keys.get("latencies", {}), bool(carrying)),
+        *_latencies(reader, keys.get("latencies", {})),
         *_drives(reader, keys.get("drives", {}), joints),
     )
     clearance = reader.mapping("clearance", keys.get("clearance", {}), ("table", "blade", "pairs"), KEYS["clearance"])
@@ -234,10 +234,9 @@ def _mount(reader: _Reader, given: Any) -> tuple[tuple[float, float, float], flo
     return (position[0], position[1], position[2]), yaw
 
 
-def _latencies(reader: _Reader, given: Any, axes: bool) -> list[tuple[str, float]]:
-    known = [key for key in LATENCIES if axes or not key.startswith("carrying")]
+def _latencies(reader: _Reader, given: Any) -> list[tuple[str, float]]:
     found = []
-    for key, pair in reader.mapping("latencies", given, known, KEYS["latencies"]).items():
+    for key, pair in reader.mapping("latencies", given, LATENCIES, KEYS["latencies"]).items():
         allowed = f"[mean, deviation] in s, each from 0 to {LONGEST_LATENCY:g}"
         values = reader.numbers(f"latencies.{key}", pair, 2, allowed)
         if values and not all(0.0 <= value <= LONGEST_LATENCY for value in values):

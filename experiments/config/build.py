@@ -94,16 +94,12 @@ def robot_of(config: Config, where: str) -> tuple[Robot, str | dict[str, Any] | 
     if given is None or given == robots.DEFAULT:
         return robots.paper(), given
     if isinstance(given, dict):
-        return _robot(given, f"{where}: robot"), given
+        return checked("", robots.from_content, given, f"{where}: robot"), given
     if given in robots.names():
         return robots.load_shipped(given), given
     data = checked(f"{where}: robot", robots.content, given)
-    return _robot(data, str(checked(where, robots.yaml_path, given))), data
-
-
-def _robot(data: dict[str, Any], where: str) -> Robot:
     try:
-        return robots.from_content(data, where)
+        return robots.load(given), data
     except ValueError as error:  # whose lines name their origin
         raise ConfigError(str(error)) from None
 

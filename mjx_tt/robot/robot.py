@@ -35,7 +35,7 @@ from robot_io.robot_file import RobotFile
 ASSETS = Path(__file__).parents[1] / "assets"
 SHIPPED = ASSETS / "robots"
 DEFAULT = "irb120_gantry"  # the paper's
-YAML = "robot.yaml"
+YAML = "description.yaml"
 ELSEWHERE = "mjcf_file"  # key of a robot's content: where an MJCF lies that needs files beside it, such as meshes
 
 
@@ -103,7 +103,9 @@ def load(path: str | Path) -> Robot:
     Raises ValueError with a line for every mistake, naming file, key or element, and what to change; OSError where a
     file cannot be read.
     """
-    return from_content(content(path), str(path))
+    file = yaml_path(path)
+    data = content(file)
+    return from_content(data, str(file), _mjcf_path(file))
 
 
 def paper() -> Robot:
@@ -155,8 +157,18 @@ def content(path: str | Path) -> dict[str, Any]:
     return data | {"mjcf": text} | beside
 
 
-def from_content(data: Any, where: str) -> Robot:
-    """The robot in plain data as ``content`` gives it; ``where`` names its origin. Raises ValueError as ``load``."""
+def _mjcf_path(file: Path) -> str | None:
+    """Path of the MJCF that a YAML names, for messages."""
+    data = yaml.read(file)
+    named = isinstance(data, dict) and isinstance(data.get("mjcf"), str) and "<" not in data["mjcf"]
+    return str(file.parent / data["mjcf"]) if named else None
+
+
+def from_content(data: Any, where: str, mjcf: str | None = None) -> Robot:
+    """The robot in plain data as ``content`` gives it. Raises ValueError as ``load``.
+
+    where, mjcf: names of the origins of YAML and MJCF in messages
+    """
     path = data.get(ELSEWHERE) if isinstance(data, dict) else None
     if isinstance(data, dict):
         data = {key: value for key, value in data.items() if key != ELSEWHERE}
@@ -164,7 +176,7 @@ def from_content(data: Any, where: str) -> Robot:
     if path is not None and (not Path(path).is_file() or Path(path).read_text(encoding="utf-8") != parsed.mjcf):
         raise ValueError(f"{where}: {path} is missing or was changed since; put the MJCF and its files back there")
     robot = Robot(parsed, parsed.mjcf, path)
-    mistakes = list(mjcf_checks.mistakes(robot, f"{where}: {path or 'the MJCF'}", where))
+    mistakes = list(mjcf_checks.mistakes(robot, mjcf or path or f"{where}: mjcf", where))
     if mistakes:
         raise ValueError("\n".join(mistakes))
     return robot
