@@ -21,13 +21,13 @@ from experiments.commands import (
     is2r,
     log,
     options,
-    own_robot,
     predict,
     render,
     run,
     train,
 )
 from experiments.errors import explained
+from experiments.robots import command as robot_command
 
 DESCRIPTION = """\
 From measured human balls to a trained, evaluated and exported table-tennis policy.
@@ -126,7 +126,7 @@ app = App(
     version=lambda: metadata.version("mjx-tt"),
     default_parameter=Parameter(negative=(), show_default=False),
 )
-for _command in (own_robot.new_app, own_robot.place_app, own_robot.list_app):
+for _command in (robot_command.new_app, robot_command.place_app, robot_command.list_app):
     run.robot_app.command(_command)
 for _place, _command in enumerate(COMMANDS):
     _command.sort_key = _place

@@ -62,7 +62,7 @@ ROOMS = {
     ),
     "experiments": (
         "errors . config runs evaluation training baselines deploy finetuning study/workflow study/analysis "
-        "study/blind study/target_domain study/report study view robots sharing commands cli"
+        "study/blind study/target_domain study/report study view sharing commands robots cli"
     ),
 }
 # Module -> module that points up a package's rooms, and goes when it is mended.

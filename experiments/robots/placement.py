@@ -102,7 +102,7 @@ def placed(robot: Robot, candidate: np.ndarray) -> Robot:
 
 
 def meetings(robot: Robot, balls: Balls, samples: int, seed: int) -> Meetings:
-    """Where balls of the distribution can be met. Raises ConfigError where none comes by."""
+    """Places at which balls of the distribution can be met. Raises ConfigError where none comes by."""
     params = build.nominal_model(robot).ball
     state = sample_pool(jax.random.key(seed), balls, params, samples).state
 

@@ -83,7 +83,7 @@ def still(robot: Robot) -> Policy:
 
 
 def standing(robot: Robot, balls: str) -> Play:
-    """What the viewer shows of a robot that stands at home while balls come."""
+    """Programme of the viewer: the robot stands at home while balls come."""
     from experiments.view.programme import Play  # needs the packages of the viewer
     from experiments.view.studio import Studio
     from mjx_tt.sim.model import ModelFile
