@@ -118,30 +118,33 @@ class RobotGeometry:
     rows    what each watched gap is between, for messages: "col_wrist to the table", ...
     kinds   (R,) what kind of gap a row is: "table", "self" or "floor"
     home    (n,) joint positions of the home pose
-    joints  names of the joints, in the contract's order
+    joints  names of the joints, in the contract's order, and their units, "m" or "rad"
+    tip     the capsule whose middle is the blade's centre
     """
 
     def __init__(self, data: dict[str, Any], where: str = "geometry", joints: tuple[str, ...] = JOINT_NAMES) -> None:
         """From parsed JSON of a robot with these joints; ``where`` names its origin in errors. Raises GeometryError."""
         self.joints = _check(data, where, joints)
+        self.units = tuple("m" if joint["type"] == "slide" else "rad" for joint in data["joints"])
         self.home = np.array(data["home"], float)
         self._basis = _transform_basis(data["joints"])
         self._hinge = np.array([[joint["type"] == "hinge"] for joint in data["joints"]], float)
         capsules = {c["name"]: c for c in data["capsules"]}
-        watched, pairs = data["table_capsules"], data["self_pairs"]
+        watched, pairs, self.tip = data["table_capsules"], data["self_pairs"], data["blade_capsules"][0]
         unknown = sorted({*watched, *data["blade_capsules"], *(n for pair in pairs for n in pair)} - capsules.keys())
         if unknown:
             raise GeometryError(f"{where}: no capsules named {unknown}; it has {sorted(capsules)}")
         order = self._names = list(capsules)
         self._fixed = any(capsules[n]["joint"] == FIXED for n in order)
+        self._base = np.eye(4)  # of what nothing moves
         self._joint = np.array([(*self.joints, FIXED).index(capsules[n]["joint"]) for n in order])
         local = np.array([[[*capsules[n][end], 1.0] for end in ("p0", "p1")] for n in order])
         self._local = local.swapaxes(1, 2)[:, None]  # (capsules, 1, 4, 2)
         self._radius = np.array([capsules[n]["radius"] for n in order], float)[:, None]
         self._table_rows = np.array([order.index(n) for n in watched])
         self._blade_rows = np.array([watched.index(n) for n in data["blade_capsules"]])
-        self._first = np.array([order.index(a) for a, _ in pairs])
-        self._second = np.array([order.index(b) for _, b in pairs])
+        self._first = np.array([order.index(a) for a, _ in pairs], int)
+        self._second = np.array([order.index(b) for _, b in pairs], int)
         centre, half = (np.array(data["table"][key], float).reshape(3, 1, 1) for key in ("centre", "half"))
         self._floor = float(data["floor"])
         self._top = Box(centre - half, centre + half)
@@ -183,6 +186,7 @@ class RobotGeometry:
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = base.matrix, base.position
         other = copy.copy(self)
+        other._base = place
         other._basis = self._basis.copy()
         other._basis[0] = (place @ self._basis[0].reshape(4, 4, 4)).reshape(4, 16)
         return other
@@ -206,14 +210,14 @@ class RobotGeometry:
         """World end points (2, 3, capsules, B) of every capsule's axis at joint positions q (n, B)."""
         world = self._frames(q)
         if self._fixed:
-            world = np.concatenate([world, np.broadcast_to(np.eye(4), (1, *world.shape[1:]))])
+            world = np.concatenate([world, np.broadcast_to(self._base, (1, *world.shape[1:]))])
         points = np.matmul(world[self._joint, :, :3], self._local)  # (capsules, B, 3, 2)
         return np.ascontiguousarray(points.transpose(3, 2, 0, 1))
 
     @property
     def blade(self) -> np.ndarray:
-        """The blade's centre (3,) [m] in the last joint's frame; its normal is y."""
-        return self._local[self._names.index(BLADE), 0, :3].mean(axis=1)
+        """The blade's centre (3,) [m] in the last joint's frame; of the paper's robot the normal is y."""
+        return self._local[self._names.index(self.tip), 0, :3].mean(axis=1)
 
     def blade_points(self, q: np.ndarray) -> np.ndarray:
         """World end points (3, 4, B) [m] of the blade's capsules at joint positions q (n, B)."""
@@ -232,7 +236,7 @@ class RobotGeometry:
         """The simulation's clearances at joint positions q (n, B)."""
         ends = self.ends(np.asarray(q, float))
         table = self._to_box(self._top, ends)
-        return Clearances(table.min(0), self._own(ends).min(0), table[self._blade_rows].min(0))
+        return Clearances(table.min(0), self._own(ends).min(0, initial=np.inf), table[self._blade_rows].min(0))
 
     def gaps(self, q: np.ndarray) -> np.ndarray:
         """Every watched gap (R, B) [m] in the order of ``rows`` at q (n, B).
@@ -296,6 +300,8 @@ class RobotGeometry:
         return box.distance(some[0], some[1]) - self._radius[self._table_rows]
 
     def _own(self, ends: np.ndarray) -> np.ndarray:
+        if not self._first.size:
+            return np.zeros((0, ends.shape[-1]))
         first, second = ends[:, :, self._first], ends[:, :, self._second]
         distance = segment_distance(first[0], first[1], second[0], second[1])
         return distance - self._radius[self._first] - self._radius[self._second]
