@@ -1,4 +1,4 @@
-"""Robots with other joints than the paper's on the emulator: arm, axes, gate and bridge take them from the same YAML."""
+"""Robots with other joints than the paper's: the emulator's arm and axes, gate and bridge take them from one YAML."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_a_wild_policy_touches_nothing_and_keeps_the_limits(played):
 
 
 def test_the_policy_sees_the_joints_in_the_contracts_order(played):
-    """What it saw last is where the joints were a moment before, each in its own place."""
+    """Every component of what it saw lies where its own joint was."""
     robot, _, policy, _, moved, _ = played
     seen = np.array(policy.seen)[:, 3:]
     low, high = moved[:, : robot.contract.n_joints].min(axis=0), moved[:, : robot.contract.n_joints].max(axis=0)
