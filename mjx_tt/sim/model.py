@@ -127,13 +127,13 @@ class ModelFile:
     provenance: dict = field(default_factory=dict)
 
     @classmethod
-    def load(cls, path: str | os.PathLike, joints: tuple[str, ...] = JOINT_NAMES) -> ModelFile:
-        """Reads a model YAML of a robot with these joints.
+    def load(cls, path: str | os.PathLike, nominal: SimModel | None = None) -> ModelFile:
+        """Reads a model YAML; ``nominal``, by default the paper's robot's, has what it leaves out.
 
         Raises ValueError naming file, key, what was given and what is allowed.
         """
         data = randomisation.with_content(yaml_file.read(path), Path(path).parent)
-        return from_dict(data or {}, str(path), SimModel(joints=joints))
+        return from_dict(data or {}, str(path), nominal)
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes parameters, ranges and provenance, whole or not at all. Drives only if the model has them."""

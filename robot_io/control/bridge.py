@@ -81,8 +81,6 @@ class Bridge:
     ) -> None:
         self.arm_session, self.axes, self.tracker, self.gate = arm, axes, tracker, gate
         self.config, contract = config, config.contract
-        if gate.geometry.joints != contract.joints:
-            raise ValueError(f"the gate is of {gate.geometry.joints}, the contract of {contract.joints}")
         self._axes_rows, self._arm_rows = list(contract.carrying), list(contract.arm)
         self.recorder = recorder or NullRecorder()
         self.play = Play(self._log, on_episode, on_rally, config.box, config.contract.limits)
@@ -282,8 +280,7 @@ class Bridge:
         self._tick_time = now
         with self._guarded(now):
             if self.gate.engaged:
-                festo = self._axes_rows
-                self.axes.command(self._start[festo], sent.velocity[festo], now)
+                self.axes.command(self._start[self._axes_rows], sent.velocity[self._axes_rows], now)
         with self._guarded(now):
             self._after(now)
         with self._guarded(now):
