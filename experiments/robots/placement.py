@@ -37,14 +37,14 @@ from robot_io.safety.clearance import RobotGeometry
 STEP = 1.0 / 150.0  # [s] of the balls' flights
 LONGEST = 1.6  # [s]
 PLACES = 4  # at which a ball may be met
-WHERE = (-2.4, -1.2)  # [m] y of such a place
-LOWEST = 0.05  # [m] over the table
+WHERE = (-2.1, -1.35)  # [m] y of such a place
+LOWEST = 0.15  # [m] over the table: lower balls take a faster blade
 RETURN_SECONDS = 0.45  # [s] that a return flies
 GRAVITY = 9.81
 REACTION = 0.15  # [s] of latency and of seeing the ball
 ITERATIONS = 14  # of the inverse kinematics
 DAMPING = 0.05
-CLOSE, ASKEW, SOON = 0.03, 0.25, 0.05  # [m], [rad], [s] by which a place may be missed
+CLOSE, ASKEW, SOON = 0.03, 0.25, 0.1  # [m], [rad], [s] by which a place may be missed
 FACING = 0.4  # [rad] by which the blade at home may face elsewhere than most balls want
 GAP = 0.02  # [m] to keep from table, floor and itself
 CANDIDATES, ELITES, ROUNDS = 40, 8, 24
@@ -64,7 +64,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Meetings:
-    """Places where balls can be met: time (B, K) [s], position and wanted normal of the blade (B, K, 3)."""
+    """Places where balls can be met: time (B, K) [s], position [m] and wanted normal (B, K, 3) of the blade."""
 
     time: np.ndarray
     position: np.ndarray
