@@ -27,6 +27,7 @@ from experiments.commands import (
     train,
 )
 from experiments.errors import explained
+from experiments.robots import command as robot_command
 
 DESCRIPTION = """\
 From measured human balls to a trained, evaluated and exported table-tennis policy.
@@ -73,6 +74,7 @@ def diagnose(
     policy: Annotated[
         str | None, options.option("POLICY", "a run or artefact: what the defect costs it in play")
     ] = None,
+    robot: Annotated[str | None, options.option("FOLDER", "whose joints were logged (default: the paper's)")] = None,
     retrain: Annotated[int, options.option("UPDATES", "and what this much retraining brings back")] = 0,
     episodes: Annotated[int, Parameter(help="of each evaluation (2000)")] = 2000,
 ) -> None:
@@ -82,10 +84,10 @@ def diagnose(
 
     screen, folder = options.console(), Path(out)
     names = tuple(name for part in without for name in part.split(",") if name)
-    request = diagnosis.Request(logs, folder, model, spin, names, seed, randomise, policy, retrain, home)
+    request = diagnosis.Request(logs, folder, model, spin, names, seed, randomise, policy, retrain, home, robot)
     found = diagnosis.diagnose(request, screen)
     extended = diagnosis.save(found, folder)
-    diagnosis.show(found, screen)
+    diagnosis.show(found, screen, request.the_robot().contract)
     cost = diagnosis.play(extended, request, episodes, screen) if policy else None
     diagnosis.draw(found, folder, ", ".join(Path(p).name for p in logs), screen, cost)
 
@@ -125,6 +127,8 @@ app = App(
     version=lambda: metadata.version("mjx-tt"),
     default_parameter=Parameter(negative=(), show_default=False),
 )
+for _command in (robot_command.new_app, robot_command.place_app, robot_command.list_app):
+    run.robot_app.command(_command)
 for _place, _command in enumerate(COMMANDS):
     _command.sort_key = _place
     app.command(_command)

@@ -12,14 +12,20 @@ observation fills the whole history.
 
 Action: eight numbers in [-1, 1], in ``JOINT_NAMES`` order; times ``LIMITS.policy_velocity`` they are the requested
 joint velocities [m/s], [rad/s]. The request passes ``robot_io.limits`` before anything moves.
+
+The constants are those of the paper's robot. Another robot has a ``Contract`` of its own, with n joints in place of
+eight and 3 + n observations in place of eleven; everything else is the same.
 """
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+
+from robot_io.errors import ContractError
 
 CONTRACT_VERSION = 1
 
@@ -31,7 +37,8 @@ JOINT_UNITS = ("m", "m", "rad", "rad", "rad", "rad", "rad", "rad")
 FESTO_JOINTS = (0, 1)  # indices into JOINT_NAMES moved by the two linear axes
 ABB_JOINTS = (2, 3, 4, 5, 6, 7)  # indices moved by the arm's controller
 
-OBSERVATION_NAMES = ("ball_x", "ball_y", "ball_z", *JOINT_NAMES)
+_BALL = ("ball_x", "ball_y", "ball_z")
+OBSERVATION_NAMES = (*_BALL, *JOINT_NAMES)
 OBSERVATION_UNITS = ("m", "m", "m", *JOINT_UNITS)
 N_JOINTS = len(JOINT_NAMES)
 N_OBSERVATION = len(OBSERVATION_NAMES)
@@ -39,13 +46,16 @@ N_OBSERVATION = len(OBSERVATION_NAMES)
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Kinematic limits of the eight joints, each a tuple in ``JOINT_NAMES`` order; SI units.
+    """Kinematic limits of a robot's joints, each a tuple in the order of ``joints``; SI units.
 
     lower, upper      position range [m] / [rad]
     velocity          highest joint speed [m/s] / [rad/s]: what the hardware does (ABB 120T manual; Festo: estimate)
     acceleration      highest commanded acceleration [m/s^2] / [rad/s^2]
     margin            distance kept from lower and upper by the braking envelope [m] / [rad]
     policy_velocity   joint velocity that an action of 1 asks for; at most ``velocity``
+    joints            names of the joints
+
+    Raises ValueError naming the limit, the joint and what was given.
     """
 
     lower: tuple[float, ...]
@@ -54,16 +64,17 @@ class JointLimits:
     acceleration: tuple[float, ...]
     margin: tuple[float, ...]
     policy_velocity: tuple[float, ...]
+    joints: tuple[str, ...] = JOINT_NAMES
 
     def __post_init__(self) -> None:
-        for name, values in asdict(self).items():
-            if len(values) != N_JOINTS:
+        for name, values in self.numbers().items():
+            if len(values) != len(self.joints):
                 raise ValueError(
-                    f"JointLimits.{name} needs {N_JOINTS} numbers in the order {JOINT_NAMES}, got {len(values)}"
+                    f"JointLimits.{name} needs {len(self.joints)} numbers in the order {self.joints}, got {len(values)}"
                 )
             if not np.all(np.isfinite(values)):
                 raise ValueError(f"JointLimits.{name} has a non-finite number: {values}")
-        for i, joint in enumerate(JOINT_NAMES):
+        for i, joint in enumerate(self.joints):
             if not self.upper[i] - self.lower[i] > 2 * self.margin[i] >= 0:
                 raise ValueError(
                     f"{joint}: range [{self.lower[i]}, {self.upper[i]}] leaves no room inside a margin of "
@@ -75,6 +86,10 @@ class JointLimits:
                 )
             if not self.acceleration[i] > 0:
                 raise ValueError(f"{joint}: acceleration {self.acceleration[i]} must be positive")
+
+    def numbers(self) -> dict[str, tuple[float, ...]]:
+        """The limits by name, without the joints' names."""
+        return {name: values for name, values in asdict(self).items() if name != "joints"}
 
 
 def _rad(*degrees: float) -> tuple[float, ...]:
@@ -93,6 +108,65 @@ LIMITS = JointLimits(
     policy_velocity=(2.0, 2.0, *_rad(250.0, 250.0, 250.0, 420.0, 590.0, 600.0)),
 )
 
+
+@dataclass(frozen=True)
+class Contract:
+    """One robot's contract: its joints in order, from the base to the paddle, and what they may do.
+
+    robot     the robot's name
+    units     "m" or "rad" of each joint
+    carrying  indices of the linear axes that carry the arm; the other joints are the arm's
+    limits    with the joints' names
+    geometry  capsules and home pose as JSON text, as ``robot_io.safety.clearance`` reads it; None: the shipped file's
+
+    Hashable, so that it may be a static argument of a compiled function.
+    """
+
+    robot: str
+    units: tuple[str, ...]
+    carrying: tuple[int, ...]
+    limits: JointLimits
+    geometry: str | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.units) != self.n_joints or not set(self.units) <= {"m", "rad"}:
+            raise ValueError(f"units are {self.units}: m or rad is needed for each of {self.joints}")
+        if not set(self.carrying) <= set(range(self.n_joints)):
+            raise ValueError(f"carrying is {self.carrying}: indices of the {self.n_joints} joints are needed")
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return self.limits.joints
+
+    @property
+    def n_joints(self) -> int:
+        return len(self.joints)
+
+    @property
+    def arm(self) -> tuple[int, ...]:
+        """Indices of the joints that are no carrying axes."""
+        return tuple(i for i in range(self.n_joints) if i not in self.carrying)
+
+    @property
+    def observation_names(self) -> tuple[str, ...]:
+        return (*_BALL, *self.joints)
+
+    @property
+    def observation_units(self) -> tuple[str, ...]:
+        return ("m", "m", "m", *self.units)
+
+    @property
+    def n_observation(self) -> int:
+        return len(_BALL) + self.n_joints
+
+    @property
+    def filters(self) -> tuple[int, ...]:
+        """Outputs of the network's layers: those of the last one are the action."""
+        return (*FILTERS[:-1], self.n_joints)
+
+
+PAPER = Contract("irb120_gantry", JOINT_UNITS, FESTO_JOINTS, LIMITS)
+
 # The 976-parameter policy: three valid 1-D convolutions of kernel 2 over the history; layers 1 and 2 are gated
 # (tanh * sigmoid, so the convolution has twice the filters), layer 3 ends in tanh. reference: paper, appendix E.
 KERNEL = 2
@@ -101,16 +175,16 @@ DILATIONS = (1, 2, 4)
 GATED = (True, True, False)
 
 
-def parameter_shapes() -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the policy's parameters in the order of the flat vector theta (976,).
+def parameter_shapes(n_joints: int = N_JOINTS) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the policy's parameters in the order of the flat vector theta, (976,) for eight joints.
 
     ``conv<i>/kernel`` is (KERNEL, inputs, outputs) with kernel tap 0 the OLDER observation; the outputs of a gated
     layer are the tanh half first, then the sigmoid half. ``conv<i>/bias`` is (outputs,). Arrays are
     flattened in C order.
     """
     shapes: dict[str, tuple[int, ...]] = {}
-    inputs = N_OBSERVATION
-    for i, (filters, gated) in enumerate(zip(FILTERS, GATED, strict=True), start=1):
+    inputs = len(_BALL) + n_joints
+    for i, (filters, gated) in enumerate(zip((*FILTERS[:-1], n_joints), GATED, strict=True), start=1):
         outputs = filters * (2 if gated else 1)
         shapes[f"conv{i}/kernel"] = (KERNEL, inputs, outputs)
         shapes[f"conv{i}/bias"] = (outputs,)
@@ -118,39 +192,70 @@ def parameter_shapes() -> dict[str, tuple[int, ...]]:
     return shapes
 
 
-def n_parameters() -> int:
-    """Number of policy parameters: 976."""
-    return sum(int(np.prod(shape)) for shape in parameter_shapes().values())
+def n_parameters(n_joints: int = N_JOINTS) -> int:
+    """Number of policy parameters: 976 for eight joints."""
+    return sum(int(np.prod(shape)) for shape in parameter_shapes(n_joints).values())
 
 
-def unflatten(theta: Any) -> dict[str, Any]:
+def unflatten(theta: Any, n_joints: int = N_JOINTS) -> dict[str, Any]:
     """Splits theta (976, ...batch) into a dict of arrays shaped as ``parameter_shapes`` with batch axes last.
 
-    Works on NumPy and JAX arrays. Raises ValueError when the first axis is not 976 long.
+    Works on NumPy and JAX arrays. Raises ValueError when the first axis has another length.
     """
-    if theta.shape[0] != n_parameters():
-        raise ValueError(f"theta has {theta.shape[0]} parameters, the policy has {n_parameters()}")
+    if theta.shape[0] != n_parameters(n_joints):
+        raise ValueError(
+            f"theta has {theta.shape[0]} parameters, the policy of {n_joints} joints has {n_parameters(n_joints)}"
+        )
     parts, start = {}, 0
-    for name, shape in parameter_shapes().items():
+    for name, shape in parameter_shapes(n_joints).items():
         size = int(np.prod(shape))
         parts[name] = theta[start : start + size].reshape(shape + theta.shape[1:])
         start += size
     return parts
 
 
-def describe() -> dict:
-    """The contract as plain data for manifests and error messages."""
-    return {
+def describe(robot: Contract = PAPER) -> dict[str, Any]:
+    """The contract as plain data for manifests and error messages.
+
+    Another robot's has the keys ``robot``, ``carrying`` and ``geometry`` besides: all that its safety gate needs.
+    """
+    names, units, limits = robot.joints, robot.units, robot.limits
+    data = {
         "version": CONTRACT_VERSION,
         "control_rate_hz": CONTROL_RATE,
         "history": HISTORY,
-        "observation": [{"name": n, "unit": u} for n, u in zip(OBSERVATION_NAMES, OBSERVATION_UNITS, strict=True)],
+        "observation": [
+            {"name": n, "unit": u} for n, u in zip(robot.observation_names, robot.observation_units, strict=True)
+        ],
         "action": [
             {"name": n, "unit": f"{u}/s", "scale": v}
-            for n, u, v in zip(JOINT_NAMES, JOINT_UNITS, LIMITS.policy_velocity, strict=True)
+            for n, u, v in zip(names, units, limits.policy_velocity, strict=True)
         ],
-        "limits": {name: list(values) for name, values in asdict(LIMITS).items()},
-        "parameters": {name: list(shape) for name, shape in parameter_shapes().items()},
+        "limits": {name: list(values) for name, values in limits.numbers().items()},
+        "parameters": {name: list(shape) for name, shape in parameter_shapes(robot.n_joints).items()},
         "frame": "origin at the table's centre on its top surface; x across, y along the table (human y > 0), z up; "
         "SI units",
     }
+    if robot == PAPER:
+        return data
+    geometry = None if robot.geometry is None else json.loads(robot.geometry)
+    return data | {"robot": robot.robot, "carrying": [names[i] for i in robot.carrying], "geometry": geometry}
+
+
+def from_description(data: Any) -> Contract:
+    """The contract that ``describe`` wrote; without the key ``robot`` it is the paper's robot's.
+
+    Raises ContractError where such data cannot be made a contract of. That the rest of the data agrees with this
+    program is for the caller to see, by comparing it with ``describe``.
+    """
+    if not isinstance(data, dict) or "robot" not in data:
+        return PAPER
+    try:
+        names = tuple(str(action["name"]) for action in data["action"])
+        units = tuple(str(action["unit"]).removesuffix("/s") for action in data["action"])
+        limits = {name: tuple(float(v) for v in values) for name, values in data["limits"].items()}
+        carrying = tuple(names.index(name) for name in data["carrying"])
+        geometry = None if data["geometry"] is None else json.dumps(data["geometry"])
+        return Contract(str(data["robot"]), units, carrying, JointLimits(**limits, joints=names), geometry)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ContractError(f"no contract of a robot: {type(error).__name__}: {error}") from error

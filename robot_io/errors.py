@@ -13,3 +13,7 @@ class RefusedError(RuntimeError):
 
 class JogFirstError(RefusedError):
     """It is not safe where the robot is: somebody has to jog it elsewhere first."""
+
+
+class ContractError(ValueError):
+    """Data that cannot be the contract of a robot."""

@@ -30,6 +30,7 @@ ALLOWED = {
         "robot_io.limits",
         "robot_io.policy",
         "robot_io.rally_ends",
+        "robot_io.robot_file",
         "robot_io.safety.clearance",
     ),
     "experiments": PACKAGES,
@@ -62,7 +63,7 @@ ROOMS = {
     "experiments": (
         "errors . config runs view/film view/studio view/programme "
         "evaluation training baselines deploy finetuning study/workflow study/analysis "
-        "study/blind study/target_domain study/report study view sharing commands cli"
+        "study/blind study/target_domain study/report study view sharing commands robots cli"
     ),
 }
 # Module -> module that points up a package's rooms, and goes when it is mended.

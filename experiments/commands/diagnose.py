@@ -22,10 +22,10 @@ from experiments.training import loop
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis import report
 from mjx_tt.diagnosis.report import Play, Rate
-from mjx_tt.robot.model import home_qpos, load_model
-from mjx_tt.sim import model
+from mjx_tt.robot import robot as robots
+from mjx_tt.robot.robot import Robot
 from mjx_tt.sim.model import ModelFile
-from robot_io.contract import JOINT_NAMES
+from robot_io.contract import PAPER, Contract
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,11 @@ class Request:
     policy: str | None = None
     retrain: int = 0
     home: str = ""
+    robot: str | None = None  # another one than the paper's
+
+    def the_robot(self) -> Robot:
+        """The robot whose joints were logged. Raises ConfigError."""
+        return robots.paper() if self.robot is None else checked("--robot", robots.load, self.robot)
 
     def check(self) -> None:
         """Refuses at once a request that would fail after the work. Raises ConfigError."""
@@ -53,7 +58,7 @@ class Request:
             raise ConfigError(f"--retrain {self.retrain}: a number of updates is wanted")
         if self.policy is not None and load(self.policy).config is None:
             raise ConfigError(f"{self.policy}: does not say how it was trained; give the run that it came from")
-        resting_pose(self.home)
+        resting_pose(self.home, self.the_robot())
         existing = next(p for p in (self.out, *self.out.absolute().parents) if p.exists())
         if not existing.is_dir():
             raise ConfigError(f"--out {self.out}: {existing} is a file, a folder is wanted")
@@ -61,15 +66,17 @@ class Request:
             raise ConfigError(f"--out {self.out}: {existing} cannot be written to")
 
 
-def resting_pose(text: str) -> dict[str, float]:
+def resting_pose(text: str, robot: Robot | None = None) -> dict[str, float]:
     """Positions [rad], [m] by joint: the robot's home pose, or pairs joint=position. Raises ConfigError."""
+    robot = robots.paper() if robot is None else robot
+    joints = robot.contract.joints
     if text in ("", "home"):
-        return dict(zip(JOINT_NAMES, home_qpos(load_model()).tolist(), strict=True)) if text else {}
+        return dict(zip(joints, robot.home.tolist(), strict=True)) if text else {}
     pose = {}
     for pair in text.split(","):
         joint, _, value = pair.partition("=")
-        if joint not in JOINT_NAMES:
-            raise ConfigError(f"--home {text}: no joint {joint!r}; there are {', '.join(JOINT_NAMES)}, or home for all")
+        if joint not in joints:
+            raise ConfigError(f"--home {text}: no joint {joint!r}; there are {', '.join(joints)}, or home for all")
         if joint in pose:
             raise ConfigError(f"--home {text}: {joint} is given twice; once is allowed")
         try:
@@ -81,8 +88,8 @@ def resting_pose(text: str) -> dict[str, float]:
     return pose
 
 
-def read_logs(paths: Sequence[str]) -> diagnosis.Logs:
-    """Logs of balls and joints, sessions at the robot among them.
+def read_logs(paths: Sequence[str], robot: Robot | None = None) -> diagnosis.Logs:
+    """Logs of balls and joints, sessions at the robot among them. robot: whose joints; None: the paper's.
 
     Raises ValueError or FileNotFoundError naming the file.
     """
@@ -90,7 +97,11 @@ def read_logs(paths: Sequence[str]) -> diagnosis.Logs:
     sessions = [f for f in files if session_logs.is_session(f)]
     others = [f for f in files if f not in sessions]
     if not sessions:
-        return diagnosis.load_logs(paths)
+        return diagnosis.load_logs(paths, robot)
+    if robot is not None and robot.contract != PAPER:
+        raise ValueError(
+            f"{sessions[0]}: a session of the paper's robot; joints of {robot.name} are read from CSV only"
+        )
     rest = diagnosis.load_logs(others) if others else diagnosis.Logs((), (), {})
     balls, records = list(rest.balls), [("the CSV files", rest.joints)] if rest.joints else []
     for file in sessions:
@@ -108,10 +119,13 @@ def read_logs(paths: Sequence[str]) -> diagnosis.Logs:
 def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
     """Runs the diagnosis and writes its files. Raises ConfigError for bad logs before anything is written."""
     request.check()
-    nominal = checked("--model", ModelFile.load, request.model) if request.model else ModelFile(model.SimModel())
-    logs = checked("", read_logs, request.logs)
+    robot = request.the_robot()
+    nominal = ModelFile(build.nominal_model(robot))
+    if request.model:
+        nominal = checked("--model", ModelFile.load, request.model, nominal.model)
+    logs = checked("", read_logs, request.logs, robot)
     balls, joints = len(logs.balls), len(logs.joints)
-    home = resting_pose(request.home)
+    home = resting_pose(request.home, robot)
     if home and not joints:
         raise ConfigError(f"--home {request.home}: the logs hold no joints")
     console.print(
@@ -127,7 +141,7 @@ def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
         "model": request.model or "nominal",
         "seed": request.seed,
         "spin": request.spin,
-    }
+    } | ({} if request.robot is None else {"robot": robot.name})
     if request.model:
         provenance["model_sha256"] = hashlib.sha256(Path(request.model).read_bytes()).hexdigest()
     return checked(
@@ -207,14 +221,14 @@ def draw(found: diagnosis.Diagnosis, folder: Path, title: str, console: Console,
             console.print(f"  {folder / name}", highlight=False)
 
 
-def show(found: diagnosis.Diagnosis, console: Console) -> None:
-    """Prints the verdict in a few lines."""
-    v = found.verdict
+def show(found: diagnosis.Diagnosis, console: Console, contract: Contract = PAPER) -> None:
+    """Prints the verdict in a few lines; contract: of the robot that was logged."""
+    v, units = found.verdict, dict(zip(contract.joints, contract.units, strict=True))
     console.print(f"verdict: {v.verdict}", style="bold")
     for warning in v.warnings:
         console.print(f"  note: {warning}", highlight=False)
     for c in v.causes:
-        unit = "mm" if c.name.startswith("gantry") else "mrad"
+        unit = next((f"m{units[joint]}" for joint in units if c.name.startswith(f"{joint}.")), "mrad")
         size = f"{unit} rms" if "." in c.name else "mm at the end of a flight"
         console.print(f"  {c.name}: {c.effect_mm:.1f} {size}, confidence {c.confidence:.0%}", highlight=False)
         for path, e in c.parameters.items():

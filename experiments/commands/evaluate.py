@@ -118,7 +118,7 @@ def evaluate(
         if not together.first:
             return
         with stage("drawing pictures"):
-            finalize.save_evaluation(folder, played, experiment.task.reward_weights)
+            finalize.save_evaluation(folder, played, experiment)
     finalize.print_report(screen, played.report, str(trained.source))
     screen.print(f"  {folder}/evaluation.json, pictures in {folder}/plots", highlight=False, soft_wrap=True)
 

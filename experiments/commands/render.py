@@ -92,7 +92,7 @@ def render(
     experiment = experiment_of(trained, balls, model)
     played = video.replay(experiment, trained, episodes, experiment.config.evaluation.seed if seed is None else seed)
     for path in out:
-        checked("", video.draw, Path(path), played, camera)
+        checked("", video.draw, Path(path), played, camera, experiment.task.robot)
         screen.print(path, highlight=False)
 
 
@@ -155,6 +155,8 @@ def view(
         if follow:
             show.wait_for_checkpoint(Path(what[0]), screen)
         trained = [load_policy.load(folder) for folder in what or (SHIPPED,)]
+        if len({one.policy.n_observation for one in trained}) > 1:
+            raise ConfigError("policies of robots with different joints are not shown side by side; one by one")
         if len({one.policy.network for one in trained}) > 1:
             raise ConfigError("policies of different networks are not shown side by side; look at them one by one")
         experiment = experiment_of(trained[0], balls, model)

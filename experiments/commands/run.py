@@ -51,8 +51,9 @@ rig_app = command(
 )
 robot_app = command(
     "robot",
-    "bring a robot into service: a dry run, small motions by hand",
+    "a robot of your own in simulation (new, place, list); bring one into service (check, jog)",
     """\
+  mjx-tt robot new my_arm/my_arm.xml                                a first YAML for an MJCF, checked
   mjx-tt robot check --robot robot.yaml                             tracker and arm are heard, nothing is sent
   mjx-tt robot check --robot robot.yaml --artefact runs/quickstart  and a policy plays the balls in thought
   mjx-tt robot jog --robot robot.yaml                               armed, slow, in small steps

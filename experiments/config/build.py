@@ -20,9 +20,11 @@ from mjx_tt.env import own as user_file
 from mjx_tt.env import rewards
 from mjx_tt.env.own import Definitions, Network
 from mjx_tt.env.task import TaskConfig
+from mjx_tt.robot import robot as robots
+from mjx_tt.robot.robot import Robot
 from mjx_tt.sim import model as models
 from mjx_tt.sim import randomisation
-from mjx_tt.sim.model import ModelFile
+from mjx_tt.sim.model import ModelFile, SimModel
 
 # What a seed is used for; each purpose has its own key.
 TRAINING_BALLS, INITIAL_STATE, PROGRESS_BALLS, PROGRESS_EPISODES, EVALUATION_BALLS, EVALUATION_EPISODES = range(6)
@@ -50,11 +52,13 @@ class Experiment:
 def experiment(config: Config, where: str) -> Experiment:
     """Looks up what a configuration names; ``where`` is its origin in errors. Raises ConfigError."""
     balls = distribution(config.balls, f"{where}: balls")
+    robot, robot_data = robot_of(config, where)
+    nominal = checked(f"{where}: robot", nominal_model, robot)
     model_data = _mapping(config.model, f"{where}: model")
     if isinstance(config.model, str):
-        model = checked(f"{where}: model", models.from_dict, model_data, config.model)
+        model = checked(f"{where}: model", models.from_dict, model_data, config.model, nominal)
     else:
-        model = checked(where, models.from_dict, model_data, "model")
+        model = checked(where, models.from_dict, model_data, "model", nominal)
     if config.initial_policy is not None and not Path(config.initial_policy).is_dir():
         raise ConfigError(
             f"{where}: initial_policy: {config.initial_policy} is no folder; allowed: a run or an artefact"
@@ -62,7 +66,12 @@ def experiment(config: Config, where: str) -> Experiment:
     named = isinstance(config.balls, str) and config.balls in registry.names()
     own, text = definitions(config, where)
     alone = config.model_copy(
-        update={"balls": config.balls if named else balls.to_dict(), "model": model_data, "definitions": text}
+        update={
+            "balls": config.balls if named else balls.to_dict(),
+            "model": model_data,
+            "robot": robot_data,
+            "definitions": text,
+        }
     )
     if config.training.later_rewards is not None:
         checked(f"{where}: training.later_rewards", reward_weights, config.training.later_rewards.rewards, own)
@@ -70,10 +79,34 @@ def experiment(config: Config, where: str) -> Experiment:
         config=alone,
         distribution=balls,
         model=model,
-        task=checked(f"{where}: task", task_config, config.task, own),
+        task=checked(f"{where}: task", task_config, config.task, own, robot),
         bgs=checked(f"{where}: optimiser", bgs_config, config.optimiser, config.training.updates),
         network=network(config, where),
     )
+
+
+def robot_of(config: Config, where: str) -> tuple[Robot, str | dict[str, Any] | None]:
+    """The experiment's robot, and its content in place of the folder; a name of the program's own robots stays.
+
+    Raises ConfigError with a line for every mistake.
+    """
+    given = config.robot
+    if given is None or given == robots.DEFAULT:
+        return robots.paper(), given
+    if isinstance(given, dict):
+        return checked("", robots.from_content, given, f"{where}: robot"), given
+    if given in robots.names():
+        return robots.load_shipped(given), given
+    data = checked(f"{where}: robot", robots.content, given)
+    try:
+        return robots.load(given), data
+    except ValueError as error:  # whose lines name their origin
+        raise ConfigError(str(error)) from None
+
+
+def nominal_model(robot: Robot) -> SimModel:
+    """The simulation's parameters with the latencies and drives that the robot's YAML gives. Raises ValueError."""
+    return models.with_values(SimModel(joints=robot.contract.joints), dict(robot.file.model))
 
 
 def definitions(config: Config, where: str) -> tuple[Definitions, str | None]:
@@ -81,15 +114,16 @@ def definitions(config: Config, where: str) -> tuple[Definitions, str | None]:
     given = config.definitions
     if given is None:
         return Definitions(), None
+    contract = robot_of(config, where)[0].contract
     if "\n" in given:
-        return checked(f"{where}: definitions", user_file.load, given, f"definitions of {config.name}"), given
+        return checked(f"{where}: definitions", user_file.load, given, f"definitions of {config.name}", contract), given
     if not given.endswith(".py"):
         raise ConfigError(f"{where}: definitions: {given}: a Python file is wanted, such as my_task.py")
     try:
         text = Path(given).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{where}: definitions: {given}: cannot be read: {error}") from None
-    return checked(f"{where}: definitions", user_file.load, text, given), text
+    return checked(f"{where}: definitions", user_file.load, text, given, contract), text
 
 
 def network(config: Config, where: str) -> Network | None:
@@ -110,10 +144,17 @@ def distribution(balls: str | dict[str, Any], where: str) -> Balls:
     return checked(where, registry.resolve, balls)
 
 
-def task_config(task: Task, own: Definitions = Definitions()) -> TaskConfig:  # noqa: B008, it is never changed
-    """Raises ValueError where the numbers do not fit together."""
+def task_config(
+    task: Task,
+    own: Definitions = Definitions(),  # noqa: B008, it is never changed
+    robot: Robot | None = None,
+) -> TaskConfig:
+    """Settings of the task for a robot; None: the paper's. Raises ValueError where the numbers do not fit together."""
     weights = reward_weights(task.rewards, own)
-    return TaskConfig(**_shared(task, TaskConfig), reward_weights=weights, own_terms=tuple(own.terms.values()))
+    terms = tuple(own.terms.values())
+    return TaskConfig(
+        **_shared(task, TaskConfig), reward_weights=weights, own_terms=terms, robot=robot or robots.paper()
+    )
 
 
 def reward_weights(chosen: str | Rewards, own: Definitions = Definitions()) -> tuple[float, ...]:  # noqa: B008

@@ -253,6 +253,9 @@ class Config(Section):
     """A distribution's name such as player3/M1 or narrow, the path of a YAML, or the YAML's content."""
     model: str | dict[str, Any] = {}
     """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise."""
+    robot: str | dict[str, Any] | None = None
+    """A folder with YAML and MJCF of your own robot (docs/how-to/bring-your-own-robot.md), that YAML, its content, or
+    the name of a robot that comes with the program; null: the paper's."""
     task: Task = Task()
     """The episode."""
     optimiser: Optimiser = Optimiser()
@@ -279,8 +282,10 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
 
 
 def _absolute(data: dict[str, Any], folder: Path) -> None:
-    for key in ("balls", "model", "initial_policy", "definitions"):
+    for key in ("balls", "model", "robot", "initial_policy", "definitions"):
         value = data.get(key)
+        if key == "robot" and not (folder / str(value)).exists():  # the name of one that comes with the program
+            continue
         if key == "definitions" and "\n" in str(value):  # the file's content
             continue
         if isinstance(value, str) and (key != "balls" or Path(value).suffix in (".yaml", ".yml")):

@@ -20,6 +20,7 @@ from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, RECOVER, Keyb
 from experiments.deploy.recovery import Recovery
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session_report import PlayedSession
+from experiments.errors import of_the_paper
 from experiments.runs import run_dir
 from robot_io.control import messages, process
 from robot_io.control.config import RobotConfig
@@ -200,6 +201,7 @@ def run(
     0: all went well, 1: it ended early, 130: the operator ended it with Ctrl-C; the summary is written in any case.
     """
     loaded = artefacts.load(artefact)
+    of_the_paper(loaded.contract, str(artefact), "mjx-tt run")
     with ExitStack() as stack:
         rig = None
         if robot == RIG:

@@ -20,7 +20,7 @@ from ballmodel import constants as c
 from ballmodel.io.atomic_files import replacing
 from experiments.evaluation.evaluate import Played
 from mjx_tt.env.task import HIT, MISSED, RETURNED
-from robot_io.contract import JOINT_NAMES, JOINT_UNITS, LIMITS
+from robot_io.contract import PAPER, Contract
 
 RETURNED_COLOUR, HIT_COLOUR, MISSED_COLOUR = "#1b7837", "#e08214", "#b2182b"
 TABLE_COLOUR, INK = "#e9eff7", "#303030"
@@ -44,7 +44,7 @@ STYLE = RcParams(
 )
 
 
-def draw_evaluation(folder: Path, played: Played, weights: tuple[float, ...]) -> list[Path]:
+def draw_evaluation(folder: Path, played: Played, weights: tuple[float, ...], contract: Contract = PAPER) -> list[Path]:
     """Writes landing map, return rate by incoming ball, rewards and joint speeds; ``weights`` of the eleven terms."""
     folder.mkdir(parents=True, exist_ok=True)
     with plt.rc_context(STYLE):
@@ -52,7 +52,7 @@ def draw_evaluation(folder: Path, played: Played, weights: tuple[float, ...]) ->
             save(folder / "landing_map.png", _landing_map(played)),
             save(folder / "return_rate_map.png", _return_rate_map(played)),
             save(folder / "rewards.png", _rewards(played.report["terms"], weights)),
-            save(folder / "joint_speeds.png", _joint_speeds(played)),
+            save(folder / "joint_speeds.png", _joint_speeds(played, contract)),
         ]
 
 
@@ -113,11 +113,14 @@ def _rewards(terms: dict[str, float | None], weights: tuple[float, ...]) -> Figu
     return figure
 
 
-def _joint_speeds(played: Played) -> Figure:
+def _joint_speeds(played: Played, contract: Contract) -> Figure:
     peaks = played.result.peak_velocity[:, played.result.finite]
-    figure, grid = plt.subplots(2, 4, figsize=(10.5, 4.6), sharey=True)
-    for i, axes in enumerate(grid.flat):
-        limit = LIMITS.velocity[i]
+    columns = -(-contract.n_joints // 2)
+    figure, grid = plt.subplots(2, columns, figsize=(2.625 * columns, 4.6), sharey=True, squeeze=False)
+    for axes in grid.flat[contract.n_joints :]:
+        axes.set_axis_off()
+    for i, axes in enumerate(grid.flat[: contract.n_joints]):
+        limit = contract.limits.velocity[i]
         axes.hist(
             peaks[i],
             bins=np.linspace(0, limit, 31),
@@ -126,8 +129,8 @@ def _joint_speeds(played: Played) -> Figure:
         )
         axes.axvline(limit, color=MISSED_COLOUR, linewidth=1.5)
         axes.set_xlim(0, 1.06 * limit)
-        axes.set_title(JOINT_NAMES[i])
-        axes.set_xlabel(f"{JOINT_UNITS[i]}/s")
+        axes.set_title(contract.joints[i])
+        axes.set_xlabel(f"{contract.units[i]}/s")
         axes.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
     for axes in grid[:, 0]:
         axes.set_ylabel("episodes")

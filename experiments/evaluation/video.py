@@ -12,6 +12,7 @@ from experiments.runs.load_policy import TrainedPolicy
 from experiments.view.film import Film
 from experiments.view.programme import Play
 from experiments.view.studio import Studio
+from mjx_tt.robot.robot import Robot
 from mjx_tt.viz import rendering
 from mjx_tt.viz.caption import GOOD, POOR, Caption
 from mjx_tt.viz.rendering import Moment
@@ -34,21 +35,22 @@ def replay(experiment: Experiment, trained: TrainedPolicy, count: int, seed: int
     return [play.films(number)[0] for number in range(count)]
 
 
-def draw(path: Path, films: Sequence[Film], camera: str = rendering.CAMERA) -> Path:
+def draw(path: Path, films: Sequence[Film], camera: str = rendering.CAMERA, robot: Robot | None = None) -> Path:
     """Writes a picture (.png) of the first ball's moment of contact, or a video (.mp4, .gif) of all.
 
-    A video is in real time but for the contact, and the caption says so.
+    A video is in real time but for the contact, and the caption says so. robot: None: the paper's.
     Raises ValueError for a wrong suffix or camera, RuntimeError without OpenGL.
     """
+    model = None if robot is None else robot.model()
     allowed = (".png", *rendering.VIDEO_SUFFIXES)
     if path.suffix not in allowed:
         raise ValueError(f"{path}: suffix {path.suffix!r}; allowed: {', '.join(allowed)}")
     if path.suffix == ".png":
-        rendering.render_png(path, at_contact(films[0]), camera, PICTURE_SIZE)
+        rendering.render_png(path, at_contact(films[0]), camera, PICTURE_SIZE, model)
     else:
         rate = FRAME_RATE[path.suffix]
         moments = [moment for number, film in enumerate(films, 1) for moment in video_moments(film, number, rate)]
-        rendering.render_video(path, moments, rate, camera, VIDEO_SIZE)
+        rendering.render_video(path, moments, rate, camera, VIDEO_SIZE, model)
     return path
 
 

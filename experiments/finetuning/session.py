@@ -18,6 +18,7 @@ from experiments.deploy.operator_console import Keyboard, View
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session import Session
 from experiments.deploy.virtual_player import VirtualPlayer
+from experiments.errors import of_the_paper
 from experiments.finetuning import loop
 from experiments.finetuning.bridge_robot import BridgeRobot
 from experiments.finetuning.robot import LockStepRallies, Robot
@@ -49,6 +50,7 @@ def finetune(
     if installed is not None:
         contradictions.check(installed, robot)
     experiment = loop.experiment_of(source, distribution)
+    of_the_paper(experiment.task.robot.contract, source, "mjx-tt finetune")
     if robot == LOCK_STEP:
         params = robots.load_rig(rig_params)
         lock_step: Robot = (

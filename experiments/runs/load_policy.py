@@ -78,7 +78,7 @@ def _from_artefact(folder: Path) -> TrainedPolicy:
     provenance = artefact.manifest["provenance"]
     recorded = provenance.get("config") if isinstance(provenance, dict) else None
     config = parse(recorded, f"{folder}: provenance.config") if recorded else None
-    policy = own.simulated(artefact.policy, str(folder)).astype(np.float32)
+    policy = own.simulated(artefact.policy, str(folder), artefact.contract).astype(np.float32)
     return TrainedPolicy(policy, folder, config, provenance)
 
 

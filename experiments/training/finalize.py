@@ -32,7 +32,9 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
         experiment, trained, evaluation.episodes, evaluation.seed, evaluation.reachable_balls, stage
     )
     with stage("drawing pictures"):
-        pictures = figures.draw_evaluation(run.plots, played, experiment.task.reward_weights)
+        pictures = figures.draw_evaluation(
+            run.plots, played, experiment.task.reward_weights, experiment.task.robot.contract
+        )
         title = f"{experiment.config.name}: training on {experiment.distribution.name}"
         rows, marks = metrics.read(run.metrics), learning_curves.changes(experiment)
         pictures.append(learning_curves.draw_training(run.plots / "training.png", rows, title, marks))
@@ -63,7 +65,7 @@ def show_episodes(
     with stage(f"drawing {' and '.join(path.name for path in paths)}"):
         for path in paths:
             try:
-                drawn.append(video.draw(path, played))
+                drawn.append(video.draw(path, played, robot=experiment.task.robot))
             except RuntimeError as error:
                 failed[path] = error
     for path, reason in failed.items():
@@ -89,7 +91,7 @@ def export_policy(
         "update": trained.notes.get("update"),
         "evaluation": report,
     }
-    export.write(folder, trained.policy, provenance, overwrite=True)
+    export.write(folder, trained.policy, provenance, overwrite=True, robot=experiment.task.robot.contract)
     return True
 
 
@@ -114,8 +116,8 @@ def print_report(console: Console, report: dict[str, Any], title: str) -> None:
     console.print(table)
 
 
-def save_evaluation(folder: Path, played: Played, weights: tuple[float, ...]) -> None:
+def save_evaluation(folder: Path, played: Played, experiment: Experiment) -> None:
     """evaluation.json and its pictures, in a folder of their own."""
     folder.mkdir(parents=True, exist_ok=True)
-    figures.draw_evaluation(folder / "plots", played, weights)
+    figures.draw_evaluation(folder / "plots", played, experiment.task.reward_weights, experiment.task.robot.contract)
     run_dir.write_json(folder / "evaluation.json", played.report)

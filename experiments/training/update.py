@@ -27,7 +27,7 @@ from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
 from mjx_tt.env.task import MISSED, RETURNED
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
-from robot_io.contract import N_OBSERVATION, n_parameters
+from robot_io.contract import n_parameters
 
 
 @jax.tree_util.register_dataclass
@@ -87,11 +87,12 @@ class Trainer:
         Raises ValueError where theta is not this network's.
         """
         theta_key, run_key = jax.random.split(key)
-        size = n_parameters() if self.network is None else self.network.size
+        contract = self.simulator.task.contract
+        size = n_parameters(contract.n_joints) if self.network is None else self.network.size
         theta = initial_theta(theta_key, self._initial_scale, size) if theta is None else jnp.asarray(theta)
         if theta.shape != (size,):
             raise ValueError(f"the first policy has {theta.shape[0]} parameters, the network has {size}")
-        statistics = normalizer.empty(N_OBSERVATION) if statistics is None else statistics
+        statistics = normalizer.empty(contract.n_observation) if statistics is None else statistics
         return self.simulator.replicate(TrainState(strategy.init(theta, self.bgs_config), statistics, run_key))
 
     def update(self, state: TrainState) -> tuple[TrainState, dict]:

@@ -11,7 +11,7 @@ import viser
 from ballmodel import registry
 from experiments.view.page import Viewer, put
 from experiments.view.programme import Play
-from experiments.view.studio import PARAMETERS, Parameter
+from experiments.view.studio import DRIVES, Parameter, groups
 from mjx_tt.rally import human_player
 
 ONE_BALL, RALLY = "one ball", "rally with "
@@ -43,8 +43,8 @@ class Controls:
                     self._number(f"spin {name} [rad/s]", -MOST_SPIN, MOST_SPIN, 5.0)
         with viewer.tabs.add_tab("Physics"):
             reset = gui.add_button("As the model has it", icon=viser.Icon.RESTORE)
-            for group, parameters in PARAMETERS.items():
-                with gui.add_folder(group, expand_by_default=group != "Gains of the drives"):
+            for group, parameters in groups(play.studio.joints).items():
+                with gui.add_folder(group, expand_by_default=group != DRIVES):
                     for parameter in parameters:
                         self._slider(parameter)
         self.gizmo = viewer.server.scene.add_transform_controls(
@@ -80,7 +80,7 @@ class Controls:
 
     def _reset(self) -> None:
         self._play.values = self._play.studio.nominal()
-        for group in PARAMETERS.values():
+        for group in groups(self._play.studio.joints).values():
             for p in group:
                 if np.isfinite(value := self._play.values[p.path]):
                     put(self.sliders[p.path], round(value / p.unit, 6))

@@ -205,8 +205,8 @@ class Rally:
         if len(since) and int(shot.outcome[i]) != MISSED:
             at_hit = jnp.repeat(jnp.asarray(qpos[hit], jnp.float32)[:, None], len(film.time), axis=1)
             seconds = jnp.asarray(np.maximum(film.time - film.decided, 0.0), jnp.float32)
-            home = self._simulator.task.home
-            qpos[hit:] = np.asarray(homeward(home, at_hit, seconds)).T[hit : last + 1]
+            home, limits = self._simulator.task.home, self._simulator.task.contract.limits
+            qpos[hit:] = np.asarray(homeward(home, at_hit, seconds, limits)).T[hit : last + 1]
         balls = {"ball": film.balls["ball"][: last + 1]}
         landing = next_landing(balls["ball"])
         return replace(

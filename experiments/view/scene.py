@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from importlib import resources
 
 import mujoco
 import numpy as np
@@ -16,7 +15,7 @@ from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from experiments.view.film import RATE, Film
 from mjx_tt.env.outgoing_ball import FLOOR
 from mjx_tt.robot.model import PADDLE_SITE
-from robot_io.contract import N_JOINTS
+from mjx_tt.robot.robot import Robot
 
 SPACING = -3.2  # [m] from the middle of a table to the next one's, which stands to its right for the person
 BALL_TRAIL, PADDLE_TRAIL = 0.25, 0.35  # [s]
@@ -37,10 +36,9 @@ PADDLE_COLOUR, LANDING_COLOUR, MARK_COLOUR = (150, 60, 170), (20, 160, 80), (90,
 NOWHERE = np.full((1, 2, 3), -5.0)  # a segment below the floor
 
 
-def tables(count: int) -> mujoco.MjModel:
+def tables(count: int, robot: Robot) -> mujoco.MjModel:
     """The scene ``count`` times, along x, without its floor and ball; the person's place is a disc."""
-    with resources.as_file(resources.files("mjx_tt") / "assets" / "scene.xml") as path:
-        parts = [mujoco.MjSpec.from_file(str(path)) for _ in range(count)]
+    parts = [mujoco.MjSpec.from_file(str(robot.scene())) for _ in range(count)]
     for i, part in enumerate(parts):
         # What is seen through is not here, and would hide the ball.
         figure = [geom.name for geom in part.geoms if geom.name.startswith("person") and geom.name != "person_place"]
@@ -66,9 +64,10 @@ def first_ball(film: Film) -> np.ndarray:
 class Scene:
     """Shows one film per table."""
 
-    def __init__(self, server: viser.ViserServer, count: int) -> None:
+    def __init__(self, server: viser.ViserServer, count: int, robot: Robot) -> None:
         self.server, self.count = server, count
-        self._model = tables(count)
+        self._model = tables(count, robot)
+        self._joints = self._model.nq // count
         self._data = mujoco.MjData(self._model)
         sites = [i for i in range(self._model.nsite) if self._model.site(i).name.endswith(PADDLE_SITE)]
         self._paddles = sites
@@ -163,7 +162,7 @@ class Scene:
         trails, paddles = [], []
         frames = [film.frame(t) for film in self._films]
         for i, (film, frame) in enumerate(zip(self._films, frames, strict=True)):
-            self._data.qpos[N_JOINTS * i : N_JOINTS * (i + 1)] = film.qpos[frame]
+            self._data.qpos[self._joints * i : self._joints * (i + 1)] = film.qpos[frame]
             first = first_ball(film)
             behind = [max(0, frame - round(seconds * RATE)) for seconds in (BALL_TRAIL, PADDLE_TRAIL)]
             trails.append(segments(self._at(i, first[behind[0] : frame + 1 : STRIDE])))
@@ -201,7 +200,7 @@ class Scene:
     def _paddle_path(self, table: int, film: Film) -> np.ndarray:
         path = []
         for qpos in film.qpos[::STRIDE]:
-            self._data.qpos[N_JOINTS * table : N_JOINTS * (table + 1)] = qpos
+            self._data.qpos[self._joints * table : self._joints * (table + 1)] = qpos
             mujoco.mj_kinematics(self._model, self._data)
             path.append(self._data.site_xpos[self._paddles[table]].copy())
         return np.array(path)

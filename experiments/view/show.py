@@ -19,6 +19,8 @@ from experiments.view.page import REST, Viewer
 from experiments.view.programme import Play, Programme
 from experiments.view.scene import Scene
 from experiments.view.studio import Studio
+from mjx_tt.robot import robot as robots
+from mjx_tt.robot.robot import Robot
 from mjx_tt.sim.model import ModelFile, SimModel
 
 EXPORTED_RATE = 30.0  # [Hz]
@@ -51,11 +53,16 @@ def recorded(path: Path, model: str | None) -> Programme:
 
 def viewer(server: Server, programme: Programme) -> Viewer:
     """The page of a programme, with all controls that it allows."""
-    made = Viewer(server, Scene(server, len(programme.films(0))), programme)
+    made = Viewer(server, Scene(server, len(programme.films(0)), robot_of(programme)), programme)
     made.controls = Controls(made, programme) if isinstance(programme, Play) else None
     made.go(0)
     made.add_details()
     return made
+
+
+def robot_of(programme: Programme) -> Robot:
+    """The robot that a programme shows; sessions and diagnoses are of the paper's."""
+    return programme.studio.simulator.config.robot if isinstance(programme, Play) else robots.paper()
 
 
 class Followed:
@@ -92,7 +99,7 @@ def wait_for_checkpoint(folder: Path, console: Console) -> None:
 
 def export(server: Server, programme: Programme, entries: int, path: Path) -> int:
     """Writes a page with the first ``entries`` entries that needs no server; returns its size in bytes."""
-    scene = Scene(server, len(programme.films(0)))
+    scene = Scene(server, len(programme.films(0)), robot_of(programme))
     recording = server.get_scene_serializer()
     for number in range(entries if programme.count is None else min(entries, programme.count)):
         films = programme.films(number)

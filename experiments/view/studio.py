@@ -27,7 +27,7 @@ from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import LATENCIES, ModelFile, SimModel
-from robot_io.contract import JOINT_NAMES, N_JOINTS
+from robot_io.contract import JOINT_NAMES
 
 # Few episodes are computed: a program that is compiled in a third of the time is worth more than a fast one.
 QUICKLY = {
@@ -53,7 +53,7 @@ class Parameter:
 
 
 MILLI = 1e-3
-PARAMETERS: dict[str, tuple[Parameter, ...]] = {
+_COMMON: dict[str, tuple[Parameter, ...]] = {
     "Latencies": (
         Parameter("latency.ball_observation", "ball [ms]", 0.0, 100.0, 1.0, MILLI),
         Parameter("latency.abb_observation", "arm's joints [ms]", 0.0, 100.0, 1.0, MILLI),
@@ -72,15 +72,19 @@ PARAMETERS: dict[str, tuple[Parameter, ...]] = {
         Parameter("sensing.ball_noise", "tracker [mm]", 0.0, 150.0, 1.0, MILLI),
         Parameter("latency.ball_observation_std", "ball's latency [ms]", 0.0, 30.0, 0.5, MILLI),
     ),
-    "Gains of the drives": tuple(
-        Parameter(f"drives.{joint}.velocity_gain", joint, 0.5, 1.5, 0.01) for joint in JOINT_NAMES
-    ),
 }
+DRIVES = "Gains of the drives"
 
 
-def sliders() -> list[Parameter]:
+def groups(joints: tuple[str, ...] = JOINT_NAMES) -> dict[str, tuple[Parameter, ...]]:
+    """The sliders of a robot with these joints, in the order of the page."""
+    gains = (Parameter(f"drives.{joint}.velocity_gain", joint, 0.5, 1.5, 0.01) for joint in joints)
+    return _COMMON | {DRIVES: tuple(gains)}
+
+
+def sliders(joints: tuple[str, ...] = JOINT_NAMES) -> list[Parameter]:
     """Every slider, in the order of the page."""
-    return [parameter for group in PARAMETERS.values() for parameter in group]
+    return [parameter for group in groups(joints).values() for parameter in group]
 
 
 @jax.tree_util.register_dataclass
@@ -107,7 +111,8 @@ class Watched:
         return self.policy.mean
 
     def start(self, observation: Array) -> Any:
-        return self.policy.start(observation), observation, jnp.zeros((N_JOINTS, *observation.shape[1:]))
+        action = jnp.zeros((observation.shape[0] - 3, *observation.shape[1:]))
+        return self.policy.start(observation), observation, action
 
     def act(self, tick: Any, state: Any, observation: Array) -> tuple[Array, Any]:
         action, inner = self.policy.act(tick, state[0], observation)
@@ -122,11 +127,16 @@ class Studio:
         self.episodes = jax.jit(self._episodes)
         self._record = jax.jit(self._play, compiler_options=QUICKLY if jax.default_backend() == "cpu" else None)
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the robot's joints."""
+        return self.simulator.task.contract.joints
+
     def nominal(self) -> dict[str, float]:
         """Values of the sliders in this world; NaN for a parameter that is drawn for every episode."""
         known = models.paths(self.world.model)
         drawn = {path for one in self.world.randomise for path in one.paths}
-        return {p.path: float("nan") if p.path in drawn else float(known[p.path]) for p in sliders()}
+        return {p.path: float("nan") if p.path in drawn else float(known[p.path]) for p in sliders(self.joints)}
 
     def draws(self, state: np.ndarray, numbers: Sequence[int], seed: int) -> Draws:
         """Balls with position, velocity and spin ``state`` (9, n), each with its number's chance."""
@@ -158,7 +168,7 @@ class Studio:
             for kind in ("mean", "std")
         )
         spin = draws.ball.spin + mean_spin + std_spin * draws.spin
-        home = jnp.broadcast_to(jnp.asarray(self.simulator.task.home, jnp.float32)[:, None], (N_JOINTS, *shape))
+        home = jnp.broadcast_to(jnp.asarray(self.simulator.task.home, jnp.float32)[:, None], (len(self.joints), *shape))
         latency = jnp.clip(mean + std * draws.latency, 0.0, longest)
         return Episodes(replace(draws.ball, spin=spin), latency, jnp.asarray(draws.seed), model, home)
 
@@ -224,7 +234,7 @@ class Studio:
         if r["hit"]:
             text += f" in, {speeds[over]:.1f} m/s out"
         weights = self.simulator.config.reward_weights
-        seen, joints = r["observation"][played], tuple(JOINT_NAMES)
+        seen, joints = r["observation"][played], self.joints
         return Film(
             time=time,
             qpos=qpos,

@@ -87,7 +87,7 @@ def diagnose(
         hits = diagnose_hits(found, record.tracks, joint_path(logs.joints, model), without)
         notes += [*record.lines(), *found.spin_notes, *found.small_notes]
     if logs.joints:
-        nominal = {r.joint: nominal_response(model, r.joint) for r in logs.joints}
+        nominal = {r.joint: nominal_response(model, r.joint, r.robot) for r in logs.joints}
         robot = diagnose_joints(
             logs.joints,
             nominal,

@@ -18,6 +18,7 @@ from ballmodel.io.formats import read
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
 from mjx_tt.diagnosis.tracks.frame import check
+from mjx_tt.robot.robot import Robot
 
 TURN = 0.15  # [m] that a ball comes back before it counts as hit
 ROBOT_FILES = ("command.csv", "state.csv")
@@ -49,17 +50,17 @@ def hashes(paths: Sequence[str | os.PathLike]) -> dict[Path, str]:
     return found
 
 
-def load_logs(paths: Sequence[str | os.PathLike]) -> Logs:
+def load_logs(paths: Sequence[str | os.PathLike], robot: Robot | None = None) -> Logs:
     """Reads logs: ball trajectories (CSV, MCAP, AIMY) and pairs command.csv, state.csv (or a folder that holds them).
 
-    Of several pairs the longest is used. Raises ValueError naming the file and what is wrong with it,
-    FileNotFoundError when there is none.
+    Of several pairs the longest is used. robot: whose joints they are; None: the paper's. Raises ValueError naming the
+    file and what is wrong with it, FileNotFoundError when there is none.
     """
     files = hashes(paths)
     if not files:
         raise ValueError("no log was given")
     balls: list[Trajectory] = []
-    joints, notes = longest([(str(folder), read_robot_csv(*pair)) for folder, pair in _pairs(files).items()])
+    joints, notes = longest([(str(folder), read_robot_csv(*pair, robot)) for folder, pair in _pairs(files).items()])
     for file in (f for f in files if f.name not in ROBOT_FILES):
         try:
             data = read(file)

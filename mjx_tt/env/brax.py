@@ -31,7 +31,7 @@ from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import Episodes, EpisodeState, Return, Tick
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
-from robot_io.contract import HISTORY, N_JOINTS, N_OBSERVATION
+from robot_io.contract import HISTORY, N_OBSERVATION
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that Warp, an optional engine, is not installed
     from brax.envs import register_environment as register_environment
@@ -39,7 +39,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that Warp, an opti
 
 T = TypeVar("T")
 
-OBSERVATION_SIZE = HISTORY * N_OBSERVATION
+OBSERVATION_SIZE = HISTORY * N_OBSERVATION  # of the paper's robot
 FEWEST_FLOWN = 16  # balls flown out together, at least
 
 
@@ -48,13 +48,13 @@ FEWEST_FLOWN = 16  # balls flown out together, at least
 class Given:
     """Controller with an action decided outside."""
 
-    action: Float[Array, "8 *batch"]
-    mean: Float[Array, "11"]
+    action: Float[Array, "joints *batch"]
+    mean: Float[Array, "observed"]
 
     def start(self, observation: Array) -> tuple[()]:
         return ()
 
-    def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Float[Array, "8 *batch"], tuple[()]]:
+    def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Float[Array, "joints *batch"], tuple[()]]:
         return self.action, ()
 
 
@@ -67,7 +67,7 @@ class Playing:
     key: PRNGKeyArray  # of the episodes to come
     episodes: Episodes
     state: EpisodeState
-    history: Float[Array, "8 11 *batch"]  # observations, oldest first
+    history: Float[Array, "8 observed *batch"]  # observations, oldest first
     earned: Float[Array, "*batch"]  # R so far
 
 
@@ -85,14 +85,15 @@ class TableTennis(Env):
     ) -> None:
         self._simulator, self._pool, self._model, self._randomise = simulator, pool, model, randomise
         self._task = simulator.task
+        self._unseen = jnp.zeros(self._task.contract.n_observation)
 
     @property
     def observation_size(self) -> int:
-        return OBSERVATION_SIZE
+        return HISTORY * self._task.contract.n_observation
 
     @property
     def action_size(self) -> int:
-        return N_JOINTS
+        return self._task.contract.n_joints
 
     @property
     def backend(self) -> str:
@@ -121,11 +122,11 @@ class TableTennis(Env):
         metrics = {"hit": zero, "returned": zero, "episode_return": zero}
         return State(playing, flatten(history), zero, zero, metrics, {"truncation": zero})
 
-    def step(self, state: State, action: Float[Array, "*batch 8"]) -> State:
+    def step(self, state: State, action: Float[Array, "*batch joints"]) -> State:
         """One control period under ``action`` (..., 8)."""
         task, playing = self._task, state.pipeline_state
         episodes, before = playing.episodes, playing.state
-        controller = Given(jnp.clip(jnp.moveaxis(action, -1, 0), -1.0, 1.0), jnp.zeros(N_OBSERVATION))
+        controller = Given(jnp.clip(jnp.moveaxis(action, -1, 0), -1.0, 1.0), self._unseen)
         after = task.control_step(playing.tick, before, episodes, task.prepare(episodes), controller)
         done = ~after.live | (after.sums.steps >= task.config.max_steps)
         back = self._fly_out(after, done & after.hit & after.finite, episodes)
@@ -156,7 +157,7 @@ class TableTennis(Env):
         )
 
     def _start(self, episodes: Episodes) -> EpisodeState:
-        return self._task.reset(episodes, Given(jnp.zeros(N_JOINTS), jnp.zeros(N_OBSERVATION)))
+        return self._task.reset(episodes, Given(jnp.zeros(self.action_size), self._unseen))
 
     def _fly_out(self, state: EpisodeState, hit: Bool[Array, "*batch"], episodes: Episodes) -> Return:
         """Outcome of the balls that were hit in this step.
@@ -181,9 +182,9 @@ class TableTennis(Env):
         return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), fly_some, (hit, back))[1]
 
 
-def flatten(history: Float[Array, "8 11 *batch"]) -> Float[Array, "*batch 88"]:
+def flatten(history: Float[Array, "8 observed *batch"]) -> Float[Array, "*batch size"]:
     """A network's input: the history as one axis, last."""
-    return jnp.moveaxis(history.reshape(OBSERVATION_SIZE, *history.shape[2:]), 0, -1)
+    return jnp.moveaxis(history.reshape(-1, *history.shape[2:]), 0, -1)
 
 
 def _where(done: Array, fresh: T, old: T) -> T:

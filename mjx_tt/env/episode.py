@@ -13,6 +13,8 @@ from ballmodel.flight import PaddlePose
 from ballmodel.state import BallState
 from mjx_tt.env import rewards
 from mjx_tt.env.own import Term
+from mjx_tt.robot import robot
+from mjx_tt.robot.robot import Robot
 from mjx_tt.sim.actuators import Drives, DriveState
 from mjx_tt.sim.latency import Delay
 from mjx_tt.sim.model import SimModel
@@ -39,6 +41,7 @@ class TaskConfig:
     max_action_latency: float = 0.13
     reward_weights: tuple[float, ...] = field(default=tuple(rewards.SIM_WEIGHTS.values()))  # of ``terms``
     own_terms: tuple[Term, ...] = ()  # the user's, after the eleven
+    robot: Robot = field(default_factory=robot.paper)
 
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:
@@ -73,17 +76,17 @@ class Controller(Protocol):
     """Source of the robot's velocities; batch axes last."""
 
     @property
-    def mean(self) -> Float[Array, "11 *#batch"]:
+    def mean(self) -> Float[Array, "observed *#batch"]:
         """The value about which the observations' statistics are summed."""
         ...
 
-    def start(self, observation: Float[Array, "11 *batch"]) -> Any:
+    def start(self, observation: Float[Array, "observed *batch"]) -> Any:
         """State before the first control step, a pytree, from the first observation."""
         ...
 
     def act(
-        self, tick: Tick, state: Any, observation: Float[Array, "11 *batch"]
-    ) -> tuple[Float[Array, "8 *batch"], Any]:
+        self, tick: Tick, state: Any, observation: Float[Array, "observed *batch"]
+    ) -> tuple[Float[Array, "joints *batch"], Any]:
         """Action in [-1, 1] at control step ``tick`` and the next state."""
         ...
 
@@ -97,7 +100,8 @@ class Episodes:
     latency: Float[Array, "5 *batch"]  # [s], order of model.LATENCIES
     seed: UInt32[Array, "*batch"]  # of the observation noise
     model: SimModel  # leaves scalar or (...)
-    start: Float[Array, "8 *batch"] | None = None  # joint positions at which the robot rests at first; None: at home
+    # joint positions at which the robot rests at first; None: at home
+    start: Float[Array, "joints *batch"] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -126,9 +130,9 @@ class Sums:
     low_paddle: Float[Array, "*batch"]
     bad_style: Float[Array, "*batch"]
     steps: Float[Array, "*batch"]
-    peak_velocity: Float[Array, "8 *batch"]  # [m/s], [rad/s] highest commanded speed
-    observation: Float[Array, "11 *batch"]  # sum of (x - shift)
-    observation_sq: Float[Array, "11 *batch"]  # sum of (x - shift)^2
+    peak_velocity: Float[Array, "joints *batch"]  # [m/s], [rad/s] highest commanded speed
+    observation: Float[Array, "observed *batch"]  # sum of (x - shift)
+    observation_sq: Float[Array, "observed *batch"]  # sum of (x - shift)^2
     own: tuple[Float[Array, "*batch"], ...] = ()  # sums of the user's terms per control step
 
 
@@ -137,13 +141,13 @@ class Sums:
 class EpisodeState:
     """State of phase 1 between control steps."""
 
-    qpos: Float[Array, "8 *batch"]
-    qvel: Float[Array, "8 *batch"]
+    qpos: Float[Array, "joints *batch"]
+    qvel: Float[Array, "joints *batch"]
     pose: PaddlePose
-    command: Float[Array, "8 *batch"]  # velocity commanded in the period before
-    command_acceleration: Float[Array, "8 *batch"]
-    reference: Float[Array, "8 *batch"]  # sum of commands
-    commands: Float[Array, "depth 8 *batch"]  # ring by control period
+    command: Float[Array, "joints *batch"]  # velocity commanded in the period before
+    command_acceleration: Float[Array, "joints *batch"]
+    reference: Float[Array, "joints *batch"]  # sum of commands
+    commands: Float[Array, "depth joints *batch"]  # ring by control period
     # Ring by control period, captured at the delays' phases: 11 components, with jitter also the ball's velocity.
     observations: Float[Array, "depth captured *batch"]
     controller: Any  # pytree, whatever the controller remembers

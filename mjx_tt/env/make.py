@@ -117,7 +117,8 @@ def load_policy(path: str | os.PathLike) -> Policy:
     """
     if not os.path.isdir(path):
         return Policy.load(path)
-    return own.simulated(artefact.load(Path(path)).policy, str(path)).astype(np.float32)
+    found = artefact.load(Path(path))
+    return own.simulated(found.policy, str(path), found.contract).astype(np.float32)
 
 
 def _distribution(balls: Balls) -> registry.Balls:

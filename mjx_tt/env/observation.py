@@ -11,18 +11,17 @@ from mjx_tt.env.episode import Episodes, EpisodeState, Prepared, TaskConfig, Tic
 from mjx_tt.robot.scalar_algebra import materialise
 from mjx_tt.sim import latency, noise
 from mjx_tt.sim.sensors import Filters
-from robot_io.contract import N_JOINTS
 
 
 def measured(
     episodes: Episodes, prepared: Prepared, captured: Float[Array, "captured *batch"], tick: Tick
-) -> Float[Array, "11 *batch"]:
+) -> Float[Array, "observed *batch"]:
     """Observation from the true delayed quantities, as the ring keeps them."""
-    tracker, joints = episodes.model.sensing, captured[3 : 3 + N_JOINTS]
+    tracker, joints = episodes.model.sensing, captured[3 : 3 + _joints(prepared)]
     ball = captured[:3]
     if tracker.jitter is not None:
         late = tracker.jitter * noise.normal(episodes.seed, tick, 3).astype(ball.dtype)
-        ball = ball + late[None] * captured[3 + N_JOINTS :]
+        ball = ball + late[None] * captured[3 + _joints(prepared) :]
     if prepared.camera is not None:
         ball = prepared.camera.seen(ball)
     u = noise.symmetric_uniform(episodes.seed, tick, 3).astype(captured.dtype)
@@ -33,9 +32,9 @@ def measured(
     return jnp.concatenate([ball, joints])
 
 
-def observe(tick: Tick, s: EpisodeState, episodes: Episodes, prepared: Prepared) -> Float[Array, "11 *batch"]:
+def observe(tick: Tick, s: EpisodeState, episodes: Episodes, prepared: Prepared) -> Float[Array, "observed *batch"]:
     """The policy's input at control step ``tick``."""
-    joints = slice(3, 3 + N_JOINTS)
+    joints = slice(3, 3 + _joints(prepared))
     captured = [
         latency.ring_read(s.observations[:, :3], tick - prepared.ball.periods),
         latency.ring_read(s.observations[:, joints], tick - prepared.joints.periods),
@@ -52,7 +51,7 @@ def capture(
     i: Tick,
     ball: BallState,
     filters: Filters,
-    joints: Float[Array, "8 *batch"],
+    joints: Float[Array, "joints *batch"],
 ) -> Float[Array, "captured *batch"]:
     """Share of the state at substep boundary ``i`` in the quantities that the delayed sensors see."""
     n, timestep = config.substeps, 1.0 / config.sim_rate
@@ -64,3 +63,8 @@ def capture(
     if episodes.model.sensing.jitter is not None:
         parts.append(seen_at * ball.velocity)
     return jnp.concatenate(parts)
+
+
+def _joints(prepared: Prepared) -> int:
+    """Number of the robot's joints."""
+    return prepared.joints.periods.shape[0]

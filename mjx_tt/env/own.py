@@ -32,7 +32,7 @@ from jaxtyping import Bool, Float
 
 from ballmodel.flight import PaddlePose
 from mjx_tt.env import rewards
-from robot_io.contract import N_JOINTS, N_OBSERVATION
+from robot_io.contract import PAPER, Contract
 from robot_io.policy.policy import Policy
 
 F = TypeVar("F", bound=Callable)
@@ -47,10 +47,11 @@ BATCH = (2, 3)  # of the trial calls that check what a user's function returns
 class ControlStep:
     """One control period under the policy, as it is at its end. SI units, the batch last."""
 
-    observation: Float[Array, "11 *batch"]  # ball [m] and joints [m, rad] as the policy saw them, late and with noise
-    command: Float[Array, "8 *batch"]  # [m/s, rad/s] velocities after the limits
-    acceleration: Float[Array, "8 *batch"]  # [m/s^2, rad/s^2] change of the command
-    joints: Float[Array, "8 *batch"]  # [m, rad] true positions
+    # ball [m] and joints [m, rad] as the policy saw them, late and with noise
+    observation: Float[Array, "observed *batch"]
+    command: Float[Array, "joints *batch"]  # [m/s, rad/s] velocities after the limits
+    acceleration: Float[Array, "joints *batch"]  # [m/s^2, rad/s^2] change of the command
+    joints: Float[Array, "joints *batch"]  # [m, rad] true positions
     blade: PaddlePose  # position [m], normal, velocity [m/s], angular_velocity [rad/s] of the blade's centre
     ball_position: Float[Array, "3 *batch"]  # [m] true
     ball_velocity: Float[Array, "3 *batch"]  # [m/s]
@@ -72,7 +73,7 @@ class PlayedBall:
     landing: Float[Array, "2 *batch"]  # [m] x, y where it came down to the table's height
     closest: Float[Array, "*batch"]  # [m] least distance of ball and blade centre after the bounce
     steps: Float[Array, "*batch"]  # control steps under the policy
-    peak_velocity: Float[Array, "8 *batch"]  # [m/s, rad/s] highest commanded speeds
+    peak_velocity: Float[Array, "joints *batch"]  # [m/s, rad/s] highest commanded speeds
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +126,7 @@ class Definitions:
 
 
 _open: ContextVar[Definitions | None] = ContextVar("definitions", default=None)
-_loaded: dict[str, Definitions] = {}  # by the file's text
+_loaded: dict[tuple[str, Contract], Definitions] = {}  # by the file's text and the robot
 
 
 def reward_term(name: str, per: Literal["step", "ball"] = "step") -> Callable[[F], F]:
@@ -166,14 +167,14 @@ def _add(name: str, what: str, place: Callable[[Definitions], dict], value: Any,
     place(collecting)[name] = value
 
 
-def load(text: str, where: str) -> Definitions:
+def load(text: str, where: str, contract: Contract = PAPER) -> Definitions:
     """The definitions in the text of a Python file; runs it. ``where`` names it in errors and tracebacks.
 
     The same text gives the same objects, so that what was compiled with them is found again. Raises ValueError naming
     the file, the line and what is wrong: with the file itself, or with what a function returns in a trial call.
     """
-    if text in _loaded:
-        return _loaded[text]
+    if (text, contract) in _loaded:
+        return _loaded[text, contract]
     linecache.cache[where] = (len(text), None, text.splitlines(keepends=True), where)
     found = Definitions()
     with _collecting(found), _blamed(where, where):
@@ -182,20 +183,20 @@ def load(text: str, where: str) -> Definitions:
         raise ValueError(f"{where}: defines nothing; @reward_term or @network of mjx_tt.env.own before a function does")
     for term in found.terms.values():
         with _blamed(f"{where}: reward term {term.name!r}", where):
-            _check_term(term)
+            _check_term(term, contract)
     for name, one in found.networks.items():
         one = found.networks[name] = replace(one, source=text)
         with _blamed(f"{where}: network {one.name!r}", where):
-            _check_network(one)
-    _loaded[text] = found
+            _check_network(one, contract)
+    _loaded[text, contract] = found
     return found
 
 
-def simulated(policy: Policy, where: str) -> Policy:
+def simulated(policy: Policy, where: str, contract: Contract = PAPER) -> Policy:
     """The policy of an artefact for the simulator, which runs the Python of a user's network. Raises ValueError."""
     if policy.network is None or isinstance(policy.network, Network):
         return policy
-    defined = load(policy.network.source, f"{where}: network.py").networks
+    defined = load(policy.network.source, f"{where}: network.py", contract).networks
     return replace(policy, network=defined[policy.network.name])
 
 
@@ -222,15 +223,15 @@ def _blamed(what: str, file: str) -> Iterator[None]:
         raise ValueError(f"{what}:{place} {kind}{str(error).splitlines()[0] if str(error) else ''}") from error
 
 
-def _check_term(term: Term) -> None:
+def _check_term(term: Term, contract: Contract) -> None:
     def number(*leading: int) -> Any:
         return jax.ShapeDtypeStruct((*leading, *BATCH), jnp.float32)
 
     flag: Any = jax.ShapeDtypeStruct(BATCH, bool)
-    joints, vector = number(N_JOINTS), number(3)
+    joints, vector = number(contract.n_joints), number(3)
     blade = PaddlePose(vector, vector, vector, vector)
     gaps = number(), number(), number()
-    step = ControlStep(number(N_OBSERVATION), joints, joints, joints, blade, vector, vector, flag, *gaps)
+    step = ControlStep(number(contract.n_observation), joints, joints, joints, blade, vector, vector, flag, *gaps)
     ball = PlayedBall(flag, flag, flag, number(), number(2), number(), number(), joints)
     found = jax.eval_shape(lambda given: jnp.asarray(term.function(given)), step if term.per == "step" else ball)
     if found.shape not in (BATCH, ()):
@@ -242,7 +243,7 @@ def _check_term(term: Term) -> None:
         raise ValueError("returns complex numbers")
 
 
-def _check_network(network: Network) -> None:
+def _check_network(network: Network, contract: Contract) -> None:
     bad = {
         name: shape
         for name, shape in network.shapes.items()
@@ -257,10 +258,10 @@ def _check_network(network: Network) -> None:
         action, after = network.step(parameters, state, x)
         return jnp.asarray(action), state, jax.tree.map(jnp.asarray, after)
 
-    numbers = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (network.size, N_OBSERVATION)]
+    numbers = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (network.size, contract.n_observation)]
     action, before, after = jax.eval_shape(called, *numbers)
-    if action.shape != (N_JOINTS,):
-        raise ValueError(f"step returns an action {action.shape}, ({N_JOINTS},) is wanted")
+    if action.shape != (contract.n_joints,):
+        raise ValueError(f"step returns an action {action.shape}, ({contract.n_joints},) is wanted")
     kinds: list[Any] = [jax.tree.structure(state) for state in (before, after)]
     if kinds[0] != kinds[1] or any(
         a.shape != b.shape or a.dtype != b.dtype

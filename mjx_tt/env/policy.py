@@ -23,7 +23,7 @@ from jaxtyping import Float, PRNGKeyArray
 from mjx_tt.env.episode import Tick
 from mjx_tt.env.own import Network
 from mjx_tt.robot.scalar_algebra import materialise
-from robot_io.contract import DILATIONS, GATED, N_JOINTS, n_parameters
+from robot_io.contract import DILATIONS, GATED, n_parameters
 from robot_io.policy.pytree import Policy as Policy
 
 Parameters: TypeAlias = Mapping[str, Array]  # of ``Policy.parameters``
@@ -35,7 +35,7 @@ Layer: TypeAlias = tuple[Array, Array, bool]  # kernel, bias, gated
 class PolicyState:
     """State of the streaming form, newest last."""
 
-    inputs: Float[Array, "1 11 *batch"]  # normalised observation of the tick before
+    inputs: Float[Array, "1 observed *batch"]  # normalised observation of the tick before
     layer1: Float[Array, "2 8 *batch"]
     layer2: Float[Array, "4 12 *batch"]
 
@@ -72,7 +72,7 @@ def _layers(parameters: Parameters) -> list[Layer]:
     return [(parameters[f"conv{i}/kernel"], parameters[f"conv{i}/bias"], gated) for i, gated in enumerate(GATED, 1)]
 
 
-def start(parameters: Parameters, x: Float[Array, "11 *batch"]) -> PolicyState:
+def start(parameters: Parameters, x: Float[Array, "observed *batch"]) -> PolicyState:
     """State whose whole history is the first normalised observation ``x`` (11, ...)."""
     one, two, _ = _layers(parameters)
     h1 = _layer(one, x, x)
@@ -81,8 +81,8 @@ def start(parameters: Parameters, x: Float[Array, "11 *batch"]) -> PolicyState:
 
 
 def stream(
-    parameters: Parameters, state: PolicyState, x: Float[Array, "11 *batch"]
-) -> tuple[Float[Array, "8 *batch"], PolicyState]:
+    parameters: Parameters, state: PolicyState, x: Float[Array, "observed *batch"]
+) -> tuple[Float[Array, "joints *batch"], PolicyState]:
     """One control step: normalised observation ``x`` (11, ...) -> action (8, ...) in [-1, 1] and the next state."""
     one, two, three = _layers(parameters)
     h1 = materialise(_layer(one, state.inputs[0], x))
@@ -102,8 +102,8 @@ class PolicyController:
     """
 
     parameters: Parameters
-    mean: Float[Array, "11 *#batch"]
-    inv_std: Float[Array, "11 *#batch"]
+    mean: Float[Array, "observed *#batch"]
+    inv_std: Float[Array, "observed *#batch"]
 
     @classmethod
     def of(cls, policy: Policy) -> PolicyController:
@@ -112,16 +112,16 @@ class PolicyController:
             raise ValueError(f"the policy's network is {policy.network.name!r}; here only the paper's is computed")
         return cls(policy.parameters, policy.mean, policy.inv_std)
 
-    def start(self, observation: Float[Array, "11 *batch"]) -> PolicyState:
+    def start(self, observation: Float[Array, "observed *batch"]) -> PolicyState:
         return start(self.parameters, normalised(observation, self.mean, self.inv_std))
 
     def act(
-        self, tick: Tick, state: PolicyState, observation: Float[Array, "11 *batch"]
-    ) -> tuple[Float[Array, "8 *batch"], PolicyState]:
+        self, tick: Tick, state: PolicyState, observation: Float[Array, "observed *batch"]
+    ) -> tuple[Float[Array, "joints *batch"], PolicyState]:
         return stream(self.parameters, state, normalised(observation, self.mean, self.inv_std))
 
 
-def normalised(x: Float[Array, "11 *batch"], mean: Array, inv_std: Array) -> Float[Array, "11 *batch"]:
+def normalised(x: Float[Array, "observed *batch"], mean: Array, inv_std: Array) -> Float[Array, "observed *batch"]:
     """Observations less their mean, over their deviation, both (11,) or (11, P)."""
     column = mean.shape + (1,) * (x.ndim - mean.ndim)
     return (x - mean.reshape(column)) * inv_std.reshape(column)
@@ -137,24 +137,24 @@ class NetworkController:
 
     network: Network = field(metadata={"static": True})
     theta: Float[Array, "size P"]
-    mean: Float[Array, "11 *#batch"]
-    inv_std: Float[Array, "11 *#batch"]
+    mean: Float[Array, "observed *#batch"]
+    inv_std: Float[Array, "observed *#batch"]
 
-    def start(self, observation: Float[Array, "11 *batch"]) -> Any:
+    def start(self, observation: Float[Array, "observed *batch"]) -> Any:
         def one(theta: Array, x: Array) -> Any:
             return jax.tree.map(jnp.asarray, self.network.start(self.network.unflatten(theta), x))
 
         return self._mapped(one, observation)
 
     def act(
-        self, tick: Tick, state: Any, observation: Float[Array, "11 *batch"]
-    ) -> tuple[Float[Array, "8 *batch"], Any]:
+        self, tick: Tick, state: Any, observation: Float[Array, "observed *batch"]
+    ) -> tuple[Float[Array, "joints *batch"], Any]:
         def one(theta: Array, x: Array, state: Any) -> tuple[Array, Any]:
             action, after = self.network.step(self.network.unflatten(theta), state, x)
             return jnp.clip(jnp.asarray(action), -1.0, 1.0), jax.tree.map(jnp.asarray, after)
 
         action, after = self._mapped(one, observation, state)
-        return action.reshape(N_JOINTS, *observation.shape[1:]), after
+        return action.reshape(-1, *observation.shape[1:]), after
 
     def _mapped(self, one: Callable, observation: Array, *state: Any) -> Any:
         """The function of one policy and one episode for all of them; states have the axes (..., R, P)."""

@@ -23,7 +23,6 @@ from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import AXIS, RESULT_SPECS, RolloutResult, Simulator
 from mjx_tt.env.task import RETURNED, Episodes, Tick
 from mjx_tt.sim.model import SimModel
-from robot_io.contract import N_JOINTS, N_OBSERVATION
 
 BATCH = 32  # balls searched at a time
 KNOTS = 5
@@ -38,15 +37,15 @@ FIRST_STD = 0.5  # of an action
 class MotionController:
     """Open-loop motions: knots (KNOTS, 8, P) of actions, evenly spaced over ``duration`` (P,) seconds."""
 
-    knots: Float[Array, "knots 8 P"]
+    knots: Float[Array, "knots joints P"]
     duration: Float[Array, " P"]  # [s]
     period: float  # [s]
-    mean: Float[Array, "11"]
+    mean: Float[Array, "observed"]
 
     def start(self, observation: Array) -> tuple[()]:
         return ()
 
-    def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Float[Array, "8 P"], tuple[()]]:
+    def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Float[Array, "joints P"], tuple[()]]:
         place = jnp.clip(jnp.asarray(tick).astype(self.duration.dtype) * self.period / self.duration, 0.0, 1.0) * (
             KNOTS - 1
         )
@@ -119,7 +118,8 @@ def _played(simulator: Simulator, policy: Policy, episodes: Episodes) -> np.ndar
 def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Bool[Array, " P"]:
     """True for those of this device's share of episodes (1, P) that an optimised motion returns."""
     episodes = simulator.local(episodes)
-    mine = episodes.seed.shape[-1]
+    mine, contract = episodes.seed.shape[-1], simulator.task.contract
+    n = contract.n_joints
     key = jax.random.fold_in(key, jax.lax.axis_index(AXIS))
 
     def spread(x: Array) -> Array:  # (..., 1, balls) -> (..., 1, CANDIDATES x balls)
@@ -136,14 +136,14 @@ def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Bool
 
     def iterate(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         iteration, mean, std, solved = carry
-        noise = jax.random.normal(jax.random.fold_in(key, iteration), (KNOTS, N_JOINTS, CANDIDATES, mine))
+        noise = jax.random.normal(jax.random.fold_in(key, iteration), (KNOTS, n, CANDIDATES, mine))
         knots = mean[:, :, None] + std[:, :, None] * noise
         knots = jnp.clip(knots, -1.0, 1.0).at[:, :, 0].set(mean)
         controller = MotionController(
-            knots.reshape(KNOTS, N_JOINTS, -1),
+            knots.reshape(KNOTS, n, -1),
             jnp.tile(duration, CANDIDATES),
             simulator.config.period,
-            jnp.zeros(N_OBSERVATION),
+            jnp.zeros(contract.n_observation),
         )
         result = simulator.play(controller, many)
         score = jnp.nan_to_num(result.returns, nan=-1e3).reshape(CANDIDATES, mine)
@@ -153,7 +153,7 @@ def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Bool
         mean, std = chosen.mean(axis=2), chosen.std(axis=2) + 0.02
         return iteration + 1, mean, std, solved | returned.any(axis=0)
 
-    knots = (KNOTS, N_JOINTS, mine)
+    knots = (KNOTS, n, mine)
     start = (jnp.int32(0), jnp.zeros(knots), jnp.full(knots, FIRST_STD), jnp.zeros(mine, bool))
     *_, solved = jax.lax.while_loop(searching, iterate, start)
     return solved

@@ -10,41 +10,44 @@ from jaxtyping import Float
 from mjx_tt.env import rewards
 from mjx_tt.env.episode import EpisodeState, Return, Sums
 from mjx_tt.env.own import ControlStep, PlayedBall, Term
-from robot_io.contract import LIMITS, N_JOINTS
+from robot_io.contract import LIMITS, JointLimits
 
 
 def accumulate(
     s: EpisodeState,
     step: ControlStep,
     period: float,
-    shift: Float[Array, "11 *#batch"],
+    shift: Float[Array, "observed *#batch"],
     closest: Float[Array, "*batch"],
     own: tuple[Term, ...] = (),
+    limits: JointLimits = LIMITS,
 ) -> Sums:
     """The sums after one more control period [s].
 
-    shift: value about which observations are summed; closest: least distance [m] so far; own: the user's terms.
+    shift: value about which observations are summed; closest: least distance [m] so far; own: the user's terms;
+    limits: of the robot.
     """
     sums, alive = s.sums, s.live.astype(step.command.dtype)
+    n = len(limits.joints)
 
     # Mean over the joints of |value| / limit, at most 1 each.
     def relative(values: Array, limit: np.ndarray | tuple[float, ...]) -> Array:
-        parts = [jnp.minimum(jnp.abs(values[i]) / limit[i], 1.0) for i in range(N_JOINTS)]
-        return jnp.asarray(sum(parts)) / N_JOINTS
+        parts = [jnp.minimum(jnp.abs(values[i]) / limit[i], 1.0) for i in range(n)]
+        return jnp.asarray(sum(parts)) / n
 
     jerk = (step.acceleration - s.command_acceleration) / period
-    lower, upper = np.asarray(LIMITS.lower), np.asarray(LIMITS.upper)
+    lower, upper = np.asarray(limits.lower), np.asarray(limits.upper)
     soft = rewards.SOFT_RANGE * (upper - lower)
-    inside = [(step.joints[i] > lower[i] + soft[i]) & (step.joints[i] < upper[i] - soft[i]) for i in range(N_JOINTS)]
+    inside = [(step.joints[i] > lower[i] + soft[i]) & (step.joints[i] < upper[i] - soft[i]) for i in range(n)]
     safe = inside[0]
     for each in inside[1:]:
         safe = safe & each
     centred = step.observation - shift.reshape(shift.shape + (1,) * (step.observation.ndim - shift.ndim))
     return Sums(
         closest=closest,
-        jerk=sums.jerk + alive * relative(jerk, 2.0 * np.asarray(LIMITS.acceleration) / period),
-        acceleration=sums.acceleration + alive * relative(step.acceleration, LIMITS.acceleration),
-        velocity=sums.velocity + alive * relative(step.command, LIMITS.velocity),
+        jerk=sums.jerk + alive * relative(jerk, 2.0 * np.asarray(limits.acceleration) / period),
+        acceleration=sums.acceleration + alive * relative(step.acceleration, limits.acceleration),
+        velocity=sums.velocity + alive * relative(step.command, limits.velocity),
         safe_angle=sums.safe_angle + alive * safe.astype(alive.dtype),
         collision=sums.collision + alive * ((step.table_gap <= 0.0) | (step.own_gap <= 0.0)).astype(alive.dtype),
         low_paddle=sums.low_paddle + alive * (step.blade_gap < rewards.BLADE_CLEARANCE).astype(alive.dtype),

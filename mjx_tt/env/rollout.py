@@ -49,8 +49,8 @@ class RolloutResult:
     landing: Float[Array, "2 R P"]  # [m] where the outgoing ball came down to the table's height
     finite: Bool[Array, "R P"]
     steps: Int[Array, "R P"]  # control steps under the policy
-    peak_velocity: Float[Array, "8 R P"]  # [m/s], [rad/s]
-    observation_sums: Float[Array, "2 11 P"]  # sums of (x - mean) and of (x - mean)^2 over the finite episodes
+    peak_velocity: Float[Array, "joints R P"]  # [m/s], [rad/s]
+    observation_sums: Float[Array, "2 observed P"]  # sums of (x - mean) and of (x - mean)^2 over the finite episodes
     observation_counts: Int[Array, " P"]
 
 
@@ -103,6 +103,9 @@ class Simulator:
         Within each column the episodes are in the order of the balls' arrival. What the model leaves at its nominal
         value and a program can do without is None in the episodes' model.
         """
+        if model.drives is not None and model.joints != self.task.contract.joints:
+            wanted = self.task.contract.joints
+            raise ValueError(f"the model has drives of {model.joints}, the robot's joints are {wanted}")
         balls_key, latency_key, seed_key, model_key = jax.random.split(key, 4)
         shape = (repeats, columns)
         index = jax.random.randint(balls_key, shape, 0, pool.arrival.shape[0])
@@ -227,7 +230,7 @@ class Simulator:
 
     def replay(
         self, policy: Policy, episodes: Episodes
-    ) -> tuple[Float[Array, "ticks 8 R"], Float[Array, "ticks 3 R"], Int[Array, " R"]]:
+    ) -> tuple[Float[Array, "ticks joints R"], Float[Array, "ticks 3 R"], Int[Array, " R"]]:
         """Plays single episodes for the camera: one policy, episodes (R, 1).
 
         Returns joint positions (max_steps, 8, R), ball positions (max_steps, 3, R) at the control ticks and the number

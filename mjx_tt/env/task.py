@@ -31,15 +31,15 @@ from mjx_tt.env.episode import TaskConfig as TaskConfig
 from mjx_tt.env.episode import Tick as Tick
 from mjx_tt.env.own import ControlStep
 from mjx_tt.env.reward_sums import accumulate
-from mjx_tt.robot import model as robot
+from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.clearance import CapsuleClearance
 from mjx_tt.robot.dynamics_fused import FusedEngine
 from mjx_tt.robot.kinematics import Joints, PaddleKinematics
+from mjx_tt.robot.model import capsules, paddle_frame
 from mjx_tt.robot.scalar_algebra import materialise
 from mjx_tt.sim import actuators as drives
 from mjx_tt.sim import latency, sensors
 from mjx_tt.sim.sensors import Filters
-from robot_io.contract import FESTO_JOINTS, LIMITS, N_JOINTS, N_OBSERVATION
 from robot_io.limits import limit_velocity
 
 OUT_OF_REACH = (-2.9, -0.6)  # [m] y and z of an incoming ball below which nobody can play it
@@ -52,7 +52,7 @@ class Engine(Protocol):
     def name(self) -> str: ...
 
     def step(self, qpos: Joints, qvel: Joints, ctrl: Joints) -> tuple[Joints, Joints]:
-        """Joint positions and velocities (8, ...) one substep later."""
+        """Joint positions and velocities (n, ...) one substep later."""
         ...
 
 
@@ -60,9 +60,9 @@ class Task:
     """Episodes of one robot under one configuration."""
 
     def __init__(self, config: TaskConfig) -> None:
-        self.config = config
-        model = robot.load_model()
-        chain = robot.chain_from_model(model)
+        self.config, self.contract = config, config.robot.contract
+        model = config.robot.model()
+        chain = chain_from_model(model)
         timestep = 1.0 / config.sim_rate
         self.engine: Engine
         if config.engine == "mjx":
@@ -71,9 +71,9 @@ class Task:
             self.engine = MjxEngine(model, timestep)
         else:
             self.engine = FusedEngine(chain, timestep)
-        self.home = robot.home_qpos(model)
-        self.kinematics = PaddleKinematics(chain, robot.paddle_frame(model))
-        self.clearance = CapsuleClearance(self.kinematics, robot.capsules(model))
+        self.home = config.robot.home
+        self.kinematics = PaddleKinematics(chain, paddle_frame(model))
+        self.clearance = CapsuleClearance(self.kinematics, capsules(model), config.robot.file)
         self._observation_depth = latency.ring_depth(config.max_observation_latency, config.period)
         self._action_depth = latency.ring_depth(config.max_action_latency, config.period)
 
@@ -81,9 +81,10 @@ class Task:
         """Splits the episodes' latencies, with what clock and drives add to them, and sorts drives and camera."""
         config, model, seconds = self.config, episodes.model, episodes.latency
         period, batch = config.period, seconds.shape[1:]
-        joints = jnp.stack([seconds[2 if i in FESTO_JOINTS else 1] for i in range(N_JOINTS)])
-        actions = jnp.stack([seconds[4 if i in FESTO_JOINTS else 3] for i in range(N_JOINTS)])
-        ball, by_effect = seconds[0], drives.by_effect(model.drives, batch, seconds.dtype)
+        axes, n = self.contract.carrying, self.contract.n_joints
+        joints = jnp.stack([seconds[2 if i in axes else 1] for i in range(n)])
+        actions = jnp.stack([seconds[4 if i in axes else 3] for i in range(n)])
+        ball, by_effect = seconds[0], drives.by_effect(model.drives, batch, seconds.dtype, self.contract.joints)
         if model.sensing.clock_rate is not None:
             ball = jnp.clip(ball * model.sensing.clock_rate, 0.0, config.max_observation_latency)
         if by_effect.observation_delay is not None:
@@ -104,12 +105,13 @@ class Task:
         History buffers hold these values.
         """
         batch, dtype = episodes.ball.position.shape[1:], episodes.ball.position.dtype
+        n = self.contract.n_joints
 
         def full(value: float, *leading: int) -> Array:
             return jnp.broadcast_to(jnp.asarray(value, dtype), leading + batch)
 
-        zeros = full(0.0, N_JOINTS)
-        home = jnp.asarray(self.home, dtype).reshape((N_JOINTS,) + (1,) * len(batch))
+        zeros = full(0.0, n)
+        home = jnp.asarray(self.home, dtype).reshape((n,) + (1,) * len(batch))
         home = jnp.broadcast_to(home if episodes.start is None else episodes.start, zeros.shape)
         seen = jnp.concatenate([episodes.ball.position, home])
         zero, false = full(0.0), jnp.broadcast_to(False, batch)
@@ -123,7 +125,7 @@ class Task:
             command=zeros,
             command_acceleration=zeros,
             reference=home,
-            commands=full(0.0, self._action_depth, N_JOINTS),
+            commands=full(0.0, self._action_depth, n),
             observations=jnp.broadcast_to(captured, (self._observation_depth, *captured.shape)),
             controller=controller.start(first),
             drive=drives.at_rest(prepared.drives, home),
@@ -144,8 +146,8 @@ class Task:
                 bad_style=zero,
                 steps=zero,
                 peak_velocity=zeros,
-                observation=full(0.0, N_OBSERVATION),
-                observation_sq=full(0.0, N_OBSERVATION),
+                observation=full(0.0, self.contract.n_observation),
+                observation_sq=full(0.0, self.contract.n_observation),
                 own=tuple(zero for term in self.config.own_terms if term.per == "step"),
             ),
         )
@@ -157,10 +159,11 @@ class Task:
         period = self.config.period
         seen = observation.observe(tick, s, episodes, prepared)
         action, controller_state = controller.act(tick, s.controller, seen)
-        scale = np.asarray(LIMITS.policy_velocity, action.dtype).reshape((-1,) + (1,) * (action.ndim - 1))
+        limits = self.contract.limits
+        scale = np.asarray(limits.policy_velocity, action.dtype).reshape((-1,) + (1,) * (action.ndim - 1))
         # After the contact the robot is only braked: what the real one does before it returns home.
         request = jnp.where(s.live, action * scale, 0.0)
-        command = materialise(limit_velocity(request, s.command, s.reference, period, xp=jnp))
+        command = materialise(limit_velocity(request, s.command, s.reference, period, limits, xp=jnp))
         reference = s.reference + command * period
         commands = latency.ring_write(s.commands, tick, command)
         old = latency.ring_read(commands, tick - prepared.action.periods - 1)
@@ -185,8 +188,8 @@ class Task:
             own_gap=gaps.own,
             blade_gap=gaps.blade,
         )
-        sums = accumulate(s, step, period, controller.mean, closest, self.config.own_terms)
-        ok = jnp.isfinite(sum(qpos[i] for i in range(N_JOINTS)) + sum(ball.position[i] for i in range(3)))
+        sums = accumulate(s, step, period, controller.mean, closest, self.config.own_terms, limits)
+        ok = jnp.isfinite(sum(qpos[i] for i in range(self.contract.n_joints)) + sum(ball.position[i] for i in range(3)))
         return EpisodeState(
             qpos,
             qvel,
@@ -212,8 +215,8 @@ class Task:
         s: EpisodeState,
         episodes: Episodes,
         prepared: Prepared,
-        old: Float[Array, "8 *batch"],
-        new: Float[Array, "8 *batch"],
+        old: Float[Array, "joints *batch"],
+        new: Float[Array, "joints *batch"],
     ) -> tuple[tuple, Float[Array, "captured *batch"]]:
         """Robot and ball through one control period, with what the delayed sensors capture on the way."""
         n, timestep = self.config.substeps, 1.0 / self.config.sim_rate

@@ -20,7 +20,7 @@ from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
 from mjx_tt.env.outgoing_ball import FLOOR
 from mjx_tt.rally.human_player import OVER_TABLE, Incoming
-from robot_io.contract import LIMITS
+from robot_io.contract import LIMITS, JointLimits
 
 LONGEST = 2.5  # [s] that a ball is followed
 HOME_SPEED, HOME_BRAKING = 0.5, 0.3  # shares of the limits on the way home, the defaults of robot_io.control.bridge
@@ -122,9 +122,11 @@ def meeting(
     return jax.lax.while_loop(flying, advance, (0, ball, returned, zero, start))[4]
 
 
-def homeward(home: ArrayLike, qpos: Float[Array, "8 L"], seconds: Float[Array, " L"]) -> Float[Array, "8 L"]:
-    """Joint positions (8, L) ``seconds`` (L,) after the hit, on the way home (8,) as the bridge drives it."""
-    speed, braking = HOME_SPEED * column(LIMITS.policy_velocity), HOME_BRAKING * column(LIMITS.acceleration)
+def homeward(
+    home: ArrayLike, qpos: Float[Array, "joints L"], seconds: Float[Array, " L"], limits: JointLimits = LIMITS
+) -> Float[Array, "joints L"]:
+    """Joint positions (n, L) ``seconds`` (L,) after the hit, on the way home (n,) as the bridge drives it."""
+    speed, braking = HOME_SPEED * column(limits.policy_velocity), HOME_BRAKING * column(limits.acceleration)
     error, driven = column(home) - qpos, jnp.maximum(seconds - HOME_DELAY, 0.0)[None]
     distance = jnp.abs(error)
     # At full speed until the braking distance, then along the parabola b / 2 (T - t)^2 that is left.
@@ -135,6 +137,6 @@ def homeward(home: ArrayLike, qpos: Float[Array, "8 L"], seconds: Float[Array, "
     return qpos + jnp.sign(error) * jnp.clip(moved, 0.0, distance)
 
 
-def column(values: ArrayLike) -> Float[Array, "8 1"]:
-    """Numbers of the joints as (8, 1)."""
+def column(values: ArrayLike) -> Float[Array, "joints 1"]:
+    """Numbers of the joints as (n, 1)."""
     return jnp.asarray(np.asarray(values, np.float32))[:, None]

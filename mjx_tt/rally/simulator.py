@@ -35,7 +35,6 @@ from mjx_tt.rally.end_reasons import End, ending
 from mjx_tt.rally.human_player import Player, PlayerState
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
-from robot_io.contract import LIMITS, N_JOINTS
 
 ENDLESS = 1_000_000  # touches
 FAULT = -2.0  # reward of a robot's fault, the paper's table of rewards
@@ -76,7 +75,7 @@ class RallyState:
     player: PlayerState
     ball: BallState  # (3, L)
     touches: Int[Array, " L"]  # paddle touches of this rally so far, the coming ball's included
-    start: Float[Array, "8 L"]  # joint positions of the robot
+    start: Float[Array, "joints L"]  # joint positions of the robot
     dummy: Bool[Array, " L"]  # the robot stands in the arm's own home pose
 
 
@@ -95,7 +94,7 @@ class ShotResult:
     fault: Bool[Array, " L"]  # the robot stopped itself
     end: Int[Array, " L"]  # End; NONE where the rally goes on
     return_landing: Float[Array, "2 L"]  # [m] where the robot's ball came down, NaN where it hit none
-    robot_peak: Float[Array, "8 L"]  # [m/s], [rad/s]
+    robot_peak: Float[Array, "joints L"]  # [m/s], [rad/s]
     seconds: Float[Array, " L"]  # [s] until the player's next contact, or until the ball was over
 
 
@@ -203,7 +202,7 @@ class RallySimulator:
     def _start_lanes(self, player: Player, model: SimModel, key: PRNGKeyArray, lanes: int) -> RallyState:
         fresh = human_player.fresh((lanes,))
         ball = human_player.first_ball(player, fresh, key, (lanes,))
-        home = jnp.broadcast_to(jnp.asarray(self.task.home, jnp.float32)[:, None], (N_JOINTS, lanes))
+        home = jnp.broadcast_to(jnp.asarray(self.task.home, jnp.float32)[:, None], (self.task.contract.n_joints, lanes))
         return RallyState(fresh, ball, jnp.ones(lanes, jnp.int32), home, jnp.zeros(lanes, bool))
 
     def _turn(
@@ -217,7 +216,7 @@ class RallySimulator:
         max_touches: int = ENDLESS,
     ) -> tuple[RallyState, ShotResult, Int[Array, " L"]]:
         """One ball of every lane. Returns the next state, the result and the paddle touches of each rally so far."""
-        lanes = state.touches.shape[0]
+        lanes, limits = state.touches.shape[0], self.task.contract.limits
         keys = iter(jax.random.split(key, 8))
         ball, first = state.ball, state.touches == 1
         sent = ball_flights.sent(model.ball, ball, self.config.period)
@@ -238,14 +237,14 @@ class RallySimulator:
         answer = human_player.answer(player, state.player, next(keys), met.incoming, model.ball.flight)
         answered = returned & met.reached & answer.hit
         goes_on = answered & (state.touches + 2 <= max_touches)
-        idle = jnp.all(robot.sums.peak_velocity < IDLE * column(LIMITS.policy_velocity), axis=0)
+        idle = jnp.all(robot.sums.peak_velocity < IDLE * column(limits.policy_velocity), axis=0)
         inside = jnp.ones(lanes, bool) if box is None else box.holds(ball, jnp.where(sent.valid, sent.landing, 0.0))
         end = ending(first, sent, outcome, answered, met, blind | idle, inside)
 
         learnt = jax.tree.map(partial(jnp.where, returned & met.reached), answer.state, state.player)
         rested = human_player.rested(player, learnt)
         fresh_ball = human_player.first_ball(player, rested, next(keys), (lanes,))
-        pose = homeward(self.task.home, robot.qpos, met.incoming.seconds)
+        pose = homeward(self.task.home, robot.qpos, met.incoming.seconds, limits)
         after = RallyState(
             player=jax.tree.map(partial(jnp.where, goes_on), learnt, rested),
             ball=where(goes_on, answer.ball, fresh_ball),
@@ -272,7 +271,7 @@ class RallySimulator:
         return after, result, state.touches + hit.astype(jnp.int32)
 
     def _robot(
-        self, key: PRNGKeyArray, policy: Policy, model: SimModel, ball: BallState, start: Float[Array, "8 L"]
+        self, key: PRNGKeyArray, policy: Policy, model: SimModel, ball: BallState, start: Float[Array, "joints L"]
     ) -> EpisodeState:
         """The robot's part of one episode: its last state."""
         episodes = self._episodes(key, model, ball, start)
@@ -289,7 +288,9 @@ class RallySimulator:
 
         return jax.lax.while_loop(running, advance, (jnp.int32(0), task.reset(episodes, controller)))[1]
 
-    def _episodes(self, key: PRNGKeyArray, model: SimModel, ball: BallState, start: Float[Array, "8 L"]) -> Episodes:
+    def _episodes(
+        self, key: PRNGKeyArray, model: SimModel, ball: BallState, start: Float[Array, "joints L"]
+    ) -> Episodes:
         latency_key, seed_key = jax.random.split(key)
         lanes = ball.position.shape[1:]
         longest = jnp.array([self.config.max_observation_latency] * 3 + [self.config.max_action_latency] * 2)[:, None]

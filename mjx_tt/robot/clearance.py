@@ -18,22 +18,14 @@ from jaxtyping import Float
 
 from ballmodel.contact import TABLE, Box, box_gap
 from ballmodel.vec import dot
-from mjx_tt.robot.chain import WORLD, Frame
+from mjx_tt.robot.chain import Frame
 from mjx_tt.robot.kinematics import LinkPose, PaddleKinematics, stack
 from mjx_tt.robot.model import Capsule
 from mjx_tt.robot.scalar_algebra import materialise
+from robot_io.robot_file import RobotFile
 from robot_io.safety.clearance import segment_distance
 
 BISECTIONS = 10  # of a link of 0.3 m: 0.3 mm along it, micrometres in distance
-
-# Pairs that joint limits let touch; neighbours along the arm never separate and are omitted.
-SELF_PAIRS = (
-    ("col_base", ("col_forearm", "col_wrist", "col_blade_axis", "col_blade_cross")),
-    ("col_upper_arm", ("col_wrist", "col_blade_axis", "col_blade_cross")),
-    ("col_beam", ("col_forearm", "col_wrist", "col_blade_axis", "col_blade_cross")),
-)
-TABLE_CAPSULES = ("col_upper_arm", "col_forearm", "col_wrist", "col_blade_axis", "col_blade_cross")
-BLADE_CAPSULES = ("col_blade_axis", "col_blade_cross")
 
 
 def segment_box_distance(
@@ -64,27 +56,28 @@ class Clearances:
 
 
 class CapsuleClearance:
-    """Clearances of one robot."""
+    """Clearances of one robot; ``file`` names the capsules that are watched."""
 
-    def __init__(self, kinematics: PaddleKinematics, capsules: list[Capsule]) -> None:
-        self._kinematics = kinematics
+    def __init__(self, kinematics: PaddleKinematics, capsules: list[Capsule], file: RobotFile) -> None:
+        self._kinematics, self._file = kinematics, file
         self._capsules = {capsule.name: capsule for capsule in capsules}
-        needed = {*TABLE_CAPSULES} | {n for first, others in SELF_PAIRS for n in (first, *others)}
+        needed = {*file.table, *file.blade} | {name for pair in file.pairs for name in pair}
         missing = sorted(needed - self._capsules.keys())
         if missing:
             raise ValueError(f"the model lacks the capsules {missing}; it has {sorted(self._capsules)}")
+        self._watched = needed
 
     def segments(
         self, poses: list[LinkPose], like: Float[jax.Array, "*batch"]
     ) -> dict[str, tuple[Float[jax.Array, "3 *batch"], Float[jax.Array, "3 *batch"]]]:
-        """World end points, each (3, ...), of every capsule by name."""
+        """World end points, each (3, ...), of every watched capsule by name."""
 
         def ends(capsule: Capsule) -> tuple[jax.Array, jax.Array]:
             frame = Frame(capsule.link, np.zeros(3), np.eye(3))
             p0, p1 = (stack(self._kinematics.point(poses, frame, p), like) for p in (capsule.p0, capsule.p1))
             return p0, p1
 
-        return {name: ends(capsule) for name, capsule in self._capsules.items() if capsule.link != WORLD}
+        return {name: ends(capsule) for name, capsule in self._capsules.items() if name in self._watched}
 
     def __call__(self, poses: list[LinkPose], like: Float[jax.Array, "*batch"]) -> Clearances:
         """Clearances from links' world poses (``PaddleKinematics.links``); ``like`` gives the batch shape."""
@@ -97,13 +90,16 @@ class CapsuleClearance:
             radii = np.array([self._capsules[name].radius for name in names], like.dtype)
             return *materialise((p, q)), radii.reshape(-1, *batch)
 
-        p, q, radius = gather(TABLE_CAPSULES)
+        file = self._file
+        p, q, radius = gather(file.table)
         to_table = materialise(segment_box_distance(TABLE, p, q) - radius)
-        p1, q1, radius1 = gather([first for first, others in SELF_PAIRS for _ in others])
-        p2, q2, radius2 = gather([other for _, others in SELF_PAIRS for other in others])
+        blade = _least([to_table[file.table.index(name)] for name in file.blade])
+        if not file.pairs:
+            return Clearances(_least(to_table), jnp.full_like(blade, jnp.inf), blade)
+        p1, q1, radius1 = gather([first for first, _ in file.pairs])
+        p2, q2, radius2 = gather([second for _, second in file.pairs])
         own = segment_distance(p1, q1, p2, q2, xp=jnp) - radius1 - radius2
-        blade = [TABLE_CAPSULES.index(name) for name in BLADE_CAPSULES]
-        return Clearances(_least(to_table), _least(own), _least([to_table[i] for i in blade]))
+        return Clearances(_least(to_table), _least(own), blade)
 
 
 def _least(gaps: jax.Array | list[jax.Array]) -> jax.Array:

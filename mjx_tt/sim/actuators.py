@@ -20,7 +20,9 @@ A model without drives (``SimModel.drives`` None), or an effect that no joint de
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -66,7 +68,7 @@ EFFECTS = tuple(f.name for f in dataclasses.fields(JointDrive))
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DriveParams:
-    """The eight joints' drives, by ``robot_io.contract.JOINT_NAMES``."""
+    """The eight joints' drives, by ``robot_io.contract.JOINT_NAMES``; another robot's: ``drive_params``."""
 
     gantry_x: JointDrive = field(default_factory=JointDrive)
     gantry_y: JointDrive = field(default_factory=JointDrive)
@@ -78,21 +80,31 @@ class DriveParams:
     joint_6: JointDrive = field(default_factory=JointDrive)
 
 
+@functools.cache
+def drive_params(joints: tuple[str, ...]) -> Any:
+    """The class that holds the drives of these joints, as ``DriveParams`` does those of the paper's robot."""
+    if joints == JOINT_NAMES:
+        return DriveParams
+    fields = [(joint, JointDrive, field(default_factory=JointDrive)) for joint in joints]
+    made = dataclasses.make_dataclass("DriveParams", fields, frozen=True)
+    return jax.tree_util.register_dataclass(made, data_fields=list(joints), meta_fields=[])
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Drives:
-    """The same by effect, each (8, ...), None where no joint has it: ready for the loop."""
+    """The same by effect, each (n, ...), None where no joint has it: ready for the loop."""
 
-    action_delay: Float[Array, "8 *batch"] | None
-    observation_delay: Float[Array, "8 *batch"] | None
-    lag: Float[Array, "8 *batch"] | None
-    velocity_gain: Float[Array, "8 *batch"] | None
-    joint_offset: Float[Array, "8 *batch"] | None
-    velocity_limit: Float[Array, "8 *batch"] | None
-    acceleration_limit: Float[Array, "8 *batch"] | None
-    backlash: Float[Array, "8 *batch"] | None
-    coulomb_friction: Float[Array, "8 *batch"] | None
-    deadband: Float[Array, "8 *batch"] | None
+    action_delay: Float[Array, "joints *batch"] | None
+    observation_delay: Float[Array, "joints *batch"] | None
+    lag: Float[Array, "joints *batch"] | None
+    velocity_gain: Float[Array, "joints *batch"] | None
+    joint_offset: Float[Array, "joints *batch"] | None
+    velocity_limit: Float[Array, "joints *batch"] | None
+    acceleration_limit: Float[Array, "joints *batch"] | None
+    backlash: Float[Array, "joints *batch"] | None
+    coulomb_friction: Float[Array, "joints *batch"] | None
+    deadband: Float[Array, "joints *batch"] | None
 
     @property
     def follows(self) -> bool:
@@ -105,16 +117,18 @@ class Drives:
 class DriveState:
     """State of the drives; None where an effect has none."""
 
-    velocity: Float[Array, "8 *batch"] | None  # [m/s], [rad/s] v of steps 6 and 7
-    output: Float[Array, "8 *batch"] | None  # [m], [rad] position behind the play
+    velocity: Float[Array, "joints *batch"] | None  # [m/s], [rad/s] v of steps 6 and 7
+    output: Float[Array, "joints *batch"] | None  # [m], [rad] position behind the play
 
 
-def by_effect(params: DriveParams | None, shape: tuple[int, ...], dtype: DTypeLike) -> Drives:
-    """The drives' numbers as arrays (8, *shape)."""
+def by_effect(
+    params: Any | None, shape: tuple[int, ...], dtype: DTypeLike, joints: tuple[str, ...] = JOINT_NAMES
+) -> Drives:
+    """The numbers of drives, as ``drive_params`` of the joints holds them, as arrays (n, *shape)."""
     nominal = dataclasses.asdict(JointDrive())
 
     def column(effect: str) -> Array | None:
-        values = [getattr(getattr(params, joint), effect) for joint in JOINT_NAMES] if params is not None else [None]
+        values = [getattr(getattr(params, joint), effect) for joint in joints] if params is not None else [None]
         if all(value is None for value in values):
             return None
         return jnp.stack([jnp.broadcast_to(jnp.asarray(value_or(v, nominal[effect]), dtype), shape) for v in values])
@@ -122,13 +136,13 @@ def by_effect(params: DriveParams | None, shape: tuple[int, ...], dtype: DTypeLi
     return Drives(**{effect: column(effect) for effect in EFFECTS})
 
 
-def at_rest(drives: Drives, qpos: Float[Array, "8 *batch"]) -> DriveState:
-    """The drives of a robot that stands at qpos (8, ...), in the middle of every play."""
+def at_rest(drives: Drives, qpos: Float[Array, "joints *batch"]) -> DriveState:
+    """The drives of a robot that stands at qpos (n, ...), in the middle of every play."""
     return DriveState(jnp.zeros_like(qpos) if drives.follows else None, qpos if drives.backlash is not None else None)
 
 
-def reachable(drives: Drives, command: Float[Array, "8 *batch"]) -> Float[Array, "8 *batch"]:
-    """Steps 2 to 5: the velocity (8, ...) that a delayed command (8, ...) asks of the drive in the end."""
+def reachable(drives: Drives, command: Float[Array, "joints *batch"]) -> Float[Array, "joints *batch"]:
+    """Steps 2 to 5: the velocity (n, ...) that a delayed command (n, ...) asks of the drive in the end."""
     u = command
     if drives.deadband is not None:
         u = jnp.where(jnp.abs(u) < drives.deadband, 0.0, u)
@@ -142,9 +156,9 @@ def reachable(drives: Drives, command: Float[Array, "8 *batch"]) -> Float[Array,
 
 
 def follow(
-    drives: Drives, state: DriveState, u: Float[Array, "8 *batch"], timestep: float
-) -> tuple[Float[Array, "8 *batch"], DriveState]:
-    """Steps 6 and 7 over one substep [s] of constant u (8, ...): the mean velocity in it, and the state at its end.
+    drives: Drives, state: DriveState, u: Float[Array, "joints *batch"], timestep: float
+) -> tuple[Float[Array, "joints *batch"], DriveState]:
+    """Steps 6 and 7 over one substep [s] of constant u (n, ...): the mean velocity in it, and the state at its end.
 
     As long as the lag asks for more than the acceleration limit a, v moves at a; that ends at |u - v| = a lag, and from
     there on the difference decays exponentially. The servo gets the mean, with which its way is exact.
@@ -170,11 +184,11 @@ def follow(
 def carry(
     drives: Drives,
     state: DriveState,
-    qpos: Float[Array, "8 *batch"],
-    qvel: Float[Array, "8 *batch"],
+    qpos: Float[Array, "joints *batch"],
+    qvel: Float[Array, "joints *batch"],
     timestep: float,
-) -> tuple[Float[Array, "8 *batch"], Float[Array, "8 *batch"], DriveState]:
-    """Step 9 over one substep: position and velocity (8, ...) of what the joints carry, and the state.
+) -> tuple[Float[Array, "joints *batch"], Float[Array, "joints *batch"], DriveState]:
+    """Step 9 over one substep: position and velocity (n, ...) of what the joints carry, and the state.
 
     qpos, qvel: of the joints at the substep's end.
     """

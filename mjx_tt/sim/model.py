@@ -31,11 +31,12 @@ from ballmodel.flight import BallParams, ball_params
 from ballmodel.io import yaml as yaml_file
 from ballmodel.io.atomic_files import replacing
 from mjx_tt.sim import bounds, randomisation
-from mjx_tt.sim.actuators import DriveParams
+from mjx_tt.sim.actuators import drive_params
 from mjx_tt.sim.randomisation import Randomised
 from mjx_tt.sim.randomisation import Range as Range
 from mjx_tt.sim.randomisation import Samples as Samples
 from mjx_tt.sim.sensors import SensingParams as SensingParams
+from robot_io.contract import JOINT_NAMES
 
 
 @jax.tree_util.register_dataclass
@@ -97,7 +98,8 @@ def _ball() -> BallParams:
 class SimModel:
     """The simulation's parameters; the paper's drag-only ball, integrated to second order.
 
-    ``drives`` None is the nominal robot; its paths, such as drives.joint_2.lag, exist all the same.
+    ``drives`` None is the nominal robot; its paths, such as drives.joint_2.lag, exist all the same. ``joints`` are
+    those that have drives, by default the paper's robot's.
     """
 
     ball: BallParams = field(default_factory=_ball)
@@ -105,7 +107,8 @@ class SimModel:
     latency: LatencyParams = field(default_factory=LatencyParams)
     sensing: SensingParams = field(default_factory=SensingParams)
     actuation: ActuationParams = field(default_factory=ActuationParams)
-    drives: DriveParams | None = None
+    drives: Any | None = None  # as ``actuators.drive_params`` of the joints makes them
+    joints: tuple[str, ...] = field(default=JOINT_NAMES, metadata={"static": True})
 
 
 class _Dumper(yaml.SafeDumper):
@@ -124,10 +127,13 @@ class ModelFile:
     provenance: dict = field(default_factory=dict)
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> ModelFile:
-        """Reads a model YAML. Raises ValueError naming file, key, what was given and what is allowed."""
+    def load(cls, path: str | os.PathLike, nominal: SimModel | None = None) -> ModelFile:
+        """Reads a model YAML; ``nominal``, by default the paper's robot's, has what it leaves out.
+
+        Raises ValueError naming file, key, what was given and what is allowed.
+        """
         data = randomisation.with_content(yaml_file.read(path), Path(path).parent)
-        return from_dict(data or {}, str(path))
+        return from_dict(data or {}, str(path), nominal)
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes parameters, ranges and provenance, whole or not at all. Drives only if the model has them."""
@@ -150,9 +156,9 @@ def paths(node: Any = None, prefix: str = "") -> dict[str, Any]:
     """Every leaf of a SimModel by its dotted path; of the nominal model by default. Absent drives are nominal ones."""
     node = SimModel() if node is None else node
     if isinstance(node, SimModel) and node.drives is None:
-        node = dataclasses.replace(node, drives=DriveParams())
+        node = dataclasses.replace(node, drives=drive_params(node.joints)())
     leaves: dict[str, Any] = {}
-    for f in dataclasses.fields(node):
+    for f in _parameters(node):
         value = getattr(node, f.name)
         if dataclasses.is_dataclass(value):
             leaves |= paths(value, f"{prefix}{f.name}.")
@@ -166,18 +172,23 @@ def with_values(model: SimModel, values: Mapping[str, Any]) -> SimModel:
 
     Raises ValueError for a path that does not exist.
     """
-    known = paths()
+    known = paths(SimModel(joints=model.joints))
     for path in values:
         if path not in known:
             raise ValueError(f"unknown parameter {path!r}{nearest(path, known)}")
     if model.drives is None and any(path.startswith("drives.") for path in values):
-        model = dataclasses.replace(model, drives=DriveParams())
+        model = dataclasses.replace(model, drives=drive_params(model.joints)())
     return _with_values(model, values)
+
+
+def _parameters(node: Any) -> list[dataclasses.Field]:
+    """The fields that hold numbers or groups of them."""
+    return [f for f in dataclasses.fields(node) if not f.metadata.get("static")]
 
 
 def _with_values(node: Any, values: Mapping[str, Any]) -> Any:
     changed = {}
-    for f in dataclasses.fields(node):
+    for f in _parameters(node):
         inner = {k.removeprefix(f.name + "."): v for k, v in values.items() if k.startswith(f.name + ".")}
         if inner:
             changed[f.name] = _with_values(getattr(node, f.name), inner)
@@ -215,13 +226,14 @@ def nearest(name: str, known: Collection[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}"
 
 
-def from_dict(data: Any, where: str) -> ModelFile:
-    """A ModelFile from parsed YAML; ``where`` names its origin in errors."""
+def from_dict(data: Any, where: str, nominal: SimModel | None = None) -> ModelFile:
+    """A ModelFile from parsed YAML; ``where`` names its origin in errors, ``nominal`` has what the YAML leaves out."""
+    nominal = SimModel() if nominal is None else nominal
     if not isinstance(data, dict):
         raise ValueError(f"{where}: a model is a mapping of parameter groups, got {type(data).__name__}")
     data = dict(data)
     ranges, provenance = (_mapping(data.pop(key, None), f"{where}: {key}") for key in ("randomise", "provenance"))
-    known = paths()
+    known = paths(nominal)
     values = {}
     for path, value in _flatten(data, where, known):
         if isinstance(known[path], str):
@@ -237,7 +249,7 @@ def from_dict(data: Any, where: str) -> ModelFile:
         return str(path)
 
     parsed = randomisation.parse(ranges, f"{where}: randomise", parameter, _number)
-    return ModelFile(with_values(SimModel(), values), parsed, provenance)
+    return ModelFile(with_values(nominal, values), parsed, provenance)
 
 
 def _flatten(data: dict, where: str, known: Collection[str], prefix: str = "") -> Iterator[tuple[str, Any]]:

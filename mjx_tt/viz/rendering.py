@@ -57,14 +57,21 @@ class Moment:
     caption: Caption | None = None
 
 
-def render_png(path: str | os.PathLike, moment: Moment, camera: str = CAMERA, size: tuple[int, int] = SIZE) -> None:
+def render_png(
+    path: str | os.PathLike,
+    moment: Moment,
+    camera: str = CAMERA,
+    size: tuple[int, int] = SIZE,
+    model: mujoco.MjModel | None = None,
+) -> None:
     """Writes one picture.
 
-    camera: one of ``camera_names()``; size: (width, height) in pixels.
+    camera: one of ``camera_names()``; size: (width, height) in pixels; model: a robot at the table, the paper's by
+    default.
     Raises ValueError for a wrong shape, camera or suffix, RuntimeError when no OpenGL back end works.
     """
     path = _checked_path(path, (".png",))
-    (frame,) = render_frames([moment], camera, size)
+    (frame,) = render_frames([moment], camera, size, model)
     with _replacing(path) as temporary:
         Image.fromarray(frame).save(temporary)
 
@@ -75,6 +82,7 @@ def render_video(
     fps: float,
     camera: str = CAMERA,
     size: tuple[int, int] = SIZE,
+    model: mujoco.MjModel | None = None,
 ) -> None:
     """Writes a video of moments ``1 / fps`` apart. The suffix chooses the format: .mp4 (H.264) or .gif.
 
@@ -87,19 +95,22 @@ def render_video(
         raise ValueError(f"H.264 needs an even width and height, got {size}")
     if path.suffix == ".gif" and fps * _GIF_MIN_DELAY > 1.0 + 1e-9:
         raise ValueError(f"viewers show a GIF at {1.0 / _GIF_MIN_DELAY:.0f} frames per second at most, got fps {fps}")
-    frames = render_frames(moments, camera, size)
+    frames = render_frames(moments, camera, size, model)
     with _replacing(path) as temporary:
         (_write_gif if path.suffix == ".gif" else _write_mp4)(temporary, frames, fps)
 
 
 def render_frames(
-    moments: Iterable[Moment], camera: str = CAMERA, size: tuple[int, int] = SIZE
+    moments: Iterable[Moment],
+    camera: str = CAMERA,
+    size: tuple[int, int] = SIZE,
+    model: mujoco.MjModel | None = None,
 ) -> Iterator[np.ndarray]:
     """Pictures (height, width, 3) uint8 of moments.
 
     Raises ValueError for a wrong shape or camera, RuntimeError when no OpenGL back end works.
     """
-    model = load_model()
+    model = load_model() if model is None else model
     checked = [_checked_moment(moment, model.nq) for moment in moments]
     if camera not in (names := camera_names(model)):
         raise ValueError(f"the scene has no camera {camera!r}; it has {names}")

@@ -21,7 +21,6 @@ from time import perf_counter
 
 import numpy as np
 
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, LIMITS, N_JOINTS
 from robot_io.control.commissioning import jog
 from robot_io.control.commissioning.homing import check_homing, towards
 from robot_io.control.episode import Episode, EpisodeSummary
@@ -50,7 +49,7 @@ from robot_io.log.messages import (
     json_text,
 )
 from robot_io.log.recorder import NullRecorder, SessionRecorder
-from robot_io.safety.clearance import BLADE, RobotGeometry
+from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.faults import Cause
 from robot_io.safety.gate import GateState, SafetyGate
 
@@ -81,9 +80,10 @@ class Bridge:
         on_rally: Callable[[RallySummary], None] | None = None,
     ) -> None:
         self.arm_session, self.axes, self.tracker, self.gate = arm, axes, tracker, gate
-        self.config = config
+        self.config, contract = config, config.contract
+        self._axes_rows, self._arm_rows = list(contract.carrying), list(contract.arm)
         self.recorder = recorder or NullRecorder()
-        self.play = Play(self._log, on_episode, on_rally, config.box)
+        self.play = Play(self._log, on_episode, on_rally, config.box, config.contract.limits)
         self.counts = self.play.counts
         self._policy, self.policy_version = policy, 0
         self._geometry: RobotGeometry = gate.geometry
@@ -93,10 +93,11 @@ class Bridge:
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
         self._axes_received = self._tick_time = self._last_tick = -math.inf
-        self._start = np.full(N_JOINTS, np.nan)  # reference at the start of the period
-        self._policy_limit = np.array(LIMITS.policy_velocity)
+        self._start = np.full(contract.n_joints, np.nan)  # reference at the start of the period
+        self._zeros = np.zeros(contract.n_joints)
+        self._policy_limit = np.array(contract.limits.policy_velocity)
         self._home_speed = (jog.SPEED if config.jog else config.home_speed) * self._policy_limit
-        self._home_braking = config.home_braking * np.array(LIMITS.acceleration)
+        self._home_braking = config.home_braking * np.array(contract.limits.acceleration)
         self._logged_faults = self._clock_windows = 0
         self.unlogged = 0  # records that could not be logged
         self._reported_unlogged = 0
@@ -115,7 +116,7 @@ class Bridge:
     @property
     def measured(self) -> np.ndarray:
         """Newest positions (8,); NaN for what has not reported."""
-        return joints(self.feedback)[0]
+        return joints(self.feedback, self.config.contract)[0]
 
     @property
     def at_home(self) -> bool:
@@ -140,7 +141,7 @@ class Bridge:
                 raise RefusedError(f"not armed: {what}: {problem}")
         if self.tracker.received is None or now - self.tracker.received > 0.5:
             raise RefusedError("not armed: the ball tracker is silent: start it, and check its address and clock")
-        measured, velocity = joints(self.feedback)
+        measured, velocity = joints(self.feedback, self.config.contract)
         self.gate.arm(measured, now, velocity)
         self._arm_session_id = self.arm_session.session_id
         self._arm_restarted = self._been_home = False
@@ -179,7 +180,7 @@ class Bridge:
         """
         if self.state not in (BridgeState.DISARMED, BridgeState.FAULT) or not self.gate.at_rest:
             raise RefusedError(f"axes not homed: the state is {self.state.value}; stop the robot first")
-        check_homing(self._geometry, self.measured)
+        check_homing(self._geometry, self.measured, self.config.contract)
 
     def estop(self, pressed: bool, now: float) -> None:
         """Tells the state of the emergency stop."""
@@ -212,7 +213,7 @@ class Bridge:
         feedback = self.arm_session.feedback
         if feedback is None:
             return None
-        hold = feedback.position, np.zeros(len(ABB_JOINTS))
+        hold = feedback.position, np.zeros_like(feedback.position)
         with self._guarded(now):
             position, velocity = self._arm_reference(feedback, now) or hold
             return self.arm_session.reply(position, velocity, now)
@@ -223,14 +224,14 @@ class Bridge:
     def _arm_reference(self, feedback: ArmFeedback, now: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Position (6,) and velocity (6,) for the arm at ``now``; None: hold the measured place."""
         if self.feedback.arm.add(feedback.received, feedback.position, feedback.time):
-            position, velocity = joints(self.feedback)
+            position, velocity = joints(self.feedback, self.config.contract)
             self._log(Joints(feedback.received, position, velocity))
         # Where the old reference would lead a controller that was started anew, nobody has asked for.
         self._arm_restarted |= feedback.sequence < self._arm_sequence
         self._arm_sequence = feedback.sequence
         if self.gate.state is GateState.DISARMED or self._arm_restarted or not np.isfinite(self._start).all():
             return None
-        rows = list(ABB_JOINTS)
+        rows = self._arm_rows
         velocity = self.gate.velocity[rows]
         # A tick that is overdue must not let the reference run away.
         since = min(max(now - self._tick_time, 0.0), 2.0 * self.gate.period)
@@ -262,16 +263,16 @@ class Bridge:
         axes, arm = self.feedback.axes.at(time), self.feedback.arm.at(time)
         if axes is None or arm is None:
             return np.full(3, np.inf)
-        return self._geometry.middle(BLADE, np.concatenate([axes, arm]))
+        return self._geometry.middle(self._geometry.tip, np.concatenate([axes, arm]))
 
     # The control tick
 
     def tick(self, deadline: float, now: float) -> np.ndarray:
         """One control period: observe, decide, pass the gate, hand over to the devices; the sent velocity (8,)."""
-        self.counts.ticks, self.policy_seconds, request = self.counts.ticks + 1, 0.0, np.zeros(N_JOINTS)
-        measured, measured_velocity = np.full(N_JOINTS, np.nan), np.zeros(N_JOINTS)
+        self.counts.ticks, self.policy_seconds, request = self.counts.ticks + 1, 0.0, self._zeros
+        measured, measured_velocity = np.full_like(self._zeros, np.nan), self._zeros
         with self._guarded(now):
-            measured, measured_velocity = joints(self.feedback)
+            measured, measured_velocity = joints(self.feedback, self.config.contract)
             self.play.moved(measured_velocity)
             request = self._decide(now)
         sent = self.gate.command(request, measured, measured_velocity, now)
@@ -279,8 +280,7 @@ class Bridge:
         self._tick_time = now
         with self._guarded(now):
             if self.gate.engaged:
-                festo = list(FESTO_JOINTS)
-                self.axes.command(self._start[festo], sent.velocity[festo], now)
+                self.axes.command(self._start[self._axes_rows], sent.velocity[self._axes_rows], now)
         with self._guarded(now):
             self._after(now)
         with self._guarded(now):
@@ -309,7 +309,7 @@ class Bridge:
         if self.state is BridgeState.ACTIVE:
             return self._ask_policy(now, self.play.episode, self._policy)
         way = self._home, self.gate.reference, self._home_speed, self._home_braking, self.gate.period
-        return towards(*way) if self.state is BridgeState.READY else np.zeros(N_JOINTS)
+        return towards(*way) if self.state is BridgeState.READY else self._zeros.copy()
 
     def _ages(self, now: float) -> dict[str, float]:
         arm, seen = self.arm_session.feedback, self.tracker.received
@@ -343,20 +343,20 @@ class Bridge:
         """The policy's request (8,)."""
         if episode is None or policy is None:
             self.gate.fault(Cause.INTERNAL, "neither ball nor policy to play", now)
-            return np.zeros(N_JOINTS)
+            return self._zeros.copy()
         observation = observe(self.feedback, self.config.delays, now, self.config.base)
         if observation is None:
             if self.feedback.ball.at(now - self.config.delays.ball) is None:
                 episode.over = True  # frames come, as the gate has checked, but the ball is out of sight
             else:
                 self.gate.fault(Cause.INTERNAL, "no joint positions to observe while a ball is in play", now)
-            return np.zeros(N_JOINTS)
+            return self._zeros.copy()
         began = perf_counter()
         try:
             action = action_of(policy, observation)
         except Exception as error:  # whatever a policy does, the robot is braked
             self.gate.fault(Cause.MALFORMED_COMMAND, f"the policy failed: {type(error).__name__}: {error}", now)
-            return np.zeros(N_JOINTS)
+            return self._zeros.copy()
         self.policy_seconds = perf_counter() - began
         episode.steps += 1
         self._log(Observation(self.counts.ticks, now, observation), Action(self.counts.ticks, now, action))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from robot_io.calibrated import RANGES as CALIBRATION_RANGES
 from robot_io.calibrated import Calibration
-from robot_io.contract import CONTROL_RATE, FESTO_JOINTS, LIMITS
+from robot_io.contract import CONTROL_RATE, FESTO_JOINTS, LIMITS, N_JOINTS, JointLimits
 from robot_io.control.observation import LONGEST_DELAY, ObservationDelays
 from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
@@ -138,6 +138,8 @@ class RobotConfig:
         for i, axis in enumerate(self.axes):
             if axis.direction not in (-1, 1):
                 raise ValueError(f"axes[{i}].direction is {axis.direction}, allowed are 1 and -1")
+        if len(self.safety.still) != N_JOINTS:
+            raise ValueError(f"safety.still has {len(self.safety.still)} numbers, allowed are {N_JOINTS}")
         for i in FESTO_JOINTS:
             if self.safety.following_error[i] > 0.1:
                 raise ValueError(
@@ -159,10 +161,10 @@ class RobotConfig:
                 raise ValueError(f"{path} is {value!r}, allowed is an IPv4 address such as 192.168.125.1") from None
 
 
-def axis_range(i: int, safety: SafetyConfig) -> tuple[float, float]:
+def axis_range(i: int, safety: SafetyConfig, limits: JointLimits = LIMITS) -> tuple[float, float]:
     """Range [m] that is ever commanded to linear axis ``i``: the gate's, so that no drive goes beyond it by itself."""
-    room = max(LIMITS.margin[i], safety.overshoot[i])
-    return LIMITS.lower[i] + room, LIMITS.upper[i] - room
+    room = max(limits.margin[i], safety.overshoot[i])
+    return limits.lower[i] + room, limits.upper[i] - room
 
 
 def linear_axes(config: RobotConfig) -> FestoAxes:

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from robot_io.calibrated import Frame
-from robot_io.contract import N_JOINTS
+from robot_io.contract import PAPER, Contract
 from robot_io.control.observation import HERE, ObservationDelays
 from robot_io.control.rally import Box
 
@@ -31,10 +31,11 @@ class Policy(Protocol):
 
 
 def action_of(policy: Policy, observation: np.ndarray) -> np.ndarray:
-    """The policy's answer (8,). Raises ValueError for another shape, and whatever the policy raises."""
+    """The policy's answer (n,). Raises ValueError for another shape, and whatever the policy raises."""
     action = np.asarray(policy.step(observation), float)
-    if action.shape != (N_JOINTS,):
-        raise ValueError(f"an action of shape {action.shape}, needed is ({N_JOINTS},)")
+    joints = observation.shape[0] - 3
+    if action.shape != (joints,):
+        raise ValueError(f"an action of shape {action.shape}, needed is ({joints},)")
     return action
 
 
@@ -59,6 +60,7 @@ class BridgeConfig:
     box              what the policy was trained for; None: no ball is out of distribution
     base             where the robot stands, from where the model has it
     jog              once armed it stays where it is, takes no balls and moves as ``jog`` asks
+    contract         of the robot
     """
 
     delays: ObservationDelays = ObservationDelays()
@@ -68,6 +70,7 @@ class BridgeConfig:
     box: Box | None = None
     base: Frame = HERE
     jog: bool = False
+    contract: Contract = PAPER
 
 
 STANDARD_PLAY = BridgeConfig()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robot_io.calibrated import Frame
-from robot_io.contract import N_JOINTS
+from robot_io.contract import PAPER, Contract
 from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.history import History
 
@@ -55,10 +55,11 @@ def observe(feedback: Feedback, delays: ObservationDelays, now: float, base: Fra
     return None if ball is None or axes is None or arm is None else np.concatenate([base.inward(ball), axes, arm])
 
 
-def joints(feedback: Feedback) -> tuple[np.ndarray, np.ndarray]:
-    """Newest joint positions and velocities (8,); NaN and zero for what has not reported, zero under three samples."""
-    position, velocity = np.full(N_JOINTS, np.nan), np.zeros(N_JOINTS)
-    for history, rows in ((feedback.axes, slice(0, 2)), (feedback.arm, slice(2, 8))):
+def joints(feedback: Feedback, contract: Contract = PAPER) -> tuple[np.ndarray, np.ndarray]:
+    """Newest joint positions and velocities (n,); NaN and zero for what has not reported, zero under three samples."""
+    n, axes = contract.n_joints, len(contract.carrying)
+    position, velocity = np.full(n, np.nan), np.zeros(n)
+    for history, rows in ((feedback.axes, slice(0, axes)), (feedback.arm, slice(axes, n))):
         if history.newest is not None:
             position[rows] = history.newest[1]
             slope = history.slope(SPEED_SPAN, SPEED_SAMPLES)

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from robot_io.contract import LIMITS
+from robot_io.contract import LIMITS, JointLimits
 from robot_io.control.episode import Episode, EpisodeSummary
 from robot_io.control.rally import Box, RallyCounter, RallyCounts, RallySummary
 from robot_io.control.strokes import Seen, Strokes, in_play
@@ -35,6 +35,7 @@ class Play:
     log         takes records
     on_episode  called with every EpisodeSummary as soon as its outcome is known, on_rally with every RallySummary
     box         what the policy was trained for, None: nothing is out of distribution
+    limits      of the robot
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class Play:
         on_episode: Callable[[EpisodeSummary], None] | None,
         on_rally: Callable[[RallySummary], None] | None,
         box: Box | None = None,
+        limits: JointLimits = LIMITS,
     ) -> None:
         self._log, self._on_episode, self._on_rally = log, on_episode, on_rally
         self._rallies = RallyCounter(self._rally_over, box)
@@ -52,7 +54,7 @@ class Play:
         self._waiting: deque[Episode] = deque()  # policy's part over, outcome open
         self._tracks: dict[int, list[tuple[float, ...]]] = {}  # incoming samples by episode
         self._taken = 0  # number of the newest stroke that was played, or is not going to be
-        self._slow = IDLE * np.array(LIMITS.policy_velocity)
+        self._slow = IDLE * np.array(limits.policy_velocity)
         self._now = 0.0
 
     @property

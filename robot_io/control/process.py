@@ -21,7 +21,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from robot_io import log
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_OBSERVATION, n_parameters
+from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_OBSERVATION, PAPER, n_parameters
 from robot_io.control import messages, realtime
 from robot_io.control.bridge import Bridge, BridgeConfig
 from robot_io.control.bridge import Policy as StepPolicy
@@ -107,6 +107,11 @@ class Control:
             chosen = Policy(np.zeros(n_parameters()), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION))
             self._backend, self._computed = "numpy", "no policy given: at play the robot stands still"
         else:
+            if loaded.contract != PAPER:
+                other = loaded.contract.robot
+                raise RefusedError(
+                    f"{options.artefact}: is of {other}; the control process knows the paper's robot only"
+                )
             chosen = loaded.policy
             self._backend, self._computed = choose(options.backend, chosen)
         policy = make_policy(self._backend, chosen)

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from robot_io.contract import ABB_JOINTS, LIMITS
+from robot_io.contract import ABB_JOINTS, LIMITS, PAPER, Contract
 from robot_io.devices.egm.messages import N_ARM_JOINTS, EgmError, decode_sensor, encode_robot
 
 EVENTS_KEPT = 1000
@@ -60,10 +60,12 @@ class ArmParams:
     stream_always: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("stop_deceleration", "lower", "upper", "max_speed"):
-            values = getattr(self, name)
-            if len(values) != N_ARM_JOINTS or not np.isfinite(values).all():
-                raise ValueError(f"ArmParams.{name} is {values}, allowed are {N_ARM_JOINTS} finite numbers")
+        each = {name: getattr(self, name) for name in ("stop_deceleration", "lower", "upper", "max_speed")}
+        lengths = {len(values) for values in each.values()}
+        count = N_ARM_JOINTS if N_ARM_JOINTS in lengths else min(lengths)
+        for name, values in each.items():
+            if len(values) != count or not np.isfinite(values).all():
+                raise ValueError(f"ArmParams.{name} is {values}, allowed are {count} finite numbers")
         for name in ("cycle", "low_pass", "comm_timeout", "queue_length"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"ArmParams.{name} {getattr(self, name)} must be positive")
@@ -76,6 +78,18 @@ class ArmParams:
             raise ValueError(
                 f"ArmParams.lower is {self.lower}, allowed is less than upper, {self.upper}, in each joint"
             )
+
+
+def for_robot(params: ArmParams, contract: Contract) -> ArmParams:
+    """The same controller with the joints of another robot's arm; it stops them as fast as they may accelerate."""
+    if contract == PAPER:
+        return params
+    limits = contract.limits
+    deceleration, lower, upper, speed = (
+        tuple(values[i] for i in contract.arm)
+        for values in (limits.acceleration, limits.lower, limits.upper, limits.velocity)
+    )
+    return replace(params, stop_deceleration=deceleration, lower=lower, upper=upper, max_speed=speed)
 
 
 @dataclass(frozen=True)
@@ -126,7 +140,7 @@ class ArmController:
         self._history: deque[tuple[float, np.ndarray]] = deque()  # measured positions, back to feedback_delay ago
         self._sequence = 0
         self._now: float | None = None
-        self._velocity = np.zeros(N_ARM_JOINTS)
+        self._velocity: np.ndarray = np.zeros(len(params.lower))
         self._reference: _Reference | None = None  # while EGM runs, from the first step on
         self._last_message = 0.0
         self._deceleration = np.array(params.stop_deceleration)
@@ -189,7 +203,7 @@ class ArmController:
         if not self.egm_is_running:
             return self._refuse("not_running")
         try:
-            message = decode_sensor(datagram)
+            message = decode_sensor(datagram, len(self.params.lower))
         except EgmError as error:
             return self._refuse(error.reason)
         outside = (message.position < self._lower) | (message.position > self._upper)
@@ -213,8 +227,9 @@ class ArmController:
         Returns the velocity (6,) [rad/s] for the drives until the next cycle, and the EgmRobot datagram for ``client``.
         """
         position, velocity = (np.array(x, np.float64) for x in (position, velocity))
-        if position.shape != (N_ARM_JOINTS,) or velocity.shape != position.shape:
-            raise ValueError(f"position and velocity must be ({N_ARM_JOINTS},), got {position.shape}, {velocity.shape}")
+        if position.shape != self._lower.shape or velocity.shape != position.shape:
+            needed = self._lower.shape
+            raise ValueError(f"position and velocity must be {needed}, got {position.shape}, {velocity.shape}")
         if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
             raise ValueError(f"the arm's state has a non-finite number: position {position}, velocity {velocity}")
         if self._now is not None and not now > self._now:
@@ -312,8 +327,8 @@ class _Reference:
         self.target = position  # (6,) [rad]
         self._decay = 2.0 * math.pi * params.low_pass
         self._time = now
-        self._input = np.zeros(N_ARM_JOINTS)
-        self._filtered = np.zeros(N_ARM_JOINTS)
+        self._input: np.ndarray = np.zeros_like(position)
+        self._filtered: np.ndarray = np.zeros_like(position)
         self._coming: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
 
     def push(self, due: float, speed: np.ndarray, target: np.ndarray) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from robot_io.calibrated import UNCALIBRATED, Calibration
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_JOINTS
+from robot_io.contract import PAPER
 from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState, Policy
 from robot_io.control.config import PROFILES, axis_range
 from robot_io.control.episode import EpisodeSummary
@@ -23,8 +23,9 @@ from robot_io.control.interfaces import STANDARD_PLAY
 from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.festo import Axis, DirectLink, FestoAxes
+from robot_io.devices.fixed_base import FixedBase
 from robot_io.devices.tracker import Tracker, TrackerConfig
-from robot_io.emulator.arm import ArmController, ArmStateError
+from robot_io.emulator.arm import ArmController, ArmStateError, for_robot
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams
 from robot_io.emulator.network import Network
@@ -49,6 +50,7 @@ class LockStep:
     balls   what is thrown, from ball number ``first`` on, or who plays rallies
     world   one to use again, which is reset: making it takes a while
     tracker, calibration  what the bridge knows of the installation
+    config  of the bridge; its contract says which joints arm and axes have
     """
 
     def __init__(
@@ -65,28 +67,28 @@ class LockStep:
         tracker: TrackerConfig = SAME_CLOCK,
         calibration: Calibration = UNCALIBRATED,
     ) -> None:
-        self.params = params
-        self.world = world or World(scene, params.world)
+        self.params, contract = params, config.contract
+        self._contract = contract
+        safety = safety or SafetyConfig.of(contract)
+        self.world = world or World(scene, params.world, contract)
         self.world.reset()
         arm_params = replace(params.arm, dead_time=params.arm.dead_time + params.action_delay)
-        self.arm = ArmController(BRIDGE, arm_params)
+        self.arm = ArmController(BRIDGE, for_robot(arm_params, contract))
         dead_time = params.axis_dead_time + params.action_delay
         self.emulators = [
             AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)
-            for _ in FESTO_JOINTS
+            for _ in contract.carrying
         ]
-        self.axes = FestoAxes(
-            [
-                Axis(
-                    name,
-                    DirectLink(emulator),
-                    PROFILES[params.axis_profile](),
-                    *axis_range(i, safety or SafetyConfig()),
-                )
-                for i, (name, emulator) in enumerate(zip(("gantry_x", "gantry_y"), self.emulators, strict=True))
-            ],
-            AXES_CONFIG,
-        )
+        axes = [
+            Axis(
+                contract.joints[i],
+                DirectLink(emulator),
+                PROFILES[params.axis_profile](),
+                *axis_range(i, safety, contract.limits),
+            )
+            for i, emulator in zip(contract.carrying, self.emulators, strict=True)
+        ]
+        self.axes: FestoAxes | FixedBase = FestoAxes(axes, AXES_CONFIG) if axes else FixedBase()
         seed = np.random.SeedSequence([params.seed, first]).generate_state(4)
         self.cameras = TrackerEmulator(params.tracker, int(seed[0]), params.hidden)
         self._to_bridge = Network(params.arm_network, int(seed[1]))
@@ -97,12 +99,13 @@ class LockStep:
         self.rallies: list[RallySummary] = []
         self.track = np.zeros((0, 4))  # t [s], x, y, z [m] of the newest ball with an outcome, on its way to the robot
         found = calibration.robot
-        session = EgmSession(EgmConfig(controller_address=CONTROLLER[0], zeros=found.joint_zeros))
+        zeros = found.joint_zeros if contract == PAPER else (0.0,) * len(contract.arm)
+        session = EgmSession(EgmConfig(controller_address=CONTROLLER[0], zeros=zeros))
         self.bridge = Bridge(
             session,
             self.axes,
             Tracker(tracker, calibration),
-            SafetyGate(geometry=RobotGeometry.load().moved(found.base), config=safety),
+            SafetyGate(contract.limits, geometry=RobotGeometry.of(contract).moved(found.base), config=safety),
             policy,
             replace(config, base=found.base),
             recorder,
@@ -110,7 +113,7 @@ class LockStep:
             self.rallies.append,
         )
         self._clock = 0
-        self._setpoint = np.zeros(N_JOINTS)
+        self._setpoint = np.zeros(contract.n_joints)
         self.throwing = False
         self.bridge_alive = self.arm_connected = True
 
@@ -146,10 +149,10 @@ class LockStep:
 
     def _devices(self, now: float) -> None:
         qpos, qvel = self.world.qpos, self.world.qvel
-        abb = list(ABB_JOINTS)
+        abb = list(self._contract.arm)
         speed, datagram = self.arm.step(now, self.params.hidden.counted(qpos[abb]), qvel[abb])
         self._setpoint[abb] = speed
-        for i, emulator in zip(FESTO_JOINTS, self.emulators, strict=True):
+        for i, emulator in zip(self._contract.carrying, self.emulators, strict=True):
             self._setpoint[i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
         if datagram is not None and self.arm_connected:
             self._to_bridge.send(datagram, now)

@@ -27,7 +27,7 @@ from ballmodel.constants import (
     TABLE_FRICTION,
     TABLE_RESTITUTION,
 )
-from robot_io.contract import ABB_JOINTS, JOINT_NAMES
+from robot_io.contract import PAPER, Contract
 
 SHELL_INERTIA = SHELL_INERTIA_FACTOR * BALL_MASS * BALL_RADIUS**2
 SOLIMP = [0.95, 0.95, 0.001, 0.5, 2.0]  # the same impedance at any depth: a linear spring
@@ -71,12 +71,13 @@ class WorldParams:
 class World:
     """Robot and ball; positions in the table frame, SI units."""
 
-    def __init__(self, scene: str | Path, params: WorldParams | None = None) -> None:
+    def __init__(self, scene: str | Path, params: WorldParams | None = None, contract: Contract = PAPER) -> None:
+        self._arm = list(contract.arm)
         self.params = params or WorldParams()
         robot = mujoco.MjModel.from_xml_path(str(scene))
         self.model = _model(str(scene), robot, self.params)
         self.data = mujoco.MjData(self.model)
-        joint = [self.model.joint(name) for name in JOINT_NAMES]
+        joint = [self.model.joint(name) for name in contract.joints]
         self._q = np.array([j.qposadr[0] for j in joint])
         self._v = np.array([j.dofadr[0] for j in joint])
         free = self.model.joint("ball_free")
@@ -84,7 +85,7 @@ class World:
         self._ball_body = self.model.body("ball").id
         self._ball_geom, self._paddle_geom = self.model.geom("ball").id, self.model.geom("rig_paddle").id
         self._site = self.model.site("paddle").id
-        self.home = robot.key("home").qpos[[robot.joint(name).qposadr[0] for name in JOINT_NAMES]].copy()
+        self.home = robot.key("home").qpos[[robot.joint(name).qposadr[0] for name in contract.joints]].copy()
         self.in_play = False
         self.number = self.strokes = 0  # of the ball in play, of the human
         self._touching: set[int] = set()  # geoms
@@ -155,7 +156,7 @@ class World:
 
     def jog(self) -> None:
         """Puts the arm to its home pose, as somebody does with the controller's own pendant."""
-        arm = list(ABB_JOINTS)
+        arm = self._arm
         self.data.qpos[self._q[arm]], self.data.qvel[self._v[arm]] = self.home[arm], 0.0
         mujoco.mj_forward(self.model, self.data)
 

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robot_io import contract
+from robot_io.contract import Contract
+from robot_io.errors import ContractError
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.policy.own_network import ExportedNetwork
 from robot_io.policy.policy import Policy
@@ -79,10 +81,15 @@ class Artefact:
     golden_history: np.ndarray
     golden_action: np.ndarray
 
+    @property
+    def contract(self) -> Contract:
+        """Of the robot that the policy was trained for."""
+        return contract.from_description(self.manifest["contract"])
+
     def streaming(self) -> StreamingPolicy | ExportedPolicy:
         """The policy for the control loop, at the start of an episode."""
         if self.policy.network is None:
-            return StreamingPolicy(self.policy)
+            return StreamingPolicy(self.policy, self.contract)
         from robot_io.policy.jax_network import ExportedPolicy  # imports JAX
 
         return ExportedPolicy(self.policy)
@@ -102,19 +109,20 @@ def load(folder: str | Path) -> Artefact:
         found, expected = sha256(contents[name]), manifest["files"].get(name)
         if found != expected:
             raise ArtefactError(f"{folder / name}: SHA-256 is {found}, the manifest says {expected}; {_RECOPY}")
+    robot = contract.from_description(manifest["contract"])
     if NETWORK in contents:
-        return _own(folder, contents, manifest)
-    parameters = _parameters(folder, contents, contract.parameter_shapes())
+        return _own(folder, contents, manifest, robot)
+    parameters = _parameters(folder, contents, contract.parameter_shapes(robot.n_joints))
     golden_count = manifest["golden"].get("count")
     golden = _arrays(
         folder / GOLDEN,
         contents[GOLDEN],
         {
-            "history": ((contract.HISTORY, contract.N_OBSERVATION, golden_count), "float32"),
-            "action": ((contract.N_JOINTS, golden_count), "float64"),
+            "history": ((contract.HISTORY, robot.n_observation, golden_count), "float32"),
+            "action": ((robot.n_joints, golden_count), "float64"),
         },
     )
-    mean, inv_std = _normaliser(folder / MANIFEST, manifest["normaliser"])
+    mean, inv_std = _normaliser(folder / MANIFEST, manifest["normaliser"], robot.n_observation)
     artefact = Artefact(
         folder=folder,
         digest=sha256(contents[MANIFEST]),
@@ -135,7 +143,7 @@ def load(folder: str | Path) -> Artefact:
 load_artefact = load  # its name in ``robot_io``
 
 
-def _own(folder: Path, contents: dict[str, bytes], manifest: dict[str, Any]) -> Artefact:
+def _own(folder: Path, contents: dict[str, bytes], manifest: dict[str, Any], robot: Contract) -> Artefact:
     """The artefact of a user's own network. Raises ArtefactError."""
     described = manifest["architecture"]
     shapes = {name: tuple(shape) for name, shape in described["parameters"].items()}
@@ -144,11 +152,11 @@ def _own(folder: Path, contents: dict[str, bytes], manifest: dict[str, Any]) -> 
     )
     count = manifest["golden"].get("count")
     wanted: dict[str, tuple[tuple[int, ...], str]] = {
-        "observation": ((count, contract.N_OBSERVATION), "float32"),
-        "action": ((count, contract.N_JOINTS), "float64"),
+        "observation": ((count, robot.n_observation), "float32"),
+        "action": ((count, robot.n_joints), "float64"),
     }
     golden = _arrays(folder / GOLDEN, contents[GOLDEN], wanted)
-    mean, inv_std = _normaliser(folder / MANIFEST, manifest["normaliser"])
+    mean, inv_std = _normaliser(folder / MANIFEST, manifest["normaliser"], robot.n_observation)
     policy = Policy(_parameters(folder, contents, shapes), mean, inv_std, network)
     try:
         from robot_io.policy.jax_network import ExportedPolicy
@@ -185,17 +193,17 @@ def digest_line(manifest: bytes) -> bytes:
     return f"{sha256(manifest)}  {MANIFEST}\n".encode()
 
 
-def architecture() -> dict[str, Any]:
-    """The network of ``robot_io.contract`` as plain data, with the formulas that its numbers stand for."""
+def architecture(robot: Contract = contract.PAPER) -> dict[str, Any]:
+    """The network of a robot's contract as plain data, with the formulas that its numbers stand for."""
     return {
         "kernel": contract.KERNEL,
-        "filters": list(contract.FILTERS),
+        "filters": list(robot.filters),
         "dilations": list(contract.DILATIONS),
         "gated": list(contract.GATED),
         "gated_layer": "tanh(first half of the outputs) * sigmoid(second half)",
         "plain_layer": "tanh(outputs)",
         "kernel_axes": "(tap, input, output), tap 0 is the older observation",
-        "n_parameters": contract.n_parameters(),
+        "n_parameters": contract.n_parameters(robot.n_joints),
     }
 
 
@@ -254,7 +262,11 @@ def _verified_manifest(folder: Path, contents: dict[str, bytes]) -> dict[str, An
     for key in ("normaliser", "golden", "files"):
         if not isinstance(manifest[key], dict):
             raise ArtefactError(f"{path}: {key}: found {manifest[key]!r}, expected an object; {_REEXPORT}")
-    expectations = [("contract", contract.describe()), ("architecture", architecture())]
+    try:
+        robot = contract.from_description(manifest["contract"])
+    except ContractError as error:
+        raise ArtefactError(f"{path}: contract: {error}; {_REEXPORT}") from error
+    expectations = [("contract", contract.describe(robot)), ("architecture", architecture(robot))]
     if NETWORK in contents:
         described = manifest["architecture"]
         if not isinstance(described, dict) or set(described) != set(OWN_ARCHITECTURE):
@@ -284,7 +296,7 @@ def _arrays(path: Path, content: bytes, expected: dict[str, tuple[tuple[int, ...
     return arrays
 
 
-def _normaliser(path: Path, normaliser: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _normaliser(path: Path, normaliser: dict[str, Any], size: int) -> tuple[np.ndarray, np.ndarray]:
     formula = normaliser.get("formula")
     if formula != NORMALISER_FORMULA:
         raise ArtefactError(
@@ -297,8 +309,8 @@ def _normaliser(path: Path, normaliser: dict[str, Any]) -> tuple[np.ndarray, np.
             array = np.asarray(found, np.float64)
         except (TypeError, ValueError):
             array = np.empty(0)
-        if array.shape != (contract.N_OBSERVATION,) or not np.all(np.isfinite(array)):
-            wanted = f"{contract.N_OBSERVATION} finite numbers"
+        if array.shape != (size,) or not np.all(np.isfinite(array)):
+            wanted = f"{size} finite numbers"
             raise ArtefactError(f"{path}: normaliser.{key}: found {found!r}, expected {wanted}; {_REEXPORT}")
         arrays.append(array)
     return arrays[0], arrays[1]

@@ -19,7 +19,9 @@ TRIALS = 300  # steps of each that are timed, after as many that are not
 SLOWER = 0.2e-3  # [s] by which nine of ten of JAX's steps may take longer than NumPy's: 1.5 % of a control period
 
 
-def make_policy(backend: str, policy: Policy) -> StreamingPolicy | JitPolicy | ExportedPolicy:
+def make_policy(
+    backend: str, policy: Policy, robot: contract.Contract = contract.PAPER
+) -> StreamingPolicy | JitPolicy | ExportedPolicy:
     """A policy for the loop, by "numpy" or "jit". Raises ValueError for another backend."""
     if policy.network is not None:
         if backend != "jit":
@@ -28,7 +30,7 @@ def make_policy(backend: str, policy: Policy) -> StreamingPolicy | JitPolicy | E
 
         return ExportedPolicy(policy)
     if backend == "numpy":
-        return StreamingPolicy(policy)
+        return StreamingPolicy(policy, robot)
     if backend == "jit":
         from robot_io.policy.jax_policy import JitPolicy  # imports JAX
 
@@ -36,7 +38,7 @@ def make_policy(backend: str, policy: Policy) -> StreamingPolicy | JitPolicy | E
     raise ValueError(f"policy backend {backend!r}, allowed: numpy, jit")
 
 
-def choose(backend: str, policy: Policy) -> tuple[str, str]:
+def choose(backend: str, policy: Policy, robot: contract.Contract = contract.PAPER) -> tuple[str, str]:
     """The backend that computes the policy, "numpy" or "jit", and a sentence for the log.
 
     "auto" takes JAX unless it cannot be used here or is slower (``SLOWER``). Takes some seconds for JAX to start.
@@ -46,19 +48,19 @@ def choose(backend: str, policy: Policy) -> tuple[str, str]:
     if backend != "auto":
         return backend, f"policy computed by {backend}, as chosen"
     try:
-        compiled = _slow_step(make_policy("jit", policy))
+        compiled = _slow_step(make_policy("jit", policy, robot), robot)
     except Exception as error:  # a missing or broken JAX, whatever it raises, must not keep the robot from playing
         return "numpy", f"policy computed by NumPy: JAX cannot be used here ({type(error).__name__}: {error})"
-    plain = _slow_step(make_policy("numpy", policy))
+    plain = _slow_step(make_policy("numpy", policy, robot), robot)
     times = f"90 % of steps within {1e3 * compiled:.3f} ms, by NumPy {1e3 * plain:.3f} ms"
     if compiled > plain + SLOWER:
         return "numpy", f"policy computed by NumPy: JAX is slower here ({times})"
     return "jit", f"policy compiled by JAX ({times})"
 
 
-def _slow_step(policy: StreamingPolicy | JitPolicy | ExportedPolicy) -> float:
+def _slow_step(policy: StreamingPolicy | JitPolicy | ExportedPolicy, robot: contract.Contract) -> float:
     """Time [s] within which 90 % of the steps are done; what is slower is the machine's load."""
-    observations = np.random.default_rng(0).normal(0.0, 0.5, (2 * TRIALS, contract.N_OBSERVATION))
+    observations = np.random.default_rng(0).normal(0.0, 0.5, (2 * TRIALS, robot.n_observation))
     seconds = []
     for observation in observations:
         began = perf_counter()

@@ -44,10 +44,12 @@ def write(
     policy: Policy,
     provenance: dict[str, Any],
     overwrite: bool = False,
+    robot: contract.Contract = contract.PAPER,
 ) -> dict[str, Any]:
     """Writes a policy as an artefact and returns ``verify``'s report.
 
-    ``provenance`` is plain JSON data kept in the manifest: training configuration, git state, seed, return rate.
+    ``robot`` is whose policy it is; ``provenance`` is plain JSON data kept in the manifest: training configuration, git
+    state, seed, return rate.
     The artefact is built and verified in a hidden folder beside ``folder`` and renamed into place, so ``folder`` never
     holds half of one. An existing artefact is replaced only with ``overwrite``; a folder that holds anything else never
     is. Numbers are stored as float32.
@@ -57,14 +59,16 @@ def write(
     """
     folder = Path(folder).resolve()
     _check_target(folder, overwrite)
-    given, network = policy.network, None if policy.network is None else jax_network.exported(policy.network)
+    given, size = policy.network, robot.n_observation
+    network = None if given is None else jax_network.exported(given, size)
+    parameters = contract.n_parameters(robot.n_joints) if network is None else network.size
     policy = Policy(
-        _finite(policy.theta, "theta", (contract.n_parameters() if network is None else network.size,)),
-        _finite(policy.mean, "mean", (contract.N_OBSERVATION,)),
-        _finite(policy.inv_std, "inv_std", (contract.N_OBSERVATION,)),
+        _finite(policy.theta, "theta", (parameters,)),
+        _finite(policy.mean, "mean", (size,)),
+        _finite(policy.inv_std, "inv_std", (size,)),
         network,
     )
-    contents = _contents(policy, provenance, given)
+    contents = _contents(policy, provenance, given, robot)
 
     folder.parent.mkdir(parents=True, exist_ok=True)
     staging = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}")
@@ -158,7 +162,7 @@ def random_histories(policy: Policy, count: int, seed: int) -> np.ndarray:
     """Observation histories (8, 11, count), float32, spread twice as wide as what the normaliser saw in training."""
     mean, inv_std = policy.mean, policy.inv_std
     scale = np.divide(1.0, inv_std, out=np.ones_like(inv_std), where=inv_std > 0)
-    standard = np.random.default_rng(seed).standard_normal((contract.HISTORY, contract.N_OBSERVATION, count))
+    standard = np.random.default_rng(seed).standard_normal((contract.HISTORY, policy.n_observation, count))
     return (mean[:, None] + 2.0 * scale[:, None] * standard).astype(np.float32)
 
 
@@ -201,8 +205,8 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
     graph = helper.make_graph(
         nodes,
         "table_tennis_policy",
-        [value("history", TensorProto.FLOAT, [contract.HISTORY, contract.N_OBSERVATION, "batch"])],
-        [value("action", TensorProto.FLOAT, [contract.N_JOINTS, "batch"])],
+        [value("history", TensorProto.FLOAT, [contract.HISTORY, policy.n_observation, "batch"])],
+        [value("action", TensorProto.FLOAT, [policy.n_observation - 3, "batch"])],
         [numpy_helper.from_array(array, name) for name, array in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", ONNX_OPSET)], ir_version=ONNX_IR_VERSION)
@@ -213,12 +217,12 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
 def jax_export(policy: Policy) -> bytes:
     """The policy with its numbers inside, serialised by ``jax.export`` for the CPU, any batch size."""
     function = jax.jit(partial(_forward, policy))
-    shape = jax.export.symbolic_shape(f"{contract.HISTORY}, {contract.N_OBSERVATION}, batch")
+    shape = jax.export.symbolic_shape(f"{contract.HISTORY}, {policy.n_observation}, batch")
     exported = jax.export.export(function, platforms=["cpu"])(jax.ShapeDtypeStruct(shape, jnp.float32))
     return bytes(exported.serialize())
 
 
-def _contents(policy: Policy, provenance: dict[str, Any], given: Any) -> dict[str, bytes]:
+def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: contract.Contract) -> dict[str, bytes]:
     """Files of the artefact by name. given: the user's own network as it was before its export, or None."""
     history = random_histories(policy, GOLDEN_COUNT, seed=1)
     if policy.network is None:
@@ -229,7 +233,7 @@ def _contents(policy: Policy, provenance: dict[str, Any], given: Any) -> dict[st
             artefacts.ONNX: onnx_model(policy).SerializeToString(),
             artefacts.JAX_EXPORT: jax_export(policy),
         }
-        architecture, tolerance = artefacts.architecture(), artefacts.GOLDEN_TOLERANCE
+        architecture, tolerance = artefacts.architecture(robot), artefacts.GOLDEN_TOLERANCE
     else:
         network, episode = policy.network, np.ascontiguousarray(history[0].T)
         action = jax_network.reference(given, policy, episode).astype(np.float64)
@@ -248,7 +252,7 @@ def _contents(policy: Policy, provenance: dict[str, Any], given: Any) -> dict[st
         tolerance = artefacts.OWN_TOLERANCE
     manifest = {
         "schema_version": artefacts.SCHEMA_VERSION,
-        "contract": contract.describe(),
+        "contract": contract.describe(robot),
         "architecture": architecture,
         "normaliser": {
             "formula": artefacts.NORMALISER_FORMULA,

@@ -25,7 +25,7 @@ class ExportedPolicy:
         exact = policy.astype(np.float32)
         self._arrays = jax.device_put((exact.theta, exact.mean, exact.inv_std), cpu)
         self._state, self._first = self._empty_state, True
-        self.step(np.zeros(contract.N_OBSERVATION))  # compiles
+        self.step(np.zeros(policy.n_observation))  # compiles
         self.reset()
 
     def reset(self) -> None:
@@ -35,8 +35,9 @@ class ExportedPolicy:
     def step(self, observation: np.ndarray) -> np.ndarray:
         """Action (8,) in [-1, 1]. Raises ValueError for another shape or a non-finite number."""
         observation = np.asarray(observation, np.float32)
-        if observation.shape != (contract.N_OBSERVATION,) or not np.isfinite(observation).all():
-            raise ValueError(f"observation {observation}: {contract.N_OBSERVATION} finite numbers are needed")
+        size = self._arrays[1].shape[0]
+        if observation.shape != (size,) or not np.isfinite(observation).all():
+            raise ValueError(f"observation {observation}: {size} finite numbers are needed")
         action, self._state = self._call(*self._arrays, np.bool_(self._first), self._state, observation)
         self._first = False
         return np.asarray(action)
@@ -55,7 +56,7 @@ def _compiled(network: ExportedNetwork) -> tuple[Any, tuple[np.ndarray, ...]]:
     return jax.jit(exported.call), tuple(np.zeros(leaf.shape, leaf.dtype) for leaf in state)
 
 
-def exported(network: Any) -> ExportedNetwork:
+def exported(network: Any, n_observation: int = contract.N_OBSERVATION) -> ExportedNetwork:
     """The robot's form of a network as ``mjx_tt.env.own`` defines it; one that has this form already as it is."""
     if isinstance(network, ExportedNetwork):
         return network
@@ -66,7 +67,7 @@ def exported(network: Any) -> ExportedNetwork:
     def first_state(theta: Any, x: Any) -> Any:
         return jax.tree.map(jnp.asarray, network.start(network.unflatten(theta), x))
 
-    x = number(contract.N_OBSERVATION)
+    x = number(n_observation)
     state = jax.eval_shape(first_state, number(network.size), x)
     tree = jax.tree.structure(state)
 

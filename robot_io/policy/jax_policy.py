@@ -28,9 +28,9 @@ class JitPolicy:
         jax.config.update("jax_cpu_enable_async_dispatch", False)
         cpu = jax.local_devices(backend="cpu")[0]
         self._policy = jax.device_put(policy.astype(np.float32), cpu)  # once, not at every tick
-        self._history = np.zeros((contract.HISTORY, contract.N_OBSERVATION, 1), np.float32)
+        self._history = np.zeros((contract.HISTORY, policy.n_observation, 1), np.float32)
         self._empty = True
-        self.step(np.zeros(contract.N_OBSERVATION))  # compiles
+        self.step(np.zeros(policy.n_observation))  # compiles
         self.reset()
 
     def reset(self) -> None:
@@ -39,8 +39,9 @@ class JitPolicy:
     def step(self, observation: np.ndarray) -> np.ndarray:
         """Action (8,). Raises ValueError for another shape or a non-finite number."""
         observation = np.asarray(observation, np.float32)
-        if observation.shape != (contract.N_OBSERVATION,) or not np.isfinite(observation).all():
-            raise ValueError(f"observation {observation}: {contract.N_OBSERVATION} finite numbers are needed")
+        size = self._history.shape[1]
+        if observation.shape != (size,) or not np.isfinite(observation).all():
+            raise ValueError(f"observation {observation}: {size} finite numbers are needed")
         if self._empty:
             self._history[:, :, 0] = observation
             self._empty = False

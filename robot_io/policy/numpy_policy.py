@@ -17,7 +17,14 @@ class StreamingPolicy:
     layer 2. Equal to ``Policy.apply`` over the last eight observations, the first since ``reset`` filling the history.
     """
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Policy, robot: contract.Contract = contract.PAPER) -> None:
+        """``robot``: whose contract the policy was trained for. Raises ValueError where it has other joints."""
+        if policy.n_observation != robot.n_observation:
+            raise ValueError(
+                f"the policy has observations of {policy.n_observation} numbers, those of {robot.robot} have "
+                f"{robot.n_observation}"
+            )
+        self._names = robot.observation_names
         exact = policy.astype(np.float64)
         parameters = exact.parameters
         self._mean, self._inv_std = exact.mean, exact.inv_std
@@ -40,10 +47,10 @@ class StreamingPolicy:
         Raises ValueError for another shape or a non-finite number, and then remembers nothing of it.
         """
         observation = np.asarray(observation, np.float64)
-        if observation.shape != (contract.N_OBSERVATION,):
-            raise ValueError(f"observation has shape {observation.shape}, wanted {(contract.N_OBSERVATION,)}")
+        if observation.shape != self._mean.shape:
+            raise ValueError(f"observation has shape {observation.shape}, wanted {self._mean.shape}")
         if not np.isfinite(observation).all():
-            bad = [n for n, v in zip(contract.OBSERVATION_NAMES, observation, strict=True) if not np.isfinite(v)]
+            bad = [n for n, v in zip(self._names, observation, strict=True) if not np.isfinite(v)]
             raise ValueError(f"observation has a non-finite {', '.join(bad)}")
         x = (observation - self._mean) * self._inv_std
         layers = zip(contract.DILATIONS, self._past, self._weights, self._biases, contract.GATED, strict=True)

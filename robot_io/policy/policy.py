@@ -26,8 +26,9 @@ class Policy:
     A last axis, where there is one, holds P policies side by side. ``robot_io.policy.pytree`` registers the class with
     JAX.
 
-    theta    (976,) or (976, P) parameters in the order of ``contract.parameter_shapes``
-    mean     (11,) or (11, P) in the observation's units
+    theta    (976,) or (976, P) parameters in the order of ``contract.parameter_shapes``; of another robot as many as
+             its joints take
+    mean     (11,) or (11, P) in the observation's units: of three coordinates of the ball and the joints
     inv_std  (11,) or (11, P) reciprocal standard deviations; 0 for a component that never varied
     network  what theta parameterises where it is not this network: then only what knows such networks computes it
     """
@@ -55,9 +56,14 @@ class Policy:
             np.savez(file, **{key: getattr(self, field) for field, key in _KEYS.items()})
 
     @property
+    def n_observation(self) -> int:
+        """Numbers in an observation: 11, or three more than another robot has joints."""
+        return self.mean.shape[0]
+
+    @property
     def parameters(self) -> dict[str, Any]:
         """Kernels and biases by name, shaped as ``contract.parameter_shapes`` with the axis P last."""
-        return contract.unflatten(self.theta)
+        return contract.unflatten(self.theta, self.n_observation - 3)
 
     def astype(self, dtype: type) -> Policy:
         """The policy with NumPy arrays of that type."""
@@ -70,7 +76,7 @@ class Policy:
         Computed in float64 whatever the precision of the parameters, so the reference adds no rounding of its own.
         Raises ValueError for a history of another shape.
         """
-        expected = (contract.HISTORY, contract.N_OBSERVATION)
+        expected = (contract.HISTORY, self.n_observation)
         if history.shape[:2] != expected or history.ndim not in (2, 3):
             raise ValueError(f"history has shape {history.shape}, wanted {expected} or {(*expected, 'B')}")
         action = forward(self.astype(np.float64), np.asarray(history, np.float64).reshape(*expected, -1))

@@ -1,11 +1,12 @@
 """Positions of the robot's capsules and their distances from the table, the floor and each other. NumPy, float64.
 
 ``robot_geometry.json`` (format 1) is written from the MJCF by ``python -m mjx_tt.robot.geometry_export``:
-    joints          in contract order: name, type (slide or hinge), unit axis, pos and rot of the joint's frame in the
-                    one before it at q = 0 [m]; every frame sits on its joint's anchor, hinges come after slides
-    capsules        name, the joint that carries it, axis end points p0 and p1 in that joint's frame, radius [m]
+    joints          in the contract's order: name, type (slide or hinge), unit axis, pos and rot of the joint's frame in
+                    the one before it at q = 0 [m]; every frame sits on its joint's anchor, hinges come after slides
+    capsules        name, the joint that carries it or "world" where none does, axis end points p0 and p1 in that
+                    joint's frame, radius [m]
     table           centre and half sizes of the table top's box [m];   floor: its height [m]
-    table_capsules, blade_capsules, self_pairs: names of what is watched;   home: joint positions (8,)
+    table_capsules, blade_capsules, self_pairs: names of what is watched;   home: joint positions (n,)
 
 Gaps are signed: negative by how deep a capsule overlaps, at most by its radius (an axis inside the box counts as 0).
 """
@@ -24,13 +25,14 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from robot_io.calibrated import Frame
-from robot_io.contract import JOINT_NAMES, N_JOINTS
+from robot_io.contract import JOINT_NAMES, PAPER, Contract
 
 Array = TypeVar("Array", bound=Any)  # of NumPy or JAX
 
 FORMAT = 1
 SHIPPED = "robot_geometry.json"
-BLADE = "col_blade_axis"  # the capsule whose middle is the blade's centre
+BLADE = "col_blade_axis"  # the paper's robot's capsule whose middle is the blade's centre
+FIXED = "world"  # carrier of a capsule that nothing moves
 WORST = 4  # vectors beside a way that are looked at along all of it
 LEVELS = 5  # halvings of a stretch before it counts as too close
 
@@ -115,29 +117,34 @@ class RobotGeometry:
 
     rows    what each watched gap is between, for messages: "col_wrist to the table", ...
     kinds   (R,) what kind of gap a row is: "table", "self" or "floor"
-    home    (8,) joint positions of the home pose
+    home    (n,) joint positions of the home pose
+    joints  names of the joints, in the contract's order, and their units, "m" or "rad"
+    tip     the capsule whose middle is the blade's centre
     """
 
-    def __init__(self, data: dict[str, Any], where: str = "geometry") -> None:
-        """From parsed JSON; ``where`` names its origin in errors. Raises GeometryError."""
-        _check(data, where)
+    def __init__(self, data: dict[str, Any], where: str = "geometry", joints: tuple[str, ...] = JOINT_NAMES) -> None:
+        """From parsed JSON of a robot with these joints; ``where`` names its origin in errors. Raises GeometryError."""
+        self.joints = _check(data, where, joints)
+        self.units = tuple("m" if joint["type"] == "slide" else "rad" for joint in data["joints"])
         self.home = np.array(data["home"], float)
         self._basis = _transform_basis(data["joints"])
         self._hinge = np.array([[joint["type"] == "hinge"] for joint in data["joints"]], float)
         capsules = {c["name"]: c for c in data["capsules"]}
-        watched, pairs = data["table_capsules"], data["self_pairs"]
+        watched, pairs, self.tip = data["table_capsules"], data["self_pairs"], data["blade_capsules"][0]
         unknown = sorted({*watched, *data["blade_capsules"], *(n for pair in pairs for n in pair)} - capsules.keys())
         if unknown:
             raise GeometryError(f"{where}: no capsules named {unknown}; it has {sorted(capsules)}")
         order = self._names = list(capsules)
-        self._joint = np.array([JOINT_NAMES.index(capsules[n]["joint"]) for n in order])
+        self._fixed = any(capsules[n]["joint"] == FIXED for n in order)
+        self._base = np.eye(4)  # of what nothing moves
+        self._joint = np.array([(*self.joints, FIXED).index(capsules[n]["joint"]) for n in order])
         local = np.array([[[*capsules[n][end], 1.0] for end in ("p0", "p1")] for n in order])
         self._local = local.swapaxes(1, 2)[:, None]  # (capsules, 1, 4, 2)
         self._radius = np.array([capsules[n]["radius"] for n in order], float)[:, None]
         self._table_rows = np.array([order.index(n) for n in watched])
         self._blade_rows = np.array([watched.index(n) for n in data["blade_capsules"]])
-        self._first = np.array([order.index(a) for a, _ in pairs])
-        self._second = np.array([order.index(b) for _, b in pairs])
+        self._first = np.array([order.index(a) for a, _ in pairs], int)
+        self._second = np.array([order.index(b) for _, b in pairs], int)
         centre, half = (np.array(data["table"][key], float).reshape(3, 1, 1) for key in ("centre", "half"))
         self._floor = float(data["floor"])
         self._top = Box(centre - half, centre + half)
@@ -149,11 +156,21 @@ class RobotGeometry:
             *(f"{n} to the floor" for n in watched),
         )
         self.kinds = np.array(["table"] * len(watched) + ["self"] * len(pairs) + ["floor"] * len(watched))
-        self._levers = _levers(data["joints"], [(int(j), capsules[n]) for j, n in zip(self._joint, order, strict=True)])
+        last = [-1 if capsules[n]["joint"] == FIXED else self.joints.index(capsules[n]["joint"]) for n in order]
+        self._levers = _levers(data["joints"], [(i, capsules[n]) for i, n in zip(last, order, strict=True)])
+
+    @classmethod
+    def of(cls, contract: Contract) -> RobotGeometry:
+        """The geometry of a contract's robot. Raises GeometryError where the contract has none or another's."""
+        if contract == PAPER:
+            return cls.load()
+        if contract.geometry is None:
+            raise GeometryError(f"{contract.robot}: its contract has no geometry; export its policy again")
+        return cls(json.loads(contract.geometry), f"geometry of {contract.robot}", contract.joints)
 
     @classmethod
     def load(cls, path: str | Path | None = None) -> RobotGeometry:
-        """The shipped geometry, or another file. Raises GeometryError."""
+        """The paper's robot's geometry, or another file of it. Raises GeometryError."""
         source = resources.files("robot_io.safety") / SHIPPED if path is None else Path(path)
         try:
             data = json.loads(source.read_text(encoding="utf-8"))
@@ -169,64 +186,67 @@ class RobotGeometry:
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = base.matrix, base.position
         other = copy.copy(self)
+        other._base = place
         other._basis = self._basis.copy()
         other._basis[0] = (place @ self._basis[0].reshape(4, 4, 4)).reshape(4, 16)
         return other
 
     def hand(self, q: np.ndarray) -> np.ndarray:
-        """Transforms (B, 4, 4) from the last joint's frame to the world at joint positions q (8, B)."""
+        """Transforms (B, 4, 4) from the last joint's frame to the world at joint positions q (n, B)."""
         return self._frames(q)[-1]
 
     def _frames(self, q: np.ndarray) -> np.ndarray:
-        """Transforms (8, B, 4, 4) from every joint's frame to the world."""
-        n = q.shape[1]
+        """Transforms (n, B, 4, 4) from every joint's frame to the world."""
+        n, joints = q.shape[1], len(self.joints)
         values = np.stack([np.ones_like(q), np.sin(q), 1.0 - np.cos(q), q], axis=-1)  # (8, B, 4)
-        local = np.matmul(values, self._basis).reshape(N_JOINTS, n, 4, 4)
+        local = np.matmul(values, self._basis).reshape(joints, n, 4, 4)
         world = np.empty_like(local)
         world[0] = local[0]
-        for i in range(1, N_JOINTS):
+        for i in range(1, joints):
             np.matmul(world[i - 1], local[i], out=world[i])
         return world
 
     def ends(self, q: np.ndarray) -> np.ndarray:
-        """World end points (2, 3, capsules, B) of every capsule's axis at joint positions q (8, B)."""
+        """World end points (2, 3, capsules, B) of every capsule's axis at joint positions q (n, B)."""
         world = self._frames(q)
+        if self._fixed:
+            world = np.concatenate([world, np.broadcast_to(self._base, (1, *world.shape[1:]))])
         points = np.matmul(world[self._joint, :, :3], self._local)  # (capsules, B, 3, 2)
         return np.ascontiguousarray(points.transpose(3, 2, 0, 1))
 
     @property
     def blade(self) -> np.ndarray:
-        """The blade's centre (3,) [m] in the last joint's frame; its normal is y."""
-        return self._local[self._names.index(BLADE), 0, :3].mean(axis=1)
+        """The blade's centre (3,) [m] in the last joint's frame; of the paper's robot the normal is y."""
+        return self._local[self._names.index(self.tip), 0, :3].mean(axis=1)
 
     def blade_points(self, q: np.ndarray) -> np.ndarray:
-        """World end points (3, 4, B) [m] of the blade's capsules at joint positions q (8, B)."""
+        """World end points (3, 4, B) [m] of the blade's capsules at joint positions q (n, B)."""
         ends = self.ends(q)[:, :, self._table_rows[self._blade_rows]]
         return ends.swapaxes(0, 1).reshape(3, -1, q.shape[1])
 
     def middles(self, capsule: str, q: np.ndarray) -> np.ndarray:
-        """World positions (3, B) [m] of the middle of a capsule's axis at joint positions q (8, B)."""
+        """World positions (3, B) [m] of the middle of a capsule's axis at joint positions q (n, B)."""
         return self.ends(q)[:, :, self._names.index(capsule)].mean(axis=0)
 
     def middle(self, capsule: str, q: np.ndarray) -> np.ndarray:
-        """As ``middles`` at joint positions q (8,): (3,)."""
+        """As ``middles`` at joint positions q (n,): (3,)."""
         return self.middles(capsule, q[:, None])[:, 0]
 
     def clearances(self, q: np.ndarray) -> Clearances:
-        """The simulation's clearances at joint positions q (8, B)."""
+        """The simulation's clearances at joint positions q (n, B)."""
         ends = self.ends(np.asarray(q, float))
         table = self._to_box(self._top, ends)
-        return Clearances(table.min(0), self._own(ends).min(0), table[self._blade_rows].min(0))
+        return Clearances(table.min(0), self._own(ends).min(0, initial=np.inf), table[self._blade_rows].min(0))
 
     def gaps(self, q: np.ndarray) -> np.ndarray:
-        """Every watched gap (R, B) [m] in the order of ``rows`` at q (8, B).
+        """Every watched gap (R, B) [m] in the order of ``rows`` at q (n, B).
 
         Here the table reaches down to the floor, so a gap to it is never larger than ``clearances`` says.
         """
         return self._gaps(self.ends(q))
 
     def first_too_close(self, q: np.ndarray, margin: np.ndarray, slack: float) -> int | None:
-        """Row of a gap that may come too close on the way q (8, N), straight between its points; None: proven clear.
+        """Row of a gap that may come too close on the way q (n, N), straight between its points; None: proven clear.
 
         margin  (R,) [m] wanted gaps; where a row starts with less, it must not lose anything
         slack   [m] by which gaps may be smaller between the points than at them
@@ -264,7 +284,7 @@ class RobotGeometry:
         return int(unclear.any(1).argmax())
 
     def clear_beside(self, way: np.ndarray, beside: np.ndarray, margin: np.ndarray) -> bool:
-        """True when a robot that goes beside the way (8, N) by any of the vectors (8, K) keeps gaps of ``margin`` (R,).
+        """True when a robot that goes beside the way (n, N) by any of the vectors (n, K) keeps gaps of ``margin`` (R,).
 
         A gap that starts with less must not become smaller. Of the vectors the worst where the way ends are examined,
         at the way's points.
@@ -272,7 +292,7 @@ class RobotGeometry:
         there = (self.gaps(way[:, -1:] + beside) - margin[:, None]).min(axis=0)
         worst = beside[:, there.argsort()[:WORST]]
         q = way[:, None] + worst[:, :, None]
-        gaps = self.gaps(q.reshape(N_JOINTS, -1)).reshape(-1, *q.shape[1:])
+        gaps = self.gaps(q.reshape(len(self.joints), -1)).reshape(-1, *q.shape[1:])
         return bool((gaps >= np.minimum(margin[:, None], gaps[..., 0])[..., None]).all())
 
     def _to_box(self, box: Box, ends: np.ndarray) -> np.ndarray:
@@ -280,6 +300,8 @@ class RobotGeometry:
         return box.distance(some[0], some[1]) - self._radius[self._table_rows]
 
     def _own(self, ends: np.ndarray) -> np.ndarray:
+        if not self._first.size:
+            return np.zeros((0, ends.shape[-1]))
         first, second = ends[:, :, self._first], ends[:, :, self._second]
         distance = segment_distance(first[0], first[1], second[0], second[1])
         return distance - self._radius[self._first] - self._radius[self._second]
@@ -296,7 +318,7 @@ class RobotGeometry:
         return np.concatenate([alone, pairs, alone])
 
     def _bulge(self, dq: np.ndarray) -> np.ndarray:
-        """Bounds (R, B) of a row's gap against that along the chords, for joints moving straight by dq (8, B)."""
+        """Bounds (R, B) of a row's gap against that along the chords, for joints moving straight by dq (n, B)."""
         size = np.abs(dq) * self._hinge
         inner = np.cumsum(size, axis=0) - size
         bulge = self._levers @ (size * (size + 2.0 * inner)) / 8.0  # (capsules, B)
@@ -305,8 +327,8 @@ class RobotGeometry:
 
 
 def _transform_basis(joints: list[dict]) -> np.ndarray:
-    """(8, 4, 16): every joint's 4 x 4 transform is the sum of these times 1, sin q, 1 - cos q and q (Rodrigues)."""
-    basis = np.zeros((N_JOINTS, 4, 4, 4))
+    """(n, 4, 16): every joint's 4 x 4 transform is the sum of these times 1, sin q, 1 - cos q and q (Rodrigues)."""
+    basis = np.zeros((len(joints), 4, 4, 4))
     for i, joint in enumerate(joints):
         rot, axis = np.array(joint["rot"], float), np.array(joint["axis"], float)
         basis[i, 0, :3, :3], basis[i, 0, :3, 3], basis[i, 0, 3, 3] = rot, joint["pos"], 1.0
@@ -316,12 +338,12 @@ def _transform_basis(joints: list[dict]) -> np.ndarray:
             x, y, z = axis
             skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
             basis[i, 1, :3, :3], basis[i, 2, :3, :3] = rot @ skew, rot @ skew @ skew
-    return basis.reshape(N_JOINTS, 4, 16)
+    return basis.reshape(len(joints), 4, 16)
 
 
 def _levers(joints: list[dict], capsules: list[tuple[int, dict]]) -> np.ndarray:
-    """(capsules, 8) [m]: bound on the distance of a capsule's axis from each hinge that moves it, in any pose."""
-    levers = np.zeros((len(capsules), N_JOINTS))
+    """(capsules, n) [m]: bound on the distance of a capsule's axis from each hinge that moves it, in any pose."""
+    levers = np.zeros((len(capsules), len(joints)))
     for row, (last, capsule) in enumerate(capsules):
         length = max(math.hypot(*capsule["p0"]), math.hypot(*capsule["p1"]))
         for i in range(last, -1, -1):
@@ -331,7 +353,8 @@ def _levers(joints: list[dict], capsules: list[tuple[int, dict]]) -> np.ndarray:
     return levers
 
 
-def _check(data: Any, where: str) -> None:
+def _check(data: Any, where: str, joints: tuple[str, ...]) -> tuple[str, ...]:
+    """The joints' names. Raises GeometryError."""
     rewrite = "write it again with python -m mjx_tt.robot.geometry_export"
     if not isinstance(data, dict) or set(data) != set(_KEYS):
         found = sorted(data) if isinstance(data, dict) else type(data).__name__
@@ -340,8 +363,8 @@ def _check(data: Any, where: str) -> None:
         raise GeometryError(f"{where}: format is {data['format']!r}, this program reads {FORMAT}; {rewrite}")
     try:
         names = tuple(joint["name"] for joint in data["joints"])
-        if names != JOINT_NAMES:
-            raise GeometryError(f"{where}: joints are {names}, the contract's are {JOINT_NAMES}; {rewrite}")
+        if names != joints:
+            raise GeometryError(f"{where}: joints are {names}, the contract's are {joints}; {rewrite}")
         types = [joint["type"] for joint in data["joints"]]
         if types != sorted(types, key=("slide", "hinge").index):
             raise GeometryError(f"{where}: joint types are {types}; slides must come before hinges")
@@ -357,14 +380,15 @@ def _check(data: Any, where: str) -> None:
                 for key, shape in (("p0", 3), ("p1", 3), ("radius", ()))
             ),
             *(np.array(data["table"][key], float).reshape(3) for key in ("centre", "half")),
-            np.array(data["home"], float).reshape(N_JOINTS),
+            np.array(data["home"], float).reshape(len(names)),
             np.array(data["floor"], float).reshape(()),
         ]
-        if any(c["joint"] not in JOINT_NAMES for c in data["capsules"]):
-            raise GeometryError(f"{where}: a capsule is on a joint that is none of {JOINT_NAMES}; {rewrite}")
+        if any(c["joint"] not in (*names, FIXED) for c in data["capsules"]):
+            raise GeometryError(f"{where}: a capsule is on a joint that is none of {names}; {rewrite}")
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, GeometryError):
             raise
         raise GeometryError(f"{where}: malformed ({error!r}); {rewrite}") from error
     if not all(np.isfinite(n).all() for n in numbers):
         raise GeometryError(f"{where}: holds a non-finite number; {rewrite}")
+    return names

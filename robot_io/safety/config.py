@@ -5,18 +5,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from robot_io.contract import JOINT_UNITS, N_JOINTS
+from robot_io.contract import JOINT_UNITS, N_JOINTS, Contract
 
 SLACK = 5e-4  # [m] by which margins may be missed between two ticks
 
 
-def _each(slide: float, hinge: float) -> tuple[float, ...]:
-    return tuple(slide if unit == "m" else hinge for unit in JOINT_UNITS)
+def _each(slide: float, hinge: float, units: tuple[str, ...] = JOINT_UNITS) -> tuple[float, ...]:
+    return tuple(slide if unit == "m" else hinge for unit in units)
+
+
+# Of a slide [m] and of a hinge [rad].
+_OVERSHOOT, _STILL, _FOLLOWING_ERROR = (0.03, 0.06), (0.02, 0.05), (0.06, 0.2)
 
 
 @dataclass(frozen=True)
 class SafetyConfig:
-    """Limits of the gate; lengths in m, angles in rad, times in s, tuples in ``JOINT_NAMES`` order.
+    """Limits of the gate; lengths in m, angles in rad, times in s, tuples in the order of the robot's joints.
+
+    The defaults are the paper's robot's; ``of`` has those of another one.
 
     speed_scale      (0, 1], share of every requested velocity and of every velocity limit
     table_margin     smallest gap of arm and paddle to the table and to everything under it
@@ -43,11 +49,11 @@ class SafetyConfig:
     floor_margin: float = 0.17
     blade_speed: float = 8.0
     blade_acceleration: float = 150.0
-    overshoot: tuple[float, ...] = _each(0.03, 0.06)
+    overshoot: tuple[float, ...] = _each(*_OVERSHOOT)
     escape_speed: float = 0.05
-    still: tuple[float, ...] = _each(0.02, 0.05)
+    still: tuple[float, ...] = _each(*_STILL)
     overspeed: float = 1.5
-    following_error: tuple[float, ...] = _each(0.06, 0.2)
+    following_error: tuple[float, ...] = _each(*_FOLLOWING_ERROR)
     delay: tuple[float, float] = (0.0, 0.2)
     following_ticks: int = 3
     late: float = 0.05
@@ -55,6 +61,12 @@ class SafetyConfig:
     stale_axes: float = 0.05
     stale_tracker: float = 0.035
     stale_policy: float = 0.05
+
+    @classmethod
+    def of(cls, contract: Contract) -> SafetyConfig:
+        """The defaults for a contract's robot."""
+        overshoot, still, following = (_each(*pair, contract.units) for pair in (_OVERSHOOT, _STILL, _FOLLOWING_ERROR))
+        return cls(overshoot=overshoot, still=still, following_error=following)
 
     def __post_init__(self) -> None:
         for name in ("speed_scale", "escape_speed"):
@@ -67,9 +79,11 @@ class SafetyConfig:
         for name in ("blade_speed", "blade_acceleration", "overspeed", "late", "following_ticks", *ages):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)}, it must be positive and finite")
-        for name in ("still", "overshoot", "following_error"):
-            values = getattr(self, name)
-            if len(values) != N_JOINTS or not all(0.0 < v < math.inf for v in values):
-                raise ValueError(f"SafetyConfig.{name} is {values}, allowed are {N_JOINTS} positive numbers")
+        each = {name: getattr(self, name) for name in ("still", "overshoot", "following_error")}
+        lengths = {len(values) for values in each.values()}
+        count = N_JOINTS if N_JOINTS in lengths else min(lengths)
+        for name, values in each.items():
+            if len(values) != count or not all(0.0 < v < math.inf for v in values):
+                raise ValueError(f"SafetyConfig.{name} is {values}, allowed are {count} positive numbers")
         if not 0.0 <= self.delay[0] < self.delay[1] < math.inf:
             raise ValueError(f"SafetyConfig.delay is {self.delay}, allowed are a shortest and a longer time in s")

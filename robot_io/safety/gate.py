@@ -18,14 +18,14 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robot_io.contract import CONTROL_RATE, JOINT_NAMES, JOINT_UNITS, LIMITS, N_JOINTS, JointLimits
+from robot_io.contract import CONTROL_RATE, LIMITS, JointLimits
 from robot_io.errors import JogFirstError, RefusedError
 from robot_io.limits import limit_velocity
-from robot_io.safety.clearance import BLADE, RobotGeometry
+from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.config import SLACK
 from robot_io.safety.config import SafetyConfig as SafetyConfig
 from robot_io.safety.faults import Cause, Fault, FaultLatch
-from robot_io.safety.monitor import FeedbackMonitor, eight, worst
+from robot_io.safety.monitor import FeedbackMonitor, numbers_of, worst
 from robot_io.safety.stopping import StopReference
 
 SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
@@ -82,6 +82,12 @@ class SafetyGate:
             raise ValueError(f"period is {period} s, it must be positive")
         self.config = config = config or SafetyConfig()
         self.geometry = geometry or RobotGeometry.load()
+        n, joints = len(limits.joints), self.geometry.joints
+        if joints != limits.joints or len(config.still) != n:
+            raise ValueError(
+                f"the limits are of {limits.joints}, the geometry of {joints}, the safety settings of "
+                f"{len(config.still)} joints: they must be one robot's"
+            )
         self.period = period
         scale = config.speed_scale
         self.limits = (
@@ -106,17 +112,17 @@ class SafetyGate:
         self._inside = np.zeros(self._margin.shape, bool)  # gaps that have been below their margin since arming
         self._still = np.array(config.still)
         self._monitor = FeedbackMonitor(limits, self.geometry, config)
-        self._stop = StopReference(limits, config)
+        self._stop = StopReference(limits, config, self.geometry.units)
         self._latch = FaultLatch()
         self._mode = GateState.DISARMED  # apart from faults
         self._engaged = False  # whether the reference is ours, not the measured position
-        self._velocity, self._acceleration = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
-        self._reference = np.full(N_JOINTS, np.nan)
+        self._velocity, self._acceleration = np.zeros(n), np.zeros(n)
+        self._reference = np.full(n, np.nan)
         self._start = self._reference  # where the period in force starts
         self._measured: tuple[np.ndarray, np.ndarray] | None = None  # position and velocity, when credible
-        self._unexplained = np.zeros(N_JOINTS)
-        self._deviation = np.zeros(N_JOINTS)  # of the measured position from the way of the reference
-        self._offset = np.zeros(N_JOINTS)  # the same, remembered while the reference moves
+        self._unexplained = np.zeros(n)
+        self._deviation = np.zeros(n)  # of the measured position from the way of the reference
+        self._offset = np.zeros(n)  # the same, remembered while the reference moves
         self._measured_velocity: np.ndarray | None = None
         self._last: float | None = None  # time of the command before
         self._lead = 0.0  # [s] that commands are ahead of the clock
@@ -184,14 +190,14 @@ class SafetyGate:
             raise RefusedError("not armed: it is armed or still stopping")
         if not math.isfinite(now):
             raise RefusedError(f"not armed: the time is {now}")
-        position, problem = eight(measured, "measured position")
+        position, problem = numbers_of(self.geometry.joints, measured, "measured position")
         if problem or position is None:
             raise RefusedError(f"not armed: {problem}")
         outside = (position < self._low) | (position > self._high)
         if outside.any():
             i = int(outside.argmax())
-            allowed = f"[{self._low[i]:.4f}, {self._high[i]:.4f}] {JOINT_UNITS[i]}"
-            found = f"{JOINT_NAMES[i]} is at {position[i]:.4f}"
+            allowed = f"[{self._low[i]:.4f}, {self._high[i]:.4f}] {self.geometry.units[i]}"
+            found = f"{self.geometry.joints[i]} is at {position[i]:.4f}"
             raise JogFirstError(f"not armed: {found}, allowed is {allowed}; jog it back")
         touching = self._monitor.contact(position)
         if touching:
@@ -199,17 +205,17 @@ class SafetyGate:
         given = self._measured_velocity if measured_velocity is None else measured_velocity
         if given is None:
             raise RefusedError("not armed: no measured velocity yet")
-        velocity, problem = eight(given, "measured velocity")
+        velocity, problem = numbers_of(self.geometry.joints, given, "measured velocity")
         if problem or velocity is None:
             raise RefusedError(f"not armed: {problem}")
         if (np.abs(velocity) > self._still).any():
-            raise RefusedError(f"not armed: {worst(velocity, self._still, '/s')}, it must be at rest")
+            raise RefusedError(f"not armed: {worst(self.geometry, velocity, self._still, '/s')}, it must be at rest")
         self._mode, self._engaged, self._armed_at = GateState.ARMED, True, now
-        self._velocity, self._acceleration = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
+        self._velocity, self._acceleration = np.zeros_like(self._velocity), np.zeros_like(self._velocity)
         self._reference = self._start = position
         self._inside = np.ones(self._margin.shape, bool)
         self._stop.restart()
-        self._deviation, self._offset = np.zeros(N_JOINTS), np.zeros(N_JOINTS)
+        self._deviation, self._offset = np.zeros_like(self._velocity), np.zeros_like(self._velocity)
         self._lead, self._last = 0.0, None
         self._monitor.restart(position, now)
 
@@ -284,7 +290,7 @@ class SafetyGate:
         wanted = self._request(request, now)
         if not self._engaged:
             self._start = self._reference
-            return Sent(np.zeros(N_JOINTS), self._reference.copy(), (self.state.value,), self.state)
+            return Sent(np.zeros_like(self._velocity), self._reference.copy(), (self.state.value,), self.state)
         if self.state is not GateState.ARMED:
             self._follow_the_arm(now)
         left = np.abs(self._velocity) - self._step
@@ -392,7 +398,7 @@ class SafetyGate:
     def _too_fast(self, way: np.ndarray) -> str:
         """The limit of the blade that is broken on a way (8, N) of this period and of braking after it; empty: none."""
         way = np.concatenate([self._start[:, None], way, way[:, -1:]], axis=1)  # with the period in force and rest
-        velocity = np.diff(self.geometry.middles(BLADE, way)) / self.period
+        velocity = np.diff(self.geometry.middles(self.geometry.tip, way)) / self.period
         if np.linalg.norm(velocity[:, 1:], axis=0).max() > self.config.blade_speed:
             return "blade_speed"
         acceleration = np.linalg.norm(np.diff(velocity), axis=0) / self.period
@@ -431,7 +437,7 @@ class SafetyGate:
             ("jerk", jerk, 2.0 * self._a / self.period),
         ):
             if not (np.abs(values) <= bound * (1.0 + ROUNDING)).all():
-                return f"accepted {name}: {worst(values, bound)}"
+                return f"accepted {name}: {worst(self.geometry, values, bound)}"
         if not ((position >= self._low - ROUNDING) & (position <= self._high + ROUNDING)).all():
             return f"accepted position {position} is outside {self._low} to {self._high}"
         return ""
@@ -457,7 +463,7 @@ class SafetyGate:
 
     def _request(self, request: ArrayLike, now: float) -> np.ndarray:
         """The requested velocity (8,), zero when it cannot be used."""
-        values, problem = eight(request, "requested velocity")
+        values, problem = numbers_of(self.geometry.joints, request, "requested velocity")
         finite = values is None or bool(np.isfinite(values).all())
         if not problem and values is not None:
             kind = np.asarray(request).dtype
@@ -466,15 +472,15 @@ class SafetyGate:
             subnormal = (values != 0.0) & (np.abs(values) < tiny)
             if subnormal.any():
                 i = int(subnormal.argmax())
-                problem = f"requested velocity: {JOINT_NAMES[i]} is {values[i]}, a subnormal number"
+                problem = f"requested velocity: {self.geometry.joints[i]} is {values[i]}, a subnormal number"
         self.condition(Cause.NON_FINITE_COMMAND, not finite, problem, now)
         self.condition(Cause.MALFORMED_COMMAND, bool(problem) and finite, problem, now)
-        return np.zeros(N_JOINTS) if problem or values is None else values
+        return np.zeros_like(self._velocity) if problem or values is None else values
 
     def _watch(self, measured: ArrayLike, measured_velocity: ArrayLike, now: float) -> None:
         """Looks at what was measured."""
-        position, problem = eight(measured, "measured position")
-        velocity, second = eight(measured_velocity, "measured velocity")
+        position, problem = numbers_of(self.geometry.joints, measured, "measured position")
+        velocity, second = numbers_of(self.geometry.joints, measured_velocity, "measured velocity")
         problem = problem or second
         self.condition(Cause.NON_FINITE_FEEDBACK, bool(problem), problem, now)
         self._measured_velocity = None if problem else velocity

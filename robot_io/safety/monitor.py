@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robot_io.contract import JOINT_NAMES, JOINT_UNITS, N_JOINTS, JointLimits
+from robot_io.contract import JointLimits
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.config import SafetyConfig
 from robot_io.safety.faults import Cause
@@ -25,9 +25,10 @@ class FeedbackMonitor:
         self._lower, self._upper = np.array(limits.lower), np.array(limits.upper)
         self._fastest = config.overspeed * np.array(limits.velocity)
         self._geometry, self._config = geometry, config
+        self._joints, self._units = geometry.joints, geometry.units
         self._tolerance = np.array(config.following_error)
         self._past: deque[tuple[float, np.ndarray]] = deque()  # times and references at the ends of periods
-        self._low = self._high = np.zeros(N_JOINTS)  # of the references in the window
+        self._low = self._high = np.zeros(len(limits.joints))  # of the references in the window
         self._off = 0  # measurements in a row with a following error
         self._beside: deque[tuple[float, np.ndarray]] = deque()  # times and deviations
 
@@ -76,7 +77,7 @@ class FeedbackMonitor:
     @property
     def beside(self) -> np.ndarray:
         """Deviations (8, K) of the last ``FORGOTTEN`` seconds times ``WORSE``: where a noisy robot may be next."""
-        return WORSE * np.array([found for _, found in self._beside]).reshape(-1, N_JOINTS).T
+        return WORSE * np.array([found for _, found in self._beside]).reshape(-1, len(self._joints)).T
 
     def offset(self, deviation: np.ndarray, before: np.ndarray, period: float) -> np.ndarray:
         """Distance (8,) by which the robot is taken to go beside its reference: ``deviation``, while it can be told.
@@ -93,7 +94,7 @@ class FeedbackMonitor:
         self._off = self._off + 1 if (error > self._tolerance).any() else 0
         if self._off < self._config.following_ticks:
             return ""
-        return f"away from the reference: {worst(np.maximum(error, 0.0), self._tolerance)}"
+        return f"away from the reference: {worst(self._geometry, np.maximum(error, 0.0), self._tolerance)}"
 
     def _forget(self, time: float) -> None:
         while len(self._past) > 1 and self._past[1][0] <= time:
@@ -104,27 +105,27 @@ class FeedbackMonitor:
         if (outside > 0.0).any():
             i = int(outside.argmax())
             allowed = f"[{self._lower[i]:.4f}, {self._upper[i]:.4f}]"
-            return f"{JOINT_NAMES[i]} is at {position[i]:.4f} {JOINT_UNITS[i]}, its range is {allowed}"
+            return f"{self._joints[i]} is at {position[i]:.4f} {self._units[i]}, its range is {allowed}"
         if (np.abs(velocity) > self._fastest).any():
-            return f"measured speed: {worst(velocity, self._fastest, '/s')}"
+            return f"measured speed: {worst(self._geometry, velocity, self._fastest, '/s')}"
         return ""
 
 
-def eight(values: ArrayLike, what: str) -> tuple[np.ndarray | None, str]:
-    """Eight finite float64 numbers, and what is wrong with them instead; None where they are not eight numbers."""
+def numbers_of(joints: tuple[str, ...], values: ArrayLike, what: str) -> tuple[np.ndarray | None, str]:
+    """A finite float64 number for each joint, and what is wrong instead; None where they are not as many numbers."""
     try:
         given = np.asarray(values)
     except Exception as error:  # whatever an array-like object does when it is converted
         return None, f"{what} is not an array: {error}"
-    if given.shape != (N_JOINTS,) or given.dtype.kind not in "fiu":
-        return None, f"{what} is {given.dtype} {given.shape}, needed are {N_JOINTS} real numbers"
+    if given.shape != (len(joints),) or given.dtype.kind not in "fiu":
+        return None, f"{what} is {given.dtype} {given.shape}, needed are {len(joints)} real numbers"
     numbers = given.astype(np.float64)
     for i in np.flatnonzero(~np.isfinite(numbers)):
-        return numbers, f"{what}: {JOINT_NAMES[i]} is {numbers[i]}"
+        return numbers, f"{what}: {joints[i]} is {numbers[i]}"
     return numbers, ""
 
 
-def worst(values: np.ndarray, bound: np.ndarray, per: str = "") -> str:
-    """Names the joint that exceeds its bound the most; all (8,)."""
+def worst(geometry: RobotGeometry, values: np.ndarray, bound: np.ndarray, per: str = "") -> str:
+    """Names the joint that exceeds its bound the most; all (n,)."""
     i = int(np.argmax(np.abs(values) / bound))
-    return f"{JOINT_NAMES[i]} {values[i]:.4g}, allowed is {bound[i]:.4g} {JOINT_UNITS[i]}{per}"
+    return f"{geometry.joints[i]} {values[i]:.4g}, allowed is {bound[i]:.4g} {geometry.units[i]}{per}"

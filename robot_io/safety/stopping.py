@@ -12,22 +12,23 @@ import math
 
 import numpy as np
 
-from robot_io.contract import JOINT_UNITS, N_JOINTS, JointLimits
+from robot_io.contract import JOINT_UNITS, JointLimits
 from robot_io.safety.config import SafetyConfig
 
-UNEXPLAINED = np.array([0.01 if unit == "m" else 0.03 for unit in JOINT_UNITS])  # [m], [rad]: the joint does not follow
+UNEXPLAINED = {"m": 0.01, "rad": 0.03}  # [m], [rad] from which on a joint does not follow
 JITTER = 0.02  # [s] by which the time between two measurements may differ from that between two ticks
 
 
 class StopReference:
     """Corrects a reference from the first command of a stop until the gate is armed again."""
 
-    def __init__(self, limits: JointLimits, config: SafetyConfig) -> None:
+    def __init__(self, limits: JointLimits, config: SafetyConfig, units: tuple[str, ...] = JOINT_UNITS) -> None:
         self._acceleration = np.array(limits.acceleration)
         self._fastest = config.overspeed * np.array(limits.velocity)
         self._still = np.array(config.still)
         self._latency = config.delay[1]
-        self._lost = np.zeros(N_JOINTS, bool)  # joints that were found not to follow in this stop
+        self._unexplained = np.array([UNEXPLAINED[unit] for unit in units])
+        self._lost = np.zeros(len(units), bool)  # joints that were found not to follow in this stop
         self._at_rest_since = math.inf  # [s] of the commands
         self._last: tuple[float, np.ndarray] | None = None  # time and measured position
 
@@ -67,7 +68,7 @@ class StopReference:
             self._at_rest_since = math.inf
         elif self._at_rest_since == math.inf:
             self._at_rest_since = now
-        self._lost |= unexplained > UNEXPLAINED
+        self._lost |= unexplained > self._unexplained
         way = velocity * self._latency + velocity * np.abs(velocity) / (2.0 * self._acceleration)
         led = np.clip(reference, position + np.minimum(way, 0.0), position + np.maximum(way, 0.0))
         return np.where(self.settled(velocity, now), position, np.where(self._lost, led, reference))

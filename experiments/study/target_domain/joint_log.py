@@ -23,7 +23,7 @@ from mjx_tt.env.episode import Episodes, EpisodeState, Tick
 from mjx_tt.env.task import Task
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
-from robot_io.contract import JOINT_NAMES, LIMITS, N_JOINTS, N_OBSERVATION
+from robot_io.contract import LIMITS, JointLimits
 
 REST = 0.5  # [s] before the first motion, in which the joints stand where they are
 SINES = 6
@@ -36,48 +36,49 @@ REACH = 0.04  # of a joint's range that its position leaves home by, about
 class Sweeps:
     """Actions by tick as a ``Controller``."""
 
-    actions: Array  # (ticks, 8)
+    actions: Array  # (ticks, n)
 
     @property
     def mean(self) -> Array:
-        return jnp.zeros(N_OBSERVATION)
+        return jnp.zeros(3 + self.actions.shape[1])
 
     def start(self, observation: Array) -> tuple:
         return ()
 
     def act(self, tick: Tick, state: tuple, observation: Array) -> tuple[Array, tuple]:
-        return jnp.broadcast_to(self.actions[tick][:, None], (N_JOINTS, *observation.shape[1:])), ()
+        return jnp.broadcast_to(self.actions[tick][:, None], (self.actions.shape[1], *observation.shape[1:])), ()
 
 
-def multisine(rng: np.random.Generator, ticks: int, period: float) -> np.ndarray:
-    """Actions (ticks, 8) in [-1, 1]: derivatives of sums of sines that begin and end softly, after a rest."""
+def multisine(rng: np.random.Generator, ticks: int, period: float, limits: JointLimits = LIMITS) -> np.ndarray:
+    """Actions (ticks, n) in [-1, 1]: derivatives of sums of sines that begin and end softly, after a rest."""
     time = np.arange(ticks) * period - REST
-    low, high = np.log(FREQUENCIES)
-    frequency = np.exp(rng.uniform(low, high, (SINES, N_JOINTS)))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (SINES, N_JOINTS))
-    reach = REACH * (np.asarray(LIMITS.upper) - np.asarray(LIMITS.lower))
+    (low, high), n = np.log(FREQUENCIES), len(limits.joints)
+    frequency = np.exp(rng.uniform(low, high, (SINES, n)))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (SINES, n))
+    reach = REACH * (np.asarray(limits.upper) - np.asarray(limits.lower))
     rate = 2.0 * np.pi * frequency
     speed = rate * np.cos(rate * time[:, None, None] + phase) / np.maximum(frequency, 1.0)
     velocity = reach * speed.sum(axis=1) / np.sqrt(SINES)
     soft = np.clip(time / 0.5, 0.0, 1.0) * np.clip((time[-1] - time) / 0.5, 0.0, 1.0)
-    return np.clip(velocity * soft[:, None] / np.asarray(LIMITS.policy_velocity), -1.0, 1.0)
+    return np.clip(velocity * soft[:, None] / np.asarray(limits.policy_velocity), -1.0, 1.0)
 
 
 def record(task: Task, model: SimModel, key: PRNGKeyArray, seconds: float = 60.0) -> tuple[JointRecord, ...]:
     """The log of a robot of that model which was swept for so many seconds, a record for each joint."""
     ticks, period = round(seconds / task.config.period), task.config.period
-    actions = multisine(np.random.default_rng(int(jax.random.bits(key))), ticks, period)
+    actions = multisine(np.random.default_rng(int(jax.random.bits(key))), ticks, period, task.contract.limits)
     commands, positions = _swept(model, Sweeps(jnp.asarray(actions, jnp.float32)), task=task)
     time = np.arange(ticks) * period
+    numbers = [np.asarray(values, np.float64).T for values in (commands, positions)]
     return tuple(
-        JointRecord(name, time, np.asarray(commands[:, j], np.float64), time, np.asarray(positions[:, j], np.float64))
-        for j, name in enumerate(JOINT_NAMES)
+        JointRecord(name, time, command, time, position, task.config.robot)
+        for name, command, position in zip(task.contract.joints, *numbers, strict=True)
     )
 
 
 @partial(jax.jit, static_argnames="task")
 def _swept(model: SimModel, sweeps: Sweeps, task: Task) -> tuple[Array, Array]:
-    """Commands and measured positions (ticks, 8)."""
+    """Commands and measured positions (ticks, n)."""
     # Over a minute what an episode's latency is off its mean averages out.
     latency = jnp.stack([jnp.full((1,), getattr(model.latency, name)) for name in models.LATENCIES])
     still = jnp.zeros((3, 1))

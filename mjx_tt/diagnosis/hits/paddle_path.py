@@ -50,7 +50,7 @@ def joint_path(records: Sequence[JointRecord], model: SimModel) -> JointPath | N
     if set(by_name) != set(JOINT_NAMES):
         return None
     mine = [by_name[name] for name in JOINT_NAMES]
-    time = tuple(r.state_time - nominal_response(model, r.joint).observation_delay for r in mine)
+    time = tuple(r.state_time - nominal_response(model, r.joint, r.robot).observation_delay for r in mine)
     return JointPath(time, tuple(r.state_position for r in mine))
 
 

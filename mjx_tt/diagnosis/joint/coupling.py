@@ -10,7 +10,6 @@ import numpy as np
 from mjx_tt.diagnosis.joint.forward_model import JointResponse, Motion
 from mjx_tt.diagnosis.joint.log import JointRecord
 from mjx_tt.robot.servo import follow
-from robot_io.contract import JOINT_NAMES
 
 IDEAL = {"servo": 0.0, "servo_gain": 1.0}
 BARE = {"backlash": 0.0, "joint_offset": 0.0, "observation_delay": 0.0}
@@ -23,21 +22,22 @@ def coupling(records: Sequence[JointRecord], responses: Mapping[str, JointRespon
     The robot of the simulation plays the logged commands once, as a whole; nothing is known where a joint is not
     logged.
     """
-    by_name = {r.joint: r for r in records}
-    if set(by_name) != set(JOINT_NAMES):
+    by_name, robot = {r.joint: r for r in records}, records[0].robot
+    joints = robot.contract.joints
+    if set(by_name) != set(joints):
         return {}
-    mine = [by_name[name] for name in JOINT_NAMES]
+    mine = [by_name[name] for name in joints]
     begin = min(r.command_time[0] for r in mine)
     time = np.arange(begin, max(r.state_time[-1] for r in mine) + STEP, STEP)
     start = np.array([np.interp(r.command_time[0], r.state_time, r.state_position) for r in mine])
-    start -= [responses[name].joint_offset for name in JOINT_NAMES]
+    start -= [responses[name].joint_offset for name in joints]
 
     def alone(record: JointRecord, **changes: float) -> np.ndarray:
         response = dataclasses.replace(responses[record.joint], **BARE, **changes)
         return response.simulate(record.command_time, record.command_velocity, time)
 
     driven = np.stack([alone(r, **IDEAL) for r in mine], axis=1)
-    whole, step = follow(start, np.diff(driven, axis=0) / STEP)
+    whole, step = follow(robot, start, np.diff(driven, axis=0) / STEP)
     if abs(step - STEP) > 1e-9:
         raise ValueError(f"the robot's model steps by {step} s, {STEP} is wanted")
     return {

@@ -19,7 +19,6 @@ from mjx_tt.diagnosis.joint.forward_model import JointResponse
 from mjx_tt.diagnosis.joint.log import JointLog, JointRecord
 from mjx_tt.diagnosis.joint.selection import Choice
 from mjx_tt.diagnosis.verdict import Cause, Experiment, Expressed, HeldOut, Part, Unexplained
-from robot_io.contract import JOINT_NAMES
 
 
 def diagnose_joints(
@@ -43,7 +42,7 @@ def diagnose_joints(
     that do not exist.
     """
     home = home or {}
-    _check([record.joint for record in records], nominal, without, home)
+    _check(records, nominal, without, home)
     streams = np.random.default_rng(seed).spawn(len(records))
     found: dict[str, JointFindings] = {}
     beside = coupling(records, nominal) if any(n.servo for n in nominal.values()) else {}
@@ -67,9 +66,10 @@ def diagnose_joints(
     return merge(tuple(found.values()))
 
 
-def _check(joints: Sequence[str], nominal: Mapping, without: Sequence[str], home: Mapping) -> None:
-    if not joints:
+def _check(records: Sequence[JointRecord], nominal: Mapping, without: Sequence[str], home: Mapping) -> None:
+    if not records:
         raise ValueError("no record of a joint to diagnose")
+    joints, known = [record.joint for record in records], records[0].robot.contract.joints
     twice = sorted({name for name in joints if joints.count(name) > 1})
     if twice:
         raise ValueError(f"{', '.join(twice)}: more than one record; join the logs of one joint in order of time first")
@@ -78,7 +78,7 @@ def _check(joints: Sequence[str], nominal: Mapping, without: Sequence[str], home
             raise ValueError(f"no nominal response of {joint}; there are {', '.join(nominal)}")
     for name in without:
         joint, _, effect = name.rpartition(".")
-        if effect not in NAMES or joint not in ("", *JOINT_NAMES):
+        if effect not in NAMES or joint not in ("", *known):
             raise ValueError(
                 f"no robot effect {name!r} to leave out; effects are {', '.join(NAMES)}, with or without a joint"
             )

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mjx_tt.robot import robot as robots
+from mjx_tt.robot.robot import Robot
 from mjx_tt.robot.servo import servos
 from mjx_tt.sim.model import SimModel
-from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
 
 CLOSE = 1e-5
 Motion = tuple[np.ndarray, np.ndarray]  # times [s] and positions [rad], [m]
@@ -258,9 +259,14 @@ class _Path:
         return velocity if self._lag == 0.0 else velocity - decay / self._lag * np.exp(-x / self._lag)
 
 
-def nominal_response(model: SimModel, joint: str) -> JointResponse:
-    """Response of a joint in the model: its mean latencies, its drive where there is one, and its servo at home."""
-    axis = "festo" if JOINT_NAMES.index(joint) in FESTO_JOINTS else "abb"
+def nominal_response(model: SimModel, joint: str, robot: Robot | None = None) -> JointResponse:
+    """Response of a joint in the model: its mean latencies, its drive where there is one, and its servo at home.
+
+    robot: whose joint; None: the paper's.
+    """
+    robot = robots.paper() if robot is None else robot
+    place = robot.contract.joints.index(joint)
+    axis = "festo" if place in robot.contract.carrying else "abb"
     values = {
         "action_delay": float(getattr(model.latency, f"{axis}_action")),
         "observation_delay": float(getattr(model.latency, f"{axis}_observation")),
@@ -276,5 +282,5 @@ def nominal_response(model: SimModel, joint: str) -> JointResponse:
                 values[field.name] *= value
             else:
                 values[field.name] = value
-    servo = servos()[JOINT_NAMES.index(joint)]
+    servo = servos(robot)[place]
     return JointResponse(**values, servo=servo.time_constant, servo_gain=servo.gain)

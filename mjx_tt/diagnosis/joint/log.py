@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from mjx_tt.diagnosis.joint.forward_model import JointResponse, Motion
-from robot_io.contract import JOINT_NAMES, JOINT_UNITS, LIMITS
+from mjx_tt.robot import robot as robots
+from mjx_tt.robot.robot import Robot
 
 WINDOW = 2.0  # [s] of a free offset and of one cluster of the errors, a tenth of a log of less than 20 s
 SAMPLES = 4000  # states of a joint that a fit looks at, evenly spread over the log
@@ -32,9 +33,9 @@ SHORTEST = 1.0  # [s] of common time of commands and states that can tell anythi
 class JointRecord:
     """Commands and states of one joint, on one clock.
 
-    Raises ValueError, naming the joint, for a joint that is not in JOINT_NAMES, arrays that do not match, numbers that
-    are not finite, time that does not increase, fewer than SHORTEST seconds of states after the first command, times
-    that are not the same seconds, and numbers too large to be SI units.
+    Raises ValueError, naming the joint, for a joint that the robot does not have, arrays that do not match, numbers
+    that are not finite, time that does not increase, fewer than SHORTEST seconds of states after the first command,
+    times that are not the same seconds, and numbers too large to be SI units.
     """
 
     joint: str
@@ -42,10 +43,12 @@ class JointRecord:
     command_velocity: np.ndarray  # (n,) [rad/s], a gantry axis [m/s]
     state_time: np.ndarray  # (m,) [s] when each state arrived
     state_position: np.ndarray  # (m,) [rad], a gantry axis [m]
+    robot: Robot = dataclasses.field(default_factory=robots.paper)
 
     def __post_init__(self) -> None:
-        if self.joint not in JOINT_NAMES:
-            raise ValueError(f"no joint {self.joint!r}; joints are {', '.join(JOINT_NAMES)}")
+        contract = self.robot.contract
+        if self.joint not in contract.joints:
+            raise ValueError(f"no joint {self.joint!r}; joints are {', '.join(contract.joints)}")
         for name in ("command_time", "command_velocity", "state_time", "state_position"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
         for kind, values in (("command", self.command_velocity), ("state", self.state_position)):
@@ -84,9 +87,9 @@ class JointRecord:
                 f"{self.command_time[0]:.3f}..{self.command_time[-1]:.3f}, states {self.state_time[0]:.3f}.."
                 f"{self.state_time[-1]:.3f}: are the commands' times milliseconds?)"
             )
-        i = JOINT_NAMES.index(self.joint)
-        _check_size(self.joint, "velocity", self.command_velocity, FASTEST * LIMITS.velocity[i])
-        _check_size(self.joint, "position", self.state_position, WIDEST * max(-LIMITS.lower[i], LIMITS.upper[i]))
+        i, limits = contract.joints.index(self.joint), contract.limits
+        _check_size(self.joint, "velocity", self.command_velocity, FASTEST * limits.velocity[i])
+        _check_size(self.joint, "position", self.state_position, WIDEST * max(-limits.lower[i], limits.upper[i]))
         _check_units(self)
 
 
@@ -117,7 +120,7 @@ def _check_units(record: JointRecord) -> None:
                 )
 
 
-def _read(path: Path, value: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _read(path: Path, value: str, joints: tuple[str, ...]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Times and values of each joint in one file, in the order of the file."""
     columns = ("t", "joint", value)
     rows: dict[str, tuple[list[float], list[float]]] = {}
@@ -135,10 +138,8 @@ def _read(path: Path, value: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
                 if len(row) != len(header):
                     raise ValueError(f"{path}:{reader.line_num}: {len(row)} fields, the header has {len(header)}")
                 joint = row[joint_at].strip()
-                if joint not in JOINT_NAMES:
-                    raise ValueError(
-                        f"{path}:{reader.line_num}: no joint {joint!r}; joints are {', '.join(JOINT_NAMES)}"
-                    )
+                if joint not in joints:
+                    raise ValueError(f"{path}:{reader.line_num}: no joint {joint!r}; joints are {', '.join(joints)}")
                 times, values = rows.setdefault(joint, ([], []))
                 try:
                     times.append(float(row[time_at]))
@@ -152,22 +153,26 @@ def _read(path: Path, value: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return {joint: (np.array(times), np.array(values)) for joint, (times, values) in rows.items()}
 
 
-def read_robot_csv(command: str | os.PathLike, state: str | os.PathLike) -> tuple[JointRecord, ...]:
-    """Records of the joints of a pair of files, in ``JOINT_NAMES`` order.
+def read_robot_csv(
+    command: str | os.PathLike, state: str | os.PathLike, robot: Robot | None = None
+) -> tuple[JointRecord, ...]:
+    """Records of the joints of a pair of files, in the order of the robot, None for the paper's.
 
     Raises OSError for files that cannot be read and ValueError, naming file and line or joint, for content that is not
     as described above or for a joint that only one of the two files has.
     """
     command, state = Path(command), Path(state)
-    commands, states = _read(command, "velocity"), _read(state, "position")
-    for joint in JOINT_NAMES:
+    robot = robots.paper() if robot is None else robot
+    joints = robot.contract.joints
+    commands, states = _read(command, "velocity", joints), _read(state, "position", joints)
+    for joint in joints:
         if (joint in commands) != (joint in states):
             there, absent = (command, state) if joint in commands else (state, command)
             raise ValueError(f"{absent}: no row of {joint}, which {there} has")
     records = []
-    for joint in (j for j in JOINT_NAMES if j in commands):
+    for joint in (j for j in joints if j in commands):
         try:
-            records.append(JointRecord(joint, *commands[joint], *states[joint]))
+            records.append(JointRecord(joint, *commands[joint], *states[joint], robot))
         except ValueError as error:
             raise ValueError(f"{command}, {state}: {error}") from None
     return tuple(records)
@@ -194,9 +199,10 @@ class JointLog:
         sizes = np.abs(u)
         self.sizes = sizes[sizes > 0.0]
         self.fastest = float(sizes.max())
-        i = JOINT_NAMES.index(record.joint)
-        self.unit = JOINT_UNITS[i]
-        self.rated_velocity, self.rated_acceleration = LIMITS.velocity[i], LIMITS.acceleration[i]
+        contract = record.robot.contract
+        i, limits = contract.joints.index(record.joint), contract.limits
+        self.unit = contract.units[i]
+        self.rated_velocity, self.rated_acceleration = limits.velocity[i], limits.acceleration[i]
         self.every = use = np.flatnonzero(record.state_time >= record.command_time[0])
         if use.size > SAMPLES:
             use = use[np.round(np.linspace(0, use.size - 1, SAMPLES)).astype(int)]

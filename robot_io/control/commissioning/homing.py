@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, LIMITS
+from robot_io.contract import PAPER, Contract
 from robot_io.errors import JogFirstError, RefusedError
 from robot_io.safety.clearance import RobotGeometry
 
@@ -12,13 +12,16 @@ HOMING_GAP = 0.03  # [m] of everything to everything while the linear axes searc
 HOMING_PLACES = 21  # along each axis at which that is looked at
 
 
-def check_homing(geometry: RobotGeometry, measured: np.ndarray) -> None:
-    """Raise RefusedError unless the arm, measured (8,), is clear of everything wherever the linear axes may go."""
-    if not np.isfinite(measured[list(ABB_JOINTS)]).all():
+def check_homing(geometry: RobotGeometry, measured: np.ndarray, contract: Contract = PAPER) -> None:
+    """Raise RefusedError unless the arm, measured (n,), is clear of everything wherever the linear axes may go."""
+    if not np.isfinite(measured[list(contract.arm)]).all():
         raise RefusedError("axes not homed: the arm's position is not known; start its EGM session first")
-    places = np.meshgrid(*(np.linspace(LIMITS.lower[i], LIMITS.upper[i], HOMING_PLACES) for i in FESTO_JOINTS))
+    if not contract.carrying:
+        return
+    limits = contract.limits
+    places = np.meshgrid(*(np.linspace(limits.lower[i], limits.upper[i], HOMING_PLACES) for i in contract.carrying))
     q = np.repeat(measured[:, None], places[0].size, axis=1)
-    q[list(FESTO_JOINTS)] = [axis.ravel() for axis in places]
+    q[list(contract.carrying)] = [axis.ravel() for axis in places]
     gaps = geometry.gaps(q)
     if not gaps.min() > HOMING_GAP:
         row = geometry.rows[int(gaps.min(axis=1).argmin())]

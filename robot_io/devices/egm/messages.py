@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 # Fields of a message made from descriptors are known at run time only, to the type checker not at all.
 Message = Any
 
-N_ARM_JOINTS = 6
+N_ARM_JOINTS = 6  # in a message's ``joints``; a seventh joint of an arm is the first of its ``externalJoints``
 MAX_DATAGRAM = 1472  # [bytes], what fits one Ethernet frame; ABB's messages are a few hundred
 UINT32 = 1 << 32
 
@@ -148,8 +148,8 @@ class SensorMessage:
     velocity: np.ndarray
 
 
-def decode_robot(datagram: bytes) -> RobotMessage:
-    """Reads an EgmRobot. Raises EgmError where it is not one, or not a complete one."""
+def decode_robot(datagram: bytes, joints: int = N_ARM_JOINTS) -> RobotMessage:
+    """Reads an EgmRobot of an arm. Raises EgmError where it is not one, or not a complete one."""
     message = _parse(EgmRobot, datagram)
     _require(message, "header", "feedBack", "motorState", "mciState", "rapidExecState")
     _require(message.header, "seqno", "tm", "mtype")
@@ -158,7 +158,7 @@ def decode_robot(datagram: bytes) -> RobotMessage:
     return RobotMessage(
         sequence=message.header.seqno,
         time_ms=message.header.tm,
-        position=_radians(message.feedBack.joints, "EgmRobot.feedBack.joints"),
+        position=_radians(message.feedBack, "EgmRobot.feedBack", joints),
         motors_on=message.motorState.state == _MOTORS.MOTORS_ON,
         egm_running=message.mciState.state == _MCI.MCI_RUNNING,
         rapid_running=message.rapidExecState.state in (_RAPID.RAPID_RUNNING, _RAPID.RAPID_UNDEFINED),
@@ -178,8 +178,8 @@ def encode_robot(
     message = EgmRobot()
     message.header.seqno, message.header.tm = sequence % UINT32, time_ms % UINT32
     message.header.mtype = _HEADER.MSGTYPE_DATA
-    message.feedBack.joints.joints.extend(_degrees(position, "position"))
-    message.planned.joints.joints.extend(_degrees(planned, "planned"))
+    _fill(message.feedBack, position, "position")
+    _fill(message.planned, planned, "planned")
     message.motorState.state = _MOTORS.MOTORS_ON if motors_on else _MOTORS.MOTORS_OFF
     message.mciState.state = _MCI.MCI_RUNNING if egm_running else _MCI.MCI_STOPPED
     message.mciConvergenceMet = False
@@ -187,7 +187,7 @@ def encode_robot(
     return message.SerializeToString()
 
 
-def decode_sensor(datagram: bytes) -> SensorMessage:
+def decode_sensor(datagram: bytes, joints: int = N_ARM_JOINTS) -> SensorMessage:
     """Reads an EgmSensor that has joint positions and joint speeds. Raises EgmError where it has not."""
     message = _parse(EgmSensor, datagram)
     _require(message, "header", "planned", "speedRef")
@@ -197,8 +197,8 @@ def decode_sensor(datagram: bytes) -> SensorMessage:
     _require(message.speedRef, "joints")
     return SensorMessage(
         sequence=message.header.seqno,
-        position=_radians(message.planned.joints, "EgmSensor.planned.joints"),
-        velocity=_radians(message.speedRef.joints, "EgmSensor.speedRef.joints"),
+        position=_radians(message.planned, "EgmSensor.planned", joints),
+        velocity=_radians(message.speedRef, "EgmSensor.speedRef", joints),
     )
 
 
@@ -207,8 +207,8 @@ def encode_sensor(sequence: int, time_ms: int, position: ArrayLike, velocity: Ar
     message = EgmSensor()
     message.header.seqno, message.header.tm = sequence % UINT32, time_ms % UINT32
     message.header.mtype = _HEADER.MSGTYPE_CORRECTION
-    message.planned.joints.joints.extend(_degrees(position, "position"))
-    message.speedRef.joints.joints.extend(_degrees(velocity, "velocity"))
+    _fill(message.planned, position, "position")
+    _fill(message.speedRef, velocity, "velocity")
     return message.SerializeToString()
 
 
@@ -239,10 +239,16 @@ def _require_type(header: Message, wanted: int) -> None:
         raise EgmError("wrong_type", f"message type {name(header.mtype)}, expected {name(wanted)}")
 
 
-def _radians(joints: Message, name: str) -> np.ndarray:
-    degrees = joints.joints
-    if len(degrees) != N_ARM_JOINTS:
-        raise EgmError("joint_count", f"{name} has {len(degrees)} numbers, the arm has {N_ARM_JOINTS} joints")
+def _radians(holder: Message, name: str, joints: int) -> np.ndarray:
+    degrees, own = list(holder.joints.joints), min(joints, N_ARM_JOINTS)
+    if len(degrees) != own:
+        raise EgmError("joint_count", f"{name}.joints has {len(degrees)} numbers, the arm has {own} joints")
+    if joints > own:
+        degrees += holder.externalJoints.joints[: joints - own]
+        if len(degrees) != joints:
+            count = len(degrees) - own
+            wanted = f"{name}.externalJoints has {count} numbers, joints 7 to {joints} of the arm are wanted there"
+            raise EgmError("joint_count", wanted)
     radians = np.deg2rad(degrees)
     if not np.isfinite(radians).all():
         raise EgmError("not_finite", f"{name} has a non-finite number: {list(degrees)}")
@@ -250,9 +256,17 @@ def _radians(joints: Message, name: str) -> np.ndarray:
     return radians
 
 
+def _fill(holder: Message, radians: ArrayLike, name: str) -> None:
+    """Write the joints [rad], the first six as such and others as external ones."""
+    degrees = _degrees(radians, name)
+    holder.joints.joints.extend(degrees[:N_ARM_JOINTS])
+    if len(degrees) > N_ARM_JOINTS:
+        holder.externalJoints.joints.extend(degrees[N_ARM_JOINTS:])
+
+
 def _degrees(radians: ArrayLike, name: str) -> list[float]:
     values = np.asarray(radians, np.float64)
-    if values.shape != (N_ARM_JOINTS,):
+    if values.ndim != 1 or not N_ARM_JOINTS <= values.size <= 2 * N_ARM_JOINTS:
         raise ValueError(f"{name} has shape {values.shape}, the arm needs ({N_ARM_JOINTS},)")
     with np.errstate(over="ignore"):  # a finite number may leave the range of float64 here
         degrees = np.rad2deg(values)

@@ -35,7 +35,8 @@ class EgmConfig:
     controller_port     port that packets are taken from; None learns it. Two senders at once are then a problem
     period              the controller's cycle [s]
     timeout             age [s] at which feedback is stale: ``problem`` says so, and the next packet opens a new session
-    zeros               (6,) [rad] added to every position that comes, and taken from every one that goes
+    zeros               (6,) [rad] added to every position that comes, and taken from every one that goes; as many as
+                        the arm has joints
     """
 
     controller_address: str | None = None
@@ -128,7 +129,7 @@ class EgmSession:
             trusted = address if port is None or source[0] != address else f"{address} port {port}"
             return self._refuse("stranger", f"from {source[0]} port {source[1]}, only {trusted} is trusted")
         try:
-            message = decode_robot(datagram)
+            message = decode_robot(datagram, len(self._zeros))
         except EgmError as error:
             return self._refuse(error.reason, str(error))
         last, new_session = self.feedback, True

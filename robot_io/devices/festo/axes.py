@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robot_io.devices.festo.config import N_AXES, AxesConfig, AxesFault, AxesState, Axis
+from robot_io.devices.festo.config import AxesConfig, AxesFault, AxesState, Axis
 from robot_io.devices.festo.following import Move, Reference, Target, move
 from robot_io.devices.festo.modbus_link import AxisLost
 from robot_io.devices.festo.profile import AxisCommand, AxisStatus
@@ -56,11 +56,11 @@ class FestoAxes:
     """
 
     def __init__(self, axes: Sequence[Axis], config: AxesConfig = DEFAULTS) -> None:
-        if len(axes) != N_AXES:
-            raise ValueError(f"{len(axes)} axes given, the robot has {N_AXES}")
+        if not axes:
+            raise ValueError("no axes given; a robot on a fixed base has a FixedBase")
         self.config = config
         self.fault: AxesFault | None = None
-        self.commanded = np.zeros(N_AXES)
+        self.commanded = np.zeros(len(axes))
         self.stale_commands = 0
         self._channels = [_Channel(axis) for axis in axes]
         self._state: AxesState | None = None
@@ -93,8 +93,8 @@ class FestoAxes:
         numbers = []
         for name, values in (("position", position), ("velocity", velocity)):
             array = np.asarray(values, np.float64)
-            if array.shape != (N_AXES,) or not np.isfinite(array).all():
-                raise ValueError(f"{name} {values!r} must be {N_AXES} finite numbers")
+            if array.shape != self.commanded.shape or not np.isfinite(array).all():
+                raise ValueError(f"{name} {values!r} must be {self.commanded.size} finite numbers")
             numbers.append(tuple(array.tolist()))
         self._target = Target(numbers[0], numbers[1], now)
 

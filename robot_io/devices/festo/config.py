@@ -10,8 +10,6 @@ import numpy as np
 from robot_io.devices.festo.modbus_link import RegisterLink
 from robot_io.devices.festo.profile import AxisProfile
 
-N_AXES = 2
-
 
 @dataclass(frozen=True)
 class Axis:

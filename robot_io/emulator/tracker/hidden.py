@@ -42,7 +42,7 @@ class HiddenErrors:
 
     def counted(self, angles: np.ndarray) -> np.ndarray:
         """Angles (6,) [rad] of which the arm's controller knows where the joints are at ``angles``."""
-        return angles - np.array(self.joint_zeros)
+        return angles - np.array(self.joint_zeros) if any(self.joint_zeros) else angles
 
 
 NOTHING_HIDDEN = HiddenErrors()

@@ -172,6 +172,7 @@ def test_keys_and_choices_are_those_of_the_optimiser_and_the_task():
     assert {field.name for field in fields(TaskConfig)} - limits - {
         "reward_weights",
         "own_terms",
+        "robot",
     } <= config.Task.model_fields.keys()
 
 

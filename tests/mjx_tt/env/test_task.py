@@ -15,7 +15,7 @@ from mjx_tt.env import rewards
 from mjx_tt.env.rewards import TERMS
 from mjx_tt.env.task import OUT_OF_REACH, TaskConfig
 from mjx_tt.robot import model as robot
-from mjx_tt.robot.clearance import BLADE_CAPSULES, SELF_PAIRS, TABLE_CAPSULES
+from mjx_tt.robot import robot as robots
 from robot_io.contract import LIMITS, N_JOINTS
 from tests.oracles import ball_flight
 from tests.oracles.ball_flight import Touch, fly, on_blade, on_table, path
@@ -196,9 +196,10 @@ def test_pose_terms_equal_a_recount_in_mujoco(flailing):
     """Steps in contact, with a low blade and with a blade that looks aside, by MuJoCo's poses and distances."""
     mj = robot.load_model()
     data, site = mujoco.MjData(mj), mj.site(robot.PADDLE_SITE).id
-    own = [(a, b) for a, others in SELF_PAIRS for b in others]
-    table = [(name, "col_table") for name in TABLE_CAPSULES]
-    low_pairs = [(name, "col_table") for name in BLADE_CAPSULES]
+    watched = robots.paper().file
+    own = list(watched.pairs)
+    table = [(name, "col_table") for name in watched.table]
+    low_pairs = [(name, "col_table") for name in watched.blade]
 
     def gap(pairs):
         return min(mujoco.mj_geomDistance(mj, data, mj.geom(a).id, mj.geom(b).id, 1.0, None) for a, b in pairs)

@@ -11,11 +11,9 @@ import pytest
 
 from ballmodel.contact import TABLE
 from mjx_tt.robot import model as robot
+from mjx_tt.robot import robot as robots
 from mjx_tt.robot.clearance import (
     BISECTIONS,
-    BLADE_CAPSULES,
-    SELF_PAIRS,
-    TABLE_CAPSULES,
     CapsuleClearance,
     segment_box_distance,
     segment_distance,
@@ -25,7 +23,8 @@ from robot_io.contract import LIMITS
 
 N = 4000
 RADIUS = {c.name: c.radius for c in robot.capsules(robot.load_model())}
-PAIRS = {frozenset((first, other)) for first, others in SELF_PAIRS for other in others}
+WATCHED = robots.paper().file
+PAIRS = {frozenset(pair) for pair in WATCHED.pairs}
 
 # Pairs that are left out, with the reason.
 LEFT_OUT = {
@@ -69,7 +68,7 @@ def mujocos(model, poses):
     names = [c.name for c in robot.capsules(model)] + ["col_table"]
     geoms = {name: model.geom(name).id for name in names}
     distances = {frozenset(pair): np.empty(N) for pair in combinations(names, 2)}
-    pierced = {name: np.empty(N, bool) for name in TABLE_CAPSULES}
+    pierced = {name: np.empty(N, bool) for name in WATCHED.table}
     data = mujoco.MjData(model)
     for i in range(N):
         data.qpos[:] = poses[:, i]
@@ -98,7 +97,7 @@ def distances(mujocos):
 @pytest.fixture(scope="module")
 def clearances(model, poses):
     kinematics = PaddleKinematics(robot.chain_from_model(model), robot.paddle_frame(model))
-    clearance = CapsuleClearance(kinematics, robot.capsules(model))
+    clearance = CapsuleClearance(kinematics, robot.capsules(model), WATCHED)
     q = poses.astype(np.float32)
     return jax.tree.map(np.asarray, jax.jit(lambda q: clearance(kinematics.links(q), q[0]))(q))
 
@@ -115,7 +114,7 @@ def agree(ours, mujocos):
     assert 20 < (mujocos < 0).sum() and 20 < (mujocos > 0).sum()
 
 
-@pytest.mark.parametrize(("quantity", "capsules"), [("table", TABLE_CAPSULES), ("blade", BLADE_CAPSULES)])
+@pytest.mark.parametrize(("quantity", "capsules"), [("table", WATCHED.table), ("blade", WATCHED.blade)])
 def test_clearance_of_the_table(clearances, mujocos, quantity, capsules):
     """MuJoCo's capsule-box distance is wrong, at times even positive, where the capsule's axis itself passes through
     the box (version 4.0.0); such poses are in contact by at least the capsule's radius."""
@@ -183,4 +182,4 @@ def test_a_model_without_its_capsules_is_refused(model):
     kinematics = PaddleKinematics(robot.chain_from_model(model), robot.paddle_frame(model))
     some = [c for c in robot.capsules(model) if c.name != "col_wrist"]
     with pytest.raises(ValueError, match=r"lacks the capsules \['col_wrist'\]; it has .*'col_base'"):
-        CapsuleClearance(kinematics, some)
+        CapsuleClearance(kinematics, some, WATCHED)

@@ -9,6 +9,7 @@ import pytest
 
 from mjx_tt.env.policy import PolicyController, initial_theta
 from mjx_tt.robot import model as robot
+from mjx_tt.robot import robot as robots
 from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.dynamics_fused import FusedEngine
 from mjx_tt.robot.dynamics_mjx import MjxEngine
@@ -38,7 +39,7 @@ def a_pendulum():
 @pytest.mark.parametrize(
     ("model", "timestep"),
     [
-        pytest.param(robot.load_model(), None, id="robot"),
+        *(pytest.param(robots.load_shipped(name).model(), None, id=name) for name in robots.names()),
         pytest.param(mujoco.MjModel.from_xml_string(SKEW), 1 / 300, id="skew"),
         pytest.param(mujoco.MjModel.from_xml_string(CRANE), None, id="crane"),
         pytest.param(mujoco.MjModel.from_xml_string(CART), 1 / 300, id="cart"),

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from mjx_tt.robot import model as robot
+from mjx_tt.robot import robot as robots
 from mjx_tt.robot import scalar_algebra
 from mjx_tt.robot.chain import chain_from_model, site_frame
 from mjx_tt.robot.kinematics import PaddleKinematics
 from tests.oracles.chains import CART, CRANE, SKEW
 
 MODELS = [
-    pytest.param(robot.load_model(), robot.PADDLE_SITE, id="robot"),
+    *(pytest.param(robots.load_shipped(name).model(), robot.PADDLE_SITE, id=name) for name in robots.names()),
     pytest.param(mujoco.MjModel.from_xml_string(SKEW), "tip", id="skew"),
     pytest.param(mujoco.MjModel.from_xml_string(CRANE), "tip", id="crane"),
     pytest.param(mujoco.MjModel.from_xml_string(CART), "tip", id="cart"),

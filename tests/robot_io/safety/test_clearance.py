@@ -12,6 +12,7 @@ import pytest
 
 from mjx_tt.robot import clearance, geometry_export
 from mjx_tt.robot import model as robot
+from mjx_tt.robot import robot as robots
 from mjx_tt.robot.kinematics import PaddleKinematics
 from robot_io.contract import LIMITS
 from robot_io.safety import clearance as shipped
@@ -45,7 +46,7 @@ def simulated(model, poses):
     """The simulation's clearances in float64, each (N,)."""
     with jax.enable_x64(True):
         kinematics = PaddleKinematics(robot.chain_from_model(model), robot.paddle_frame(model))
-        gaps = clearance.CapsuleClearance(kinematics, robot.capsules(model))
+        gaps = clearance.CapsuleClearance(kinematics, robot.capsules(model), robots.paper().file)
         return jax.tree.map(np.asarray, jax.jit(lambda q: gaps(kinematics.links(q), q[0]))(poses))
 
 
@@ -64,9 +65,9 @@ def mujocos(model, poses, ours):
     return found[: len(pairs)], found[len(pairs) :]
 
 
-def test_the_shipped_file_is_current(model):
+def test_the_shipped_file_is_current():
     message = "run python -m mjx_tt.robot.geometry_export"
-    assert geometry_export.path().read_text(encoding="utf-8") == geometry_export.text(model), message
+    assert geometry_export.path().read_text(encoding="utf-8") == geometry_export.text(robots.paper()), message
 
 
 def test_home_is_the_models(model, ours):
