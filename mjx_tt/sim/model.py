@@ -108,7 +108,7 @@ class SimModel:
     sensing: SensingParams = field(default_factory=SensingParams)
     actuation: ActuationParams = field(default_factory=ActuationParams)
     drives: Any | None = None  # as ``actuators.drive_params`` of the joints makes them
-    joints: tuple[str, ...] = field(default=JOINT_NAMES, metadata={"static": True})
+    joints: tuple[str, ...] = field(default=JOINT_NAMES, metadata={"static": True, "parameter": False})
 
 
 class _Dumper(yaml.SafeDumper):
@@ -182,8 +182,8 @@ def with_values(model: SimModel, values: Mapping[str, Any]) -> SimModel:
 
 
 def _parameters(node: Any) -> list[dataclasses.Field]:
-    """The fields that hold numbers or groups of them."""
-    return [f for f in dataclasses.fields(node) if not f.metadata.get("static")]
+    """The fields that hold parameters or groups of them."""
+    return [f for f in dataclasses.fields(node) if f.metadata.get("parameter", True)]
 
 
 def _with_values(node: Any, values: Mapping[str, Any]) -> Any:
