@@ -37,7 +37,7 @@ class Cause:
     group: tuple[str, ...]  # the name first, then its equals
     confidence: float  # share of bootstrap draws in which this group is chosen
     parameters: dict[str, Estimate]  # by dotted path of SimModel, of a joint by joint.parameter
-    effect_mm: float  # median shift of a flight's last sample; rms movement of a joint [mrad], a gantry axis [mm]
+    effect_mm: float  # median shift of a flight's last sample; rms movement of a joint [mrad], an axis [mm]
     separating_measurement: str
 
 

@@ -27,7 +27,7 @@ def held_out(fitter: Fitter, values: Mapping[str, float], sigma: float, rng: np.
     spread = np.sqrt(squares[:, draws].sum(axis=-1) / counts[draws].sum(axis=-1))
     low, high = np.quantile(spread[0] - spread[1], (0.05, 0.95))
     total = np.sqrt(squares.sum(axis=-1) / counts.sum())
-    return JointGain(log.record.joint, float(total[0]), float(total[1]), float(low), float(high))
+    return JointGain(log.record.joint, float(total[0]), float(total[1]), float(low), float(high), log.unit)
 
 
 def residuals(log: JointLog, values: Mapping[str, float]) -> JointResidual:
@@ -39,4 +39,4 @@ def residuals(log: JointLog, values: Mapping[str, float]) -> JointResidual:
     for parameters in ({}, values):
         line = log.simulate(parameters, time)
         lines.append(line + (np.add.reduceat(measured - line, starts) / count)[window])
-    return JointResidual(log.record.joint, time, measured, *lines)
+    return JointResidual(log.record.joint, time, measured, *lines, log.unit)

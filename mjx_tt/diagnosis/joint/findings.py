@@ -29,18 +29,19 @@ class JointFinding:
     block: str
     where: str
     direction: str
-    size: float  # [mrad], a gantry axis [mm]
+    size: float  # [mrad], an axis [mm]
 
 
 @dataclass(frozen=True)
 class JointGain:
-    """Prediction error of positions on windows that the fit did not see; [rad], a gantry axis [m]."""
+    """Prediction error of positions on windows that the fit did not see; [rad], an axis [m]."""
 
     joint: str
     before: float  # rms, nominal model
     after: float  # rms, with the named causes
     low: float  # 90 % bootstrap interval over windows of before - after
     high: float
+    unit: str = "rad"  # or m
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,14 @@ class JointResidual:
     measured: Float[np.ndarray, " m"]
     nominal: Float[np.ndarray, " m"]
     extended: Float[np.ndarray, " m"]
+    unit: str = "rad"  # or m
 
 
 @dataclass(frozen=True)
 class JointFindings:
     """All that the logs hold about the joints' responses."""
 
-    causes: tuple[Cause, ...] = ()  # largest effect first; effects are rms movements [mrad], a gantry axis [mm]
+    causes: tuple[Cause, ...] = ()  # largest effect first; effects are rms movements [mrad], an axis [mm]
     not_excited: tuple[Undecided, ...] = ()
     not_identifiable: tuple[Undecided, ...] = ()
     unexplained_by_joint: tuple[JointFinding, ...] = ()  # largest first

@@ -40,9 +40,9 @@ class JointRecord:
 
     joint: str
     command_time: np.ndarray  # (n,) [s] when each command was sent; it holds until the next one
-    command_velocity: np.ndarray  # (n,) [rad/s], a gantry axis [m/s]
+    command_velocity: np.ndarray  # (n,) [rad/s], an axis [m/s]
     state_time: np.ndarray  # (m,) [s] when each state arrived
-    state_position: np.ndarray  # (m,) [rad], a gantry axis [m]
+    state_position: np.ndarray  # (m,) [rad], an axis [m]
     robot: Robot = dataclasses.field(default_factory=robots.paper)
 
     def __post_init__(self) -> None:

@@ -193,7 +193,7 @@ def joint_gains(robot: JointFindings) -> Figure:
         wide = sizes.max() > FAR * max(sizes.min(), 1e-9)
         if wide:
             ax.set_xscale("log")
-        ax.set_yticks(at, [f"{g.joint} [{'mm' if g.joint.startswith('gantry') else 'mrad'}]" for g in rows])
+        ax.set_yticks(at, [f"{g.joint} [m{g.unit}]" for g in rows])
         ax.invert_yaxis()
         ax.tick_params(axis="y", length=0)
         ax.grid(axis="x", color="#e6e9ed", linewidth=0.7)

@@ -80,7 +80,7 @@ def _joint(r: JointResidual) -> tuple[Figure, str]:
     parts = [(time >= t) & (time <= t + EXCERPT) for t in starts]
     part = max(parts, key=lambda p: float(np.mean(before[p] ** 2)))
     same = np.array_equal(before, after)
-    unit = "mm" if r.joint.startswith("gantry") else "mrad"
+    unit = f"m{r.unit}"
     kinds = ((before, UNCHANGED),) if same else ((before, BEFORE), (after, AFTER))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")

@@ -309,9 +309,14 @@ def _held_out(d: Diagnosis, page: Page) -> Context:
         "balls": balls,
         "joints": joints,
         "gains": [
-            (g.joint, f"{1e3 * g.before:.3f}", f"{1e3 * g.after:.3f}", f"{1e3 * g.low:.3f} to {1e3 * g.high:.3f}", unit)
+            (
+                g.joint,
+                f"{1e3 * g.before:.3f}",
+                f"{1e3 * g.after:.3f}",
+                f"{1e3 * g.low:.3f} to {1e3 * g.high:.3f}",
+                f"m{g.unit}",
+            )
             for g in gains
-            for unit in ["mm" if g.joint.startswith("gantry") else "mrad"]
         ],
     }
 

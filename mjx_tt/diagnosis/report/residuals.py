@@ -231,7 +231,7 @@ def joints(robot: JointFindings) -> Figure:
         figure = Figure(figsize=(WIDTH, 0.8 + 1.55 * len(rows)), layout="constrained")
         axes = figure.subplots(len(rows), 2, squeeze=False, width_ratios=(2.0, 1.0), sharey="row")
         for r, (left, right) in zip(rows, axes, strict=True):
-            unit = "mm" if r.joint.startswith("gantry") else "mrad"
+            unit = f"m{r.unit}"
             _joint(left, right, r)
             left.set_ylabel(f"{r.joint}\n[{unit}]")
             right.set_xlabel(f"velocity [{'m/s' if unit == 'mm' else 'rad/s'}]", fontsize=9, labelpad=1)
