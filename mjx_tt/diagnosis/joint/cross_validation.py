@@ -39,4 +39,4 @@ def residuals(log: JointLog, values: Mapping[str, float]) -> JointResidual:
     for parameters in ({}, values):
         line = log.simulate(parameters, time)
         lines.append(line + (np.add.reduceat(measured - line, starts) / count)[window])
-    return JointResidual(log.record.joint, time, measured, *lines, log.unit)
+    return JointResidual(log.record.joint, time, measured, *lines, unit=log.unit)
