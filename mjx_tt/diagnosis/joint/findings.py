@@ -53,7 +53,7 @@ class JointResidual:
     measured: Float[np.ndarray, " m"]
     nominal: Float[np.ndarray, " m"]
     extended: Float[np.ndarray, " m"]
-    unit: str = "rad"  # or m
+    unit: str = field(default="rad", kw_only=True)  # or m
 
 
 @dataclass(frozen=True)

@@ -286,7 +286,7 @@ def test_names_a_table_that_springs_back_sideways():
 
 
 def ripple(measured: np.ndarray) -> np.ndarray:
-    """What a tracker makes of positions whose calibration ripples along the table, by three millimetres."""
+    """Positions as a tracker sees them whose calibration ripples along the table, by three millimetres."""
     error = np.zeros_like(measured)
     error[2] = 0.003 * np.sin(2.0 * np.pi * measured[1] / 1.4)
     error[0] = 0.002 * np.cos(2.0 * np.pi * measured[1] / 1.1)
