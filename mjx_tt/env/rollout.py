@@ -22,8 +22,8 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import BallPool
-from ballmodel.state import BallState, where
-from mjx_tt.env.outgoing_ball import fly_out, fly_out_step
+from ballmodel.state import BallState
+from mjx_tt.env.outgoing_ball import fly_out
 from mjx_tt.env.policy import controller
 from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, EpisodeState, Task, TaskConfig
@@ -227,36 +227,6 @@ class Simulator:
             peak_velocity=state.sums.peak_velocity,
         )
         return result, observed, jnp.where(finite, steps, 0)
-
-    def replay(
-        self, policy: Policy, episodes: Episodes
-    ) -> tuple[Float[Array, "ticks joints R"], Float[Array, "ticks 3 R"], Int[Array, " R"]]:
-        """Plays single episodes for the camera: one policy, episodes (R, 1).
-
-        Returns joint positions (max_steps, 8, R), ball positions (max_steps, 3, R) at the control ticks and the number
-        of ticks (R,) until the ball came down.
-        """
-        task = self.task
-        plays = controller(replace(policy, theta=policy.theta[:, None]))
-        prepared = task.prepare(episodes)
-        state = task.reset(episodes, plays)
-        grounded = jnp.zeros_like(state.live)
-        outcome = fly_out(self.config, state.ball, grounded, episodes.model)
-        flight = replace(episodes.model.ball.flight, integrator="midpoint")
-        params = replace(episodes.model.ball, flight=flight)
-
-        def advance(carry: tuple, tick: Array) -> tuple[tuple, tuple[Array, Array]]:
-            state, ball, flying, outcome, length = carry
-            shown = (state.qpos[..., 0], ball.position[..., 0])
-            new = task.control_step(tick, state, episodes, prepared, plays)
-            out, outcome, still = fly_out_step(self.config, params, ball, flying, outcome)
-            ball = where(state.hit, out, new.ball)
-            flying = still | (new.hit & ~state.hit)
-            return (new, ball, flying, outcome, jnp.where(new.live | flying, tick + 2, length)), shown
-
-        start = (state, state.ball, grounded, outcome, jnp.zeros(grounded.shape, jnp.int32))
-        (*_, length), (qpos, ball) = jax.lax.scan(advance, start, jnp.arange(self.config.max_steps))
-        return qpos, ball, jnp.minimum(length[..., 0], self.config.max_steps)
 
 
 def held_here(tree: T) -> T:

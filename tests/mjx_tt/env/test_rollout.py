@@ -205,17 +205,6 @@ def test_a_randomised_drive_shows_in_the_rollout(simulator, pool, theta, episode
     assert (np.abs(np.asarray(found.returns) - result.returns) > 1e-4).mean() > 0.5
 
 
-def test_replay_shows_the_same_episode(simulator, theta, episodes, played):
-    one = jax.tree.map(lambda x: x[..., :1] if x.ndim >= 2 else x, episodes)
-    qpos, ball, length = jax.jit(simulator.replay)(Policy(theta[:, 0], MEAN, INVERSE_SCALE), one)
-    columns = np.arange(0, R * P, P)
-    np.testing.assert_allclose(qpos[1:121], played.qpos[..., columns], atol=1e-4)
-    for i, b in enumerate(columns):
-        live = int(played.live[:, b].sum())
-        np.testing.assert_allclose(ball[1 : live + 1, :, i], played.ball[:live, :, b], atol=1e-4)
-        assert live < length[i] <= simulator.config.max_steps
-
-
 def test_mistakes_are_named(simulator, theta, episodes):
     with pytest.raises(ValueError, match="theta has 3 columns, the episodes 4"):
         simulator.rollout(Policy(theta[:, :3], MEAN, INVERSE_SCALE), episodes)
