@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 from pathlib import Path
 
 import pytest
+
+# Started in the background (nohup, &) the tests ignore Ctrl-C, and so would their processes: one that is sent it would
+# never end.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Tests compile far more than they compute: without LLVM's optimisation a program compiles in half the time. Set to 0,
 # the tests run the programs that users get, as those marked ``optimised`` do, in which computing is most of the work.
