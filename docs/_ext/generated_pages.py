@@ -190,6 +190,7 @@ def dataclass_page(
 def model_page() -> str:
     """Every parameter of the simulation's model, its nominal value and its comment."""
     from mjx_tt.sim import model
+    from mjx_tt.sim.actuators import DriveParams
 
     sections: dict[str, dict[str, Any]] = {}
     for path, value in model.paths().items():
@@ -218,7 +219,8 @@ def model_page() -> str:
             continue
         owner: Any = model.SimModel
         for name in section.split("."):
-            hint = typing.get_type_hints(owner)[name]
+            # The class of the drives is made for a robot's joints: its name tells no type.
+            hint = DriveParams if name == "drives" else typing.get_type_hints(owner)[name]
             owner = next(h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h))
         summary, notes = field_notes(owner)
         title = "drives.JOINT" if section in joints else section
