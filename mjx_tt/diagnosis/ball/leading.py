@@ -48,8 +48,8 @@ def leading(found: BallFindings, say: Callable[[str], None], seed: int = 0) -> L
     problem, g, trial = found.problem, found.problem.grid, found.trial
     say("looking for a leading cause")
     best = Settled(found.situation, found.linear, found.choice, found.noise, found.projected, trial)
+    nominal = Situation(np.zeros(len(trial.effects)), found.start0)
     if trial.spin != "never":
-        nominal = Situation(np.zeros(len(trial.effects)), found.start0)
         other, _ = spinning(problem, trial, nominal, say, SCATTER)
         if evidence.misfit(other, g) < evidence.misfit(best, g) and evidence.lifts(other):
             best = other
@@ -60,6 +60,8 @@ def leading(found: BallFindings, say: Callable[[str], None], seed: int = 0) -> L
     patterns = find(best, g, found.sessions, found.age, called).findings
     open_ = max((f.gain for f in patterns), default=0.0)
     total = scores.gain(rated, best.choice.effects) - alone + open_
+    if total <= 0.0:
+        return None
     spins = best.choice.prior is not None
     able = [
         i
@@ -68,18 +70,16 @@ def leading(found: BallFindings, say: Callable[[str], None], seed: int = 0) -> L
     ]
     able = [i for i in able if not any(i == one for one, _ in trial.bound)]
     shares = {i: (scores.gain(rated, (i,)) - alone) / total for i in able if _possible(rated, trial, i)}
-    if not shares or total <= 0.0:
+    if not shares:
         return None
-    priced = scores.priced(rated, trial.effects)
     near = [i for i in shares if shares[i] > max(shares.values()) - RIVAL]
-    leads = min(near, key=lambda i: (shares[i] < LEAST_SHARE, _surprise(priced, trial, i)))
+    leads = min(near, key=lambda i: (shares[i] < LEAST_SHARE, _surprise(rated, trial, i)))
     if shares[leads] < LEAST_SHARE:
         return None
     say(f"{trial.effects[leads].name} leads: once more with what balls and tables differ in")
     kept = {leads, problem.coefficient, *(i for i, e in enumerate(trial.effects) if e.name in BALL_AND_TABLE)}
     others = tuple(i for i in range(len(trial.effects)) if i not in kept or i in trial.left_out)
     few = replace(trial, left_out=others, spin=trial.spin if spins else "never")
-    nominal = Situation(np.zeros(len(trial.effects)), found.start0)
     settled, _ = spinning(problem, few, nominal, say) if spins else plain(problem, few, nominal, say)
     if leads not in settled.choice.effects or (spins and not evidence.lifts(settled)):
         return None
