@@ -129,7 +129,7 @@ class Task:
             observations=jnp.broadcast_to(captured, (self._observation_depth, *captured.shape)),
             controller=controller.start(first),
             drive=drives.at_rest(prepared.drives, home),
-            filters=Filters.at(tracker, episodes.ball.position),
+            filters=Filters.at(tracker, episodes.ball.position, 1.0 / self.config.sim_rate),
             ball=episodes.ball,
             bounced=false,
             hit=false,

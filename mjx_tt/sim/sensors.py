@@ -18,6 +18,10 @@ from ballmodel.vec import Scalars, dot, row
 SHORTEST = 1e-9  # [s], keeps the filters' exponents finite
 FILTER_GATE = 0.03  # [m]: ten deviations of a usual tracker's noise
 SOFT_GATE = 0.3  # of the gate, below and above it: noise blurs where a filter starts afresh
+FRESH = 300.0  # variance that an opened filter adds, in the noise's: 5 cm of a ball that is measured to 3 mm
+SETTLED = (2.0, 2.0, 1.0, 3.0, 2.0, 2.0)  # of h: covariance of a settled filter that measures without a pause
+ROUNDS = 12  # of measurements, after which it is that of a filter that measures now and then
+LONGEST = 10.0  # memories between measurements, from where on a filter keeps nothing
 
 
 @jax.tree_util.register_dataclass
@@ -98,36 +102,103 @@ def smoothed(
     return jnp.asarray(after) - behind + (filtered - before + behind) * jnp.exp(-timestep / tau)
 
 
+# xx, xv, xa, vv, va, aa; unit of length: the deviation of the measurements' noise, of time: the memory
+Covariance = Float[Array, "6 *batch"]
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Lag:
-    """Estimate minus truth of a causal filter that assumes constant acceleration.
+    """Estimate minus truth of a Kalman filter that assumes constant acceleration.
 
-    The fading-memory filter of second degree (Morrison, Introduction to Sequential Smoothing and Prediction, 1969), the
-    steady form of a Kalman filter with this model: a flight shows no lag, a jump of the velocity leaves one that fades
-    with the filter's memory. A surprise beyond the gate opens the filter: it starts afresh at what it measures.
+    State: position, velocity, acceleration; driven by a white jerk of density q, measured with a noise of density r
+    (variance times interval). What it leaves of a truth depends on one number, its memory (r / q)^(1/6) [s]: settled
+    and measured often, the filter's poles are those of the third-order Butterworth filter of that time (Kalman and
+    Bucy, New Results in Linear Filtering and Prediction Theory, 1961). A flight shows no lag; a jump of the velocity
+    leaves one that fades. A surprise beyond the gate opens the filter: its covariance grows by FRESH, so that it
+    believes what it measures until it has settled again.
     """
 
     position: Float[Array, "3 *batch"]  # [m]
     velocity: Float[Array, "3 *batch"]  # [m/s]
     acceleration: Float[Array, "3 *batch"]  # [m/s^2]
+    covariance: Covariance
+
+    @classmethod
+    def settled(cls, dt: Scalars, memory: Scalars, like: Float[Array | np.ndarray, "3 *batch"]) -> Lag:
+        """A filter that has watched a flight, measured every ``dt`` [s]: no lag. memory [s]."""
+        zero = jnp.zeros_like(like)
+        h = jnp.broadcast_to(_interval(dt, memory), zero.shape[1:])
+        covariance = h * jnp.stack([jnp.full_like(h, x) for x in SETTLED])
+        for _ in range(ROUNDS):
+            grown = _grown(covariance, h, h)
+            covariance = _measured(grown, _gains(grown))
+        return cls(zero, zero, zero, covariance)
 
     def predicted(self, dt: Scalars, jump: Float[Array, "3 *batch"], since: Scalars) -> Lag:
         """The lag after ``dt`` [s] without a measurement; jump: of the ball's velocity [m/s], ``since`` [s] ago."""
         moved = self.position + row(dt) * self.velocity + row(0.5 * dt**2) * self.acceleration - row(since) * jump
-        return Lag(moved, self.velocity + row(dt) * self.acceleration - jump, self.acceleration)
+        return Lag(moved, self.velocity + row(dt) * self.acceleration - jump, self.acceleration, self.covariance)
 
-    def corrected(self, dt: Scalars, memory: Scalars, gate: Scalars) -> Lag:
-        """The lag after a measurement, ``dt`` [s] after the one before. memory [s], gate [m]."""
-        kept = jnp.exp(-dt / jnp.maximum(memory, SHORTEST))
+    def corrected(self, dt: Scalars, usual: Scalars, memory: Scalars, gate: Scalars) -> Lag:
+        """The lag after a measurement, ``dt`` [s] after the one before. memory [s], zero: no lag; gate [m].
+
+        usual: interval [s] of measurements for which the filter was made.
+        """
+        h = _interval(usual, memory)
         surprise = jnp.sqrt(dot(self.position, self.position) + SHORTEST**2)
         share = jnp.clip(0.5 - 0.5 * (surprise - gate) / (SOFT_GATE * gate), 0.0, 1.0)
-        shut = row(share * share * (3.0 - 2.0 * share))
-        spread = jnp.maximum(dt, SHORTEST)
-        gains = kept**3, 1.5 * (1.0 - kept) ** 2 * (1.0 + kept) / spread, ((1.0 - kept) ** 3) / spread**2
-        position = jnp.asarray(shut * row(gains[0]) * self.position)
-        velocity = jnp.asarray(shut * (self.velocity - row(gains[1]) * self.position))
-        return Lag(position, velocity, jnp.asarray(shut * (self.acceleration - row(gains[2]) * self.position)))
+        shut = share * share * (3.0 - 2.0 * share)  # of balls whose filter did not open
+        grown = _grown(self.covariance, _interval(dt, memory), h)
+        opened = jnp.stack([grown[0] + FRESH, *grown[1:3], grown[3] + FRESH / h**2, grown[4], grown[5] + FRESH / h**4])
+        gains = [shut * a + (1.0 - shut) * b for a, b in zip(_gains(grown), _gains(opened), strict=True)]
+        covariance = shut * _measured(grown, _gains(grown)) + (1.0 - shut) * _measured(opened, _gains(opened))
+        time = jnp.maximum(memory, SHORTEST)
+        there = memory > 0.0
+        return Lag(
+            jnp.where(there, row(1.0 - gains[0]) * self.position, 0.0),
+            jnp.where(there, self.velocity - row(gains[1] / time) * self.position, 0.0),
+            jnp.where(there, self.acceleration - row(gains[2] / time**2) * self.position, 0.0),
+            covariance,
+        )
+
+
+def _interval(dt: Scalars, memory: Scalars) -> Array:
+    """Time between measurements in memories; bounded, where there is hardly any memory."""
+    return jnp.clip(dt / jnp.maximum(memory, SHORTEST), SHORTEST, LONGEST)
+
+
+def _grown(covariance: Covariance, h: Scalars, usual: Scalars) -> Covariance:
+    """The covariance before a measurement, ``h`` memories after the one before: F P F' + Q.
+
+    With the noise's variance and the memory as units the jerk's density is the usual interval, and
+    Q = usual h [h^4/20, h^3/8, h^2/6; ., h^2/3, h/2; ., ., 1].
+    """
+    xx, xv, xa, vv, va, aa = covariance
+    x0, x1, x2 = xx + h * xv + h**2 / 2.0 * xa, xv + h * vv + h**2 / 2.0 * va, xa + h * va + h**2 / 2.0 * aa
+    v1, v2 = vv + h * va, va + h * aa
+    return jnp.stack(
+        [
+            x0 + h * x1 + h**2 / 2.0 * x2 + usual * h**5 / 20.0,
+            x1 + h * x2 + usual * h**4 / 8.0,
+            x2 + usual * h**3 / 6.0,
+            v1 + h * v2 + usual * h**3 / 3.0,
+            v2 + usual * h**2 / 2.0,
+            aa + usual * h,
+        ]
+    )
+
+
+def _gains(grown: Covariance) -> Array:
+    """Gains (3, ...) of position, velocity and acceleration: P H' / (H P H' + 1)."""
+    return grown[:3] / (grown[0] + 1.0)
+
+
+def _measured(grown: Covariance, gains: Array) -> Covariance:
+    """The covariance after a measurement: (1 - K H) P."""
+    k0, k1, k2 = gains
+    xx, xv, xa, vv, va, aa = grown
+    return jnp.stack([k0, (1.0 - k0) * xv, (1.0 - k0) * xa, vv - k1 * xv, va - k1 * xa, aa - k2 * xa])
 
 
 def jump(
@@ -146,10 +217,9 @@ class Filters:
     lag: Lag | None
 
     @classmethod
-    def at(cls, params: SensingParams, position: Float[Array | np.ndarray, "3 *batch"]) -> Filters:
-        """Filters that have settled on a position [m]."""
-        zero = jnp.zeros_like(position)
-        lag = None if params.filter_time is None else Lag(zero, zero, zero)
+    def at(cls, params: SensingParams, position: Float[Array | np.ndarray, "3 *batch"], timestep: float) -> Filters:
+        """Filters that have settled on a position [m], with a substep of ``timestep`` [s]."""
+        lag = None if params.filter_time is None else Lag.settled(timestep, params.filter_time, position)
         return cls(None if params.smoothing is None else position, lag)
 
     def seen(self, position: Float[Array | np.ndarray, "3 *batch"]) -> Float[Array | np.ndarray, "3 *batch"]:
@@ -174,6 +244,6 @@ class Filters:
             struck = jnp.where(contact, jump(before.velocity, after.velocity, timestep), 0.0)
             gate = value_or(params.filter_gate, FILTER_GATE)
             lag = lag.predicted(timestep, struck, jnp.where(contact, since, 0.0)).corrected(
-                timestep, params.filter_time, gate
+                timestep, timestep, params.filter_time, gate
             )
         return Filters(smooth, lag)

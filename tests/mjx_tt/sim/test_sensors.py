@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.integrate import solve_ivp
+from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 
 from ballmodel import constants as c
 from ballmodel.partial_params import without_nominal
 from mjx_tt.sim import model, sensors
 from mjx_tt.sim.model import SensingParams
-from mjx_tt.sim.sensors import Lag
+from mjx_tt.sim.sensors import FRESH, Lag
 from tests.support import scripted_episodes
 from tests.support.scripted_episodes import TICKS, episodes, play, task
 
@@ -132,31 +133,81 @@ def test_a_tracker_without_errors_is_left_out():
     np.testing.assert_allclose(one.seen(START), 1.02 * START, rtol=1e-6)
 
 
+def butterworth(t, memory):
+    """Answer [s] to a unit jump of the velocity: s / (s^3 + 2 w s^2 + 2 w^2 s + w^3), w = 1 / memory, negative."""
+    x, b = t / memory, np.sqrt(0.75)
+    return memory * (np.exp(-x) - np.exp(-x / 2.0) * (np.cos(b * x) + np.sin(b * x) / np.sqrt(3.0)))
+
+
 def test_a_filter_of_constant_acceleration_fades_behind_a_jump_of_the_velocity():
-    """Transfer function of its error: (T s)^3 / (T s + 1)^3; a jump dv answers with dv (t - t^2 / 2T) exp(-t / T)."""
     memory, step, kick = 0.02, 2e-5, np.array([1.0, -2.0, 4.0])
 
     def advance(lag, _):
-        lag = lag.predicted(step, still, 0.0).corrected(step, memory, 1e6)
+        lag = lag.predicted(step, still, 0.0).corrected(step, step, memory, 1e6)
         return lag, lag.position
 
     with jax.enable_x64(True):
         still = jnp.zeros(3)
-        _, error = jax.lax.scan(advance, Lag(still, still, still).predicted(0.0, jnp.array(kick), 0.0), length=5000)
-    t = step * np.arange(1, 5001)[:, None]
-    wanted = -kick * (t - t**2 / (2.0 * memory)) * np.exp(-t / memory)
+        lag = Lag.settled(step, memory, still).predicted(0.0, jnp.array(kick), 0.0)
+        _, error = jax.lax.scan(advance, lag, length=5000)
+    wanted = butterworth(step * np.arange(1, 5001)[:, None], memory) * kick
     np.testing.assert_allclose(error, wanted, atol=5e-3 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("memory", [0.004, 0.012, 0.05])
+def test_a_settled_filters_covariance_solves_riccatis_equation(memory):
+    """By SciPy's solver, in seconds and metres, at 125 Hz and 3 mm of noise."""
+    dt, variance = 0.008, 0.003**2
+    q = variance * dt / memory**6
+    move = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
+    shape = [[dt**4 / 20, dt**3 / 8, dt**2 / 6], [dt**3 / 8, dt**2 / 3, dt / 2], [dt**2 / 6, dt / 2, 1.0]]
+    seen = np.array([[1.0], [0.0], [0.0]])
+    before = solve_discrete_are(move.T, seen, q * dt * np.array(shape), np.array([[variance]]))
+    gain = before[:, :1] / (before[0, 0] + variance)
+    after = (before - gain @ before[:1]) / variance * np.outer(*2 * [memory ** np.arange(3)])
+    with jax.enable_x64(True):
+        covariance = Lag.settled(dt, memory, jnp.zeros(3)).covariance
+    np.testing.assert_allclose(covariance, after[np.triu_indices(3)], rtol=2e-2)
+
+
+def test_a_filter_follows_the_textbooks_recursion_after_it_opened():
+    """Opened wide by a surprise, shut from then on, a sample missing: matrices in seconds and metres."""
+    memory, kick = 0.012, 5.0
+    times = np.array([0.008, 0.008, 0.016, 0.008, 0.008, 0.008])
+    gates = [0.02, *[1e3] * 5]
+    q = 0.008 / memory**6
+    seen, wanted = [], []
+    with jax.enable_x64(True):
+        lag = Lag.settled(0.008, memory, jnp.zeros(3))
+        covariance = np.zeros((3, 3))
+        covariance[np.triu_indices(3)] = lag.covariance
+        covariance = covariance + np.triu(covariance, 1).T
+        covariance = covariance / np.outer(*2 * [memory ** np.arange(3)])
+        state = np.zeros(3)
+        for i, (dt, gate) in enumerate(zip(times, gates, strict=True)):
+            hit = kick if i == 0 else 0.0
+            lag = lag.predicted(dt, jnp.array([0.0, 0.0, hit]), dt).corrected(dt, 0.008, memory, gate)
+            move = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
+            shape = [[dt**4 / 20, dt**3 / 8, dt**2 / 6], [dt**3 / 8, dt**2 / 3, dt / 2], [dt**2 / 6, dt / 2, 1.0]]
+            state = move @ state - np.array([dt * hit, hit, 0.0])
+            covariance = move @ covariance @ move.T + q * dt * np.array(shape)
+            if i == 0:
+                covariance = covariance + FRESH * np.diag([1.0, 0.008**-2, 0.008**-4])
+            gain = covariance[:, 0] / (covariance[0, 0] + 1.0)
+            state, covariance = state - gain * state[0], covariance - np.outer(gain, covariance[0])
+            seen.append(lag.position[2])
+            wanted.append(state[0])
+    np.testing.assert_allclose(seen, wanted, rtol=1e-6)
 
 
 def test_a_filter_that_is_surprised_starts_afresh():
     still, kick = jnp.zeros(3), jnp.array([0.0, 0.0, 5.0])
-    seen = []
+    left = []
     for gate in (0.02, 0.2):
-        lag = Lag(still, still, still).predicted(0.008, kick, 0.008).corrected(0.008, 0.03, gate)
-        seen.append(float(jnp.linalg.norm(lag.position)))
-    # Innovation 40 mm; at the wider gate the share exp(-3 dt / T) of it stays.
-    assert seen[0] < 2e-3
-    np.testing.assert_allclose(seen[1], 0.04 * np.exp(-3 * 0.008 / 0.03), rtol=0.01)
+        lag = Lag.settled(0.008, 0.03, still).predicted(0.008, kick, 0.008).corrected(0.008, 0.008, 0.03, gate)
+        left.append(float(jnp.linalg.norm(lag.position)))
+    assert left[0] < 2e-3  # of 40 mm
+    assert left[1] > 0.015
 
 
 def test_a_filter_of_constant_acceleration_is_wrong_behind_a_bounce_in_an_episode():
@@ -172,7 +223,7 @@ def test_a_filter_of_constant_acceleration_is_wrong_behind_a_bounce_in_an_episod
     error = ball[:, 2, 1] - ball[:, 2, 0]
     since = np.maximum(np.arange(TICKS) * T - np.sqrt(2.0 * height / g), 0.0)
     kick = (1.0 + c.TABLE_RESTITUTION) * np.sqrt(2.0 * g * height)
-    wanted = -kick * (since - since**2 / (2.0 * memory)) * np.exp(-since / memory)
+    wanted = kick * butterworth(since, memory)
     first = (since > 0.0) & (since < 0.2)
     assert np.abs(wanted[first]).max() > 0.06
     np.testing.assert_allclose(error[first], wanted[first], atol=0.15 * np.abs(wanted).max())

@@ -206,7 +206,7 @@ def _fly(
         filtered = follow(follow(filtered, state.position, corner, t), corner, new.position, dt - t)
         kick = jnp.where(hit, jump(state.velocity, new.velocity, dt), 0.0)
         lag, unmeasured = lag.predicted(dt, kick, dt - t), unmeasured + dt
-        met = lag.corrected(unmeasured, memory, gate)
+        met = lag.corrected(unmeasured, usual, memory, gate)
         lag = jax.tree.map(lambda a, b: jnp.where(sampled, a, b), met, lag)
         unmeasured = jnp.where(sampled, 0.0, unmeasured)
         bounced = jnp.where(first, (elapsed + t) * rate, bounced)
@@ -221,10 +221,12 @@ def _fly(
     # In steady motion the filter trails by tau v: it was running before the first sample.
     filtered = start[:3] - smoothing * start[3:6]
     still = jnp.zeros_like(start[:3])
-    carry = (state, filtered, (Lag(still, still, still), zero), zero, zero + jnp.inf, still, still, zero + jnp.inf)
     # Steps at whose end the tracker measures: behind a ball's last sample nothing moves.
     columns = jnp.arange(shape[0])
     frames = jnp.zeros((len(steps) + 1, *shape), bool).at[index, columns].set(True)[1:]
+    usual = jnp.sum(steps, axis=0) / jnp.maximum(jnp.sum(frames, axis=0), 1)  # [s] between measurements
+    lag = Lag.settled(usual, memory, still)
+    carry = (state, filtered, (lag, zero), zero, zero + jnp.inf, still, still, zero + jnp.inf)
     ends = () if paddle is None else (slice(None, -1), slice(1, None))
     blades = tuple(jax.tree.map(lambda x, part=part: x[part], paddle) for part in ends)
     inputs = (steps, frames, *blades)
