@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import beta, binom
 
+from mjx_tt.diagnosis.verdict import NOT_ADOPTED
 from tests.exam.generator.cases import EFFECTS
 
 PEOPLE = "human_single human_pair human_deleted human_invented"
@@ -39,6 +40,7 @@ def score(truth: dict, verdict: dict) -> dict:
     elif kind in ("invented", "invisible", "unexcited"):
         accepted = {}
     record["outcome"] = _outcome(kind, accepted, named, verdict["verdict"])
+    record["leads"] = _leads(accepted, verdict)
     record["confidences"] = [
         [c["confidence"], any(names & group for names in accepted.values())]
         for c, group in zip(given, named, strict=True)
@@ -60,6 +62,14 @@ def score(truth: dict, verdict: dict) -> dict:
         record["declared"] = all(c in flat for c in causes)
     record["held_out_reported"] = verdict.get("held_out")
     return record
+
+
+def _leads(accepted: dict[str, set[str]], verdict: dict) -> str | None:
+    """"right" or "wrong" where a cause leads beside what is unexplained, so that the extended model holds it."""
+    if verdict["verdict"] != "unexplained" or NOT_ADOPTED in verdict["warnings"] or not verdict["causes"]:
+        return None
+    groups = [{c["name"], *c.get("group", ())} for c in verdict["causes"]]
+    return "right" if all(any(names & g for names in accepted.values()) for g in groups) else "wrong"
 
 
 def _names(entry) -> list[str]:
@@ -216,6 +226,7 @@ def table(records: list[dict]) -> list[Row]:
     alone = [r["outcome"] == right and not r["twins_reported"] for r in exact]
     readings = [r["reading"] == right for r in by["gauge"] if "reading" in r]
     declared = [r["outcome"] == right and r["declared"] for r in by["unexcited"] if "declared" in r]
+    leads = [r["leads"] for r in records if r.get("leads")]
     delays = [_delay_error(r) <= 2e-3 for r in _delays(by["robot"])]
     return [
         _share("1", "nothing wrong: any name", "<= 2 %", named("none noise")),
@@ -261,6 +272,8 @@ def table(records: list[dict]) -> list[Row]:
         _share("-", "in 5 % of the balls only: flagged or right", "-", ended("rare", flagged, right)),
         _share("-", "in 5 % of the balls only: wrong name", "-", ended("rare", wrong)),
         _share("-", "invisible in a ball log: named", "-", named("invisible")),
+        _share("-", "a cause leads beside what is unexplained: true", "-", [x == "right" for x in leads]),
+        _share("-", "any log: a false cause leads", "-", [r.get("leads") == "wrong" for r in records]),
         _share("-", "ended with an error", "-", [r["outcome"] == "error" for r in records]),
     ]
 
