@@ -17,8 +17,8 @@ from ballmodel.vec import Scalars, dot, row
 
 SHORTEST = 1e-9  # [s], keeps the filters' exponents finite
 FILTER_GATE = 0.03  # [m]: ten deviations of a usual tracker's noise
-# Of the gate, below and above it. Trackers open at three to nine deviations of a surprise, whose noise blurs where they do
-# by a third to a ninth of the gate; this is a deviation of 0.22.
+# Of the gate, below and above it: trackers open at three to nine deviations of a surprise, whose noise blurs the gate
+# by a third to a ninth of it. This is a deviation of 0.22.
 SOFT_GATE = 0.5
 FRESH = 300.0  # variance that an opened filter adds, in the noise's: 5 cm of a ball that is measured to 3 mm
 SETTLED = (2.0, 2.0, 1.0, 3.0, 2.0, 2.0)  # of h: covariance of a settled filter that measures without a pause
