@@ -17,9 +17,8 @@ from ballmodel.vec import Scalars, dot, row
 
 SHORTEST = 1e-9  # [s], keeps the filters' exponents finite
 FILTER_GATE = 0.03  # [m]: ten deviations of a usual tracker's noise
-# Of the gate, below and above it: trackers open at three to nine deviations of a surprise, whose noise blurs the gate
-# by a third to a ninth of it. This is a deviation of 0.22.
-SOFT_GATE = 0.5
+SURPRISE = 0.006  # [m] deviation of a usual surprise: noise blurs where a filter starts afresh
+SOFTNESS = 2.2  # a step's half width in deviations: the smooth step 3 s^2 - 2 s^3 has a deviation of 0.45 of it
 FRESH = 300.0  # variance that an opened filter adds, in the noise's: 5 cm of a ball that is measured to 3 mm
 SETTLED = (2.0, 2.0, 1.0, 3.0, 2.0, 2.0)  # of h: covariance of a settled filter that measures without a pause
 ROUNDS = 12  # of measurements, after which it is that of a filter that measures now and then
@@ -142,14 +141,16 @@ class Lag:
         moved = self.position + row(dt) * self.velocity + row(0.5 * dt**2) * self.acceleration - row(since) * jump
         return Lag(moved, self.velocity + row(dt) * self.acceleration - jump, self.acceleration, self.covariance)
 
-    def corrected(self, dt: Scalars, usual: Scalars, memory: Scalars, gate: Scalars) -> Lag:
+    def corrected(
+        self, dt: Scalars, usual: Scalars, memory: Scalars, gate: Scalars, blur: float | Array = SURPRISE
+    ) -> Lag:
         """The lag after a measurement, ``dt`` [s] after the one before. memory [s], zero: no lag; gate [m].
 
-        usual: interval [s] of measurements for which the filter was made.
+        usual: interval [s] of measurements for which the filter was made. blur: deviation [m] of surprises' noise.
         """
         h = _interval(usual, memory)
         surprise = jnp.sqrt(dot(self.position, self.position) + SHORTEST**2)
-        share = jnp.clip(0.5 - 0.5 * (surprise - gate) / (SOFT_GATE * gate), 0.0, 1.0)
+        share = jnp.clip(0.5 - 0.5 * (surprise - gate) / (SOFTNESS * blur), 0.0, 1.0)
         shut = share * share * (3.0 - 2.0 * share)  # of balls whose filter did not open
         grown = _grown(self.covariance, _interval(dt, memory), h)
         opened = jnp.stack([grown[0] + FRESH, *grown[1:3], grown[3] + FRESH / h**2, grown[4], grown[5] + FRESH / h**4])

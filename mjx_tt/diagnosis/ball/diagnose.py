@@ -176,6 +176,8 @@ def _diagnose(
     mode = "never" if spin == "none" and "magnus" in gone else spin
     names, sessions, age = _sessions(kept)
     g = grid(kept)
+    if before is not None:
+        g = replace(g, surprise=before.problem.grid.surprise)
     if hidden is not None:
         g = replace(g, mask=g.mask & ~hidden)
     problem = BallProblem(g, model, fitted, heading(g))
@@ -183,6 +185,10 @@ def _diagnose(
     none = np.zeros(len(fitted))
     start = first_fit(problem) if before is None else fit_starts(problem, none, before.start0, g)
     nominal = Situation(none, start)
+    if before is None:
+        flown = problem.fly(none, start)
+        g = replace(g, surprise=noise.surprise(g.measured - flown.measured[:, :, 0], flown.bounce_time[0], g))
+        problem = BallProblem(g, model, fitted, heading(g))
     linear = problem.linearise(nominal)
     called = [e.name for e in fitted]
     bound = tuple(

@@ -25,7 +25,7 @@ from ballmodel.partial_params import value_or, without_nominal
 from ballmodel.state import BallState
 from ballmodel.trajectory import Trajectory
 from mjx_tt.sim.model import SensingParams, SimModel, paths, with_values
-from mjx_tt.sim.sensors import FILTER_GATE, Lag, jump
+from mjx_tt.sim.sensors import FILTER_GATE, SURPRISE, Lag, jump
 
 LONGEST_STEP = 0.01  # [s]; second order: 0.05 mm over a flight
 PAD = 16  # numbers of steps are rounded up to it, so that similar logs share one compiled program
@@ -43,6 +43,7 @@ class Grid:
     measured: Float[np.ndarray, "3 T n"]  # [m]
     mask: Bool[np.ndarray, "T n"]  # True for a sample
     paddle: PaddlePose | None = None  # the blade at the steps' ends, each quantity (3, L + 1, n)
+    surprise: float = SURPRISE  # [m] deviation of the noise in what surprises a tracker's filter
 
     @property
     def n(self) -> int:
@@ -77,7 +78,7 @@ def picked(g: Grid, index: Int[np.ndarray, " m"]) -> Grid:
     """The grid of the balls with these indices, which may repeat."""
     paddle = g.paddle and jax.tree.map(lambda x: x[..., index], g.paddle)
     steps, step, time, measured, mask = (x[..., index] for x in (g.steps, g.index, g.time, g.measured, g.mask))
-    return Grid(steps, step, time, measured, mask, paddle)
+    return Grid(steps, step, time, measured, mask, paddle, g.surprise)
 
 
 @dataclass(frozen=True)
@@ -140,6 +141,7 @@ def predict(
                 g.steps[:, some],
                 g.index[:, some],
                 paddle,
+                g.surprise,
             )
             return [np.asarray(x)[..., : v * n - first] for x in flown]
 
@@ -160,7 +162,13 @@ def predict(
 
 @jax.jit
 def _fly(
-    model: SimModel, values: dict[str, Array], start: Array, steps: Array, index: Array, paddle: PaddlePose | None
+    model: SimModel,
+    values: dict[str, Array],
+    start: Array,
+    steps: Array,
+    index: Array,
+    paddle: PaddlePose | None,
+    surprise: float | Array,
 ) -> tuple[Array, ...]:
     """Fields of Flown for columns (12, c) of starts; values (c,), steps (L, c), index (T, c), paddle (L + 1, 3, c)."""
     nominal_latency = model.latency.ball_observation
@@ -206,7 +214,7 @@ def _fly(
         filtered = follow(follow(filtered, state.position, corner, t), corner, new.position, dt - t)
         kick = jnp.where(hit, jump(state.velocity, new.velocity, dt), 0.0)
         lag, unmeasured = lag.predicted(dt, kick, dt - t), unmeasured + dt
-        met = lag.corrected(unmeasured, usual, memory, gate)
+        met = lag.corrected(unmeasured, usual, memory, gate, surprise)
         lag = jax.tree.map(lambda a, b: jnp.where(sampled, a, b), met, lag)
         unmeasured = jnp.where(sampled, 0.0, unmeasured)
         bounced = jnp.where(first, (elapsed + t) * rate, bounced)
