@@ -13,6 +13,7 @@ from mjx_tt.diagnosis.ball import cross_validation, experiment_design, leading, 
 from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, shaking
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE, Effect, Twin, Values
+from mjx_tt.diagnosis.ball.flights import tracker_gate
 from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, REFERENCE_MAGNUS
 from mjx_tt.diagnosis.ball.leading import Leading
 from mjx_tt.diagnosis.ball.model_averaging import Averaged, averaged
@@ -57,6 +58,8 @@ def part(
         if lead is not None:
             named, beside = [_leading_cause(lead, without)], leading.beside(lead)
             prediction = lead.prediction
+    if any(n.cause.name == "tracker_filter" for n in named):
+        beside = {tracker_gate.GATE: found.problem.nominal[tracker_gate.GATE], **beside}
     held_out = cross_validation.held_out(prediction, seed)
     # A tracker's filter shows for a moment behind the bounce, of which a whole flight's error says little.
     sizes = [n.cause.effect_mm for n in named if not n.cause.name.startswith("tracker_")]

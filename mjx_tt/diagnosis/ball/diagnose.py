@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import evidence, posterior, scores, selection
 from mjx_tt.diagnosis.ball.effects import BY_NAME, EFFECTS
-from mjx_tt.diagnosis.ball.flights import noise
+from mjx_tt.diagnosis.ball.flights import noise, tracker_gate
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Projected, Situation, shifts
@@ -23,7 +23,7 @@ from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial, search
 from mjx_tt.diagnosis.ball.spins import Spins, estimate
 from mjx_tt.diagnosis.ball.unexplained import Finding, Left, find
 from mjx_tt.diagnosis.logs import before_racket
-from mjx_tt.sim.model import SimModel
+from mjx_tt.sim.model import SimModel, with_values
 
 FEWEST_SAMPLES = 15  # of a flight
 FEWEST_BALLS = 12
@@ -177,7 +177,7 @@ def _diagnose(
     names, sessions, age = _sessions(kept)
     g = grid(kept)
     if before is not None:
-        g = replace(g, surprise=before.problem.grid.surprise)
+        g, model = replace(g, surprise=before.problem.grid.surprise), before.problem.model
     if hidden is not None:
         g = replace(g, mask=g.mask & ~hidden)
     problem = BallProblem(g, model, fitted, heading(g))
@@ -190,6 +190,11 @@ def _diagnose(
         g = replace(g, surprise=noise.surprise(g.measured - flown.measured[:, :, 0], flown.bounce_time[0], g))
         problem = BallProblem(g, model, fitted, heading(g))
     linear = problem.linearise(nominal)
+    if before is None and model.sensing.filter_time in (None, 0.0) and "tracker_filter" not in gone:
+        gate = tracker_gate.likeliest(problem, nominal, linear)
+        if gate is not None and gate != problem.nominal[tracker_gate.GATE]:
+            problem = BallProblem(g, with_values(model, {tracker_gate.GATE: gate}), fitted, heading(g))
+            linear = problem.linearise(nominal)
     called = [e.name for e in fitted]
     bound = tuple(
         (i, called.index(e.beside))

@@ -180,7 +180,8 @@ def _fly(
     smoothing = jnp.broadcast_to(jnp.asarray(value_or(sensing.smoothing, 0.0), start.dtype), shape)
     tau = jnp.maximum(smoothing, 1e-9)
     memory = jnp.broadcast_to(jnp.asarray(value_or(sensing.filter_time, 0.0), start.dtype), shape)
-    gate = jnp.broadcast_to(jnp.asarray(value_or(sensing.filter_gate, FILTER_GATE), start.dtype), shape)
+    gate = jnp.maximum(value_or(sensing.filter_gate, FILTER_GATE), 1e-3)  # [m]
+    gate = jnp.broadcast_to(jnp.asarray(gate, start.dtype), shape)
 
     def follow(filtered: Array, before: Array, after: Array, dt: Array) -> Array:
         """The filter's output after a piece of straight motion: exact."""
