@@ -17,6 +17,7 @@ from experiments.config.validation import LONGEST, nearest
 from experiments.errors import ConfigError, checked
 from robot_io.calibrated import RANGES as CALIBRATION_RANGES
 from robot_io.calibrated import Calibration
+from robot_io.contract import PAPER, Contract
 from robot_io.control import config as robot_config
 from robot_io.control.config import RobotConfig
 from robot_io.emulator import config as rig_config
@@ -43,12 +44,13 @@ RANGES = {RobotConfig: robot_config.RANGES, RigParams: rig_config.RANGES, Calibr
 Config = TypeVar("Config", RobotConfig, RigParams, Calibration)
 
 
-def load_robot(path: str | Path, calibrated: bool = True) -> RobotConfig:
+def load_robot(path: str | Path, calibrated: bool = True, contract: Contract = PAPER) -> RobotConfig:
     """A robot.yaml, its calibration in it or in a file that it names. Raises ConfigError.
 
     Without ``safety.speed_scale`` the robot is slow: COMMISSIONING.
 
     calibrated  False: its calibration is not looked at
+    contract    whose joints it has
     """
     data = _mapping(path)
     if not calibrated:
@@ -58,7 +60,9 @@ def load_robot(path: str | Path, calibrated: bool = True) -> RobotConfig:
     safety = data.setdefault("safety", {})
     if isinstance(safety, dict):
         safety.setdefault("speed_scale", COMMISSIONING)
-    return fill(RobotConfig, data, str(path))
+    config = fill(RobotConfig, data, str(path), RobotConfig.of(contract))
+    checked(str(path), config.check_joints, contract)
+    return config
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -88,13 +92,13 @@ def _completed(given: Any, defaults: Any) -> Any:
     return defaults | {key: _completed(value, defaults.get(key)) for key, value in given.items()}
 
 
-def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
-    """An instance of a dataclass; omitted keys keep their defaults. Raises ConfigError with one line per mistake."""
+def fill(kind: type[Config], data: dict[str, Any], where: str, defaults: Config | None = None) -> Config:
+    """An instance of a dataclass; omitted keys keep their defaults, the class's or those given. Raises ConfigError with one line per mistake."""
     found = {path: (value, words) for path, value, words in outside(data, RANGES[kind]) if is_number(value)}
     lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
     try:
         # By JSON, whose lists are tuples: nothing else is converted.
-        content = _completed(data, _defaults()[kind])
+        content = _completed(data, _defaults()[kind] if defaults is None else plain(defaults))
         config = _adapters()[kind].validate_json(json.dumps({"file": content}, default=str)).file
     except ValidationError as error:
         for mistake in error.errors(include_url=False):

@@ -20,7 +20,6 @@ from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, RECOVER, Keyb
 from experiments.deploy.recovery import Recovery
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session_report import PlayedSession
-from experiments.errors import of_the_paper
 from experiments.runs import run_dir
 from robot_io.control import messages, process
 from robot_io.control.config import RobotConfig
@@ -201,7 +200,6 @@ def run(
     0: all went well, 1: it ended early, 130: the operator ended it with Ctrl-C; the summary is written in any case.
     """
     loaded = artefacts.load(artefact)
-    of_the_paper(loaded.contract, str(artefact), "mjx-tt run")
     with ExitStack() as stack:
         rig = None
         if robot == RIG:
@@ -209,7 +207,7 @@ def run(
             rig = stack.enter_context(rig_for(loaded, distribution, rig_params, seed, player))
             config, text = rig.robot, robots.to_yaml(rig.robot)
         else:
-            config = robots.load_robot(robot)
+            config = robots.load_robot(robot, contract=loaded.contract)
             contradictions.check(config, robot, log_folder)
             text = Path(robot).read_text(encoding="utf-8")
         name = time.strftime("%Y%m%d-%H%M%S")

@@ -10,7 +10,6 @@ from mcap.reader import make_reader
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint.log import SHORTEST, JointRecord
-from robot_io.contract import JOINT_NAMES
 from robot_io.log import SessionLog, read
 
 LONGEST_GAP = 0.1  # [s] without a sample that ends a flight
@@ -57,7 +56,7 @@ def _joints(log: SessionLog) -> tuple[JointRecord, ...]:
         return ()
     ticks, sent = np.unique(commands.time, return_index=True)
     out = []
-    for j, name in enumerate(JOINT_NAMES):
+    for j, name in enumerate(log.robot.joints):
         known = np.flatnonzero(np.isfinite(states.position[j]))  # arm and gantry report by turns
         moments, first = np.unique(states.time[known], return_index=True)
         if moments.size > 1 and moments[-1] - max(moments[0], ticks[0]) >= SHORTEST:

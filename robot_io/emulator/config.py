@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from robot_io.contract import PAPER, Contract
 from robot_io.devices.festo import AxesConfig
+from robot_io.emulator import arm as arms
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.axis_drive import DriveParams
 from robot_io.emulator.network import FAULT_RANGES, NetworkFaults
@@ -90,3 +92,13 @@ class RigParams:
 
 
 STANDARD_RIG = RigParams()
+
+
+def for_robot(params: RigParams, contract: Contract) -> RigParams:
+    """The rig with the joints of a contract's robot. Raises ValueError naming what belongs to the paper's robot only."""
+    if contract != PAPER and any(params.hidden.joint_zeros):
+        raise ValueError(
+            f"hidden.joint_zeros is {params.hidden.joint_zeros}, allowed for {contract.robot} are zeros: they are the "
+            "paper's robot's"
+        )
+    return replace(params, arm=arms.for_robot(params.arm, contract))
