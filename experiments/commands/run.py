@@ -151,7 +151,9 @@ def rig(
         5021,
         5022,
     ),
-    robot: Annotated[str | None, option("NAME", "robot that stands there, by name or folder (default: the paper's)")] = None,
+    robot: Annotated[
+        str | None, option("NAME", "robot that stands there, by name or folder (default: the paper's)")
+    ] = None,
     out: Annotated[str, option("YAML", "where its robot.yaml is written")] = "rig-robot.yaml",
     distribution: Annotated[str, option("NAME", "balls that are thrown (default: player3/M0)")] = "player3/M0",
     rig: RigFile = None,

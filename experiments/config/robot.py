@@ -93,7 +93,7 @@ def _completed(given: Any, defaults: Any) -> Any:
 
 
 def fill(kind: type[Config], data: dict[str, Any], where: str, defaults: Config | None = None) -> Config:
-    """An instance of a dataclass; omitted keys keep their defaults, the class's or those given. Raises ConfigError with one line per mistake."""
+    """An instance of a dataclass; omitted keys keep the class's defaults or those given. Raises ConfigError, a line per mistake."""
     found = {path: (value, words) for path, value, words in outside(data, RANGES[kind]) if is_number(value)}
     lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
     try:

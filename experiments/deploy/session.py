@@ -21,11 +21,13 @@ from experiments.deploy.recovery import Recovery
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session_report import PlayedSession
 from experiments.runs import run_dir
+from robot_io.contract import PAPER
 from robot_io.control import messages, process
 from robot_io.control.config import RobotConfig
 from robot_io.control.messages import Message, Played, RallyOver, Refused, Request, Status
 from robot_io.emulator.processes import Rig
 from robot_io.errors import JogFirstError, RefusedError
+from robot_io.log import view as log_view
 from robot_io.policy import artefact as artefacts
 
 READY_TIME = 60.0  # [s] for the control process to start
@@ -242,6 +244,10 @@ def run(
     log_file = process.log_path(options)
     summary = session_report.summary(loaded, config, played, session.status, session.timings, log_file)
     summary |= {"faults": [asdict(fault) for fault in played.faults], "player": player}
+    if loaded.contract != PAPER:  # the shipped layout of the viewers is for the paper's robot's log
+        path = log_folder / f"{name}.layout.json"
+        run_dir.write_json(path, log_view.layout(loaded.contract))
+        summary["layout"] = str(path)
     _finish(summary, config, log_file, log_folder / f"{name}.json", console)
     if problem:
         console.print(problem, style="red", highlight=False)

@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint.log import SHORTEST, JointRecord
+from robot_io.contract import Contract
 from robot_io.log import SessionLog, read
 
 LONGEST_GAP = 0.1  # [s] without a sample that ends a flight
@@ -27,10 +28,10 @@ def is_session(path: Path) -> bool:
     return summary is not None and any(c.topic == "/joint_states" for c in summary.channels.values())
 
 
-def load(path: Path) -> tuple[tuple[Trajectory, ...], tuple[JointRecord, ...]]:
-    """Flights and joint records of a session. Raises robot_io.errors' exceptions for a damaged log."""
+def load(path: Path) -> tuple[tuple[Trajectory, ...], tuple[JointRecord, ...], Contract]:
+    """Flights and joint records of a session, and its robot's contract. Raises robot_io.errors' exceptions for a damaged log."""
     log = read(path)
-    return _flights(log, path.stem), _joints(log)
+    return _flights(log, path.stem), _joints(log), log.robot
 
 
 def _flights(log: SessionLog, session: str) -> tuple[Trajectory, ...]:

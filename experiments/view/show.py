@@ -61,8 +61,8 @@ def viewer(server: Server, programme: Programme) -> Viewer:
 
 
 def robot_of(programme: Programme) -> Robot:
-    """The robot that a programme shows; sessions and diagnoses are of the paper's."""
-    return programme.studio.simulator.config.robot if isinstance(programme, Play) else robots.paper()
+    """The robot that a programme shows; a diagnosis of balls shows the paper's."""
+    return programme.studio.simulator.config.robot if isinstance(programme, Play) else programme.robot or robots.paper()
 
 
 class Followed:

@@ -153,7 +153,6 @@ class RobotConfig:
             except ValueError:
                 raise ValueError(f"{path} is {value!r}, allowed is an IPv4 address such as 192.168.125.1") from None
 
-
     @classmethod
     def of(cls, contract: Contract) -> RobotConfig:
         """The defaults for a contract's robot."""
@@ -171,14 +170,15 @@ class RobotConfig:
             )
         if len(self.safety.still) != contract.n_joints:
             raise ValueError(
-                f"safety.still has {len(self.safety.still)} numbers, allowed are {contract.n_joints} for {contract.robot}"
+                f"safety.still has {len(self.safety.still)} numbers, allowed for {contract.robot} are "
+                f"{contract.n_joints}"
             )
         for i in contract.carrying:
             speed, most = self.axes_motion.speed, contract.limits.velocity[i]
             if contract != PAPER and most > speed:
                 raise ValueError(
-                    f"axes_motion.speed is {speed} m/s, {contract.joints[i]} of {contract.robot} may be asked for {most} "
-                    f"m/s: allowed is at least that, up to {RANGES['axes_motion.speed'][1]} m/s"
+                    f"axes_motion.speed is {speed} m/s, {contract.joints[i]} of {contract.robot} may be asked for "
+                    f"{most} m/s: allowed is at least that, up to {RANGES['axes_motion.speed'][1]} m/s"
                 )
             if self.safety.following_error[i] > 0.1:
                 raise ValueError(

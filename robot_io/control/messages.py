@@ -202,7 +202,13 @@ class Status:
 
     @classmethod
     def of(
-        cls, bridge: Bridge, axes: AxesThread | DryAxes | FixedBase, timings: Timings, dropped: int, now: float, dry: bool
+        cls,
+        bridge: Bridge,
+        axes: AxesThread | DryAxes | FixedBase,
+        timings: Timings,
+        dropped: int,
+        now: float,
+        dry: bool,
     ) -> Status:
         """The state at ``now``; ``dropped``: records that the log lost."""
         counts, tracker, session = bridge.counts, bridge.tracker, bridge.arm_session

@@ -143,7 +143,13 @@ class Control:
             egm = EgmConfig(arm.controller, arm.controller_port, timeout=arm.timeout, zeros=zeros)
             home = gate.geometry.home
             self._session = DryArm(egm, home[list(contract.arm)]) if options.dry else EgmSession(egm)
-            axes = FixedBase() if not contract.carrying else DryAxes(home[list(contract.carrying)]) if options.dry else None
+            axes = (
+                FixedBase()
+                if not contract.carrying
+                else DryAxes(home[list(contract.carrying)])
+                if options.dry
+                else None
+            )
             self._axes = self._open(axes or AxesThread(linear_axes(config, contract)))
             self._tracker = Tracker(config.tracker, config.calibration)
             bridge_config = BridgeConfig(

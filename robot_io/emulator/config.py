@@ -95,7 +95,7 @@ STANDARD_RIG = RigParams()
 
 
 def for_robot(params: RigParams, contract: Contract) -> RigParams:
-    """The rig with the joints of a contract's robot. Raises ValueError naming what belongs to the paper's robot only."""
+    """The rig with a contract's joints. Raises ValueError naming what belongs to the paper's robot only."""
     if contract != PAPER and any(params.hidden.joint_zeros):
         raise ValueError(
             f"hidden.joint_zeros is {params.hidden.joint_zeros}, allowed for {contract.robot} are zeros: they are the "

@@ -40,7 +40,7 @@ PATIENCE = 0.4  # [s]; a world that is later was stopped
 
 
 class Shared:
-    """Views into the block by name; ``Shared()`` makes one, ``Shared(name)`` attaches to it; ``joints`` of the robot."""
+    """Views into the block by name; ``Shared()`` makes one for so many joints, ``Shared(name)`` attaches to it."""
 
     def __init__(self, name: str | None = None, joints: int = N_JOINTS) -> None:
         counts = {field: joints if count == JOINTS else count for field, count in _FIELDS.items()}

@@ -273,7 +273,9 @@ def _event(message: Any) -> Event:
     return Event(0.0, Level(message.level), message.name, message.message)
 
 
-def _topic(path: str | os.PathLike, channel: Channel, schemas: dict[int, str], topics: dict[str, Topic]) -> Topic | None:
+def _topic(
+    path: str | os.PathLike, channel: Channel, schemas: dict[int, str], topics: dict[str, Topic]
+) -> Topic | None:
     topic = topics.get(channel.topic)
     if topic is not None:
         expected = topic.message.DESCRIPTOR.full_name

@@ -187,7 +187,10 @@ class Encoder:
                 message = self._joint_states(record.velocity, record.position)
                 return [Encoded(self.topics[JOINT_STATES], record.log_time, record.time, 0, message)]
             case Command():
-                requested, sent = self._joint_states(record.requested), self._joint_states(record.sent, record.reference)
+                requested, sent = (
+                    self._joint_states(record.requested),
+                    self._joint_states(record.sent, record.reference),
+                )
                 return [
                     Encoded(self.topics[topic], record.time, record.time, record.tick, message)
                     for topic, message in ((REQUESTED, requested), (SENT, sent))
