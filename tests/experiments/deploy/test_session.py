@@ -217,7 +217,7 @@ def test_arming_that_is_refused_after_a_reset_can_be_tried_again(policy, monkeyp
             simulated.control.run()
 
     def press(pressed):
-        simulated.script.append((0.0, lambda: bridge.estop(pressed, simulation.now)))
+        simulated.script.append((0.0, lambda: bridge.gate.estop(pressed, simulation.now)))
 
     thread = threading.Thread(target=control, daemon=True)
     monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
