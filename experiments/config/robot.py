@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -21,12 +22,13 @@ from robot_io.contract import PAPER, Contract
 from robot_io.control import config as robot_config
 from robot_io.control.config import RobotConfig
 from robot_io.emulator import config as rig_config
-from robot_io.emulator.config import RigParams
+from robot_io.emulator.config import RigParams, for_robot
 from robot_io.emulator.opponent import Throws
 from robot_io.ranges import is_number, outside
 
 if TYPE_CHECKING:  # a robot.yaml is read without JAX
     from ballmodel.registry import Balls
+    from mjx_tt.robot.robot import Robot
     from mjx_tt.sim.model import SimModel
 
 COMMISSIONING = 0.1  # speed_scale of a robot.yaml that sets none: full speed is asked for, not forgotten
@@ -70,9 +72,26 @@ def load_calibration(path: str | Path) -> Calibration:
     return fill(Calibration, _mapping(path), str(path))
 
 
-def load_rig(path: str | Path | None) -> RigParams:
-    """A rig.yaml, or the standard rig. Raises ConfigError."""
-    return RigParams() if path is None else fill(RigParams, _mapping(path), str(path))
+def load_rig(path: str | Path | None, robot: Robot | None = None) -> RigParams:
+    """A rig.yaml, or the standard rig, for a robot; None: the paper's. Raises ConfigError.
+
+    Another robot's arm and axes react as late as its YAML says, unless rig.yaml says how late.
+    """
+    standard = RigParams()
+    if robot is not None and robot.contract != PAPER:
+        known, arm = dict(robot.file.model), standard.arm
+        late, reported, moved = (
+            known.get(f"latency.{key}") for key in ("abb_action", "abb_observation", "festo_action")
+        )
+        arm = replace(
+            arm,
+            feedback_delay=arm.feedback_delay if reported is None else reported,
+            dead_time=arm.dead_time if late is None else max(late - rig_config.ARM_RESPONSE, 0.0),
+        )
+        dead = standard.axis_dead_time if moved is None else max(moved - rig_config.AXIS_RESPONSE, 0.0)
+        standard = replace(standard, arm=arm, axis_dead_time=dead)
+    params = standard if path is None else fill(RigParams, _mapping(path), str(path), standard)
+    return params if robot is None else checked("" if path is None else str(path), for_robot, params, robot.contract)
 
 
 def to_yaml(config: RobotConfig | RigParams | Calibration) -> str:
@@ -93,7 +112,7 @@ def _completed(given: Any, defaults: Any) -> Any:
 
 
 def fill(kind: type[Config], data: dict[str, Any], where: str, defaults: Config | None = None) -> Config:
-    """An instance of a dataclass; omitted keys keep the class's defaults or those given. Raises ConfigError, a line per mistake."""
+    """An instance of a dataclass; omitted keys keep the class's or the given defaults. Raises ConfigError."""
     found = {path: (value, words) for path, value, words in outside(data, RANGES[kind]) if is_number(value)}
     lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
     try:

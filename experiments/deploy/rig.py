@@ -18,9 +18,8 @@ from experiments.errors import ConfigError, checked
 from mjx_tt.robot import robot as simulated
 from mjx_tt.robot.robot import Robot
 from mjx_tt.sim.model import SimModel
-from robot_io.control.rally import Box
 from robot_io.contract import PAPER
-from robot_io.emulator.config import RigParams, for_robot
+from robot_io.control.rally import Box
 from robot_io.emulator.opponent import Opponent, Throws
 from robot_io.emulator.processes import Ports, Rig
 from robot_io.policy import artefact as artefacts
@@ -36,14 +35,15 @@ def rig_for(
 
     The robot that stands there is the one that the policy was trained for.
     """
-    robot, params = robot_of(artefact), robots.load_rig(params_path)
+    robot = robot_of(artefact)
+    params = robots.load_rig(params_path, robot)
     thrower: Opponent | Throws
     if player is not None:
         thrower = VirtualPlayer(player, seed)
     else:
         distribution = build.distribution(balls or _trained_on(artefact), "--distribution")
         thrower = robots.throws_of(distribution, SimModel(), THROWS, seed)
-    return _rig(robot, thrower, params)
+    return Rig(str(robot.scene()), thrower, params, None, robot.contract)
 
 
 def robot_of(artefact: artefacts.Artefact) -> Robot:
@@ -64,11 +64,6 @@ def robot_of(artefact: artefacts.Artefact) -> Robot:
     if robot.contract != artefact.contract:
         raise ConfigError(f"{where}: no more the {name} of the policy's contract; export the policy again")
     return robot
-
-
-def _rig(robot: Robot, balls: Throws | Opponent, params: RigParams, ports: Ports | None = None) -> Rig:
-    checked("", for_robot, params, robot.contract)
-    return Rig(str(robot.scene()), balls, params, ports, robot.contract)
 
 
 def box_of(artefact: artefacts.Artefact) -> Box | None:
@@ -120,7 +115,8 @@ def rig(
     }
     for key in ("f", "c") if not axes else ():
         del keys[key]
-    with _rig(standing, throws, robots.load_rig(rig_params), chosen) as running, Keyboard() as keyboard:
+    params = robots.load_rig(rig_params, standing)
+    with Rig(str(standing.scene()), throws, params, chosen, standing.contract) as running, Keyboard() as keyboard:
         out.write_text(robots.to_yaml(running.robot), encoding="utf-8")
         console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}", highlight=False)
         console.print("   ".join(f"\\[{k}] {text}" for k, (_, text) in keys.items()), highlight=False)

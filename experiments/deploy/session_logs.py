@@ -29,7 +29,7 @@ def is_session(path: Path) -> bool:
 
 
 def load(path: Path) -> tuple[tuple[Trajectory, ...], tuple[JointRecord, ...], Contract]:
-    """Flights and joint records of a session, and its robot's contract. Raises robot_io.errors' exceptions for a damaged log."""
+    """Flights and joint records of a session, and its robot's contract. Raises LogError for a damaged log."""
     log = read(path)
     return _flights(log, path.stem), _joints(log), log.robot
 

@@ -18,14 +18,12 @@ from experiments.deploy.operator_console import Keyboard, View
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session import Session
 from experiments.deploy.virtual_player import VirtualPlayer
-from experiments.errors import checked
 from experiments.finetuning import loop
 from experiments.finetuning.bridge_robot import BridgeRobot
 from experiments.finetuning.robot import LockStepRallies, Robot
 from experiments.runs import load_policy, run_dir
 from experiments.training import finalize
 from robot_io.control import process
-from robot_io.emulator.config import for_robot
 from robot_io.policy import artefact as artefacts
 
 LOCK_STEP = "lockstep"
@@ -53,8 +51,7 @@ def finetune(
     if installed is not None:
         contradictions.check(installed, robot)
     if robot == LOCK_STEP:
-        params = robots.load_rig(rig_params)
-        checked("", for_robot, params, moved.contract)
+        params = robots.load_rig(rig_params, moved)
         lock_step: Robot = (
             loop.lock_step_robot(experiment, params, seed)
             if player is None

@@ -111,8 +111,8 @@ def sessions(paths: Sequence[Path]) -> Recording:
         robot = robot or session.robot
         if session.robot != robot:
             raise ConfigError(
-                f"{path}: a session of {session.robot.robot}, {paths[0]} is one of {robot.robot}; one data set holds one "
-                "robot, and one version of its YAML"
+                f"{path}: a session of {session.robot.robot}, {paths[0]} is one of {robot.robot}; one data set holds "
+                "one robot, and one version of its YAML"
             )
         emulated.add(session.metadata["session"].get("robot") in ("rig", "lockstep"))
         seen, sent = session.observations, session.commands

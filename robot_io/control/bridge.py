@@ -91,6 +91,7 @@ class Bridge:
         self._geometry: RobotGeometry = gate.geometry
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
         self.feedback = Feedback(ball=self.play.strokes.track, axes=History(256), arm=ArmHistory(256))  # a second
+        self._blade = partial(blade, self.feedback, self._geometry)
         self._state = BridgeState.DISARMED
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
@@ -250,7 +251,7 @@ class Bridge:
         if sample is None or sample.position is None:
             return
         self._log(Ball(sample.captured, now, sample.position, sample.ball))
-        self.play.follow(sample, partial(blade, self.feedback, self._geometry), now, armed=self.gate.engaged, at_start=self._been_home)
+        self.play.follow(sample, self._blade, now, armed=self.gate.engaged, at_start=self._been_home)
 
     def axes_received(self, position: np.ndarray, received: float) -> None:
         """The linear axes' newest position (2,) [m], as it was at ``received``."""
@@ -305,11 +306,11 @@ class Bridge:
             return self._ask_policy(now, self.play.episode, self._policy)
         return self._way_home.velocity(self._home) if self.state is BridgeState.READY else self._zeros.copy()
 
-    def _ages(self, now: float) -> list[float]:
+    def _ages(self, now: float) -> tuple[float, float, float]:
         """Ages [s] of what was last heard of arm, axes and tracker, infinite for never."""
-        arm = self.arm_session.feedback
-        heard = (arm and arm.received, self._axes_received, self.tracker.received)
-        return [math.inf if time is None else now - time for time in heard]
+        arm, seen = self.arm_session.feedback, self.tracker.received
+        heard = -math.inf if arm is None else arm.received, -math.inf if seen is None else seen
+        return now - heard[0], now - self._axes_received, now - heard[1]
 
     def _watch(self, now: float) -> None:
         """Tells the gate what is wrong with the devices."""

@@ -152,16 +152,13 @@ class Control:
             )
             self._axes = self._open(axes or AxesThread(linear_axes(config, contract)))
             self._tracker = Tracker(config.tracker, config.calibration)
-            bridge_config = BridgeConfig(
-                delays=config.delays, box=options.box, base=found.base, jog=options.jog, contract=contract
-            )
             self.bridge = Bridge(
                 self._session,
                 self._axes,
                 self._tracker,
                 gate,
                 policy,
-                bridge_config,
+                BridgeConfig(config.delays, box=options.box, base=found.base, jog=options.jog, contract=contract),
                 recorder,
                 self._episode,
                 lambda summary: self._send(messages.RallyOver(summary)),

@@ -37,7 +37,7 @@ def check_homing(geometry: RobotGeometry, measured: np.ndarray, contract: Contra
 
 
 def prepare(axes: AxesThread | DryAxes | FixedBase, check: Callable[[], None]) -> None:
-    """Acknowledge faults, switch on, and home what is not homed; ``check`` raises RefusedError where that is not safe."""
+    """Acknowledge faults, switch on, home what is not homed; ``check`` raises RefusedError where that is not safe."""
     if axes.axes.fault:
         axes.acknowledge()
     axes.enable()
