@@ -121,7 +121,7 @@ def sessions(paths: Sequence[Path]) -> Recording:
         i, j = i[played], j[played]
         time = seen.time[i]
         following = (*(episode.start for episode in session.episodes[1:]), np.inf)
-        for episode, bound in zip(session.episodes, following, strict=True):
+        for episode, bound in zip(session.episodes, following, strict=False):  # there may be none
             end = bound if episode.end is None else episode.end
             mine = np.flatnonzero((time >= episode.start) & (time <= end) & (time < bound))
             if episode.details.get("discarded"):
