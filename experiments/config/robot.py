@@ -90,6 +90,7 @@ def load_rig(path: str | Path | None, robot: Robot | None = None) -> RigParams:
         )
         dead = standard.axis_dead_time if moved is None else max(moved - rig_config.AXIS_RESPONSE, 0.0)
         standard = replace(standard, arm=arm, axis_dead_time=dead)
+        checked("", RobotConfig.of(robot.contract).check_joints, robot.contract)
     params = standard if path is None else fill(RigParams, _mapping(path), str(path), standard)
     return params if robot is None else checked("" if path is None else str(path), for_robot, params, robot.contract)
 

@@ -9,6 +9,7 @@ from robot_io.calibrated import RANGES as CALIBRATION_RANGES
 from robot_io.calibrated import Calibration
 from robot_io.contract import CONTROL_RATE, LIMITS, PAPER, Contract, JointLimits
 from robot_io.control.observation import LONGEST_DELAY, ObservationDelays
+from robot_io.devices.egm.messages import N_ARM_JOINTS
 from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.ranges import check_ranges
@@ -163,6 +164,11 @@ class RobotConfig:
     def check_joints(self, contract: Contract = PAPER) -> None:
         """Raise ValueError naming the key where this is no installation of the contract's robot."""
         names = [contract.joints[i] for i in contract.carrying]
+        if not N_ARM_JOINTS <= len(contract.arm) <= 2 * N_ARM_JOINTS:
+            raise ValueError(
+                f"{contract.robot}: its arm has {len(contract.arm)} joints; allowed are {N_ARM_JOINTS} to "
+                f"{2 * N_ARM_JOINTS}, which EGM carries"
+            )
         if len(self.axes) != len(names):
             raise ValueError(
                 f"axes: got {len(self.axes)} entries; allowed: {len(names)} for {contract.robot}, "

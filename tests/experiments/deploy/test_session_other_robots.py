@@ -194,6 +194,12 @@ def test_a_robot_yaml_for_other_joints_is_refused_by_key(tmp_path):
         RobotConfig().check_joints(ur10e)
 
 
+def test_an_arm_that_egm_does_not_carry_is_refused():
+    short = replace(simulated.load_shipped(UR10E).contract, robot="short", carrying=(0, 1))
+    with pytest.raises(ValueError, match="short: its arm has 5 joints; allowed are 6 to 12, which EGM carries"):
+        RobotConfig.of(short).check_joints(short)
+
+
 def test_the_control_process_says_which_robot_it_was_given(tmp_path):
     policy = exported(tmp_path / "artefact", UR10E)
     options = play.process.ControlOptions(str(policy))
