@@ -98,16 +98,10 @@ def read_logs(paths: Sequence[str], robot: Robot | None = None) -> diagnosis.Log
     others = [f for f in files if f not in sessions]
     if not sessions:
         return diagnosis.load_logs(paths, robot)
-    wanted = PAPER if robot is None else robot.contract
     rest = diagnosis.load_logs(others, robot) if others else diagnosis.Logs((), (), {})
     balls, records = list(rest.balls), [("the CSV files", rest.joints)] if rest.joints else []
     for file in sessions:
-        flights, joints, played = session_logs.load(file)
-        if played.limits.joints != wanted.joints:
-            raise ValueError(
-                f"{file}: a session of {played.robot}, whose joints are {', '.join(played.joints)}; --robot is "
-                f"{wanted.robot}, allowed is {played.robot}"
-            )
+        flights, joints = session_logs.load(file, robot)
         diagnosis.check(flights, str(file))
         balls += flights
         if joints:

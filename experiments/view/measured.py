@@ -42,7 +42,7 @@ def session(path: Path, model: SimModel) -> Fixed:
     log = read(path)
     if log.joints.time.size < 2:
         raise ConfigError(f"{path}: holds no joints")
-    flights, _, _ = session_logs.load(path)
+    flights = session_logs.flights(log)
     robot = played_by(log, path)
     strokes = [t for t in clean(flights)[0] if t.time[-1] - t.time[0] > FITTED] if flights else []
     flown = list(zip(strokes, _flights(strokes, model), strict=True))
@@ -208,7 +208,7 @@ def _logs(folder: Path, extended: ModelFile) -> Iterator[Trajectory]:
                 f"{folder / EXTENDED}: provenance.logs {path}: no such file; look from where it was diagnosed"
             )
         if session_logs.is_session(path):
-            yield from session_logs.load(path)[0]
+            yield from session_logs.flights(read(path))
         elif path.name not in ("command.csv", "state.csv"):
             yield from diagnosis.load_logs([path]).balls
 
