@@ -62,9 +62,7 @@ def load_robot(path: str | Path, calibrated: bool = True, contract: Contract = P
     safety = data.setdefault("safety", {})
     if isinstance(safety, dict):
         safety.setdefault("speed_scale", COMMISSIONING)
-    config = fill(RobotConfig, data, str(path), RobotConfig.of(contract))
-    checked(str(path), config.check_joints, contract)
-    return config
+    return fill(RobotConfig, data, str(path), RobotConfig.of(contract), contract)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -112,8 +110,13 @@ def _completed(given: Any, defaults: Any) -> Any:
     return defaults | {key: _completed(value, defaults.get(key)) for key, value in given.items()}
 
 
-def fill(kind: type[Config], data: dict[str, Any], where: str, defaults: Config | None = None) -> Config:
-    """An instance of a dataclass; omitted keys keep the class's or the given defaults. Raises ConfigError."""
+def fill(
+    kind: type[Config], data: dict[str, Any], where: str, defaults: Config | None = None, contract: Contract = PAPER
+) -> Config:
+    """An instance of a dataclass; omitted keys keep the class's or the given defaults. Raises ConfigError.
+
+    contract  whose joints a RobotConfig has
+    """
     found = {path: (value, words) for path, value, words in outside(data, RANGES[kind]) if is_number(value)}
     lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
     try:
@@ -126,6 +129,8 @@ def fill(kind: type[Config], data: dict[str, Any], where: str, defaults: Config 
             if not found or (mistake["type"] != "value_error" and _path(mistake) not in found):
                 lines.append(_line(mistake, kind))
     if not lines:
+        if isinstance(config, RobotConfig):
+            checked(where, config.check_joints, contract)
         return config
     raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
 

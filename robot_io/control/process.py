@@ -293,7 +293,7 @@ class Control:
                 self.timings.reply.add(time.monotonic() - began)
 
     def _take_axes(self) -> None:
-        if not isinstance(self._axes, AxesThread):
+        if isinstance(self._axes, DryAxes | FixedBase):
             now = time.monotonic()
             self._axes.cycle(now)
             if isinstance(self._session, DryArm):

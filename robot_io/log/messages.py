@@ -370,7 +370,7 @@ def _alike(record: Record, first: str, *others: str) -> bytes:
 
 
 def _parts(data: bytes, offset: int, count: int) -> list[np.ndarray]:
-    """What ``_alike`` packed: so many arrays of one length."""
+    """Arrays of one length, ``count`` of them, that ``_alike`` packed."""
     length = (len(data) - offset) // (8 * count)
     return _arrays(data, offset, *[length] * count)
 

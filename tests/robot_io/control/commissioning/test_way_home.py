@@ -53,7 +53,7 @@ class Ideal:
         return began
 
     def go(self, target, seconds=LONGEST):
-        """Whether it gets there."""
+        """True where it gets there."""
         end = self.now + seconds
         while self.now < end and not self.way.problem:
             if np.abs(self.gate.reference - target).max() < 1e-3:
@@ -94,7 +94,7 @@ def test_a_robot_that_the_gate_holds_gets_home_with_its_margin(name):
 
 
 def test_back_along_its_own_way_where_nothing_else_is_clear(monkeypatch):
-    """Where the geometry clears no straight way but short ones, what was gone before is gone back."""
+    """Only short straight ways count as clear: what was gone before is gone back."""
     name = "ur10e_rail"
     ideal, short = Ideal(name), 0.4
     ideal.arm(ideal.robot.home)
