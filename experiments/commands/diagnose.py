@@ -98,14 +98,10 @@ def read_logs(paths: Sequence[str], robot: Robot | None = None) -> diagnosis.Log
     others = [f for f in files if f not in sessions]
     if not sessions:
         return diagnosis.load_logs(paths, robot)
-    if robot is not None and robot.contract != PAPER:
-        raise ValueError(
-            f"{sessions[0]}: a session of the paper's robot; joints of {robot.name} are read from CSV only"
-        )
-    rest = diagnosis.load_logs(others) if others else diagnosis.Logs((), (), {})
+    rest = diagnosis.load_logs(others, robot) if others else diagnosis.Logs((), (), {})
     balls, records = list(rest.balls), [("the CSV files", rest.joints)] if rest.joints else []
     for file in sessions:
-        flights, joints = session_logs.load(file)
+        flights, joints = session_logs.load(file, robot)
         diagnosis.check(flights, str(file))
         balls += flights
         if joints:

@@ -137,20 +137,23 @@ def known_player(player: str | None, robot: str, distribution: str | None) -> No
 def _ports(_type: Any, tokens: Sequence[Token]) -> tuple[int, ...]:
     text = tokens[0].value
     parts = text.split(",")
-    if len(parts) != 4 or not all(part.isdigit() and 0 < int(part) < 65536 for part in parts):
-        raise ValueError(f"{text!r}: four ports are needed, such as 6510,6520,5021,5022")
+    if not 2 <= len(parts) <= 8 or not all(part.isdigit() and 0 < int(part) < 65536 for part in parts):
+        raise ValueError(f"{text!r}: a port for each device is needed, such as 6510,6520,5021,5022")
     return tuple(map(int, parts))
 
 
 @rig_app.default
 def rig(
     *,
-    ports: Annotated[tuple[int, ...], option("ARM,TRACKER,X,Y", "of the devices", converter=_ports)] = (
+    ports: Annotated[tuple[int, ...], option("ARM,TRACKER,AXES", "of the devices", converter=_ports)] = (
         6510,
         6520,
         5021,
         5022,
     ),
+    robot: Annotated[
+        str | None, option("NAME", "robot that stands there, by name or folder (default: the paper's)")
+    ] = None,
     out: Annotated[str, option("YAML", "where its robot.yaml is written")] = "rig-robot.yaml",
     distribution: Annotated[str, option("NAME", "balls that are thrown (default: player3/M0)")] = "player3/M0",
     rig: RigFile = None,
@@ -161,4 +164,4 @@ def rig(
     start_jax(1)
     from experiments.deploy import rig as emulated
 
-    return emulated.rig(distribution, rig, seed, ports, Path(out), console())
+    return emulated.rig(distribution, rig, seed, ports, Path(out), console(), robot)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -17,15 +18,17 @@ from experiments.config.validation import LONGEST, nearest
 from experiments.errors import ConfigError, checked
 from robot_io.calibrated import RANGES as CALIBRATION_RANGES
 from robot_io.calibrated import Calibration
+from robot_io.contract import PAPER, Contract
 from robot_io.control import config as robot_config
 from robot_io.control.config import RobotConfig
 from robot_io.emulator import config as rig_config
-from robot_io.emulator.config import RigParams
+from robot_io.emulator.config import RigParams, for_robot
 from robot_io.emulator.opponent import Throws
 from robot_io.ranges import is_number, outside
 
 if TYPE_CHECKING:  # a robot.yaml is read without JAX
     from ballmodel.registry import Balls
+    from mjx_tt.robot.robot import Robot
     from mjx_tt.sim.model import SimModel
 
 COMMISSIONING = 0.1  # speed_scale of a robot.yaml that sets none: full speed is asked for, not forgotten
@@ -43,12 +46,13 @@ RANGES = {RobotConfig: robot_config.RANGES, RigParams: rig_config.RANGES, Calibr
 Config = TypeVar("Config", RobotConfig, RigParams, Calibration)
 
 
-def load_robot(path: str | Path, calibrated: bool = True) -> RobotConfig:
+def load_robot(path: str | Path, calibrated: bool = True, contract: Contract = PAPER) -> RobotConfig:
     """A robot.yaml, its calibration in it or in a file that it names. Raises ConfigError.
 
     Without ``safety.speed_scale`` the robot is slow: COMMISSIONING.
 
     calibrated  False: its calibration is not looked at
+    contract    whose joints it has
     """
     data = _mapping(path)
     if not calibrated:
@@ -58,7 +62,7 @@ def load_robot(path: str | Path, calibrated: bool = True) -> RobotConfig:
     safety = data.setdefault("safety", {})
     if isinstance(safety, dict):
         safety.setdefault("speed_scale", COMMISSIONING)
-    return fill(RobotConfig, data, str(path))
+    return fill(RobotConfig, data, str(path), RobotConfig.of(contract), contract)
 
 
 def load_calibration(path: str | Path) -> Calibration:
@@ -66,9 +70,27 @@ def load_calibration(path: str | Path) -> Calibration:
     return fill(Calibration, _mapping(path), str(path))
 
 
-def load_rig(path: str | Path | None) -> RigParams:
-    """A rig.yaml, or the standard rig. Raises ConfigError."""
-    return RigParams() if path is None else fill(RigParams, _mapping(path), str(path))
+def load_rig(path: str | Path | None, robot: Robot | None = None) -> RigParams:
+    """A rig.yaml, or the standard rig, for a robot; None: the paper's. Raises ConfigError.
+
+    Another robot's arm and axes react as late as its YAML says, unless rig.yaml says how late.
+    """
+    standard = RigParams()
+    if robot is not None and robot.contract != PAPER:
+        known, arm = dict(robot.file.model), standard.arm
+        late, reported, moved = (
+            known.get(f"latency.{key}") for key in ("abb_action", "abb_observation", "festo_action")
+        )
+        arm = replace(
+            arm,
+            feedback_delay=arm.feedback_delay if reported is None else reported,
+            dead_time=arm.dead_time if late is None else max(late - rig_config.ARM_RESPONSE, 0.0),
+        )
+        dead = standard.axis_dead_time if moved is None else max(moved - rig_config.AXIS_RESPONSE, 0.0)
+        standard = replace(standard, arm=arm, axis_dead_time=dead)
+        checked("", RobotConfig.of(robot.contract).check_joints, robot.contract)
+    params = standard if path is None else fill(RigParams, _mapping(path), str(path), standard)
+    return params if robot is None else checked("" if path is None else str(path), for_robot, params, robot.contract)
 
 
 def to_yaml(config: RobotConfig | RigParams | Calibration) -> str:
@@ -88,13 +110,18 @@ def _completed(given: Any, defaults: Any) -> Any:
     return defaults | {key: _completed(value, defaults.get(key)) for key, value in given.items()}
 
 
-def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
-    """An instance of a dataclass; omitted keys keep their defaults. Raises ConfigError with one line per mistake."""
+def fill(
+    kind: type[Config], data: dict[str, Any], where: str, defaults: Config | None = None, contract: Contract = PAPER
+) -> Config:
+    """An instance of a dataclass; omitted keys keep the class's or the given defaults. Raises ConfigError.
+
+    contract  whose joints a RobotConfig has
+    """
     found = {path: (value, words) for path, value, words in outside(data, RANGES[kind]) if is_number(value)}
     lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
     try:
         # By JSON, whose lists are tuples: nothing else is converted.
-        content = _completed(data, _defaults()[kind])
+        content = _completed(data, _defaults()[kind] if defaults is None else plain(defaults))
         config = _adapters()[kind].validate_json(json.dumps({"file": content}, default=str)).file
     except ValidationError as error:
         for mistake in error.errors(include_url=False):
@@ -102,6 +129,8 @@ def fill(kind: type[Config], data: dict[str, Any], where: str) -> Config:
             if not found or (mistake["type"] != "value_error" and _path(mistake) not in found):
                 lines.append(_line(mistake, kind))
     if not lines:
+        if isinstance(config, RobotConfig):
+            checked(where, config.check_joints, contract)
         return config
     raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
 

@@ -12,12 +12,14 @@ from rich.console import Console
 from experiments.config import robot as robots
 from experiments.deploy.operator_console import KEYS, QUIT, Key, Keyboard, View
 from experiments.deploy.session import Session
+from experiments.errors import of_the_paper
 from robot_io.calibrated import Calibration
 from robot_io.calibration import points
 from robot_io.contract import FESTO_JOINTS, JOINT_NAMES, N_JOINTS
 from robot_io.control import messages, process
 from robot_io.control.messages import Request
 from robot_io.errors import RefusedError
+from robot_io.policy import artefact as artefacts
 
 COLUMNS = (*points.TABLE, *points.BALL, *JOINT_NAMES)
 MARK = Key("note this point, of the last second", messages.Mark())
@@ -118,6 +120,8 @@ def _operate(
     console: Console,
     dry: bool,
 ) -> int:
+    if artefact is not None:
+        of_the_paper(artefacts.load(artefact).contract, str(artefact), "mjx-tt robot check")
     config, name = robots.load_robot(robot), time.strftime("%Y%m%d-%H%M%S")
     attachments = (
         ("robot.yaml", robot.read_text(encoding="utf-8")),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,13 @@ from experiments.config import build
 from experiments.config import robot as robots
 from experiments.deploy.operator_console import Keyboard
 from experiments.deploy.virtual_player import VirtualPlayer
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, checked
+from mjx_tt.robot import robot as simulated
+from mjx_tt.robot.robot import Robot
 from mjx_tt.sim.model import SimModel
+from robot_io.contract import PAPER
 from robot_io.control.rally import Box
+from robot_io.emulator.opponent import Opponent, Throws
 from robot_io.emulator.processes import Ports, Rig
 from robot_io.policy import artefact as artefacts
 
@@ -25,21 +28,42 @@ RIG = "rig"
 THROWS = 4096  # balls that the rig can throw before it begins anew
 
 
-def scene() -> str:
-    """Path of the robot's MJCF."""
-    return str(resources.files("mjx_tt") / "assets" / "scene.xml")
-
-
 def rig_for(
     artefact: artefacts.Artefact, balls: str | None, params_path: str | None, seed: int, player: str | None = None
 ) -> Rig:
-    """A rig with a virtual player, or that throws balls of a distribution: the named one, or that of the training."""
+    """A rig with a virtual player, or that throws balls of a distribution: the named one, or that of the training.
+
+    The robot that stands there is the one that the policy was trained for.
+    """
+    robot = robot_of(artefact)
+    params = robots.load_rig(params_path, robot)
+    thrower: Opponent | Throws
     if player is not None:
-        return Rig(scene(), VirtualPlayer(player, seed), robots.load_rig(params_path))
-    chosen = balls or _trained_on(artefact)
-    distribution = build.distribution(chosen, "--distribution")
-    throws = robots.throws_of(distribution, SimModel(), THROWS, seed)
-    return Rig(scene(), throws, robots.load_rig(params_path))
+        thrower = VirtualPlayer(player, seed)
+    else:
+        distribution = build.distribution(balls or _trained_on(artefact), "--distribution")
+        thrower = robots.throws_of(distribution, SimModel(), THROWS, seed)
+    return Rig(str(robot.scene()), thrower, params, None, robot.contract)
+
+
+def robot_of(artefact: artefacts.Artefact) -> Robot:
+    """The robot that a policy is for, from its recorded configuration.
+
+    Raises ConfigError where that names no robot, or another one than the artefact's contract.
+    """
+    if artefact.contract == PAPER:
+        return simulated.paper()
+    given = ((artefact.manifest.get("provenance") or {}).get("config") or {}).get("robot")
+    where, name = f"{artefact.folder}: provenance.config.robot", artefact.contract.robot
+    if isinstance(given, dict):
+        robot = checked("", simulated.from_content, given, where)
+    elif given in simulated.names():
+        robot = simulated.load_shipped(given)
+    else:
+        raise ConfigError(f"{where}: got {given!r}; allowed: the content of a robot's YAML, that of {name}")
+    if robot.contract != artefact.contract:
+        raise ConfigError(f"{where}: no more the {name} of the policy's contract; export the policy again")
+    return robot
 
 
 def box_of(artefact: artefacts.Artefact) -> Box | None:
@@ -61,10 +85,25 @@ def _trained_on(artefact: artefacts.Artefact) -> str | dict[str, Any]:
     return config["balls"]
 
 
-def rig(balls: str, rig_params: str | None, seed: int, ports: tuple[int, ...], out: Path, console: Console) -> int:
-    """The rig alone, for a bridge that runs elsewhere; until the operator quits."""
+def rig(
+    balls: str,
+    rig_params: str | None,
+    seed: int,
+    ports: tuple[int, ...],
+    out: Path,
+    console: Console,
+    robot: str | None = None,
+) -> int:
+    """The rig alone, for a bridge that runs elsewhere; until the operator quits.
+
+    robot: name or folder of the robot that stands there, None: the paper's. Raises ConfigError.
+    """
+    standing = simulated.paper() if robot is None else checked("--robot", simulated.load, robot)
+    axes = len(standing.contract.carrying)
+    if len(ports) < 2 + axes:
+        raise ConfigError(f"--ports: got {len(ports)}; allowed: {2 + axes}, of arm, tracker and {axes} linear axes")
     throws = robots.throws_of(build.distribution(balls, "--distribution"), SimModel(), THROWS, seed)
-    chosen = Ports(ports[0], ports[1], (ports[2], ports[3]))
+    chosen = Ports(ports[0], ports[1], ports[2 : 2 + axes])
     keys: dict[str, tuple[str, str]] = {
         "o": ("switch_on", "switch the arm on"),
         "b": ("throw", "throw balls, or stop"),
@@ -74,7 +113,10 @@ def rig(balls: str, rig_params: str | None, seed: int, ports: tuple[int, ...], o
         "t": ("drop_out", "tracker silent for 1 s"),
         "q": ("quit", "end"),
     }
-    with Rig(scene(), throws, robots.load_rig(rig_params), chosen) as running, Keyboard() as keyboard:
+    for key in ("f", "c") if not axes else ():
+        del keys[key]
+    params = robots.load_rig(rig_params, standing)
+    with Rig(str(standing.scene()), throws, params, chosen, standing.contract) as running, Keyboard() as keyboard:
         out.write_text(robots.to_yaml(running.robot), encoding="utf-8")
         console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}", highlight=False)
         console.print("   ".join(f"\\[{k}] {text}" for k, (_, text) in keys.items()), highlight=False)

@@ -20,13 +20,14 @@ from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, RECOVER, Keyb
 from experiments.deploy.recovery import Recovery
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session_report import PlayedSession
-from experiments.errors import of_the_paper
 from experiments.runs import run_dir
+from robot_io.contract import PAPER
 from robot_io.control import messages, process
 from robot_io.control.config import RobotConfig
 from robot_io.control.messages import Message, Played, RallyOver, Refused, Request, Status
 from robot_io.emulator.processes import Rig
 from robot_io.errors import JogFirstError, RefusedError
+from robot_io.log import view as log_view
 from robot_io.policy import artefact as artefacts
 
 READY_TIME = 60.0  # [s] for the control process to start
@@ -201,7 +202,6 @@ def run(
     0: all went well, 1: it ended early, 130: the operator ended it with Ctrl-C; the summary is written in any case.
     """
     loaded = artefacts.load(artefact)
-    of_the_paper(loaded.contract, str(artefact), "mjx-tt run")
     with ExitStack() as stack:
         rig = None
         if robot == RIG:
@@ -209,7 +209,7 @@ def run(
             rig = stack.enter_context(rig_for(loaded, distribution, rig_params, seed, player))
             config, text = rig.robot, robots.to_yaml(rig.robot)
         else:
-            config = robots.load_robot(robot)
+            config = robots.load_robot(robot, contract=loaded.contract)
             contradictions.check(config, robot, log_folder)
             text = Path(robot).read_text(encoding="utf-8")
         name = time.strftime("%Y%m%d-%H%M%S")
@@ -244,6 +244,10 @@ def run(
     log_file = process.log_path(options)
     summary = session_report.summary(loaded, config, played, session.status, session.timings, log_file)
     summary |= {"faults": [asdict(fault) for fault in played.faults], "player": player}
+    if loaded.contract != PAPER:  # the shipped layout of the viewers is for the paper's robot's log
+        path = log_folder / f"{name}.layout.json"
+        run_dir.write_json(path, log_view.layout(loaded.contract))
+        summary["layout"] = str(path)
     _finish(summary, config, log_file, log_folder / f"{name}.json", console)
     if problem:
         console.print(problem, style="red", highlight=False)

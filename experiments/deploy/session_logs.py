@@ -10,7 +10,8 @@ from mcap.reader import make_reader
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint.log import SHORTEST, JointRecord
-from robot_io.contract import JOINT_NAMES
+from mjx_tt.robot import robot as robots
+from mjx_tt.robot.robot import Robot
 from robot_io.log import SessionLog, read
 
 LONGEST_GAP = 0.1  # [s] without a sample that ends a flight
@@ -28,13 +29,23 @@ def is_session(path: Path) -> bool:
     return summary is not None and any(c.topic == "/joint_states" for c in summary.channels.values())
 
 
-def load(path: Path) -> tuple[tuple[Trajectory, ...], tuple[JointRecord, ...]]:
-    """Flights and joint records of a session. Raises robot_io.errors' exceptions for a damaged log."""
-    log = read(path)
-    return _flights(log, path.stem), _joints(log)
+def load(path: Path, robot: Robot | None = None) -> tuple[tuple[Trajectory, ...], tuple[JointRecord, ...]]:
+    """Flights and joint records of a session of a robot; None: the paper's.
+
+    Raises robot_io.errors' exceptions for a damaged log, ValueError for one of a robot with other joints.
+    """
+    log, wanted = read(path), robot or robots.paper()
+    played = log.robot
+    if played.joints != wanted.contract.joints:
+        raise ValueError(
+            f"{path}: a session of {played.robot}, whose joints are {', '.join(played.joints)}; --robot is "
+            f"{wanted.name}, allowed is {played.robot}"
+        )
+    return flights(log), _joints(log, wanted)
 
 
-def _flights(log: SessionLog, session: str) -> tuple[Trajectory, ...]:
+def flights(log: SessionLog) -> tuple[Trajectory, ...]:
+    """The balls of a session, each between two gaps."""
     out = []
     for ball in np.unique(log.ball.id):
         mine = np.flatnonzero(log.ball.id == ball)
@@ -47,19 +58,20 @@ def _flights(log: SessionLog, session: str) -> tuple[Trajectory, ...]:
         for k, part in enumerate(np.split(np.arange(order.size), cuts)):
             if part.size:
                 name = f"{ball}" if not cuts.size else f"{ball}.{k}"
-                out.append(Trajectory(session, name, time[part], position[:, part]))
+                out.append(Trajectory(log.path.stem, name, time[part], position[:, part]))
     return tuple(out)
 
 
-def _joints(log: SessionLog) -> tuple[JointRecord, ...]:
+def _joints(log: SessionLog, robot: Robot) -> tuple[JointRecord, ...]:
     states, commands = log.joints, log.commands
     if states.time.size < 2 or commands.time.size < 2:
         return ()
     ticks, sent = np.unique(commands.time, return_index=True)
     out = []
-    for j, name in enumerate(JOINT_NAMES):
+    for j, name in enumerate(log.robot.joints):
         known = np.flatnonzero(np.isfinite(states.position[j]))  # arm and gantry report by turns
         moments, first = np.unique(states.time[known], return_index=True)
         if moments.size > 1 and moments[-1] - max(moments[0], ticks[0]) >= SHORTEST:
-            out.append(JointRecord(name, ticks, commands.sent[j, sent], moments, states.position[j, known[first]]))
+            positions = states.position[j, known[first]]
+            out.append(JointRecord(name, ticks, commands.sent[j, sent], moments, positions, robot=robot))
     return tuple(out)

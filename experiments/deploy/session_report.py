@@ -69,6 +69,8 @@ def summary(
     report["timings"] = timings or (status.timings if status else {})
     report["egm"] = status.egm if status else {}
     report |= {k: getattr(status, k, None) for k in ("axes_cycles", "axes_late", "tracker_counts", "log_dropped")}
+    if not config.axes:  # nothing to exchange with
+        report |= {"axes_cycles": None, "axes_late": None}
     report["log"] = None if log_file is None else str(log_file)
     return report
 
@@ -125,5 +127,5 @@ def show(console: Console, report: dict[str, Any], path: Path) -> None:
         if value:
             console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
     if report["log"]:
-        layout = resources.files("robot_io.log") / "layout.json"
+        layout = report.get("layout") or resources.files("robot_io.log") / "layout.json"
         console.print(f"  to see it  Foxglove or Lichtblick, with the layout {layout}", highlight=False, soft_wrap=True)

@@ -109,7 +109,8 @@ def experiment_of(source: str | Path, balls: str | None = None) -> Experiment:
 def lock_step_robot(experiment: Experiment, params: RigParams | None = None, seed: int = 0) -> LockStepRobot:
     """The emulated robot with balls of the experiment's distribution; ``seed`` draws them."""
     pool = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), LOCK_STEP_BALLS)
-    return LockStepRobot(thrown(pool.state), params)
+    robot = experiment.task.robot
+    return LockStepRobot(thrown(pool.state), params, robot.scene(), robot.contract)
 
 
 def reward_terms(summary: EpisodeSummary) -> dict[str, float]:

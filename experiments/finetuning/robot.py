@@ -12,8 +12,11 @@ import numpy as np
 import mjx_tt
 from ballmodel.state import BallState
 from experiments.errors import RunError
+from robot_io.contract import PAPER, Contract
 from robot_io.control.bridge import BridgeState
 from robot_io.control.episode import EpisodeSummary
+from robot_io.control.interfaces import BridgeConfig
+from robot_io.control.interfaces import Policy as StepPolicy
 from robot_io.control.rally import RallySummary
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
@@ -93,17 +96,24 @@ class LockStepRobot:
 
     repeatable = True
 
-    def __init__(self, throws: Throws, params: RigParams | None = None, scene: str | Path = SCENE) -> None:
-        self._throws, self._params, self._scene = throws, params or RigParams(), scene
-        self._world = World(scene, self._params.world)
+    def __init__(
+        self,
+        throws: Throws,
+        params: RigParams | None = None,
+        scene: str | Path = SCENE,
+        contract: Contract = PAPER,
+    ) -> None:
+        self._throws, self._params, self._scene, self._contract = throws, params or RigParams(), scene, contract
+        self._world = World(scene, self._params.world, contract)
 
     def play(self, policy: Policy, episode_number: int) -> PlayedBall:
         balls = BallRecorder()
         rig = LockStep(
             self._scene,
             self._throws,
-            make_policy("numpy" if policy.network is None else "jit", policy),
+            make_policy("numpy" if policy.network is None else "jit", policy, self._contract),
             self._params,
+            BridgeConfig(contract=self._contract),
             recorder=balls,
             first=episode_number,
             world=self._world,
@@ -118,14 +128,15 @@ class LockStepRobot:
         return PlayedBall(found[0], balls.trajectory(found[0].ball))
 
     def describe(self) -> dict[str, Any]:
-        return {"robot": "lock-step", "params": repr(self._params), "balls": int(self._throws.position.shape[1])}
+        found = {"robot": "lock-step", "params": repr(self._params), "balls": int(self._throws.position.shape[1])}
+        return found | _named(self._contract)
 
 
 class LockStepRallies:
     """The emulated robot in this process, in rallies with an opponent; one session, which is not repeated.
 
     It takes balls only while an episode is asked for, and credits only those that the policy of that episode played.
-    recorder: of the whole session
+    recorder: of the whole session; contract: of the robot in ``scene``
     """
 
     repeatable = False
@@ -136,9 +147,11 @@ class LockStepRallies:
         params: RigParams | None = None,
         scene: str | Path = SCENE,
         recorder: SessionRecorder | None = None,
+        contract: Contract = PAPER,
     ) -> None:
-        self._params = params or RigParams()
-        self._made = partial(LockStep, scene, opponent, params=self._params, recorder=recorder)
+        self._params, self._contract = params or RigParams(), contract
+        config = BridgeConfig(contract=contract)
+        self._made = partial(LockStep, scene, opponent, params=self._params, config=config, recorder=recorder)
         self._rig: LockStep | None = None
         self._version = 0
 
@@ -150,7 +163,7 @@ class LockStepRallies:
     def play(self, policy: Policy, episode_number: int) -> PlayedBall:
         """Play the next ball of the session, whatever ``episode_number`` is."""
         if self._rig is None:
-            self._rig = self._made(policy=make_policy("numpy" if policy.network is None else "jit", policy))
+            self._rig = self._made(policy=self._computed(policy))
             self._rig.start()
             self._rig.throwing = True
         rig, bridge = self._rig, self._rig.bridge
@@ -174,14 +187,22 @@ class LockStepRallies:
         rig = self._rig
         while rig is not None:
             try:
-                rig.bridge.set_policy(make_policy("numpy" if policy.network is None else "jit", policy), self._version)
+                rig.bridge.set_policy(self._computed(policy), self._version)
                 rig.bridge.paused = False
                 return
             except RefusedError:
                 rig.run(EXCHANGE)
 
     def describe(self) -> dict[str, Any]:
-        return {"robot": "rallies in lock-step", "params": repr(self._params)}
+        return {"robot": "rallies in lock-step", "params": repr(self._params)} | _named(self._contract)
+
+    def _computed(self, policy: Policy) -> StepPolicy:
+        return make_policy("numpy" if policy.network is None else "jit", policy, self._contract)
+
+
+def _named(contract: Contract) -> dict[str, str]:
+    """Another robot than the paper's, for the description."""
+    return {} if contract == PAPER else {"joints": contract.robot}
 
 
 class BallRecorder(NullRecorder):

@@ -18,7 +18,6 @@ from experiments.deploy.operator_console import Keyboard, View
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session import Session
 from experiments.deploy.virtual_player import VirtualPlayer
-from experiments.errors import of_the_paper
 from experiments.finetuning import loop
 from experiments.finetuning.bridge_robot import BridgeRobot
 from experiments.finetuning.robot import LockStepRallies, Robot
@@ -46,17 +45,17 @@ def finetune(
 
     player: virtual player who rallies with the robot on RIG or LOCK_STEP, in place of thrown balls
     """
-    installed = None if robot in (LOCK_STEP, RIG) else robots.load_robot(robot)
+    experiment = loop.experiment_of(source, distribution)
+    moved = experiment.task.robot
+    installed = None if robot in (LOCK_STEP, RIG) else robots.load_robot(robot, contract=moved.contract)
     if installed is not None:
         contradictions.check(installed, robot)
-    experiment = loop.experiment_of(source, distribution)
-    of_the_paper(experiment.task.robot.contract, source, "mjx-tt finetune")
     if robot == LOCK_STEP:
-        params = robots.load_rig(rig_params)
+        params = robots.load_rig(rig_params, moved)
         lock_step: Robot = (
             loop.lock_step_robot(experiment, params, seed)
             if player is None
-            else LockStepRallies(VirtualPlayer(player, seed), params)
+            else LockStepRallies(VirtualPlayer(player, seed), params, moved.scene(), contract=moved.contract)
         )
         return loop.finetune(source, settings, run, lock_step, console, None, experiment)
     run.folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +64,7 @@ def finetune(
         rig = None
         if robot == RIG:
             rig = stack.enter_context(rig_for(artefacts.load(artefact), distribution, rig_params, seed, player))
-        config = rig.robot if rig else installed or robots.load_robot(robot)
+        config = rig.robot if rig else installed or robots.load_robot(robot, contract=moved.contract)
         options = process.ControlOptions(
             str(artefact),
             backend,

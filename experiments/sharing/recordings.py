@@ -15,11 +15,11 @@ from experiments.deploy.session_logs import LONGEST_GAP, is_session
 from experiments.errors import ConfigError, checked
 from mjx_tt import diagnosis
 from robot_io import log
-from robot_io.contract import CONTROL_RATE, JOINT_NAMES, JOINT_UNITS, OBSERVATION_NAMES, OBSERVATION_UNITS
+from robot_io.contract import CONTROL_RATE, PAPER, Contract
 
 RETURN = "return the ball to the person's side of the table"
 FLIGHT = "flight of a ball over the table"
-ROBOT = "IRB 120T on two linear axes"
+ROBOT = "IRB 120T on two linear axes"  # the paper's
 SHORTEST = 2  # frames
 LATE = 1.5  # periods between two frames that are told
 
@@ -58,19 +58,24 @@ class Recording:
     notes: tuple[str, ...]
 
 
-_SPEEDS = (JOINT_NAMES, tuple(f"{unit}/s" for unit in JOINT_UNITS))
 _TIME = {"session_time": Feature("float64", units=("s",))}  # since the session's start, as it was measured
 _DONE = {"next.done": Feature("bool")}
-BALLS = {"observation.state": Feature("float32", OBSERVATION_NAMES[:3], OBSERVATION_UNITS[:3]), **_TIME, **_DONE}
-SESSION = {
-    "observation.state": Feature("float32", OBSERVATION_NAMES, OBSERVATION_UNITS),
-    "action": Feature("float32", *_SPEEDS),  # as the policy requested
-    "sent": Feature("float32", *_SPEEDS),  # after limiter and safety gate
-    **_TIME,
-    "next.success": Feature("bool"),
-    **_DONE,
-}
+_BALL = PAPER.observation_names[:3], PAPER.observation_units[:3]
+BALLS = {"observation.state": Feature("float32", *_BALL), **_TIME, **_DONE}
 REWARD = {"next.reward": Feature("float32")}
+
+
+def features_of(robot: Contract) -> dict[str, Feature]:
+    """The columns of a robot's sessions."""
+    speeds = robot.joints, tuple(f"{unit}/s" for unit in robot.units)
+    return {
+        "observation.state": Feature("float32", robot.observation_names, robot.observation_units),
+        "action": Feature("float32", *speeds),  # as the policy requested
+        "sent": Feature("float32", *speeds),  # after limiter and safety gate
+        **_TIME,
+        "next.success": Feature("bool"),
+        **_DONE,
+    }
 
 
 def read(paths: Sequence[str]) -> Recording:
@@ -94,13 +99,21 @@ def sessions(paths: Sequence[Path]) -> Recording:
     """Every episode of sessions, from its ball's detection to its outcome: the ticks in which the policy played.
 
     The reward, the sum of the terms that the log holds, comes with the last frame, where all episodes have one.
+    Raises ConfigError where the sessions are of different robots.
     """
+    robot: Contract | None = None
     episodes: list[Episode] = []
     rewards: list[float | None] = []
     left, steps, latest = Counter[str](), [np.empty(0)], 0.0
     emulated = set()
     for path in paths:
         session = checked("", log.read, path)
+        robot = robot or session.robot
+        if session.robot != robot:
+            raise ConfigError(
+                f"{path}: a session of {session.robot.robot}, {paths[0]} is one of {robot.robot}; one data set holds "
+                "one robot, and one version of its YAML"
+            )
         emulated.add(session.metadata["session"].get("robot") in ("rig", "lockstep"))
         seen, sent = session.observations, session.commands
         ticks, i, j = np.intersect1d(seen.tick, sent.tick, return_indices=True)
@@ -108,7 +121,7 @@ def sessions(paths: Sequence[Path]) -> Recording:
         i, j = i[played], j[played]
         time = seen.time[i]
         following = (*(episode.start for episode in session.episodes[1:]), np.inf)
-        for episode, bound in zip(session.episodes, following, strict=True):
+        for episode, bound in zip(session.episodes, following, strict=False):  # there may be none
             end = bound if episode.end is None else episode.end
             mine = np.flatnonzero((time >= episode.start) & (time <= end) & (time < bound))
             if episode.details.get("discarded"):
@@ -136,15 +149,16 @@ def sessions(paths: Sequence[Path]) -> Recording:
             f"{late.sum():,} of {late.size:,} steps took longer than {LATE:g} periods, and frames are up to "
             f"{1e3 * latest:.1f} ms off the even clock: session_time has their true times"
         )
-    features, given = SESSION, [reward for reward in rewards if reward is not None]
+    features, given = features_of(robot or PAPER), [reward for reward in rewards if reward is not None]
     if given and len(given) == len(episodes):
-        features = SESSION | REWARD
+        features = features | REWARD
         for one, reward in zip(episodes, given, strict=True):
             one.columns["next.reward"] = _last(len(one.columns["next.done"]), reward)
     elif given:
         notes.append(f"no rewards: {len(rewards) - len(given)} of {len(rewards)} episodes have none")
-    robot = ROBOT + (", emulated" if emulated == {True} else "")
-    return Recording(RETURN, robot, features, tuple(episodes), tuple(notes))
+    name = ROBOT if robot in (None, PAPER) else robot.robot
+    name += ", emulated" if emulated == {True} else ""
+    return Recording(RETURN, name, features, tuple(episodes), tuple(notes))
 
 
 def balls(paths: Sequence[str]) -> Recording:

@@ -16,9 +16,10 @@ from experiments.view.programme import Fixed
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.prediction.state_fit import SpinPrior, fit_states, fly_on, lift_known
+from mjx_tt.robot import robot as robots
 from mjx_tt.robot.model import home_qpos, load_model
+from mjx_tt.robot.robot import Robot
 from mjx_tt.sim.model import ModelFile, SimModel
-from robot_io.contract import JOINT_NAMES
 from robot_io.log import Episode, Level, SessionLog, read
 
 FITTED = 0.2  # [s] of a measured flight from which its start is fitted; the rest is predicted
@@ -41,14 +42,26 @@ def session(path: Path, model: SimModel) -> Fixed:
     log = read(path)
     if log.joints.time.size < 2:
         raise ConfigError(f"{path}: holds no joints")
-    flights, _ = session_logs.load(path)
+    flights = session_logs.flights(log)
+    robot = played_by(log, path)
     strokes = [t for t in clean(flights)[0] if t.time[-1] - t.time[0] > FITTED] if flights else []
     flown = list(zip(strokes, _flights(strokes, model), strict=True))
     whole = Episode(1, float(log.joints.time[0]), float(log.joints.time[-1]), "", {}, {})
     episodes = log.episodes or (whole,)
-    films = [_episode(log, episode, flights, flown) for episode in episodes]
+    films = [_episode(log, episode, flights, flown, robot) for episode in episodes]
     captions = [f"{path.name}, episode {e.number} of {len(episodes)}" for e in episodes]
-    return Fixed([[film] for film in films], captions)
+    return Fixed([[film] for film in films], captions, robot)
+
+
+def played_by(log: SessionLog, path: Path) -> Robot:
+    """The robot of a session, to be drawn. Raises ConfigError where its MJCF did not come with the program."""
+    name = log.robot.robot
+    if name not in robots.names():
+        raise ConfigError(
+            f"{path}: a session of {name}, whose MJCF is not in the log; shown are {', '.join(robots.names())} only; "
+            "Foxglove and Lichtblick draw it from the log"
+        )
+    return robots.load_shipped(name)
 
 
 def _episode(
@@ -56,6 +69,7 @@ def _episode(
     episode: Episode,
     flights: Sequence[Trajectory],
     flown: Sequence[tuple[Trajectory, np.ndarray]],
+    robot: Robot,
 ) -> Film:
     start = episode.start - BEFORE
     stop = min(float(log.joints.time[-1]), (episode.start + 2.0 if episode.end is None else episode.end) + AFTER)
@@ -67,7 +81,7 @@ def _episode(
     for stroke, way in flown:
         _draw(simulated, clock, stroke.time[0] + np.arange(len(way)) / RATE, way)
     c, seen, acted = log.commands, log.observations, log.actions
-    joints = tuple(JOINT_NAMES)
+    joints = log.robot.joints
     series = {
         "Commands sent [m/s, rad/s]": _series(joints, c.time, c.sent, clock),
         "Requested by the policy [m/s, rad/s]": _series(joints, c.time, c.requested, clock),
@@ -80,7 +94,7 @@ def _episode(
     marks = np.concatenate([f.position.T[(f.time >= start) & (f.time <= stop)] for f in flights] or [np.empty((0, 3))])
     return Film(
         time=clock - start,
-        qpos=np.stack([_joint(log, j, clock) for j in range(len(JOINT_NAMES))], axis=1),
+        qpos=np.stack([_joint(log, j, clock, home) for j, home in enumerate(robot.home)], axis=1),
         balls={"measured": ball, "simulated": simulated},
         title=f"episode {episode.number}: measured (orange), simulated (blue)",
         outcome=episode.outcome,
@@ -101,10 +115,10 @@ def _draw(path: np.ndarray, clock: np.ndarray, time: np.ndarray, position: np.nd
     path[during] = np.stack([np.interp(clock[during], time, axis) for axis in position.T], axis=1)
 
 
-def _joint(log: SessionLog, j: int, clock: np.ndarray) -> np.ndarray:
+def _joint(log: SessionLog, j: int, clock: np.ndarray, home: float) -> np.ndarray:
     known = np.isfinite(log.joints.position[j])  # arm and axes report by turns
     if not known.any():
-        return np.full(len(clock), home_qpos(load_model())[j])
+        return np.full(len(clock), home)
     return np.interp(clock, log.joints.time[known], log.joints.position[j, known])
 
 
@@ -194,7 +208,7 @@ def _logs(folder: Path, extended: ModelFile) -> Iterator[Trajectory]:
                 f"{folder / EXTENDED}: provenance.logs {path}: no such file; look from where it was diagnosed"
             )
         if session_logs.is_session(path):
-            yield from session_logs.load(path)[0]
+            yield from session_logs.flights(read(path))
         elif path.name not in ("command.csv", "state.csv"):
             yield from diagnosis.load_logs([path]).balls
 

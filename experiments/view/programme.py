@@ -21,6 +21,7 @@ from mjx_tt.rally import human_player
 from mjx_tt.rally.ball_flights import homeward
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.rally.simulator import RallySimulator, ShotResult
+from mjx_tt.robot.robot import Robot
 from mjx_tt.sim.model import SimModel
 
 POOL = 512  # balls of a distribution
@@ -44,10 +45,11 @@ class Programme(Protocol):
 
 @dataclass(frozen=True)
 class Fixed:
-    """A finished list."""
+    """A finished list; ``robot`` of its films, None: the paper's."""
 
     entries: Sequence[Sequence[Film]]
     captions: Sequence[str]
+    robot: Robot | None = None
 
     @property
     def count(self) -> int | None:

@@ -16,7 +16,7 @@ from experiments.view import measured
 from experiments.view.controls import Controls
 from experiments.view.guard import Server
 from experiments.view.page import REST, Viewer
-from experiments.view.programme import Play, Programme
+from experiments.view.programme import Fixed, Play, Programme
 from experiments.view.scene import Scene
 from experiments.view.studio import Studio
 from mjx_tt.robot import robot as robots
@@ -61,8 +61,10 @@ def viewer(server: Server, programme: Programme) -> Viewer:
 
 
 def robot_of(programme: Programme) -> Robot:
-    """The robot that a programme shows; sessions and diagnoses are of the paper's."""
-    return programme.studio.simulator.config.robot if isinstance(programme, Play) else robots.paper()
+    """The robot that a programme shows; a diagnosis of balls shows the paper's."""
+    if isinstance(programme, Play):
+        return programme.studio.simulator.config.robot
+    return (programme.robot if isinstance(programme, Fixed) else None) or robots.paper()
 
 
 class Followed:

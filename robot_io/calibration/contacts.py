@@ -15,7 +15,8 @@ import numpy as np
 
 from ballmodel.constants import BALL_RADIUS, GRAVITY, PADDLE_RADIUS, PADDLE_THICKNESS
 from robot_io.calibrated import Calibration
-from robot_io.log import SessionLog
+from robot_io.contract import PAPER
+from robot_io.log import LogError, SessionLog
 from robot_io.safety.clearance import RobotGeometry
 
 SIDE = 4  # samples before and after the turn
@@ -45,7 +46,9 @@ class Contacts:
 
 
 def measure(log: SessionLog, calibration: Calibration) -> Contacts:
-    """Contacts of a log, with the robot where its calibration says."""
+    """Contacts of a log, with the robot where its calibration says. Raises LogError for another than the paper's."""
+    if log.robot != PAPER:
+        raise LogError(f"{log.path}: a session of {log.robot.robot}; contacts are measured with the paper's robot only")
     geometry = RobotGeometry.load().moved(calibration.robot.base)
     blade = geometry.blade
     found = [turn for ball in np.unique(log.ball.id) for turn in _turns(log, log.ball.id == ball)]

@@ -17,18 +17,20 @@ import math
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from time import perf_counter
 
 import numpy as np
 
 from robot_io.control.commissioning import jog
-from robot_io.control.commissioning.homing import check_homing, towards
+from robot_io.control.commissioning.homing import check_homing
+from robot_io.control.commissioning.way_home import WayHome
 from robot_io.control.episode import Episode, EpisodeSummary
 from robot_io.control.interfaces import STANDARD_PLAY, Axes, action_of
 from robot_io.control.interfaces import BridgeConfig as BridgeConfig
 from robot_io.control.interfaces import BridgeState as BridgeState
 from robot_io.control.interfaces import Policy as Policy
-from robot_io.control.observation import Feedback, joints, observe
+from robot_io.control.observation import Feedback, blade, joints, observe
 from robot_io.control.play import Play
 from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.arm_history import ArmHistory
@@ -51,7 +53,7 @@ from robot_io.log.messages import (
 from robot_io.log.recorder import NullRecorder, SessionRecorder
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.faults import Cause
-from robot_io.safety.gate import GateState, SafetyGate
+from robot_io.safety.gate import GateState, SafetyGate, Sent
 
 CLOCK_EVERY = 10  # seconds of frames between two reports of the tracker's clock
 AT_HOME = 0.02  # [m], [rad] of every joint
@@ -89,6 +91,7 @@ class Bridge:
         self._geometry: RobotGeometry = gate.geometry
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
         self.feedback = Feedback(ball=self.play.strokes.track, axes=History(256), arm=ArmHistory(256))  # a second
+        self._blade = partial(blade, self.feedback, self._geometry)
         self._state = BridgeState.DISARMED
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
@@ -96,8 +99,9 @@ class Bridge:
         self._start = np.full(contract.n_joints, np.nan)  # reference at the start of the period
         self._zeros = np.zeros(contract.n_joints)
         self._policy_limit = np.array(contract.limits.policy_velocity)
-        self._home_speed = (jog.SPEED if config.jog else config.home_speed) * self._policy_limit
-        self._home_braking = config.home_braking * np.array(contract.limits.acceleration)
+        speed = (jog.SPEED if config.jog else config.home_speed) * self._policy_limit
+        braking = config.home_braking * np.array(contract.limits.acceleration)
+        self._way_home = WayHome(gate, contract.limits, speed, braking)
         self._logged_faults = self._clock_windows = 0
         self.unlogged = 0  # records that could not be logged
         self._reported_unlogged = 0
@@ -146,6 +150,7 @@ class Bridge:
         self._arm_session_id = self.arm_session.session_id
         self._arm_restarted = self._been_home = False
         self._start = measured
+        self._way_home.restart()
         self._home = measured if self.config.jog else self._home
         self._change(BridgeState.READY, now, "armed by the operator")
 
@@ -181,10 +186,6 @@ class Bridge:
         if self.state not in (BridgeState.DISARMED, BridgeState.FAULT) or not self.gate.at_rest:
             raise RefusedError(f"axes not homed: the state is {self.state.value}; stop the robot first")
         check_homing(self._geometry, self.measured, self.config.contract)
-
-    def estop(self, pressed: bool, now: float) -> None:
-        """Tells the state of the emergency stop."""
-        self.gate.estop(pressed, now)
 
     def discard(self, now: float) -> None:
         """Marks the ball in play, or the one before, as not to be used."""
@@ -258,13 +259,6 @@ class Bridge:
             self._axes_received = received
             self.feedback.axes.add(received, position)
 
-    def _blade(self, time: float) -> np.ndarray:
-        """The blade's centre (3,) [m] at ``time``."""
-        axes, arm = self.feedback.axes.at(time), self.feedback.arm.at(time)
-        if axes is None or arm is None:
-            return np.full(3, np.inf)
-        return self._geometry.middle(self._geometry.tip, np.concatenate([axes, arm]))
-
     # The control tick
 
     def tick(self, deadline: float, now: float) -> np.ndarray:
@@ -282,10 +276,11 @@ class Bridge:
             if self.gate.engaged:
                 self.axes.command(self._start[self._axes_rows], sent.velocity[self._axes_rows], now)
         with self._guarded(now):
+            self._follow_the_way(request, sent, now)
             self._after(now)
         with self._guarded(now):
-            ages, n = self._ages(now), self.counts.ticks
-            timing = Tick(n, now, now - deadline, self.policy_seconds, ages["ball"], ages["axes"], ages["arm"])
+            n, ages = self.counts.ticks, reversed(self._ages(now))
+            timing = Tick(n, now, now - deadline, self.policy_seconds, *ages)
             self._log(timing, Command(n, now, request, sent.velocity, self._start))
         if self.unlogged > self._reported_unlogged:
             self._reported_unlogged = self.unlogged
@@ -307,25 +302,22 @@ class Bridge:
             self._policy.reset()
             self._change(BridgeState.ACTIVE, now, f"ball {self.tracker.ball}")
         if self.state is BridgeState.ACTIVE:
+            self._way_home.give_up()
             return self._ask_policy(now, self.play.episode, self._policy)
-        way = self._home, self.gate.reference, self._home_speed, self._home_braking, self.gate.period
-        return towards(*way) if self.state is BridgeState.READY else self._zeros.copy()
+        return self._way_home.velocity(self._home) if self.state is BridgeState.READY else self._zeros.copy()
 
-    def _ages(self, now: float) -> dict[str, float]:
+    def _ages(self, now: float) -> tuple[float, float, float]:
+        """Ages [s] of what was last heard of arm, axes and tracker, infinite for never."""
         arm, seen = self.arm_session.feedback, self.tracker.received
-        return {
-            "arm": math.inf if arm is None else now - arm.received,
-            "axes": now - self._axes_received,
-            "ball": math.inf if seen is None else now - seen,
-        }
+        heard = -math.inf if arm is None else arm.received, -math.inf if seen is None else seen
+        return now - heard[0], now - self._axes_received, now - heard[1]
 
     def _watch(self, now: float) -> None:
         """Tells the gate what is wrong with the devices."""
-        ages = self._ages(now)
         since_tick = 0.0 if self._last_tick == -math.inf else now - self._last_tick
         self._last_tick = now
         playing = self.state is BridgeState.ACTIVE
-        self.gate.check(now, ages["arm"], ages["axes"], ages["ball"], playing, since_tick)
+        self.gate.check(now, *self._ages(now), playing, since_tick)
         arm, axes = self.arm_session.problem(now), self.axes.problem(now)
         self.gate.condition(Cause.ARM_NOT_READY, arm is not None, arm or "", now)
         self.gate.condition(Cause.AXIS_LOST, axes is not None, axes or "", now)
@@ -381,6 +373,14 @@ class Bridge:
             if self.gate.settled or now - self._stopping_since > LONGEST_STOP:
                 self.gate.disarm(now)
                 self._change(BridgeState.DISARMED, now, "at rest")
+
+    def _follow_the_way(self, request: np.ndarray, sent: Sent, now: float) -> None:
+        """Tells the way home what became of it; where there is none the robot is held, and that is a fault."""
+        way, ready = self._way_home, self.state is BridgeState.READY
+        if way.sent(request, sent, self._home, ready and not self.config.jog):
+            self.event(now, Level.INFO, "way_home", "held for a clearance: another way is looked for")
+        if way.problem and ready:
+            self.gate.fault(Cause.NO_WAY_HOME, way.problem, now)
 
     def _change(self, state: BridgeState, now: float, why: str) -> None:
         self.event(now, Level.INFO, "state", json_text({"from": self._state.value, "to": state.value, "why": why}))

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 from robot_io.calibrated import RANGES as CALIBRATION_RANGES
 from robot_io.calibrated import Calibration
-from robot_io.contract import CONTROL_RATE, FESTO_JOINTS, LIMITS, N_JOINTS, JointLimits
+from robot_io.contract import CONTROL_RATE, LIMITS, PAPER, Contract, JointLimits
 from robot_io.control.observation import LONGEST_DELAY, ObservationDelays
+from robot_io.devices.egm.messages import N_ARM_JOINTS
 from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.ranges import check_ranges
@@ -16,7 +17,6 @@ from robot_io.safety.config import SafetyConfig
 
 PROFILES = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
 ANSWER_TIME = 0.035  # [s] for an axis to answer: less than the age at which its state counts as stale
-AXIS_NAMES = ("gantry_x", "gantry_y")
 SAME_ZERO = 1e-4  # [m] by which the zeros of a linear axis may differ from those of the robot's calibration
 
 PORT = (1, 65535)
@@ -115,13 +115,16 @@ class RealTimeConfig:
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """A robot. The arm's and the axes' limits are the contract's; ``safety`` can only narrow what moves."""
+    """An installed robot. Limits of arm and axes are the contract's; ``safety`` can only narrow what moves.
+
+    Which joints it has is in the policy's contract: ``check_joints``.
+    """
 
     name: str = "robot"
     rate: float = CONTROL_RATE
     arm: ArmConfig = ArmConfig()
     axis_profile: str = "cmmt"
-    axes: tuple[AxisConfig, AxisConfig] = (AxisConfig(), AxisConfig())
+    axes: tuple[AxisConfig, ...] = (AxisConfig(), AxisConfig())
     axes_motion: AxesConfig = field(default_factory=AxesConfig)
     tracker: TrackerConfig = TrackerConfig()
     delays: ObservationDelays = ObservationDelays()
@@ -132,21 +135,12 @@ class RobotConfig:
     def __post_init__(self) -> None:
         if self.axis_profile not in PROFILES:
             raise ValueError(f"axis_profile is {self.axis_profile!r}, allowed: {', '.join(PROFILES)}")
-        if len(self.axes) != len(FESTO_JOINTS):
-            raise ValueError(f"{len(self.axes)} axes given, the robot has {len(FESTO_JOINTS)}: {', '.join(AXIS_NAMES)}")
         check_ranges(self, RANGES)
         for i, axis in enumerate(self.axes):
             if axis.direction not in (-1, 1):
                 raise ValueError(f"axes[{i}].direction is {axis.direction}, allowed are 1 and -1")
-        if len(self.safety.still) != N_JOINTS:
-            raise ValueError(f"safety.still has {len(self.safety.still)} numbers, allowed are {N_JOINTS}")
-        for i in FESTO_JOINTS:
-            if self.safety.following_error[i] > 0.1:
-                raise ValueError(
-                    f"safety.following_error[{i}] is {self.safety.following_error[i]} m, allowed is 0.005 to 0.1"
-                )
         measured, zeros = self.calibration.robot, tuple(axis.zero for axis in self.axes)
-        if measured.date and any(abs(a - b) > SAME_ZERO for a, b in zip(measured.axes_zero, zeros, strict=True)):
+        if measured.date and any(abs(a - b) > SAME_ZERO for a, b in zip(measured.axes_zero, zeros, strict=False)):
             raise ValueError(
                 f"calibration.robot.axes_zero is {measured.axes_zero}, axes[0].zero and axes[1].zero are {zeros}: the "
                 "robot was calibrated with other zeros; take calibration out of robot.yaml, note points and "
@@ -160,6 +154,48 @@ class RobotConfig:
             except ValueError:
                 raise ValueError(f"{path} is {value!r}, allowed is an IPv4 address such as 192.168.125.1") from None
 
+    @classmethod
+    def of(cls, contract: Contract) -> RobotConfig:
+        """The defaults for a contract's robot."""
+        if contract == PAPER:
+            return cls()
+        return cls(axes=(AxisConfig(),) * len(contract.carrying), safety=SafetyConfig.of(contract))
+
+    def check_joints(self, contract: Contract = PAPER) -> None:
+        """Raise ValueError naming the key where this is no installation of the contract's robot."""
+        names = [contract.joints[i] for i in contract.carrying]
+        if not N_ARM_JOINTS <= len(contract.arm) <= 2 * N_ARM_JOINTS:
+            raise ValueError(
+                f"{contract.robot}: its arm has {len(contract.arm)} joints; allowed are {N_ARM_JOINTS} to "
+                f"{2 * N_ARM_JOINTS}, which EGM carries"
+            )
+        if len(self.axes) != len(names):
+            raise ValueError(
+                f"axes: got {len(self.axes)} entries; allowed: {len(names)} for {contract.robot}, "
+                f"{', '.join(names) or 'which has no linear axes'}"
+            )
+        if len(self.safety.still) != contract.n_joints:
+            raise ValueError(
+                f"safety.still has {len(self.safety.still)} numbers, allowed for {contract.robot} are "
+                f"{contract.n_joints}"
+            )
+        for i in contract.carrying:
+            speed, most = self.axes_motion.speed, contract.limits.velocity[i]
+            if contract != PAPER and most > speed:
+                raise ValueError(
+                    f"axes_motion.speed is {speed} m/s, {contract.joints[i]} of {contract.robot} may be asked for "
+                    f"{most} m/s: allowed is at least that, up to {RANGES['axes_motion.speed'][1]} m/s"
+                )
+            if self.safety.following_error[i] > 0.1:
+                raise ValueError(
+                    f"safety.following_error[{i}] is {self.safety.following_error[i]} m, allowed is 0.005 to 0.1"
+                )
+        if contract != PAPER and self.calibration.robot.date:
+            raise ValueError(
+                f"calibration.robot: base and zeros of {contract.robot} cannot be calibrated; allowed with the paper's "
+                "robot only, leave it out"
+            )
+
 
 def axis_range(i: int, safety: SafetyConfig, limits: JointLimits = LIMITS) -> tuple[float, float]:
     """Range [m] that is ever commanded to linear axis ``i``: the gate's, so that no drive goes beyond it by itself."""
@@ -167,13 +203,12 @@ def axis_range(i: int, safety: SafetyConfig, limits: JointLimits = LIMITS) -> tu
     return limits.lower[i] + room, limits.upper[i] - room
 
 
-def linear_axes(config: RobotConfig) -> FestoAxes:
+def linear_axes(config: RobotConfig, contract: Contract = PAPER) -> FestoAxes:
     """The axes behind their Modbus connections, which the first exchange opens."""
     axes = []
-    for i, axis in enumerate(config.axes):
+    for i, axis in zip(contract.carrying, config.axes, strict=True):
         link = ModbusLink(axis.host, axis.port, ANSWER_TIME, axis.device_id)
         profile = PROFILES[config.axis_profile]()
-        axes.append(
-            Axis(AXIS_NAMES[i], link, profile, *axis_range(i, config.safety), zero=axis.zero, direction=axis.direction)
-        )
+        low, high = axis_range(i, config.safety, contract.limits)
+        axes.append(Axis(contract.joints[i], link, profile, low, high, zero=axis.zero, direction=axis.direction))
     return FestoAxes(axes, config.axes_motion)

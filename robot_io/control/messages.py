@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robot_io.contract import JOINT_NAMES
 from robot_io.control.commissioning.mark import Stay
 from robot_io.control.episode import EpisodeSummary
 from robot_io.control.rally import RallySummary
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from robot_io.control.commissioning.dry import DryAxes
     from robot_io.control.timings import Timings
     from robot_io.devices.festo import AxesThread
+    from robot_io.devices.fixed_base import FixedBase
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,13 @@ class Status:
 
     @classmethod
     def of(
-        cls, bridge: Bridge, axes: AxesThread | DryAxes, timings: Timings, dropped: int, now: float, dry: bool
+        cls,
+        bridge: Bridge,
+        axes: AxesThread | DryAxes | FixedBase,
+        timings: Timings,
+        dropped: int,
+        now: float,
+        dry: bool,
     ) -> Status:
         """The state at ``now``; ``dropped``: records that the log lost."""
         counts, tracker, session = bridge.counts, bridge.tracker, bridge.arm_session
@@ -218,7 +224,7 @@ class Status:
             arm=session.problem(now),
             axes=axes.problem(now),
             tracker="silent" if heard is None or now - heard >= 0.5 else None,
-            joints=list(zip(JOINT_NAMES, positions, velocities, strict=True)),
+            joints=list(zip(bridge.config.contract.joints, positions, velocities, strict=True)),
             ball=None if seen is None or seen.position is None else tuple(seen.position.tolist()),
             clock=tracker.clock.report(),
             dry=dry,

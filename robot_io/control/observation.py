@@ -15,6 +15,7 @@ from robot_io.calibrated import Frame
 from robot_io.contract import PAPER, Contract
 from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.history import History
+from robot_io.safety.clearance import RobotGeometry
 
 HERE = Frame()
 LONGEST_DELAY = 0.1  # [s]
@@ -53,6 +54,14 @@ def observe(feedback: Feedback, delays: ObservationDelays, now: float, base: Fra
     ball = feedback.ball.at(now - delays.ball)
     axes, arm = feedback.axes.at(now - delays.axes), feedback.arm.at(now - delays.arm)
     return None if ball is None or axes is None or arm is None else np.concatenate([base.inward(ball), axes, arm])
+
+
+def blade(feedback: Feedback, geometry: RobotGeometry, time: float) -> np.ndarray:
+    """The blade's centre (3,) [m] at ``time``, infinite while that is not known."""
+    axes, arm = feedback.axes.at(time), feedback.arm.at(time)
+    if axes is None or arm is None:
+        return np.full(3, np.inf)
+    return geometry.middle(geometry.tip, np.concatenate([axes, arm]))
 
 
 def joints(feedback: Feedback, contract: Contract = PAPER) -> tuple[np.ndarray, np.ndarray]:

@@ -21,11 +21,12 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from robot_io import log
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS, N_OBSERVATION, PAPER, n_parameters
+from robot_io.contract import PAPER, n_parameters
 from robot_io.control import messages, realtime
 from robot_io.control.bridge import Bridge, BridgeConfig
 from robot_io.control.bridge import Policy as StepPolicy
 from robot_io.control.commissioning.dry import DryArm, DryAxes
+from robot_io.control.commissioning.homing import prepare
 from robot_io.control.commissioning.mark import Stay
 from robot_io.control.config import RobotConfig, linear_axes
 from robot_io.control.episode import EpisodeSummary
@@ -33,6 +34,7 @@ from robot_io.control.rally import Box
 from robot_io.control.timings import Timings
 from robot_io.devices.egm.session import EgmConfig, EgmSession, EgmSocket
 from robot_io.devices.festo import AxesThread
+from robot_io.devices.fixed_base import FixedBase
 from robot_io.devices.tracker import Tracker, TrackerSocket
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
@@ -103,18 +105,16 @@ class Control:
         self._config, self._options, self._pipe = config, options, pipe
         arm, found = config.arm, config.calibration.robot
         loaded = None if options.artefact is None else artefacts.load(options.artefact)
+        self._contract = contract = PAPER if loaded is None else loaded.contract
+        config.check_joints(contract)
         if loaded is None:
-            chosen = Policy(np.zeros(n_parameters()), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION))
+            seen = contract.n_observation
+            chosen = Policy(np.zeros(n_parameters(contract.n_joints)), np.zeros(seen), np.ones(seen))
             self._backend, self._computed = "numpy", "no policy given: at play the robot stands still"
         else:
-            if loaded.contract != PAPER:
-                other = loaded.contract.robot
-                raise RefusedError(
-                    f"{options.artefact}: is of {other}; the control process knows the paper's robot only"
-                )
             chosen = loaded.policy
-            self._backend, self._computed = choose(options.backend, chosen)
-        policy = make_policy(self._backend, chosen)
+            self._backend, self._computed = choose(options.backend, chosen, contract)
+        policy = make_policy(self._backend, chosen, contract)
         self.timings = Timings()
         self._opened: list[Closable] = []
         self._unsent: deque[messages.Message] = deque()
@@ -130,25 +130,35 @@ class Control:
                     "robot_base": [found.base_position, found.base_rotation],
                 }
                 recorder = log.Recorder.start(
-                    options.log_folder, options.log_name, metadata | dict(options.metadata), dict(options.attachments)
+                    options.log_folder,
+                    options.log_name,
+                    metadata | dict(options.metadata),
+                    dict(options.attachments),
+                    contract,
                 )
             self._recorder = self._open(recorder)
-            gate = SafetyGate(geometry=RobotGeometry.load().moved(found.base), config=config.safety)
-            egm = EgmConfig(arm.controller, arm.controller_port, timeout=arm.timeout, zeros=found.joint_zeros)
+            geometry = RobotGeometry.of(contract).moved(found.base)
+            gate = SafetyGate(contract.limits, geometry=geometry, config=config.safety)
+            zeros = found.joint_zeros if contract == PAPER else (0.0,) * len(contract.arm)
+            egm = EgmConfig(arm.controller, arm.controller_port, timeout=arm.timeout, zeros=zeros)
             home = gate.geometry.home
-            self._session = DryArm(egm, home[list(ABB_JOINTS)]) if options.dry else EgmSession(egm)
-            self._axes: AxesThread | DryAxes = self._open(
-                DryAxes(home[list(FESTO_JOINTS)]) if options.dry else AxesThread(linear_axes(config))
+            self._session = DryArm(egm, home[list(contract.arm)]) if options.dry else EgmSession(egm)
+            axes = (
+                FixedBase()
+                if not contract.carrying
+                else DryAxes(home[list(contract.carrying)])
+                if options.dry
+                else None
             )
+            self._axes = self._open(axes or AxesThread(linear_axes(config, contract)))
             self._tracker = Tracker(config.tracker, config.calibration)
-            bridge_config = BridgeConfig(delays=config.delays, box=options.box, base=found.base, jog=options.jog)
             self.bridge = Bridge(
                 self._session,
                 self._axes,
                 self._tracker,
                 gate,
                 policy,
-                bridge_config,
+                BridgeConfig(config.delays, box=options.box, base=found.base, jog=options.jog, contract=contract),
                 recorder,
                 self._episode,
                 lambda summary: self._send(messages.RallyOver(summary)),
@@ -186,8 +196,8 @@ class Control:
     def _warm_up(policy: StepPolicy, gate: SafetyGate) -> None:
         """First calls import and allocate: not in the loop."""
         for _ in range(20):
-            policy.step(np.zeros(11))
-            gate.geometry.gaps(np.zeros((8, 8)))
+            policy.step(np.zeros(3 + len(gate.geometry.joints)))
+            gate.geometry.gaps(np.zeros((len(gate.geometry.joints), 8)))
         policy.reset()
 
     def run(self) -> None:
@@ -283,11 +293,12 @@ class Control:
                 self.timings.reply.add(time.monotonic() - began)
 
     def _take_axes(self) -> None:
-        if isinstance(self._session, DryArm) and isinstance(self._axes, DryAxes):
+        if isinstance(self._axes, DryAxes | FixedBase):
             now = time.monotonic()
-            self._session.pretend(now, self.bridge.gate.engaged)
-            self._axes.pretend(now)
-            self.bridge.arm_received(now)
+            self._axes.cycle(now)
+            if isinstance(self._session, DryArm):
+                self._session.pretend(now, self.bridge.gate.engaged)
+                self.bridge.arm_received(now)
         state = self._axes.state
         if state is not None:
             self.bridge.axes_received(state.position, state.received)
@@ -323,7 +334,7 @@ class Control:
                 case messages.Arm():
                     self.bridge.arm(now)
                 case messages.Prepare():
-                    self._prepare_axes()
+                    prepare(self._axes, self.bridge.check_homing)
                 case messages.Stop():
                     self.bridge.stop(now)
                 case messages.Reset():
@@ -338,7 +349,7 @@ class Control:
                 case messages.Pause(on):
                     self.bridge.paused = on or self._options.jog
                 case messages.SetPolicy(policy, version):
-                    self.bridge.set_policy(make_policy(self._backend, policy), version)
+                    self.bridge.set_policy(make_policy(self._backend, policy, self._contract), version)
                     self._send(messages.PolicySet(version))
                 case messages.Quit():
                     self._quit = True
@@ -349,17 +360,6 @@ class Control:
         except Exception as error:  # a request that cannot be carried out must not end the play
             name = type(request).__name__
             self._send(messages.Refused(request, RefusedError(f"{name}: {type(error).__name__}: {error}")))
-
-    def _prepare_axes(self) -> None:
-        """Acknowledge faults, switch on, and home what is not homed. Raises RefusedError where homing is not safe."""
-        if self._axes.axes.fault:
-            self._axes.acknowledge()
-        self._axes.enable()
-        if not self._axes.axes.answering:  # whether they must be homed is not known: a cable was out
-            raise RefusedError("axes not ready: one of them does not answer yet; try again")
-        if not self._axes.axes.homed:
-            self.bridge.check_homing()
-            self._axes.home()
 
     def _episode(self, summary: EpisodeSummary) -> None:
         self._send(messages.Played(summary, self.bridge.play.track(summary.number)))

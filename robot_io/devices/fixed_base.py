@@ -1,4 +1,4 @@
-"""No linear axes at all: an arm on a fixed base, in the place of ``FestoAxes``."""
+"""No linear axes at all: an arm on a fixed base, in the place of ``FestoAxes`` and of the thread that drives them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,15 @@ class FixedBase:
     homed: bool = True
     enabled: bool = True
     answering: bool = True
+    cycles: int = 0  # none: there is nobody to exchange with
+    late: int = 0
 
     @property
     def state(self) -> FixedBase:
+        return self
+
+    @property
+    def axes(self) -> FixedBase:
         return self
 
     def cycle(self, now: float) -> None:
@@ -33,7 +39,7 @@ class FixedBase:
 
     def enable(self) -> None: ...
 
-    home = acknowledge = stop = disable = enable
+    home = acknowledge = stop = disable = start = close = enable
 
     def problem(self, now: float) -> str | None:
         return None

@@ -81,15 +81,28 @@ class ArmParams:
 
 
 def for_robot(params: ArmParams, contract: Contract) -> ArmParams:
-    """The same controller with the joints of another robot's arm; it stops them as fast as they may accelerate."""
+    """The same controller with the joints of another robot's arm; it stops them as fast as they may accelerate.
+
+    Raises ValueError where the parameters give the joints limits of their own: another robot's are the contract's.
+    """
     if contract == PAPER:
         return params
-    limits = contract.limits
-    deceleration, lower, upper, speed = (
-        tuple(values[i] for i in contract.arm)
-        for values in (limits.acceleration, limits.lower, limits.upper, limits.velocity)
-    )
-    return replace(params, stop_deceleration=deceleration, lower=lower, upper=upper, max_speed=speed)
+    limits, standard = contract.limits, ArmParams()
+    own = {
+        name: tuple(values[i] for i in contract.arm)
+        for name, values in (
+            ("stop_deceleration", limits.acceleration),
+            ("lower", limits.lower),
+            ("upper", limits.upper),
+            ("max_speed", limits.velocity),
+        )
+    }
+    for name, values in own.items():
+        if getattr(params, name) not in (getattr(standard, name), values):
+            raise ValueError(
+                f"arm.{name} is {getattr(params, name)}, allowed is nothing: those of {contract.robot} are its YAML's"
+            )
+    return replace(params, **own)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from robot_io.contract import PAPER, Contract
 from robot_io.devices.festo import AxesConfig
+from robot_io.emulator import arm as arms
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.axis_drive import DriveParams
 from robot_io.emulator.network import FAULT_RANGES, NetworkFaults
@@ -17,6 +19,8 @@ from robot_io.ranges import check_ranges
 # The latency that training knows and the lag of the carriage's servo behind it.
 AXES_CONFIG = AxesConfig(latency=0.0645 + 0.033 + 0.035, gain=2.0)
 AXIS_FEEDBACK_DELAY = 0.033  # [s], paper: latency of the linear axes' observation
+# Training knows the time from a command to its effect; of the paper's 0.071 and 0.0645 s so much is no dead time.
+ARM_RESPONSE, AXIS_RESPONSE = 0.016, 0.0145  # [s]
 
 RANGES = {
     "world.timestep": (1e-4, 0.002),
@@ -90,3 +94,13 @@ class RigParams:
 
 
 STANDARD_RIG = RigParams()
+
+
+def for_robot(params: RigParams, contract: Contract) -> RigParams:
+    """The rig with a contract's joints. Raises ValueError naming what belongs to the paper's robot only."""
+    if contract != PAPER and any(params.hidden.joint_zeros):
+        raise ValueError(
+            f"hidden.joint_zeros is {params.hidden.joint_zeros}, allowed for {contract.robot} are zeros: they are the "
+            "paper's robot's"
+        )
+    return replace(params, arm=arms.for_robot(params.arm, contract))

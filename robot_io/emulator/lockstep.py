@@ -25,9 +25,9 @@ from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.festo import Axis, DirectLink, FestoAxes
 from robot_io.devices.fixed_base import FixedBase
 from robot_io.devices.tracker import Tracker, TrackerConfig
-from robot_io.emulator.arm import ArmController, ArmStateError, for_robot
+from robot_io.emulator.arm import ArmController, ArmStateError
 from robot_io.emulator.axes import AxisEmulator
-from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams
+from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
 from robot_io.emulator.tracker import TrackerEmulator
@@ -67,13 +67,14 @@ class LockStep:
         tracker: TrackerConfig = SAME_CLOCK,
         calibration: Calibration = UNCALIBRATED,
     ) -> None:
-        self.params, contract = params, config.contract
+        contract = config.contract
+        self.params = params = for_robot(params, contract)
         self._contract = contract
         safety = safety or SafetyConfig.of(contract)
         self.world = world or World(scene, params.world, contract)
         self.world.reset()
         arm_params = replace(params.arm, dead_time=params.arm.dead_time + params.action_delay)
-        self.arm = ArmController(BRIDGE, for_robot(arm_params, contract))
+        self.arm = ArmController(BRIDGE, arm_params)
         dead_time = params.axis_dead_time + params.action_delay
         self.emulators = [
             AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)

@@ -14,14 +14,14 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-from robot_io.contract import ABB_JOINTS, FESTO_JOINTS
+from robot_io.contract import PAPER, Contract
 from robot_io.control import realtime
 from robot_io.control.config import ArmConfig, AxisConfig, RobotConfig
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.emulator.arm import ArmController, ArmStateError
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_server import serve
-from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams
+from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
 from robot_io.emulator.shared_state import Motion, Shared
@@ -42,10 +42,10 @@ class Ports:
 
     arm: int
     tracker: int
-    axes: tuple[int, int]
+    axes: tuple[int, ...]
 
 
-def free_ports() -> Ports:
+def free_ports(axes: int = len(PAPER.carrying)) -> Ports:
     """Ports that nobody uses now, below those that the system gives to sockets without one of their own: between this
     look and their use it would give them away. Raises DeviceError when there are too few."""
     found: list[int] = []
@@ -57,22 +57,30 @@ def free_ports() -> Ports:
             except OSError:
                 continue
         found.append(port)
-        if len(found) == 4:
-            return Ports(found[0], found[1], (found[2], found[3]))
+        if len(found) == 2 + axes:
+            return Ports(found[0], found[1], tuple(found[2:]))
     raise DeviceError(f"no free ports for the rig between {PORT_RANGE[0]} and {PORT_RANGE[1]}")
 
 
 class Rig:
-    """The four processes; use as a context manager. ``robot`` is what a bridge needs to connect to them.
+    """The processes; use as a context manager. ``robot`` is what a bridge needs to connect to them.
+
+    contract  of the robot that stands in ``scene``; without carrying axes it has no process for them
 
     Raises DeviceError when one of them does not start.
     """
 
     def __init__(
-        self, scene: str, balls: Throws | Opponent, params: RigParams = STANDARD_RIG, ports: Ports | None = None
+        self,
+        scene: str,
+        balls: Throws | Opponent,
+        params: RigParams = STANDARD_RIG,
+        ports: Ports | None = None,
+        contract: Contract = PAPER,
     ) -> None:
-        self.params, self.ports = params, ports or free_ports()
-        self._shared = Shared()
+        params = for_robot(params, contract)
+        self.params, self.ports, self._contract = params, ports or free_ports(len(contract.carrying)), contract
+        self._shared = Shared(joints=contract.n_joints)
         self._shared["silent_until"][0] = -1.0
         context = multiprocessing.get_context("spawn")
         jobs: dict[str, tuple[Callable, tuple]] = {
@@ -81,11 +89,16 @@ class Rig:
             "axes": (_axes, ()),
             "tracker": (_tracker, ()),
         }
+        if not contract.carrying:
+            del jobs["axes"]
+            self._shared["driven"][1] = np.inf  # nobody to wait for
         self._processes, self._pipes = {}, {}
         for name, (job, arguments) in jobs.items():
             mine, theirs = context.Pipe()
             process = context.Process(
-                target=_run, args=(job, self._shared.name, params, self.ports, theirs, arguments), name=f"rig-{name}"
+                target=_run,
+                args=(job, self._shared.name, params, self.ports, contract, theirs, arguments),
+                name=f"rig-{name}",
             )
             process.start()
             theirs.close()
@@ -101,12 +114,12 @@ class Rig:
 
     @property
     def robot(self) -> RobotConfig:
-        axes = AxisConfig(HOST, self.ports.axes[0]), AxisConfig(HOST, self.ports.axes[1])
-        return RobotConfig(
+        return replace(
+            RobotConfig.of(self._contract),
             name="rig",
             arm=ArmConfig(HOST, self.ports.arm, HOST),
             axis_profile=self.params.axis_profile,
-            axes=axes,
+            axes=tuple(AxisConfig(HOST, port) for port in self.ports.axes),
             axes_motion=AXES_CONFIG,
             tracker=TrackerConfig(HOST, self.ports.tracker, HOST),
         )
@@ -120,16 +133,21 @@ class Rig:
         self._pipes["arm"].send(("motors_off",))
 
     def drive_fault(self, axis: int, code: int) -> None:
-        """A fault of one linear axis's drive."""
-        self._pipes["axes"].send(("fault", axis, code))
+        """A fault of one linear axis's drive. Raises DeviceError for a robot without such an axis."""
+        self._to_axis("fault", axis, code)
 
     def connect_arm(self, connected: bool) -> None:
         """Pulls the network cable of the arm's controller or plugs it in again."""
         self._pipes["arm"].send(("reconnect" if connected else "disconnect",))
 
     def connect_axis(self, axis: int, connected: bool) -> None:
-        """Pulls a linear axis's network cable or plugs it in again."""
-        self._pipes["axes"].send(("reconnect" if connected else "disconnect", axis))
+        """Pulls a linear axis's network cable or plugs it in again. Raises DeviceError as ``drive_fault`` does."""
+        self._to_axis("reconnect" if connected else "disconnect", axis)
+
+    def _to_axis(self, request: str, axis: int, *details: int) -> None:
+        if not 0 <= axis < len(self.ports.axes):
+            raise DeviceError(f"rig: {self._contract.robot} has {len(self.ports.axes)} linear axes, no number {axis}")
+        self._pipes["axes"].send((request, axis, *details))
 
     def drop_out(self, seconds: float) -> None:
         """The tracker sends nothing for a while."""
@@ -148,7 +166,7 @@ class Rig:
         return int(self._shared.value("thrown"))
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """True joint positions and velocities (8,)."""
+        """True joint positions and velocities (n,)."""
         qpos, qvel = self._shared.read("qpos", "qvel")
         return qpos, qvel
 
@@ -176,13 +194,21 @@ class Rig:
         self.close()
 
 
-def _run(job: Callable, name: str, params: RigParams, ports: Ports, pipe: Connection, arguments: tuple) -> None:
+def _run(
+    job: Callable,
+    name: str,
+    params: RigParams,
+    ports: Ports,
+    contract: Contract,
+    pipe: Connection,
+    arguments: tuple,
+) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    shared = Shared(name)
+    shared = Shared(name, contract.n_joints)
     # These stand for hardware, which nothing else on this machine can delay; below the bridge's priority.
     realtime.prepare(PRIORITY)
     try:
-        job(shared, params, ports, pipe, *arguments)
+        job(shared, params, ports, contract, pipe, *arguments)
     except (KeyboardInterrupt, BrokenPipeError, EOFError):
         pass
     except OSError as error:
@@ -212,9 +238,15 @@ def _paced(shared: Shared, pipe: Connection, period: float) -> Iterator[float]:
 
 
 def _world(
-    shared: Shared, params: RigParams, ports: Ports, pipe: Connection, scene: str, balls: Throws | Opponent
+    shared: Shared,
+    params: RigParams,
+    ports: Ports,
+    contract: Contract,
+    pipe: Connection,
+    scene: str,
+    balls: Throws | Opponent,
 ) -> None:
-    world = World(scene, params.world)
+    world = World(scene, params.world, contract)
     source = ball_source(balls, params)
 
     def publish(now: float) -> None:
@@ -234,7 +266,7 @@ def _world(
         publish(now)
 
 
-def _arm(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> None:
+def _arm(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pipe: Connection) -> None:
     client = (HOST, ports.arm)
     controller = ArmController(client, replace(params.arm, dead_time=params.arm.dead_time + params.action_delay))
     out, back = Network(params.arm_network, params.seed), Network(params.arm_network, params.seed + 1)
@@ -242,7 +274,7 @@ def _arm(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> N
         wire.bind((HOST, 0))
         wire.setblocking(False)
         pipe.send("ready")
-        rows, connected, motion = list(ABB_JOINTS), True, Motion(shared)
+        rows, connected, motion = list(contract.arm), True, Motion(shared)
         for now in _paced(shared, pipe, params.arm.cycle):
             while pipe.poll():
                 request = pipe.recv()[0]
@@ -285,11 +317,11 @@ def _operate(controller: ArmController, request: str) -> None:
             pass  # it is so already
 
 
-def _axes(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> None:
+def _axes(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pipe: Connection) -> None:
     dead_time = params.axis_dead_time + params.action_delay
     emulators = [
         AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)
-        for _ in FESTO_JOINTS
+        for _ in contract.carrying
     ]
     servers = [serve(emulator, HOST, port) for emulator, port in zip(emulators, ports.axes, strict=True)]
     try:
@@ -304,7 +336,7 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> 
                     "fault": emulators[axis].inject_fault,
                 }[kind](*rest)
             qpos, qvel = motion.at(now)
-            for i, emulator in zip(FESTO_JOINTS, emulators, strict=True):
+            for i, emulator in zip(contract.carrying, emulators, strict=True):
                 shared["setpoint"][i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
             shared["driven"][1] = now
     finally:
@@ -312,7 +344,7 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> 
             server.close()
 
 
-def _tracker(shared: Shared, params: RigParams, ports: Ports, pipe: Connection) -> None:
+def _tracker(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pipe: Connection) -> None:
     cameras, network = (
         TrackerEmulator(params.tracker, params.seed + 2, params.hidden),
         Network(params.tracker_network, params.seed + 3),

@@ -13,16 +13,17 @@ import numpy as np
 
 from robot_io.contract import N_JOINTS
 
+JOINTS = -1  # stands for as many numbers as the robot has joints
 _FIELDS = {
     "version": 1,
     "time": 1,
-    "qpos": N_JOINTS,
-    "qvel": N_JOINTS,
+    "qpos": JOINTS,
+    "qvel": JOINTS,
     "ball": 3,
     "ball_number": 1,
     "ball_in_play": 1,
     "collisions": 1,
-    "setpoint": N_JOINTS,
+    "setpoint": JOINTS,
     "throwing": 1,
     "thrown": 1,
     "finish": 1,
@@ -39,18 +40,19 @@ PATIENCE = 0.4  # [s]; a world that is later was stopped
 
 
 class Shared:
-    """Views into the block by name; ``Shared()`` makes one, ``Shared(name)`` attaches to it."""
+    """Views into the block by name; ``Shared()`` makes one for so many joints, ``Shared(name)`` attaches to it."""
 
-    def __init__(self, name: str | None = None) -> None:
-        size = 8 * sum(_FIELDS.values())
+    def __init__(self, name: str | None = None, joints: int = N_JOINTS) -> None:
+        counts = {field: joints if count == JOINTS else count for field, count in _FIELDS.items()}
+        size = 8 * sum(counts.values())
         self._owner = name is None
         self._memory = shared_memory.SharedMemory(name=name, create=name is None, size=size, **_untracked(name))
-        self._block = np.ndarray((sum(_FIELDS.values()),), np.float64, self._memory.buf)
+        self._block = np.ndarray((sum(counts.values()),), np.float64, self._memory.buf)
         if self._owner:
             self._block[:] = 0.0
         start = 0
         self.views: dict[str, np.ndarray] = {}
-        for field, count in _FIELDS.items():
+        for field, count in counts.items():
             self.views[field] = self._block[start : start + count]
             start += count
 
@@ -121,7 +123,7 @@ class Motion:
         self._newest = self._before = self._look()
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities (8,) at ``time`` [s]; as they were last when the world is late by PATIENCE."""
+        """Positions and velocities (n,) at ``time`` [s]; as they were last when the world is late by PATIENCE."""
         if time > self._newest[0]:
             self._before, self._newest = self._newest, self._look()
         while self._newest[0] < time - AHEAD and clock.monotonic() < time + PATIENCE and not self._shared["finish"][0]:

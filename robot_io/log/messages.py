@@ -4,7 +4,8 @@ All times are seconds of the control process's monotonic clock. A record's ``log
 had it: measurements also carry the time at which they were true, and the two are never mixed.
 
 Packed, a record is one kind byte and its fields, little endian without padding; arrays are float64. ``unpack`` is the
-inverse. A packed record has at most LARGEST bytes, so that a pipe takes a frame whole or not at all.
+inverse; its length says how many joints there are. A packed record has at most LARGEST bytes, so that a pipe takes a
+frame whole or not at all.
 """
 
 from __future__ import annotations
@@ -18,8 +19,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-
-from robot_io.contract import N_JOINTS, N_OBSERVATION
 
 LARGEST = 4094  # bytes: PIPE_BUF of Linux, less the two of a frame's length
 _CUT = " [cut]"
@@ -71,11 +70,11 @@ class Ball:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Joints:
-    """Measured joint state in the order of ``contract.JOINT_NAMES``.
+    """Measured joint state in the order of the robot's contract.
 
     time      [s] when it was true
-    position  (8,) [m], [rad]
-    velocity  (8,) [m/s], [rad/s]
+    position  (n,) [m], [rad]
+    velocity  (n,) [m/s], [rad/s]
     received  [s] when it reached the control process; ``time`` if left out
     """
 
@@ -91,12 +90,12 @@ class Joints:
 
     def pack(self) -> bytes:
         head = _TWO_TIMES.pack(self.KIND, self.time, self.log_time)
-        return head + _array(self, "position", N_JOINTS) + _array(self, "velocity", N_JOINTS)
+        return head + _alike(self, "position", "velocity")
 
     @classmethod
     def unpack(cls, data: bytes) -> Joints:
         _, time, received = _TWO_TIMES.unpack_from(data)
-        position, velocity = _arrays(data, _TWO_TIMES.size, N_JOINTS, N_JOINTS)
+        position, velocity = _parts(data, _TWO_TIMES.size, 2)
         return cls(time, position, velocity, received)
 
 
@@ -104,9 +103,9 @@ class Joints:
 class Command:
     """Velocity that the policy asked for and that which went to the robot in one control tick.
 
-    requested  (8,) joint velocity asked for [m/s], [rad/s]
-    sent       (8,) joint velocity commanded, after the limiter
-    reference  (8,) commanded joint position at ``time``, from which ``sent`` goes on [m], [rad]
+    requested  (n,) joint velocity asked for [m/s], [rad/s]
+    sent       (n,) joint velocity commanded, after the limiter
+    reference  (n,) commanded joint position at ``time``, from which ``sent`` goes on [m], [rad]
     """
 
     KIND: ClassVar[int] = 3
@@ -121,19 +120,17 @@ class Command:
         return self.time
 
     def pack(self) -> bytes:
-        head = _TICKED.pack(self.KIND, self.tick, self.time)
-        arrays = [_array(self, name, N_JOINTS) for name in ("requested", "sent", "reference")]
-        return b"".join([head, *arrays])
+        return _TICKED.pack(self.KIND, self.tick, self.time) + _alike(self, "requested", "sent", "reference")
 
     @classmethod
     def unpack(cls, data: bytes) -> Command:
         _, tick, time = _TICKED.unpack_from(data)
-        return cls(tick, time, *_arrays(data, _TICKED.size, N_JOINTS, N_JOINTS, N_JOINTS))
+        return cls(tick, time, *_parts(data, _TICKED.size, 3))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """The newest observation (11,) that the policy was given in one control tick, SI units, not normalised."""
+    """The newest observation (3 + n,) that the policy was given in one control tick, SI units, not normalised."""
 
     KIND: ClassVar[int] = 4
     tick: int
@@ -145,17 +142,17 @@ class Observation:
         return self.time
 
     def pack(self) -> bytes:
-        return _TICKED.pack(self.KIND, self.tick, self.time) + _array(self, "observation", N_OBSERVATION)
+        return _TICKED.pack(self.KIND, self.tick, self.time) + _alike(self, "observation")
 
     @classmethod
     def unpack(cls, data: bytes) -> Observation:
         _, tick, time = _TICKED.unpack_from(data)
-        return cls(tick, time, *_arrays(data, _TICKED.size, N_OBSERVATION))
+        return cls(tick, time, *_parts(data, _TICKED.size, 1))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Action:
-    """The policy's answer (8,) in one control tick, in [-1, 1]."""
+    """The policy's answer (n,) in one control tick, in [-1, 1]."""
 
     KIND: ClassVar[int] = 5
     tick: int
@@ -167,12 +164,12 @@ class Action:
         return self.time
 
     def pack(self) -> bytes:
-        return _TICKED.pack(self.KIND, self.tick, self.time) + _array(self, "action", N_JOINTS)
+        return _TICKED.pack(self.KIND, self.tick, self.time) + _alike(self, "action")
 
     @classmethod
     def unpack(cls, data: bytes) -> Action:
         _, tick, time = _TICKED.unpack_from(data)
-        return cls(tick, time, *_arrays(data, _TICKED.size, N_JOINTS))
+        return cls(tick, time, *_parts(data, _TICKED.size, 1))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -362,6 +359,20 @@ def _array(record: Record, name: str, length: int) -> bytes:
     if values.shape != (length,):
         raise LogError(f"{type(record).__name__}.{name} has shape {values.shape}, expected ({length},)")
     return values.tobytes()
+
+
+def _alike(record: Record, first: str, *others: str) -> bytes:
+    """Arrays as long as the first one, which is as long as the robot has joints."""
+    shape = np.shape(getattr(record, first))
+    if len(shape) != 1:
+        raise LogError(f"{type(record).__name__}.{first} has shape {shape}, expected one number for each joint")
+    return b"".join(_array(record, name, shape[0]) for name in (first, *others))
+
+
+def _parts(data: bytes, offset: int, count: int) -> list[np.ndarray]:
+    """Arrays of one length, ``count`` of them, that ``_alike`` packed."""
+    length = (len(data) - offset) // (8 * count)
+    return _arrays(data, offset, *[length] * count)
 
 
 def _arrays(data: bytes, offset: int, *lengths: int) -> list[np.ndarray]:

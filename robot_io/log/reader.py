@@ -14,12 +14,12 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 
-from robot_io.contract import N_JOINTS
+from robot_io.contract import Contract
 from robot_io.log import schema
 from robot_io.log.messages import Event, Level, LogError
 from robot_io.log.scan import Fault, Scan
-from robot_io.log.schema import NANO, TOPICS, Topic
-from robot_io.log.writer import FORMAT, FORMAT_VERSION
+from robot_io.log.schema import NANO, Topic
+from robot_io.log.writer import FORMAT, FORMAT_VERSION, robot_of
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class BallSeries:
 
 @dataclass(frozen=True)
 class JointSeries:
-    """time, received (n,) [s]; position (8, n) [m], [rad]; velocity (8, n)."""
+    """time, received (n,) [s]; position (joints, n) [m], [rad]; velocity (joints, n)."""
 
     time: np.ndarray
     received: np.ndarray
@@ -44,7 +44,7 @@ class JointSeries:
 
 @dataclass(frozen=True)
 class CommandSeries:
-    """tick (n,); time (n,) [s]; requested, sent (8, n) velocities; reference (8, n) commanded position at ``time``."""
+    """tick (n,); time (n,) [s]; requested, sent (joints, n) velocities; reference (joints, n) commanded position."""
 
     tick: np.ndarray
     time: np.ndarray
@@ -55,7 +55,7 @@ class CommandSeries:
 
 @dataclass(frozen=True)
 class PolicySeries:
-    """tick (n,); time (n,) [s]; values (11, n) observations or (8, n) actions."""
+    """tick (n,); time (n,) [s]; values (3 + joints, n) observations or (joints, n) actions."""
 
     tick: np.ndarray
     time: np.ndarray
@@ -94,12 +94,14 @@ class Episode:
 class SessionLog:
     """A session as it was recorded; times are seconds of the control process's monotonic clock.
 
+    robot        its contract
     metadata     MCAP metadata records by name; "session" is always there, "end" if the recorder finished the file
     attachments  files kept with the session
     faults       what is wrong with the file; always empty unless it was read with ``salvage``
     """
 
     path: Path
+    robot: Contract
     metadata: dict[str, dict[str, str]]
     attachments: dict[str, bytes]
     ball: BallSeries
@@ -182,16 +184,23 @@ def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
     (docs/reference/log-format.md); OSError when the file cannot be read.
     """
     scan = Scan(path)
-    columns = {name: _Column(topic) for name, topic in TOPICS.items() if topic.width}
+    topics: dict[str, Topic] = {}  # of the robot that the metadata of the session names, which stand before messages
+    columns: dict[str, _Column] = {}
     events: list[tuple[int, Event]] = []
     metadata: dict[str, dict[str, str]] = {}
     attachments: dict[str, bytes] = {}
     schemas: dict[int, str] = {}
+    declared: dict[int, Channel] = {}
     channels: dict[int, Topic | None] = {}
     count, last = 0, 0
     for record in scan:
         if isinstance(record, Message):
             count, last = count + 1, max(last, record.log_time)
+            if not topics:
+                topics = schema.topics(robot_of(metadata.get("session", {}), str(path)))
+                columns = {name: _Column(topic) for name, topic in topics.items() if topic.width}
+            if record.channel_id not in channels and record.channel_id in declared:
+                channels[record.channel_id] = _topic(path, declared[record.channel_id], schemas, topics)
             topic = channels.get(record.channel_id)
             if topic is None:  # a topic of a later version, or its declaration was lost
                 continue
@@ -206,7 +215,7 @@ def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
         elif isinstance(record, Schema):
             schemas[record.id] = record.name
         elif isinstance(record, Channel):
-            channels[record.id] = _topic(path, record, schemas)
+            declared[record.id] = record
         elif isinstance(record, Metadata):
             metadata[record.name] = record.metadata
         elif isinstance(record, Attachment):
@@ -217,34 +226,38 @@ def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
     if session.get("format") != FORMAT or session.get("format_version") != str(FORMAT_VERSION):
         found = f"{session.get('format')!r} version {session.get('format_version')!r}"
         raise LogError(f"{path}: format is {found}, expected {FORMAT!r} version '{FORMAT_VERSION}'")
-    return _assemble(scan, metadata, attachments, columns, events)
+    robot = robot_of(session, str(path))
+    columns = columns or {name: _Column(topic) for name, topic in schema.topics(robot).items() if topic.width}
+    return _assemble(scan, robot, metadata, attachments, columns, events)
 
 
 def _assemble(
     scan: Scan,
+    robot: Contract,
     metadata: dict[str, dict[str, str]],
     attachments: dict[str, bytes],
     columns: dict[str, _Column],
     events: list[tuple[int, Event]],
 ) -> SessionLog:
-    offset = int(metadata["session"]["clock_offset_ns"])
+    offset, n = int(metadata["session"]["clock_offset_ns"]), robot.n_joints
     arrays = {name: column.arrays(offset) for name, column in columns.items()}
     captured, received, ids, positions = arrays[schema.BALL.name]
-    time, joints_received, _, joints = arrays[schema.JOINT_STATES.name]
-    _, _, requested_ticks, requested = arrays[schema.REQUESTED.name]
-    sent_time, _, sent_ticks, sent = arrays[schema.SENT.name]
+    time, joints_received, _, joints = arrays[schema.JOINT_STATES]
+    _, _, requested_ticks, requested = arrays[schema.REQUESTED]
+    sent_time, _, sent_ticks, sent = arrays[schema.SENT]
     # One of the two messages may be lost with a damaged chunk.
     ticks, i, j = np.intersect1d(requested_ticks, sent_ticks, return_indices=True)
     tick_time, _, tick, tick_numbers = arrays[schema.TICK.name]
     return SessionLog(
         path=scan.path,
+        robot=robot,
         metadata=metadata,
         attachments=attachments,
         ball=BallSeries(captured, received, positions, ids),
-        joints=JointSeries(time, joints_received, joints[:N_JOINTS], joints[N_JOINTS:]),
-        commands=CommandSeries(ticks, sent_time[j], requested[:, i], sent[N_JOINTS:, j], sent[:N_JOINTS, j]),
-        observations=_policy(arrays[schema.OBSERVATION.name]),
-        actions=_policy(arrays[schema.ACTION.name]),
+        joints=JointSeries(time, joints_received, joints[:n], joints[n:]),
+        commands=CommandSeries(ticks, sent_time[j], requested[:, i], sent[n:, j], sent[:n, j]),
+        observations=_policy(arrays[schema.OBSERVATION]),
+        actions=_policy(arrays[schema.ACTION]),
         ticks=TickSeries(tick, tick_time, *tick_numbers),
         events=tuple(Event((stamp - offset) / NANO, event.level, event.name, event.text) for stamp, event in events),
         faults=tuple(scan.faults),
@@ -260,8 +273,10 @@ def _event(message: Any) -> Event:
     return Event(0.0, Level(message.level), message.name, message.message)
 
 
-def _topic(path: str | os.PathLike, channel: Channel, schemas: dict[int, str]) -> Topic | None:
-    topic = TOPICS.get(channel.topic)
+def _topic(
+    path: str | os.PathLike, channel: Channel, schemas: dict[int, str], topics: dict[str, Topic]
+) -> Topic | None:
+    topic = topics.get(channel.topic)
     if topic is not None:
         expected = topic.message.DESCRIPTOR.full_name
         found = schemas.get(channel.schema_id)

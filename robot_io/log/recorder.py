@@ -20,6 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any, Protocol
 
+from robot_io.contract import PAPER, Contract
 from robot_io.log.messages import LARGEST, End, Event, Level, LogError, Record
 from robot_io.log.writer import Session, SessionWriter, sample_clock_offset, session
 
@@ -76,17 +77,19 @@ class Recorder:
         name: str,
         metadata: Mapping[str, Any],
         attachments: Mapping[str, str | bytes] | None = None,
+        robot: Contract = PAPER,
     ) -> Recorder:
         """Starts the recorder process and returns when its file ``folder/name.mcap.part`` is open.
 
         metadata     facts about the session, such as the artefact's digest and the git state; what is no string is
                      kept as JSON
         attachments  contents of files to be kept whole, such as robot.yaml, by name
+        robot        whose joints are recorded
 
         To be called before the control thread takes real-time priority. Raises LogError when the file exists or cannot
         be made, with the reason.
         """
-        made = session(folder, name, metadata, attachments or {}, sample_clock_offset(), time.monotonic(), host=True)
+        made = session(folder, name, metadata, attachments or {}, sample_clock_offset(), time.monotonic(), True, robot)
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
         process = _Process(
@@ -261,13 +264,14 @@ class FileRecorder:
         attachments: Mapping[str, str | bytes] | None = None,
         start_time: float = 0.0,
         clock_offset_ns: int = 0,
+        robot: Contract = PAPER,
     ) -> FileRecorder:
         """As ``Recorder.start``. Reads no clock and names no host, so that equal runs give equal files.
 
         ``start_time`` [s] is the session's start on the scheduler's clock, ``clock_offset_ns`` puts that clock's zero
         somewhere else than at the start of 1970.
         """
-        return cls(session(folder, name, metadata, attachments or {}, clock_offset_ns, start_time, host=False))
+        return cls(session(folder, name, metadata, attachments or {}, clock_offset_ns, start_time, False, robot))
 
     @property
     def failure(self) -> None:

@@ -1,4 +1,4 @@
-"""The log's topics: which record becomes which message, and back into numbers.
+"""The log's topics: which record becomes which message, and back into numbers, for the joints of one robot.
 
 Positions, joint states and events use Foxglove's protobuf schemas, so that viewers draw them as they are; the policy's
 vectors and the ticks have two small schemas of their own.
@@ -15,8 +15,8 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Point3InFrame_pb2 import Point3InFrame
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 
-from robot_io.contract import JOINT_NAMES, JOINT_UNITS, N_JOINTS, N_OBSERVATION, OBSERVATION_NAMES, OBSERVATION_UNITS
-from robot_io.log.messages import Action, Ball, Command, Event, Joints, Observation, Tick
+from robot_io.contract import PAPER, Contract
+from robot_io.log.messages import Action, Ball, Command, Event, Joints, LogError, Observation, Tick
 
 NANO = 1_000_000_000
 FRAME = "table"
@@ -98,11 +98,11 @@ def _point(message: Any) -> list[float]:
     return [message.point.x, message.point.y, message.point.z]
 
 
-def _joints(*names: str) -> Callable[[Any], list[float]]:
+def _joints(joints: tuple[str, ...], *names: str) -> Callable[[Any], list[float]]:
     def numbers(message: Any) -> list[float]:
         found = tuple(joint.name for joint in message.joints)
-        if found != JOINT_NAMES:
-            raise ValueError(f"joints are {found}, expected {JOINT_NAMES}")
+        if found != joints:
+            raise ValueError(f"joints are {found}, expected {joints}")
         return [getattr(joint, name) for name in names for joint in message.joints]
 
     return numbers
@@ -121,23 +121,29 @@ def _tick(message: Any) -> list[float]:
     return [getattr(message, name) for name in TICK_FIELDS]
 
 
-_JOINT_METADATA = {"position": " ".join(JOINT_UNITS), "velocity": " ".join(f"{unit}/s" for unit in JOINT_UNITS)}
-
 BALL = Topic("/ball", Point3InFrame, 3, _point, {"frame": FRAME, "unit": "m"})
-JOINT_STATES = Topic("/joint_states", JointStates, 2 * N_JOINTS, _joints("position", "velocity"), _JOINT_METADATA)
-REQUESTED = Topic("/commands/requested", JointStates, N_JOINTS, _joints("velocity"), _JOINT_METADATA)
-SENT = Topic("/commands/sent", JointStates, 2 * N_JOINTS, _joints("position", "velocity"), _JOINT_METADATA)
-OBSERVATION = Topic(
-    "/observation",
-    Values,
-    N_OBSERVATION,
-    _values(N_OBSERVATION),
-    {"names": " ".join(OBSERVATION_NAMES), "units": " ".join(OBSERVATION_UNITS)},
-)
-ACTION = Topic("/action", Values, N_JOINTS, _values(N_JOINTS), {"names": " ".join(JOINT_NAMES), "units": "1"})
 TICK = Topic("/tick", TickMessage, len(TICK_FIELDS), _tick, {"unit": "s"})
 EVENT = Topic("/event", Log)
-TOPICS = {topic.name: topic for topic in (BALL, JOINT_STATES, REQUESTED, SENT, OBSERVATION, ACTION, TICK, EVENT)}
+JOINT_STATES, REQUESTED, SENT = "/joint_states", "/commands/requested", "/commands/sent"
+OBSERVATION, ACTION = "/observation", "/action"
+
+
+def topics(robot: Contract = PAPER) -> dict[str, Topic]:
+    """The topics of a robot's log, by name."""
+    joints, units, n, seen = robot.joints, robot.units, robot.n_joints, robot.n_observation
+    moved = {"position": " ".join(units), "velocity": " ".join(f"{unit}/s" for unit in units)}
+    observed = {"names": " ".join(robot.observation_names), "units": " ".join(robot.observation_units)}
+    found = (
+        BALL,
+        Topic(JOINT_STATES, JointStates, 2 * n, _joints(joints, "position", "velocity"), moved),
+        Topic(REQUESTED, JointStates, n, _joints(joints, "velocity"), moved),
+        Topic(SENT, JointStates, 2 * n, _joints(joints, "position", "velocity"), moved),
+        Topic(OBSERVATION, Values, seen, _values(seen), observed),
+        Topic(ACTION, Values, n, _values(n), {"names": " ".join(joints), "units": "1"}),
+        TICK,
+        EVENT,
+    )
+    return {topic.name: topic for topic in found}
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,41 +165,59 @@ def stamps(message: Any) -> list[Any]:
     return [part.timestamp for name in ("transforms", "entities") if name in fields for part in getattr(message, name)]
 
 
-def encode(record: Ball | Joints | Command | Observation | Action | Tick | Event) -> list[Encoded]:
-    """The messages of a record; the caller stamps them with ``publish_time``."""
-    match record:
-        case Ball():
-            x, y, z = record.position.tolist()
-            message = Point3InFrame(frame_id=FRAME)
-            message.point.x, message.point.y, message.point.z = x, y, z
-            return [Encoded(BALL, record.received, record.capture_time, record.id, message)]
-        case Joints():
-            message = _joint_states(record.velocity, record.position)
-            return [Encoded(JOINT_STATES, record.log_time, record.time, 0, message)]
-        case Command():
-            requested, sent = _joint_states(record.requested), _joint_states(record.sent, record.reference)
-            return [
-                Encoded(topic, record.time, record.time, record.tick, message)
-                for topic, message in ((REQUESTED, requested), (SENT, sent))
-            ]
-        case Observation():
-            message = Values(tick=record.tick, values=record.observation.tolist())
-            return [Encoded(OBSERVATION, record.time, record.time, record.tick, message)]
-        case Action():
-            message = Values(tick=record.tick, values=record.action.tolist())
-            return [Encoded(ACTION, record.time, record.time, record.tick, message)]
-        case Tick():
-            message = TickMessage(tick=record.tick, **{name: getattr(record, name) for name in TICK_FIELDS})
-            return [Encoded(TICK, record.time, record.time, record.tick, message)]
-        case Event():
-            message = Log(level=Log.Level.ValueType(record.level), name=record.name, message=record.text)
-            return [Encoded(EVENT, record.time, record.time, 0, message)]
-    raise TypeError(f"{type(record).__name__} is no record with messages")
+class Encoder:
+    """Records of one robot into messages."""
 
+    def __init__(self, robot: Contract = PAPER) -> None:
+        self.topics = topics(robot)
+        self._joints, self._seen = robot.joints, robot.n_observation
 
-def _joint_states(velocity: Any, position: Any = None) -> Any:
-    message = JointStates()
-    positions = [None] * N_JOINTS if position is None else position.tolist()
-    for name, p, v in zip(JOINT_NAMES, positions, velocity.tolist(), strict=True):
-        message.joints.add(name=name, position=p, velocity=v)
-    return message
+    def encode(self, record: Ball | Joints | Command | Observation | Action | Tick | Event) -> list[Encoded]:
+        """The messages of a record; the caller stamps them with ``publish_time``.
+
+        Raises LogError for a record of another number of joints than the robot has.
+        """
+        match record:
+            case Ball():
+                x, y, z = record.position.tolist()
+                message = Point3InFrame(frame_id=FRAME)
+                message.point.x, message.point.y, message.point.z = x, y, z
+                return [Encoded(BALL, record.received, record.capture_time, record.id, message)]
+            case Joints():
+                message = self._joint_states(record.velocity, record.position)
+                return [Encoded(self.topics[JOINT_STATES], record.log_time, record.time, 0, message)]
+            case Command():
+                requested, sent = (
+                    self._joint_states(record.requested),
+                    self._joint_states(record.sent, record.reference),
+                )
+                return [
+                    Encoded(self.topics[topic], record.time, record.time, record.tick, message)
+                    for topic, message in ((REQUESTED, requested), (SENT, sent))
+                ]
+            case Observation():
+                message = Values(tick=record.tick, values=self._numbers(record.observation, self._seen))
+                return [Encoded(self.topics[OBSERVATION], record.time, record.time, record.tick, message)]
+            case Action():
+                message = Values(tick=record.tick, values=self._numbers(record.action, len(self._joints)))
+                return [Encoded(self.topics[ACTION], record.time, record.time, record.tick, message)]
+            case Tick():
+                message = TickMessage(tick=record.tick, **{name: getattr(record, name) for name in TICK_FIELDS})
+                return [Encoded(TICK, record.time, record.time, record.tick, message)]
+            case Event():
+                message = Log(level=Log.Level.ValueType(record.level), name=record.name, message=record.text)
+                return [Encoded(EVENT, record.time, record.time, 0, message)]
+        raise TypeError(f"{type(record).__name__} is no record with messages")
+
+    def _joint_states(self, velocity: Any, position: Any = None) -> Any:
+        message, count = JointStates(), len(self._joints)
+        positions = [None] * count if position is None else self._numbers(position, count)
+        for name, p, v in zip(self._joints, positions, self._numbers(velocity, count), strict=True):
+            message.joints.add(name=name, position=p, velocity=v)
+        return message
+
+    @staticmethod
+    def _numbers(values: Any, count: int) -> list[float]:
+        if len(values) != count:
+            raise LogError(f"a record of {len(values)} numbers, the robot's have {count}")
+        return values.tolist()

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from ballmodel.io.atomic_files import replacing
-from robot_io.contract import JOINT_NAMES
 from robot_io.log.reader import BallSeries, SessionLog
 
 GAP = 0.25  # [s] without a sample, after which a ball of the same number is another trajectory
@@ -29,12 +28,13 @@ def export(log: SessionLog, folder: str | Path) -> list[Path]:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     start, commands, joints, ticks = log.start_time, log.commands, log.joints, log.ticks
+    names = log.robot.joints
     ages = (ticks.ball_age, ticks.gantry_age, ticks.arm_age)
     seconds = (ticks.time - start, ticks.lateness, ticks.policy_seconds, *ages)
     tables = {
         "ball.csv": ("session,trajectory,t,x,y,z", _balls(log)),
-        "command.csv": ("t,joint,velocity", _by_joint(commands.time - start, commands.sent)),
-        "state.csv": ("t,joint,position", _by_joint(joints.time - start, joints.position)),
+        "command.csv": ("t,joint,velocity", _by_joint(names, commands.time - start, commands.sent)),
+        "state.csv": ("t,joint,position", _by_joint(names, joints.time - start, joints.position)),
         "events.csv": (
             "t,level,name,text",
             ((_seconds(event.time - start), event.level.name.lower(), event.name, event.text) for event in log.events),
@@ -86,9 +86,9 @@ def _balls(log: SessionLog) -> Iterator[tuple]:
             yield (log.name, name, _seconds(t), *map(_number, position))
 
 
-def _by_joint(times: np.ndarray, values: np.ndarray) -> Iterator[tuple]:
+def _by_joint(names: tuple[str, ...], times: np.ndarray, values: np.ndarray) -> Iterator[tuple]:
     for t, row in zip(times, values.T, strict=True):
-        yield from ((_seconds(t), joint, _number(value)) for joint, value in zip(JOINT_NAMES, row, strict=True))
+        yield from ((_seconds(t), joint, _number(value)) for joint, value in zip(names, row, strict=True))
 
 
 def _seconds(value: float) -> str:

@@ -1,8 +1,8 @@
 """Frames, shapes and states for viewers such as Foxglove and Lichtblick, beside the measurements.
 
 Made by the process that writes the file, from records that are there anyway, so it costs the control loop nothing.
-Frames are named after the joints of ``robot_io.contract`` and stand as in ``robot_io.safety.robot_geometry.json``; the
-ball has a frame of its own. ``layout.json`` arranges it all.
+Frames are named after the robot's joints and stand as in its safety geometry; the ball has a frame of its own.
+``layout.json`` arranges it all, ``layout`` for another robot than the paper's.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from ballmodel.constants import (
     TABLE_WIDTH,
 )
 from robot_io.calibrated import Frame
+from robot_io.contract import PAPER, Contract
 from robot_io.log.messages import Ball, Event, Joints, Record
 from robot_io.log.schema import FRAME, Encoded, Topic
-from robot_io.safety.clearance import BLADE, SHIPPED
+from robot_io.safety.clearance import FIXED, SHIPPED
 
 HERE = Frame()
 RATE = 30.0  # [1/s] of the robot's frames; viewers interpolate
@@ -44,6 +45,8 @@ BLADE_THICKNESS = 0.012  # [m] as drawn
 BLUE, WHITE, GREY, STEEL = (0.05, 0.27, 0.52, 1.0), (1.0, 1.0, 1.0, 1.0), (0.3, 0.3, 0.3, 0.5), (0.7, 0.72, 0.75, 1.0)
 ORANGE, RED = (1.0, 0.5, 0.0, 1.0), (0.75, 0.1, 0.1, 1.0)
 
+NOTHING = '{"joints": [], "capsules": [], "blade_capsules": []}'  # geometry of a robot that is not drawn
+
 TF = Topic("/tf", FrameTransforms)
 SCENE = Topic("/scene", SceneUpdate)
 STATE = Topic("/state", KeyValuePair)
@@ -53,13 +56,15 @@ TOPICS = {topic.name: topic for topic in (TF, SCENE, STATE)}
 class View:
     """Messages for viewers, from the records of one session in their order.
 
-    base  where the robot stands, from where the model has it
+    base   where the robot stands, from where the model has it
+    robot  without a geometry in its contract it is not drawn
     """
 
-    def __init__(self, base: Frame = HERE) -> None:
+    def __init__(self, base: Frame = HERE, robot: Contract = PAPER) -> None:
         self._base, self._turned = base, _quaternion(base.matrix)
-        geometry = json.loads((resources.files("robot_io.safety") / SHIPPED).read_text(encoding="utf-8"))
-        self._joints = geometry["joints"]
+        shipped = (resources.files("robot_io.safety") / SHIPPED).read_text(encoding="utf-8")
+        geometry = json.loads(shipped if robot == PAPER else robot.geometry or NOTHING)
+        self._joints, self._blade = geometry["joints"], geometry["blade_capsules"]
         self._fixed = [_quaternion(np.array(joint["rot"], float)) for joint in self._joints]
         self._capsules = geometry["capsules"]
         self._due = {Joints: -math.inf, Ball: -math.inf}
@@ -72,16 +77,20 @@ class View:
         _sphere(ball, (0.0, 0.0, 0.0), BALL_DIAMETER, ORANGE)
         links = {j["name"]: update.entities.add(id=j["name"], frame_id=j["name"]) for j in self._joints}
         for capsule in self._capsules:
-            if capsule["name"].startswith("col_blade"):
+            if capsule["name"] in self._blade:
                 continue
             p, q = capsule["p0"], capsule["p1"]
+            if capsule["joint"] == FIXED:
+                p, q = (self._base.outward(np.array(end)).tolist() for end in (p, q))
+                links.setdefault(FIXED, update.entities.add(id=FIXED, frame_id=FRAME))
             link, width = links[capsule["joint"]], 2.0 * capsule["radius"]
             _cylinder(link, *_stretch(p, q), width, math.dist(p, q), STEEL)
             _sphere(link, p, width, STEEL)
             _sphere(link, q, width, STEEL)
-        blade = next(capsule for capsule in self._capsules if capsule["name"] == BLADE)
-        middle, _ = _stretch(blade["p0"], blade["p1"])
-        _cylinder(links[blade["joint"]], middle, (0.0, 1.0, 0.0), 2.0 * PADDLE_RADIUS, BLADE_THICKNESS, RED)
+        blade = [capsule for name in self._blade for capsule in self._capsules if capsule["name"] == name]
+        if blade:
+            middle, _ = _stretch(blade[0]["p0"], blade[0]["p1"])
+            _cylinder(links[blade[0]["joint"]], middle, _normal(blade), 2.0 * PADDLE_RADIUS, BLADE_THICKNESS, RED)
         for entity in update.entities:
             entity.frame_locked = True
         return Encoded(SCENE, time, time, 0, update)
@@ -89,7 +98,8 @@ class View:
     def encode(self, record: Record) -> Iterator[Encoded]:
         """Messages that follow from a record; never raises."""
         if isinstance(record, Joints):
-            if self._is_due(record, record.time, RATE) and np.isfinite(record.position).all():
+            drawn = self._joints and np.isfinite(record.position).all()
+            if self._is_due(record, record.time, RATE) and drawn:
                 yield Encoded(TF, record.log_time, record.time, 0, self._frames(record.position.tolist()))
         elif isinstance(record, Ball):
             if self._is_due(record, record.capture_time, BALL_RATE) and np.isfinite(record.position).all():
@@ -110,8 +120,8 @@ class View:
         message, parent = FrameTransforms(), FRAME
         for joint, fixed, q in zip(self._joints, self._fixed, position, strict=True):
             place, turned = joint["pos"], fixed
-            if joint["type"] == "slide":  # slides come first, in frames that are not turned
-                place = [p + q * a for p, a in zip(place, joint["axis"], strict=True)]
+            if joint["type"] == "slide":
+                place = (np.array(place) + q * np.array(joint["rot"]) @ np.array(joint["axis"])).tolist()
             else:
                 s = math.sin(0.5 * q)
                 turned = _product(fixed, (*(s * a for a in joint["axis"]), math.cos(0.5 * q)))
@@ -120,6 +130,18 @@ class View:
             _frame(message, parent, joint["name"], place, turned)
             parent = joint["name"]
         return message
+
+
+def layout(robot: Contract) -> dict[str, Any]:
+    """``layout.json`` with a robot's joints in the plot of the commands."""
+    shipped = json.loads((resources.files("robot_io.log") / "layout.json").read_text(encoding="utf-8"))
+    plot = shipped["configById"]["Plot!commands"]
+    line = plot["paths"][0]
+    plot["paths"] = [
+        line | {"value": f"/commands/sent.joints[{i}].velocity", "label": f"{name} sent"}
+        for i, name in enumerate(robot.joints)
+    ]
+    return shipped
 
 
 def _state(event: Event) -> str | None:
@@ -186,6 +208,16 @@ def _pose(shape: Any, place: Sequence[float], turned: Sequence[float], colour: S
     pose.position.x, pose.position.y, pose.position.z = place
     pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = turned
     shape.color.r, shape.color.g, shape.color.b, shape.color.a = colour
+
+
+def _normal(blade: Sequence[dict[str, Any]]) -> list[float]:
+    """Direction across the blade: across its first two capsules, or whatever lies across the only one."""
+    (_, first), (_, second) = (_stretch(c["p0"], c["p1"]) for c in (blade[0], blade[-1]))
+    normal = np.cross(first, second)
+    if not normal.any():
+        normal = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
+    normal = normal / np.linalg.norm(normal)
+    return (normal * np.sign(normal[np.argmax(np.abs(normal))]) + 0.0).tolist()  # without a negative zero
 
 
 def _stretch(p: Sequence[float], q: Sequence[float]) -> tuple[list[float], list[float]]:

@@ -20,6 +20,8 @@ from mcap.writer import CompressionType, Writer
 from ballmodel.io.atomic_files import sync_folder
 from robot_io import contract
 from robot_io.calibrated import Frame
+from robot_io.contract import PAPER, Contract
+from robot_io.errors import ContractError
 from robot_io.log import schema, view
 from robot_io.log.messages import End, LogError, Metadata, as_strings, unpack
 
@@ -28,6 +30,7 @@ FORMAT_VERSION = 1
 SUFFIX = ".mcap"
 UNFINISHED = ".mcap.part"
 CHUNK_SIZE = 64 * 1024  # bytes; a recorder's flushes usually end a chunk earlier
+CONTRACT = "contract"  # key of the session's metadata: another robot's contract as JSON; the paper's has none
 FORBIDDEN = frozenset('/\\:*?"<>|\0')  # in a file's name, somewhere
 
 
@@ -74,10 +77,12 @@ def session(
     clock_offset_ns: int,
     start_time: float,
     host: bool,
+    robot: Contract = PAPER,
 ) -> Session:
     """Adds what every log says of itself to ``metadata``.
 
     ``start_time`` [s] is the session's start on the control process's clock; ``host`` adds the machine and the date.
+    ``robot`` has the joints; another one's than the paper's contract is kept whole.
     Raises LogError for names that cannot be, an entry that would hide one of the log's own, and a file that exists.
     """
     if not name or name.startswith(".") or FORBIDDEN & set(name):
@@ -88,12 +93,14 @@ def session(
         "name": name,
         "contract_version": contract.CONTRACT_VERSION,
         "control_rate_hz": contract.CONTROL_RATE,
-        "joint_names": list(contract.JOINT_NAMES),
-        "joint_units": list(contract.JOINT_UNITS),
-        "observation_names": list(contract.OBSERVATION_NAMES),
+        "joint_names": list(robot.joints),
+        "joint_units": list(robot.units),
+        "observation_names": list(robot.observation_names),
         "clock_offset_ns": clock_offset_ns,
         "start_time": start_time,
     }
+    if robot != PAPER:
+        own[CONTRACT] = contract.describe(robot)
     if host:
         started = datetime.fromtimestamp(start_time + clock_offset_ns / schema.NANO, UTC)
         own |= {
@@ -102,7 +109,7 @@ def session(
             "system": platform.platform(),
             "python": platform.python_version(),
         }
-    hidden = sorted({*own, "checksum"} & set(metadata))
+    hidden = sorted({*own, CONTRACT, "checksum"} & set(metadata))
     if hidden:
         raise LogError(f"metadata {', '.join(hidden)}: written by the log itself, choose another key")
     made = Session(
@@ -125,6 +132,15 @@ def sample_clock_offset() -> int:
         before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
         looks.append((after - before, wall - (before + after) // 2))
     return min(looks)[1]
+
+
+def robot_of(metadata: Mapping[str, str], where: str) -> Contract:
+    """The contract of a session's robot, from its metadata. Raises LogError where that is none."""
+    text = metadata.get(CONTRACT)
+    try:
+        return PAPER if text is None else contract.from_description(json.loads(text))
+    except (ContractError, ValueError) as error:
+        raise LogError(f"{where}: metadata {CONTRACT!r}: {error}") from None
 
 
 def checksum(name: str, entries: Mapping[str, str]) -> str:
@@ -157,14 +173,16 @@ class SessionWriter:
             self._writer.add_attachment(start, start, name, media_type, content)
         schemas: dict[str, int] = {}
         self._channels = {}
-        for topic in (*schema.TOPICS.values(), *view.TOPICS.values()):
+        robot = robot_of(session.metadata, session.name)
+        self._encoder = schema.Encoder(robot)
+        for topic in (*self._encoder.topics.values(), *view.TOPICS.values()):
             schema_name = topic.message.DESCRIPTOR.full_name
             if schema_name not in schemas:
                 schemas[schema_name] = self._writer.register_schema(schema_name, "protobuf", topic.schema())
             self._channels[topic.name] = self._writer.register_channel(
                 topic.name, "protobuf", schemas[schema_name], topic.metadata
             )
-        self._view = view.View(Frame(*map(tuple, json.loads(session.metadata.get("robot_base", "[]")))))
+        self._view = view.View(Frame(*map(tuple, json.loads(session.metadata.get("robot_base", "[]")))), robot)
         self._add_message(self._view.scene(float(session.metadata["start_time"])))
         self._file.flush()
 
@@ -176,7 +194,7 @@ class SessionWriter:
         elif isinstance(record, End):
             self._end = record
         else:
-            for encoded in (*schema.encode(record), *self._view.encode(record)):
+            for encoded in (*self._encoder.encode(record), *self._view.encode(record)):
                 self._add_message(encoded)
         self._unflushed = True
 

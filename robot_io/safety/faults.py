@@ -25,6 +25,7 @@ class Cause(Enum):
     FOLLOWING_ERROR = "following_error"  # the robot is not where it was sent
     LIMIT = "limit"  # a measured position or speed is outside its limit
     CLEARANCE = "clearance"  # measured positions are in contact with table, floor or robot
+    NO_WAY_HOME = "no_way_home"  # held before table, floor or robot, and no other way to the home pose is clear
     TIMING = "timing"  # commands come too fast, too late, or time goes backwards
     OPERATOR = "operator"  # asked for by a person or a program that supervises
     INTERNAL = "internal"  # a check of our own results failed

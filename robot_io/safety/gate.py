@@ -133,6 +133,11 @@ class SafetyGate:
         return GateState.FAULT if self._latch else self._mode
 
     @property
+    def margins(self) -> np.ndarray:
+        """Smallest gaps (R,) [m] that are kept, in the order of the geometry's rows."""
+        return self._margin.copy()
+
+    @property
     def at_rest(self) -> bool:
         """True when the command in force is zero velocity."""
         return not self._velocity.any()

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 
+from robot_io.contract import PAPER
 from tests.support.lockstep_play import world
 
 AMPLITUDE = np.array([0.1, 0.05, 0.3, 0.1, 0.1, 0.1, 0.2, 0.1])
@@ -46,6 +47,7 @@ def made_up(lag, noise=0.003, gap=0.0, count=30, seed=0):
     moments = np.arange(0.5, count + 2.0, 0.004)
     ball = np.array(balls).T + noise * random.normal(size=(3, len(balls)))
     return SimpleNamespace(
+        robot=PAPER,
         ball=SimpleNamespace(capture_time=np.array(times), position=ball, id=np.array(numbers)),
         joints=SimpleNamespace(time=moments + lag, position=np.array([place(t) for t in moments]).T),
     )

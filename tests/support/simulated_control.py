@@ -50,7 +50,7 @@ class Simulated:
         self.pipe, theirs = multiprocessing.Pipe()
         monkeypatch.setattr(process, "EgmSocket", lambda *_: ArmSocket(self.simulation))
         monkeypatch.setattr(process, "TrackerSocket", lambda *_: FrameSocket(self.simulation))
-        monkeypatch.setattr(process, "linear_axes", lambda _: None)
+        monkeypatch.setattr(process, "linear_axes", lambda *_: None)
         monkeypatch.setattr(process, "AxesThread", lambda _: self.simulation.axes)
         monkeypatch.setattr(realtime, "prepare", lambda *_: [])
         clock = SimpleNamespace(monotonic=lambda: self.simulation.now, sleep=self._sleep)

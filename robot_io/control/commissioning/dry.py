@@ -51,7 +51,7 @@ class DryArm(EgmSession):
 
 @dataclass
 class DryAxes:
-    """Linear axes in thought, for ``AxesThread``; position (2,) [m]."""
+    """Linear axes in thought, for ``AxesThread``; position (axes,) [m]."""
 
     position: np.ndarray
     received: float = 0.0
@@ -69,7 +69,7 @@ class DryAxes:
     def axes(self) -> DryAxes:
         return self
 
-    def pretend(self, now: float) -> None:
+    def cycle(self, now: float) -> None:
         """Report the position at ``now``."""
         self.received = now
 

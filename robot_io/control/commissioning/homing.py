@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from robot_io.contract import PAPER, Contract
+from robot_io.control.commissioning.dry import DryAxes
+from robot_io.devices.festo import AxesThread
+from robot_io.devices.fixed_base import FixedBase
 from robot_io.errors import JogFirstError, RefusedError
 from robot_io.safety.clearance import RobotGeometry
 
@@ -29,6 +34,18 @@ def check_homing(geometry: RobotGeometry, measured: np.ndarray, contract: Contra
             f"axes not homed: somewhere on their way {row} comes as near as {gaps.min():.3f} m, allowed is "
             f"{HOMING_GAP} m; jog the arm to its home pose first"
         )
+
+
+def prepare(axes: AxesThread | DryAxes | FixedBase, check: Callable[[], None]) -> None:
+    """Acknowledge faults, switch on, home what is not homed; ``check`` raises RefusedError where that is not safe."""
+    if axes.axes.fault:
+        axes.acknowledge()
+    axes.enable()
+    if not axes.axes.answering:  # whether they must be homed is not known: a cable was out
+        raise RefusedError("axes not ready: one of them does not answer yet; try again")
+    if not axes.axes.homed:
+        check()
+        axes.home()
 
 
 def towards(target: np.ndarray, at: np.ndarray, speed: np.ndarray, braking: np.ndarray, period: float) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -15,6 +16,7 @@ from experiments.deploy import session as play
 from experiments.errors import ConfigError
 from experiments.finetuning import session as tuning
 from experiments.runs import run_dir
+from mjx_tt.robot.robot import paper
 from robot_io.calibration import contacts
 from robot_io.control.config import RobotConfig
 from robot_io.log.messages import LogError
@@ -85,4 +87,7 @@ def test_fine_tuning_refuses_what_a_session_contradicts(tmp_path, monkeypatch):
     session(folder, "1.json", found, count=20, lag=0.045, lag_deviation=0.001, spread=0.006)
     run = run_dir.Run(tmp_path / "run")
     with pytest.raises(ConfigError, match=r"robot.yaml: calibration.clock.lag .*1.json"):
+        monkeypatch.setattr(
+            tuning.loop, "experiment_of", lambda *_: SimpleNamespace(task=SimpleNamespace(robot=paper()))
+        )
         tuning.finetune("nowhere", FineTuning(), run, "robot.yaml", None, None, "numpy", 0, Console())

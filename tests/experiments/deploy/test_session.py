@@ -22,6 +22,7 @@ from experiments.config import build, robot
 from experiments.deploy import rig as deploy_rig
 from experiments.deploy import session as play
 from experiments.errors import ConfigError, explained
+from mjx_tt.robot import robot as simulated
 from mjx_tt.sim.model import SimModel
 from robot_io import contract, log
 from robot_io.control import process
@@ -216,7 +217,7 @@ def test_arming_that_is_refused_after_a_reset_can_be_tried_again(policy, monkeyp
             simulated.control.run()
 
     def press(pressed):
-        simulated.script.append((0.0, lambda: bridge.estop(pressed, simulation.now)))
+        simulated.script.append((0.0, lambda: bridge.gate.estop(pressed, simulation.now)))
 
     thread = threading.Thread(target=control, daemon=True)
     monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
@@ -360,4 +361,4 @@ def test_rig_that_cannot_start_says_why():
         other.bind(("127.0.0.1", ports.axes[0]))
         other.listen()
         with pytest.raises(DeviceError, match=f"port {ports.axes[0]}"):
-            Rig(deploy_rig.scene(), throws, RigParams(), ports)
+            Rig(str(simulated.paper().scene()), throws, RigParams(), ports)

@@ -176,7 +176,7 @@ def test_sessions_and_other_logs_are_read_together(tmp_path, monkeypatch):
     (folder / "session.mcap").write_bytes(b"as if")
     flown = gap.load_logs([write(tmp_path / "flown.csv", flights(5, seed=1))]).balls
     monkeypatch.setattr(session_logs, "is_session", lambda path: path.suffix == ".mcap")
-    monkeypatch.setattr(session_logs, "load", lambda path: (flown, ()))
+    monkeypatch.setattr(session_logs, "load", lambda path, robot: (flown, ()))
     logs = diagnose.read_logs([str(folder)])
     assert len(logs.balls) == 25 and len(logs.joints) == 1 and len(logs.sources) == 4
 

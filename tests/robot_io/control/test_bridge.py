@@ -73,12 +73,12 @@ def test_arming_is_refused_with_the_reason():
     policy, rig.bridge._policy = rig.bridge._policy, None
     refused(rig, "no policy is loaded")
     rig.bridge._policy = policy
-    rig.bridge.estop(True, rig.now)
+    rig.bridge.gate.estop(True, rig.now)
     with pytest.raises(RefusedError, match="the state is fault"):
         rig.bridge.arm(rig.now)
     with pytest.raises(RefusedError, match="ESTOP"):
         rig.bridge.reset(rig.now)
-    rig.bridge.estop(False, rig.now)
+    rig.bridge.gate.estop(False, rig.now)
     rig.bridge.reset(rig.now)
     rig.bridge.arm(rig.now)
     assert rig.bridge.state is BridgeState.READY
@@ -119,7 +119,7 @@ def go_silent(rig):
 
 
 def press(rig):
-    rig.bridge.estop(True, rig.now)
+    rig.bridge.gate.estop(True, rig.now)
 
 
 def mend_axes(rig):
@@ -148,7 +148,7 @@ EVENTS = {
     "arm's emergency stop": (switch_off, Cause.ARM_NOT_READY, mend_arm, 0.0, "arm"),
     "lost axis": (lose_axis, Cause.AXIS_LOST, mend_axes, 0.035, "bridge"),
     "drive fault": (break_drive, Cause.AXIS_LOST, mend_axes, 0.035, "bridge"),
-    "emergency stop": (press, Cause.ESTOP, lambda rig: rig.bridge.estop(False, rig.now), 0.0, "bridge"),
+    "emergency stop": (press, Cause.ESTOP, lambda rig: rig.bridge.gate.estop(False, rig.now), 0.0, "bridge"),
     "silent tracker": (go_silent, Cause.STALE_TRACKER, lambda rig: rig.cameras.drop_out(0.0), 0.035, "bridge"),
 }
 

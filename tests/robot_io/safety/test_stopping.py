@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from robot_io.contract import LIMITS
-from robot_io.control import bridge
 from robot_io.control.bridge import BridgeState
+from robot_io.control.commissioning import way_home
 from robot_io.log.messages import Event, json_text
 from robot_io.log.recorder import NullRecorder
 from robot_io.safety.faults import Cause
@@ -148,9 +148,9 @@ def test_an_exception_anywhere_brakes_the_robot_and_is_a_fault(part, monkeypatch
     owner = simulation.bridge
     for step in path:
         owner = getattr(owner, step)
-    monkeypatch.setattr(bridge if name == "towards" else owner, name, fail)
+    monkeypatch.setattr(way_home if name == "towards" else owner, name, fail)
     if part == "axes.stop":
-        simulation.bridge.estop(True, simulation.now)
+        simulation.bridge.gate.estop(True, simulation.now)
     answered = len(simulation.replies)
     simulation.run(1.0)
     gate = simulation.bridge.gate
@@ -212,7 +212,7 @@ def test_a_joint_that_is_blocked_while_it_brakes_is_not_pushed_either(stop):
     assert simulation.run(3.0, lambda: simulation.bridge.state is BridgeState.ACTIVE)
     simulation.run(0.25)
     simulation.blocked[0] = True
-    simulation.bridge.stop(simulation.now) if stop == "stop" else simulation.bridge.estop(True, simulation.now)
+    simulation.bridge.stop(simulation.now) if stop == "stop" else simulation.bridge.gate.estop(True, simulation.now)
     simulation.run(1.0)
     _, position, velocity = simulation.replies[-1]
     np.testing.assert_allclose(position, simulation.arm, rtol=0, atol=1e-4)
@@ -228,7 +228,7 @@ def test_an_arm_that_follows_brakes_along_the_way_that_was_proven():
         np.abs(gate.velocity), np.array(LIMITS.acceleration) / 75
     )
     way = gate.braking_way(left)
-    simulation.bridge.estop(True, simulation.now)
+    simulation.bridge.gate.estop(True, simulation.now)
     assert simulation.run(0.5, lambda: gate.at_rest)
     np.testing.assert_allclose(gate.reference, way[:, -1], rtol=0, atol=1e-12)
     simulation.run(0.5)

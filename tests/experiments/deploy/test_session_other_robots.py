@@ -1,0 +1,232 @@
+"""Robots with other joints than the paper's on the rig: real processes, real sockets, and what reads their logs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+
+from experiments.commands import diagnose
+from experiments.config import build
+from experiments.config import robot as robots
+from experiments.deploy import rig as deploy_rig
+from experiments.deploy import session as play
+from experiments.errors import ConfigError
+from experiments.finetuning.robot import LockStepRobot
+from experiments.sharing import recordings
+from experiments.view import measured, show
+from mjx_tt.robot import robot as simulated
+from mjx_tt.sim.model import SimModel
+from robot_io import log
+from robot_io.contract import CONTROL_RATE, PAPER, n_parameters
+from robot_io.control.config import AxisConfig, RobotConfig
+from robot_io.emulator.config import RigParams, for_robot
+from robot_io.errors import RefusedError
+from robot_io.policy import artefact as artefacts
+from robot_io.policy import export
+from robot_io.policy.policy import Policy
+from robot_io.safety.clearance import RobotGeometry
+
+FR3, UR10E = "fr3_pedestal", "ur10e_rail"
+BALLS = 3
+
+
+def small(robot) -> Policy:
+    """Small random weights: the robot moves, and hits nothing on purpose."""
+    contract = robot.contract
+    theta = 0.05 * np.random.default_rng(0).standard_normal(n_parameters(contract.n_joints))
+    return Policy(theta, np.zeros(contract.n_observation), np.ones(contract.n_observation))
+
+
+def exported(folder, name, recorded=None):
+    robot = simulated.load_shipped(name)
+    provenance = {"config": {"balls": "narrow", "robot": name if recorded is None else recorded}}
+    export.write(folder, small(robot), provenance, robot=robot.contract)
+    return folder
+
+
+@pytest.fixture(scope="module", params=[FR3, UR10E])
+def played(request, tmp_path_factory):
+    """A robot, the session that it played on the rig, and its summary."""
+    folder = tmp_path_factory.mktemp("rig")
+    policy = exported(folder / "artefact", request.param)
+    console = Console(record=True, width=200)
+    status = play.run(policy, deploy_rig.RIG, BALLS, None, "numpy", folder / "log", None, 0, None, console)
+    assert status == 0, console.export_text()
+    (path,) = (folder / "log").glob("*.mcap")
+    summary = json.loads((folder / "log" / f"{path.stem}.json").read_text())
+    return simulated.load_shipped(request.param), path, summary
+
+
+@pytest.mark.realtime
+def test_it_plays_over_real_sockets_and_its_log_holds_its_joints(played):
+    robot, path, summary = played
+    contract, session = robot.contract, log.read(path)
+    assert session.robot == contract and len(session.episodes) == summary["episodes"] == BALLS
+    assert summary["egm"]["replies"] > 100 and summary["egm"]["lost"] == 0
+    assert summary["axes_cycles"] is None if not contract.carrying else summary["axes_cycles"] > 100
+    n, position = contract.n_joints, session.joints.position
+    assert position.shape == session.joints.velocity.shape and position.shape[0] == n
+    later = position[:, session.joints.time > session.ticks.time[0] + 5.0]
+    assert np.isfinite(later).all() and (np.ptp(later, axis=1) > 1e-3).all()  # every joint is there and moves
+    low, high = (np.array(values)[:, None] for values in (contract.limits.lower, contract.limits.upper))
+    assert ((later > low) & (later < high)).all()
+    geometry = RobotGeometry.of(contract)
+    gaps = geometry.gaps(later[:, ::10])[geometry.kinds != "floor"]
+    assert gaps.min() > 0.0
+    assert session.observations.values.shape[0] == 3 + n and session.actions.values.shape[0] == n
+    speeds = np.abs(session.commands.sent).max(axis=1)
+    assert (speeds > 0).all() and (speeds <= np.array(contract.limits.velocity)).all()
+    settled = session.commands.reference[:, np.isfinite(session.commands.reference).all(axis=0)]
+    np.testing.assert_allclose(np.median(settled, axis=1), robot.home, atol=0.3)
+
+
+@pytest.mark.realtime
+def test_the_viewers_layout_and_frames_are_the_robots(played):
+    robot, path, summary = played
+    layout = json.loads(open(summary["layout"]).read())
+    labels = [line["label"] for line in layout["configById"]["Plot!commands"]["paths"]]
+    assert labels == [f"{name} sent" for name in robot.contract.joints]
+    films = measured.session(path, SimModel())
+    assert show.robot_of(films) == robot and films.count == BALLS
+    (film,) = films.films(0)
+    assert film.qpos.shape[1] == robot.contract.n_joints and np.isfinite(film.qpos).all()
+
+
+@pytest.mark.realtime
+def test_its_session_is_diagnosed_with_the_robot_and_refused_without(played):
+    robot, path, _ = played
+    found = diagnose.read_logs([str(path)], robot)
+    assert [record.joint for record in found.joints] == list(robot.contract.joints)
+    with pytest.raises(ValueError, match=f"a session of {robot.name}, whose joints .* allowed is {robot.name}"):
+        diagnose.read_logs([str(path)])
+
+
+@pytest.mark.realtime
+def test_its_session_is_exported_with_its_joints(played):
+    robot, path, _ = played
+    recording = recordings.read([str(path)])
+    contract = robot.contract
+    assert recording.robot == f"{robot.name}, emulated"
+    assert recording.features["observation.state"].names == contract.observation_names
+    assert recording.features["sent"].names == contract.joints
+    for episode in recording.episodes:
+        assert episode.columns["observation.state"].shape[1] == contract.n_observation
+        assert episode.columns["action"].shape[1] == contract.n_joints
+
+
+@pytest.mark.realtime
+def test_its_tables_name_its_joints(played, tmp_path):
+    robot, path, _ = played
+    log.export(log.read(path), tmp_path)
+    rows = [line.split(",")[1] for line in (tmp_path / "state.csv").read_text().splitlines()[1:]]
+    assert tuple(dict.fromkeys(rows)) == robot.contract.joints
+
+
+def test_sessions_of_two_robots_are_no_data_set(tmp_path):
+    paths = [made_up(tmp_path, robot) for robot in (simulated.paper(), simulated.load_shipped(FR3))]
+    with pytest.raises(ConfigError, match="a session of fr3_pedestal, .* is one of irb120_gantry"):
+        recordings.sessions(paths)
+
+
+def made_up(folder, robot):
+    """A session of two ticks."""
+    n = robot.contract.n_joints
+    with log.FileRecorder.start(folder, robot.name, {}, robot=robot.contract) as recorder:
+        for k in range(2):
+            now = (k + 1) / CONTROL_RATE
+            recorder.put(log.Joints(now, np.full(n, float(k)), np.zeros(n)), log.Command(k, now, *np.zeros((3, n))))
+            recorder.put(log.Observation(k, now, np.zeros(3 + n)), log.Action(k, now, np.zeros(n)))
+    return folder / f"{robot.name}.mcap"
+
+
+def test_a_log_keeps_the_whole_contract_and_refuses_another_number_of_joints(tmp_path):
+    robot = simulated.load_shipped(FR3)
+    found = log.read(made_up(tmp_path, robot))
+    assert found.robot == robot.contract and found.robot.geometry == robot.contract.geometry
+    with log.FileRecorder.start(tmp_path, "wrong", {}, robot=robot.contract) as recorder:
+        with pytest.raises(log.LogError, match="a record of 8 numbers, the robot's have 7"):
+            recorder.put(log.Action(1, 0.1, np.zeros(8)))
+    with pytest.raises(log.LogError, match="metadata contract: written by the log itself"):
+        log.FileRecorder.start(tmp_path, "hidden", {"contract": "{}"})
+
+
+def test_a_session_of_a_robot_without_its_mjcf_is_not_shown(tmp_path):
+    contract = replace(simulated.load_shipped(FR3).contract, robot="mine")
+    own = SimpleNamespace(name="mine", contract=contract)
+    path = made_up(tmp_path, own)
+    with pytest.raises(ConfigError, match="a session of mine, whose MJCF is not in the log"):
+        measured.session(path, SimModel())
+
+
+def test_the_robot_of_a_policy_must_be_that_of_its_contract(tmp_path):
+    policy = exported(tmp_path / "artefact", FR3, recorded=UR10E)
+    with pytest.raises(ConfigError, match="provenance.config.robot: no more the fr3_pedestal of the policy's contract"):
+        deploy_rig.robot_of(artefacts.load(policy))
+    policy = exported(tmp_path / "nameless", FR3, recorded=7)
+    with pytest.raises(ConfigError, match="provenance.config.robot: got 7; allowed: the content of a robot's YAML"):
+        deploy_rig.robot_of(artefacts.load(policy))
+
+
+def test_a_robot_yaml_for_other_joints_is_refused_by_key(tmp_path):
+    ur10e = simulated.load_shipped(UR10E).contract
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump({"axes": [{"host": "127.0.0.1"}]}))
+    found = robots.load_robot(path, contract=ur10e)
+    assert found.axes == (AxisConfig(),) and len(found.safety.still) == 7
+    with pytest.raises(ConfigError, match="axes: got 1 entries; allowed: 2 for irb120_gantry, gantry_x, gantry_y"):
+        robots.load_robot(path)
+    fr3 = simulated.load_shipped(FR3).contract
+    with pytest.raises(ConfigError, match="axes: got 1 entries; allowed: 0 for fr3_pedestal, which has no linear axes"):
+        robots.load_robot(path, contract=fr3)
+    path.write_text(yaml.safe_dump({"axes": [{}], "axes_motion": {"speed": 1.0}}))
+    with pytest.raises(ConfigError, match=r"axes_motion.speed is 1.0 m/s, rail of ur10e_rail may be asked for 2.0"):
+        robots.load_robot(path, contract=ur10e)
+    path.write_text(yaml.safe_dump({"axes": [{}], "safety": {"still": [0.05] * 8, "overshoot": [0.05] * 8}}))
+    with pytest.raises(ConfigError, match="SafetyConfig.following_error|safety.*8 positive numbers"):
+        robots.load_robot(path, contract=ur10e)
+    with pytest.raises(ValueError, match="axes: got 2 entries"):
+        RobotConfig().check_joints(ur10e)
+
+
+def test_an_arm_that_egm_does_not_carry_is_refused():
+    short = replace(simulated.load_shipped(UR10E).contract, robot="short", carrying=(0, 1))
+    with pytest.raises(ValueError, match="short: its arm has 5 joints; allowed are 6 to 12, which EGM carries"):
+        RobotConfig.of(short).check_joints(short)
+
+
+def test_the_control_process_says_which_robot_it_was_given(tmp_path):
+    policy = exported(tmp_path / "artefact", UR10E)
+    options = play.process.ControlOptions(str(policy))
+    with pytest.raises(RefusedError, match="axes: got 2 entries; allowed: 1 for ur10e_rail, rail"):
+        play.Session(RobotConfig(), options, Console())
+
+
+def test_a_rig_reacts_as_late_as_the_robots_yaml_says_unless_rig_yaml_does(tmp_path):
+    robot = simulated.load_shipped(FR3)
+    found = robots.load_rig(None, robot)
+    assert found.arm.feedback_delay == 0.005 and found.arm.dead_time == pytest.approx(0.004)
+    assert found.arm.upper == robot.contract.limits.upper and robots.load_rig(None) == RigParams()
+    path = tmp_path / "rig.yaml"
+    path.write_text("arm: {dead_time: 0.03}\n")
+    assert robots.load_rig(path, robot).arm.dead_time == 0.03
+    path.write_text("hidden: {joint_zeros: [0.01, 0, 0, 0, 0, 0]}\n")
+    with pytest.raises(ConfigError, match="rig.yaml: hidden.joint_zeros .* allowed for fr3_pedestal are zeros"):
+        robots.load_rig(path, robot)
+    params = replace(RigParams().arm, max_speed=(1.0,) * 6)
+    with pytest.raises(ValueError, match="arm.max_speed is .* those of fr3_pedestal are its YAML's"):
+        for_robot(replace(RigParams(), arm=params), robot.contract)
+    assert for_robot(RigParams(), PAPER) == RigParams()
+
+
+def test_an_episode_of_fine_tuning_in_lock_step():
+    robot = simulated.load_shipped(FR3)
+    throws = robots.throws_of(build.distribution("narrow", "test"), SimModel(), 8, 0)
+    learner = LockStepRobot(throws, robots.load_rig(None, robot), robot.scene(), robot.contract)
+    ball = learner.play(small(robot), 0)
+    assert not ball.summary.fault and ball.trajectory.shape[0] > 10 and learner.describe()["joints"] == FR3
