@@ -65,7 +65,7 @@ def score(truth: dict, verdict: dict) -> dict:
 
 
 def _leads(accepted: dict[str, set[str]], verdict: dict) -> str | None:
-    """"right" or "wrong" where a cause leads beside what is unexplained, so that the extended model holds it."""
+    """ "right" or "wrong" where a cause leads beside what is unexplained, so that the extended model holds it."""
     if verdict["verdict"] != "unexplained" or NOT_ADOPTED in verdict["warnings"] or not verdict["causes"]:
         return None
     groups = [{c["name"], *c.get("group", ())} for c in verdict["causes"]]
