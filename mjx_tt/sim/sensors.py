@@ -130,7 +130,7 @@ class Lag:
         """A filter that has watched a flight, measured every ``dt`` [s]: no lag. memory [s]."""
         zero = jnp.zeros_like(like)
         h = jnp.broadcast_to(_interval(dt, memory), zero.shape[1:])
-        covariance = h * jnp.stack([jnp.full_like(h, x) for x in SETTLED])
+        covariance = jnp.asarray(row(h) * jnp.stack([jnp.full_like(h, x) for x in SETTLED]))
         for _ in range(ROUNDS):
             grown = _grown(covariance, h, h)
             covariance = _measured(grown, _gains(grown))
@@ -155,14 +155,14 @@ class Lag:
         grown = _grown(self.covariance, _interval(dt, memory), h)
         opened = jnp.stack([grown[0] + FRESH, *grown[1:3], grown[3] + FRESH / h**2, grown[4], grown[5] + FRESH / h**4])
         gains = [shut * a + (1.0 - shut) * b for a, b in zip(_gains(grown), _gains(opened), strict=True)]
-        covariance = shut * _measured(grown, _gains(grown)) + (1.0 - shut) * _measured(opened, _gains(opened))
+        mixed = row(shut) * _measured(grown, _gains(grown)) + row(1.0 - shut) * _measured(opened, _gains(opened))
         time = jnp.maximum(memory, SHORTEST)
-        there = memory > 0.0
+        there = row(memory) > 0.0
         return Lag(
             jnp.where(there, row(1.0 - gains[0]) * self.position, 0.0),
             jnp.where(there, self.velocity - row(gains[1] / time) * self.position, 0.0),
             jnp.where(there, self.acceleration - row(gains[2] / time**2) * self.position, 0.0),
-            covariance,
+            jnp.asarray(mixed),
         )
 
 
@@ -194,7 +194,7 @@ def _grown(covariance: Covariance, h: Scalars, usual: Scalars) -> Covariance:
 
 def _gains(grown: Covariance) -> Array:
     """Gains (3, ...) of position, velocity and acceleration: P H' / (H P H' + 1)."""
-    return grown[:3] / (grown[0] + 1.0)
+    return jnp.asarray(grown[:3] / row(grown[0] + 1.0))
 
 
 def _measured(grown: Covariance, gains: Array) -> Covariance:
