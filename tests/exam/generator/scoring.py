@@ -11,7 +11,6 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import beta, binom
 
-from mjx_tt.diagnosis.verdict import NOT_ADOPTED
 from tests.exam.generator.cases import EFFECTS
 
 PEOPLE = "human_single human_pair human_deleted human_invented"
@@ -66,7 +65,9 @@ def score(truth: dict, verdict: dict) -> dict:
 
 def _leads(accepted: dict[str, set[str]], verdict: dict) -> str | None:
     """ "right" or "wrong" where a cause leads beside what is unexplained, so that the extended model holds it."""
-    if verdict["verdict"] != "unexplained" or NOT_ADOPTED in verdict["warnings"] or not verdict["causes"]:
+    if verdict["verdict"] != "unexplained" or not verdict["causes"]:
+        return None
+    if any("the extended model does not hold them" in warning for warning in verdict.get("warnings", ())):
         return None
     groups = [{c["name"], *c.get("group", ())} for c in verdict["causes"]]
     return "right" if all(any(names & g for names in accepted.values()) for g in groups) else "wrong"
