@@ -146,8 +146,8 @@ class Loop:
         return Step(f"seed{seed}/reality", "seal", 1, (), (path,), run)
 
     def _reality(self, seed: int) -> dict[str, Any]:
-        without = tuple(self.study.reality.without)
-        return realities.content(realities.draw(seed, without), seed, without)
+        without, outside = tuple(self.study.reality.without), tuple(self.study.reality.outside)
+        return realities.content(realities.draw(seed, without, outside), seed, without, outside)
 
     def _open(self, seed: int) -> Step:
         sealed, path = (self.seed_folder(seed) / f"reality.{kind}" for kind in ("sealed", "yaml"))
