@@ -16,18 +16,25 @@ from typing import Any
 
 import numpy as np
 
+from ballmodel.io import read
 from ballmodel.io.atomic_files import replacing
+from ballmodel.trajectory import Dataset, Trajectory
+from experiments import measurements
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis import Diagnosis
 from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR
-from mjx_tt.diagnosis.joint import JointRecord
+from mjx_tt.diagnosis.hits.paddle_path import JointPath, joint_path
+from mjx_tt.diagnosis.hits.posterior import HitPosterior, settle
+from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.sim import model as models
-from mjx_tt.sim.model import ModelFile
+from mjx_tt.sim.model import ModelFile, SimModel
 from mjx_tt.sim.randomisation import Randomised, Samples
 from robot_io.contract import JOINT_NAMES
 
+BALLS, CLOCK = "balls.csv", 1e6  # [s] by which the clocks of several folders of hits are set apart
+BALL_DELAY = "latency.ball_observation"
 LIFT = "ball.flight.magnus_coefficient"
 # The frame is the table's: bounces that lie too high are a camera that sees high, not a table that stands there.
 HEIGHT, SEEN_HIGH = "ball.table.height", "sensing.ball_offset_z"
@@ -40,12 +47,12 @@ def prior(data: Mapping[str, Any], where: str) -> tuple[Randomised, ...]:
 
 
 def identify(
-    logs: Sequence[Path], most: int, believed: ModelFile, before: Sequence[Randomised]
+    logs: Sequence[Path], most: int, believed: ModelFile, before: Sequence[Randomised], hits: Sequence[Path] = ()
 ) -> tuple[ModelFile, Diagnosis]:
     """The world to train in after these logs, and the diagnosis behind it.
 
     most: balls that are looked at; believed: the model so far; before: ranges of what may be wrong of it, used where
-    the logs say nothing. Raises ValueError naming the log at fault.
+    the logs say nothing; hits: folders that ``write_hits`` made. Raises ValueError naming the log at fault.
     """
     read = diagnosis.load_logs([str(path) for path in logs])
     if len(read.balls) > most:
@@ -59,9 +66,57 @@ def identify(
     extended, settled = _in_the_tables_frame(found.extended), _settled(found)
     settled |= {SEEN_HIGH} if HEIGHT in settled else set()
     left = tuple(one for one in before if not set(one.paths) <= settled)
+    drawn = [one for one in extended.randomise if isinstance(one, Samples)]
+    ranges = {path: (ends[0], ends[1]) for one in left for path, ends in one.ends().items()}
+    shown = _of_hits(found, hits, extended.model, ranges)
+    if shown is not None:
+        left = tuple(one for one in left if not set(one.paths) & set(shown.paths))
+        settled |= set(shown.paths)
+        values = dict(zip(shown.paths, shown.mean.tolist(), strict=True))
+        joined = _joined([*drawn, shown.samples(ranges)])
+        others = tuple(one for one in extended.randomise if one not in drawn and not set(one.paths) & set(shown.paths))
+        extended = replace(extended, model=models.with_values(extended.model, values), randomise=(joined, *others))
     own = {path for one in left for path in one.paths}
     kept = tuple(one for one in believed.randomise if not set(one.paths) & (settled | own))
     return replace(extended, randomise=(*extended.randomise, *left, *kept)), found
+
+
+def _of_hits(
+    found: Diagnosis, folders: Sequence[Path], world: SimModel, ranges: Mapping[str, tuple[float, float]]
+) -> HitPosterior | None:
+    """What hits say of what is still drawn from its range; None without hits, or where the flights are unexplained."""
+    if not folders or found.balls is None or not ranges:
+        return None
+    balls: list[Trajectory] = []
+    paths: list[JointPath] = []
+    for i, folder in enumerate(folders):
+        later = CLOCK * i
+        data, joints = read(folder / BALLS), read_robot_csv(*(folder / name for name in ROBOT_FILES))
+        if not isinstance(data, Dataset):
+            raise ValueError(f"{folder / BALLS}: holds no trajectories")
+        balls += [replace(t, time=t.time + later) for t in data.trajectories]
+        path = joint_path(joints, world)
+        if path is None:
+            raise ValueError(f"{folder}: not all joints are in it; hits need all eight")
+        paths.append(JointPath(tuple(t + later for t in path.time), path.position))
+    times, places = (
+        tuple(map(np.concatenate, zip(*(getattr(path, name) for path in paths), strict=True)))
+        for name in ("time", "position")
+    )
+    prior = {path: (0.5 * (low + high), (high - low) / 12**0.5) for path, (low, high) in ranges.items()}
+    if BALL_DELAY in prior:
+        # The joints' delay shows in sums with their commands' alone, where it is taken as believed: by how much it is
+        # not, the ball's seems to differ.
+        mean, deviation = prior[BALL_DELAY]
+        prior[BALL_DELAY] = mean, 2**0.5 * deviation
+    return settle(found.balls, balls, JointPath(times, places), prior)
+
+
+def _joined(parts: Sequence[Samples]) -> Samples:
+    """Independent samples side by side: rows of each in a random order, as many as the longest has."""
+    rng, rows = np.random.default_rng(0), max(len(one.weight) for one in parts)
+    picked = [one.values[rng.choice(len(one.weight), rows, p=one.weight / one.weight.sum())] for one in parts]
+    return Samples(tuple(p for one in parts for p in one.paths), np.concatenate(picked, axis=1), np.ones(rows))
 
 
 def _in_the_tables_frame(world: ModelFile) -> ModelFile:
@@ -92,6 +147,12 @@ def _settled(found: Diagnosis) -> set[str]:
         if set(sound) == set(JOINT_NAMES):
             settled |= {path for path in models.paths() if path.startswith(OF_ALL_JOINTS)}
     return settled
+
+
+def write_hits(folder: Path, balls: Dataset, records: Collection[JointRecord]) -> None:
+    """Writes balls with their hits, and the joints by the same clock, into a folder."""
+    write_joints(folder, records)
+    measurements.write_csv(folder / BALLS, balls)
 
 
 def write_joints(folder: Path, records: Collection[JointRecord]) -> None:

@@ -187,9 +187,14 @@ def measure(model: SimModel, balls: BallState, noise: float, key: PRNGKeyArray) 
     n = balls.position.shape[1]
     padded = jax.tree.map(lambda x: jnp.pad(jnp.asarray(x, jnp.float32), ((0, 0), (0, -n % 256)), mode="edge"), balls)
     positions, length = _fly(without_nominal(model.ball), padded, round(_LONGEST * CAMERA_RATE))
-    seen, camera = jnp.moveaxis(positions, 1, 0), sensors.camera(model.sensing)
-    if camera is not None:
-        seen = camera.seen(seen)
+    tracked = seen(model, jnp.moveaxis(positions, 1, 0), noise, key)
+    return Measured(np.moveaxis(tracked, 0, 1)[..., :n], np.asarray(length)[:n])
+
+
+def seen(model: SimModel, position: Array | np.ndarray, noise: float, key: PRNGKeyArray) -> np.ndarray:
+    """Positions (3, ...) [m] as the reality's cameras give them: calibration and noise [m]."""
+    camera = sensors.camera(model.sensing)
+    place = jnp.asarray(position) if camera is None else camera.seen(jnp.asarray(position))
     offset = jnp.array([getattr(model.sensing, f"ball_offset_{axis}") for axis in "xyz"])
-    seen = seen + offset[:, None, None] + noise * jax.random.normal(key, seen.shape)
-    return Measured(np.moveaxis(np.asarray(seen, np.float64), 0, 1)[..., :n], np.asarray(length)[:n])
+    offset = offset.reshape((3,) + (1,) * (place.ndim - 1))
+    return np.asarray(place + offset + noise * jax.random.normal(key, place.shape), np.float64)

@@ -1,0 +1,117 @@
+"""What hits say of rubber, delay of the ball, encoders' zeros and the camera's sideways offset, all of them together.
+
+None of these shows in a ball before its hit or in the joints alone, and none can be told apart in a single hit; they
+are ordinary sizes of what every installation has. So nothing is named here: each has a prior, and the maximum of the
+posterior is sought by Gauss-Newton on the returns' place and velocity behind the paddle. The spread from hit to hit is
+the noise, as in ``diagnose``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from ballmodel.trajectory import Trajectory
+from mjx_tt.diagnosis.ball.diagnose import BallFindings
+from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading
+from mjx_tt.diagnosis.ball.flights.forward_model import grid, predict
+from mjx_tt.diagnosis.ball.flights.linearization import BallProblem
+from mjx_tt.diagnosis.hits.diagnose import FARTHEST, FEWEST_HITS, line_behind, spread, watched_hits
+from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses
+from mjx_tt.sim.randomisation import Samples
+from robot_io.contract import JOINT_NAMES
+
+PADDLE = ("ball.paddle.restitution", "ball.paddle.tangential_gain", "latency.ball_observation")
+CAMERA = ("sensing.ball_offset_x", "sensing.ball_offset_y")
+ZEROS = tuple(f"drives.{joint}.joint_offset" for joint in JOINT_NAMES)
+SHOWN = (*PADDLE, *CAMERA, *ZEROS)  # by hits, and by no other log
+STEP = 0.05  # of a prior's deviation, by which derivatives are taken
+ROUNDS = 4
+SETTLED = 0.1  # deviations
+DRAWS = 256
+Prior = Mapping[str, tuple[float, float]]  # mean and standard deviation by dotted path
+
+
+@dataclass(frozen=True)
+class HitPosterior:
+    """Gaussian posterior of parameters by dotted path; zeros as measured less true position."""
+
+    paths: tuple[str, ...]
+    mean: Float[np.ndarray, " P"]
+    covariance: Float[np.ndarray, "P P"]
+    hits: int
+
+    def samples(self, ranges: Mapping[str, tuple[float, float]], seed: int = 0) -> Samples:
+        """Draws, kept within the ranges given by path."""
+        drawn = np.random.default_rng(seed).multivariate_normal(self.mean, self.covariance, DRAWS, method="eigh")
+        low, high = (np.array([ranges[path][end] for path in self.paths]) for end in (0, 1))
+        return Samples(self.paths, np.clip(drawn, low, high), np.ones(DRAWS))
+
+
+def settle(
+    found: BallFindings, trajectories: Sequence[Trajectory], path: JointPath | None, prior: Prior
+) -> HitPosterior | None:
+    """The posterior after the hits among the trajectories; None where there are fewer than FEWEST_HITS of them.
+
+    found: of the balls before their hits, whose causes are taken as settled. path: of the joints on the balls' clock,
+    with the zeros that were reported. prior: of those of ``SHOWN`` that are sought; the others stay as they are.
+    """
+    pairs = watched_hits(trajectories, path)
+    if len(pairs) < FEWEST_HITS or path is None:
+        return None
+    names = tuple(name for name in SHOWN if name in prior)
+    whole, before = [t for t, _ in pairs], np.array([n for _, n in pairs])
+    g = grid(whole)
+    incoming = np.arange(len(g.time))[:, None] < before[None]
+    problem = BallProblem(g, found.problem.model, found.problem.effects, heading(g))
+    theta, spins = found.situation.theta, found.choice.prior
+    start = first_fit(problem, theta, None if spins is None else spins.mean, incoming)
+    if spins is not None:  # the spin that a ball's own flight and bounce show decides where the rubber sends it
+        start = fit_starts(problem, theta, start, replace(g, mask=g.mask & incoming), None, spins)
+    settled, out = problem.values(theta[:, None, None]), g.mask & ~incoming
+
+    def seen(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Measured positions (3, T, n) that the model plays, and when each is hit (n,)."""
+        at = dict(zip(names, values, strict=True))
+        zeros = [at.get(name, 0.0) for name in ZEROS]
+        moved = JointPath(path.time, tuple(q - zero for q, zero in zip(path.position, zeros, strict=True)))
+        changed, begin = dict(settled), start.copy()
+        for name in (*PADDLE, *CAMERA):
+            if name in at:
+                changed[name] = np.full((1, 1), at[name])
+        for i, name in enumerate(CAMERA):  # the ball is where the camera's offset puts it
+            begin[i] -= at.get(name, problem.nominal[name]) - problem.nominal[name]
+        flown = predict(problem.model, changed, begin[:, None], replace(g, paddle=poses(whole, g.steps, moved)), axes)
+        return flown.measured[:, :, 0], flown.hit_time[0]
+
+    axes = problem.axes
+    mean, deviation = np.array([prior[name] for name in names]).T
+    values, precision = mean.copy(), np.diag(deviation**-2.0)
+    for _ in range(ROUNDS):
+        base, hit = seen(values)
+        behind = line_behind(g, out, hit)
+        y = behind(np.where(out, g.measured - base, 0.0))
+        usable = np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)
+        columns = []
+        for i, size in enumerate(STEP * deviation):
+            other, met = seen(values + size * np.eye(len(values))[i])
+            columns.append(behind(np.where(out, other - base, 0.0)) / size)
+            usable &= np.isfinite(met)
+        if usable.sum() < FEWEST_HITS:
+            return None
+        jacobian, y = np.array(columns)[:, :, usable], y[:, usable]
+        change = np.zeros(len(values))
+        for _ in range(ROUNDS):  # the noise is what the change leaves over
+            root, weight = spread(y - np.einsum("kcn,k->cn", jacobian, change))
+            j = np.einsum("cd,kdn->kcn", root, jacobian) * np.sqrt(weight)
+            gram = np.einsum("kcn,lcn->kl", j, j) + precision
+            right = np.einsum("kcn,cn->k", j, root @ y * np.sqrt(weight)) + precision @ (mean - values)
+            covariance = np.linalg.inv(gram)
+            change = covariance @ right
+        values = values + change
+        if np.max(np.abs(change) / np.sqrt(np.diagonal(covariance))) < SETTLED:
+            break
+    return HitPosterior(names, values, covariance, int(usable.sum()))
