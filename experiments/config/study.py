@@ -119,6 +119,7 @@ PRIOR: dict[str, Any] = {
     "ball.paddle.tangential_gain": [0.5, 0.86],
     "ball.table.restitution": [0.88, 0.98],
     "ball.table.friction": [0.12, 0.38],
+    "ball.flight.drag_coefficient": [0.42, 0.52],  # 0.46 to 0.49 of several sources, air from 0 to 30 degrees
     "ball.flight.magnus_coefficient": [0.0, 1.5],
     "ball.flight.spin_decay": [0.0, 0.12],
     **{f"sensing.ball_offset_{axis}": [-0.015, 0.015] for axis in "xyz"},

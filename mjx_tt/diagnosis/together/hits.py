@@ -10,17 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float
 
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading
 from mjx_tt.diagnosis.ball.flights.forward_model import grid, predict
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem
 from mjx_tt.diagnosis.hits.diagnose import FARTHEST, FEWEST_HITS, line_behind, spread, watched_hits
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses
+from mjx_tt.diagnosis.together.balls import LIFT_ERROR, BallsTogether
 from mjx_tt.sim.randomisation import Samples
 from robot_io.contract import JOINT_NAMES
 
@@ -28,6 +29,7 @@ PADDLE = ("ball.paddle.restitution", "ball.paddle.tangential_gain", "latency.bal
 CAMERA = ("sensing.ball_offset_x", "sensing.ball_offset_y")
 ZEROS = tuple(f"drives.{joint}.joint_offset" for joint in JOINT_NAMES)
 SHOWN = (*PADDLE, *CAMERA, *ZEROS)  # by hits, and by no other log
+LIFT = "lift"  # error of its coefficient, along which the balls' parameters go
 STEP = 0.05  # of a prior's deviation, by which derivatives are taken
 ROUNDS = 4
 SETTLED = 0.1  # deviations
@@ -36,49 +38,56 @@ Prior = Mapping[str, tuple[float, float]]  # mean and standard deviation by dott
 
 
 @dataclass(frozen=True)
-class HitPosterior:
-    """Gaussian posterior of parameters by dotted path; zeros as measured less true position."""
+class HitsTogether:
+    """Gaussian posterior of parameters by dotted path, and last of LIFT; zeros as measured less true position."""
 
     paths: tuple[str, ...]
     mean: Float[np.ndarray, " P"]
     covariance: Float[np.ndarray, "P P"]
     hits: int
 
-    def samples(self, ranges: Mapping[str, tuple[float, float]], seed: int = 0) -> Samples:
-        """Draws, kept within the ranges given by path."""
+    def samples(
+        self, ranges: Mapping[str, tuple[float, float]], seed: int = 0
+    ) -> tuple[Samples, Float[np.ndarray, " S"]]:
+        """Draws, kept within the ranges given by path; and the error of the balls' lift in each of them."""
         drawn = np.random.default_rng(seed).multivariate_normal(self.mean, self.covariance, DRAWS, method="eigh")
-        low, high = (np.array([ranges[path][end] for path in self.paths]) for end in (0, 1))
-        return Samples(self.paths, np.clip(drawn, low, high), np.ones(DRAWS))
+        low, high = (np.array([ranges[path][end] for path in self.paths[:-1]]) for end in (0, 1))
+        return Samples(self.paths[:-1], np.clip(drawn[:, :-1], low, high), np.ones(DRAWS)), drawn[:, -1]
 
 
-def settle(
-    found: BallFindings, trajectories: Sequence[Trajectory], path: JointPath | None, prior: Prior
-) -> HitPosterior | None:
+def fit(
+    balls: BallsTogether, trajectories: Sequence[Trajectory], path: JointPath | None, prior: Prior
+) -> HitsTogether | None:
     """The posterior after the hits among the trajectories; None where there are fewer than FEWEST_HITS of them.
 
-    found: of the balls before their hits, whose causes are taken as settled. path: of the joints on the balls' clock,
+    balls: what flights before a hit say, which is taken as settled but for the lift. path: of the joints on the balls' clock,
     with the zeros that were reported. prior: of those of ``SHOWN`` that are sought; the others stay as they are.
     """
     pairs = watched_hits(trajectories, path)
     if len(pairs) < FEWEST_HITS or path is None:
         return None
-    names = tuple(name for name in SHOWN if name in prior)
+    prior = {**prior, LIFT: (0.0, LIFT_ERROR)}
+    names = (*(name for name in SHOWN if name in prior), LIFT)
     whole, before = [t for t, _ in pairs], np.array([n for _, n in pairs])
     g = grid(whole)
     incoming = np.arange(len(g.time))[:, None] < before[None]
-    problem = BallProblem(g, found.problem.model, found.problem.effects, heading(g))
-    theta, spins = found.situation.theta, found.choice.prior
-    start = first_fit(problem, theta, None if spins is None else spins.mean, incoming)
-    if spins is not None:  # the spin that a ball's own flight and bounce show decides where the rubber sends it
-        start = fit_starts(problem, theta, start, replace(g, mask=g.mask & incoming), None, spins)
-    settled, out = problem.values(theta[:, None, None]), g.mask & ~incoming
+    problem = BallProblem(g, balls.problem.model, balls.problem.effects, heading(g))
+    theta, spins = balls.posterior.theta, replace(balls.spins, own_mean=None, own_covariance=None)
+    # The spin that a ball's own flight and bounce show decides where the rubber sends it.
+    first, before_hit = first_fit(problem, theta, spins.mean, incoming), replace(g, mask=g.mask & incoming)
+    out = g.mask & ~incoming
+
+    @cache
+    def started(lift: float) -> np.ndarray:
+        return fit_starts(problem, balls.along_lift(lift), first, before_hit, None, spins)
 
     def seen(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Measured positions (3, T, n) that the model plays, and when each is hit (n,)."""
         at = dict(zip(names, values, strict=True))
         zeros = [at.get(name, 0.0) for name in ZEROS]
         moved = JointPath(path.time, tuple(q - zero for q, zero in zip(path.position, zeros, strict=True)))
-        changed, begin = dict(settled), start.copy()
+        changed = problem.values(balls.along_lift(float(at[LIFT]))[:, None, None])
+        begin = started(float(at[LIFT])).copy()
         for name in (*PADDLE, *CAMERA):
             if name in at:
                 changed[name] = np.full((1, 1), at[name])
@@ -114,4 +123,4 @@ def settle(
         values = values + change
         if np.max(np.abs(change) / np.sqrt(np.diagonal(covariance))) < SETTLED:
             break
-    return HitPosterior(names, values, covariance, int(usable.sum()))
+    return HitsTogether(names, values, covariance, int(usable.sum()))
