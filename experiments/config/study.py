@@ -125,6 +125,7 @@ PRIOR: dict[str, Any] = {
     **{f"sensing.ball_offset_{axis}": [-0.015, 0.015] for axis in "xyz"},
     **{f"sensing.camera_rotation_{axis}": [-0.01, 0.01] for axis in "xyz"},
     "sensing.camera_scale": [0.994, 1.006],
+    "sensing.ball_noise": [0.002, 0.015],  # of a tracker; training's own 40 mm is a precaution
     "latency.ball_observation": [0.024, 0.056],
     "latency.abb_observation": [0.013, 0.045],
     "latency.festo_observation": [0.015, 0.051],

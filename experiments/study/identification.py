@@ -1,8 +1,8 @@
 """The simulation as a round's measurements have it: the world that the next training believes in.
 
-Balls across the table, a minute of joint motion and, after the first play, hits: all parameters are fitted at once, each
-with its prior (``mjx_tt.diagnosis.together``). What the logs leave open of them is drawn for every episode as samples;
-what no log shows is drawn from a stated prior. Nothing here knows the reality.
+Balls across the table, a minute of joint motion and, after the first play, hits: all parameters are fitted at once,
+each with its prior (``mjx_tt.diagnosis.together``). What the logs leave open of them is drawn for every episode as
+samples; what no log shows is drawn from a stated prior. Nothing here knows the reality.
 """
 
 from __future__ import annotations
@@ -93,7 +93,8 @@ def identify(
     own = settled | {one.path for one in before}
     others += [one for one in believed.randomise if not set(one.paths) & own]
     middle = dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
-    world = ModelFile(models.with_values(flown.model(), middle), (samples, *others))
+    made_of = {"flights": flown.problem.grid.n, "hits": 0 if struck is None else struck.hits, "joints": driven.left}
+    world = ModelFile(models.with_values(flown.model(), middle), (samples, *others), {"identified": made_of})
     return Identified(world, flown.problem.grid.n, 0 if struck is None else struck.hits, driven.left)
 
 
@@ -112,7 +113,7 @@ def _of_hits(
     paths: list[JointPath] = []
     for i, folder in enumerate(folders):
         later = CLOCK * i
-        data, joints = read(folder / BALLS), read_robot_csv(*(folder / name for name in ROBOT_FILES))
+        data, joints = read(folder / BALLS), read_robot_csv(folder / ROBOT_FILES[0], folder / ROBOT_FILES[1])
         if not isinstance(data, Dataset):
             raise ValueError(f"{folder / BALLS}: holds no trajectories")
         balls += [replace(t, time=t.time + later) for t in data.trajectories]

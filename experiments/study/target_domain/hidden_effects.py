@@ -61,9 +61,9 @@ _ENCODERS = {
 #   magnus   k 0.65 fitted to SpinDOE's measured spins; others 0 (the paper), 0.32, 1.33, 1.47
 #   latency  the paper's means +- 1.5 of the deviations in its table; from the actions half of the lags' range is taken
 #            off, since a delay that is measured from command to motion has it in it
-#   drives   lag: a second filter as slow as the servo's (EGM's default low-pass has 8 ms), or twice as slow; gain within
-#            5 %; encoders: an axis with its nominal feed constant is off by 4.4 mm over 2 m (CMMP manual), the arm 0.7
-#            degrees; camera: within a centimetre, half a degree, half a per cent (estimates)
+#   drives   lag: a second filter up to twice as slow as the servo's (EGM's default low-pass has 8 ms); gain within 5 %
+#   encoders an axis with its nominal feed constant is off by 4.4 mm over 2 m (CMMP manual), the arm by 0.7 degrees
+#   camera   within a centimetre, half a degree, half a per cent (estimates)
 RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "rubber": {"ball.paddle.restitution": (0.847, 0.987), "ball.paddle.tangential_gain": (0.56, 0.80)},
     "table": {"ball.table.restitution": (0.895, 0.965), "ball.table.friction": (0.15, 0.35)},
@@ -88,9 +88,9 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
 # What neither training's parameters nor the prior of an identification have, in place of what they have for it.
 #   lift     C_L = S / (0.55 + 3.55 S) within 10 %, fitted to 1,597 shots with measured spin (``aerodynamics``); the
 #            diagnosis has an entry for saturation
-#   bounce   restitution falls with speed: the table's by a tenth to a quarter over 10 m/s (estimate; the diagnosis has an
-#            entry for it), the rubber's half as fast as that of the racket training has (slopes 0.007 to 0.018 of other
-#            rackets, github.com/gossardt/tt_rackets)
+#   bounce   restitution falls with speed: the table's by a tenth to a quarter over 10 m/s (estimate; the diagnosis has
+#            an entry for it), the rubber's less than that of training's racket (0.007 to 0.018 s/m of other rackets,
+#            github.com/gossardt/tt_rackets)
 #   blade    a sweet spot: at its rim the blade returns less of the speed (estimate)
 #   mount    the arm's base and wrist bend: resonances of 10 to 20 Hz; the encoders do not see it
 OUTSIDE: dict[str, dict[str, tuple[float, float]]] = {

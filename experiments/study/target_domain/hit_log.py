@@ -20,6 +20,8 @@ from jaxtyping import Float, PRNGKeyArray
 
 from ballmodel import flight
 from ballmodel.constants import BALL_RADIUS
+from ballmodel.flight import PaddlePose
+from ballmodel.state import BallState
 from ballmodel.trajectory import Dataset, Trajectory
 from experiments.study.target_domain import hidden_effects
 from experiments.study.target_domain.hidden_effects import CAMERA_RATE
@@ -67,7 +69,7 @@ def record(
     policy = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[..., None], lanes, axis=-1), policy)
     state, task = simulator.start(player, model, start_key, lanes), simulator.task
     balls: list[Trajectory] = []
-    states: list[tuple[np.ndarray, ...]] = []
+    states: list[_States] = []
     for turn in range(turns):
         turn_key = jax.random.fold_in(play_key, turn)
         episodes = simulator.episodes(turn_key, model, state)
@@ -81,32 +83,40 @@ def record(
             late = float(latency[0, lane]) - SimModel().latency.ball_observation
             count = _in_sight(watched[0][..., lane])
             time = begin + late + np.arange(count) / CAMERA_RATE
-            balls.append(Trajectory(session, str(len(balls)), time, seen[:, :count, lane]))
-            states.append((begin, latency[:, lane], *(x[..., lane] for x in watched[1:])))
+            balls.append(Trajectory(session, str(len(balls)), np.asarray(time), seen[:, :count, lane]))
+            commands, encoders = (np.asarray(x)[..., lane] for x in watched[1:])
+            states.append(_States(begin, latency[:, lane], commands, encoders))
     return HitLog(Dataset(tuple(balls), session), _records(task, model, states))
 
 
-def _in_sight(position: Float[np.ndarray, "3 T"]) -> int:
+@dataclass(frozen=True)
+class _States:
+    """The joints during one ball."""
+
+    begin: float  # [s] on the log's clock
+    latency: np.ndarray  # (5,) [s]
+    command: np.ndarray  # (ticks, 8) by control period
+    encoder: np.ndarray  # (8, T) true positions at ENCODER_RATE
+
+
+def _in_sight(position: Float[np.ndarray, "3 frames"]) -> int:
     """Frames until a ball lies low, passes the robot or comes back to where it was hit."""
     x, y, z = position
     gone = (z < BALL_RADIUS - 0.05) | (y < -2.3) | (y > y[0] + AWAY)
     return int(np.argmax(gone)) if gone.any() else len(gone)
 
 
-def _records(task: Task, model: SimModel, states: list[tuple]) -> tuple[JointRecord, ...]:
+def _records(task: Task, model: SimModel, states: list[_States]) -> tuple[JointRecord, ...]:
     """What encoders reported over all balls: positions (8, T) between the control periods, and the commands."""
     period, records = task.config.period, []
     for i, name in enumerate(task.contract.joints):
         zero = 0.0 if model.drives is None else getattr(model.drives, name).joint_offset or 0.0
-        festo = i in FESTO_JOINTS
-        command_time, command, time, position = [], [], [], []
-        for begin, latency, commands, encoders in states:
-            command_time.append(begin + period * np.arange(commands.shape[0]))
-            command.append(commands[:, i])
-            time.append(begin + np.arange(encoders.shape[1]) / ENCODER_RATE + latency[2 if festo else 1])
-            position.append(encoders[i] + zero)
-        columns = (np.concatenate(x).astype(float) for x in (command_time, command, time, position))
-        records.append(JointRecord(name, *columns, task.config.robot))
+        late = 2 if i in FESTO_JOINTS else 1
+        command_time = np.concatenate([one.begin + period * np.arange(len(one.command)) for one in states])
+        ticks = [np.arange(one.encoder.shape[1]) / ENCODER_RATE + one.begin + one.latency[late] for one in states]
+        command = np.concatenate([one.command[:, i] for one in states])
+        position = np.concatenate([one.encoder[i] + zero for one in states])
+        records.append(JointRecord(name, command_time, command, np.concatenate(ticks), position, task.config.robot))
     return tuple(records)
 
 
@@ -128,14 +138,16 @@ def _watched(policy: Policy, episodes: Episodes, task: Task) -> tuple[Array, Arr
     swing = jnp.concatenate([jnp.zeros((1, *swing.shape[1:])), swing])
     frames, rate = round(SECONDS * CAMERA_RATE), CAMERA_RATE * SUBSTEPS
     time = jnp.arange(frames * SUBSTEPS + 1) / rate
-    bent = [a + b for a, b in zip(_between(q, v, time, task), _between(swing[:, 0], swing[:, 1], time, task))]
+    carried = (_between(q, v, time, task), _between(swing[:, 0], swing[:, 1], time, task))
+    bent = [a + b for a, b in zip(*carried, strict=True)]
     pose = task.kinematics.pose(*(jnp.moveaxis(x, 0, 1) for x in bent))  # each (3, K, L)
 
-    def substep(ball, pair):
+    def substep(ball: BallState, pair: tuple[PaddlePose, PaddlePose]) -> tuple[BallState, Array | np.ndarray]:
         new, _ = flight.step(episodes.model.ball, ball, 1.0 / rate, pair)
         return new, ball.position
 
-    pairs = tuple(jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0)[part], pose) for part in (slice(0, -1), slice(1, None)))
+    poses = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), pose)
+    pairs = (jax.tree.map(lambda x: x[:-1], poses), jax.tree.map(lambda x: x[1:], poses))
     _, path = jax.lax.scan(substep, episodes.ball, pairs)
     encoders, _ = _between(q, v, jnp.arange(round(SECONDS * ENCODER_RATE)) / ENCODER_RATE, task)
     return jnp.moveaxis(path[::SUBSTEPS], 0, 1), commands, jnp.moveaxis(encoders, 0, 1)

@@ -60,8 +60,8 @@ def fit(
 ) -> HitsTogether | None:
     """The posterior after the hits among the trajectories; None where there are fewer than FEWEST_HITS of them.
 
-    balls: what flights before a hit say, which is taken as settled but for the lift. path: of the joints on the balls' clock,
-    with the zeros that were reported. prior: of those of ``SHOWN`` that are sought; the others stay as they are.
+    balls: what flights before a hit say, which is taken as settled but for the lift. path: of the joints on the balls'
+    clock, with the zeros that were reported. prior: of those of ``SHOWN`` that are sought; the others stay as they are.
     """
     pairs = watched_hits(trajectories, path)
     if len(pairs) < FEWEST_HITS or path is None:

@@ -116,4 +116,6 @@ def _bus(
     covariance = covariance + np.diag([0.0 if path.endswith("gain") else LEAST_ERROR**2 for path in (*paths, "")])
     bus = "festo" if JOINT_NAMES.index(names[0]) in FESTO_JOINTS else "abb"
     values[-1] -= observation
-    return JointsTogether((*paths, f"latency.{bus}_action"), values, covariance, dict(zip(names, left.tolist(), strict=True)))
+    return JointsTogether(
+        (*paths, f"latency.{bus}_action"), values, covariance, dict(zip(names, left.tolist(), strict=True))
+    )
