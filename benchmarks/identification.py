@@ -1,4 +1,4 @@
-"""What identification is worth: ``python -m benchmarks.identification [--out runs/identification] [--realities 10]``.
+"""Worth of the identification: ``python -m benchmarks.identification [--out runs/identification] [--realities 10]``.
 
 In each of several hidden realities, every second one from outside of the model's class, a player's balls, a minute of
 the joints and a hundred hits are logged and the simulation is identified. The shipped quickstart is trained on in the

@@ -106,7 +106,7 @@ def _in_the_tables_frame(drawn: Samples) -> Samples:
 def _of_hits(
     flown: of_balls.BallsTogether, folders: Sequence[Path], world: SimModel, known: of_hits.Prior
 ) -> of_hits.HitsTogether | None:
-    """What the hits in these folders say; None where there are none, or too few."""
+    """Posterior after the hits in these folders; None where there are none, or too few."""
     if not folders:
         return None
     balls: list[Trajectory] = []

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from ballmodel import flight
 from ballmodel.constants import BALL_RADIUS
@@ -99,15 +99,15 @@ class _States:
     encoder: np.ndarray  # (8, T) true positions at ENCODER_RATE
 
 
-def _in_sight(position: Float[np.ndarray, "3 frames"]) -> int:
-    """Frames until a ball lies low, passes the robot or comes back to where it was hit."""
+def _in_sight(position: np.ndarray) -> int:
+    """Frames of a ball's positions (3, T) [m] until it lies low, passes the robot or comes back to where it was hit."""
     x, y, z = position
     gone = (z < BALL_RADIUS - 0.05) | (y < -2.3) | (y > y[0] + AWAY)
     return int(np.argmax(gone)) if gone.any() else len(gone)
 
 
 def _records(task: Task, model: SimModel, states: list[_States]) -> tuple[JointRecord, ...]:
-    """What encoders reported over all balls: positions (8, T) between the control periods, and the commands."""
+    """Positions that encoders reported over all balls, and the commands, of each joint."""
     period, records = task.config.period, []
     for i, name in enumerate(task.contract.joints):
         zero = 0.0 if model.drives is None else getattr(model.drives, name).joint_offset or 0.0

@@ -1,4 +1,4 @@
-"""What flights say of all effects that a prior names, at once: draws for training, and the balls' spins."""
+"""Posterior of all effects that a prior names, from flights before a hit: draws for training, and the balls' spins."""
 
 from __future__ import annotations
 
@@ -37,13 +37,14 @@ class BallsTogether:
     posterior: Posterior
 
     @property
-    def spins(self) -> SpinPrior:
-        """Distribution of the balls' spins in axes of their own heading."""
-        assert self.posterior.prior is not None  # ``fit`` gives every ball a spin
+    def spins(self) -> SpinPrior | None:
+        """Distribution of the balls' spins in axes of their own heading; None in a model whose air lifts no ball."""
         return self.posterior.prior
 
     def model(self) -> SimModel:
         """The model with the balls' spins, for balls that come towards the robot."""
+        if self.spins is None:
+            return self.problem.model
         spread = zip("xyz", self.spins.mean, self.spins.std, strict=True)
         values = {
             f"ball_spin.{kind}_{axis}": float(value)
@@ -80,8 +81,9 @@ class BallsTogether:
 def fit(
     balls: Sequence[Trajectory], model: SimModel, prior: Prior, say: Callable[[str], None] = lambda text: None
 ) -> BallsTogether:
-    """The posterior of those parameters that the prior has and flights before a hit show; every ball has its own spin.
+    """The posterior of those parameters that the prior has and flights before a hit show.
 
+    Every ball has a spin of its own, unless neither model nor prior has a lift by which it would show.
     Raises ValueError where fewer than FEWEST_BALLS flights can be used, or where nothing of the prior shows in them.
     """
     strokes, _ = clean(balls, True)
@@ -99,5 +101,7 @@ def fit(
     g = grid(kept)
     problem = BallProblem(g, model, effects, heading(g))
     nominal = Situation(np.zeros(len(effects)), first_fit(problem))
+    if problem.nominal[LIFT] == 0.0 and LIFT not in prior:
+        return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say))
     say(f"fitting the spins of {g.n} balls")
     return BallsTogether(problem, posterior.fit(problem, *own_spins(problem, nominal), (), say))

@@ -1,4 +1,4 @@
-"""What hits say of rubber, delay of the ball, encoders' zeros and the camera's sideways offset, all of them together.
+"""Posterior of rubber, delay of the ball, encoders' zeros and the camera's sideways offset, from hits.
 
 None of these shows in a ball before its hit or in the joints alone, and none can be told apart in a single hit; they
 are ordinary sizes of what every installation has. So nothing is named here: each has a prior, and the maximum of the
@@ -72,9 +72,11 @@ def fit(
     g = grid(whole)
     incoming = np.arange(len(g.time))[:, None] < before[None]
     problem = BallProblem(g, balls.problem.model, balls.problem.effects, heading(g))
-    theta, spins = balls.posterior.theta, replace(balls.spins, own_mean=None, own_covariance=None)
     # The spin that a ball's own flight and bounce show decides where the rubber sends it.
-    first, before_hit = first_fit(problem, theta, spins.mean, incoming), replace(g, mask=g.mask & incoming)
+    theta, spins = balls.posterior.theta, balls.spins
+    spins = spins and replace(spins, own_mean=None, own_covariance=None)
+    first = first_fit(problem, theta, None if spins is None else spins.mean, incoming)
+    before_hit = replace(g, mask=g.mask & incoming)
     out = g.mask & ~incoming
 
     @cache

@@ -1,4 +1,4 @@
-"""What the joints' log says of all drives at once: lags, gains, and a delay that the joints of one bus share.
+"""Posterior of all drives from the joints' log: lags, gains, and a delay that the joints of one bus share.
 
 Of the delays of command and measurement only the sum shows; the measurement's is left as the model has it and the
 command's takes the change. In play sums alone matter as well. A lag and a delay look alike in slow motion: that all
