@@ -54,15 +54,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=0, help="seed of the first reality")
     parser.add_argument("--updates", type=int, default=500, help="of 2,000 balls, of each training")
     parser.add_argument("--player", default="player3")
+    parser.add_argument("--untrained", action="store_true", help="intervals alone: nothing is trained or played")
     parser.add_argument("--summary", action="store_true", help="only print what is finished")
     chosen = parser.parse_args(arguments)
     platform.configure(devices=1)
     if not chosen.summary:
-        measure(chosen.out, range(chosen.first, chosen.first + chosen.realities), chosen.updates, chosen.player)
+        measure(
+            chosen.out,
+            range(chosen.first, chosen.first + chosen.realities),
+            0 if chosen.untrained else chosen.updates,
+            chosen.player,
+        )
     found = [json.loads(path.read_text()) for path in sorted(chosen.out.glob("reality_*.json"))]
     if not found:
         print(f"{chosen.out}: no reality is finished")
         return 1
+    if chosen.untrained:
+        print("\n".join(coverage([one for one in found if not one["outside"]], ("identified", "hits"))))
+        return 0
     text = summary(found)
     (chosen.out / "summary.txt").write_text(text + "\n", encoding="utf-8")
     plot(found, chosen.out / "identification.png")
@@ -83,7 +92,11 @@ def measure(out: Path, seeds: range, updates: int, player: str) -> None:
             raise SystemExit(f"reality {seed}: the process ended with {process.exitcode}; run it again to go on")
         result = json.loads(_file(out, seed).read_text(encoding="utf-8"))
         spent += 1
-        rates = ", ".join(f"{world} {result['returned'][world]['rate']:.1%}" for world in WORLDS)
+        rates = (
+            "intervals"
+            if not updates
+            else ", ".join(f"{world} {result['returned'][world]['rate']:.1%}" for world in WORLDS)
+        )
         minutes = (time.monotonic() - began) / spent * (len(left) - spent) / 60.0
         print(f"reality {seed} {result['outside'] or 'in class'}: {rates}; {minutes:.0f} min left", flush=True)
 
@@ -94,7 +107,7 @@ def _one(out: Path, seed: int, updates: int, player: str) -> None:
 
 
 def of_reality(out: Path, seed: int, updates: int, player: str) -> dict[str, Any]:
-    """Logs, identification, trainings and evaluations of one reality."""
+    """Logs, identification, trainings and evaluations of one reality; without updates no trainings and evaluations."""
     outside = CLASSES[seed % len(CLASSES)]
     rounds = [{"simulated": 1, "real": 1}] * 3
     study = studies.parse(
@@ -120,6 +133,16 @@ def of_reality(out: Path, seed: int, updates: int, player: str) -> dict[str, Any
         counts[name] = found.hits
         found.world.save(folder / f"{name}.yaml")
     worlds["truth"] = ModelFile(reality.model)
+    base = {
+        "seed": seed,
+        "outside": list(outside),
+        "reality": hidden_effects.differences(reality.model),
+        "hits": counts["hits"],
+        "identification_seconds": seconds,
+        "intervals": {name: intervals(worlds[name], reality.model) for name in ("identified", "hits")},
+    }
+    if not updates:
+        return base
     policies = {}
     for name, world in worlds.items():
         shared = name in ("nominal", "prior")
@@ -130,18 +153,12 @@ def of_reality(out: Path, seed: int, updates: int, player: str) -> dict[str, Any
     predicted = {name: returned(reality, person, believed, p, keys[3]) for name, p in policies.items()}
     nominal = {name: returned(reality, person, without_nominal(SimModel()), p, keys[3]) for name, p in policies.items()}
     best = played["truth"]
-    return {
-        "seed": seed,
-        "outside": list(outside),
-        "reality": hidden_effects.differences(reality.model),
-        "hits": counts["hits"],
-        "identification_seconds": seconds,
+    return base | {
         "returned": {name: _rate(x) for name, x in played.items()},
         "below_truth": {name: _paired(best, x) for name, x in played.items()},
         "predicted": {name: float(x.mean()) for name, x in predicted.items()},
         "predicted_nominal": {name: float(x.mean()) for name, x in nominal.items()},
         "rally": rallies(reality, person, policies, keys[5]),
-        "intervals": {name: intervals(worlds[name], reality.model) for name in ("identified", "hits")},
     }
 
 
@@ -234,6 +251,14 @@ def _of_class(title: str, some: list[dict[str, Any]]) -> list[str]:
             f"{gap.max():.1f}); above the prior alone in {int((gain > 0).sum())} of {len(some)}, by "
             f"{np.median(gain):.1f} in the median"
         )
+        lines += [f"    {line}" for line in coverage(some, (w,))]
+    return lines
+
+
+def coverage(some: list[dict[str, Any]], worlds: tuple[str, ...]) -> list[str]:
+    """Share of the truths in their 90 % intervals, over all parameters that the logs decided."""
+    lines = []
+    for w in worlds:
         hold: dict[str, list[bool]] = {}
         for f in some:
             changed = [part for effect in f["outside"] for part in SHARED[effect]]
@@ -244,10 +269,8 @@ def _of_class(title: str, some: list[dict[str, Any]]) -> list[str]:
         low, high = wilson(inside, total)
         worst = sorted(hold, key=lambda path: sum(hold[path]) - len(hold[path]))[:8]
         missed = ", ".join(f"{path} {hold[path].count(False)}" for path in worst if not all(hold[path]))
-        lines.append(
-            f"    {inside} of {total} truths in 90 % intervals, {inside / total:.0%} ({low:.0%}-{high:.0%}); "
-            f"missed most: {missed or 'none'}"
-        )
+        share = f"{inside / total:.0%} ({low:.0%}-{high:.0%})"
+        lines.append(f"{w}: {inside} of {total} truths in 90 % intervals, {share}; missed most: {missed or 'none'}")
     return lines
 
 

@@ -116,12 +116,15 @@ def fit(
         jacobian, y = np.array(columns)[:, :, usable], y[:, usable]
         change = np.zeros(len(values))
         for _ in range(ROUNDS):  # the noise is what the change leaves over
-            root, weight = spread(y - np.einsum("kcn,k->cn", jacobian, change))
+            left = y - np.einsum("kcn,k->cn", jacobian, change)
+            root, weight = spread(left)
             j = np.einsum("cd,kdn->kcn", root, jacobian) * np.sqrt(weight)
-            gram = np.einsum("kcn,lcn->kl", j, j) + precision
+            inverse = np.linalg.inv(np.einsum("kcn,lcn->kl", j, j) + precision)
             right = np.einsum("kcn,cn->k", j, root @ y * np.sqrt(weight)) + precision @ (mean - values)
-            covariance = np.linalg.inv(gram)
-            change = covariance @ right
+            change = inverse @ right
+        # Not the spread of the noise alone: what differs from hit to hit of what the model has alike counts as well.
+        own = np.einsum("kcn,cn->kn", j, root @ (y - np.einsum("kcn,k->cn", jacobian, change)) * np.sqrt(weight))
+        covariance = inverse @ (own @ own.T + precision) @ inverse
         values = values + change
         if np.max(np.abs(change) / np.sqrt(np.diagonal(covariance))) < SETTLED:
             break

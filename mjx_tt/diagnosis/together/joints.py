@@ -28,7 +28,7 @@ FITTED = ("lag", "velocity_gain", "action_delay")
 DELAY_DEVIATION = 0.025  # [s] of what is known beforehand of the sum of two delays of a bus
 ROUNDS, PASSES = 6, 2  # of Gauss-Newton; with the other joints' motion as believed, then as found
 SETTLED = 0.02  # deviations
-LEAST_ERROR = 0.0003  # [s] of lags and delays: a simulation moves by steps of 3 ms, a command waits for one
+LEAST_ERROR = 0.0003  # [s] of lags and delays, and of gains: a simulation moves by steps of 3 ms
 Prior = Mapping[str, tuple[float, float]]  # mean and standard deviation by dotted path
 
 
@@ -113,7 +113,7 @@ def _bus(
         values = np.maximum(values + change, 0.0)
         if np.max(np.abs(change) / np.sqrt(np.diagonal(inverse))) < SETTLED:
             break
-    covariance = covariance + np.diag([0.0 if path.endswith("gain") else LEAST_ERROR**2 for path in (*paths, "")])
+    covariance = covariance + LEAST_ERROR**2 * np.eye(len(values))
     bus = "festo" if JOINT_NAMES.index(names[0]) in FESTO_JOINTS else "abb"
     values[-1] -= observation
     return JointsTogether(

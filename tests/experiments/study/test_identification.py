@@ -114,10 +114,10 @@ def test_a_world_is_what_the_logs_say_and_the_prior_for_the_rest(identified, tmp
 @pytest.mark.slow
 def test_hits_of_real_play_decide_the_rubber_and_the_delay(tmp_path):
     """In a reality of the same simulator, camera and delays of each ball included; the rubber is none of training's."""
-    data = {"name": "x", "simulation": {"rounds": [{"simulated": 1, "real": 1}] * 3}, "reality": {"without": ["spin"]}}
+    data = {"name": "x", "simulation": {"rounds": [{"simulated": 1, "real": 1}] * 3}, "reality": {}}
     reality = VirtualReality(study_config.parse(data, "study"), 2)
     player, policy = reality.player("player3"), load_policy.load(QUICKSTART).policy
-    measurements.write_csv(tmp_path / "D0.csv", reality.first_balls(player, 200, jax.random.key(0), "D0"))
+    measurements.write_csv(tmp_path / "D0.csv", reality.first_balls(player, 300, jax.random.key(0), "D0"))
     identification.write_joints(tmp_path / "joints", swept(reality.simulator.task, reality.known))
     log = hit_log.record(reality.simulator, reality.known, player, policy, jax.random.key(1), "hits", 0.003)
     # The clock is one: a ball's track and its joints cover the same time.
@@ -128,10 +128,11 @@ def test_hits_of_real_play_decide_the_rubber_and_the_delay(tmp_path):
     assert found.hits > 40 and found.world.provenance["identified"]["hits"] == found.hits
     rows = {row["parameter"]: row for row in estimates(found.world)}
     truth, middle = models.paths(reality.model), models.paths(found.world.model)
-    for path, wide in (("ball.paddle.restitution", 0.02), ("ball.paddle.tangential_gain", 0.03)):
-        assert abs(middle[path] - truth[path]) < wide and rows[path]["high"] - rows[path]["low"] < 4 * wide
-    late = truth["latency.ball_observation"] - truth["latency.abb_observation"] + 0.029
-    assert middle["latency.ball_observation"] == pytest.approx(late, abs=0.003)
+    delay = "latency.ball_observation"  # against the joints' delay, which is left as believed
+    truth[delay] += models.paths()["latency.abb_observation"] - truth["latency.abb_observation"]
+    for path in ("ball.paddle.restitution", "ball.paddle.tangential_gain", delay):
+        open_ = PRIOR[path][1] - PRIOR[path][0]
+        assert abs(middle[path] - truth[path]) < open_ / 6.0 and rows[path]["high"] - rows[path]["low"] < open_ / 3.0
 
 
 def test_a_prior_with_an_unknown_path_is_refused():
