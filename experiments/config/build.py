@@ -56,7 +56,7 @@ def experiment(config: Config, where: str) -> Experiment:
     balls = distribution(config.balls, f"{where}: balls")
     robot, robot_data = robot_of(config, where)
     nominal = checked(f"{where}: robot", nominal_model, robot)
-    model_data = _with_prior(_mapping(config.model, f"{where}: model"), robot, where)
+    model_data = with_prior(_mapping(config.model, f"{where}: model"), robot, where)
     if isinstance(config.model, str):
         model = checked(f"{where}: model", models.from_dict, model_data, config.model, nominal)
     else:
@@ -87,7 +87,7 @@ def experiment(config: Config, where: str) -> Experiment:
     )
 
 
-def _with_prior(data: dict[str, Any], robot: Robot, where: str) -> dict[str, Any]:
+def with_prior(data: dict[str, Any], robot: Robot, where: str) -> dict[str, Any]:
     """A model's plain data with the ranges of the prior in place of its name. Raises ConfigError."""
     if data.get("randomise") != prior.NAME:
         return data

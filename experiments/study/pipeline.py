@@ -50,6 +50,7 @@ from experiments.study.training import POLICY
 from experiments.study.workflow import Step
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.env.policy import Policy
+from mjx_tt.robot import robot as robots
 from mjx_tt.sim import model as models
 
 CONVERGENCE = "convergence.json"
@@ -217,7 +218,8 @@ class Loop:
         hits = tuple(self.hits(seed, player, d) for d in item.hits)
 
         def run() -> str:
-            believed = models.from_dict(self.study.simulation.model, "simulation.model")
+            data = build.with_prior(self.study.simulation.model, robots.paper(), "simulation")
+            believed = models.from_dict(data, "simulation.model")
             before = identification.prior(settings.prior, "identification.prior")
             found = checked(name, identification.identify, [*data, joints], settings.balls, believed, before, hits)
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -94,7 +94,7 @@ def cosine(a: np.ndarray, b: np.ndarray) -> float:
 # The YAML and the plan
 
 
-@pytest.mark.parametrize("name", ["study_quick", "study_night", "study_full"])
+@pytest.mark.parametrize("name", ["study_quick", "study_night", "study_full", "study_paper"])
 def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for_one(name):
     shipped = study_config.load(study_config.shipped()[name])
     assert [r.real for r in shipped.simulation.rounds] == [60, 70, 70]
@@ -237,6 +237,23 @@ def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
         later.optimiser.step.learning_rate < first.optimiser.step.learning_rate == oracle.optimiser.step.learning_rate
     )
     assert build.later_weights(later.training)[0] == 0
+
+
+def test_the_papers_study_trains_as_the_papers_training():
+    """With the settings of the shipped paper.yaml, which the tests of training hold against the paper."""
+    study_ = study_config.load(study_config.shipped()["study_paper"])
+    paper = experiment.load(experiment.shipped()["paper"])
+    assert study_.simulation.optimiser == paper.optimiser
+    step = paper.optimiser.step
+    assert (step.kind, step.learning_rate, step.schedule.kind) == ("sgd", 0.00375, "constant")
+    assert [(r.simulated, r.real, r.step, r.later_rewards) for r in study_.simulation.rounds] == [
+        (30000, 60, None, None),
+        (5000, 70, None, None),
+        (5000, 70, None, None),
+    ]
+    assert study_.simulation.rounds[0].simulated == paper.training.updates
+    item = next(i for i in schedule.items(study_, "player1") if isinstance(i, Simulated))
+    assert training.configuration(study_, item, "narrow", None, 0).training.later_rewards is None
 
 
 # The hidden reality
