@@ -218,8 +218,8 @@ class Loop:
         hits = tuple(self.hits(seed, player, d) for d in item.hits)
 
         def run() -> str:
-            data = build.with_prior(self.study.simulation.model, robots.paper(), "simulation")
-            believed = models.from_dict(data, "simulation.model")
+            plain = build.with_prior(self.study.simulation.model, robots.paper(), "simulation")
+            believed = models.from_dict(plain, "simulation.model")
             before = identification.prior(settings.prior, "identification.prior")
             found = checked(name, identification.identify, [*data, joints], settings.balls, believed, before, hits)
             path.parent.mkdir(parents=True, exist_ok=True)
