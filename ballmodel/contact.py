@@ -58,6 +58,8 @@ class PaddleParams:
     tilt: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
     # [m], shift of the blade along its (turned) normal
     offset: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
+    # share of the restitution that is lost at the blade's rim; it grows with the square of the distance from its centre
+    rim_loss: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
 
 
 def table_params() -> SurfaceParams:
@@ -115,21 +117,33 @@ def surface_impact(
 
 
 def paddle_impact(
-    params: PaddleParams, velocity: Vector, spin: Vector, normal: Vector, paddle_velocity: Vector, radius: Scalars
+    params: PaddleParams,
+    velocity: Vector,
+    spin: Vector,
+    normal: Vector,
+    paddle_velocity: Vector,
+    radius: Scalars,
+    off_centre: Scalars = 0.0,
 ) -> tuple[Vec, Vec]:
     """Velocity and spin after an impact on the moving paddle.
 
     velocity, paddle_velocity (of the contact point) [m/s], spin [rad/s] and the unit normal pointing to the ball are
-    Vecs or (3, ...) arrays; radius [m].
+    Vecs or (3, ...) arrays; radius [m]. off_centre: square of the contact's distance from the blade's centre over that
+    of the rim.
     The arm is so much heavier than the ball (60 kg to 2.7 g) that the paddle keeps its speed.
     """
+
+    def restitution(normal_speed: Scalars) -> Scalars:
+        e = restitution_at(params, normal_speed)
+        return e if params.rim_loss is None else e * (1.0 - params.rim_loss * off_centre)
+
     return _apply(
         velocity,
         spin,
         normal,
         paddle_velocity,
         radius,
-        lambda s: restitution_at(params, s),
+        restitution,
         lambda e, normal_speed, slip_speed: params.tangential_gain,
     )
 

@@ -262,8 +262,12 @@ def step(
             _mix(start.angular_velocity, end.angular_velocity, w), arm
         )
         blade_normal, blade_velocity = stored((blade_normal, blade_velocity))
+        off_centre: Scalars = 0.0
+        if params.paddle.rim_loss is not None:
+            along = dot(arm, blade_normal)
+            off_centre = (dot(arm, arm) - along * along) / (params.paddle.radius * params.paddle.radius)
         v_paddle, w_paddle = contact.paddle_impact(
-            params.paddle, at.velocity, at.spin, blade_normal, blade_velocity, radius
+            params.paddle, at.velocity, at.spin, blade_normal, blade_velocity, radius, off_centre
         )
         velocity = select(hit_paddle, v_paddle, velocity)
         spin = select(hit_paddle, w_paddle, spin)

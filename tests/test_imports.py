@@ -57,7 +57,7 @@ ROOMS = {
     "mjx_tt": (
         ". sim robot diagnosis/description diagnosis/robust diagnosis/verdict diagnosis/joint diagnosis/tracks "
         "diagnosis/logs diagnosis/ball/effects diagnosis/ball/flights "
-        "diagnosis/ball diagnosis/hits diagnosis prediction "
+        "diagnosis/ball diagnosis/hits diagnosis/together diagnosis prediction "
         "viz diagnosis/report env rally"
     ),
     "experiments": (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from ballmodel.registry import Balls
 from ballmodel.sampling import BallPool, sample_pool
 from bgs import optimizers
 from bgs.strategy import BGSConfig
+from experiments.config import prior
 from experiments.config.experiment import Config, Optimiser, Rewards, Section, Task, Training
 from experiments.errors import ConfigError, checked
 from mjx_tt.env import own as user_file
@@ -25,6 +26,7 @@ from mjx_tt.robot.robot import Robot
 from mjx_tt.sim import model as models
 from mjx_tt.sim import randomisation
 from mjx_tt.sim.model import ModelFile, SimModel
+from robot_io.contract import JOINT_NAMES
 
 # What a seed is used for; each purpose has its own key.
 TRAINING_BALLS, INITIAL_STATE, PROGRESS_BALLS, PROGRESS_EPISODES, EVALUATION_BALLS, EVALUATION_EPISODES = range(6)
@@ -54,7 +56,7 @@ def experiment(config: Config, where: str) -> Experiment:
     balls = distribution(config.balls, f"{where}: balls")
     robot, robot_data = robot_of(config, where)
     nominal = checked(f"{where}: robot", nominal_model, robot)
-    model_data = _mapping(config.model, f"{where}: model")
+    model_data = with_prior(_mapping(config.model, f"{where}: model"), robot, where)
     if isinstance(config.model, str):
         model = checked(f"{where}: model", models.from_dict, model_data, config.model, nominal)
     else:
@@ -85,6 +87,18 @@ def experiment(config: Config, where: str) -> Experiment:
     )
 
 
+def with_prior(data: dict[str, Any], robot: Robot, where: str) -> dict[str, Any]:
+    """A model's plain data with the ranges of the prior in place of its name. Raises ConfigError."""
+    if data.get("randomise") != prior.NAME:
+        return data
+    if robot.contract.joints != JOINT_NAMES:
+        raise ConfigError(
+            f"{where}: model.randomise: {prior.NAME} has ranges of the paper's robot alone; allowed: a range for each "
+            "parameter, as in model.randomise: {ball.paddle.restitution: [0.83, 1.0]}"
+        )
+    return data | {"randomise": dict(prior.PRIOR)}
+
+
 def robot_of(config: Config, where: str) -> tuple[Robot, str | dict[str, Any] | None]:
     """The experiment's robot, and its content in place of the folder; a name of the program's own robots stays.
 
@@ -102,6 +116,14 @@ def robot_of(config: Config, where: str) -> tuple[Robot, str | dict[str, Any] | 
         return robots.load(given), data
     except ValueError as error:  # whose lines name their origin
         raise ConfigError(str(error)) from None
+
+
+def unknown_worlds(experiment: Experiment) -> Experiment | None:
+    """The experiment with every ball in a world of its own, drawn from the prior; None for another robot."""
+    if experiment.task.robot.contract.joints != JOINT_NAMES:
+        return None
+    drawn = models.from_dict({"randomise": dict(prior.PRIOR)}, "prior").randomise
+    return replace(experiment, model=ModelFile(experiment.model.model, drawn))
 
 
 def nominal_model(robot: Robot) -> SimModel:

@@ -242,6 +242,8 @@ class Evaluation(Section):
     """[Hz] of the physics; null: that of the task."""
     reachable_balls: Count | None = 128
     """Balls for which a motion is optimised, one by one, for a lower bound on the return rate in reach; null: none."""
+    unknown_worlds: Count | None = None
+    """Balls that are also played in worlds unknown to training, each in one drawn from the prior; null: none."""
 
 
 class Config(Section):
@@ -252,7 +254,8 @@ class Config(Section):
     balls: str | dict[str, Any]
     """A distribution's name such as player3/M1 or narrow, the path of a YAML, or the YAML's content."""
     model: str | dict[str, Any] = {}
-    """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise."""
+    """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise, ranges or
+    prior: what a laboratory that has measured nothing may expect."""
     robot: str | dict[str, Any] | None = None
     """A folder with YAML and MJCF of your own robot (docs/how-to/bring-your-own-robot.md), that YAML, its content, or
     the name of a robot that comes with the program; null: the paper's."""

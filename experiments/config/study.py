@@ -27,12 +27,13 @@ from experiments.config.experiment import (
 )
 from experiments.config.finetuning import FineTuning
 from experiments.config.finetuning import parse as parse_fine_tuning
-from robot_io.contract import JOINT_NAMES
+from experiments.config.prior import PRIOR
 
 Player = Literal["player1", "player2", "player3", "player4", "player5"]
 PLAYERS: tuple[Player, ...] = get_args(Player)
 Effect = Literal["rubber", "table", "magnus", "spin", "noise", "latency", "camera", "drives", "encoders"]
 EFFECTS: tuple[Effect, ...] = get_args(Effect)
+Outside = Literal["lift", "bounce", "blade", "mount"]
 FEWEST_RALLIES = 50  # of each model that are reported
 
 
@@ -77,6 +78,8 @@ class Reality(Section):
 
     without: list[Effect] = []
     """Effects that are left out: there, reality is what training believes."""
+    outside: list[Outside] = []
+    """Effects from outside of the model's class, which no identification can name; none of them by default."""
     sim_rate: Positive = 300.0
     """[Hz] of its physics."""
     camera_noise: Positive = 0.003
@@ -105,31 +108,6 @@ class Evaluation(Section):
     """Also with the two other players of the paper's table."""
     effects: bool = True
     """Also in the virtual reality with one hidden effect left out at a time."""
-
-
-_LAGS = {name: (0.0, 0.04 if name.startswith("gantry") else 0.025) for name in JOINT_NAMES}  # [s]
-_ZEROS = {name: 0.006 if name.startswith("gantry") else 0.012 for name in JOINT_NAMES}  # [m], [rad]
-PRIOR: dict[str, Any] = {
-    # Rubbers of several makes, new and worn; glass tables and worn ones; lift as published (k 0.4 to 1.2).
-    "ball.paddle.restitution": [0.78, 0.95],
-    "ball.paddle.tangential_gain": [0.45, 0.8],
-    "ball.table.restitution": [0.87, 0.95],
-    "ball.table.friction": [0.12, 0.38],
-    "ball.flight.magnus_coefficient": [0.0, 1.2],
-    # Calibration within a centimetre, half a degree and half a per cent.
-    **{f"sensing.ball_offset_{axis}": [-0.012, 0.012] for axis in "xyz"},
-    **{f"sensing.camera_rotation_{axis}": [-0.008, 0.008] for axis in "xyz"},
-    "sensing.camera_scale": [0.995, 1.005],
-    # The paper's means of latency, give or take two of its deviations.
-    "latency.ball_observation": [0.024, 0.056],
-    "latency.abb_observation": [0.013, 0.045],
-    "latency.festo_observation": [0.015, 0.051],
-    "latency.abb_action": [0.060, 0.088],
-    "latency.festo_action": [0.042, 0.088],
-    **{f"drives.{name}.lag": list(ends) for name, ends in _LAGS.items()},
-    **{f"drives.{name}.velocity_gain": [0.92, 1.05] for name in JOINT_NAMES},
-    **{f"drives.{name}.joint_offset": [-size, size] for name, size in _ZEROS.items()},
-}
 
 
 class Identification(Section):

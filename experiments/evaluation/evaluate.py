@@ -61,12 +61,13 @@ def evaluate(
     reachable_balls: int | None = None,
     stage: Stage = silent,
     devices: int | None = None,
+    unknown_balls: int | None = None,
 ) -> Played:
     """Plays the policy on at least ``episodes`` balls that training has not seen.
 
     reachable_balls: on how many of the balls to seek a lower bound of the return rate in reach; None: no bound. stage:
     shows what is being done. devices: this process' own by default, or all of several processes, each of which calls
-    this.
+    this. unknown_balls: on how many to play in worlds drawn from the prior as well.
     """
     config = experiment.config
     task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
@@ -93,7 +94,22 @@ def evaluate(
     if reachable_balls is not None:
         with stage(f"finding what is in reach of {reachable_balls} of them"):
             reachable = _reachable(experiment, simulator, balls, key, reachable_balls, trained.policy)
-    return Played(summary(result, task.terms) | {"reachable": reachable} | conditions, result, incoming)
+    unknown = None
+    if unknown_balls is not None:
+        unknown = _unknown(experiment, trained, unknown_balls, seed, stage, devices)
+    found = {"reachable": reachable, "unknown_worlds": unknown}
+    return Played(summary(result, task.terms) | found | conditions, result, incoming)
+
+
+def _unknown(
+    experiment: Experiment, trained: TrainedPolicy, balls: int, seed: int, stage: Stage, devices: int | None
+) -> dict[str, Any] | None:
+    """Return rate where every ball meets a world of its own, drawn from the prior; None for another robot."""
+    drawn = build.unknown_worlds(experiment)
+    if drawn is None:
+        return None
+    report = evaluate(drawn, trained, balls, seed, stage=stage, devices=devices).report
+    return {name: report[name] for name in ("return_rate", "low", "high", "episodes")}
 
 
 def _reachable(

@@ -81,7 +81,8 @@ def play_without(
     absent, everything = tuple(study.reality.without), tuple(realities.RANGES)
     special = {effect_costs.NOTHING: (), effect_costs.ALL: everything}
     left_out = [absent + special.get(world, (world,)) for world in effect_costs.WORLDS]
-    worlds = [realities.draw(seed, names) for names in left_out]
+    outside = tuple(study.reality.outside)
+    worlds = [realities.draw(seed, names, () if set(names) == set(everything) else outside) for names in left_out]
     people = [
         human_player.without_spin(person) if "spin" in names else person
         for names in left_out

@@ -1,97 +1,149 @@
 """The simulation as a round's measurements have it: the world that the next training believes in.
 
-Balls across the table and a minute of joint motion go through the diagnosis. Its extended model, with all that the logs
-leave open of it as samples, becomes the simulation; what no such log shows (the rubber, delays of the ball, encoder
-zeros, a joint that stays unexplained) is drawn from a stated prior. Nothing here knows the reality.
+Balls across the table, a minute of joint motion and, after the first play, hits: all parameters are fitted at once,
+each with its prior (``mjx_tt.diagnosis.together``). What the logs leave open of them is drawn for every episode as
+samples; what no log shows is drawn from a stated prior. Nothing here knows the reality.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ballmodel.io import read
 from ballmodel.io.atomic_files import replacing
-from mjx_tt import diagnosis
-from mjx_tt.diagnosis import Diagnosis
-from mjx_tt.diagnosis.ball.effects import EFFECTS
-from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR
-from mjx_tt.diagnosis.joint import JointRecord
-from mjx_tt.diagnosis.logs import ROBOT_FILES
+from ballmodel.trajectory import Dataset, Trajectory
+from experiments import measurements
+from mjx_tt.diagnosis.hits.paddle_path import JointPath, joint_path
+from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
+from mjx_tt.diagnosis.logs import ROBOT_FILES, load_logs
+from mjx_tt.diagnosis.together import balls as of_balls
+from mjx_tt.diagnosis.together import hits as of_hits
+from mjx_tt.diagnosis.together import joints as of_joints
 from mjx_tt.sim import model as models
-from mjx_tt.sim.model import ModelFile
-from mjx_tt.sim.randomisation import Randomised, Samples
-from robot_io.contract import JOINT_NAMES
+from mjx_tt.sim.model import ModelFile, SimModel
+from mjx_tt.sim.randomisation import Randomised, Range, Samples
 
-LIFT = "ball.flight.magnus_coefficient"
+BALLS, CLOCK = "balls.csv", 1e6  # [s] by which the clocks of several folders of hits are set apart
+BALL_DELAY = "latency.ball_observation"
 # The frame is the table's: bounces that lie too high are a camera that sees high, not a table that stands there.
 HEIGHT, SEEN_HIGH = "ball.table.height", "sensing.ball_offset_z"
-OF_ALL_JOINTS = ("latency.abb_", "latency.festo_")  # delays that a sound log of every joint settles
+# Delays of which the joints' log shows sums: these are left as believed, the actions' take the change.
+GAUGE = ("latency.abb_observation", "latency.festo_observation")
 
 
-def prior(data: Mapping[str, Any], where: str) -> tuple[Randomised, ...]:
+@dataclass(frozen=True)
+class Identified:
+    """A world to train in, and what it was made of."""
+
+    world: ModelFile
+    flights: int
+    hits: int  # 0: the rubber is drawn from the prior
+    left: Mapping[str, float]  # [rad], [m] deviation of each joint that nothing explains
+
+
+def prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
     """Ranges of the prior by dotted path. Raises ValueError naming ``where`` and the path at fault."""
-    return models.from_dict({"randomise": dict(data)}, where).randomise
+    found = models.from_dict({"randomise": dict(data)}, where).randomise
+    for one in found:
+        if not isinstance(one, Range):
+            raise ValueError(f"{where}: samples; a prior has ranges")
+    return tuple(one for one in found if isinstance(one, Range))
 
 
 def identify(
-    logs: Sequence[Path], most: int, believed: ModelFile, before: Sequence[Randomised]
-) -> tuple[ModelFile, Diagnosis]:
-    """The world to train in after these logs, and the diagnosis behind it.
+    logs: Sequence[Path],
+    most: int,
+    believed: ModelFile,
+    before: Sequence[Range],
+    hits: Sequence[Path] = (),
+    say: Callable[[str], None] = lambda text: None,
+) -> Identified:
+    """The world to train in after these logs.
 
     most: balls that are looked at; believed: the model so far; before: ranges of what may be wrong of it, used where
-    the logs say nothing. Raises ValueError naming the log at fault.
+    the logs say nothing; hits: folders that ``write_hits`` made. Raises ValueError naming the log at fault.
     """
-    read = diagnosis.load_logs([str(path) for path in logs])
-    if len(read.balls) > most:
-        chosen = np.sort(np.random.default_rng(0).permutation(len(read.balls))[:most])
-        read = replace(read, balls=tuple(read.balls[i] for i in chosen))
-    # People's balls spin, and the table spins those that do not: a lift is believed, and every ball has its own spin.
-    model = believed.model
-    if model.ball.flight.magnus_coefficient == 0.0:
-        model = models.with_values(model, {LIFT: MAGNUS_PRIOR[0]})
-    found = diagnosis.diagnose(read, model, spin="free", randomise=True)
-    extended, settled = _in_the_tables_frame(found.extended), _settled(found)
-    settled |= {SEEN_HIGH} if HEIGHT in settled else set()
-    left = tuple(one for one in before if not set(one.paths) <= settled)
-    own = {path for one in left for path in one.paths}
-    kept = tuple(one for one in believed.randomise if not set(one.paths) & (settled | own))
-    return replace(extended, randomise=(*extended.randomise, *left, *kept)), found
+    read_ = load_logs([str(path) for path in logs])
+    balls = read_.balls
+    if len(balls) > most:
+        balls = tuple(balls[i] for i in np.sort(np.random.default_rng(0).permutation(len(balls))[:most]))
+    ranges = {one.path: (one.low, one.high) for one in before}
+    known = {path: (0.5 * (low + high), (high - low) / 12**0.5) for path, (low, high) in ranges.items()}
+    seen = {HEIGHT if path == SEEN_HIGH else path: normal for path, normal in known.items()}
+    flown = of_balls.fit(balls, believed.model, seen, say)
+    say("fitting the drives")
+    driven = of_joints.fit(read_.joints, believed.model, known)
+    say("fitting the hits")
+    struck = _of_hits(flown, hits, believed.model, known)
+    drawn = [driven.samples()]
+    lift = np.random.default_rng(1).normal(0.0, of_balls.LIFT_ERROR, of_balls.DRAWS)
+    if struck is not None:
+        shown, lift = struck.samples(ranges)
+        drawn.append(shown)
+    samples = _joined([_in_the_tables_frame(flown.samples(lift)), *drawn])
+    settled = {*samples.paths, *GAUGE}
+    others: list[Randomised] = [one for one in before if one.path not in settled]
+    own = settled | {one.path for one in before}
+    others += [one for one in believed.randomise if not set(one.paths) & own]
+    middle = dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
+    made_of = {"flights": flown.problem.grid.n, "hits": 0 if struck is None else struck.hits, "joints": driven.left}
+    world = ModelFile(models.with_values(flown.model(), middle), (samples, *others), {"identified": made_of})
+    return Identified(world, flown.problem.grid.n, 0 if struck is None else struck.hits, driven.left)
 
 
-def _in_the_tables_frame(world: ModelFile) -> ModelFile:
+def _in_the_tables_frame(drawn: Samples) -> Samples:
     """The same with the camera's offset in place of the table's height, which no ball before a hit can tell apart."""
-    values = models.paths(world.model)
-    moved = {HEIGHT: 0.0, SEEN_HIGH: values[SEEN_HIGH] + values[HEIGHT]}
-    randomise = tuple(_renamed(one) if isinstance(one, Samples) else one for one in world.randomise)
-    return replace(world, model=models.with_values(world.model, moved), randomise=randomise)
-
-
-def _renamed(drawn: Samples) -> Samples:
     return replace(drawn, paths=tuple(SEEN_HIGH if path == HEIGHT else path for path in drawn.paths))
 
 
-def _settled(found: Diagnosis) -> set[str]:
-    """Parameters that the logs have settled, whether they moved or not."""
-    settled = {path for one in found.extended.randomise for path in one.paths}
-    gained = found.verdict.held_out is not None and found.verdict.held_out.low > 0.0
-    if found.verdict.verdict == "undetermined" and not gained:  # nothing of it was adopted
-        return settled
-    if found.balls is not None and not found.balls.findings:
-        seen = {e.name: e.path for e, s in zip(found.balls.trial.effects, found.balls.seen, strict=True) if s}
-        settled |= {e.path for e in EFFECTS if e.name in seen}
-    if found.robot is not None:
-        open_ = {finding.joint for finding in found.robot.unexplained_by_joint}
-        sound = [joint for joint in found.robot.responses if joint not in open_]
-        settled |= {f"drives.{joint}.{effect}" for joint in sound for effect in ("lag", "velocity_gain")}
-        if set(sound) == set(JOINT_NAMES):
-            settled |= {path for path in models.paths() if path.startswith(OF_ALL_JOINTS)}
-    return settled
+def _of_hits(
+    flown: of_balls.BallsTogether, folders: Sequence[Path], world: SimModel, known: of_hits.Prior
+) -> of_hits.HitsTogether | None:
+    """Posterior after the hits in these folders; None where there are none, or too few."""
+    if not folders:
+        return None
+    balls: list[Trajectory] = []
+    paths: list[JointPath] = []
+    for i, folder in enumerate(folders):
+        later = CLOCK * i
+        data, joints = read(folder / BALLS), read_robot_csv(folder / ROBOT_FILES[0], folder / ROBOT_FILES[1])
+        if not isinstance(data, Dataset):
+            raise ValueError(f"{folder / BALLS}: holds no trajectories")
+        balls += [replace(t, time=t.time + later) for t in data.trajectories]
+        path = joint_path(joints, world)
+        if path is None:
+            raise ValueError(f"{folder}: not all joints are in it; hits need all eight")
+        paths.append(JointPath(tuple(t + later for t in path.time), path.position))
+    times, places = (
+        tuple(map(np.concatenate, zip(*(getattr(path, name) for path in paths), strict=True)))
+        for name in ("time", "position")
+    )
+    known = dict(known)
+    if BALL_DELAY in known:
+        # The joints' delay shows in sums with their commands' alone, where it is taken as believed: by how much it is
+        # not, the ball's seems to differ.
+        mean, deviation = known[BALL_DELAY]
+        known[BALL_DELAY] = mean, 2**0.5 * deviation
+    return of_hits.fit(flown, balls, JointPath(times, places), known)
+
+
+def _joined(parts: Sequence[Samples]) -> Samples:
+    """Samples of equal length and weight side by side, row by row."""
+    values = np.concatenate([one.values for one in parts], axis=1)
+    return Samples(tuple(path for one in parts for path in one.paths), values, np.ones(len(values)))
+
+
+def write_hits(folder: Path, balls: Dataset, records: Collection[JointRecord]) -> None:
+    """Writes balls with their hits, and the joints by the same clock, into a folder."""
+    write_joints(folder, records)
+    measurements.write_csv(folder / BALLS, balls)
 
 
 def write_joints(folder: Path, records: Collection[JointRecord]) -> None:

@@ -50,6 +50,7 @@ from experiments.study.training import POLICY
 from experiments.study.workflow import Step
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.env.policy import Policy
+from mjx_tt.robot import robot as robots
 from mjx_tt.sim import model as models
 
 CONVERGENCE = "convergence.json"
@@ -81,6 +82,10 @@ class Loop:
 
     def data(self, seed: int, player: str, name: str) -> Path:
         return self.seed_folder(seed) / player / "balls" / f"{name}.csv"
+
+    def hits(self, seed: int, player: str, name: str) -> Path:
+        """Folder of the hits that were logged in the play of a data set."""
+        return self.seed_folder(seed) / player / "hits" / name
 
     def human(self, seed: int, player: str, name: str) -> Path:
         return self.seed_folder(seed) / player / "balls" / f"human_{name}.yaml"
@@ -146,8 +151,8 @@ class Loop:
         return Step(f"seed{seed}/reality", "seal", 1, (), (path,), run)
 
     def _reality(self, seed: int) -> dict[str, Any]:
-        without = tuple(self.study.reality.without)
-        return realities.content(realities.draw(seed, without), seed, without)
+        without, outside = tuple(self.study.reality.without), tuple(self.study.reality.outside)
+        return realities.content(realities.draw(seed, without, outside), seed, without, outside)
 
     def _open(self, seed: int) -> Step:
         sealed, path = (self.seed_folder(seed) / f"reality.{kind}" for kind in ("sealed", "yaml"))
@@ -210,17 +215,19 @@ class Loop:
         path, name = self.world(seed, player, item.name), f"seed{seed}/{player}/{item.name}"
         data, joints = tuple(self.data(seed, player, d) for d in item.data), self.seed_folder(seed) / JOINTS
 
-        def run() -> str:
-            believed = models.from_dict(self.study.simulation.model, "simulation.model")
-            before = identification.prior(settings.prior, "identification.prior")
-            world, found = checked(name, identification.identify, [*data, joints], settings.balls, believed, before)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            found.verdict.save(path.with_suffix(".verdict.json"))
-            world.save(path)
-            named = ", ".join(cause.name for cause in found.verdict.causes if "." not in cause.name) or "nothing"
-            return f"{found.verdict.verdict}: {named}; {len(estimates(world))} parameters moved or drawn"
+        hits = tuple(self.hits(seed, player, d) for d in item.hits)
 
-        inputs = (*data, *(joints / file for file in ROBOT_FILES))
+        def run() -> str:
+            plain = build.with_prior(self.study.simulation.model, robots.paper(), "simulation")
+            believed = models.from_dict(plain, "simulation.model")
+            before = identification.prior(settings.prior, "identification.prior")
+            found = checked(name, identification.identify, [*data, joints], settings.balls, believed, before, hits)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            found.world.save(path)
+            count = len(estimates(found.world))
+            return f"{found.flights} flights, {found.hits} hits; {count} parameters moved or drawn"
+
+        inputs = (*data, *(joints / file for file in ROBOT_FILES), *(folder / identification.BALLS for folder in hits))
         return Step(name, "identification", len(data), inputs, (path,), run)
 
     def _simulated(self, seed: int, player: str, item: Simulated) -> Step:
@@ -243,16 +250,21 @@ class Loop:
     def _real(self, seed: int, player: str, item: Real) -> Step:
         folder, name = self.model_folder(seed, player, item.key), f"seed{seed}/{player}/{item.key}"
         data = None if item.data is None else self.data(seed, player, item.data)
+        hits = self.hits(seed, player, item.data) if item.hits and item.data is not None else None
 
         def run() -> str:
             source = self.run_of(seed, player, item.source)
-            hits, text = self._world[seed].fine_tune(player, source, updates(self.study, item), folder, name)
+            if hits is not None:
+                log = self._virtual[seed].hits(player, source, f"{name}/hits")
+                identification.write_hits(hits, log.balls, log.joints)
+            strokes, text = self._world[seed].fine_tune(player, source, updates(self.study, item), folder, name)
             if data is not None:
-                measurements.write_csv(data, hits)
+                measurements.write_csv(data, strokes)
             load_policy.load(folder).policy.save(folder / training.POLICY)
             return text
 
-        outputs = (folder / POLICY, *(() if data is None else (data,)))
+        written = None if hits is None else hits / identification.BALLS
+        outputs = (folder / POLICY, *(path for path in (data, written) if path is not None))
         inputs = (self.model_folder(seed, player, item.source) / POLICY,)
         return Step(name, "fine-tuning", updates(self.study, item), inputs, outputs, run)
 

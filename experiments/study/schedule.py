@@ -21,10 +21,14 @@ class Human:
 
 @dataclass(frozen=True)
 class Identified:
-    """A world to train in: what data sets together, and the joints' log, say of the simulation."""
+    """A world to train in: what data sets together, and the joints' log, say of the simulation.
+
+    hits: data sets of whose play the robot's hits were logged as well
+    """
 
     name: str
     data: tuple[str, ...]
+    hits: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -46,12 +50,17 @@ class Simulated:
 
 @dataclass(frozen=True)
 class Real:
-    """A policy fine-tuned in reality. data: name of the data set that the player's hits become; None: not used."""
+    """A policy fine-tuned in reality.
+
+    data: name of the data set that the player's hits become; None: not used
+    hits: before it is fine-tuned the policy plays some balls of which everything is logged: ball, joints, returns
+    """
 
     key: str
     source: str
     round: int
     data: str | None = None
+    hits: bool = False
 
 
 Item = Human | Identified | Simulated | Real
@@ -81,13 +90,13 @@ FRESH: tuple[Item, ...] = (
 IDENTIFIED: tuple[Item, ...] = (
     Identified("world0", ("D0",)),
     Simulated("id-sim1", "M0", None, 0, "world0"),
-    Real("id-ft35", "id-sim1", 0, "D1-id"),
+    Real("id-ft35", "id-sim1", 0, "D1-id", hits=True),
     Human("M1-id", ("D0", "D1-id")),
-    Identified("world1", ("D0", "D1-id")),
+    Identified("world1", ("D0", "D1-id"), ("D1-id",)),
     Simulated("id-sim2", "M1-id", "id-ft35", 1, "world1"),
-    Real("id-ft65", "id-sim2", 1, "D2-id"),
+    Real("id-ft65", "id-sim2", 1, "D2-id", hits=True),
     Human("M2-id", ("D0", "D1-id", "D2-id")),
-    Identified("world2", ("D0", "D1-id", "D2-id")),
+    Identified("world2", ("D0", "D1-id", "D2-id"), ("D1-id", "D2-id")),
     Simulated("id-sim3", "M2-id", "id-ft65", 2, "world2"),
     Real("id-ft100", "id-sim3", 2),
 )

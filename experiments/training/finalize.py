@@ -29,7 +29,13 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
     trained, evaluation = load_policy.load(run.folder), experiment.config.evaluation
     stage = printed(console, str(run.folder))
     played = evaluate.evaluate(
-        experiment, trained, evaluation.episodes, evaluation.seed, evaluation.reachable_balls, stage
+        experiment,
+        trained,
+        evaluation.episodes,
+        evaluation.seed,
+        evaluation.reachable_balls,
+        stage,
+        unknown_balls=evaluation.unknown_worlds,
     )
     with stage("drawing pictures"):
         pictures = figures.draw_evaluation(
@@ -106,6 +112,10 @@ def print_report(console: Console, report: dict[str, Any], title: str) -> None:
             f"{bound['return_rate']:.1%}  ({bound['balls']} balls, interval {bound['low']:.1%} to {bound['high']:.1%})"
         )
         table.add_row("reachable, at least", text)
+    if report.get("unknown_worlds") is not None:
+        other = report["unknown_worlds"]
+        text = f"{other['return_rate']:.1%}  ({other['episodes']} balls, {other['low']:.1%} to {other['high']:.1%})"
+        table.add_row("in unknown worlds", text)
     table.add_row("hit rate", f"{report['hit_rate']:.1%}")
     counts = ", ".join(f"{count:,} {name}" for name, count in report["outcomes"].items())
     table.add_row("episodes", f"{report['episodes']:,}: {counts}; {report['non_finite']} not finite")

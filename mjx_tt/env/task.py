@@ -232,9 +232,13 @@ class Task:
             share = latency.old_command_share(prepared.action, i, timestep)
             velocity, drive = drives.follow(drive_params, drive, new + share * (old - new), timestep)
             control = jnp.asarray(materialise(row(gain) * velocity))
-            qpos, qvel = self.engine.step(qpos, qvel, control)
+            was, (qpos, qvel) = qvel, self.engine.step(qpos, qvel, control)
             carried, carried_velocity, drive = drives.carry(drive_params, drive, qpos, qvel, timestep)
-            after = materialise(self.kinematics.pose(carried, carried_velocity))
+            drive = drives.swung(drive_params, drive, was, qvel, timestep)
+            bent, bent_velocity = carried, carried_velocity
+            if drive.swing is not None:
+                bent, bent_velocity = carried + drive.swing[0], carried_velocity + drive.swing[1]
+            after = materialise(self.kinematics.pose(bent, bent_velocity))
             moved, events = flight.step(params, ball, timestep, (pose, after))
             moved, events = materialise((moved, events))
             before, ball = ball, where(live, moved, ball)

@@ -12,6 +12,8 @@ The velocity command u passes steps 1 to 7 before the simulated servo follows it
     8. the servo of the MJCF follows v: dq/dt = v but for the arm's dynamics
     9. backlash b: what the joint carries follows q with play, and moves only when |q - output| reaches b / 2
    10. measured is output(t - observation delay) + joint_offset
+   11. on a flexible mount what the joint carries swings about the output: d'' = -w^2 d - 2 z w d' - q'', with
+       w = 2 pi resonance; neither the encoder nor the check for contact with the table sees it
 
 Steps 2 to 5 have no memory and act on the commands, 6 and 7 are solved exactly over a substep in which u is constant.
 A model without drives (``SimModel.drives`` None), or an effect that no joint departs from, costs nothing.
@@ -37,6 +39,7 @@ from robot_io.contract import JOINT_NAMES, LIMITS
 NO_VELOCITY_LIMIT = 10.0 * max(LIMITS.velocity)  # [m/s], [rad/s]
 NO_ACCELERATION_LIMIT = 1e5 * NO_VELOCITY_LIMIT  # [m/s^2], [rad/s^2]
 SHORTEST = 1e-9  # [s], keeps exponents finite
+SWING_DAMPING = 0.1  # ratio z of a flexible mount, estimate: bolted metal without a damper
 
 
 @jax.tree_util.register_dataclass
@@ -60,6 +63,7 @@ class JointDrive:
     backlash: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m], [rad] width of the play
     coulomb_friction: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m/s], [rad/s] that friction costs
     deadband: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m/s], [rad/s]
+    resonance: Float[Array, "*#batch"] | float | None = optional(0.0)  # [Hz] of a flexible mount; 0: it is rigid
 
 
 EFFECTS = tuple(f.name for f in dataclasses.fields(JointDrive))
@@ -105,6 +109,7 @@ class Drives:
     backlash: Float[Array, "joints *batch"] | None
     coulomb_friction: Float[Array, "joints *batch"] | None
     deadband: Float[Array, "joints *batch"] | None
+    resonance: Float[Array, "joints *batch"] | None
 
     @property
     def follows(self) -> bool:
@@ -119,6 +124,7 @@ class DriveState:
 
     velocity: Float[Array, "joints *batch"] | None  # [m/s], [rad/s] v of steps 6 and 7
     output: Float[Array, "joints *batch"] | None  # [m], [rad] position behind the play
+    swing: Float[Array, "2 joints *batch"] | None = None  # [m], [rad] of a flexible mount about it, and its velocity
 
 
 def by_effect(
@@ -138,7 +144,11 @@ def by_effect(
 
 def at_rest(drives: Drives, qpos: Float[Array, "joints *batch"]) -> DriveState:
     """The drives of a robot that stands at qpos (n, ...), in the middle of every play."""
-    return DriveState(jnp.zeros_like(qpos) if drives.follows else None, qpos if drives.backlash is not None else None)
+    return DriveState(
+        jnp.zeros_like(qpos) if drives.follows else None,
+        qpos if drives.backlash is not None else None,
+        jnp.zeros((2, *qpos.shape), qpos.dtype) if drives.resonance is not None else None,
+    )
 
 
 def reachable(drives: Drives, command: Float[Array, "joints *batch"]) -> Float[Array, "joints *batch"]:
@@ -178,7 +188,7 @@ def follow(
     left = gap - speed_up  # u - v when the limit is left
     decay = jnp.exp(-rest / jnp.maximum(lag, SHORTEST))
     way = (v + 0.5 * speed_up) * limited + u * rest - left * lag * (1.0 - decay)
-    return way / timestep, DriveState(u - left * decay, state.output)
+    return way / timestep, dataclasses.replace(state, velocity=u - left * decay)
 
 
 def carry(
@@ -196,4 +206,29 @@ def carry(
         return qpos, qvel, state
     half = 0.5 * drives.backlash
     output = jnp.clip(state.output, qpos - half, qpos + half)
-    return output, (output - state.output) / timestep, DriveState(state.velocity, output)
+    return output, (output - state.output) / timestep, dataclasses.replace(state, output=output)
+
+
+def swung(
+    drives: Drives,
+    state: DriveState,
+    before: Float[Array, "joints *batch"],
+    after: Float[Array, "joints *batch"],
+    timestep: float,
+) -> DriveState:
+    """Step 11 over one substep: the state with the swing of flexible mounts at its end.
+
+    before, after: velocity (n, ...) of the joints at the substep's ends. Between them the acceleration is taken as
+    constant, for which the damped oscillator is solved exactly.
+    """
+    if drives.resonance is None or state.swing is None:
+        return state
+    flexible, zeta = drives.resonance > 0.0, SWING_DAMPING
+    w = 2.0 * jnp.pi * jnp.where(flexible, drives.resonance, 1.0)
+    rest = -(after - before) / timestep / w**2  # about which it swings
+    x, v = state.swing[0] - rest, state.swing[1]
+    damped = w * (1.0 - zeta**2) ** 0.5
+    decay, cos, sin = jnp.exp(-zeta * w * timestep), jnp.cos(damped * timestep), jnp.sin(damped * timestep)
+    position = rest + decay * (x * cos + (v + zeta * w * x) / damped * sin)
+    velocity = decay * (v * cos - (w**2 * x + zeta * w * v) / damped * sin)
+    return dataclasses.replace(state, swing=jnp.where(flexible, jnp.stack([position, velocity]), 0.0))

@@ -28,6 +28,7 @@ BOUNDS: tuple[tuple[str, tuple[float, float]], ...] = (
     ("ball.*.friction", (0.0, 5.0)),
     ("ball.*.tangential_gain", (-2.0, 2.0)),
     ("ball.paddle.radius", (0.01, 0.5)),  # [m]
+    ("ball.paddle.rim_loss", (0.0, 1.0)),
     ("ball.paddle.thickness", (0.0, 0.1)),  # [m]
     ("ball.*.height", (-0.5, 0.5)),  # [m]
     ("ball.paddle.offset", (-0.5, 0.5)),  # [m]

@@ -393,6 +393,21 @@ def test_tilts_of_zero_change_nothing_and_can_be_differentiated():
         np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-6)
 
 
+def test_a_blade_gives_back_less_towards_its_rim():
+    """Of restitution e = 0.9 and a loss of 40 % at the rim, the square of the distance decides."""
+    bare = replace(ball_params(), flight=replace(VACUUM, gravity_z=0.0))
+    blade = PaddleParams(restitution=0.9, restitution_slope=0.0, tangential_gain=0.0, rim_loss=0.4)
+    x = blade.radius * np.array([0.0, 0.5, 0.99])
+    state = ball_state(np.stack([x, 0 * x + 0.04, 0 * x + 0.5]), np.stack([0 * x, 0 * x - 5.0, 0 * x]))
+    pose = jax.tree.map(lambda a: a[:, None], still_pose([0, 0, 0.5], [0, 1, 0]))
+    new, events = step(replace(bare, paddle=blade), state, 0.01, pose)
+    assert events.paddle.all()
+    np.testing.assert_allclose(new.velocity[1], 5.0 * 0.9 * (1.0 - 0.4 * np.array([0.0, 0.25, 0.99**2])), rtol=1e-6)
+    # Without the loss the program never knew of it.
+    left_out = without_nominal(replace(bare, paddle=PaddleParams()))
+    assert left_out.paddle.rim_loss is None
+
+
 def test_a_turned_and_shifted_blade_reflects_from_where_it_is():
     """An elastic blade without friction, whose normal SciPy turns about the horizontal line in it."""
     tilt, offset, normal = 0.1, 0.008, np.array([0.3, 0.9, 0.2])

@@ -2,7 +2,8 @@
 
 Three sources of chance are kept apart. Student's t over the pooled rallies is the paper's way. The bootstrap over
 rallies draws them anew within each policy. The bootstrap over seeds draws the study's repetitions anew as well, so that
-its interval holds for a policy that is trained again; players are always the same ones.
+its interval holds for a policy that is trained again; players are always the same ones. Of fewer than FEWEST_SEEDS
+seeds it would draw a handful of points, which are no 95 %: there it is the bootstrap over rallies.
 """
 
 from __future__ import annotations
@@ -17,9 +18,15 @@ from experiments.stats import sign_flip, t_interval, welch_interval, welch_p
 from experiments.study.analysis.scoring import Rallies
 
 DRAWS = 2000
+FEWEST_SEEDS = 5  # drawn anew: 4 of 5 give 70 different means, 1 of 2 give two
 PERMUTATIONS = 4000
 Cell = tuple[int, str, str, str]  # seed, trainer, evaluator, model
 Models = str | Iterable[str]  # one or several
+
+
+def chance(seeds: int) -> str:
+    """Name of what the bootstrap draws anew in a study of so many seeds."""
+    return "seeds and rallies" if seeds >= FEWEST_SEEDS else "rallies"
 
 
 @dataclass(frozen=True)
@@ -63,8 +70,9 @@ class Estimate:
 class Bootstrap:
     """Means over cells (one seed's policy with one evaluator) whose rallies, and the seeds, are drawn anew.
 
-    With S > 1 seeds, S - 1 of them are drawn with replacement: the spread of the draws is then an unbiased estimate of
-    the spread of a mean over S seeds (Rao and Wu 1988), which drawing S makes too small by (S - 1) / S.
+    With S seeds, FEWEST_SEEDS at least, S - 1 of them are drawn with replacement: the spread of the draws is then an
+    unbiased estimate of the spread of a mean over S seeds (Rao and Wu 1988), which drawing S makes too small by
+    (S - 1) / S.
     """
 
     def __init__(
@@ -83,7 +91,9 @@ class Bootstrap:
         self.point = {cell: float(v.mean()) for cell, v in self.cells.items()}
         self._draws = {cell: v[rng.integers(0, v.size, (draws, v.size))].mean(axis=1) for cell, v in self.cells.items()}
         # Which seeds each draw takes, by how many there are: the same for all means, so that their differences pair.
-        self._chosen = {s: rng.integers(0, s, (s - 1, draws)) for s in range(2, len(self.seeds) + 1) if over_seeds}
+        self._chosen = {
+            s: rng.integers(0, s, (s - 1, draws)) for s in range(FEWEST_SEEDS, len(self.seeds) + 1) if over_seeds
+        }
 
     def mean(self, models: Models, trainers: Iterable[str], own: bool | None = True) -> Estimate | None:
         """Mean over the models' cells of a trainer, then over trainers, then over seeds; None where there is no cell.
@@ -189,7 +199,7 @@ def t_mean(values: ArrayLike) -> Interval:
 class Difference:
     """Mean of one set of policies minus that of another, with what speaks for it.
 
-    bootstrap: over seeds and rallies; welch: t interval over the pooled rallies, the paper's way
+    bootstrap: over seeds, if there are enough, and rallies; welch: t interval over the pooled rallies, the paper's way
     p_welch, p_rallies: two-sided, a rally is the unit (Welch's t; permutation within each pair of policies)
     p_policies: two-sided, a pair of policies (one seed, one player) is the unit; ``pairs`` of them
     """

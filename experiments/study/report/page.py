@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from experiments.study.analysis.claims import NOT_COMPARABLE, VERDICTS, Measurements, findings, show, span
 from experiments.study.analysis.claims import __doc__ as RULES
 from experiments.study.analysis.paper import LEVELS, RALLIES, WITHOUT
-from experiments.study.analysis.statistics import Estimate
+from experiments.study.analysis.statistics import FEWEST_SEEDS, Estimate, chance
 from experiments.study.analysis.study_folder import Study, load
 from experiments.study.report import figures, further_figures, heatmaps, human_model_figures, tables, tsne
 from experiments.study.report import text as words
@@ -79,6 +79,8 @@ class Report:
             counts={v: sum(f.verdict == v for f in self.findings.values()) for v in VERDICTS},
             broken_off=tables.broken_off(self.study),
             most_missing=MOST_MISSING,
+            fewest_seeds=FEWEST_SEEDS,
+            chance=chance(len(self.study.seeds)),
             rallies_reported=RALLIES,
             seed=f"Seed {self.study.seeds[0]}. " if self.study.seeds else "",
             rules=RULES,

@@ -29,7 +29,7 @@ from experiments.study.analysis.paper import (
     level,
     of_level,
 )
-from experiments.study.analysis.statistics import t_mean
+from experiments.study.analysis.statistics import FEWEST_SEEDS, chance, t_mean
 from experiments.study.analysis.study_folder import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
 from mjx_tt.rally.end_reasons import ROWS, End
 from mjx_tt.sim.model import ModelFile
@@ -78,7 +78,7 @@ def effects_left_out(study: Study) -> Table:
 
 def models(study: Study, m: Measurements) -> Table:
     """Rally length of every model in every group of players, with the intervals of three sources of chance."""
-    fixed = Measurements(study, over_seeds=False)
+    fixed, over_seeds = Measurements(study, over_seeds=False), len(study.seeds) >= FEWEST_SEEDS
     rows = []
     for group in GROUPS:
         for model in (*MODELS, *VARIANT, *LEARNED, *ABLATED):
@@ -97,7 +97,7 @@ def models(study: Study, m: Measurements) -> Table:
                     f"{seeds.value:.1f}",
                     span("hits", t),
                     span("hits", rallies),
-                    span("hits", seeds),
+                    span("hits", seeds) if over_seeds else f"fewer than {FEWEST_SEEDS} seeds",
                     *quartiles,
                     f"{chosen.length.max()}",
                     f"{every.length.mean():.1f}",
@@ -147,7 +147,7 @@ def significance(m: Measurements) -> Table:
         "scale",
         "difference",
         "mean",
-        "95 %, seeds and rallies",
+        f"95 %, {chance(len(m.study.seeds))}",
         "95 %, Welch",
         "p Welch",
         "p permuted",

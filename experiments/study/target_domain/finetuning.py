@@ -72,7 +72,7 @@ class VirtualReality:
         self._compared = jax.jit(self._shots_of, static_argnames="turns")
 
     def _draw(self, seed: int) -> None:
-        self.model = hidden_effects.draw(seed, tuple(self._study.reality.without))
+        self.model = hidden_effects.draw(seed, tuple(self._study.reality.without), tuple(self._study.reality.outside))
         self.known = without_nominal(self.model)
 
     def at(self, seed: int) -> VirtualReality:

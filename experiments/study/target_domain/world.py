@@ -18,8 +18,9 @@ from experiments.config.study import Study
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import CONFIG, Run
-from experiments.study.target_domain import joint_log
+from experiments.study.target_domain import hit_log, joint_log
 from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.study.target_domain.hit_log import HitLog
 from mjx_tt.diagnosis.joint import JointRecord
 
 STUDY = 6  # purpose of a key, beside those of experiments.config.build
@@ -55,6 +56,12 @@ class VirtualWorld:
     def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
         """Commands and measured positions of all joints in so many seconds of motion without a ball."""
         return joint_log.record(self.reality.simulator.task, self.reality.known, self._key(name), seconds)
+
+    def hits(self, player: str, source: Path, name: str) -> HitLog:
+        """Balls of rallies with the policy of the run ``source``: ball and joints by one clock."""
+        reality, policy = self.reality, load_policy.load(source).policy
+        person, noise = reality.player(player), self._study.reality.camera_noise
+        return hit_log.record(reality.simulator, reality.known, person, policy, self._key(name), name, noise)
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         theta, statistics = load_policy.load_statistics(source)

@@ -8,7 +8,7 @@ is the noise.
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from mjx_tt.diagnosis.ball.causes import estimates, quantile, readings
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, flights
 from mjx_tt.diagnosis.ball.effects import EFFECTS, INVISIBLE, Effect
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading
-from mjx_tt.diagnosis.ball.flights.forward_model import grid, predict
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid, predict
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem
 from mjx_tt.diagnosis.ball.scores import Scores, Subset
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses, watched
@@ -64,15 +64,7 @@ def diagnose_hits(
     found: BallFindings, trajectories: Sequence[Trajectory], joints: JointPath | None, without: Sequence[str]
 ) -> HitFindings | None:
     """Judges the hits of the watched balls; None where there are fewer than FEWEST_HITS."""
-    pairs = []
-    for t in trajectories:
-        cut = flights([t])
-        if not cut or len(cut[0]) + 6 > len(t) or not watched(t, joints) or cut[0].position[1, -1] > 0.0:
-            continue
-        n0 = len(cut[0])
-        stop = int(np.searchsorted(t.time, t.time[n0] + RETURN))
-        if stop - n0 >= 8:
-            pairs.append((t.part(0, stop), n0))
+    pairs = watched_hits(trajectories, joints)
     if len(pairs) < FEWEST_HITS:
         return None
     effects = tuple(e for e in EFFECTS if e.at_paddle and e.name not in without)
@@ -121,6 +113,20 @@ def diagnose_hits(
     return HitFindings(tuple(causes), int(usable.sum()), quiet, first[:, usable], after[:, usable])
 
 
+def watched_hits(trajectories: Sequence[Trajectory], joints: JointPath | None) -> list[tuple[Trajectory, int]]:
+    """Balls up to RETURN after their hit by a paddle whose joints were watched, each with its samples before it."""
+    pairs = []
+    for t in trajectories:
+        cut = flights([t])
+        if not cut or len(cut[0]) + 6 > len(t) or not watched(t, joints) or cut[0].position[1, -1] > 0.0:
+            continue
+        n0 = len(cut[0])
+        stop = int(np.searchsorted(t.time, t.time[n0] + RETURN))
+        if stop - n0 >= 8:
+            pairs.append((t.part(0, stop), n0))
+    return pairs
+
+
 def part(found: BallFindings, hits: HitFindings | None, without: Container[str]) -> Part:
     """The hits' part of the verdict; without hits, the effects at the paddle are not excited."""
     if hits is None:
@@ -151,20 +157,30 @@ def _compare(
         problem.model, problem.values(thetas[:, :, None]), np.repeat(start[:, None], variants, axis=1), g, problem.axes
     )
     out = g.mask & ~incoming
-    since = np.where(out, g.time - np.where(np.isfinite(flown.hit_time[0]), flown.hit_time[0], 0.0), 0.0)
+    behind = line_behind(g, out, flown.hit_time[0])
+    y = behind(np.where(out, g.measured - flown.measured[:, :, 0], 0.0))
+    change = np.moveaxis(flown.measured[:, :, 1:] - flown.measured[:, :, :1], 2, 0)
+    return y, behind(np.where(out, change, 0.0)) / moves[:, None, None], flown.hit_time[0]
+
+
+def line_behind(
+    g: Grid, out: Bool[np.ndarray, "T n"], hit_time: Float[np.ndarray, " n"]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Function that turns differences (..., 3, T, n) of returns into place and velocity behind the paddle (..., 6, n).
+
+    out: samples of the return; hit_time: [s] since the first sample.
+    """
+    since = np.where(out, g.time - np.where(np.isfinite(hit_time), hit_time, 0.0), 0.0)
     weight = out.astype(float)
     moments = np.array([[weight.sum(0), since.sum(0)], [since.sum(0), (since**2).sum(0)]])  # (2, 2, n)
     inverse = np.linalg.inv(np.moveaxis(moments, -1, 0) + 1e-12 * np.eye(2))
 
     def behind(difference: np.ndarray) -> np.ndarray:
-        """(..., 3, T, n) -> (..., 6, n): a line through the differences of the return."""
         sums = np.stack([(difference * weight).sum(-2), (difference * since).sum(-2)], axis=-1)  # (..., 3, n, 2)
         line = np.einsum("nij,...nj->i...n", inverse, sums)
         return np.concatenate([line[0], line[1]], axis=-2)
 
-    y = behind(np.where(out, g.measured - flown.measured[:, :, 0], 0.0))
-    change = np.moveaxis(flown.measured[:, :, 1:] - flown.measured[:, :, :1], 2, 0)
-    return y, behind(np.where(out, change, 0.0)) / moves[:, None, None], flown.hit_time[0]
+    return behind
 
 
 def _choose(
@@ -174,7 +190,7 @@ def _choose(
     left = y - np.median(y, axis=1, keepdims=True)
     chosen: Subset = ()
     for _ in range(ROUNDS):
-        root, weight = _spread(left)
+        root, weight = spread(left)
         j = np.einsum("cd,kdn->kcn", root, jacobian) * np.sqrt(weight)
         t = root @ y * np.sqrt(weight)
         gram = np.einsum("kcn,lcn->nkl", j, j)
@@ -197,7 +213,7 @@ def _choose(
     return chosen, values, errors, rated
 
 
-def _spread(left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def spread(left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Root (6, 6) of the inverse covariance of residuals (6, n), robustly, and Huber's weights (n,).
 
     Place and velocity behind the paddle err together: a hit that is early by a millisecond is both ahead and faster.

@@ -161,7 +161,7 @@ JOINT_OFFSET = Description(  # found by encoder_home
     reading="hold {joint} still at its home position before it moves",
 )
 DESCRIPTIONS: dict[str, Description] = {e.name: e for e in (*EFFECTS, OBSERVATION_DELAY, JOINT_OFFSET)}
-NAMES = tuple(field.name for field in dataclasses.fields(JointDrive))
+NAMES = tuple(field.name for field in dataclasses.fields(JointDrive) if field.name in DESCRIPTIONS)
 
 
 def members(effect: str) -> tuple[str, ...]:

@@ -280,7 +280,7 @@ def nominal_response(model: SimModel, joint: str, robot: Robot | None = None) ->
                 values[field.name] += value
             elif field.name == "velocity_gain":
                 values[field.name] *= value
-            else:
+            elif field.name != "resonance":  # which no encoder sees
                 values[field.name] = value
     servo = servos(robot)[place]
     return JointResponse(**values, servo=servo.time_constant, servo_gain=servo.gain)

@@ -17,6 +17,7 @@ from experiments.config import build
 from experiments.config import experiment as config
 from experiments.config.baselines import Comparison
 from experiments.config.finetuning import FineTuning
+from experiments.config.prior import PRIOR
 from experiments.config.study import Study
 from experiments.errors import ConfigError
 from mjx_tt.env import rewards
@@ -259,3 +260,21 @@ def test_paper_settings_are_the_papers():
     assert (sigma(0), sigma(end)) == (0.025, pytest.approx(falling.optimiser.sigma_fall.final))
     change, _ = bgs.step.update([1.0], bgs.step.init([0.0]))
     assert change == [pytest.approx(-0.00375)]
+
+
+def test_the_prior_is_drawn_where_a_model_names_it(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text("name: a\nballs: narrow\nmodel: {sensing: {ball_offset_x: 0.001}, randomise: prior}\n")
+    made = build.experiment(config.load(file), str(file))
+    assert {one.path: [one.low, one.high] for one in made.model.randomise} == PRIOR
+    assert made.model.model.sensing.ball_offset_x == 0.001
+    assert made.config.model["randomise"] == PRIOR  # the run keeps the numbers, whatever the program's become
+    plain = build.experiment(config.load(file, ("model={}",)), str(file))
+    unknown = build.unknown_worlds(plain)
+    assert plain.model.randomise == () and {one.path for one in unknown.model.randomise} == set(PRIOR)
+    file.write_text("name: a\nballs: narrow\nrobot: ur10e_rail\nmodel: {randomise: prior}\n")
+    other = config.load(file)
+    with pytest.raises(ConfigError, match="model.randomise: prior has ranges of the paper's robot alone"):
+        build.experiment(other, str(file))
+    file.write_text("name: a\nballs: narrow\nrobot: ur10e_rail\n")
+    assert build.unknown_worlds(build.experiment(config.load(file), str(file))) is None

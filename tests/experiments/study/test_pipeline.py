@@ -12,6 +12,7 @@ import sys
 import time
 from io import StringIO
 from pathlib import Path
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -93,7 +94,7 @@ def cosine(a: np.ndarray, b: np.ndarray) -> float:
 # The YAML and the plan
 
 
-@pytest.mark.parametrize("name", ["study_quick", "study_night", "study_full"])
+@pytest.mark.parametrize("name", ["study_quick", "study_night", "study_full", "study_paper"])
 def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for_one(name):
     shipped = study_config.load(study_config.shipped()[name])
     assert [r.real for r in shipped.simulation.rounds] == [60, 70, 70]
@@ -238,6 +239,23 @@ def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
     assert build.later_weights(later.training)[0] == 0
 
 
+def test_the_papers_study_trains_as_the_papers_training():
+    """With the settings of the shipped paper.yaml, which the tests of training hold against the paper."""
+    study_ = study_config.load(study_config.shipped()["study_paper"])
+    paper = experiment.load(experiment.shipped()["paper"])
+    assert study_.simulation.optimiser == paper.optimiser
+    step = paper.optimiser.step
+    assert (step.kind, step.learning_rate, step.schedule.kind) == ("sgd", 0.00375, "constant")
+    assert [(r.simulated, r.real, r.step, r.later_rewards) for r in study_.simulation.rounds] == [
+        (30000, 60, None, None),
+        (5000, 70, None, None),
+        (5000, 70, None, None),
+    ]
+    assert study_.simulation.rounds[0].simulated == paper.training.updates
+    item = next(i for i in schedule.items(study_, "player1") if isinstance(i, Simulated))
+    assert training.configuration(study_, item, "narrow", None, 0).training.later_rewards is None
+
+
 # The hidden reality
 
 
@@ -255,6 +273,38 @@ def test_leaving_out_an_effect_changes_no_other_and_seeds_differ():
     assert all(other[path] != value for path, value in everything.items())
     with pytest.raises(ValueError, match="no effect is called 'magic'; there are rubber"):
         hidden_effects.draw(3, ("magic",))
+
+
+def test_realities_lie_to_both_sides_of_what_training_believes_and_within_the_prior():
+    nominal = models.paths()
+    for effect, ranges in hidden_effects.RANGES.items():
+        for path, (low, high) in ranges.items():
+            wide = study_config.PRIOR[path]
+            assert wide[0] <= low < high <= wide[1], path
+            if effect != "noise":
+                assert low <= nominal[path] <= high, path
+    drawn = [models.paths(hidden_effects.draw(seed)) for seed in range(40)]
+    for path in ("ball.paddle.restitution", "ball.table.restitution", "ball.table.friction", "sensing.camera_scale"):
+        above = sum(values[path] > nominal[path] for values in drawn)
+        assert 8 < above < 32, path
+
+
+def test_effects_from_outside_come_on_top_and_change_no_other():
+    inside = hidden_effects.differences(hidden_effects.draw(3))
+    for effect, ranges in hidden_effects.OUTSIDE.items():
+        model = hidden_effects.draw(3, outside=(effect,))
+        found = hidden_effects.differences(model)
+        assert {p: v for p, v in found.items() if p not in ranges} == {
+            p: v for p, v in inside.items() if p not in ranges
+        }
+        assert all(low <= found[path] <= high for path, (low, high) in ranges.items())
+        # What no prior has: an identification cannot come upon it by chance.
+        assert not set(ranges) <= set(study_config.PRIOR)
+        assert hidden_effects.content(model, 3, (), (effect,))["outside"] == [effect]
+    assert "outside" not in hidden_effects.content(hidden_effects.draw(3), 3, ())
+    assert tuple(hidden_effects.OUTSIDE) == get_args(study_config.Outside)
+    with pytest.raises(ValueError, match="outside of the model is called 'magic'; there are lift, bounce"):
+        hidden_effects.draw(3, outside=("magic",))
 
 
 def test_measured_balls_are_the_flight_as_the_camera_sees_it():

@@ -51,7 +51,7 @@ def test_bootstrap_of_one_policy_is_scipys():
     assert (interval.low, interval.high) == pytest.approx(theirs, abs=0.15)
 
 
-@pytest.mark.parametrize("count", [2, 3, 6])
+@pytest.mark.parametrize("count", [5, 6, 9])
 def test_bootstrap_over_seeds_has_the_spread_of_a_mean_over_seeds(count):
     levels = np.random.default_rng(count).integers(2, 40, count)  # rallies of a seed do not differ: only seeds do
     data = rallies({(s, "player1", "player1", "m"): np.full(5, level) for s, level in enumerate(levels)})
@@ -60,6 +60,13 @@ def test_bootstrap_over_seeds_has_the_spread_of_a_mean_over_seeds(count):
     assert draws.var() == pytest.approx(levels.var(ddof=1) / count, rel=0.05)
     fixed = Bootstrap(data, over_seeds=False).mean("m", ["player1"]).draws
     assert np.ptp(fixed) == 0.0
+
+
+def test_fewer_than_five_seeds_are_not_drawn_anew():
+    levels = [3, 30, 12, 7]
+    data = rallies({(s, "player1", "player1", "m"): np.full(5, level) for s, level in enumerate(levels)})
+    assert np.ptp(Bootstrap(data).mean("m", ["player1"]).draws) == 0.0
+    assert [statistics.chance(n) for n in (1, 4, 5)] == ["rallies", "rallies", "seeds and rallies"]
 
 
 def test_the_interval_covers_as_often_as_it_says():

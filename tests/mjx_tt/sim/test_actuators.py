@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from ballmodel.partial_params import without_nominal
 from mjx_tt.robot import model as robot
@@ -188,6 +190,28 @@ def test_velocity_follows_exactly_over_a_substep_of_any_length(case):
             velocity, way = respond(lag, a, v, u, seconds, fine)
             np.testing.assert_allclose(state.velocity, velocity, atol=1e-3 * np.abs(u - v).max())
             np.testing.assert_allclose(mean * seconds, way, atol=1e-5)
+
+
+def test_a_flexible_mount_swings_as_the_differential_equation():
+    """Against SciPy, the joint's acceleration held over each step; a rigid joint beside it does not swing."""
+    frequency, steps = 14.0, 60
+    w, z = 2.0 * np.pi * frequency, actuators.SWING_DAMPING
+    v = np.cumsum(np.random.default_rng(3).normal(0.0, 0.1, steps + 1))
+    with jax.enable_x64(True):
+        drive = effects(resonance=jnp.array([frequency, 0.0]))
+        state = actuators.at_rest(drive, jnp.zeros(2))
+        wanted = np.zeros(2)
+        for before, after in itertools.pairwise(v):
+            state = actuators.swung(drive, state, jnp.full(2, before), jnp.full(2, after), H)
+            a = (after - before) / H
+
+            def motion(_, y, a=a):
+                return [y[1], -(w**2) * y[0] - 2 * z * w * y[1] - a]
+
+            wanted = solve_ivp(motion, (0, H), wanted, rtol=1e-10, atol=1e-13).y[:, -1]
+            np.testing.assert_allclose(state.swing[:, 0], wanted, rtol=1e-6, atol=1e-12)
+    assert np.abs(wanted).max() > 0.0 and not np.any(state.swing[:, 1])
+    assert actuators.at_rest(effects(), jnp.zeros(2)).swing is None
 
 
 def test_carried_joints_stay_within_the_play_and_move_with_the_joint_at_its_end():

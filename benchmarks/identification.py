@@ -1,0 +1,320 @@
+"""Worth of the identification: ``python -m benchmarks.identification [--out runs/identification] [--realities 10]``.
+
+In each of several hidden realities, every second one from outside of the model's class, a player's balls, a minute of
+the joints and a hundred hits are logged and the simulation is identified. The shipped quickstart is trained on in the
+nominal world, in the prior alone, in the identified worlds without and with hits, and in the reality itself; all five
+then play in the reality, on the same balls. Resumable: what is finished is kept, ``--summary`` prints it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from ballmodel.partial_params import without_nominal
+from experiments import measurements
+from experiments.config import build, experiment
+from experiments.config import study as studies
+from experiments.runs import load_policy, run_dir
+from experiments.runs.run_dir import Run
+from experiments.stats import wilson
+from experiments.study import identification
+from experiments.study.target_domain import hidden_effects, hit_log, joint_log
+from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.training.loop import train
+from mjx_tt import platform
+from mjx_tt.env.policy import Policy
+from mjx_tt.env.task import RETURNED
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import ModelFile, SimModel
+
+QUICKSTART = Path("experiments/shipped/policies/quickstart")
+WORLDS = ("nominal", "prior", "identified", "hits", "truth")
+CLASSES = ((), ("lift",), (), ("bounce",), (), ("blade",), (), ("mount",), (), ("lift", "bounce", "blade", "mount"))
+BALLS, RALLIES, LANES = 4000, 80, 16  # balls of each evaluation; rallies of each policy, in lanes
+CAMERA_NOISE = 0.003  # [m]
+SHARED = {"lift": ("flight",), "bounce": ("restitution",), "blade": ("paddle.restitution",), "mount": ()}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measures, prints and writes; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("runs/identification"))
+    parser.add_argument("--realities", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first reality")
+    parser.add_argument("--updates", type=int, default=500, help="of 2,000 balls, of each training")
+    parser.add_argument("--player", default="player3")
+    parser.add_argument("--untrained", action="store_true", help="intervals alone: nothing is trained or played")
+    parser.add_argument("--summary", action="store_true", help="only print what is finished")
+    chosen = parser.parse_args(arguments)
+    platform.configure(devices=1)
+    if not chosen.summary:
+        measure(
+            chosen.out,
+            range(chosen.first, chosen.first + chosen.realities),
+            0 if chosen.untrained else chosen.updates,
+            chosen.player,
+        )
+    found = [json.loads(path.read_text()) for path in sorted(chosen.out.glob("reality_*.json"))]
+    if not found:
+        print(f"{chosen.out}: no reality is finished")
+        return 1
+    if chosen.untrained:
+        print("\n".join(coverage([one for one in found if not one["outside"]], ("identified", "hits"))))
+        return 0
+    text = summary(found)
+    (chosen.out / "summary.txt").write_text(text + "\n", encoding="utf-8")
+    plot(found, chosen.out / "identification.png")
+    print(text)
+    return 0
+
+
+def measure(out: Path, seeds: range, updates: int, player: str) -> None:
+    """Everything of the realities that are not finished yet, one JSON each."""
+    out.mkdir(parents=True, exist_ok=True)
+    left, began, spent = [s for s in seeds if not _file(out, s).exists()], time.monotonic(), 0
+    for seed in left:
+        # In a process of its own: a dozen compiled programs each, and a process may map only so many of them.
+        process = get_context("spawn").Process(target=_one, args=(out, seed, updates, player))
+        process.start()
+        process.join()
+        if process.exitcode:
+            raise SystemExit(f"reality {seed}: the process ended with {process.exitcode}; run it again to go on")
+        result = json.loads(_file(out, seed).read_text(encoding="utf-8"))
+        spent += 1
+        rates = (
+            "intervals"
+            if not updates
+            else ", ".join(f"{world} {result['returned'][world]['rate']:.1%}" for world in WORLDS)
+        )
+        minutes = (time.monotonic() - began) / spent * (len(left) - spent) / 60.0
+        print(f"reality {seed} {result['outside'] or 'in class'}: {rates}; {minutes:.0f} min left", flush=True)
+
+
+def _one(out: Path, seed: int, updates: int, player: str) -> None:
+    platform.configure(devices=1)
+    run_dir.write_json(_file(out, seed), of_reality(out, seed, updates, player))
+
+
+def of_reality(out: Path, seed: int, updates: int, player: str) -> dict[str, Any]:
+    """Logs, identification, trainings and evaluations of one reality; without updates no trainings and evaluations."""
+    outside = CLASSES[seed % len(CLASSES)]
+    rounds = [{"simulated": 1, "real": 1}] * 3
+    study = studies.parse(
+        {"name": "x", "simulation": {"rounds": rounds}, "reality": {"outside": list(outside)}}, "study"
+    )
+    reality, folder = VirtualReality(study, seed), out / f"logs_{seed}"
+    person, keys = reality.player(player), jax.random.split(jax.random.key(seed), 6)
+    measurements.write_csv(_made(folder) / "D0.csv", reality.first_balls(person, 300, keys[0], "D0"))
+    records = joint_log.record(reality.simulator.task, reality.known, keys[1], 60.0)
+    identification.write_joints(folder / "joints", records)
+    policy = load_policy.load(QUICKSTART).policy
+    log = hit_log.record(reality.simulator, reality.known, person, policy, keys[2], "hits", CAMERA_NOISE)
+    identification.write_hits(folder / "hits", log.balls, log.joints)
+    prior = identification.prior(studies.PRIOR, "prior")
+    worlds = {"nominal": ModelFile(SimModel()), "prior": ModelFile(SimModel(), prior)}
+    seconds: dict[str, float] = {}
+    logs = [folder / "D0.csv", folder / "joints"]
+    counts = {}
+    for name, hits in (("identified", ()), ("hits", (folder / "hits",))):
+        began = time.monotonic()
+        found = identification.identify(logs, 400, ModelFile(SimModel()), prior, hits)
+        seconds[name], worlds[name] = time.monotonic() - began, found.world
+        counts[name] = found.hits
+        found.world.save(folder / f"{name}.yaml")
+    worlds["truth"] = ModelFile(reality.model)
+    base = {
+        "seed": seed,
+        "outside": list(outside),
+        "reality": hidden_effects.differences(reality.model),
+        "hits": counts["hits"],
+        "identification_seconds": seconds,
+        "intervals": {name: intervals(worlds[name], reality.model) for name in ("identified", "hits")},
+    }
+    if not updates:
+        return base
+    policies = {}
+    for name, world in worlds.items():
+        shared = name in ("nominal", "prior")
+        policies[name] = trained(out / "runs" / (name if shared else f"{name}_{seed}"), world, updates, player)
+    policies["quickstart"] = policy
+    played = {name: returned(reality, person, reality.known, p, keys[3]) for name, p in policies.items()}
+    believed = without_nominal(models.draw(keys[4], worlds["hits"].model, worlds["hits"].randomise, (BALLS,)))
+    predicted = {name: returned(reality, person, believed, p, keys[3]) for name, p in policies.items()}
+    nominal = {name: returned(reality, person, without_nominal(SimModel()), p, keys[3]) for name, p in policies.items()}
+    best = played["truth"]
+    return base | {
+        "returned": {name: _rate(x) for name, x in played.items()},
+        "below_truth": {name: _paired(best, x) for name, x in played.items()},
+        "predicted": {name: float(x.mean()) for name, x in predicted.items()},
+        "predicted_nominal": {name: float(x.mean()) for name, x in nominal.items()},
+        "rally": rallies(reality, person, policies, keys[5]),
+    }
+
+
+def trained(folder: Path, world: ModelFile, updates: int, player: str) -> Policy:
+    """The quickstart after so many updates in a world."""
+    _made(folder)
+    world.save(folder.parent / f"{folder.name}.yaml")
+    overrides = (
+        f"balls={player}/M0",
+        f"model={folder.parent / f'{folder.name}.yaml'}",
+        f"initial_policy={QUICKSTART}",
+        f"training.updates={updates}",
+        "training.evaluate_every=null",
+        "training.later_rewards.after=0",
+        "optimiser.step.learning_rate=0.005",
+        "optimiser.step.schedule.hold=0",
+        "training.devices=1",
+    )
+    config = experiment.load(experiment.shipped()["quickstart"], overrides)
+    made, run = build.experiment(config, folder.name), Run(folder)
+    if not run.trained(made.config):
+        train(made, run, Console(quiet=True))
+    return load_policy.load(folder).policy
+
+
+def returned(reality: VirtualReality, person: Any, model: SimModel, policy: Policy, key: jax.Array) -> np.ndarray:
+    """Which of the same BALLS first balls of the player are returned in a world, (BALLS,)."""
+    start_key, key = jax.random.split(key)
+    wide = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x, jnp.float32)[..., None], BALLS, axis=-1), policy)
+    # The player aims in the reality whatever the world: the balls are the same.
+    state = reality.simulator.start(person, reality.known, start_key, BALLS)
+    _, shots = reality.simulator.shots(wide, person, model, state, key)
+    return np.asarray((shots.outcome == RETURNED) & shots.finite)
+
+
+def rallies(reality: VirtualReality, person: Any, policies: dict[str, Policy], key: jax.Array) -> dict[str, Any]:
+    """Length of RALLIES rallies of each policy: mean, and its standard error over the sessions."""
+    wide = jax.tree.map(
+        lambda *x: jnp.repeat(jnp.stack([jnp.asarray(a, jnp.float32) for a in x], -1), LANES, -1), *policies.values()
+    )
+    result = reality.simulator.play(wide, person, reality.known, key, RALLIES // LANES)
+    length = np.asarray(result.length).reshape(-1, len(policies), LANES).mean(axis=0)
+    error = length.std(axis=1, ddof=1) / LANES**0.5
+    return {name: {"mean": float(length[i].mean()), "error": float(error[i])} for i, name in enumerate(policies)}
+
+
+def intervals(world: ModelFile, reality: SimModel) -> dict[str, list[float]]:
+    """Truth, low and high end of the 90 % interval of every parameter that the logs decided.
+
+    Delays as sums or differences, which is all that logs and play show.
+    """
+    truth, believed = models.paths(reality), models.paths()
+    for bus in ("abb", "festo"):
+        truth[f"latency.{bus}_action"] += truth[f"latency.{bus}_observation"] - believed[f"latency.{bus}_observation"]
+    truth["latency.ball_observation"] += believed["latency.abb_observation"] - truth["latency.abb_observation"]
+    samples = world.randomise[0].ends()
+    return {path: [float(truth[path]), *ends] for path, ends in samples.items()}
+
+
+def summary(found: list[dict[str, Any]]) -> str:
+    """The bars of the issue in words and numbers."""
+    lines = ["seed class " + " ".join(f"{w:>16s}" for w in WORLDS) + "   rally of the same"]
+    for one in found:
+        rates = [one["returned"][world] for world in WORLDS]
+        cells = " ".join(f"{100 * r['rate']:5.1f} ({100 * r['low']:4.1f}-{100 * r['high']:4.1f})" for r in rates)
+        rally = " ".join(f"{one['rally'][w]['mean']:4.1f}" for w in WORLDS)
+        lines.append(f"{one['seed']:4d} {'+'.join(one['outside']) or 'in':24s} {cells}   {rally}")
+    for title, outside in (("in class", False), ("outside", True)):
+        some = [one for one in found if bool(one["outside"]) == outside]
+        if some:
+            lines += _of_class(title, some)
+    for name, key in (("identified with hits", "predicted"), ("nominal", "predicted_nominal")):
+        errors = np.array([100 * abs(f[key][w] - f["returned"][w]["rate"]) for f in found for w in f["returned"]])
+        close, middle = int((errors <= 5).sum()), float(np.median(errors))
+        lines.append(f"predicted by {name}: {close} of {errors.size} policies within 5 points, median {middle:.1f}")
+    seconds = ", ".join(f"{f['identification_seconds']['identified']:.0f}" for f in found)
+    with_hits = ", ".join(f"{f['identification_seconds']['hits']:.0f}" for f in found)
+    lines.append(f"seconds of identification: {seconds}; with hits, compiled or not: {with_hits}")
+    return "\n".join(lines)
+
+
+def _of_class(title: str, some: list[dict[str, Any]]) -> list[str]:
+    rate = {w: np.array([100 * f["returned"][w]["rate"] for f in some]) for w in (*WORLDS, "quickstart")}
+    medians = ", ".join(f"{w} {np.median(x):.1f}" for w, x in rate.items())
+    lines = [f"{title}, {len(some)} realities, median returned [%]: {medians}"]
+    for w in ("identified", "hits"):
+        gap, gain = rate["truth"] - rate[w], rate[w] - rate["prior"]
+        lines.append(
+            f"  {w}: {np.median(gap):.1f} points below the true world in the median ({gap.min():.1f} to "
+            f"{gap.max():.1f}); above the prior alone in {int((gain > 0).sum())} of {len(some)}, by "
+            f"{np.median(gain):.1f} in the median"
+        )
+        lines += [f"    {line}" for line in coverage(some, (w,))]
+    return lines
+
+
+def coverage(some: list[dict[str, Any]], worlds: tuple[str, ...]) -> list[str]:
+    """Share of the truths in their 90 % intervals, over all parameters that the logs decided."""
+    lines = []
+    for w in worlds:
+        hold: dict[str, list[bool]] = {}
+        for f in some:
+            changed = [part for effect in f["outside"] for part in SHARED[effect]]
+            for path, (truth, low, high) in f["intervals"][w].items():
+                if not any(part in path for part in changed):
+                    hold.setdefault(path, []).append(low <= truth <= high)
+        inside, total = sum(map(sum, hold.values())), sum(map(len, hold.values()))
+        low, high = wilson(inside, total)
+        worst = sorted(hold, key=lambda path: sum(hold[path]) - len(hold[path]))[:8]
+        missed = ", ".join(f"{path} {hold[path].count(False)}" for path in worst if not all(hold[path]))
+        share = f"{inside / total:.0%} ({low:.0%}-{high:.0%})"
+        lines.append(f"{w}: {inside} of {total} truths in 90 % intervals, {share}; missed most: {missed or 'none'}")
+    return lines
+
+
+def plot(found: list[dict[str, Any]], path: Path) -> None:
+    """Returned balls by world and reality; predicted against measured."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained")
+    for one in found:
+        rates = [100 * one["returned"][w]["rate"] for w in WORLDS]
+        left.plot(WORLDS, rates, "o--" if one["outside"] else "o-", label=f"{one['seed']} {'+'.join(one['outside'])}")
+        measured = [100 * one["returned"][w]["rate"] for w in one["returned"]]
+        right.plot(measured, [100 * one["predicted"][w] for w in one["returned"]], "o" if one["outside"] else "s")
+    left.set_ylabel("returned in the reality [%]")
+    left.legend(fontsize=7, title="reality")
+    right.plot([0, 100], [0, 100], "k", lw=0.5)
+    right.set_xlabel("measured [%]")
+    right.set_ylabel("predicted after identification with hits [%]")
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def _rate(x: np.ndarray) -> dict[str, float]:
+    low, high = wilson(int(x.sum()), x.size)
+    return {"rate": float(x.mean()), "low": low, "high": high}
+
+
+def _paired(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
+    """Mean of a - b ball by ball, with its standard error."""
+    d = a.astype(float) - b.astype(float)
+    return {"points": float(100 * d.mean()), "error": float(100 * d.std(ddof=1) / d.size**0.5)}
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _file(out: Path, seed: int) -> Path:
+    return out / f"reality_{seed:03d}.json"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,163 @@
+"""Balls of the virtual reality from the player's paddle to the robot's and back, with the joints on the same clock.
+
+Turns of a rally are played, and each is watched: the robot's motion as the simulator of the rallies has it, the ball
+flown along it once more in finer steps, so that a camera's frame needs no control period. What comes out is what a
+laboratory logs: a tracker's positions when they arrive, encoders' positions when they arrive, each as late as that
+episode's draw of its latency, with the errors of camera and zeros.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import PRNGKeyArray
+
+from ballmodel import flight
+from ballmodel.constants import BALL_RADIUS
+from ballmodel.flight import PaddlePose
+from ballmodel.state import BallState
+from ballmodel.trajectory import Dataset, Trajectory
+from experiments.study.target_domain import hidden_effects
+from experiments.study.target_domain.hidden_effects import CAMERA_RATE
+from mjx_tt.diagnosis.joint import JointRecord
+from mjx_tt.env.episode import Episodes, EpisodeState, Tick
+from mjx_tt.env.policy import Policy
+from mjx_tt.env.policy import controller as controller_of
+from mjx_tt.env.task import Task
+from mjx_tt.rally.human_player import Player
+from mjx_tt.rally.simulator import RallySimulator
+from mjx_tt.sim.model import SimModel
+from robot_io.contract import FESTO_JOINTS
+
+SECONDS = 1.4  # of each ball that are watched
+EVERY = 4.0  # [s] from ball to ball on the log's clock
+ENCODER_RATE = 250.0  # [Hz]
+SUBSTEPS = 4  # of the ball per camera frame
+AWAY = 0.3  # [m] beyond the player's contact at which a return is out of sight
+
+
+@dataclass(frozen=True)
+class HitLog:
+    """Tracks of balls with hits and returns in them, and the joints' records over all of them, by one clock."""
+
+    balls: Dataset
+    joints: tuple[JointRecord, ...]
+
+
+def record(
+    simulator: RallySimulator,
+    model: SimModel,
+    player: Player,
+    policy: Policy,
+    key: PRNGKeyArray,
+    session: str,
+    noise: float,
+    lanes: int = 12,
+    turns: int = 10,
+) -> HitLog:
+    """``lanes`` x ``turns`` balls of rallies of a player with a policy, one after the other on the log's clock.
+
+    model: the reality, without what is nominal; noise: [m] of the camera.
+    """
+    start_key, play_key, camera_key = jax.random.split(key, 3)
+    policy = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[..., None], lanes, axis=-1), policy)
+    state, task = simulator.start(player, model, start_key, lanes), simulator.task
+    balls: list[Trajectory] = []
+    states: list[_States] = []
+    for turn in range(turns):
+        turn_key = jax.random.fold_in(play_key, turn)
+        episodes = simulator.episodes(turn_key, model, state)
+        watched = jax.tree.map(np.asarray, _watched(policy, episodes, task=task))
+        state, _ = simulator.shots(policy, player, model, state, turn_key)
+        seen = hidden_effects.seen(model, watched[0], noise, jax.random.fold_in(camera_key, turn))
+        latency = np.asarray(episodes.latency)
+        for lane in range(lanes):
+            begin = EVERY * (turn * lanes + lane)
+            # Less what the model believes: a log's stamps are put right by it when they are read.
+            late = float(latency[0, lane]) - SimModel().latency.ball_observation
+            count = _in_sight(watched[0][..., lane])
+            time = begin + late + np.arange(count) / CAMERA_RATE
+            balls.append(Trajectory(session, str(len(balls)), np.asarray(time), seen[:, :count, lane]))
+            commands, encoders = (np.asarray(x)[..., lane] for x in watched[1:])
+            states.append(_States(begin, latency[:, lane], commands, encoders))
+    return HitLog(Dataset(tuple(balls), session), _records(task, model, states))
+
+
+@dataclass(frozen=True)
+class _States:
+    """The joints during one ball."""
+
+    begin: float  # [s] on the log's clock
+    latency: np.ndarray  # (5,) [s]
+    command: np.ndarray  # (ticks, 8) by control period
+    encoder: np.ndarray  # (8, T) true positions at ENCODER_RATE
+
+
+def _in_sight(position: np.ndarray) -> int:
+    """Frames of a ball's positions (3, T) [m] until it lies low, passes the robot or comes back to where it was hit."""
+    x, y, z = position
+    gone = (z < BALL_RADIUS - 0.05) | (y < -2.3) | (y > y[0] + AWAY)
+    return int(np.argmax(gone)) if gone.any() else len(gone)
+
+
+def _records(task: Task, model: SimModel, states: list[_States]) -> tuple[JointRecord, ...]:
+    """Positions that encoders reported over all balls, and the commands, of each joint."""
+    period, records = task.config.period, []
+    for i, name in enumerate(task.contract.joints):
+        zero = 0.0 if model.drives is None else getattr(model.drives, name).joint_offset or 0.0
+        late = 2 if i in FESTO_JOINTS else 1
+        command_time = np.concatenate([one.begin + period * np.arange(len(one.command)) for one in states])
+        ticks = [np.arange(one.encoder.shape[1]) / ENCODER_RATE + one.begin + one.latency[late] for one in states]
+        command = np.concatenate([one.command[:, i] for one in states])
+        position = np.concatenate([one.encoder[i] + zero for one in states])
+        records.append(JointRecord(name, command_time, command, np.concatenate(ticks), position, task.config.robot))
+    return tuple(records)
+
+
+@partial(jax.jit, static_argnames="task")
+def _watched(policy: Policy, episodes: Episodes, task: Task) -> tuple[Array, Array, Array]:
+    """Positions of balls (3, T, L) at the camera's rate, commands (ticks, 8, L), true joints (8, T', L) by encoders."""
+    controller, prepared = controller_of(policy), task.prepare(episodes)
+    ticks = round(SECONDS / task.config.period) + 1
+
+    def advance(s: EpisodeState, tick: Tick) -> tuple[EpisodeState, tuple]:
+        after = task.control_step(tick, s, episodes, prepared, controller)
+        still = jnp.zeros((2, *after.qpos.shape)) if after.drive.swing is None else after.drive.swing
+        return after, (after.qpos, after.qvel, still, after.command)
+
+    first = task.reset(episodes, controller)
+    _, (q, v, swing, commands) = jax.lax.scan(advance, first, jnp.arange(ticks))
+    at_rest = jnp.zeros_like(first.qpos)
+    q, v = (jnp.concatenate([a[None], x]) for a, x in ((first.qpos, q), (at_rest, v)))
+    swing = jnp.concatenate([jnp.zeros((1, *swing.shape[1:])), swing])
+    frames, rate = round(SECONDS * CAMERA_RATE), CAMERA_RATE * SUBSTEPS
+    time = jnp.arange(frames * SUBSTEPS + 1) / rate
+    carried = (_between(q, v, time, task), _between(swing[:, 0], swing[:, 1], time, task))
+    bent = [a + b for a, b in zip(*carried, strict=True)]
+    pose = task.kinematics.pose(*(jnp.moveaxis(x, 0, 1) for x in bent))  # each (3, K, L)
+
+    def substep(ball: BallState, pair: tuple[PaddlePose, PaddlePose]) -> tuple[BallState, Array | np.ndarray]:
+        new, _ = flight.step(episodes.model.ball, ball, 1.0 / rate, pair)
+        return new, ball.position
+
+    poses = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), pose)
+    pairs = (jax.tree.map(lambda x: x[:-1], poses), jax.tree.map(lambda x: x[1:], poses))
+    _, path = jax.lax.scan(substep, episodes.ball, pairs)
+    encoders, _ = _between(q, v, jnp.arange(round(SECONDS * ENCODER_RATE)) / ENCODER_RATE, task)
+    return jnp.moveaxis(path[::SUBSTEPS], 0, 1), commands, jnp.moveaxis(encoders, 0, 1)
+
+
+def _between(q: Array, v: Array, time: ArrayLike, task: Task) -> tuple[Array, Array]:
+    """Positions and velocities (K, 8, L) at times (K,) [s] from those at control periods, by cubic pieces."""
+    h = task.config.period
+    n = jnp.minimum((jnp.asarray(time) / h).astype(int), q.shape[0] - 2)
+    s = (jnp.asarray(time) / h - n)[:, None, None]
+    a, b, va, vb = q[n], q[n + 1], h * v[n], h * v[n + 1]
+    c2, c3 = 3.0 * (b - a) - 2.0 * va - vb, 2.0 * (a - b) + va + vb
+    return a + s * (va + s * (c2 + s * c3)), (va + s * (2.0 * c2 + 3.0 * s * c3)) / h

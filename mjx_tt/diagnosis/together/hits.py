@@ -1,0 +1,130 @@
+"""Posterior of rubber, delay of the ball, encoders' zeros and the camera's sideways offset, from hits.
+
+None of these shows in a ball before its hit or in the joints alone, and none can be told apart in a single hit; they
+are ordinary sizes of what every installation has. So nothing is named here: each has a prior, and the maximum of the
+posterior is sought by Gauss-Newton on the returns' place and velocity behind the paddle. The spread from hit to hit is
+the noise, as in ``diagnose``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float
+
+from ballmodel.trajectory import Trajectory
+from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading
+from mjx_tt.diagnosis.ball.flights.forward_model import grid, predict
+from mjx_tt.diagnosis.ball.flights.linearization import BallProblem
+from mjx_tt.diagnosis.hits.diagnose import FARTHEST, FEWEST_HITS, line_behind, spread, watched_hits
+from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses
+from mjx_tt.diagnosis.together.balls import LIFT_ERROR, BallsTogether
+from mjx_tt.sim.randomisation import Samples
+from robot_io.contract import JOINT_NAMES
+
+PADDLE = ("ball.paddle.restitution", "ball.paddle.tangential_gain", "latency.ball_observation")
+CAMERA = ("sensing.ball_offset_x", "sensing.ball_offset_y")
+ZEROS = tuple(f"drives.{joint}.joint_offset" for joint in JOINT_NAMES)
+SHOWN = (*PADDLE, *CAMERA, *ZEROS)  # by hits, and by no other log
+LIFT = "lift"  # error of its coefficient, along which the balls' parameters go
+STEP = 0.05  # of a prior's deviation, by which derivatives are taken
+ROUNDS = 4
+# Times the noise that hits scatter by. What all hits share is wrong as well: spins that a flight hardly shows, a
+# camera's yaw, the balls' own parameters. Over eleven realities errors were one to four times what the scatter gives.
+WIDER = 2.0
+SETTLED = 0.1  # deviations
+DRAWS = 256
+Prior = Mapping[str, tuple[float, float]]  # mean and standard deviation by dotted path
+
+
+@dataclass(frozen=True)
+class HitsTogether:
+    """Gaussian posterior of parameters by dotted path, and last of LIFT; zeros as measured less true position."""
+
+    paths: tuple[str, ...]
+    mean: Float[np.ndarray, " P"]
+    covariance: Float[np.ndarray, "P P"]
+    hits: int
+
+    def samples(
+        self, ranges: Mapping[str, tuple[float, float]], seed: int = 0
+    ) -> tuple[Samples, Float[np.ndarray, " S"]]:
+        """Draws, kept within the ranges given by path; and the error of the balls' lift in each of them."""
+        drawn = np.random.default_rng(seed).multivariate_normal(self.mean, self.covariance, DRAWS, method="eigh")
+        low, high = (np.array([ranges[path][end] for path in self.paths[:-1]]) for end in (0, 1))
+        return Samples(self.paths[:-1], np.clip(drawn[:, :-1], low, high), np.ones(DRAWS)), drawn[:, -1]
+
+
+def fit(
+    balls: BallsTogether, trajectories: Sequence[Trajectory], path: JointPath | None, prior: Prior
+) -> HitsTogether | None:
+    """The posterior after the hits among the trajectories; None where there are fewer than FEWEST_HITS of them.
+
+    balls: what flights before a hit say, which is taken as settled but for the lift. path: of the joints on the balls'
+    clock, with the zeros that were reported. prior: of those of ``SHOWN`` that are sought; the others stay as they are.
+    """
+    pairs = watched_hits(trajectories, path)
+    if len(pairs) < FEWEST_HITS or path is None:
+        return None
+    prior = {**prior, LIFT: (0.0, LIFT_ERROR)}
+    names = (*(name for name in SHOWN if name in prior), LIFT)
+    whole, before = [t for t, _ in pairs], np.array([n for _, n in pairs])
+    g = grid(whole)
+    incoming = np.arange(len(g.time))[:, None] < before[None]
+    problem = BallProblem(g, balls.problem.model, balls.problem.effects, heading(g))
+    # The spin that a ball's own flight and bounce show decides where the rubber sends it.
+    theta, spins = balls.posterior.theta, balls.spins
+    spins = spins and replace(spins, own_mean=None, own_covariance=None)
+    first = first_fit(problem, theta, None if spins is None else spins.mean, incoming)
+    before_hit = replace(g, mask=g.mask & incoming)
+    out = g.mask & ~incoming
+
+    @cache
+    def started(lift: float) -> np.ndarray:
+        return fit_starts(problem, balls.along_lift(lift), first, before_hit, None, spins)
+
+    def seen(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Measured positions (3, T, n) that the model plays, and when each is hit (n,)."""
+        at = dict(zip(names, values, strict=True))
+        zeros = [at.get(name, 0.0) for name in ZEROS]
+        moved = JointPath(path.time, tuple(q - zero for q, zero in zip(path.position, zeros, strict=True)))
+        changed = problem.values(balls.along_lift(float(at[LIFT]))[:, None, None])
+        begin = started(float(at[LIFT])).copy()
+        for name in (*PADDLE, *CAMERA):
+            if name in at:
+                changed[name] = np.full((1, 1), at[name])
+        for i, name in enumerate(CAMERA):  # the ball is where the camera's offset puts it
+            begin[i] -= at.get(name, problem.nominal[name]) - problem.nominal[name]
+        flown = predict(problem.model, changed, begin[:, None], replace(g, paddle=poses(whole, g.steps, moved)), axes)
+        return flown.measured[:, :, 0], flown.hit_time[0]
+
+    axes = problem.axes
+    mean, deviation = np.array([prior[name] for name in names]).T
+    values, precision = mean.copy(), np.diag(deviation**-2.0)
+    for _ in range(ROUNDS):
+        base, hit = seen(values)
+        behind = line_behind(g, out, hit)
+        y = behind(np.where(out, g.measured - base, 0.0))
+        usable = np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)
+        columns = []
+        for i, size in enumerate(STEP * deviation):
+            other, met = seen(values + size * np.eye(len(values))[i])
+            columns.append(behind(np.where(out, other - base, 0.0)) / size)
+            usable &= np.isfinite(met)
+        if usable.sum() < FEWEST_HITS:
+            return None
+        jacobian, y = np.array(columns)[:, :, usable], y[:, usable]
+        change = np.zeros(len(values))
+        for _ in range(ROUNDS):  # the noise is what the change leaves over
+            root, weight = spread(y - np.einsum("kcn,k->cn", jacobian, change))
+            j = np.einsum("cd,kdn->kcn", root, jacobian) * np.sqrt(weight) / WIDER
+            covariance = np.linalg.inv(np.einsum("kcn,lcn->kl", j, j) + precision)
+            right = np.einsum("kcn,cn->k", j, root @ y * np.sqrt(weight)) / WIDER
+            change = covariance @ (right + precision @ (mean - values))
+        values = values + change
+        if np.max(np.abs(change) / np.sqrt(np.diagonal(covariance))) < SETTLED:
+            break
+    return HitsTogether(names, values, covariance, int(usable.sum()))

@@ -1,0 +1,62 @@
+"""Rubber, delay and zeros from returns of other code: MuJoCo C's kinematics, SciPy's flight, the rubber by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mjx_tt.diagnosis.hits.paddle_path import JointPath, joint_path
+from mjx_tt.diagnosis.together import balls, hits
+from tests.mjx_tt.diagnosis.test_hits import MODEL, Rubber, play
+
+pytestmark = pytest.mark.optimised
+
+FLIGHTS = {"ball.flight.drag_coefficient": (0.47, 0.03)}
+PRIOR = {
+    "ball.paddle.restitution": (0.9, 0.05),
+    "ball.paddle.tangential_gain": (0.66, 0.1),
+    "latency.ball_observation": (0.040, 0.01),
+    "drives.joint_5.joint_offset": (0.0, 0.01),
+}
+TRUTH = Rubber(restitution=0.84, gain=0.55, late=0.008)
+WANTED = {
+    "ball.paddle.restitution": 0.84,
+    "ball.paddle.tangential_gain": 0.55,
+    "latency.ball_observation": 0.048,
+    "drives.joint_5.joint_offset": 0.006,
+}
+
+
+def fitted(rubber: Rubber, seed: int):
+    measured, records = play(rubber, seed)
+    path = joint_path(records, MODEL)
+    moved = [q + 0.006 if i == 6 else q for i, q in enumerate(path.position)]  # joint_5 reads 6 mrad too much
+    return measured, JointPath(path.time, tuple(moved))
+
+
+def test_all_of_it_is_found_together_within_its_errors():
+    measured, path = fitted(TRUTH, 7)
+    found = hits.fit(balls.fit(measured, MODEL, FLIGHTS), measured, path, PRIOR)
+    errors = np.sqrt(np.diagonal(found.covariance))
+    for name, value in WANTED.items():
+        i = found.paths.index(name)
+        assert abs(found.mean[i] - value) < 3.0 * errors[i], (name, found.mean[i], errors[i])
+        assert errors[i] < 0.5 * PRIOR[name][1]
+    drawn, lift = found.samples({name: (m - 9 * d, m + 9 * d) for name, (m, d) in PRIOR.items()})
+    assert drawn.paths == tuple(WANTED) and lift.shape == (hits.DRAWS,)
+    np.testing.assert_allclose(np.cov(drawn.values.T), found.covariance[:-1, :-1], rtol=0.6, atol=1e-6)
+
+
+def test_too_few_hits_leave_everything_open():
+    measured, path = fitted(TRUTH, 7)
+    found = balls.fit(measured, MODEL, FLIGHTS)
+    assert hits.fit(found, measured[:8], path, PRIOR) is None
+    assert hits.fit(found, measured, None, PRIOR) is None
+
+
+def test_a_prior_without_anything_that_flies_is_refused():
+    measured, _ = play(TRUTH, 7)
+    with pytest.raises(
+        ValueError, match="nothing that flights show is in the prior, which has ball.paddle.restitution"
+    ):
+        balls.fit(measured, MODEL, {"ball.paddle.restitution": (0.9, 0.05)})
