@@ -22,7 +22,7 @@ SOFTNESS = 2.2  # a step's half width in deviations: the smooth step 3 s^2 - 2 s
 FRESH = 300.0  # variance that an opened filter adds, in the noise's: 5 cm of a ball that is measured to 3 mm
 SETTLED = (2.0, 2.0, 1.0, 3.0, 2.0, 2.0)  # of h: covariance of a settled filter that measures without a pause
 ROUNDS = 12  # of measurements, after which it is that of a filter that measures now and then
-LONGEST = 10.0  # memories between measurements, from where on a filter keeps nothing
+LONGEST = 10.0  # memories between measurements, of a filter that keeps a 20,000th of its lag
 
 
 @jax.tree_util.register_dataclass
@@ -129,7 +129,7 @@ class Lag:
     def settled(cls, dt: Scalars, memory: Scalars, like: Float[Array | np.ndarray, "3 *batch"]) -> Lag:
         """A filter that has watched a flight, measured every ``dt`` [s]: no lag. memory [s]."""
         zero = jnp.zeros_like(like)
-        h = jnp.broadcast_to(_interval(dt, memory), zero.shape[1:])
+        h = jnp.broadcast_to(dt / _shown(memory, dt), zero.shape[1:])
         covariance = jnp.asarray(row(h) * jnp.stack([jnp.full_like(h, x) for x in SETTLED]))
         for _ in range(ROUNDS):
             grown = _grown(covariance, h, h)
@@ -148,15 +148,15 @@ class Lag:
 
         usual: interval [s] of measurements for which the filter was made. blur: deviation [m] of surprises' noise.
         """
-        h = _interval(usual, memory)
+        time = _shown(memory, usual)
+        h = usual / time
         surprise = jnp.sqrt(dot(self.position, self.position) + SHORTEST**2)
         share = jnp.clip(0.5 - 0.5 * (surprise - gate) / (SOFTNESS * blur), 0.0, 1.0)
         shut = share * share * (3.0 - 2.0 * share)  # of balls whose filter did not open
-        grown = _grown(self.covariance, _interval(dt, memory), h)
+        grown = _grown(self.covariance, dt / time, h)
         opened = jnp.stack([grown[0] + FRESH, *grown[1:3], grown[3] + FRESH / h**2, grown[4], grown[5] + FRESH / h**4])
         gains = [shut * a + (1.0 - shut) * b for a, b in zip(_gains(grown), _gains(opened), strict=True)]
         mixed = row(shut) * _measured(grown, _gains(grown)) + row(1.0 - shut) * _measured(opened, _gains(opened))
-        time = jnp.maximum(memory, SHORTEST)
         there = row(memory) > 0.0
         return Lag(
             jnp.where(there, row(1.0 - gains[0]) * self.position, 0.0),
@@ -166,9 +166,9 @@ class Lag:
         )
 
 
-def _interval(dt: Scalars, memory: Scalars) -> Array:
-    """Time between measurements in memories; bounded, where there is hardly any memory."""
-    return jnp.clip(dt / jnp.maximum(memory, SHORTEST), SHORTEST, LONGEST)
+def _shown(memory: Scalars, usual: Scalars) -> Array:
+    """The memory [s], where it is a share of the interval between measurements; below that no filter shows."""
+    return jnp.maximum(memory, jnp.maximum(usual, SHORTEST) / LONGEST)
 
 
 def _grown(covariance: Covariance, h: Scalars, usual: Scalars) -> Covariance:
