@@ -320,7 +320,7 @@ def test_curve_is_the_plain_quantile_of_each_bin():
 def test_smallest_visible_effect_falls_with_more_balls(windy):
     """Half the balls hold half the information: what shows grows by the square root of two, up to its own scatter."""
     all_of_them = words.detectable(windy.balls)
-    assert set(all_of_them) >= {"table_restitution", "wind_y", "camera_scale"} and "wind_x" not in all_of_them
+    assert set(all_of_them) >= {"table_friction", "wind_y", "camera_scale"} and "wind_x" not in all_of_them
     p = windy.balls.projected
     half = replace(
         p, **{name: getattr(p, name)[::2] for name in ("gram", "right", "spin_gram", "spin_effect", "spin_right")}
