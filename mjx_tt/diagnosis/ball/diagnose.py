@@ -121,7 +121,7 @@ def diagnose_balls(
 def _blurred(found: BallFindings | Settled, g: Grid) -> Bool[np.ndarray, "T n"] | None:
     """Samples behind the bounce that a predicting filter blurs, but the first, which shows the filter; None without it.
 
-    A filter that starts afresh settles in a way of its own, which no catalogue holds: it may also show in
+    A filter that is not quite the catalogue's settles in a way of its own: it may also show in
     sets that explain more than the chosen one, but with a size that no filter has.
     """
     choice, names = found.choice, [e.name for e in found.trial.effects]
