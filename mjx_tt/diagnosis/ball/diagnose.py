@@ -190,9 +190,14 @@ def _diagnose(
         g = replace(g, surprise=noise.surprise(g.measured - flown.measured[:, :, 0], flown.bounce_time[0], g))
         problem = BallProblem(g, model, fitted, heading(g))
     linear = problem.linearise(nominal)
-    if before is None and model.sensing.filter_time in (None, 0.0) and "tracker_filter" not in gone:
+    if before is not None:
+        left_out = before.trial.left_out
+    elif model.sensing.filter_time in (None, 0.0) and "tracker_filter" not in gone:
         gate = tracker_gate.likeliest(problem, nominal, linear)
-        if gate is not None and gate != problem.nominal[tracker_gate.GATE]:
+        if gate is None:
+            # Where none shows beside free bounces, one would stand for a table or for balls that spin.
+            left_out += tuple(i for i, e in enumerate(fitted) if e.name in ("tracker_filter", "tracker_gate"))
+        elif gate != problem.nominal[tracker_gate.GATE]:
             problem = BallProblem(g, with_values(model, {tracker_gate.GATE: gate}), fitted, heading(g))
             linear = problem.linearise(nominal)
     called = [e.name for e in fitted]

@@ -97,9 +97,9 @@ def estimate(residual: np.ndarray, frame: np.ndarray, g: Grid, unknowns: int = 6
 def surprise(residual: np.ndarray, bounce_time: np.ndarray, g: Grid) -> float:
     """Deviation [m] of what surprises a tracker's filter, by residuals (3, T, n) before the bounce (n,) [s].
 
-    A filter's output has the variance K r, its surprises have r / (1 - K): between 2.0 and 2.3 of the output's deviation
-    for gains K of 0.3 to 0.7. It is told by what neighbouring samples differ, which a misfit of the flight is not in;
-    the output's memory of about a half makes that 1.4 times too small.
+    A filter's output has the variance K r, its surprises have r / (1 - K): between 2.0 and 2.3 of the output's
+    deviation for gains K of 0.3 to 0.7. It is told by what neighbouring samples differ, which a misfit of the flight
+    is not in; the output's memory of about a half makes that 1.4 times too small.
     """
     free = g.mask & (g.time < bounce_time)
     pairs = free[1:] & free[:-1]
