@@ -102,7 +102,7 @@ def diagnose_balls(
             say("it filters for longer than it seemed: once more without these samples as well")
             near = near | more
             clear = choose(near, found)
-        if clear.findings and found.untried:
+        if found.untried and (clear.findings or evidence.extraordinary(clear)):
             say("something stays open: it is not the filter's doing alone")
             found = choose(patient=False)
             near = _blurred(found, found.problem.grid)
@@ -190,14 +190,9 @@ def _diagnose(
         g = replace(g, surprise=noise.surprise(g.measured - flown.measured[:, :, 0], flown.bounce_time[0], g))
         problem = BallProblem(g, model, fitted, heading(g))
     linear = problem.linearise(nominal)
-    if before is not None:
-        left_out = before.trial.left_out
-    elif model.sensing.filter_time in (None, 0.0) and "tracker_filter" not in gone:
+    if before is None and model.sensing.filter_time in (None, 0.0) and "tracker_filter" not in gone:
         gate = tracker_gate.likeliest(problem, nominal, linear)
-        if gate is None:
-            # Where none shows beside free bounces, one would stand for a table or for balls that spin.
-            left_out += tuple(i for i, e in enumerate(fitted) if e.name in ("tracker_filter", "tracker_gate"))
-        elif gate != problem.nominal[tracker_gate.GATE]:
+        if gate is not None and gate != problem.nominal[tracker_gate.GATE]:
             problem = BallProblem(g, with_values(model, {tracker_gate.GATE: gate}), fitted, heading(g))
             linear = problem.linearise(nominal)
     called = [e.name for e in fitted]
@@ -232,14 +227,15 @@ def _diagnose(
     first = before is None
     untried = first and patient and bool(left.findings) and _blurred(best, g) is not None
     tries = first and not untried
-    if mode == "none" and tries and (left.findings or evidence.bent_too_far(best.choice)):
+    doubted = bool(left.findings) or evidence.bent_too_far(best.choice) or evidence.extraordinary(best)
+    if mode == "none" and tries and doubted:
         # Strong spin is out of reach of derivatives taken about balls that do not spin.
         say("trying balls that spin fast, each in its own way")
         other, theirs = spinning(problem, trial, nominal, say)
         gained = evidence.misfit(best, g) - evidence.misfit(other, g)
         shift = evidence.shift_of_spins(other)
         bends = evidence.lifts(other)
-        spin_notes.append(_tried(gained, shift, bends))
+        spin_notes.append(_tried(gained, shift, bends, bool(left.findings)))
         if gained > 0.0 and shift >= selection.FLOOR and bends:
             best, together = replace(other, trial=replace(other.trial, spin="none")), theirs
             left = find(best, g, sessions, age, names)
@@ -297,20 +293,19 @@ def plain(
     return found, fitted_all
 
 
-def _tried(gained: float, shift: float, bends: bool) -> str:
+def _tried(gained: float, shift: float, bends: bool, open_: bool) -> str:
     """Account of balls with spins of their own, which shift [m] flights, against balls without, by twice the log
-    evidence gained. bends: the air bends such balls as it does real ones."""
+    evidence gained. bends: the air bends such balls as it does real ones. open_: something stayed open without."""
+    why = "something stayed open without it" if open_ else "a cause was of a size that hardly any set-up has"
     if gained > 0.0 and shift < selection.FLOOR:
-        return (
-            f"spin was tried because something stayed open without it, and dropped: it moves balls {1e3 * shift:.1f} mm"
-        )
-    if gained > 0.0 and not bends:
-        return (
-            "spin was tried because something stayed open without it, and dropped: no air bends balls so much or little"
-        )
-    if gained > 0.0:
-        return f"spin was tried because something stayed open without it, and kept: its evidence is {gained:.0f} better"
-    return f"spin was tried because something stayed open without it, and dropped: its evidence is {-gained:.0f} worse"
+        then = f"dropped: it moves balls {1e3 * shift:.1f} mm"
+    elif gained > 0.0 and not bends:
+        then = "dropped: no air bends balls so much or little"
+    elif gained > 0.0:
+        then = f"kept: its evidence is {gained:.0f} better"
+    else:
+        then = f"dropped: its evidence is {-gained:.0f} worse"
+    return f"spin was tried because {why}, and {then}"
 
 
 def _of_small(left: Left) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from mjx_tt.diagnosis.ball.flights.linearization import KICK, Projected
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE
 from mjx_tt.diagnosis.ball.selection import MAGNUS_KEPT, TIE, Choice, Settled, Trial, fitted_spins, left_over
 
+EXTRAORDINARY = 5.0  # ordinary sizes beyond which a cause asks whether another kind of ball would do with less
 SPIN_COST = 3.0  # squared error by which three more numbers of a ball must pay at least
 
 
@@ -26,7 +27,7 @@ def misfit(settled: Settled, g: Grid) -> float:
     counts = g.mask & (p.weight.T > 0.0)
     error = np.minimum(noise.Whitening(n, g).distance(left) ** 2, 3.0 * noise.HUBER**2)
     spread = 2.0 * np.log(n.scale * np.sqrt(1.0 - n.memory[:, None] ** 2)).sum(axis=0)
-    own = _price_of_spins(settled, g.n) + _price_of_kicks(settled, start[KICK])
+    own = _price_of_spins(settled, g.n) + _price_of_kicks(settled, start[KICK]) + _price_of_sizes(settled)
     # As if the samples left out were as usual: to leave out must not pay.
     share = g.mask.sum() / counts.sum()
     return float(share * np.where(counts, error + spread, 0.0).sum() + own + choice.threshold * len(choice.effects))
@@ -47,6 +48,13 @@ def _price_of_spins(settled: Settled, n: int) -> float:
     away = fitted_spins(p, settled.choice) - middle
     narrower = np.linalg.slogdet(np.eye(3) + np.linalg.solve(precision, p.spin_gram))[1]
     return float(np.einsum("an,nab,bn->", away, precision, away) + narrower.sum())
+
+
+def _price_of_sizes(settled: Settled) -> float:
+    """Twice the negative log prior of the causes' sizes, beside that of none: Student's, as where all are fitted."""
+    sizes = zip(settled.choice.effects, settled.choice.theta, strict=True)
+    away = np.array([theta / settled.trial.effects[j].scale for j, theta in sizes])
+    return float(((scores.FREEDOM + 1.0) * np.log1p(away**2 / scores.FREEDOM)).sum())
 
 
 def _price_of_kicks(settled: Settled, kick: np.ndarray) -> float:
@@ -87,6 +95,12 @@ def spins_without_lift(settled: Settled) -> bool:
 def bent_too_far(choice: Choice) -> bool:
     """True if spin was chosen with a Magnus coefficient that no ball has: a line bent too far."""
     return choice.magnus is not None and not MAGNUS_KEPT[0] <= choice.magnus <= MAGNUS_KEPT[1]
+
+
+def extraordinary(settled: Settled) -> bool:
+    """True where a cause was chosen of a size that hardly any set-up has: what spin bends in one way, wind does too."""
+    sizes = zip(settled.choice.effects, settled.choice.theta, strict=True)
+    return any(abs(theta) > EXTRAORDINARY * settled.trial.effects[j].scale for j, theta in sizes)
 
 
 def imitated(p: Projected, trial: Trial, choice: Choice) -> tuple[str, ...]:

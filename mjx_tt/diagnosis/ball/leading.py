@@ -21,7 +21,8 @@ from mjx_tt.diagnosis.ball.flights.linearization import Situation
 from mjx_tt.diagnosis.ball.selection import Settled
 from mjx_tt.diagnosis.ball.unexplained import find
 
-LEAST_SHARE = 0.95  # of what all effects and unnamed patterns explain together
+LEAST_SHARE = 0.9  # of what all effects and unnamed patterns explain together
+TIE = 0.03  # share by which effects do as well as each other: of balls of one way and speed much is alike
 RIVAL = 0.1  # share that another effect may lack and still be told as an alternative
 LEAST_GAIN = 0.2  # share of the error on unseen balls that goes with it, at the lower end of the interval
 BOOTSTRAP = 100
@@ -72,10 +73,13 @@ def leading(found: BallFindings, say: Callable[[str], None], seed: int = 0) -> L
     shares = {i: (scores.gain(rated, (i,)) - alone) / total for i in able if _possible(rated, trial, i)}
     if not shares:
         return None
-    near = [i for i in shares if shares[i] > max(shares.values()) - RIVAL]
-    leads = min(near, key=lambda i: (shares[i] < LEAST_SHARE, _surprise(rated, trial, i)))
-    if shares[leads] < LEAST_SHARE:
+    most = max(shares.values())
+    if most < LEAST_SHARE:
         return None
+    near = [i for i in shares if shares[i] > most - RIVAL]
+    # Of those that do as well, one of ball and table, which are fitted in any case; then the least surprising one.
+    best_of = [i for i in near if shares[i] > most - TIE]
+    leads = min(best_of, key=lambda i: (trial.effects[i].name not in BALL_AND_TABLE, _surprise(rated, trial, i)))
     say(f"{trial.effects[leads].name} leads: once more with what balls and tables differ in")
     kept = {leads, problem.coefficient, *(i for i, e in enumerate(trial.effects) if e.name in BALL_AND_TABLE)}
     others = tuple(i for i in range(len(trial.effects)) if i not in kept or i in trial.left_out)

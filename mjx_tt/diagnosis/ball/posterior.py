@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.flights import noise
-from mjx_tt.diagnosis.ball.flights.fit import fit_starts, refit_worst
+from mjx_tt.diagnosis.ball.flights.fit import fit_starts, fit_with_cost, refit_worst
 from mjx_tt.diagnosis.ball.flights.linearization import KICK, BallProblem, Linear, Situation, project
 from mjx_tt.diagnosis.ball.flights.noise import Noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior, learned
@@ -25,6 +25,7 @@ from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE,
 ROUNDS = 7
 SETTLED = 0.2  # of a standard deviation by which nothing moves any more
 MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
+SHARES = (1.0, 0.5, 0.25, 0.1)  # of a step that are tried in turn
 LONGEST_MOVE = 3.0  # scales by which an effect may change in a round
 
 
@@ -84,7 +85,7 @@ def fit(
         # An effect that starts with a threshold has no derivative to settle on.
         smooth = [i for i in free if effects[i].step is None]
         moved = float(np.max(np.abs(change[smooth]) / np.sqrt(np.diagonal(covariance))[smooth], initial=0.0))
-        at = Situation(theta, fit_starts(problem, theta, at.start, g, own, prior, rounds=3))
+        at = _stepped(problem, at, theta, own, prior, mean, scale, free)
         scatter = noise.scattered(at.start[KICK], p.kick_gram, scatter)
         say(f"all effects at once, round {round_ + 1}: moved by {moved:.1f} deviations")
         if moved < SETTLED:
@@ -95,6 +96,41 @@ def fit(
         at = Situation(at.theta, fit_starts(problem, at.theta, start, g, own, prior))
     linear = problem.linearise(at)
     return Posterior(at.theta, covariance, tuple(free), at, linear, own, prior, converged)
+
+
+def _stepped(
+    problem: BallProblem,
+    at: Situation,
+    theta: Float[np.ndarray, " K"],
+    own: Noise,
+    prior: SpinPrior | None,
+    mean: np.ndarray,
+    scale: np.ndarray,
+    free: list[int],
+) -> Situation:
+    """Situation as far on the way to theta as flights and priors together get better, and where they are the best.
+
+    A ball that slides through its bounce grips the table a little further on: a whole step across that corner lands
+    where the derivatives lead straight back.
+    """
+
+    def price(changes: np.ndarray) -> float:
+        away = (changes - mean)[free] / scale[free]
+        return float(((scores.FREEDOM + 1.0) * np.log1p(away**2 / scores.FREEDOM)).sum())
+
+    g = problem.grid
+    best, least = at, float(fit_with_cost(problem, at.theta, at.start, g, own, prior, 0)[1].sum()) + price(at.theta)
+    for share in SHARES:
+        there = at.theta + share * (theta - at.theta)
+        start, cost = fit_with_cost(problem, there, at.start, g, own, prior, 3)
+        total = float(cost.sum()) + price(there)
+        if total < least:
+            best, least = Situation(there, start), total
+        elif best is not at:
+            break
+        if share == 1.0 and best is not at:
+            break
+    return best
 
 
 def _solved(

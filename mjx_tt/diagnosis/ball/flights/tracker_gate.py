@@ -12,7 +12,7 @@ import numpy as np
 from mjx_tt.diagnosis.ball.flights.forward_model import predict
 from mjx_tt.diagnosis.ball.flights.linearization import KICK, BallProblem, Linear, Situation
 
-MEMORIES = (0.010, 0.012, 0.0145, 0.0175, 0.021, 0.026)  # [s]
+MEMORIES = (0.007, 0.010, 0.012, 0.0145, 0.0175, 0.021, 0.026)  # [s]
 GATES = (0.015, 0.020, 0.025, 0.030, 0.036, 0.043, 0.052)  # [m]
 LEAST_GAIN = 10.0  # of log-likelihood, below which no filter shows and any gate will do
 TIME, GATE = "sensing.filter_time", "sensing.filter_gate"
