@@ -356,6 +356,14 @@ def spinning(
         )
     spinning = replace(trial, spin="free")
     found = search(problem, spinning, fitted_all.at, prior, say, fitted_all.linear, fitted_all.noise.scatter)
+    if prior is not None and evidence.extraordinary(found):
+        say("a cause of a size that hardly any set-up has: once more from spins alone")
+        alone = np.zeros(len(trial.effects))
+        if problem.coefficient is not None:
+            alone[problem.coefficient] = fitted_all.at.theta[problem.coefficient]
+        start = fit_starts(problem, alone, fitted_all.at.start, problem.grid, fitted_all.noise, prior, rounds=5)
+        other = search(problem, spinning, Situation(alone, start), prior, say, scatter=scatter)
+        found = min(found, other, key=lambda settled: evidence.misfit(settled, problem.grid))
     return found, fitted_all
 
 
