@@ -102,7 +102,7 @@ def diagnose_balls(
             say("it filters for longer than it seemed: once more without these samples as well")
             near = near | more
             clear = choose(near, found)
-        if found.untried and (clear.findings or evidence.extraordinary(clear)):
+        if found.untried and (clear.findings or evidence.extraordinary(clear.choice, clear.trial)):
             say("something stays open: it is not the filter's doing alone")
             found = choose(patient=False)
             near = _blurred(found, found.problem.grid)
@@ -227,7 +227,9 @@ def _diagnose(
     first = before is None
     untried = first and patient and bool(left.findings) and _blurred(best, g) is not None
     tries = first and not untried
-    doubted = bool(left.findings) or evidence.bent_too_far(best.choice) or evidence.extraordinary(best)
+    doubted = (
+        bool(left.findings) or evidence.bent_too_far(best.choice) or evidence.extraordinary(best.choice, best.trial)
+    )
     if mode == "none" and tries and doubted:
         # Strong spin is out of reach of derivatives taken about balls that do not spin.
         say("trying balls that spin fast, each in its own way")
@@ -356,7 +358,7 @@ def spinning(
         )
     spinning = replace(trial, spin="free")
     found = search(problem, spinning, fitted_all.at, prior, say, fitted_all.linear, fitted_all.noise.scatter)
-    if prior is not None and evidence.extraordinary(found):
+    if prior is not None and evidence.extraordinary(found.choice, found.trial):
         say("a cause of a size that hardly any set-up has: once more from spins alone")
         alone = np.zeros(len(trial.effects))
         if problem.coefficient is not None:

@@ -97,10 +97,10 @@ def bent_too_far(choice: Choice) -> bool:
     return choice.magnus is not None and not MAGNUS_KEPT[0] <= choice.magnus <= MAGNUS_KEPT[1]
 
 
-def extraordinary(settled: Settled) -> bool:
+def extraordinary(choice: Choice, trial: Trial) -> bool:
     """True where a cause was chosen of a size that hardly any set-up has: what spin bends in one way, wind does too."""
-    sizes = zip(settled.choice.effects, settled.choice.theta, strict=True)
-    return any(abs(theta) > EXTRAORDINARY * settled.trial.effects[j].scale for j, theta in sizes)
+    sizes = zip(choice.effects, choice.theta, strict=True)
+    return any(abs(theta) > EXTRAORDINARY * trial.effects[j].scale for j, theta in sizes)
 
 
 def imitated(p: Projected, trial: Trial, choice: Choice) -> tuple[str, ...]:
