@@ -1,3 +1,4 @@
+# make view   set up and show a policy that comes with the program in the browser, at once
 # make demo   set up, train the quickstart, evaluate it, export it
 # make rig-demo  the same policy plays 20 rallies with a virtual player on the emulated robot, over real sockets in
 #             real time (trains it first if need be)
@@ -14,7 +15,10 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo rig-demo study-quick test test-slow test-all check exam docs bench setup clean
+.PHONY: view demo rig-demo study-quick test test-slow test-all check exam docs bench setup clean
+
+view: $(READY)
+	$(BIN)/mjx-tt view
 
 demo: $(READY)
 	$(BIN)/mjx-tt train quickstart.yaml --out runs

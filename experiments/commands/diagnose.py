@@ -21,7 +21,7 @@ from experiments.runs.run_dir import Run
 from experiments.training import loop
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis import report
-from mjx_tt.diagnosis.report import Play, Rate
+from mjx_tt.diagnosis.report import Play, Rate, text
 from mjx_tt.robot import robot as robots
 from mjx_tt.robot.robot import Robot
 from mjx_tt.sim.model import ModelFile
@@ -247,6 +247,10 @@ def show(found: diagnosis.Diagnosis, console: Console, contract: Contract = PAPE
         console.print(
             f"  held out: {h.before:.2f} -> {h.after:.2f} mm, gain {h.low:.2f} to {h.high:.2f}", highlight=False
         )
-    for step in v.next_experiment[:2]:
-        tells = f" tells {', '.join(step.separates)}" if step.separates else ""
-        console.print(f"  next: {step.what}{tells}", highlight=False)
+    steps = v.next_experiment[:2]
+    common, own = text.advice(steps)
+    for step, tells in zip(steps, own, strict=True):
+        beside = f" {'also ' if common else ''}tells {tells}" if tells else ""
+        console.print(f"  next: {step.what}{beside}", highlight=False)
+    if common:
+        console.print(f"  each of these tells {common}", highlight=False)

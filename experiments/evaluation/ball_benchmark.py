@@ -10,6 +10,7 @@ import matplotlib
 import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from ballmodel.io import MeasuredStates, SpinDataset, read, read_events, read_spindoe
 from ballmodel.io.atomic_files import replacing
@@ -121,6 +122,9 @@ def _figure(b: Benchmark) -> Figure:
             kept = np.sort(errors[h][np.isfinite(errors[h])])
             ax.step(1e3 * kept, np.arange(1, kept.size + 1) / kept.size, where="post", label=method, lw=1.4)
         ax.set(title=f"{horizons[h]:.2g} s ahead", xlabel="error [mm]", xscale="log")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter(NullFormatter())  # else written over the others where errors span no decade
     axes[0].set_ylabel("share of flights")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3, fontsize=9, frameon=False)
     return figure

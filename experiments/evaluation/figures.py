@@ -24,7 +24,7 @@ from robot_io.contract import PAPER, Contract
 
 RETURNED_COLOUR, HIT_COLOUR, MISSED_COLOUR = "#1b7837", "#e08214", "#b2182b"
 TABLE_COLOUR, INK = "#e9eff7", "#303030"
-LANDING_FRAME = (-1.5, 1.5), (-1.45, 2.3)  # [m] x and y shown
+LANDING_FRAME = (-1.2, 1.2), (-1.45, 1.9)  # [m] x and y shown
 FEWEST_BALLS = 5  # in a cell whose rate is shown
 
 STYLE = RcParams(
@@ -58,7 +58,7 @@ def draw_evaluation(folder: Path, played: Played, weights: tuple[float, ...], co
 
 def _landing_map(played: Played) -> Figure:
     result, report = played.result, played.report
-    figure, axes = plt.subplots(figsize=(5.8, 6.6))
+    figure, axes = plt.subplots(figsize=(5.4, 7.0))
     _table(axes)
     for outcome, colour, label in ((HIT, HIT_COLOUR, "touched, not returned"), (RETURNED, RETURNED_COLOUR, "returned")):
         chosen = (result.outcome == outcome) & result.finite

@@ -96,7 +96,7 @@ def _episode(
         time=clock - start,
         qpos=np.stack([_joint(log, j, clock, home) for j, home in enumerate(robot.home)], axis=1),
         balls={"measured": ball, "simulated": simulated},
-        title=f"episode {episode.number}: measured (orange), simulated (blue)",
+        title="measured (yellow), simulated (blue)",
         outcome=episode.outcome,
         decided=(episode.end or stop) - start,
         landing=next_landing(simulated),
@@ -134,7 +134,8 @@ def _told(name: str, text: str, level: Level) -> str:
     except ValueError:
         said = text
     if isinstance(said, dict):
-        said = " ".join(str(said[key]) for key in ("from", "to", "why", "outcome", "fault") if key in said)
+        way = [f"{said['from']} to {said['to']}"] if "from" in said and "to" in said else []
+        said = ", ".join([*way, *(str(said[key]) for key in ("why", "outcome", "fault") if said.get(key))])
     return f"{name.upper() if level > Level.INFO else name}: {said}"
 
 
@@ -170,8 +171,7 @@ def diagnosed(folder: Path) -> Fixed:
                 time=clock - clock[0],
                 qpos=np.repeat(home[None], len(clock), axis=0),
                 balls={"measured": measured, **{name: flown[i] for name, flown in ways.items()}},
-                title="measured (orange), nominal (red), extended (green)",
-                outcome=text,
+                title="measured (yellow), nominal (red), extended (green)",
                 decided=float(t.time[-1] - t.time[0]),
                 landing=next_landing(ways["extended"][i]),
                 marks=t.position.T,
@@ -185,7 +185,7 @@ def diagnosed(folder: Path) -> Fixed:
                 },
             )
         )
-        captions.append(f"{verdict}: {t.label}, {place + 1} of {len(order)}")
+        captions.append(f"{verdict}: {t.label}, {place + 1} of {len(order)}; {text}")
     return Fixed([[film] for film in films], captions)
 
 

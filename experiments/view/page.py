@@ -209,9 +209,18 @@ class Viewer:
         for heading, handle in self._plots.items():
             handle.data = _until(film.series[heading], self.t)
         decided = all(self.t >= f.decided for f in self.shown)
-        self._rewards.content = _table(self.shown) if decided else "<p>after the ball</p>"
+        self._rewards.content = _table(self.shown) if decided else '<p style="margin:0.8em">after the ball</p>'
         past = [f"- {t:.2f} s: {html.escape(text)}" for f in self.shown for t, text in f.events if t <= self.t]
-        self._events.content = "\n".join(past[-LISTED:])
+        self._events.content = "\n".join([*self._outcomes(), *past[-LISTED:]])
+
+    def _outcomes(self) -> list[str]:
+        """Of films side by side: whose each is, and how its ball ended; a single one has it in the picture."""
+        if len(self.shown) < 2:
+            return []
+        ends = [f": {f.outcome}" if f.outcome and self.t >= f.decided else "" for f in self.shown]
+        return [
+            f"{i}. {html.escape(f.title + end)}" for i, (f, end) in enumerate(zip(self.shown, ends, strict=True), 1)
+        ]
 
 
 def put(handle: Any, value: Any) -> None:

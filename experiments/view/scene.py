@@ -20,6 +20,11 @@ from mjx_tt.robot.robot import Robot
 SPACING = -3.2  # [m] from the middle of a table to the next one's, which stands to its right for the person
 BALL_TRAIL, PADDLE_TRAIL = 0.25, 0.35  # [s]
 STRIDE = 4  # frames from one point of a trail to the next
+NAMED = 2  # tables up to which a label has room for its policy's name; more have numbers
+# Width over height of the picture: below the first the camera steps back, to the second of its distance over it.
+NARROW_FOR_ONE, NARROW_FOR_SEVERAL = (1.0, 1.3), (1.15, 1.15)
+PANEL_BELOW = 0.8  # width over height below which a panel may cover the lower half of the picture
+RAISED = 0.19  # distances that the camera then looks below the table
 SHOWN_RADIUS = 0.025  # [m]; the true ball, of 0.02 m, is hard to find on a small screen
 COLOURS = {
     "ball": (255, 240, 25),
@@ -115,21 +120,40 @@ class Scene:
             )
             for i in range(count)
         ]
-        middle, further = self.offset(count - 1) / 2, 2.4 * (count - 1)
+        middle, further = self.offset(count - 1) / 2, 3.1 * (count - 1)
         camera = server.initial_camera
         camera.look_at = (middle, -0.75, 0.05)
         camera.position = (middle + (1.2 if count == 1 else 0.0), 2.75 + further, 1.35 + 0.4 * further)
         camera.fov = math.radians(50.0)
-        server.on_client_connect(self._step_back)
+        self._start = np.array([camera.position, camera.look_at])
+        server.on_client_connect(self._watch)
 
-    def _step_back(self, client: viser.ClientHandle) -> None:
-        """Moves the camera of a narrow page away, until the tables fit above the panel, which stands at the bottom."""
-        further = 1.3 / max(client.camera.aspect, 0.1)
-        if further > 1.3:
-            start = self.server.initial_camera
-            at = np.asarray(start.look_at)
-            client.camera.position = at + (np.asarray(start.position) - at) * further
-            client.camera.look_at = at - np.array([0.0, 0.0, 0.75 * further])
+    def _watch(self, client: viser.ClientHandle) -> None:
+        """Fits the tables into a page's picture, whose size changes when the panel docks; a hand's view stays."""
+        placed = self._start
+
+        def fit(camera: viser.CameraHandle) -> None:
+            nonlocal placed
+            wanted = self._view(camera.aspect)
+            if any(np.allclose(camera.position, view[0], atol=1e-3) for view in (placed, self._start)):
+                if not np.allclose([camera.position, camera.look_at], wanted, atol=1e-3):
+                    placed = wanted
+                    camera.position = wanted[0]
+                    camera.look_at = wanted[1]
+
+        async def updated(camera: viser.CameraHandle) -> None:  # in the order in which the page's messages come
+            fit(camera)
+
+        fit(client.camera)
+        client.camera.on_update(updated)
+
+    def _view(self, aspect: float) -> np.ndarray:
+        """Position and target (2, 3) [m] from which a picture of this width over height shows the tables whole."""
+        narrow, wanted = NARROW_FOR_ONE if self.count == 1 else NARROW_FOR_SEVERAL
+        position, at = self._start
+        away = (position - at) * (wanted / max(aspect, 0.1) if aspect < narrow else 1.0)
+        below = RAISED * np.linalg.norm(away) if aspect < PANEL_BELOW else 0.0
+        return np.array([at + away, at - np.array([0.0, 0.0, below])])
 
     @staticmethod
     def offset(table: int) -> float:
@@ -186,13 +210,20 @@ class Scene:
                 self._shadows[i].visible = bool(np.isfinite(at).all())
                 if self._shadows[i].visible:
                     self._shadows[i].position = (self.offset(i) + at[0], at[1], 0.003 if over else FLOOR + 0.003)
-                text = f"{film.title}: {film.outcome}" if film.outcome and t >= film.decided else film.title
+                text = self._label(i, film, t)
                 if self._labels[i].text != text:
                     self._labels[i].text = text
             self._trail.points = np.concatenate(trails).astype(np.float32)
             self._trail_edge.points = self._trail.points + BEHIND
             self._paddle_trail.points = np.concatenate(paddles).astype(np.float32)
         self.server.flush()
+
+    def _label(self, table: int, film: Film, t: float) -> str:
+        """What stands above a table, short where labels stand beside each other; the panel has it in full."""
+        name = film.title if self.count <= NAMED else str(table + 1)
+        if not film.outcome or t < film.decided:
+            return name
+        return f"{name}: {film.outcome if self.count == 1 else film.outcome.partition(',')[0]}"
 
     def _at(self, table: int, position: np.ndarray) -> np.ndarray:
         return np.asarray(position) + np.array([self.offset(table), 0.0, 0.0])

@@ -84,6 +84,8 @@ def aggregated(study: Study, m: Measurements) -> Figure | None:
     boxes(centre, [lengths(m.normalised, key, "all") for key in FINAL], FINAL, "normalised rally length")
     centre.set_title("Normalised by player")
     _histogram(right, m)
+    if right.has_data():
+        figure.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=2)
     return figure
 
 
@@ -100,8 +102,6 @@ def _histogram(axes: Axes, m: Measurements) -> None:
     axes.set_xlabel("rally length")
     axes.set_ylabel("rallies [%]")
     axes.set_title("Histogram")
-    if axes.has_data():
-        axes.legend()
 
 
 @styled

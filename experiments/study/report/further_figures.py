@@ -107,6 +107,7 @@ def fine_tuning(study: Study, m: Measurements) -> Figure | None:
         axes.yaxis.set_major_formatter(lambda v, _: f"{v:.0%}")
         axes.grid(axis="y", alpha=0.25)
         note_empty(axes)
+    figure.axes[0].set_ylim(0.0, max(0.05, figure.axes[0].get_ylim()[1]))  # of all: the axis is shared
     figure.axes[0].set_ylabel("returned while fine-tuning")
     handles = [
         Line2D([], [], color=COLOUR[k], label=label)
@@ -189,11 +190,13 @@ def variant(study: Study, m: Measurements) -> Figure | None:
     left.set_xticks(range(4), ("sim 2", "fine-tuned 65 %", "sim 3", "fine-tuned 100 %"))
     left.set_ylabel("mean rally length, 95 %")
     left.set_title("All players")
-    left.legend(
+    figure.legend(
         handles=[
             Patch(facecolor=COLOUR[IS2R], label="carried back"),
             Patch(facecolor=COLOUR[FRESH], label="not carried back"),
-        ]
+        ],
+        loc="outside lower left",
+        ncols=2,
     )
     groups = ("all", *LEVELS)
     ratios = [interval_of(m.ratio("is2r-ft100", "fresh-ft100", group)) for group in groups]
@@ -217,11 +220,13 @@ def identification(study: Study, m: Measurements) -> Figure | None:
     left.set_xticks(range(len(stages)), names)
     left.set_ylabel("mean rally length, 95 %")
     left.set_title("All players")
-    left.legend(
+    figure.legend(
         handles=[
             Patch(facecolor=COLOUR[IS2R], label="simulation as believed"),
             Patch(facecolor=COLOUR[IDENTIFIED], label="identified from each round's balls and joints"),
-        ]
+        ],
+        loc="outside lower left",
+        ncols=2,
     )
     pairs = [(f"id-{stage}", f"is2r-{stage}") for stage in ("sim1", "sim2", "sim3", "ft100")]
     ratios = [interval_of(m.ratio(a, b, "all")) for a, b in pairs]

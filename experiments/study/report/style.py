@@ -18,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from experiments.study.analysis.paper import (
     ABLATION,
@@ -169,6 +170,8 @@ def forest(axes: Axes, intervals: Sequence[Interval | None], labels: Sequence[st
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     ticks = [t for t in (0.1, 0.2, 0.3, 0.5, 0.7, 1, 1.5, 2, 3, 5, 10) if low <= t <= high]
+    if len(ticks) < 2:  # ratios close to 1
+        ticks = [float(t) for t in MaxNLocator(4).tick_values(low, high) if low <= t <= high]
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
     axes.minorticks_off()
     axes.grid(axis="x", alpha=0.25)

@@ -344,15 +344,11 @@ def _play(play: Play | None, page: Page) -> Context:
 
 def _next(d: Diagnosis, page: Page) -> Context:
     steps = d.verdict.next_experiment
-    told = [step.separates for step in steps if step.separates]
-    common = [line for line in told[0] if all(line in other for other in told)] if len(told) > 1 else []
-    rows = []
-    for step in steps:
-        own = [line for line in step.separates if line not in common]
-        gain = f"{step.gain:.0f}" if step.gain > 0.0 else ""
-        rows.append((step.what, gain, text.told(own) if own else ""))
+    common, own = text.advice(steps)
+    gains = [f"{step.gain:.0f}" if step.gain > 0.0 else "" for step in steps]
+    rows = [(step.what, gain, tells) for step, gain, tells in zip(steps, gains, own, strict=True)]
     readings = any(len(c.group) > 1 and c.separating_measurement for c in d.verdict.causes)
-    return {"rows": rows, "few": FEW, "common": text.told(common) if common else "", "readings": readings}
+    return {"rows": rows, "few": FEW, "common": common, "readings": readings}
 
 
 def _spins(d: Diagnosis, page: Page) -> Context:

@@ -13,7 +13,7 @@ from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.description import Description, Way
 from mjx_tt.diagnosis.diagnose import Diagnosis
 from mjx_tt.diagnosis.joint import effects as joint_effects
-from mjx_tt.diagnosis.verdict import Cause, Estimate, Unexplained
+from mjx_tt.diagnosis.verdict import Cause, Estimate, Experiment, Unexplained
 
 SUBSET = "a subset of the balls"  # block of balls of their own kind
 # Units that read better in thousandths below a size.
@@ -61,7 +61,7 @@ def _noun(name: str) -> str:
 
 
 def told(separates: Sequence[str]) -> str:
-    """Lines "a from b" and "whether there is c" as one, each first word once."""
+    """Lines "a from b" and "whether there is c" as one, each first word once; "" for none."""
     pairs: dict[str, list[str]] = {}
     for line in separates:
         for word in (" from ", "whether there is "):
@@ -72,6 +72,15 @@ def told(separates: Sequence[str]) -> str:
         else:
             pairs.setdefault(line, [])
     return _and([head + _or(tails) if tails else head for head, tails in pairs.items()])
+
+
+def advice(steps: Sequence[Experiment]) -> tuple[str, list[str]]:
+    """What all next steps tell alike, and what each tells beside that, in words; "" for nothing."""
+    informative = [step.separates for step in steps if step.separates]
+    shared = [line for line in informative[0] if all(line in other for other in informative)] if informative else []
+    common = shared if len(informative) > 1 else []  # one step alone says for itself what it tells
+    own = [[line for line in step.separates if line not in common] for step in steps]
+    return told(common), [told(lines) for lines in own]
 
 
 def sentence(diagnosis: Diagnosis) -> str:
@@ -206,7 +215,7 @@ def _or(names: Sequence[str]) -> str:
 
 
 def _and(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+    return "".join(names) if len(names) < 2 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
 def _odd(u: Unexplained) -> str:

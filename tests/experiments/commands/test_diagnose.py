@@ -1,11 +1,17 @@
-"""``mjx-tt diagnose``: what is refused before the work."""
+"""``mjx-tt diagnose``: what is refused before the work, and what is said after it."""
 
 from __future__ import annotations
 
-import pytest
+import io
 
-from experiments.commands.diagnose import resting_pose
+import pytest
+from rich.console import Console
+
+from experiments.commands.diagnose import resting_pose, show
 from experiments.errors import ConfigError
+from mjx_tt.diagnosis import Diagnosis
+from mjx_tt.diagnosis.verdict import Experiment, Verdict
+from mjx_tt.sim.model import ModelFile, SimModel
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "x", ""])
@@ -18,3 +24,27 @@ def test_a_joint_rests_at_one_place():
     with pytest.raises(ConfigError, match="joint_1 is given twice"):
         resting_pose("joint_1=0.1,joint_2=0.2,joint_1=0.1")
     assert resting_pose("joint_1=0.1,gantry_x=-2e-1") == {"joint_1": 0.1, "gantry_x": -0.2}
+
+
+def said(*steps: Experiment) -> list[str]:
+    """Lines of the command line about what to do next."""
+    verdict = Verdict("none", (), None, None, (), (), steps)
+    console = Console(file=io.StringIO(), record=True, width=200)
+    show(Diagnosis(verdict, ModelFile(SimModel()), None, None, None, None), console)
+    return console.export_text().splitlines()[1:]
+
+
+def test_what_both_next_steps_tell_is_said_once():
+    """And each one's own in the fewest words; a step that tells nothing is named alone."""
+    shared = ("a from b", "a from c", "whether there is d")
+    fast = Experiment("fast balls", shared, 30.0)
+    slow = Experiment("slow balls", (*shared, "whether there is e", "whether there is f"), 20.0)
+    assert said(fast, slow) == [
+        "  next: fast balls",
+        "  next: slow balls also tells whether there is e or f",
+        "  each of these tells a from b or c and whether there is d",
+    ]
+    assert said(fast) == ["  next: fast balls tells a from b or c and whether there is d"]
+    sweep = Experiment("a sweep of joint_2", (), 0.0)
+    assert said(sweep, fast) == ["  next: a sweep of joint_2", *said(fast)]
+    assert said(sweep) == ["  next: a sweep of joint_2"] and said() == []

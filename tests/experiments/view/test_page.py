@@ -22,6 +22,7 @@ from PIL import Image
 from viser.transforms import SO3
 
 from ballmodel import registry
+from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from experiments import cli
 from experiments.commands.render import SHIPPED
 from experiments.runs import load_policy
@@ -211,6 +212,44 @@ def pixel(client, point: np.ndarray) -> np.ndarray:
     x, y, z = SO3(camera.wxyz).as_matrix().T @ (point - camera.position)
     focal = 0.5 * camera.image_height / np.tan(0.5 * camera.fov)
     return np.array([0.5 * camera.image_width + focal * x / z, 0.5 * camera.image_height + focal * y / z])
+
+
+@pytest.mark.parametrize("size", [WIDE, NARROW], ids=["wide", "narrow"])
+def test_four_tables_fit_into_the_picture_and_the_panel_says_whose_they_are(shown, open_page, studio, size):
+    policy, names = load_policy.load(SHIPPED).policy, ["one", "two", "three", "four"]
+    viewer, address = shown(Play(studio, names, [policy] * 4, registry.load("player3/M0")))
+    page = open_page(address, size)
+    until(lambda: viewer.server.get_clients(), "the page's connection")
+    (client,) = viewer.server.get_clients().values()
+    x, y = 0.5 * TABLE_WIDTH, 0.5 * TABLE_LENGTH
+    corners = [np.array([at, side * y, 0.0]) for at in (x, viewer.scene.offset(3) - x) for side in (-1, 1)]
+
+    def whole() -> bool:
+        seen, camera = np.array([pixel(client, corner) for corner in corners]), client.camera
+        # The panel stands beside the picture, or covers its lower part where the page is narrow.
+        low = camera.image_height * (0.42 if size is NARROW else 1.0)
+        docked = size is NARROW or camera.image_width < size[0]
+        return bool(docked and (seen > 0.0).all() and (seen < (camera.image_width, low)).all())
+
+    until(whole, "all four tables in the picture")
+    until(lambda: "three: returned, " in page.content(), "how a ball ended, and whose it was")
+    fitted = np.array(client.camera.position)
+
+    def turned() -> bool:
+        page.mouse.move(0.3 * size[0], 0.35 * size[1])
+        page.mouse.down()
+        page.mouse.move(0.2 * size[0], 0.3 * size[1], steps=3)
+        page.mouse.up()
+        time.sleep(1.0)
+        return bool(np.abs(client.camera.position - fitted).max() > 0.3)
+
+    until(turned, "the view turned by hand")
+    time.sleep(1.0)
+    moved = np.array(client.camera.position)
+    page.set_viewport_size({"width": size[0] - 40, "height": size[1]})
+    until(lambda: client.camera.image_height / client.camera.image_width > size[1] / size[0], "the new size")
+    time.sleep(1.0)
+    np.testing.assert_allclose(client.camera.position, moved, atol=0.02)  # a hand's view stays
 
 
 @pytest.mark.skipif(not os.environ.get("DRAG"), reason="DRAG=1 not set: a page drawn by software may miss the mouse")
