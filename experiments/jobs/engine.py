@@ -8,8 +8,10 @@ so nothing depends on who does it.
 from __future__ import annotations
 
 import importlib
+import os
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
@@ -40,6 +42,9 @@ class Setup:
 
     def prepared(self) -> Callable[..., Any]:
         """Function that does a job, in a worker."""
+        # JAX warns of every fork, but git and ffmpeg are started by fork and exec at once.
+        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as in a command
         platform.configure(self.devices, self.cache)
         module, _, function = self.prepare.partition(":")
         return getattr(importlib.import_module(module), function)(*self.given)
