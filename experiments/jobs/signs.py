@@ -34,7 +34,7 @@ class Owner:
         (self.folder / DOING).mkdir(parents=True)
         self._file = open(self.folder / OWNER, "w", encoding="utf-8")
         fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        self._stopping, self._closed = threading.Event(), threading.Event()
+        self._stopping, self._closed, self._writing = threading.Event(), threading.Event(), threading.Lock()
         self._write("0")
         threading.Thread(target=self._beat, daemon=True).start()
 
@@ -44,8 +44,9 @@ class Owner:
 
     def stop(self) -> None:
         """Asks the workers to save and stop."""
-        self._stopping.set()
-        self._write(STOP)
+        with self._writing:
+            self._stopping.set()
+            self._write(STOP)
 
     def busy(self) -> bool:
         """True while a worker is doing a job."""
@@ -53,9 +54,10 @@ class Owner:
 
     def close(self, keep: bool) -> None:
         """Ends the signs; ``keep``: the folder's other files stay."""
-        self._closed.set()
-        (self.folder / OWNER).unlink(missing_ok=True)
-        self._file.close()
+        with self._writing:
+            self._closed.set()
+            (self.folder / OWNER).unlink(missing_ok=True)
+            self._file.close()
         if not keep:
             shutil.rmtree(self.folder, ignore_errors=True)
 
@@ -63,8 +65,9 @@ class Owner:
         count = 0
         while not self._closed.wait(BEAT):
             count += 1
-            if not self._stopping.is_set():
-                self._write(str(count))
+            with self._writing:
+                if not self._stopping.is_set() and not self._closed.is_set():
+                    self._write(str(count))
 
     def _write(self, text: str) -> None:
         # In the locked file itself, as one put in its place would not be locked; always as long, so never half of two.

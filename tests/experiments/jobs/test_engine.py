@@ -125,6 +125,31 @@ def test_signs_of_a_dead_process_are_taken_away_and_those_of_a_living_one_stay(t
     assert not (other.folder / OWNER).exists(), "its workers end"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("gone, status, said", [(True, 1, ""), (False, 0, "saved")])
+def test_a_worker_ends_when_nobody_waits_for_it_and_saves_when_signs_stay_away(gone, status, said, tmp_path):
+    code = """
+import sys, time
+from pathlib import Path
+from experiments.jobs import signs
+from experiments.jobs.engine import sigterm_interrupts
+signs.BEAT, signs.SILENCE = 0.5, 2.0
+watch = signs.Watch(Path(sys.argv[1]))
+try:
+    with watch.doing("a/b"), sigterm_interrupts():
+        time.sleep(60.0)
+except KeyboardInterrupt:
+    print("saved")
+"""
+    (tmp_path / "doing").mkdir()
+    (tmp_path / OWNER).write_text("17")
+    worker = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    wait_for(lambda: (tmp_path / "doing" / "a_b").exists())
+    if gone:
+        (tmp_path / OWNER).unlink()
+    assert (worker.communicate(timeout=60)[0].strip(), worker.returncode) == (said, status)
+
+
 # -- both engines -----------------------------------------------------------------------------------------------------
 
 
