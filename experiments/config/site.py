@@ -8,16 +8,25 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from experiments.config import validation
 from experiments.config.experiment import Count, Positive, Section, read_yaml
 from experiments.errors import ConfigError
 
-Walltime = Annotated[str, Field(pattern=r"^\d{1,3}:[0-5]\d:[0-5]\d$", description="Hours:minutes:seconds, in quotes.")]
+
+def _walltime(value: Any) -> Any:
+    """YAML reads 08:00:00 without quotes as 28800, and shorter forms mean different things to SLURM and PBS."""
+    if not isinstance(value, str) or not re.fullmatch(r"\d{1,3}:[0-5]\d:[0-5]\d", value):
+        raise ValueError('hours:minutes:seconds in quotes, such as "08:00:00"')
+    return value
+
+
+Walltime = Annotated[str, BeforeValidator(_walltime)]
 BatchOption = Annotated[str, Field(pattern=r"^[^\n]+$")]
 OWN = "local"  # the name of the process pool, which needs no file
 
@@ -35,7 +44,7 @@ class Slurm(Section):
     kind: Literal["slurm"]
     """Parsl's SlurmProvider."""
     walltime: Walltime
-    """Longest time of a block; a job that it cuts goes on in the next block from its checkpoint."""
+    """Longest time of a block as "HH:MM:SS"; a job that it cuts goes on in the next block from its checkpoint."""
     nodes_per_block: Count = 1
     """Hosts of a block: of what is asked for at once."""
     partition: str | None = None
@@ -58,7 +67,7 @@ class Pbs(Section):
     kind: Literal["pbs"]
     """Parsl's PBSProProvider."""
     walltime: Walltime
-    """Longest time of a block; a job that it cuts goes on in the next block from its checkpoint."""
+    """Longest time of a block as "HH:MM:SS"; a job that it cuts goes on in the next block from its checkpoint."""
     queue: str | None = None
     """Queue; null: the cluster's default."""
     account: str | None = None

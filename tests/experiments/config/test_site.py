@@ -41,7 +41,11 @@ def write(folder, data):
         (SLURM | {"provider": {"kind": "slurm"}}, r"provider\.walltime: missing"),
         (
             SLURM | {"provider": {"kind": "slurm", "walltime": "90"}},
-            r"provider\.walltime: got '90'; allowed: .*pattern",
+            r"provider\.walltime: got '90'; allowed: hours:minutes:seconds in quotes",
+        ),
+        (
+            "provider: {kind: slurm, walltime: 1:30:00}\nworkers_per_node: 1",
+            r"provider\.walltime: got 5400; allowed: hours:minutes:seconds in quotes",
         ),
         ({**LOCAL, "provider": {"kind": "local", "walltime": "1:00:00"}}, r"provider\.walltime: unknown key"),
         (SLURM | {"workers_per_node": 0}, r"workers_per_node: got 0; allowed: greater than or equal to 1"),
