@@ -23,6 +23,10 @@ class RunError(ExperimentError):
     """A run folder cannot be used as asked."""
 
 
+class LockedError(RunError):
+    """Another process is at work in a run's folder."""
+
+
 class CheckpointError(ExperimentError):
     """A checkpoint cannot be written or read: the message says which, why, and what is left."""
 

@@ -61,7 +61,7 @@ ROOMS = {
         "viz diagnosis/report env rally"
     ),
     "experiments": (
-        "errors . config runs view/film view/studio view/programme "
+        "errors . config jobs runs view/film view/studio view/programme "
         "evaluation training baselines deploy finetuning study/workflow study/analysis "
         "study/blind study/target_domain study/report study view sharing commands robots cli"
     ),

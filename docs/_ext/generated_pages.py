@@ -38,7 +38,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 def write_all() -> None:
     """Write every generated page."""
-    from experiments.config import baselines, experiment, study
+    from experiments.config import baselines, experiment, site, study
     from experiments.config.finetuning import FineTuning
     from experiments.config.robot import COMMISSIONING, RANGES
     from robot_io.control.config import RobotConfig
@@ -50,6 +50,7 @@ def write_all() -> None:
     _write("fine-tuning", schema_page("Fine-tuning", "mjx-tt finetune", FineTuning.model_json_schema(), known))
     _write("study", schema_page("Study", "mjx-tt is2r", study.Study.model_json_schema(), known))
     _write("comparison", schema_page("Comparison", "mjx-tt compare", baselines.Comparison.model_json_schema(), known))
+    _write("site", schema_page("Site", "--site", site.Site.model_json_schema(), known))
     verdict = json.loads((REFERENCE / "verdict.schema.json").read_text("utf-8"))
     _write("verdict", schema_page("Verdict", "", verdict, {}))
     _write("model", model_page())

@@ -2,6 +2,7 @@
 
 Folder of a comparison:
   comparison.yaml                     the request, defaults written out
+  <algorithm>/seed<K>/started.json    versions, once its program is compiled
   <algorithm>/seed<K>/training.json   the curve, and under which conditions it came about
   <algorithm>/seed<K>/policy/         the controller's arrays
   <algorithm>/seed<K>/evaluation.json
@@ -14,7 +15,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +41,9 @@ from experiments.config.build import Experiment
 from experiments.config.experiment import Config
 from experiments.errors import RunError, checked
 from experiments.evaluation import evaluate
+from experiments.jobs import engine
+from experiments.jobs.engine import Job, Setup
+from experiments.jobs.site import ALONE, Workers
 from experiments.runs import checkpoint, run_dir
 from experiments.training.update import Trainer
 from mjx_tt.env.brax import TableTennis
@@ -45,6 +51,7 @@ from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import Controller
 from mjx_tt.sim.model import ModelFile
 
+STARTED = "started.json"
 RELATIVE = ("velocity", "acceleration", "jerk")  # reward terms: 1 - mean over joints and steps of |value| / limit
 
 
@@ -76,19 +83,51 @@ class Common:
         }
 
 
-def compare(comparison: Comparison, config: Config, where: str, out: Path, console: Console) -> Path:
-    """Runs what is not finished yet and writes the report; returns the comparison's folder. Raises ExperimentErrors."""
+def choose(comparison: Comparison, processes: int | None) -> int:
+    """Number of processes: ``processes`` where it is given, else one per core, and no more than trainings.
+
+    One where minutes are the budget: what a training does in them would depend on its neighbours. Call it when JAX is
+    configured.
+    """
+    most = len(comparison.algorithms) * len(comparison.seeds)
+    if processes is not None:
+        return min(processes, most)
+    if comparison.budget.minutes is not None or jax.default_backend() != "cpu":
+        return 1
+    return min(len(os.sched_getaffinity(0)), most)
+
+
+def compare(
+    comparison: Comparison, config: Config, where: str, out: Path, console: Console, workers: Workers = ALONE
+) -> Path:
+    """Runs what is not finished yet and writes the report; returns the comparison's folder. Raises ExperimentErrors.
+
+    workers: that train side by side; alone, this process trains one after the other.
+    """
     common = prepare(comparison, config, where, out, console)
     missing = unfinished(common)
     common.folder.mkdir(parents=True, exist_ok=True)
     with replacing(common.folder / "comparison.yaml") as temporary:
         temporary.write_text(yaml.safe_dump(common.comparison.to_dict(), sort_keys=False), encoding="utf-8")
-    judge = Judge(common) if any(missing.values()) else None
     for name, seeds in missing.items():
-        if judge is not None and seeds:
-            _run(common, judge, name, seeds)
-        else:
+        if not seeds:
             console.print(f"{common.folder / name}: done before, skipped", highlight=False)
+    left = [
+        Job(f"{name}/seed{seed}", (name, seed), program=name, compiled=common.run_folder(name, seed) / STARTED)
+        for name, seeds in missing.items()
+        for seed in seeds
+    ]
+
+    def say(job: Job, text: str) -> None:
+        console.print(f"{common.folder / job.name}: {text}", highlight=False)
+
+    if left and workers.alone:
+        alone = Trainings(common)
+        for job in left:
+            say(job, alone.run(*job.arguments))
+    elif left:
+        setup = Setup("experiments.baselines.compare:trainings", (comparison, config, where, out))
+        engine.run(workers.engine(setup, common.folder), left, say)
     report.write(common.folder, common.comparison)
     return common.folder
 
@@ -160,27 +199,43 @@ class Judge:
         return found | {"restlessness": {"action_change": change if math.isfinite(change) else None} | restless}
 
 
-def _run(common: Common, judge: Judge, name: str, seeds: list[int]) -> None:
-    """Does what is missing of training and evaluation of one algorithm."""
-    algorithm = learner(common.comparison.algorithms[name], common.experiment)
-    key = build.key(seeds[0], build.INITIAL_STATE)
-    compiled = None
-    for seed in seeds:
-        folder = common.run_folder(name, seed)
+class Trainings:
+    """Trainings of one process, one after the other: those of an algorithm share its compiled program."""
+
+    def __init__(self, common: Common) -> None:
+        self._common, self._judge = common, Judge(common)
+        self._name = ""
+        self._algorithm: Learner[Any]
+        self._compiled: Advance[Any] | None = None
+
+    def run(self, name: str, seed: int) -> str:
+        """Does what is missing of training and evaluation; the return rates in words. Raises RunError."""
+        common, key = self._common, build.key(seed, build.INITIAL_STATE)
+        if name != self._name:
+            self._algorithm, self._compiled = learner(common.comparison.algorithms[name], common.experiment), None
+            self._name = name
+        algorithm, folder = self._algorithm, common.run_folder(name, seed)
         if not (folder / "training.json").exists():
-            state = algorithm.init(build.key(seed, build.INITIAL_STATE))
-            if compiled is None:
+            state = algorithm.init(key)
+            if self._compiled is None:
                 common.console.print(f"{folder}: compiling ...", highlight=False)
-                compiled = algorithm.compiled(state)
-            _train(common, judge, name, folder, algorithm, compiled, state)
+                self._compiled = algorithm.compiled(state)
+            folder.mkdir(parents=True, exist_ok=True)
+            run_dir.write_json(folder / STARTED, run_dir.provenance())
+            _train(common, self._judge, name, folder, algorithm, self._compiled, state)
         template = jax.eval_shape(lambda key: algorithm.controller(algorithm.init(key)), key)
         restored = checkpoint.load_latest(folder / "policy", template)
         if restored is None:
             raise RunError(f"{folder / 'policy'}: holds no policy, though training.json is there; remove {folder}")
-        found = judge.final(restored[0])
+        found = self._judge.final(restored[0])
         run_dir.write_json(folder / "evaluation.json", {"conditions": common.evaluation_conditions()} | found)
         rates = (f"{world} {found[world]['return_rate']:.1%}" for world in ("simulation", "reality"))
-        common.console.print(f"{folder}: returned in {', in '.join(rates)}", highlight=False)
+        return f"returned in {', in '.join(rates)}"
+
+
+def trainings(comparison: Comparison, config: Config, where: str, out: Path) -> Callable[[str, int], str]:
+    """The function that does the training of an algorithm with a seed, in a worker."""
+    return Trainings(prepare(comparison, config, where, out, Console(force_terminal=False))).run
 
 
 def _finished(common: Common, name: str, seed: int) -> bool:

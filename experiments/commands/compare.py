@@ -7,7 +7,18 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands.options import changes, command, console, option, shipped_or_own, start_jax, writable
+from experiments.commands.options import (
+    Site,
+    changes,
+    command,
+    console,
+    count,
+    option,
+    shipped_or_own,
+    site_of,
+    start_jax,
+    writable,
+)
 
 app = command(
     "compare",
@@ -15,6 +26,7 @@ app = command(
     """\
   mjx-tt compare compare_quick.yaml                         BGS, ARS, PPO, SAC, QT-Opt: three minutes each
   mjx-tt compare mine.yaml --set budget.minutes=60 --set seeds=[0,1,2]
+  mjx-tt compare mine.yaml --site cluster.yaml              each training on a cluster: docs/how-to/use-a-cluster.md
 
 Algorithms and seeds that are finished are kept: the same command continues, and one with more of them adds to it.
 A file name without a folder that is not in the current folder is looked up among the shipped comparisons.
@@ -29,18 +41,26 @@ def compare(
     *,
     out: Annotated[str, option("FOLDER", "where its folder goes (default: runs)")] = "runs",
     overrides: Annotated[tuple[str, ...], changes("change one key")] = (),
+    processes: Annotated[
+        int | None,
+        count("trainings at a time (default: one, where minutes are the budget; else one per processor core)"),
+    ] = None,
+    site: Site = None,
 ) -> None:
     """Prints where the comparison is."""
     from experiments.config import baselines
 
     path = shipped_or_own(comparison, baselines.shipped())
     loaded, experiment = baselines.load(path, overrides)
+    elsewhere = site_of(site, processes=processes)
     writable(out)
-    start_jax(1)
+    start_jax(1, elsewhere is not None)
     from experiments.baselines import compare as comparing
+    from experiments.jobs.site import Workers
     from experiments.stages import interruptible
 
     screen = console()
+    workers = Workers(1 if elsewhere else comparing.choose(loaded, processes), elsewhere, str(site))
     with interruptible():
-        folder = comparing.compare(loaded, experiment, str(path), Path(out), screen)
+        folder = comparing.compare(loaded, experiment, str(path), Path(out), screen, workers)
     screen.print(f"{folder}/comparison.md, with its pictures beside it", highlight=False, soft_wrap=True)

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 
 from experiments.commands.options import (
     Devices,
+    Site,
     changes,
     command,
     console,
@@ -17,9 +18,11 @@ from experiments.commands.options import (
     existing,
     option,
     shipped_or_own,
+    site_of,
     start_jax,
     writable,
 )
+from experiments.errors import ConfigError
 
 app = command(
     "is2r",
@@ -27,6 +30,7 @@ app = command(
     """\
   mjx-tt is2r study_quick.yaml                              five virtual players, twenty minutes, ends in a report
   mjx-tt is2r study_full.yaml --set players=[player3]       the paper's number of balls
+  mjx-tt is2r study_full.yaml --site cluster.yaml           its steps on a cluster: docs/how-to/use-a-cluster.md
   mjx-tt is2r anna.yaml                                     with "robot: robot.yaml": docs/how-to/run-a-study.md
 
 Every finished step is kept: the same command continues after an interruption, a crash, or when people have played.
@@ -60,18 +64,23 @@ def is2r(
         ),
     ] = None,
     devices: Devices = None,
+    site: Site = None,
 ) -> int:
     """Returns 130 while the study waits for people."""
     from experiments.config import study as study_config
 
     loaded = study_config.load(shipped_or_own(study, study_config.shipped()), overrides)
+    elsewhere = site_of(site, processes=processes, devices=devices)
+    if elsewhere is not None and loaded.robot is not None:
+        raise ConfigError(f"--site {site}: with a robot the steps are done where it stands; allowed: local")
     writable(out)
     own = loaded.simulation.devices
-    start_jax(devices or (None if own == "auto" else own))
+    start_jax(devices or (None if own == "auto" else own), elsewhere is not None)
+    from experiments.jobs.site import Workers
     from experiments.stages import interruptible
     from experiments.study import session, workers
 
-    side_by_side = workers.choose(loaded, processes, devices)
+    side_by_side = Workers(1 if elsewhere else workers.choose(loaded, processes, devices), elsewhere, str(site))
     with interruptible() if loaded.robot is None else nullcontext():
         return 0 if session.run(loaded, Path(out) / loaded.name, console(), side_by_side) else 130
 

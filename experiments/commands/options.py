@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from experiments.config.build import Experiment
+    from experiments.config.site import Site as SiteFile
     from experiments.runs.load_policy import TrainedPolicy
 
 SHIPPED_HINT = (
@@ -58,7 +59,13 @@ Distributed = Annotated[
     str | None,
     option("auto|HOST:PORT", "share the work with other processes, on any hosts: as the cluster says, or by address"),
 ]
-Processes = Annotated[int | None, count("how many processes take part (with HOST:PORT)")]
+Processes = Annotated[
+    int | None, count("how many runs at a time (default: one per processor core); with HOST:PORT, how many take part")
+]
+Site = Annotated[
+    str | None,
+    option("local|YAML", "who does the jobs: processes of this machine (default), or the workers of a site's YAML"),
+]
 Process = Annotated[int | None, option("I", "which of them this one is, from 0 (with HOST:PORT)")]
 PolicyFolder = Annotated[str, Parameter("RUN_OR_ARTEFACT", help="folder of a run or of an exported policy")]
 Balls = Annotated[str | None, option("NAME_OR_YAML", "other balls, such as player1/M1")]
@@ -76,16 +83,38 @@ def console() -> Console:
     return Console(soft_wrap=not sys.stdout.isatty())
 
 
-def start_jax(devices: int | None) -> None:
-    """Configures JAX; called from a process that runs it already, a command takes the devices that are there."""
+def start_jax(devices: int | None, elsewhere: bool = False) -> None:
+    """Configures JAX; called from a process that runs it already, a command takes the devices that are there.
+
+    elsewhere: others do the jobs, so this process leaves accelerators to them.
+    """
     # XLA reports slow compilations and the like on stderr; what goes wrong comes as an exception all the same.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     from mjx_tt import platform
 
     with contextlib.suppress(RuntimeError):
         platform.configure(devices)
+        if elsewhere:
+            import jax
+
+            jax.config.update("jax_platforms", "cpu")
     # JAX warns of every fork, but git and ffmpeg are started by fork and exec at once, which its threads do not mind.
     warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
+
+
+def site_of(name: str | None, **others: Any) -> SiteFile | None:
+    """The site, None for this machine; ``others`` are options that do not go with a site. Raises ConfigError."""
+    from experiments.config import site
+
+    if name is None or name == site.OWN:
+        return None
+    loaded = site.load(name)
+    for option_name, value in others.items():
+        if value is not None:
+            raise ConfigError(
+                f"--{option_name} {value}: with --site {name} its workers_per_node, cores_per_worker and blocks say so"
+            )
+    return loaded
 
 
 # Refusals before anything heavy is imported

@@ -15,11 +15,13 @@ from experiments.commands.options import (
     Distributed,
     Process,
     Processes,
+    Site,
     changes,
     command,
     console,
     option,
     shipped_or_own,
+    site_of,
     start_jax,
     writable,
 )
@@ -33,6 +35,7 @@ app = command(
   mjx-tt train narrow.yaml medium.yaml --seeds 0,1,2        six runs: runs/narrow/seed0/ ... runs/medium/seed2/
   mjx-tt train player3_m2.yaml --seeds 0,1,2 --select       and name the best seed, as the paper does
   mjx-tt train my.yaml --set training.updates=500 --set balls=player1/M0
+  mjx-tt train my.yaml --seeds 0,1,2,3 --site cluster.yaml   on a cluster's nodes: docs/how-to/use-a-cluster.md
   srun mjx-tt train my.yaml --distributed auto               one training by all processes of a SLURM job
 
 Run the same command again after an interruption: finished runs are skipped, others continue from their last
@@ -72,21 +75,26 @@ def train(
     distributed: Distributed = None,
     processes: Processes = None,
     process: Process = None,
+    site: Site = None,
 ) -> int:
     """Returns the exit status."""
     from experiments.config import experiment as config
 
     if distributed and (len(experiments) > 1 or seeds):
         raise ConfigError(f"--distributed {distributed}: trains one experiment; start a job for each file and seed")
+    if distributed and site:
+        raise ConfigError(f"--site {site}: with --distributed each process is started by you, or by srun")
     if select and not seeds:
         raise ConfigError("--select chooses among seeds: give them with --seeds, such as --seeds 0,1,2")
     paths = [shipped_or_own(name, config.shipped()) for name in experiments]
     configs = [(str(path), config.load(path, overrides)) for path in paths]
+    elsewhere = site_of(site, processes=processes, devices=devices)
     writable(out)
     # As many as the experiment with the most needs; where all leave it open, as many as there are cores.
     most = max((c.training.devices for _, c in configs if c.training.devices != "auto"), default=None)
     # Several processes of several host devices each hang on queued collectives.
-    start_jax(devices or (1 if distributed else most))
+    start_jax(devices or (1 if distributed else most), elsewhere is not None)
+    from experiments.jobs.site import Workers
     from experiments.stages import interruptible
     from experiments.training import ranks, sweep
 
@@ -98,8 +106,10 @@ def train(
         with interruptible(), together.together():
             sweep.run_together(planned[0], screen, together)
         return 0
+    side_by_side = 1 if elsewhere else sweep.choose(planned, processes, devices)
+    workers = Workers(side_by_side, elsewhere, str(site))
     with interruptible():
-        ok = sweep.run_all(planned, screen)
+        ok = sweep.run_all(planned, screen, Path(out), workers)
         if select and ok:
             for name in dict.fromkeys(job.config.name for job in planned):
                 sweep.select(Path(out) / name, [job for job in planned if job.config.name == name], screen)

@@ -18,7 +18,7 @@ import yaml
 
 from ballmodel.io.atomic_files import replacing
 from experiments.config.experiment import Config, parse, read_yaml
-from experiments.errors import RunError
+from experiments.errors import LockedError, RunError
 
 CONFIG, SESSIONS, LOCK = "config.yaml", "run.json", ".lock"
 # What may change between the sessions of a run: none of it touches what an update computes.
@@ -41,6 +41,7 @@ class Run:
     checkpoints      states to continue from
     artefact         the exported policy
     plots            pictures of the evaluation
+    output           lines of a run that is one of several at a time
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -52,6 +53,7 @@ class Run:
         self.metrics = self.folder / "metrics.jsonl"
         self.evaluation = self.folder / "evaluation.json"
         self.status = self.folder / "status.json"
+        self.output = self.folder / "output.txt"
 
     def config(self) -> Config:
         """The configuration that the run was started with. Raises RunError when the folder is no run."""
@@ -99,7 +101,15 @@ class Run:
 
     def _untouched(self) -> bool:
         """True where the folder holds no more than the records of a start: no checkpoint, no measurement."""
-        kept = {CONFIG, SESSIONS, LOCK, self.checkpoints.name, self.metrics.name, self.tensorboard.name}
+        kept = {
+            CONFIG,
+            SESSIONS,
+            LOCK,
+            self.output.name,
+            self.checkpoints.name,
+            self.metrics.name,
+            self.tensorboard.name,
+        }
         if any(path.name not in kept for path in self.folder.iterdir()):
             return False
         measured = self.metrics.exists() and self.metrics.stat().st_size > 0
@@ -109,13 +119,13 @@ class Run:
     def locked(self) -> Iterator[None]:
         """Keeps a second process out of the folder; the system frees the lock however this one ends.
 
-        Raises RunError when another process holds it.
+        Raises LockedError when another process holds it.
         """
         with open(self.folder / LOCK, "w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise RunError(
+                raise LockedError(
                     f"{self.folder}: another process is training here; wait for it or choose another --out"
                 ) from None
             yield

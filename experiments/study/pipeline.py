@@ -26,6 +26,7 @@ from experiments.config.study import Study
 from experiments.errors import RunError, checked
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
+from experiments.runs.run_dir import Run
 from experiments.study import evaluation, identification, training
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis import study_folder as study_data
@@ -245,7 +246,9 @@ class Loop:
 
         optimiser = self.study.simulation.optimiser
         work = updates(self.study, item) * optimiser.num_directions * optimiser.repeats * self.study.simulation.seeds
-        return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run)
+        program = f"training of round {item.round}" if world is None else None  # an identified world is in the program
+        compiled = Run(folder / "training" / "seed0").metrics
+        return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run, program, compiled)
 
     def _real(self, seed: int, player: str, item: Real) -> Step:
         folder, name = self.model_folder(seed, player, item.key), f"seed{seed}/{player}/{item.key}"
@@ -266,7 +269,7 @@ class Loop:
         written = None if hits is None else hits / identification.BALLS
         outputs = (folder / POLICY, *(path for path in (data, written) if path is not None))
         inputs = (self.model_folder(seed, player, item.source) / POLICY,)
-        return Step(name, "fine-tuning", updates(self.study, item), inputs, outputs, run)
+        return Step(name, "fine-tuning", updates(self.study, item), inputs, outputs, run, "fine-tuning")
 
     def _convergence(self, seed: int, player: str) -> Step:
         sources = {name: self.human(seed, player, name) for name in ("M0", "M1", "M2")}

@@ -11,6 +11,7 @@ from experiments.config import build
 from experiments.config.experiment import read_yaml
 from experiments.config.study import Study, parse
 from experiments.errors import RunError, checked
+from experiments.jobs.site import ALONE, Workers
 from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
 from experiments.study import identification, training
@@ -24,12 +25,12 @@ SETTINGS, SESSIONS = "study.yaml", "study.json"
 CHANGEABLE = ("players", "seeds", "simulation.checkpoint_seconds", "simulation.devices")
 
 
-def run(study: Study, folder: Path, console: Console, processes: int = 1) -> bool:
+def run(study: Study, folder: Path, console: Console, workers: Workers = ALONE) -> bool:
     """Does, or goes on with, a study in ``folder``, up to its report; False when it waits for people.
 
-    processes: that do steps which need nothing of each other side by side, each on its share of the cores; 1: this one
-    does them all. Raises RunError for a folder of another study, naming the differences, ConfigError for what the study
-    names and is not there, and what the steps raise.
+    workers: that do steps which need nothing of each other side by side; alone, this process does them all. Raises
+    RunError for a folder of another study, naming the differences, ConfigError for what the study names and is not
+    there, and what the steps raise.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with Run(folder).locked():
@@ -39,10 +40,10 @@ def run(study: Study, folder: Path, console: Console, processes: int = 1) -> boo
         _open(study, folder)
         try:
             steps, journal = loop.steps(), Journal(folder / JOURNAL)
-            if processes > 1:
-                run_side_by_side(study, folder, steps, journal, console, processes)
-            else:
+            if workers.alone:
                 run_all(steps, journal, console)
+            else:
+                run_side_by_side(study, folder, steps, journal, console, workers)
         except Waiting as waiting:
             console.print(str(waiting), highlight=False, soft_wrap=True, markup=False)
             return False

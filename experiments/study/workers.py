@@ -1,4 +1,4 @@
-"""Steps of a study that need nothing of each other, done side by side: one process per share of the machine's cores.
+"""Steps of a study that need nothing of each other, done side by side by the workers of this machine or of a site.
 
 One training on all cores is slower than as many trainings on a core each, and most of a study's steps are independent:
 players, seeds, methods. The process that was asked decides what is next, marks what is done and says so; the workers
@@ -8,25 +8,18 @@ only do what they are told. What a step makes follows from its name alone, so no
 from __future__ import annotations
 
 import os
-import signal
-import threading
-from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import connection, get_context, parent_process
-from multiprocessing.queues import SimpleQueue
-from multiprocessing.synchronize import Event
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 
 import jax
 from rich.console import Console
 
 from experiments.config.study import Study
-from experiments.errors import ConfigError, RunError
+from experiments.errors import ConfigError
+from experiments.jobs import engine
+from experiments.jobs.engine import Job, Setup
+from experiments.jobs.site import Workers
 from experiments.study.workflow import Journal, Ledger, Step, perform
-from mjx_tt import platform
 
 
 def choose(study: Study, processes: int | None, devices: int | None) -> int:
@@ -49,138 +42,46 @@ def choose(study: Study, processes: int | None, devices: int | None) -> int:
 
 
 def run_side_by_side(
-    study: Study, folder: Path, steps: list[Step], journal: Journal, console: Console, processes: int
+    study: Study, folder: Path, steps: list[Step], journal: Journal, console: Console, workers: Workers
 ) -> None:
-    """Does what is not done yet of a study's steps, each as soon as its inputs are made and a process is free.
+    """Does what is not done yet of a study's steps, each as soon as its inputs are made and a worker is free.
 
     Ctrl-C and SIGTERM stop the workers, which save what they train, and then raise KeyboardInterrupt; so does the first
     error of a step, which is raised when the others have stopped. Raises RunError when a worker was killed.
     """
-    ledger = Ledger(steps, journal, console, processes)
+    ledger = Ledger(steps, journal, console, workers.count)
     if not ledger.left:
         return
-    context = get_context("spawn")  # a fork of a process in which JAX has run hangs
-    shares: SimpleQueue[list[int]] = context.SimpleQueue()
-    started: SimpleQueue[int] = context.SimpleQueue()
-    stopping = context.Event()
-    cores = sorted(os.sched_getaffinity(0))
-    for i in range(processes):
-        shares.put(cores[i::processes] or cores)
-    cache = jax.config.values["jax_compilation_cache_dir"]
-    executor = ProcessPoolExecutor(processes, context, _start, (study, folder, cache, shares, started, stopping))
-    waiting = list(ledger.left)
-    running: dict[Future[tuple[str, float]], Step] = {}
-    with _sigterm_interrupts():
-        try:
-            while waiting or running:
-                for step in _ready(waiting, list(running.values()))[: processes - len(running)]:
-                    running[executor.submit(_perform, step.name)] = step
-                    waiting.remove(step)
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    ledger.ended(running[future], *future.result())
-                    del running[future]
-        except BrokenProcessPool:
-            raise RunError(
-                f"{folder}: a process was killed, perhaps for want of memory; finished steps are kept. "
-                "The same command continues, --processes with fewer needs less memory"
-            ) from None
-        except BaseException as error:
-            said = _stop(running, started, stopping)
-            if isinstance(error, KeyboardInterrupt):
-                raise KeyboardInterrupt("\n".join(said)) from None
-            raise
-        finally:
-            executor.shutdown(cancel_futures=True)
+    by_name = {step.name: step for step in ledger.left}
+    setup = Setup("experiments.study.workers:prepare", (study, folder))
+
+    def ended(job: Job, result: tuple[str, float]) -> None:
+        ledger.ended(by_name[job.name], *result)
+
+    engine.run(workers.engine(setup, folder), jobs(ledger.left), ended)
 
 
-def _ready(waiting: list[Step], running: list[Step]) -> list[Step]:
-    """The steps, in their order, none of whose inputs is still to be made."""
-    coming = {path for step in (*waiting, *running) for path in step.outputs}
-    return [step for step in waiting if not coming.intersection(step.inputs)]
+def jobs(steps: list[Step]) -> list[Job]:
+    """The steps, each after those that make its inputs; a round's trainings share a program."""
+    makers = {path: step.name for step in steps for path in step.outputs}
+    return [
+        Job(
+            step.name,
+            (step.name,),
+            frozenset(makers[path] for path in step.inputs if path in makers),
+            step.program,
+            step.compiled,
+        )
+        for step in steps
+    ]
 
 
-def _stop(running: dict[Future[tuple[str, float]], Step], started: SimpleQueue[int], stopping: Event) -> list[str]:
-    """Asks the workers to save and stop, and waits for them; what they said. A second Ctrl-C does not wait."""
-    stopping.set()  # for those that have not begun
-    pids = []
-    while not started.empty():
-        pids.append(started.get())
-    _signal(pids, signal.SIGTERM)
-    try:
-        wait(running)
-    except KeyboardInterrupt:
-        _signal(pids, signal.SIGKILL)
-    ends = [future.exception() for future in running if future.done() and not future.cancelled()]
-    return [str(end) for end in ends if isinstance(end, KeyboardInterrupt) and str(end)]
-
-
-def _signal(pids: list[int], number: int) -> None:
-    for pid in pids:
-        try:
-            os.kill(pid, number)
-        except ProcessLookupError:
-            pass
-
-
-@contextmanager
-def _sigterm_interrupts() -> Iterator[None]:
-    """Inside, SIGTERM is a Ctrl-C, also for a worker's step."""
-    if threading.current_thread() is not threading.main_thread():  # where nobody may set handlers
-        yield
-        return
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-# -- in a worker ----------------------------------------------------------------------------------------------------
-
-_steps: dict[str, Step] = {}  # of this worker's study, by name
-_stopping: Event  # set: no further step is to begin
-
-
-def _start(
-    study: Study,
-    folder: Path,
-    cache: str | None,
-    shares: SimpleQueue[list[int]],
-    started: SimpleQueue[int],
-    stopping: Event,
-) -> None:
-    """Takes a share of the cores, and makes the steps."""
-    global _stopping
-    _stopping = stopping
-    # A terminal's Ctrl-C reaches all processes: the one that was asked passes it on, as SIGTERM.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    started.put(os.getpid())
-    os.sched_setaffinity(0, shares.get())
-    platform.configure(1, cache)
-    from experiments.study.pipeline import Loop  # its libraries count the cores when they load
+def prepare(study: Study, folder: Path) -> Callable[[str], tuple[str, float]]:
+    """The function that does a step of that name, in a worker."""
+    from experiments.study.pipeline import Loop
 
     simulation = study.simulation.model_copy(update={"devices": 1})
     console = Console(force_terminal=False)  # live bars of several processes would overwrite each other
     loop = Loop(study.model_copy(update={"simulation": simulation}), folder, console)
-    _steps.update({step.name: step for step in loop.steps()})
-
-
-def _end_with_parent() -> None:
-    """Nobody would mark what an orphan does, and the next start would meet it in the same folder."""
-    parent = parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
-
-
-def _perform(name: str) -> tuple[str, float]:
-    with _sigterm_interrupts():
-        if _stopping.is_set():
-            raise KeyboardInterrupt
-        return perform(_steps[name])
+    steps = {step.name: step for step in loop.steps()}
+    return lambda name: perform(steps[name])

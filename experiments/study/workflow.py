@@ -35,6 +35,7 @@ class Step:
     kind     steps of a kind take time in proportion to their ``work``
     inputs   files that it reads, outputs: files that it makes
     run      does it; the sentence that it returns is shown
+    program  steps of one program wait for the first of them to compile it, when ``compiled`` is filled or it has ended
     """
 
     name: str
@@ -43,6 +44,8 @@ class Step:
     inputs: tuple[Path, ...]
     outputs: tuple[Path, ...]
     run: Callable[[], str]
+    program: str | None = None
+    compiled: Path | None = None
 
 
 class Journal:

@@ -205,14 +205,19 @@ class Session:
         self._saved = (self.update, time.monotonic())
 
 
-def _compiled(config: Config, trainer: Trainer, state: TrainState) -> Compiled:
-    """The update's program: one for all runs of this process that differ in balls, seed and first policy only."""
+def program(config: Config, devices: int | str) -> str:
+    """Everything that decides an update's program."""
     sections, training = [config.to_dict()[name] for name in ("task", "model", "optimiser")], config.training
     length = training.updates if config.optimiser.step.schedule.kind == "cosine" else None
-    rest: list[Any] = [length, training.pool, trainer.simulator.devices, config.definitions, config.network]
+    rest: list[Any] = [length, training.pool, devices, config.definitions, config.network]
     if training.later_rewards is not None:
         rest.append(training.later_rewards.to_dict())
-    decides = json.dumps([*sections, *rest], sort_keys=True)
+    return json.dumps([*sections, *rest], sort_keys=True)
+
+
+def _compiled(config: Config, trainer: Trainer, state: TrainState) -> Compiled:
+    """The update's program: one for all runs of this process that differ in balls, seed and first policy only."""
+    decides = program(config, trainer.simulator.devices)
     if decides not in _programs:
         _programs[decides] = trainer.lower(state).compile()
     return _programs[decides]

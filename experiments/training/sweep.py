@@ -1,12 +1,15 @@
-"""A batch of trainings: several experiments, several seeds, one after the other."""
+"""A batch of trainings: several experiments, several seeds, side by side or one after the other."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -14,15 +17,20 @@ from rich.table import Table
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
-from experiments.errors import ConfigError, explained
+from experiments.errors import ConfigError, RunError, explained
 from experiments.evaluation import evaluate
+from experiments.jobs import engine
+from experiments.jobs.engine import Setup
+from experiments.jobs.site import ALONE, Workers
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
+from experiments.training import loop
 from experiments.training.finalize import finish
 from experiments.training.loop import train
 from experiments.training.ranks import Ranks
 
+WIDTH = 120  # [characters] of lines in a file
 SELECTION_EPISODES = 50  # Abeyruwan et al. 2022, appendix "Seed Selection for Rounds of Simulated Training"
 
 
@@ -58,8 +66,29 @@ def plan(configs: list[tuple[str, Config]], seeds: tuple[int, ...], out: Path) -
     return jobs
 
 
-def run_all(jobs: list[Job], console: Console) -> bool:
-    """Runs, resumes or skips each job; one that fails does not stop the others. Returns whether all succeeded."""
+def choose(jobs: list[Job], processes: int | None, devices: int | None) -> int:
+    """Number of processes for a batch: ``processes`` where it is given, else one per core, and no more than jobs.
+
+    On an accelerator, for one job, or where a number of devices is asked for, one does them all. It follows from the
+    whole batch, not from what is left of it: it decides the devices of each, and these the last bits. Call it when JAX
+    is configured.
+    """
+    if processes is not None:
+        return min(processes, len(jobs))
+    if devices is not None or len(jobs) == 1 or any(job.config.training.devices != "auto" for job in jobs):
+        return 1
+    return min(len(os.sched_getaffinity(0)), len(jobs)) if jax.default_backend() == "cpu" else 1
+
+
+def run_all(jobs: list[Job], console: Console, out: Path, workers: Workers = ALONE) -> bool:
+    """Runs, resumes or skips each job; one that fails does not stop the others. Returns whether all succeeded.
+
+    workers: alone, this process runs one after the other; others run side by side, each run's lines in a file of its
+    folder. out: folder of the runs. Raises KeyboardInterrupt when it was stopped, ConfigError for a site that cannot be
+    used.
+    """
+    if not workers.alone:
+        return _run_side_by_side(jobs, console, out, workers)
     outcomes: list[tuple[Job, str, str]] = []
     for job in jobs:
         try:
@@ -74,6 +103,59 @@ def run_all(jobs: list[Job], console: Console) -> bool:
     if len(jobs) > 1:
         _print_outcomes(outcomes, console)
     return all(state == "done" for _, state, _ in outcomes)
+
+
+def _run_side_by_side(jobs: list[Job], console: Console, out: Path, workers: Workers) -> bool:
+    by_name = {str(job.run.folder): job for job in jobs}
+    outcomes: dict[str, tuple[Job, str, str]] = {}
+
+    def note(name: str, state: str, result: str) -> None:
+        outcomes[name] = (by_name[name], state, result)
+        line = f"[{len(outcomes)}/{len(jobs)}] {name}: {'' if state == 'done' else 'failed: '}{result}"
+        console.print(line, style="red" if state == "failed" else None, highlight=False, soft_wrap=True, markup=False)
+
+    left = []
+    for name, job in by_name.items():
+        if job.run.done(job.config):
+            note(name, "done", _run(job, console))
+        else:
+            # Runs of one program: the first compiles it for all.
+            program = hashlib.sha256(loop.program(job.config, job.config.training.devices).encode()).hexdigest()
+            left.append(engine.Job(name, (job,), program=program, compiled=job.run.metrics))
+    if left:
+        console.print(
+            f"{len(left)} runs, {workers.text}; each writes its lines to {jobs[0].run.output.name} in its folder",
+            highlight=False,
+            soft_wrap=True,
+        )
+        asked = max((c.devices for c in (job.config.training for job in jobs) if c.devices != "auto"), default=1)
+        setup = Setup("experiments.training.sweep:prepare", (), max(asked, workers.cores))
+        engine.run(
+            workers.engine(setup, out),
+            left,
+            lambda job, result: note(job.name, "done", result),
+            lambda job, error: note(job.name, "failed", str(error)),
+        )
+    _print_outcomes([outcomes[name] for name in by_name], console)
+    return all(state == "done" for _, state, _ in outcomes.values())
+
+
+def prepare() -> Callable[[Job], str]:
+    """The function that does a job, in a worker."""
+    return _run_into_file
+
+
+def _run_into_file(job: Job) -> str:
+    job.run.folder.mkdir(parents=True, exist_ok=True)
+    with open(job.run.output, "a", encoding="utf-8") as file:
+        console = Console(file=file, width=WIDTH)
+        try:
+            return _run(job, console)
+        except Exception as error:
+            if explained(error):
+                raise
+            console.print_exception()
+            raise RunError(f"{type(error).__name__}: {error}; see {job.run.output}") from None
 
 
 def run_together(job: Job, console: Console, ranks: Ranks) -> None:

@@ -31,6 +31,12 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from experiments.commands.options import site_of
+from experiments.errors import ConfigError
+from experiments.jobs import engine
+from experiments.jobs.engine import Job, Setup
+from experiments.jobs.site import ALONE as ONE_BY_ONE
+from experiments.jobs.site import Workers
 from tests.exam.generator import cases as drawing
 from tests.exam.generator import held_out, human_strokes, scoring
 from tests.exam.generator.cases import BallCase, Case
@@ -269,29 +275,47 @@ def _draw_reliability(bins: list[scoring.Reliability], path: Path) -> None:
     plt.close(figure)
 
 
-def run_all(cases: list[Case], folder: Path, keep: bool, part: tuple[int, int] = (1, 1)) -> list[dict]:
+def examiner() -> Callable[[Case, Path], dict]:
+    """The function that examines a case, in a worker."""
+    return examine
+
+
+def run_all(
+    cases: list[Case], folder: Path, keep: bool, part: tuple[int, int] = (1, 1), workers: Workers = ONE_BY_ONE
+) -> list[dict]:
     """Examines what is not yet in OUT/cases.jsonl, or every n-th case of it; returns the records of all that are done.
 
-    Several processes may work on the parts of one examination: each appends whole lines.
+    Several processes may work on the parts of one examination: each appends whole lines. workers: that examine side by
+    side.
     """
     path = folder / "cases.jsonl"
     wanted = {case.name for case in cases}
     done = {r["key"] for r in read_lines(path)}
     left = [case for case in cases[part[0] - 1 :: part[1]] if case.name not in done]
-    began = time.perf_counter()
-    for i, case in enumerate(left):
-        record = examine(case, folder / "cases" / case.name)
+    began, ended = time.perf_counter(), 0
+
+    def note(case: Case, record: dict) -> None:
+        nonlocal ended
         append(path, record)
         if not keep:
             shutil.rmtree(folder / "cases" / case.name)
-        remaining = (time.perf_counter() - began) / (i + 1) * (len(left) - i - 1)
+        ended += 1
+        remaining = (time.perf_counter() - began) / ended * (len(left) - ended)
         print(
-            f"{i + 1}/{len(left)} {case.name}: {record['outcome']} ({record['answer']}), "
+            f"{ended}/{len(left)} {case.name}: {record['outcome']} ({record['answer']}), "
             f"{record['seconds']:.1f} s; {remaining / 60:.0f} min left",
             flush=True,
         )
-        if i % 20 == 19:
+        if ended % 20 == 0:
             summarise([r for r in read_lines(path) if r["key"] in wanted], {}, [], folder)
+
+    if workers.alone:
+        for case in left:
+            note(case, examine(case, folder / "cases" / case.name))
+    elif left:
+        jobs = [Job(case.name, (case, folder / "cases" / case.name)) for case in left]
+        setup = Setup("tests.exam.examination:examiner", ())
+        engine.run(workers.engine(setup, folder), jobs, lambda job, record: note(job.arguments[0], record))
     return [r for r in read_lines(path) if r["key"] in wanted]
 
 
@@ -307,6 +331,8 @@ def main(arguments: list[str] | None = None) -> int:
     help_ = "only every N-th case, for N processes on one OUT; the first does bars 11 and 12"
     parser.add_argument("--part", default="1/1", metavar="K/N", help=help_)
     parser.add_argument("--keep", action="store_true", help="keep logs, truths and reports of every case")
+    parser.add_argument("--processes", type=int, metavar="N", help="cases at a time, by as many processes (default: 1)")
+    parser.add_argument("--site", metavar="YAML", help="by the workers of a site: docs/how-to/use-a-cluster.md")
     options = parser.parse_args(arguments)
     bars = options.bars.split(",")
     if not human_strokes.DATA.exists():
@@ -323,11 +349,16 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--part {options.part}: K/N is wanted, such as 1/2")
     if not 1 <= part <= parts:
         parser.error(f"--part {options.part}: K of K/N runs from 1 to N")
+    try:
+        elsewhere = site_of(options.site, processes=options.processes)
+    except ConfigError as error:
+        parser.error(str(error))
+    workers = Workers(options.processes or 1, elsewhere, str(options.site))
     options.out.mkdir(parents=True, exist_ok=True)
     alone = {}
     if "11" in bars and part == 1:
         alone["11"] = by_itself(lambda: time_run(options.out / "time", options.seed))
-    records = run_all(plan(bars, options.cases, options.seed), options.out, options.keep, (part, parts))
+    records = run_all(plan(bars, options.cases, options.seed), options.out, options.keep, (part, parts), workers)
     if "12" in bars and part == 1 and DATA.is_dir():
         alone["12"] = by_itself(lambda: real_data(options.out / "launcher"))
     compared: list[dict] = []

@@ -35,7 +35,7 @@ SlurmdPidFile={folder}/slurmd.pid
 SlurmctldLogFile={folder}/slurmctld.log
 SlurmdLogFile={folder}/slurmd.log
 KillOnBadExit=0
-NodeName={host} CPUs={cpus} State=UNKNOWN
+NodeName={host} CPUs={cpus} RealMemory={memory} State=UNKNOWN
 PartitionName=all Nodes=ALL Default=YES State=UP OverSubscribe=FORCE:4
 """
 
@@ -55,7 +55,10 @@ def slurm(folder: Path) -> Iterator[dict[str, str]]:
         (folder / name).mkdir(parents=True)
     host = socket.gethostname().split(".")[0]
     controller, node = free_ports(2)
-    text = CONFIGURATION.format(host=host, controller=controller, node=node, folder=folder, cpus=os.cpu_count())
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2**20  # [MiB]
+    text = CONFIGURATION.format(
+        host=host, controller=controller, node=node, folder=folder, cpus=os.cpu_count(), memory=memory
+    )
     (folder / "slurm.conf").write_text(text)
     environment = os.environ | {"SLURM_CONF": str(folder / "slurm.conf")}
     daemons = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from collections import deque
 
 import jax
@@ -23,7 +24,10 @@ from experiments.baselines.qt_opt import Critics, QtOptAgent, best_action
 from experiments.baselines.sac import SacAgent
 from experiments.config import baselines
 from experiments.config.baselines import Ppo, QtOpt, Replay, Sac
+from experiments.config.site import Site
 from experiments.errors import ConfigError, RunError
+from experiments.jobs.site import ALONE, Workers
+from experiments.runs import checkpoint
 from mjx_tt.env.brax import OBSERVATION_SIZE
 from robot_io.contract import N_JOINTS
 
@@ -261,3 +265,30 @@ def test_a_mistake_in_the_yaml_is_named(tmp_path, override, message):
 def test_a_shipped_comparison_is_valid(name):
     comparison, experiment = baselines.load(baselines.shipped()[name])
     assert comparison.name == name
+
+
+@pytest.mark.slow
+def test_a_site_trains_the_same(tmp_path):
+    """One after the other in this process, and by a worker of Parsl's: the same policies, curves and evaluations."""
+    path = write(tmp_path, SMALL | {"seeds": [0, 1]})
+    here = Site.model_validate({"provider": {"kind": "local"}, "workers_per_node": 1, "memory_per_worker": 1.0})
+    for out, workers in (("alone", ALONE), ("site", Workers(1, here, "here.yaml"))):
+        compare.compare(*baselines.load(path), str(path), tmp_path / out, Console(), workers)
+    for seed in (0, 1):
+        alone, site = (tmp_path / out / "small" / "ES" / f"seed{seed}" for out in ("alone", "site"))
+        arrays, others = (checkpoint.read_latest(folder / "policy")[0] for folder in (alone, site))
+        assert arrays.keys() == others.keys() and len(arrays) > 0
+        assert all(arrays[name].tobytes() == others[name].tobytes() for name in arrays)
+        assert (alone / "evaluation.json").read_bytes() == (site / "evaluation.json").read_bytes()
+        curves = [json.loads((folder / "training.json").read_text())["curve"] for folder in (alone, site)]
+        timeless = [[p | {"seconds": 0, "cpu_seconds": 0} for p in curve] for curve in curves]
+        assert timeless[0] == timeless[1]
+
+
+def test_trainings_at_a_time():
+    parsed = baselines.Comparison.model_validate(SMALL | {"seeds": [0, 1, 2]})
+    if jax.default_backend() == "cpu":
+        assert compare.choose(parsed, None) == min(3, len(os.sched_getaffinity(0)))
+    assert compare.choose(parsed, 2) == 2 and compare.choose(parsed, 9) == 3
+    timed = parsed.model_copy(update={"budget": baselines.Budget(minutes=1.0)})
+    assert compare.choose(timed, None) == 1

@@ -73,9 +73,11 @@ from pathlib import Path
 from mjx_tt import platform
 platform.configure(devices=2, cache=Path(".cache/jax"))
 from rich.console import Console
-from experiments.config import study as config
+from experiments.config import site, study as config
+from experiments.jobs.site import Workers
 from experiments.study import session
-session.run(config.parse(json.loads(sys.argv[1]), "test"), Path(sys.argv[2]), Console(), processes=2)
+workers = Workers(1, site.load(sys.argv[3])) if sys.argv[3:] else Workers(2)
+session.run(config.parse(json.loads(sys.argv[1]), "test"), Path(sys.argv[2]), Console(), workers)
 """
 
 
@@ -614,6 +616,10 @@ def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tm
     loop(study(), folder)
     entries = [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
     assert len(entries) == len(set(entries))  # nothing was done twice
+    assert_same_bits(folder, finished)
+
+
+def assert_same_bits(folder: Path, finished: Path) -> None:
     for path in sorted(finished.rglob("*")):
         if path.suffix in (".csv", ".npz", ".yaml") and path.name != "config.yaml":
             mine = folder / path.relative_to(finished)
@@ -625,6 +631,29 @@ def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tm
                         np.testing.assert_array_equal(a[name], b[name], err_msg=f"{path}: {name}")
             else:
                 assert path.read_bytes() == mine.read_bytes(), path
+
+
+@pytest.mark.slow
+def test_a_study_by_parsl_killed_and_resumed_ends_as_one_by_this_process(finished, tmp_path):
+    """The process that was asked is killed while a worker trains; the same command ends the study."""
+    folder = tmp_path / "tiny"
+    here = {"provider": {"kind": "local"}, "workers_per_node": 1, "memory_per_worker": 1.0}
+    (tmp_path / "here.yaml").write_text(yaml.safe_dump(here))
+    command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder), str(tmp_path / "here.yaml")]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
+    measured = folder / "seed0" / "player3" / "is2r-sim1" / "training" / "seed0" / "metrics.jsonl"
+    while not measured.exists():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    before = len(Journal(folder / "steps.jsonl").entries)
+    assert 0 < before < 10  # of 20
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200)
+    assert done.returncode == 0, done.stdout + done.stderr
+    entries = [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
+    assert len(entries) == len(set(entries)) > before
+    assert_same_bits(folder, finished)
 
 
 @pytest.mark.slow

@@ -1,0 +1,61 @@
+"""Cost of a job beside its work: empty jobs by the process pool and by Parsl's workers on this machine.
+
+    python -m benchmarks.job_engines
+
+Start: from the call to the end of the first job: processes start, load JAX and prepare themselves. Each: the rest of
+``JOBS`` empty jobs over their number, two workers at a time, one submitted as another ends.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from experiments.config.site import Site
+from experiments.jobs import engine
+from experiments.jobs.engine import Job, Setup
+from experiments.jobs.site import Workers
+
+JOBS = 400
+WORKERS = 2
+HERE = {"provider": {"kind": "local"}, "workers_per_node": WORKERS, "memory_per_worker": 0.5}
+
+
+def prepare() -> Callable[[], None]:
+    """A job of nothing, in a worker."""
+    return lambda: None
+
+
+def measure(workers: Workers, folder: Path) -> dict[str, float]:
+    """Seconds to the first end, per further job, and of the end of the workers."""
+    ends: list[float] = []
+    jobs = [Job(str(i), ()) for i in range(JOBS)]
+    began = time.monotonic()
+    setup = Setup("benchmarks.job_engines:prepare", ())
+    engine.run(workers.engine(setup, folder), jobs, lambda job, result: ends.append(time.monotonic()))
+    closed = time.monotonic() - ends[-1]
+    rest = ends[WORKERS:]  # each worker has had its first
+    return {"start": ends[0] - began, "each": (rest[-1] - rest[0]) / (len(rest) - 1), "end": closed}
+
+
+def main(console: Console) -> None:
+    """Prints both engines."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, workers in {
+            "process pool": Workers(WORKERS),
+            "Parsl": Workers(1, Site.model_validate(HERE), "here"),
+        }.items():
+            took = measure(workers, Path(folder))
+            console.print(
+                f"{name}: {took['start']:.1f} s to the end of the first job, {1000 * took['each']:.1f} ms for each "
+                f"further one, {took['end']:.1f} s to end the workers",
+                highlight=False,
+            )
+
+
+if __name__ == "__main__":
+    main(Console())

@@ -1,0 +1,184 @@
+"""Common face of the engines that do jobs, and the order in which jobs are given to them.
+
+A job is known by its name and does what follows from files: killed at any moment and given again, it goes on from what
+it left. The process that was asked decides what is next and records what has ended; workers only do what they are told,
+so nothing depends on who does it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import threading
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+from mjx_tt import platform
+
+POLL = 0.5  # [s] between looks at whether a stop was asked for, and at which programs are compiled
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Preparation of a worker, in a form that travels to other hosts.
+
+    prepare    "module:function", called once in each worker with ``given``; returns the function that does a job. Its
+               module is loaded when the worker has its cores, which libraries count when they load
+    devices    host devices of a worker, the least that its jobs need
+    cache      folder of compiled programs; None: JAX keeps none
+    """
+
+    prepare: str
+    given: tuple[Any, ...]
+    devices: int = 1
+    cache: str | None = None
+
+    def prepared(self) -> Callable[..., Any]:
+        """Function that does a job, in a worker."""
+        # JAX warns of every fork, but git and ffmpeg are started by fork and exec at once.
+        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # as in a command
+        platform.configure(self.devices, self.cache)
+        module, _, function = self.prepare.partition(":")
+        return getattr(importlib.import_module(module), function)(*self.given)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One call of the function that a worker has prepared.
+
+    arguments   of the call, in a form that travels
+    after       names of jobs that have to end before; others count as done
+    program     jobs of one program wait until the first of them has compiled it: then it is in the cache
+    compiled    file that is not empty once it has; None: when the first has ended
+    """
+
+    name: str
+    arguments: tuple[Any, ...]
+    after: frozenset[str] = frozenset()
+    program: str | None = None
+    compiled: Path | None = None
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """Result of a job that saved what it had because it was asked to stop; ``text`` says what."""
+
+    text: str
+
+
+class JobEngine(Protocol):
+    """Workers that do jobs.
+
+    slots: jobs that it takes at a time
+    """
+
+    slots: int
+
+    def submit(self, job: Job) -> Future[Any]:
+        """Result of the job, or ``Stopped``. Raises nothing; the future raises what the job does, or RunError."""
+
+    def check(self) -> None:
+        """Raises KeyboardInterrupt where a stop was asked for in another way than by Ctrl-C."""
+
+    def stop(self, running: Iterable[Future[Any]], at_once: bool) -> None:
+        """Asks the workers to save and to stop, and waits for them; ``at_once``: ends them as they are."""
+
+    def close(self) -> None:
+        """Ends the workers, which are idle."""
+
+
+def run(
+    engine: JobEngine,
+    jobs: Sequence[Job],
+    ended: Callable[[Job, Any], None],
+    failed: Callable[[Job, Exception], None] | None = None,
+) -> None:
+    """Does the jobs, each as soon as those that it comes after have ended and a worker is free; ``ended`` gets results.
+
+    failed: told of a job's error, which then costs no other job; without it the first error stops the others, which
+    save what they have, and is raised. Ctrl-C and SIGTERM stop all in the same way and raise KeyboardInterrupt with
+    what the jobs said.
+    """
+    waiting = list(jobs)
+    running: dict[Future[Any], Job] = {}
+    warm: set[str] = set()
+    with sigterm_interrupts():
+        try:
+            while waiting or running:
+                for job in _ready(waiting, list(running.values()), warm)[: engine.slots - len(running)]:
+                    running[engine.submit(job)] = job
+                    waiting.remove(job)
+                for future in wait(running, POLL, FIRST_COMPLETED).done:
+                    job = running[future]
+                    error = future.exception()
+                    if error is None and isinstance(future.result(), Stopped):
+                        raise KeyboardInterrupt(future.result().text)
+                    if isinstance(error, Exception) and failed is not None:
+                        failed(job, error)
+                    else:
+                        ended(job, future.result())
+                    if job.program:
+                        warm.add(job.program)
+                    del running[future]
+                engine.check()
+        except BaseException as error:
+            said = _stop(engine, running)
+            if isinstance(error, KeyboardInterrupt):
+                raise KeyboardInterrupt("\n".join(said)) from None
+            raise
+        finally:
+            engine.close()
+
+
+def _ready(waiting: list[Job], running: list[Job], warm: set[str]) -> list[Job]:
+    """The jobs, in their order, that nothing holds back."""
+    coming = {job.name for job in (*waiting, *running)}
+    warm |= {job.program for job in running if job.program and _filled(job.compiled)}
+    compiling = {job.program for job in running if job.program} - warm
+    found: list[Job] = []
+    for job in waiting:
+        if coming.intersection(job.after) or job.program in compiling:
+            continue
+        found.append(job)
+        if job.program and job.program not in warm:
+            compiling.add(job.program)
+    return found
+
+
+def _filled(path: Path | None) -> bool:
+    return path is not None and path.exists() and path.stat().st_size > 0
+
+
+def _stop(engine: JobEngine, running: dict[Future[Any], Job]) -> list[str]:
+    """Texts of the jobs that were asked to save and stop. A second Ctrl-C does not wait for them."""
+    try:
+        engine.stop(running, at_once=False)
+    except KeyboardInterrupt:
+        engine.stop(running, at_once=True)
+    ends = [f.result() for f in running if f.done() and not f.cancelled() and f.exception() is None]
+    return [end.text for end in ends if isinstance(end, Stopped) and end.text]
+
+
+@contextmanager
+def sigterm_interrupts() -> Iterator[None]:
+    """Inside, SIGTERM is a Ctrl-C, also for a worker's job."""
+    if threading.current_thread() is not threading.main_thread():  # where nobody may set handlers
+        yield
+        return
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
