@@ -219,7 +219,7 @@ class Scene:
         self.server.flush()
 
     def _label(self, table: int, film: Film, t: float) -> str:
-        """What stands above a table, short where labels stand beside each other; the panel has it in full."""
+        """Label above a table, short where labels stand beside each other; the panel has it in full."""
         name = film.title if self.count <= NAMED else str(table + 1)
         if not film.outcome or t < film.decided:
             return name

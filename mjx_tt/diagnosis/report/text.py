@@ -75,7 +75,7 @@ def told(separates: Sequence[str]) -> str:
 
 
 def advice(steps: Sequence[Experiment]) -> tuple[str, list[str]]:
-    """What all next steps tell alike, and what each tells beside that, in words; "" for nothing."""
+    """Advice that all next steps give alike, and what each gives beside that, in words; "" for nothing."""
     informative = [step.separates for step in steps if step.separates]
     shared = [line for line in informative[0] if all(line in other for other in informative)] if informative else []
     common = shared if len(informative) > 1 else []  # one step alone says for itself what it tells
