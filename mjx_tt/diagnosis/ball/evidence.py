@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.flights import noise
@@ -27,7 +28,8 @@ def misfit(settled: Settled, g: Grid) -> float:
     counts = g.mask & (p.weight.T > 0.0)
     error = np.minimum(noise.Whitening(n, g).distance(left) ** 2, 3.0 * noise.HUBER**2)
     spread = 2.0 * np.log(n.scale * np.sqrt(1.0 - n.memory[:, None] ** 2)).sum(axis=0)
-    own = _price_of_spins(settled, g.n) + _price_of_kicks(settled, start[KICK]) + _price_of_sizes(settled)
+    own = _price_of_spins(settled, g.n) + _price_of_kicks(settled, start[KICK])
+    own += float(scores.price(_sizes(choice, settled.trial), np.ones(len(choice.effects))))
     # As if the samples left out were as usual: to leave out must not pay.
     share = g.mask.sum() / counts.sum()
     return float(share * np.where(counts, error + spread, 0.0).sum() + own + choice.threshold * len(choice.effects))
@@ -50,11 +52,9 @@ def _price_of_spins(settled: Settled, n: int) -> float:
     return float(np.einsum("an,nab,bn->", away, precision, away) + narrower.sum())
 
 
-def _price_of_sizes(settled: Settled) -> float:
-    """Twice the negative log prior of the causes' sizes, beside that of none: Student's, as where all are fitted."""
-    sizes = zip(settled.choice.effects, settled.choice.theta, strict=True)
-    away = np.array([theta / settled.trial.effects[j].scale for j, theta in sizes])
-    return float(((scores.FREEDOM + 1.0) * np.log1p(away**2 / scores.FREEDOM)).sum())
+def _sizes(choice: Choice, trial: Trial) -> Float[np.ndarray, " c"]:
+    """Sizes of the causes in ordinary ones."""
+    return np.asarray(choice.theta) / np.array([trial.effects[j].scale for j in choice.effects])
 
 
 def _price_of_kicks(settled: Settled, kick: np.ndarray) -> float:
@@ -99,8 +99,7 @@ def bent_too_far(choice: Choice) -> bool:
 
 def extraordinary(choice: Choice, trial: Trial) -> bool:
     """True where a cause was chosen of a size that hardly any set-up has: what spin bends in one way, wind does too."""
-    sizes = zip(choice.effects, choice.theta, strict=True)
-    return any(abs(theta) > EXTRAORDINARY * trial.effects[j].scale for j, theta in sizes)
+    return bool(np.any(np.abs(_sizes(choice, trial)) > EXTRAORDINARY))
 
 
 def imitated(p: Projected, trial: Trial, choice: Choice) -> tuple[str, ...]:

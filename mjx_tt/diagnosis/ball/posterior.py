@@ -115,8 +115,7 @@ def _stepped(
     """
 
     def price(changes: np.ndarray) -> float:
-        away = (changes - mean)[free] / scale[free]
-        return float(((scores.FREEDOM + 1.0) * np.log1p(away**2 / scores.FREEDOM)).sum())
+        return float(scores.price((changes - mean)[free], scale[free]))
 
     g = problem.grid
     best, least = at, float(fit_with_cost(problem, at.theta, at.start, g, own, prior, 0)[1].sum()) + price(at.theta)
@@ -124,12 +123,12 @@ def _stepped(
         there = at.theta + share * (theta - at.theta)
         start, cost = fit_with_cost(problem, there, at.start, g, own, prior, 3)
         total = float(cost.sum()) + price(there)
+        if total >= least and best is not at:
+            break
         if total < least:
             best, least = Situation(there, start), total
-        elif best is not at:
-            break
-        if share == 1.0 and best is not at:
-            break
+            if share == 1.0:
+                break
     return best
 
 

@@ -153,7 +153,7 @@ def solve(scores: Scores, chosen: Sequence[int]) -> Float[np.ndarray, " c"]:
     return np.linalg.lstsq(gram / scale[:, None] / scale, right / scale, rcond=1e-10)[0] / scale
 
 
-def _price(theta: Float[np.ndarray, "*sets c"], scale: Float[np.ndarray, "*sets c"]) -> Float[np.ndarray, "*sets"]:
+def price(theta: Float[np.ndarray, "*sets c"], scale: Float[np.ndarray, "*sets c"]) -> Float[np.ndarray, "*sets"]:
     """Evidence that sizes cost which would surprise: -2 times Student's log density of each.
 
     Two effects that undo each other fit as well at any size; without a price the largest would win by a digit.
@@ -167,7 +167,7 @@ def gain(scores: Scores, subset: Sequence[int]) -> float:
     if not chosen:
         return scores.base
     theta = solve(scores, chosen)
-    cost = 0.0 if scores.scale is None else float(_price(theta, scores.scale[chosen]))
+    cost = 0.0 if scores.scale is None else float(price(theta, scores.scale[chosen]))
     return scores.base + float(_sub(scores, chosen)[1] @ theta) - cost
 
 
@@ -189,7 +189,7 @@ def _gains(scores: Scores, subsets: Sequence[Subset]) -> dict[Subset, float]:
     x = np.linalg.solve(unit, (right / scale)[..., None])[..., 0] / scale
     gains = scores.base + (x * right).sum(axis=1)
     if scores.scale is not None:
-        gains = gains - _price(x, scores.scale[index])
+        gains = gains - price(x, scores.scale[index])
     return dict(zip(subsets, gains.tolist(), strict=True))
 
 
