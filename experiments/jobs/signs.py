@@ -12,6 +12,7 @@ import fcntl
 import os
 import shutil
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -30,8 +31,9 @@ class Owner:
         place.mkdir(parents=True, exist_ok=True)
         for other in place.iterdir():
             _end_if_dead(other)
-        self.folder = place / f"{os.getpid()}-{time.time_ns() // 1_000_000:x}"
-        (self.folder / DOING).mkdir(parents=True)
+        # Hosts share process numbers, and one process may begin twice in a millisecond.
+        self.folder = Path(tempfile.mkdtemp(prefix=f"{os.getpid()}-", dir=place))
+        (self.folder / DOING).mkdir()
         self._file = open(self.folder / OWNER, "w", encoding="utf-8")
         fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._stopping, self._closed, self._writing = threading.Event(), threading.Event(), threading.Lock()
