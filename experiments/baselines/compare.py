@@ -61,6 +61,7 @@ class Common:
 
     comparison: Comparison
     experiment: Experiment
+    trains_in: dict[str, Experiment]  # by algorithm: the experiment, or with balls and a model of its own
     reality: ModelFile
     folder: Path
     console: Console
@@ -70,7 +71,7 @@ class Common:
 
     def conditions(self, name: str) -> dict[str, Any]:
         """Settings that decide a training, as plain data."""
-        config = self.experiment.config.to_dict()
+        config = self.trains_in[name].config.to_dict()
         shared = {key: config[key] for key in ("balls", "model", "task")} | {"pool": config["training"]["pool"]}
         given = self.comparison.to_dict()
         return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": given["algorithms"][name]}
@@ -136,9 +137,20 @@ def prepare(comparison: Comparison, config: Config, where: str, out: Path, conso
     """Looks up what the comparison names; ``where`` is its origin in errors. Raises ConfigError."""
     experiment = build.experiment(config, where)
     real = build.experiment(config.model_copy(update={"model": comparison.reality}), f"{where}: reality")
-    alone = {"experiment": experiment.config.to_dict(), "reality": real.config.model}
+    own = {name: settings.own() for name, settings in comparison.algorithms.items()}
+    trains_in = {
+        name: build.experiment(config.model_copy(update=changed), f"{where}: algorithms.{name}")
+        if changed
+        else experiment
+        for name, changed in own.items()
+    }
+    algorithms = {
+        name: settings.model_copy(update={key: getattr(trains_in[name].config, key) for key in own[name]})
+        for name, settings in comparison.algorithms.items()
+    }
+    alone = {"experiment": experiment.config.to_dict(), "reality": real.config.model, "algorithms": algorithms}
     folder = out / comparison.name
-    return Common(comparison.model_copy(update=alone), experiment, real.model, folder, console)
+    return Common(comparison.model_copy(update=alone), experiment, trains_in, real.model, folder, console)
 
 
 def unfinished(common: Common) -> dict[str, list[int]]:
@@ -212,7 +224,7 @@ class Trainings:
         """Does what is missing of training and evaluation; the return rates in words. Raises RunError."""
         common, key = self._common, build.key(seed, build.INITIAL_STATE)
         if name != self._name:
-            self._algorithm, self._compiled = learner(common.comparison.algorithms[name], common.experiment), None
+            self._algorithm, self._compiled = learner(common.comparison.algorithms[name], common.trains_in[name]), None
             self._name = name
         algorithm, folder = self._algorithm, common.run_folder(name, seed)
         if not (folder / "training.json").exists():

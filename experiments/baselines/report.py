@@ -26,7 +26,7 @@ from experiments.runs import run_dir
 from experiments.stats import wilson
 
 COLOURS = ("#1b7837", "#7fbf7b", "#762a83", "#2166ac", "#b35806", "#b2182b", "#542788", "#4d4d4d")
-WORLDS = {"simulation": "in the simulation it trained in", "reality": "in a world that it has never seen"}
+WORLDS = {"simulation": "in simulation", "reality": "in a world that it has never seen"}
 CURVE = ("episodes", "steps", "seconds", "cpu_seconds", "return_rate", "low", "high", "hit_rate", "mean_return")
 RESTLESSNESS = {
     "action_change": "mean square of an action's change",
@@ -148,7 +148,8 @@ def _bars(axes: Axes, heights: dict[str, float], colours: Colours) -> np.ndarray
     """A bar per algorithm; returns their places."""
     place = np.arange(len(heights))
     axes.bar(place, list(heights.values()), width=0.62, color=[colours[name] for name in heights])
-    axes.set_xticks(place, list(heights))
+    many = len(heights) > 6
+    axes.set_xticks(place, list(heights), rotation=30 if many else 0, ha="right" if many else "center")
     axes.grid(axis="y", alpha=0.25)
     return place
 

@@ -23,7 +23,20 @@ LearningRate = Annotated[Positive, Field(description="Of Adam, for every network
 RewardScale = Annotated[Positive, Field(description="By which rewards are multiplied before learning.")]
 
 
-class Bgs(Section):
+class Learning(Section):
+    """Settings of every algorithm."""
+
+    balls: str | dict[str, Any] | None = None
+    """Balls that this one trains on, in place of the experiment's; all are judged on the experiment's."""
+    model: str | dict[str, Any] | None = None
+    """The SimModel that this one trains in, likewise."""
+
+    def own(self) -> dict[str, Any]:
+        """Keys of the experiment that this algorithm has values of its own for, and those."""
+        return {key: value for key in ("balls", "model") if (value := getattr(self, key)) is not None}
+
+
+class Bgs(Learning):
     """An evolution strategy on the paper's network of 976 parameters: BGS, or with other settings ARS."""
 
     kind: Literal["bgs"]
@@ -34,7 +47,7 @@ class Bgs(Section):
     """Updates over which a cosine schedule of the learning rate falls; it then stays."""
 
 
-class Ppo(Section):
+class Ppo(Learning):
     """Proximal policy optimisation with brax's networks and loss."""
 
     kind: Literal["ppo"]
@@ -85,7 +98,7 @@ class Replay(Section):
     """Transitions of a gradient step."""
 
 
-class OffPolicy(Section):
+class OffPolicy(Learning):
     """Settings of all learners from kept experience."""
 
     replay: Replay = Replay()
@@ -207,6 +220,10 @@ def _absolute(data: dict[str, Any], folder: Path) -> None:
     for key in ("experiment", "reality"):
         if isinstance(data.get(key), str):
             data[key] = str((folder / data[key]).resolve())
+    algorithms = data.get("algorithms")
+    for settings in algorithms.values() if isinstance(algorithms, dict) else ():
+        if isinstance(settings, dict):
+            config.absolute_paths(settings, folder)
 
 
 def shipped() -> dict[str, Path]:

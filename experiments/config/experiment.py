@@ -281,10 +281,11 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
     Relative paths in the file are relative to its folder, those of overrides to the current one. Raises ConfigError.
     """
     path = Path(path)
-    return parse(read_mapping(path, overrides, "an experiment", Config, shipped(), _absolute), str(path))
+    return parse(read_mapping(path, overrides, "an experiment", Config, shipped(), absolute_paths), str(path))
 
 
-def _absolute(data: dict[str, Any], folder: Path) -> None:
+def absolute_paths(data: dict[str, Any], folder: Path) -> None:
+    """Makes paths in an experiment's plain data absolute that are relative to ``folder``."""
     for key in ("balls", "model", "robot", "initial_policy", "definitions"):
         value = data.get(key)
         if key == "robot" and not (folder / str(value)).exists():  # the name of one that comes with the program

@@ -20,7 +20,7 @@ _BEYOND = """() => [...document.querySelectorAll('body, body *')].filter(e => {
 def beyond_the_edge(page: Path, width: int = WIDTH) -> list[str]:
     """Elements of a page, everything unfolded, that reach beyond a window of this width; a sideways scroll hides none.
 
-    Pictures alone may scroll sideways, in a frame of their own: a phone's width leaves their letters unreadable. They must
+    Pictures alone may scroll sideways, in a frame of their own: on a phone nobody reads their letters. They must
     have loaded, and letters be at least 9 pixels high.
     """
     from playwright.sync_api import sync_playwright  # not where the test is skipped

@@ -16,6 +16,7 @@ from brax.envs.base import Env, State
 from brax.training.types import Transition
 from rich.console import Console
 
+from ballmodel import registry
 from experiments.baselines import compare, off_policy
 from experiments.baselines import learner as learners
 from experiments.baselines.off_policy import OffPolicyLearner
@@ -233,6 +234,9 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
     assert missing("seeds=[0, 3]") == {"ES": [3]}
     assert missing("algorithms.P={kind: ppo}") == {"ES": [], "P": [0]}
     assert missing("reality.ball_spin.mean_x=100.0") == {"ES": [0]}  # to be evaluated again
+    assert missing("algorithms.ES.balls=narrow", "seeds=[3]") == {"ES": [3]}
+    with pytest.raises(RunError, match="ES/seed0.*other settings of (balls, )?.*algorithm"):
+        missing("algorithms.ES.model={sensing: {ball_noise: 0}}")
     for override in ("budget.episodes=80", "algorithms.ES.optimiser.num_directions=3", "experiment.balls=narrow"):
         with pytest.raises(RunError, match="ES/seed0.*other settings of (budget|algorithm|balls);"):
             missing(override)
@@ -259,6 +263,36 @@ def test_a_mistake_in_the_yaml_is_named(tmp_path, override, message):
     with pytest.raises(ConfigError, match=message) as error:
         baselines.load(write(tmp_path, SMALL), (override,))
     assert "small.yaml" in str(error.value)
+
+
+def test_an_algorithm_trains_in_a_world_of_its_own_and_is_judged_in_that_of_all(tmp_path):
+    """The training alone has another model and other balls."""
+    own = {"model": {"sensing": {"ball_noise": 0.0}, "latency": {"ball_observation": 0.0}}, "balls": "mine.yaml"}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(registry.load("player3/M1").to_dict()))
+    data = SMALL | {"algorithms": SMALL["algorithms"] | {"own": SMALL["algorithms"]["ES"] | own}}
+    path = write(tmp_path, data)
+    common = compare.prepare(*baselines.load(path), str(path), tmp_path, Console())
+    shared, alone = (compare.learner(common.comparison.algorithms[n], common.trains_in[n]) for n in ("ES", "own"))
+    models = [x._trainer._model for x in (shared, alone)]
+    assert [float(m.sensing.ball_noise) for m in models] == [0.04, 0.0]
+    assert [float(m.latency.ball_observation) for m in models] == [0.04, 0.0]
+    assert common.trains_in["ES"] is common.experiment
+    first, second = (np.asarray(x._trainer.pool.state.position) for x in (shared, alone))
+    box = registry.load("player3/M1")
+    assert np.all(
+        (second >= np.reshape(box.position_min, (3, 1)) - 1e-6)
+        & (second <= np.reshape(box.position_max, (3, 1)) + 1e-6)
+    )
+    assert not np.array_equal(first, second)
+    # The request that is kept holds what it needs, wherever it lies.
+    assert common.comparison.to_dict()["algorithms"]["own"]["balls"] == registry.load("player3/M1").to_dict()
+    mistakes = {
+        "model={sensing: {ball_nois: 0}}": r"algorithms\.own.*ball_nois",
+        "balls=nobody": r"algorithms\.own: balls.*nobody",
+    }
+    for override, message in mistakes.items():
+        with pytest.raises(ConfigError, match=message):
+            compare.prepare(*baselines.load(path, (f"algorithms.own.{override}",)), str(path), tmp_path, Console())
 
 
 @pytest.mark.parametrize("name", baselines.shipped())
