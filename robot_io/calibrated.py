@@ -90,6 +90,10 @@ class RobotCalibration:
     def base(self) -> Frame:
         return Frame(self.base_position, self.base_rotation)
 
+    def zeros(self, joints: int) -> tuple[float, ...]:
+        """``joint_zeros``; as many as the arm has joints where they were never calibrated."""
+        return self.joint_zeros if self.date else (0.0,) * joints
+
 
 @dataclass(frozen=True)
 class ClockCalibration:
