@@ -22,6 +22,7 @@ from robot_io import log
 from robot_io.contract import Contract, JointLimits
 from robot_io.control import messages
 from robot_io.emulator.processes import Rig
+from tests.experiments.deploy.test_session_other_robots import exported
 
 FR3, UR10E = "fr3_pedestal", "ur10e_rail"
 REST = 0.4  # [s] over which a robot that stands does not move
@@ -75,7 +76,6 @@ def rig(request):
     robot = simulated.load_shipped(request.param)
     balls = robots.throws_of(build.distribution("narrow", "test"), SimModel(), 8, 0)
     with Rig(str(robot.scene()), balls, robots.load_rig(None, robot), None, robot.contract) as running:
-        running.switch_on()
         yield robot, running
 
 
@@ -86,9 +86,19 @@ def jog(robot, rig, operator, folder, monkeypatch):
     monkeypatch.setattr(commissioning, "Keyboard", lambda: operator)
     monkeypatch.setattr(commissioning, "View", lambda *_: operator)
     console = Console(record=True, width=300)
-    assert commissioning.jog(path, folder, folder / "points.csv", 60.0, console, robot.name) == 0
+    assert commissioning.jog(path, folder, folder / "points.csv", 40.0, console, robot.name) == 0
     assert not operator.steps, f"never came to {len(operator.steps)} keys: {operator.said}, {operator.status}"
     return console.export_text()
+
+
+def switched_on(rig):
+    """A key that does nothing, once somebody at the arm's controller has started EGM, which waits for a bridge."""
+
+    def now():
+        rig.switch_on()
+        return None
+
+    return now
 
 
 def at_rest(rig):
@@ -121,19 +131,21 @@ def test_it_moves_armed_and_in_small_steps_only(rig, tmp_path, monkeypatch):
 
     stepped = lambda away: abs(away[0] - step) < 2e-3 and np.abs(away[1:]).max() < 2e-3  # noqa: E731
     raised = lambda _: (  # noqa: E731
-        np.abs(blade(robot, running.state()[0]) - blade(robot, places[-1]) - [0, 0, 0.005]).max() < 1e-3
+        np.abs(blade(robot, running.state()[0]) - blade(robot, places[-1]) - [0, 0, 0.005]).max() < 2e-3
     )
     operator = Operator()
     operator.steps.extend(
         [
             (operator.in_state("disarmed"), "1"),
             (lambda: True, "+"),
-            (operator.heard("arm it first"), "p"),
+            (operator.heard("arm it first"), switched_on(running)),
+            (lambda: True, "p"),
             (lambda: not operator.status.missing, look("a")),
             (operator.in_state("ready"), "s"),
             (lambda: True, "s"),
             (lambda: True, "+"),
-            (moved(stepped), look("z")),
+            (moved(stepped), "z"),
+            (lambda: at_rest(running), look("")),
             (lambda: True, "s"),
             (lambda: True, "s"),
             (lambda: True, "+"),
@@ -159,13 +171,11 @@ def test_it_moves_armed_and_in_small_steps_only(rig, tmp_path, monkeypatch):
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("doubt", ["tracker", "motors", "axis"])
+@pytest.mark.parametrize("doubt", ["cable", "motors", "axis"])
 def test_in_doubt_it_slows_down_and_holds(rig, tmp_path, monkeypatch, doubt):
     robot, running = rig
     if doubt == "axis" and not robot.contract.carrying:
-        with pytest.raises(Exception, match="has 0 linear axes"):
-            running.connect_axis(0, False)
-        return
+        pytest.skip("it has no linear axes")
     operator, places = Operator(), []
 
     def begin():
@@ -174,7 +184,7 @@ def test_in_doubt_it_slows_down_and_holds(rig, tmp_path, monkeypatch, doubt):
 
     def cause():
         {
-            "tracker": lambda: running.drop_out(1.0),
+            "cable": lambda: running.connect_arm(False),
             "motors": running.motors_off,
             "axis": lambda: running.connect_axis(0, False),
         }[doubt]()
@@ -192,7 +202,8 @@ def test_in_doubt_it_slows_down_and_holds(rig, tmp_path, monkeypatch, doubt):
 
     operator.steps.extend(
         [
-            (operator.in_state("disarmed"), "p"),
+            (operator.in_state("disarmed"), switched_on(running)),
+            (lambda: True, "p"),
             (lambda: not operator.status.missing, "a"),
             (operator.in_state("ready"), "2"),
             (lambda: True, "s"),
@@ -213,10 +224,9 @@ def test_in_doubt_it_slows_down_and_holds(rig, tmp_path, monkeypatch, doubt):
     change = np.abs(np.diff(session.commands.sent, axis=1)).max(axis=1)
     assert (change <= np.array(limits.acceleration) / 75.0 * (1 + 1e-9)).all()
     assert not session.commands.sent[:, -1].any()
-    running.switch_on()
+    running.connect_arm(True)
     if doubt == "axis":
         running.connect_axis(0, True)
-    time.sleep(1.2)  # the tracker sends again
 
 
 def test_keys_of_many_joints():
@@ -236,13 +246,11 @@ def test_keys_of_many_joints():
 
 
 def test_a_policy_for_another_robot_and_a_file_of_other_points_are_refused(tmp_path):
-    from tests.experiments.deploy.test_session_other_robots import exported
-
     policy = exported(tmp_path / "artefact", FR3)
     with pytest.raises(ConfigError, match="a policy for another robot than ur10e_rail as it is now"):
         commissioning.check(tmp_path / "robot.yaml", policy, tmp_path, tmp_path / "p.csv", 1.0, Console(), UR10E)
     with pytest.raises(ConfigError, match="nowhere: no robot; allowed: a folder"):
         commissioning.jog(tmp_path / "robot.yaml", tmp_path, tmp_path / "p.csv", 1.0, Console(), "nowhere")
-    (tmp_path / "robot.yaml").write_text("{}")
-    with pytest.raises(ConfigError, match="robot.yaml|axes"):
+    (tmp_path / "robot.yaml").write_text("axes: [{}, {}]\n")
+    with pytest.raises(ConfigError, match="robot.yaml: axes: got 2 entries; allowed: 1 for ur10e_rail, rail"):
         commissioning.jog(tmp_path / "robot.yaml", tmp_path, tmp_path / "p.csv", 1.0, Console(), UR10E)
