@@ -108,9 +108,7 @@ class Jogger:
         return f"{self._contract.joints[self._chosen]}, {size} a step"
 
 
-def note(
-    path: Path, found: Calibration, seen: messages.Marked, with_joints: bool, contract: Contract = PAPER
-) -> str:
+def note(path: Path, found: Calibration, seen: messages.Marked, with_joints: bool, contract: Contract = PAPER) -> str:
     """Add what tracker and joints reported, before any calibration, to a CSV of points; what was done, as a sentence.
 
     with_joints  False: the joints are not those of a robot

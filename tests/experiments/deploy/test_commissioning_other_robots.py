@@ -38,7 +38,7 @@ def blade(robot, qpos):
 
 
 class Operator:
-    """Presses keys, each as soon as its condition holds; hears what the terminal shows. Stands for Keyboard and View."""
+    """Keyboard and View of one who presses keys, each as soon as its condition holds, and hears what is shown."""
 
     def __init__(self, *steps):
         self.steps, self.said, self.status = deque(steps), [], None
