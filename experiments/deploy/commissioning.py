@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from experiments.config import robot as robots
+from experiments.deploy import robot_attachment
 from experiments.deploy.operator_console import KEYS, QUIT, Key, Keyboard, View
 from experiments.deploy.session import Session
 from experiments.errors import ConfigError, checked
@@ -139,18 +140,24 @@ def _columns(path: Path) -> list[str]:
         return next(csv.reader(stream), [])
 
 
-def _joints_of(artefact: Path | None, own: str | None) -> Contract:
-    """Contract of the robot that stands there: the named one, the policy's or the paper's. Raises ConfigError."""
-    policys = None if artefact is None else artefacts.load(artefact).contract
+def _robot_of(
+    artefact: Path | None, own: str | None, console: Console
+) -> tuple[Contract, robot_attachment.Attachments]:
+    """Contract of the robot that stands there, the named one, the policy's or the paper's, and the robot for the log.
+
+    Raises ConfigError.
+    """
+    loaded = None if artefact is None else artefacts.load(artefact)
     if own is None:
-        return PAPER if policys is None else policys
+        return (PAPER, ()) if loaded is None else (loaded.contract, robot_attachment.of_policy(loaded, console))
     contract = checked("", simulated.load, own).contract
-    if policys not in (None, contract):
+    if loaded is not None and loaded.contract != contract:
         raise ConfigError(
             f"--artefact {artefact}: a policy for another robot than {own} as it is now; allowed: one of "
             f"{contract.robot}, exported since it was changed last"
         )
-    return contract
+    kept = () if contract == PAPER else robot_attachment.of_content(simulated.content(own), own, console)
+    return contract, kept
 
 
 def _cells(values: np.ndarray | None, count: int) -> list[str]:
@@ -167,11 +174,12 @@ def _operate(
     dry: bool,
     own: str | None,
 ) -> int:
-    contract = _joints_of(artefact, own)
+    contract, kept = _robot_of(artefact, own, console)
     config, name = robots.load_robot(robot, contract=contract), time.strftime("%Y%m%d-%H%M%S")
     attachments = (
         ("robot.yaml", robot.read_text(encoding="utf-8")),
         ("calibration.yaml", robots.to_yaml(config.calibration)),
+        *kept,
     )
     folder = None if artefact is None else str(artefact)
     title = f"{config.name}: nothing is sent" if dry else f"{config.name}: by hand"
