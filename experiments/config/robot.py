@@ -90,7 +90,8 @@ def load_rig(path: str | Path | None, robot: Robot | None = None) -> RigParams:
         standard = replace(standard, arm=arm, axis_dead_time=dead)
         checked("", RobotConfig.of(robot.contract).check_joints, robot.contract)
     params = standard if path is None else fill(RigParams, _mapping(path), str(path), standard)
-    return params if robot is None else checked("" if path is None else str(path), for_robot, params, robot.contract)
+    contract = PAPER if robot is None else robot.contract
+    return checked("" if path is None else str(path), for_robot, params, contract)
 
 
 def to_yaml(config: RobotConfig | RigParams | Calibration) -> str:

@@ -25,10 +25,7 @@ from robot_io.contract import PAPER
 from robot_io.policy.artefact import Artefact
 
 NAME = "robot.zip"  # of the attachment
-CONTENT, MJCF = (
-    "robot.json",
-    "robot.xml",
-)  # in it: what ``mjx_tt.robot.robot.content`` gives, and where the MJCF belongs
+CONTENT, MJCF = "robot.json", "robot.xml"  # in it: ``mjx_tt.robot.robot.content``, and where the MJCF belongs
 LARGEST, UNPACKED = 32 << 20, 256 << 20  # bytes of the attachment, and of what is in it
 
 Attachments = tuple[tuple[str, bytes], ...]

@@ -59,10 +59,9 @@ def played_by(log: SessionLog, path: Path) -> Robot:
     if kept is not None:
         robot = robot_attachment.unpack(kept, str(path))
         if robot.contract.joints != log.robot.joints:
-            raise ConfigError(
-                f"{path}: {robot_attachment.NAME}: a robot with the joints {', '.join(robot.contract.joints)}; allowed: "
-                f"the session's, {', '.join(log.robot.joints)}"
-            )
+            joints, wanted = ", ".join(robot.contract.joints), ", ".join(log.robot.joints)
+            where = f"{path}: {robot_attachment.NAME}"
+            raise ConfigError(f"{where}: a robot with the joints {joints}; allowed: the session's, {wanted}")
         return robot
     if name not in robots.names():
         raise ConfigError(

@@ -14,9 +14,10 @@ AMPLITUDE = np.array([0.1, 0.05, 0.3, 0.1, 0.1, 0.1, 0.2, 0.1])
 REACH = 0.02 + 0.006  # [m] ball's radius and half the paddle
 
 
-def place(t, rig=None, data=None):
-    """The joints (8,) at t, and with MuJoCo's data the blade's centre and normal towards the human."""
-    q = world().home + AMPLITUDE * np.sin(2 * np.pi * np.array([0.7, 0.5, 1.3, 0.9, 1.1, 0.6, 1.2, 0.8]) * t)
+def place(t, rig, data=None):
+    """The joints at t, and with MuJoCo's data the blade's centre and normal towards the human."""
+    n = len(rig.home)
+    q = rig.home + AMPLITUDE[-n:] * np.sin(2 * np.pi * np.array([0.7, 0.5, 1.3, 0.9, 1.1, 0.6, 1.2, 0.8])[-n:] * t)
     if data is None:
         return q
     data.qpos[rig._q] = q
@@ -26,9 +27,9 @@ def place(t, rig=None, data=None):
     return data.site_xpos[site].copy(), normal * np.sign(normal[1])
 
 
-def made_up(lag, noise=0.003, gap=0.0, count=30, seed=0):
-    """A log of ``count`` contacts, one a second."""
-    rig, random = world(), np.random.default_rng(seed)
+def made_up(lag, noise=0.003, gap=0.0, count=30, seed=0, rig=None, robot=PAPER):
+    """A log of ``count`` contacts, one a second; ``rig``: the world of another robot, whose contract is ``robot``."""
+    rig, random = rig or world(), np.random.default_rng(seed)
     data, gravity = mujoco.MjData(rig.model), np.array([0.0, 0.0, -9.81])
     times, balls, numbers = [], [], []
     for k in range(count):
@@ -47,7 +48,8 @@ def made_up(lag, noise=0.003, gap=0.0, count=30, seed=0):
     moments = np.arange(0.5, count + 2.0, 0.004)
     ball = np.array(balls).T + noise * random.normal(size=(3, len(balls)))
     return SimpleNamespace(
-        robot=PAPER,
+        robot=robot,
+        path="made up",
         ball=SimpleNamespace(capture_time=np.array(times), position=ball, id=np.array(numbers)),
-        joints=SimpleNamespace(time=moments + lag, position=np.array([place(t) for t in moments]).T),
+        joints=SimpleNamespace(time=moments + lag, position=np.array([place(t, rig) for t in moments]).T),
     )

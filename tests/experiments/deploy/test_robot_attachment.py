@@ -50,9 +50,8 @@ def folder(tmp_path):
     body = '<body name="carriage" childclass="ur10e" gravcomp="1">'
     geoms = "".join(f'<geom type="mesh" mesh="{name}" contype="0" conaffinity="0"/>' for name in ("hood", "cap"))
     assert body in text and "<compiler " in text
-    text = text.replace(body, body + geoms).replace(
-        "<compiler ", '<include file="meshes.xml"/><compiler meshdir="looks" '
-    )
+    text = text.replace("<compiler ", '<include file="meshes.xml"/><compiler meshdir="looks" ')
+    text = text.replace(body, body + geoms)
     (folder / "robot.xml").write_text(text)
     description = (folder / robots.YAML).read_text()
     assert "name: ur10e_rail" in description
