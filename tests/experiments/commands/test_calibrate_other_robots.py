@@ -157,6 +157,6 @@ def test_points_calibrations_and_parts_of_another_robot_are_refused(tmp_path, mo
 @pytest.mark.parametrize("name", [FR3, UR10E])
 def test_contacts_tell_the_lag_of_its_joints(name):
     robot, world = standing(name)
-    found = contacts.measure(made_up(0.03, rig=world, robot=robot.contract), UNCALIBRATED)
+    found = contacts.measure(made_up(0.03, rig=world, robot=robot.contract, swing=2.5), UNCALIBRATED)
     assert found.count >= 25 and found.lag == pytest.approx(0.03, abs=3 * found.lag_deviation)
     assert found.lag_deviation < 0.002 and found.spread < 0.006
