@@ -176,7 +176,7 @@ def _operate(
 ) -> int:
     contract, kept = _robot_of(artefact, own, console)
     config, name = robots.load_robot(robot, contract=contract), time.strftime("%Y%m%d-%H%M%S")
-    attachments = (
+    attachments: tuple[tuple[str, str | bytes], ...] = (
         ("robot.yaml", robot.read_text(encoding="utf-8")),
         ("calibration.yaml", robots.to_yaml(config.calibration)),
         *kept,

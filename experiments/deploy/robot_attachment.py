@@ -60,7 +60,8 @@ def pack(content: dict[str, Any], where: str) -> bytes:
     Raises ConfigError for no robot, one that cannot be made anew from that alone, and one too large.
     """
     robot = checked("", robots.from_content, content, where)
-    kept, files = {key: value for key, value in content.items() if key != robots.ELSEWHERE}, {}
+    kept = {key: value for key, value in content.items() if key != robots.ELSEWHERE}
+    files: dict[str, Path] = {}
     if robot.path is not None:
         kept["mjcf"], files = _gathered(robot, where)
     size = sum(path.stat().st_size for path in files.values())
@@ -81,7 +82,7 @@ def pack(content: dict[str, Any], where: str) -> bytes:
 
 def _gathered(robot: Robot, where: str) -> tuple[str, dict[str, Path]]:
     """The MJCF with its includes in it and every file beside it, and those files by their names there."""
-    spec, names = robot.own_spec(), {}
+    spec, names = robot.own_spec(), dict[str, str]()
 
     def absolute(path: Path) -> str:
         names.setdefault(str(path), f"{len(names)}-{path.name}")

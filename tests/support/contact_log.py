@@ -17,7 +17,9 @@ REACH = 0.02 + 0.006  # [m] ball's radius and half the paddle
 def place(t, rig, data=None, swing=1.0):
     """The joints at t, and with MuJoCo's data the blade's centre and normal towards the human."""
     n = len(rig.home)
-    q = rig.home + swing * AMPLITUDE[-n:] * np.sin(2 * np.pi * np.array([0.7, 0.5, 1.3, 0.9, 1.1, 0.6, 1.2, 0.8])[-n:] * t)
+    q = rig.home + swing * AMPLITUDE[-n:] * np.sin(
+        2 * np.pi * np.array([0.7, 0.5, 1.3, 0.9, 1.1, 0.6, 1.2, 0.8])[-n:] * t
+    )
     if data is None:
         return q
     data.qpos[rig._q] = q
