@@ -12,7 +12,7 @@ from robot_io.emulator.axis_drive import DriveParams
 from robot_io.emulator.network import FAULT_RANGES, NetworkFaults
 from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.tracker.cameras import RANGES as CAMERA_RANGES
-from robot_io.emulator.tracker.hidden import HiddenErrors
+from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
 from robot_io.emulator.world import WorldParams
 from robot_io.ranges import check_ranges
 
@@ -99,7 +99,7 @@ STANDARD_RIG = RigParams()
 def for_robot(params: RigParams, contract: Contract) -> RigParams:
     """The rig with a contract's joints. Raises ValueError naming what does not fit them."""
     zeros, names = params.hidden.joint_zeros, [contract.joints[i] for i in contract.arm]
-    if any(zeros) and len(zeros) != len(names):
+    if zeros != NOTHING_HIDDEN.joint_zeros and len(zeros) != len(names):
         raise ValueError(
             f"hidden.joint_zeros: got {len(zeros)} entries; allowed: {len(names)} for {contract.robot}, "
             f"{', '.join(names)}"
