@@ -72,6 +72,8 @@ class Common:
         """Settings that decide a training, as plain data."""
         config = self.experiment.config.to_dict()
         shared = {key: config[key] for key in ("balls", "model", "task")} | {"pool": config["training"]["pool"]}
+        if config["robot"] is not None:  # trainings of before have no such key
+            shared["robot"] = config["robot"]
         given = self.comparison.to_dict()
         return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": given["algorithms"][name]}
 
@@ -137,6 +139,8 @@ def prepare(comparison: Comparison, config: Config, where: str, out: Path, conso
     experiment = build.experiment(config, where)
     real = build.experiment(config.model_copy(update={"model": comparison.reality}), f"{where}: reality")
     alone = {"experiment": experiment.config.to_dict(), "reality": real.config.model}
+    if comparison.robot is not None:
+        alone["robot"] = experiment.config.robot
     folder = out / comparison.name
     return Common(comparison.model_copy(update=alone), experiment, real.model, folder, console)
 
@@ -162,7 +166,8 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner[Any]:
     env = TableTennis(simulator, pool, model.model, model.randomise)
     if isinstance(settings, Ppo):
         return PpoLearner(settings, env)
-    agent = SacAgent(settings) if isinstance(settings, Sac) else QtOptAgent(settings)
+    sizes = env.observation_size, env.action_size
+    agent = SacAgent(settings, *sizes) if isinstance(settings, Sac) else QtOptAgent(settings, *sizes)
     return OffPolicyLearner(settings.replay, env, agent)
 
 
