@@ -138,9 +138,8 @@ def prepare(comparison: Comparison, config: Config, where: str, out: Path, conso
     """Looks up what the comparison names; ``where`` is its origin in errors. Raises ConfigError."""
     experiment = build.experiment(config, where)
     real = build.experiment(config.model_copy(update={"model": comparison.reality}), f"{where}: reality")
-    alone = {"experiment": experiment.config.to_dict(), "reality": real.config.model}
-    if comparison.robot is not None:
-        alone["robot"] = experiment.config.robot
+    robot = None if comparison.robot is None else experiment.config.robot
+    alone = {"experiment": experiment.config.to_dict(), "reality": real.config.model, "robot": robot}
     folder = out / comparison.name
     return Common(comparison.model_copy(update=alone), experiment, real.model, folder, console)
 

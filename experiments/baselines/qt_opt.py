@@ -47,9 +47,9 @@ class Critics(linen.Module):
 def best_action(value: Callable[[jax.Array], jax.Array], normals: jax.Array, elites: int) -> jax.Array:
     """The action (..., joints) that the cross-entropy method finds for ``value``: (..., n, joints) -> (..., n).
 
-    normals: (rounds, n, joints) standard normal numbers, or (rounds, ..., n, joints). Each round draws n actions, cut to
-    [-1, 1], about the mean of the round before with its standard deviation, and keeps the best ``elites``; the last mean
-    is the answer. The first round draws about 0 with deviation 1/2.
+    normals: (rounds, n, joints) standard normal numbers, or (rounds, ..., n, joints). Each round draws n actions, cut
+    to [-1, 1], about the mean of the round before with its standard deviation, and keeps the best ``elites``; the last
+    mean is the answer. The first round draws about 0 with deviation 1/2.
     """
     joints = normals.shape[-1]
     mean, std = jnp.zeros(joints), jnp.full(joints, 0.5)
