@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
-
-if TYPE_CHECKING:
-    from robot_io.contract import Contract
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 
@@ -40,17 +37,6 @@ def explained(error: Exception) -> bool:
     from robot_io.policy.artefact import ArtefactError
 
     return isinstance(error, (ExperimentError, ArtefactError, OSError, RefusedError, DeviceError, EgmError, LogError))
-
-
-def of_the_paper(contract: Contract, where: str, command: str) -> None:
-    """Raises ConfigError where a policy is of another robot than the paper's, which is all that the command knows."""
-    from robot_io.contract import PAPER
-
-    if contract != PAPER:
-        raise ConfigError(
-            f"{where}: is of the robot {contract.robot}; {command} knows the paper's robot only. What other robots can "
-            "do: docs/how-to/bring-your-own-robot.md"
-        )
 
 
 def checked(where: str, function: Callable[..., T], *arguments: Any) -> T:

@@ -70,18 +70,18 @@ class RobotCalibration:
 
     base_position   (3) [m] of the base from where the model has it
     base_rotation   (3) [rad] its turn, a rotation vector in the table frame
-    joint_zeros     (6) [rad] added to what the arm's controller reports
+    joint_zeros     [rad] of the arm's joints, six of the paper's robot, added to what the controller reports
     tip             (3) [m] of the paddle from where the model has it, in the last joint's frame; recorded, not applied:
                     policies know one paddle
-    axes_zero       (2) [m] zeros of the linear axes with which it was measured
+    axes_zero       [m] zeros of the linear axes with which it was measured
     residual, points, date  as of the tracker
     """
 
     base_position: Triple = ZERO
     base_rotation: Triple = ZERO
-    joint_zeros: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    joint_zeros: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     tip: Triple = ZERO
-    axes_zero: tuple[float, float] = (0.0, 0.0)
+    axes_zero: tuple[float, ...] = (0.0, 0.0)
     residual: float = 0.0
     points: int = 0
     date: str = ""
@@ -89,6 +89,10 @@ class RobotCalibration:
     @property
     def base(self) -> Frame:
         return Frame(self.base_position, self.base_rotation)
+
+    def zeros(self, joints: int) -> tuple[float, ...]:
+        """``joint_zeros``; as many as the arm has joints where they were never calibrated."""
+        return self.joint_zeros if self.date else (0.0,) * joints
 
 
 @dataclass(frozen=True)

@@ -73,8 +73,11 @@ class Common:
         """Settings that decide a training, as plain data."""
         config = self.trains_in[name].config.to_dict()
         shared = {key: config[key] for key in ("balls", "model", "task")} | {"pool": config["training"]["pool"]}
+        if config["robot"] is not None:  # trainings of before have no such key
+            shared["robot"] = config["robot"]
         given = self.comparison.to_dict()
-        return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": given["algorithms"][name]}
+        algorithm = {key: value for key, value in given["algorithms"][name].items() if key not in ("balls", "model")}
+        return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
 
     def evaluation_conditions(self) -> dict[str, Any]:
         """Settings that decide an evaluation besides the policy."""
@@ -148,7 +151,12 @@ def prepare(comparison: Comparison, config: Config, where: str, out: Path, conso
         name: settings.model_copy(update={key: getattr(trains_in[name].config, key) for key in own[name]})
         for name, settings in comparison.algorithms.items()
     }
-    alone = {"experiment": experiment.config.to_dict(), "reality": real.config.model, "algorithms": algorithms}
+    alone = {
+        "experiment": experiment.config.to_dict(),
+        "reality": real.config.model,
+        "robot": None if comparison.robot is None else experiment.config.robot,
+        "algorithms": algorithms,
+    }
     folder = out / comparison.name
     return Common(comparison.model_copy(update=alone), experiment, trains_in, real.model, folder, console)
 
@@ -174,7 +182,8 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner[Any]:
     env = TableTennis(simulator, pool, model.model, model.randomise)
     if isinstance(settings, Ppo):
         return PpoLearner(settings, env)
-    agent = SacAgent(settings) if isinstance(settings, Sac) else QtOptAgent(settings)
+    sizes = env.observation_size, env.action_size
+    agent = SacAgent(settings, *sizes) if isinstance(settings, Sac) else QtOptAgent(settings, *sizes)
     return OffPolicyLearner(settings.replay, env, agent)
 
 

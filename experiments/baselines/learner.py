@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 
 from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis, flatten
 from mjx_tt.env.task import Controller, Tick
-from robot_io.contract import HISTORY, N_OBSERVATION
+from robot_io.contract import HISTORY
 
 # Sums over the episodes that ended within a call of ``advance``, scalars on the device; "steps": control steps.
 MEASURED = ("episodes", "steps", "hit", "returned", "episode_return")
@@ -24,7 +24,7 @@ Measured = dict[str, ArrayLike]
 
 S = TypeVar("S")  # everything that learning changes, a pytree
 Advance = Callable[[S], tuple[S, Measured]]  # a piece of learning: from a state, which it may consume, to the next one
-Decide = Callable[[Params, jax.Array], jax.Array]  # (parameters, (..., 88)) -> (..., 8) in [-1, 1]
+Decide = Callable[[Params, jax.Array], jax.Array]  # (parameters, (..., size)) -> (..., joints) in [-1, 1]
 
 
 class Learner(Protocol[S]):
@@ -46,7 +46,7 @@ class NetworkController:
     """A network on the history of observations as a ``task.Controller``."""
 
     parameters: Params
-    mean: jax.Array  # (11,) of the newest observation in the normaliser
+    mean: jax.Array  # (observed,) of the newest observation in the normaliser
     decide: Decide = field(metadata={"static": True})
 
     def start(self, observation: jax.Array) -> jax.Array:
@@ -59,12 +59,13 @@ class NetworkController:
 
 def network_controller(parameters: Params, normaliser: RunningStatisticsState, decide: Decide) -> NetworkController:
     """``normaliser``: brax's running statistics of the histories."""
-    return NetworkController(parameters, normaliser.mean[-N_OBSERVATION:], decide)
+    newest = normaliser.mean.shape[0] // HISTORY
+    return NetworkController(parameters, normaliser.mean[-newest:], decide)
 
 
-def empty_normaliser() -> RunningStatisticsState:
-    """Brax's running statistics of histories (88,), before the first."""
-    return running_statistics.init_state(specs.Array((OBSERVATION_SIZE,), jnp.dtype("float32")))
+def empty_normaliser(size: int = OBSERVATION_SIZE) -> RunningStatisticsState:
+    """Brax's running statistics of histories (size,), before the first."""
+    return running_statistics.init_state(specs.Array((size,), jnp.dtype("float32")))
 
 
 def compiled(advance: Advance[S], state: S) -> Advance[S]:

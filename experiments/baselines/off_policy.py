@@ -17,10 +17,9 @@ from flax import struct
 from experiments.baselines import learner
 from experiments.baselines.learner import Advance, Learner, Measured, NetworkController
 from experiments.config.baselines import Replay
-from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis
+from mjx_tt.env.brax import TableTennis
 from robot_io.contract import N_JOINTS
 
-WIDTH = 2 * OBSERVATION_SIZE + N_JOINTS + 2  # numbers in a transition
 CALL = 64  # steps of the environments in one call of ``compiled``
 
 
@@ -31,8 +30,13 @@ A = TypeVar("A")  # networks and states of their optimisers, a pytree
 class Buffer:
     """The last transitions, one a row, as a ring. (Brax's queue moves all of its rows once it is full.)"""
 
-    rows: jax.Array  # (capacity, WIDTH)
+    rows: jax.Array  # (capacity, ``width``)
     added: jax.Array  # () int32, all transitions so far
+
+
+def width(observation_size: int, joints: int) -> int:
+    """Count of numbers in a transition."""
+    return 2 * observation_size + joints + 2
 
 
 def insert(buffer: Buffer, t: Transition) -> Buffer:
@@ -45,11 +49,11 @@ def insert(buffer: Buffer, t: Transition) -> Buffer:
     return Buffer(jax.lax.dynamic_update_slice_in_dim(buffer.rows, rows, place, 0), buffer.added + rows.shape[0])
 
 
-def sample(buffer: Buffer, key: jax.Array, n: int) -> Transition:
-    """n transitions, drawn with replacement from those that the buffer holds."""
+def sample(buffer: Buffer, key: jax.Array, n: int, joints: int = N_JOINTS) -> Transition:
+    """n transitions, drawn with replacement from those that the buffer holds; ``joints``: numbers in an action."""
     held = jnp.minimum(buffer.added, buffer.rows.shape[0])
     rows = buffer.rows[jax.random.randint(key, (n,), 0, held)]
-    ends = np.cumsum([OBSERVATION_SIZE, N_JOINTS, 1, 1])
+    ends = np.cumsum([(rows.shape[1] - joints - 2) // 2, joints, 1, 1])
     observation, action, reward, discount, following = jnp.split(rows, ends, axis=1)
     extras = {"policy_extras": {}, "state_extras": {"truncation": jnp.zeros(n)}}
     return Transition(observation, action, reward[:, 0], discount[:, 0], following, extras)
@@ -63,7 +67,7 @@ class Agent(Protocol[A]):
     def explore(
         self, agent: A, normaliser: RunningStatisticsState, observation: jax.Array, key: jax.Array
     ) -> jax.Array:
-        """Actions (B, 8) to learn from."""
+        """Actions (B, joints) to learn from."""
 
     def update(self, agent: A, normaliser: RunningStatisticsState, batch: Transition, key: jax.Array) -> A:
         """The agent after one gradient step."""
@@ -72,7 +76,7 @@ class Agent(Protocol[A]):
         """Part of the agent that ``decide`` needs."""
 
     def decide(self, parameters: tuple[RunningStatisticsState, Params], observation: jax.Array) -> jax.Array:
-        """Best actions (..., 8); ``parameters``: (normaliser, those of the agent)."""
+        """Best actions (..., joints); ``parameters``: (normaliser, those of the agent)."""
 
 
 @struct.dataclass
@@ -97,8 +101,9 @@ class OffPolicyLearner(Learner[OffPolicyState]):
         places = self.replay.environments
         env = jax.jit(self.env.reset)(jax.random.split(env_key, places))
         capacity = -(-self.replay.capacity // places) * places
-        buffer = Buffer(jnp.zeros((capacity, WIDTH)), jnp.int32(0))
-        return OffPolicyState(self.agent.init(agent_key), learner.empty_normaliser(), buffer, env, key)
+        size = self.env.observation_size
+        buffer = Buffer(jnp.zeros((capacity, width(size, self.env.action_size))), jnp.int32(0))
+        return OffPolicyState(self.agent.init(agent_key), learner.empty_normaliser(size), buffer, env, key)
 
     def compiled(self, state: OffPolicyState) -> Advance[OffPolicyState]:
         return learner.compiled(self._advance, state)
@@ -117,7 +122,8 @@ class OffPolicyLearner(Learner[OffPolicyState]):
 
         def policy(observation: jax.Array, key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
             action_key, random_key = jax.random.split(key)
-            random = jax.random.uniform(random_key, (observation.shape[0], N_JOINTS), minval=-1.0, maxval=1.0)
+            shape = observation.shape[0], self.env.action_size
+            random = jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0)
             action = self.agent.explore(state.agent, state.normaliser, observation, action_key)
             return jnp.where(warm, action, random), {}
 
@@ -127,7 +133,7 @@ class OffPolicyLearner(Learner[OffPolicyState]):
 
         def learn(agent: Any, key: jax.Array) -> tuple[Any, None]:
             sample_key, update_key = jax.random.split(key)
-            batch = sample(buffer, sample_key, self.replay.batch)
+            batch = sample(buffer, sample_key, self.replay.batch, self.env.action_size)
             return self.agent.update(agent, normaliser, batch, update_key), None
 
         keys = jax.random.split(learn_key, self.replay.gradient_steps)

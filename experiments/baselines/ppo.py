@@ -68,7 +68,8 @@ class PpoLearner(Learner[PpoState]):
             self._networks.policy_network.init(policy_key), self._networks.value_network.init(value_key)
         )
         env = jax.jit(self._env.reset)(jax.random.split(env_key, self._settings.environments))
-        return PpoState(parameters, self._optimiser.init(parameters), learner.empty_normaliser(), env, key)
+        normaliser = learner.empty_normaliser(self._env.observation_size)
+        return PpoState(parameters, self._optimiser.init(parameters), normaliser, env, key)
 
     def compiled(self, state: PpoState) -> Advance[PpoState]:
         return learner.compiled(self._advance, state)

@@ -24,7 +24,7 @@ from robot_io.contract import N_JOINTS
 
 
 class Critics(linen.Module):
-    """Two networks on observation and action: (..., 88), (..., 8) -> (..., 2).
+    """Two networks on observation and action: (..., size), (..., joints) -> (..., 2).
 
     The first layer adds a part of the observation to one of the action, so that of many actions in one state (axes of
     length 1 in the observation) the observation is taken in once.
@@ -45,17 +45,18 @@ class Critics(linen.Module):
 
 
 def best_action(value: Callable[[jax.Array], jax.Array], normals: jax.Array, elites: int) -> jax.Array:
-    """The action (..., 8) that the cross-entropy method finds for ``value``: (..., n, 8) -> (..., n).
+    """The action (..., joints) that the cross-entropy method finds for ``value``: (..., n, joints) -> (..., n).
 
-    normals: (rounds, n, 8) standard normal numbers, or (rounds, ..., n, 8). Each round draws n actions, cut to [-1, 1],
-    about the mean of the round before with its standard deviation, and keeps the best ``elites``; the last mean is the
-    answer. The first round draws about 0 with deviation 1/2.
+    normals: (rounds, n, joints) standard normal numbers, or (rounds, ..., n, joints). Each round draws n actions, cut
+    to [-1, 1], about the mean of the round before with its standard deviation, and keeps the best ``elites``; the last
+    mean is the answer. The first round draws about 0 with deviation 1/2.
     """
-    mean, std = jnp.zeros(N_JOINTS), jnp.full(N_JOINTS, 0.5)
+    joints = normals.shape[-1]
+    mean, std = jnp.zeros(joints), jnp.full(joints, 0.5)
     for z in normals:
         actions = jnp.clip(mean + std * z, -1.0, 1.0)
         values = value(actions)
-        actions = jnp.broadcast_to(actions, (*values.shape, N_JOINTS))
+        actions = jnp.broadcast_to(actions, (*values.shape, joints))
         best = jax.lax.top_k(values, elites)[1]
         chosen = jnp.take_along_axis(actions, best[..., None], axis=-2)
         mean, std = chosen.mean(axis=-2, keepdims=True), chosen.std(axis=-2, keepdims=True)
@@ -72,14 +73,15 @@ class QtOptState:
 class QtOptAgent:
     """The agent of ``off_policy.OffPolicyLearner``."""
 
-    def __init__(self, settings: QtOpt) -> None:
+    def __init__(self, settings: QtOpt, observation_size: int = OBSERVATION_SIZE, joints: int = N_JOINTS) -> None:
         self._settings, self._critics = settings, Critics(tuple(settings.layers))
+        self._size, self._joints = observation_size, joints
         self._optimiser = optax.adam(settings.learning_rate)
         # The same numbers at every decision: the policy is a function of what it sees.
         self._normals = self._draw(jax.random.key(0))
 
     def init(self, key: jax.Array) -> QtOptState:
-        critic = self._critics.init(key, jnp.zeros(OBSERVATION_SIZE), jnp.zeros(N_JOINTS))
+        critic = self._critics.init(key, jnp.zeros(self._size), jnp.zeros(self._joints))
         return QtOptState(critic, jax.tree.map(jnp.copy, critic), self._optimiser.init(critic))
 
     def explore(
@@ -119,7 +121,7 @@ class QtOptAgent:
         return self._best(critic, running_statistics.normalize(observation, normaliser), self._normals)
 
     def _best(self, critic: Params, seen: jax.Array, normals: jax.Array) -> jax.Array:
-        """``seen``: normalised observations (..., 88)."""
+        """``seen``: normalised observations (..., size)."""
         state = seen[..., None, :]
         return best_action(lambda a: self._values(critic, state, a)[..., 0], normals, self._settings.elites)
 
@@ -129,4 +131,4 @@ class QtOptAgent:
         return cast(jax.Array, self._critics.apply(critic, observation, action))
 
     def _draw(self, key: jax.Array) -> jax.Array:
-        return jax.random.normal(key, (self._settings.rounds, self._settings.candidates, N_JOINTS))
+        return jax.random.normal(key, (self._settings.rounds, self._settings.candidates, self._joints))

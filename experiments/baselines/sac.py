@@ -29,14 +29,14 @@ class SacState:
 class SacAgent:
     """The agent of ``off_policy.OffPolicyLearner``."""
 
-    def __init__(self, settings: Sac) -> None:
+    def __init__(self, settings: Sac, observation_size: int = OBSERVATION_SIZE, joints: int = N_JOINTS) -> None:
         self._settings = settings
         self._networks = networks.make_sac_networks(
-            OBSERVATION_SIZE, N_JOINTS, running_statistics.normalize, hidden_layer_sizes=tuple(settings.layers)
+            observation_size, joints, running_statistics.normalize, hidden_layer_sizes=tuple(settings.layers)
         )
         self._make_policy = networks.make_inference_fn(self._networks)
         self._optimiser = optax.adam(settings.learning_rate)
-        three = losses.make_losses(self._networks, settings.reward_scale, settings.discount, N_JOINTS)
+        three = losses.make_losses(self._networks, settings.reward_scale, settings.discount, joints)
         self._alpha_step, self._critic_step, self._actor_step = (
             gradients.gradient_update_fn(loss, self._optimiser, pmap_axis_name=None) for loss in three
         )

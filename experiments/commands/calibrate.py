@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from experiments.commands.options import command, console, existing, option, writable
-from experiments.errors import checked
+from experiments.errors import ConfigError, checked
 
 if TYPE_CHECKING:
     import numpy as np
     from rich.console import Console
 
     from robot_io.calibrated import Calibration, ClockCalibration, RobotCalibration, TrackerCalibration
+    from robot_io.contract import Contract
 
 app = command(
     "calibrate",
@@ -22,6 +23,7 @@ app = command(
     """\
   mjx-tt calibrate tracker ball.csv              table_x, table_y, table_z and ball_x, ball_y, ball_z of every point
   mjx-tt calibrate robot touches.csv --robot robot.yaml        table_x, ... and gantry_x ... joint_6 of every touch
+  mjx-tt calibrate robot touches.csv my_arm --robot robot.yaml      of a robot of your own, or one that comes with it
   mjx-tt calibrate clock runs/robot/20261121-153000.mcap       a session of half a minute or more
 
 Writes calibration.yaml, each part beside the others; robot.yaml names it: "calibration: calibration.yaml".
@@ -34,6 +36,9 @@ mjx-tt robot check writes the ball's columns of the points, robot jog the joints
 def calibrate(
     part: Annotated[Literal["tracker", "robot", "clock"], Parameter("PART")],
     source: Annotated[str, Parameter("FILE", help="CSV of points, or the log of a session")],
+    own: Annotated[
+        str | None, Parameter("ROBOT", help="of robot: the one that stands there, by folder or name (the paper's)")
+    ] = None,
     /,
     *,
     robot: Annotated[
@@ -43,6 +48,8 @@ def calibrate(
 ) -> int:
     """Returns the exit status."""
     existing(source, robot)
+    if own is not None and part != "robot":
+        raise ConfigError(f"{own}: the {part}'s calibration is of no robot; allowed with calibrate robot")
     target = Path(out)
     writable(target.parent)
     from dataclasses import asdict
@@ -51,7 +58,8 @@ def calibrate(
     from experiments.config import robot as robots
     from experiments.runs import run_dir
     from robot_io.calibrated import Calibration
-    from robot_io.control.config import AxisConfig
+    from robot_io.contract import PAPER
+    from robot_io.control.config import RobotConfig
 
     path, today, screen = Path(source), date.today().isoformat(), console()
     known = robots.load_calibration(target) if target.exists() else Calibration()
@@ -59,8 +67,9 @@ def calibrate(
     if part == "tracker":
         found = _tracker(path, today, screen)
     elif part == "robot":
-        axes = robots.load_robot(robot, calibrated=False).axes if robot else (AxisConfig(), AxisConfig())
-        found = _robot(path, (axes[0].zero, axes[1].zero), today, screen)
+        contract, end = (PAPER, None) if own is None else _standing(own)
+        config = robots.load_robot(robot, False, contract) if robot else RobotConfig.of(contract)
+        found = _robot(path, tuple(axis.zero for axis in config.axes), today, screen, contract, end)
     else:
         found = _clock(path, known, today, screen)
     # What run would refuse is not written.
@@ -86,15 +95,33 @@ def _tracker(path: Path, today: str, screen: Console) -> TrackerCalibration:
     return fit.calibration
 
 
-def _robot(path: Path, zeros: tuple[float, float], today: str, screen: Console) -> RobotCalibration:
+def _standing(own: str) -> tuple[Contract, np.ndarray | None]:
+    """Contract of a robot by its folder or name, and the end (3,) [m] of its blade in the last joint's frame.
+
+    Raises ConfigError.
+    """
+    from ballmodel.constants import PADDLE_RADIUS
+    from mjx_tt.robot import robot as robots
+    from robot_io.contract import PAPER
+
+    robot = checked("", robots.load, own)
+    if robot.contract == PAPER:
+        return PAPER, None
+    frame = robot.paddle()
+    return robot.contract, frame.pos - robot.chain().links[-1].anchor + PADDLE_RADIUS * frame.rot[:, 0]
+
+
+def _robot(
+    path: Path, zeros: tuple[float, ...], today: str, screen: Console, contract: Contract, end: np.ndarray | None
+) -> RobotCalibration:
     from robot_io.calibration import points, robot
 
-    lines, table, joints, paddle = checked("", points.touched, path)
-    fit = checked(str(path), robot.fit, table, joints, paddle, zeros, today)
+    lines, table, joints, paddle = checked("", points.touched, path, contract, end)
+    fit = checked(str(path), robot.fit, table, joints, paddle, zeros, today, contract)
     _show_points(screen, path, lines, fit.residuals, fit.used)
     found = fit.calibration
     values = (*found.joint_zeros, *found.base_position, *found.base_rotation, *found.tip)
-    for name, value, deviation in zip(robot.NAMES, values, fit.deviation, strict=True):
+    for name, value, deviation in zip(robot.names(contract), values, fit.deviation, strict=True):
         unit = "mrad" if "zero" in name or "turned" in name else "mm"
         screen.print(f"  {name:24} {1e3 * value:+8.2f} +- {1e3 * deviation:.2f} {unit}", highlight=False)
     screen.print(f"residual {1e3 * found.residual:.2f} mm", highlight=False)

@@ -57,6 +57,7 @@ robot_app = command(
   mjx-tt robot check --robot robot.yaml                             tracker and arm are heard, nothing is sent
   mjx-tt robot check --robot robot.yaml --artefact runs/quickstart  and a policy plays the balls in thought
   mjx-tt robot jog --robot robot.yaml                               armed, slow, in small steps
+  mjx-tt robot jog my_arm --robot robot.yaml                        a robot of your own; or one that comes with it
 
 m notes where ball and joints are, for mjx-tt calibrate.
 """,
@@ -66,6 +67,10 @@ m notes where ball and joints are, for mjx-tt calibrate.
 @robot_app.default
 def robot(
     action: Annotated[Literal["check", "jog"], Parameter("ACTION")],
+    own: Annotated[
+        str | None,
+        Parameter("ROBOT", help="robot that stands there, by folder or name (default: the policy's, or the paper's)"),
+    ] = None,
     /,
     *,
     robot: Annotated[str, option("YAML", "a robot.yaml")],
@@ -84,8 +89,8 @@ def robot(
     from experiments.deploy import commissioning
 
     if action == "check":
-        return commissioning.check(Path(robot), folder, Path(log), Path(points), seconds, console())
-    return commissioning.jog(Path(robot), Path(log), Path(points), seconds, console())
+        return commissioning.check(Path(robot), folder, Path(log), Path(points), seconds, console(), own)
+    return commissioning.jog(Path(robot), Path(log), Path(points), seconds, console(), own)
 
 
 @app.default

@@ -37,7 +37,8 @@ class Learning(Section):
 
 
 class Bgs(Learning):
-    """An evolution strategy on the paper's network of 976 parameters: BGS, or with other settings ARS."""
+    """An evolution strategy on the paper's network, of 976 parameters for eight joints: BGS, or with other settings
+    ARS."""
 
     kind: Literal["bgs"]
     """This algorithm."""
@@ -180,6 +181,8 @@ class Comparison(Section):
     """Folder of the comparison."""
     experiment: str | dict[str, Any]
     """An experiment's YAML, its path or content: balls, model, task, pool and evaluation hold for every algorithm."""
+    robot: str | dict[str, Any] | None = None
+    """In place of the experiment's: as ``robot`` there, a folder, its content or a name; null: the experiment's."""
     reality: str | dict[str, Any]
     """The SimModel that no training sees, its path or content."""
     algorithms: Annotated[dict[Name, Algorithm], Field(min_length=1)]
@@ -209,6 +212,8 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comp
     data = config.read_mapping(path, overrides, "a comparison", Comparison, shipped(), _absolute)
     comparison = validation.validated(Comparison, data, str(path))
     experiment = _experiment(comparison.experiment, str(path))
+    if comparison.robot is not None:
+        experiment = experiment.model_copy(update={"robot": comparison.robot})
     if experiment.training.later_rewards is not None:
         raise ConfigError(
             f"{path}: experiment: training.later_rewards: a comparison has one set of reward weights; null"
@@ -217,7 +222,9 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comp
 
 
 def _absolute(data: dict[str, Any], folder: Path) -> None:
-    for key in ("experiment", "reality"):
+    for key in ("experiment", "reality", "robot"):
+        if key == "robot" and not (folder / str(data.get(key))).exists():  # the name of one that comes with the program
+            continue
         if isinstance(data.get(key), str):
             data[key] = str((folder / data[key]).resolve())
     algorithms = data.get("algorithms")

@@ -89,8 +89,9 @@ def load_rig(path: str | Path | None, robot: Robot | None = None) -> RigParams:
         dead = standard.axis_dead_time if moved is None else max(moved - rig_config.AXIS_RESPONSE, 0.0)
         standard = replace(standard, arm=arm, axis_dead_time=dead)
         checked("", RobotConfig.of(robot.contract).check_joints, robot.contract)
-    params = standard if path is None else fill(RigParams, _mapping(path), str(path), standard)
-    return params if robot is None else checked("" if path is None else str(path), for_robot, params, robot.contract)
+    contract = PAPER if robot is None else robot.contract
+    params = standard if path is None else fill(RigParams, _mapping(path), str(path), standard, contract)
+    return for_robot(params, contract)
 
 
 def to_yaml(config: RobotConfig | RigParams | Calibration) -> str:
@@ -115,7 +116,7 @@ def fill(
 ) -> Config:
     """An instance of a dataclass; omitted keys keep the class's or the given defaults. Raises ConfigError.
 
-    contract  whose joints a RobotConfig has
+    contract  whose joints a RobotConfig and RigParams have
     """
     found = {path: (value, words) for path, value, words in outside(data, RANGES[kind]) if is_number(value)}
     lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
@@ -131,6 +132,8 @@ def fill(
     if not lines:
         if isinstance(config, RobotConfig):
             checked(where, config.check_joints, contract)
+        if isinstance(config, RigParams):
+            checked(where, for_robot, config, contract)
         return config
     raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
 

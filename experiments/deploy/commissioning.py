@@ -10,58 +10,82 @@ import numpy as np
 from rich.console import Console
 
 from experiments.config import robot as robots
+from experiments.deploy import robot_attachment
 from experiments.deploy.operator_console import KEYS, QUIT, Key, Keyboard, View
 from experiments.deploy.session import Session
-from experiments.errors import of_the_paper
+from experiments.errors import ConfigError, checked
+from mjx_tt.robot import robot as simulated
 from robot_io.calibrated import Calibration
 from robot_io.calibration import points
-from robot_io.contract import FESTO_JOINTS, JOINT_NAMES, N_JOINTS
+from robot_io.contract import PAPER, Contract
 from robot_io.control import messages, process
 from robot_io.control.messages import Request
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
 
-COLUMNS = (*points.TABLE, *points.BALL, *JOINT_NAMES)
 MARK = Key("note this point, of the last second", messages.Mark())
 # Between the halves of a second, and by noise, each [m] or [rad]: more is no point. A tracker may be noisy: the mean of
 # a hundred frames is not.
 STILL = {"ball": (0.003, 0.01), "joints": (0.002, 0.002)}
 STEPS = ((0.001, 0.002), (0.005, 0.01), (0.02, 0.05))  # [m], [rad] of small, middle and large steps
-JOG_KEYS = {
-    **{key: KEYS[key] for key in ("p", "a", " ", "r")},
-    "1..8": Key("choose a joint"),
-    "x y z": Key("or the blade, along an axis of the table"),
-    "+ -": Key("move a step"),
-    "s": Key("size of the steps"),
-    "m": MARK,
-    QUIT: KEYS[QUIT],
-}
+DIGITS = 9  # joints that a digit chooses
+NEXT = "n"
 CHECK_KEYS = {**{key: KEYS[key] for key in ("a", " ", "r")}, "m": MARK, QUIT: KEYS[QUIT]}
 
 
 def check(
-    robot: Path, artefact: Path | None, log_folder: Path, noted: Path, seconds: float | None, console: Console
+    robot: Path,
+    artefact: Path | None,
+    log_folder: Path,
+    noted: Path,
+    seconds: float | None,
+    console: Console,
+    own: str | None = None,
 ) -> int:
-    """Compute and log everything, send nothing: tracker and arm are heard, arm and axes move in thought."""
-    return _operate(robot, artefact, log_folder, noted, seconds, console, dry=True)
+    """Compute and log everything, send nothing: tracker and arm are heard, arm and axes move in thought.
+
+    robot  a robot.yaml; own: name or folder of the robot that stands there, None: the policy's, else the paper's
+    """
+    return _operate(robot, artefact, log_folder, noted, seconds, console, True, own)
 
 
-def jog(robot: Path, log_folder: Path, noted: Path, seconds: float | None, console: Console) -> int:
-    """Move the robot in small steps through the safety gate."""
-    return _operate(robot, None, log_folder, noted, seconds, console, dry=False)
+def jog(
+    robot: Path, log_folder: Path, noted: Path, seconds: float | None, console: Console, own: str | None = None
+) -> int:
+    """Move the robot in small steps through the safety gate; ``robot`` and ``own`` as of ``check``."""
+    return _operate(robot, None, log_folder, noted, seconds, console, False, own)
+
+
+def jog_keys(contract: Contract) -> dict[str, Key]:
+    """Keys of ``jog`` for the joints of a contract."""
+    more = {NEXT: Key("choose the next joint")} if contract.n_joints > DIGITS else {}
+    return {
+        **{key: KEYS[key] for key in ("p", "a", " ", "r")},
+        f"1..{min(contract.n_joints, DIGITS)}": Key("choose a joint"),
+        **more,
+        "x y z": Key("or the blade, along an axis of the table"),
+        "+ -": Key("move a step"),
+        "s": Key("size of the steps"),
+        "m": MARK,
+        QUIT: KEYS[QUIT],
+    }
 
 
 class Jogger:
     """Choice of joint or axis and of the step's size, by keys."""
 
-    def __init__(self) -> None:
+    def __init__(self, contract: Contract = PAPER) -> None:
+        self._contract = contract
+        self._digits = "123456789"[: contract.n_joints]
         self._chosen: int | str = 0
         self._size = 0
 
     def pressed(self, key: str) -> Request | None:
         """Request of a key; None where it only chooses, or means nothing."""
-        if key in "12345678":
+        if key in self._digits:
             self._chosen = int(key) - 1
+        elif key == NEXT and self._contract.n_joints > DIGITS:
+            self._chosen = 0 if isinstance(self._chosen, str) else (self._chosen + 1) % self._contract.n_joints
         elif key in "xyz":
             self._chosen = key
         elif key == "s":
@@ -74,21 +98,22 @@ class Jogger:
         metres, radians = STEPS[self._size]
         if isinstance(self._chosen, str):
             return messages.Jog(tuple(sign * metres * (axis == self._chosen) for axis in "xyz"))
-        size = metres if self._chosen in FESTO_JOINTS else radians
-        return messages.Jog(tuple(sign * size * (i == self._chosen) for i in range(N_JOINTS)))
+        size = metres if self._contract.units[self._chosen] == "m" else radians
+        return messages.Jog(tuple(sign * size * (i == self._chosen) for i in range(self._contract.n_joints)))
 
     def __str__(self) -> str:
         metres, radians = STEPS[self._size]
         if isinstance(self._chosen, str):
             return f"blade along {self._chosen}, {1e3 * metres:g} mm a step"
-        name = JOINT_NAMES[self._chosen]
-        return f"{name}, {f'{1e3 * metres:g} mm' if self._chosen in FESTO_JOINTS else f'{1e3 * radians:g} mrad'} a step"
+        size = f"{1e3 * metres:g} mm" if self._contract.units[self._chosen] == "m" else f"{1e3 * radians:g} mrad"
+        return f"{self._contract.joints[self._chosen]}, {size} a step"
 
 
-def note(path: Path, found: Calibration, seen: messages.Marked, with_joints: bool) -> str:
+def note(path: Path, found: Calibration, seen: messages.Marked, with_joints: bool, contract: Contract = PAPER) -> str:
     """Add what tracker and joints reported, before any calibration, to a CSV of points; what was done, as a sentence.
 
     with_joints  False: the joints are not those of a robot
+    contract     whose joints have the columns
     """
     left_out = {"ball": seen.ball.trouble(*STILL["ball"])}
     ball = None if left_out["ball"] else found.tracker.inward(seen.ball.mean)
@@ -96,15 +121,43 @@ def note(path: Path, found: Calibration, seen: messages.Marked, with_joints: boo
     if with_joints:
         left_out["joints"] = seen.axes.trouble(*STILL["joints"]) or seen.arm.trouble(*STILL["joints"])
         if not left_out["joints"]:
-            joints = np.concatenate([seen.axes.mean, seen.arm.mean - found.robot.joint_zeros])
+            joints = np.concatenate([seen.axes.mean, seen.arm.mean - found.robot.zeros(len(contract.arm))])
     reasons = "; ".join(f"no {what}: {trouble}" for what, trouble in left_out.items() if trouble)
     if ball is None and joints is None:
         return f"not noted: {reasons}"
+    columns = [*points.TABLE, *points.BALL, *contract.joints]
     new = not path.exists()
+    if not new and (there := _columns(path)) != columns:
+        return f"not noted: {path} has the columns {', '.join(there)}; allowed with {contract.robot}: another file"
     with open(path, "a", encoding="utf-8", newline="") as stream:
         lines = csv.writer(stream)
-        lines.writerows([COLUMNS] * new + [["", "", "", *_cells(ball, 3), *_cells(joints, N_JOINTS)]])
+        lines.writerows([columns] * new + [["", "", "", *_cells(ball, 3), *_cells(joints, contract.n_joints)]])
     return f"noted in {path}{reasons and f' ({reasons})'}; fill in table_x, table_y, table_z of its last line"
+
+
+def _columns(path: Path) -> list[str]:
+    with open(path, encoding="utf-8", newline="") as stream:
+        return next(csv.reader(stream), [])
+
+
+def _robot_of(
+    artefact: Path | None, own: str | None, console: Console
+) -> tuple[Contract, robot_attachment.Attachments]:
+    """Contract of the robot that stands there, the named one, the policy's or the paper's, and the robot for the log.
+
+    Raises ConfigError.
+    """
+    loaded = None if artefact is None else artefacts.load(artefact)
+    if own is None:
+        return (PAPER, ()) if loaded is None else (loaded.contract, robot_attachment.of_policy(loaded, console))
+    contract = checked("", simulated.load, own).contract
+    if loaded is not None and loaded.contract != contract:
+        raise ConfigError(
+            f"--artefact {artefact}: a policy for another robot than {own} as it is now; allowed: one of "
+            f"{contract.robot}, exported since it was changed last"
+        )
+    kept = () if contract == PAPER else robot_attachment.of_content(simulated.content(own), own, console)
+    return contract, kept
 
 
 def _cells(values: np.ndarray | None, count: int) -> list[str]:
@@ -119,22 +172,29 @@ def _operate(
     seconds: float | None,
     console: Console,
     dry: bool,
+    own: str | None,
 ) -> int:
-    if artefact is not None:
-        of_the_paper(artefacts.load(artefact).contract, str(artefact), "mjx-tt robot check")
-    config, name = robots.load_robot(robot), time.strftime("%Y%m%d-%H%M%S")
-    attachments = (
+    contract, kept = _robot_of(artefact, own, console)
+    config, name = robots.load_robot(robot, contract=contract), time.strftime("%Y%m%d-%H%M%S")
+    attachments: tuple[tuple[str, str | bytes], ...] = (
         ("robot.yaml", robot.read_text(encoding="utf-8")),
         ("calibration.yaml", robots.to_yaml(config.calibration)),
+        *kept,
     )
     folder = None if artefact is None else str(artefact)
     title = f"{config.name}: nothing is sent" if dry else f"{config.name}: by hand"
     log_folder.mkdir(parents=True, exist_ok=True)
     log_name = f"{name}-{'check' if dry else 'jog'}"
     options = process.ControlOptions(
-        folder, log_folder=str(log_folder), log_name=log_name, attachments=attachments, dry=dry, jog=not dry
+        folder,
+        log_folder=str(log_folder),
+        log_name=log_name,
+        attachments=attachments,
+        dry=dry,
+        jog=not dry,
+        contract=contract,
     )
-    keys, jogger = CHECK_KEYS if dry else JOG_KEYS, Jogger()
+    keys, jogger = CHECK_KEYS if dry else jog_keys(contract), Jogger(contract)
     with Session(config, options, console) as session:
         for line in session.report:
             console.print(f"  {line}", highlight=False)
@@ -144,7 +204,7 @@ def _operate(
                 for message in session.messages(0.1):
                     view.take(message)
                     if isinstance(message, messages.Marked):
-                        view.say(note(noted, config.calibration, message, not dry))
+                        view.say(note(noted, config.calibration, message, not dry, contract))
                 key = keyboard.pressed() or ""
                 if key == QUIT:
                     break

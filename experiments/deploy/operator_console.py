@@ -113,8 +113,7 @@ class View:
         joints = Table(box=None, pad_edge=False)
         for name in ("joint", "position", "command"):
             joints.add_column(name, justify="left" if name == "joint" else "right")
-        for name, position, velocity in s.joints:
-            unit = "m" if name.startswith("gantry") else "rad"
+        for name, unit, position, velocity in s.joints:
             joints.add_row(name, f"{position:+.3f} {unit}", f"{velocity:+.2f} {unit}/s")
         timing = Table(box=None, pad_edge=False)
         for name in ("", "p50", "p99", "max [ms]"):

@@ -25,6 +25,7 @@ from robot_io.emulator.processes import Ports, Rig
 from robot_io.policy import artefact as artefacts
 
 RIG = "rig"
+RECORDED = "provenance.config.robot"  # key of an artefact's manifest
 THROWS = 4096  # balls that the rig can throw before it begins anew
 
 
@@ -53,17 +54,25 @@ def robot_of(artefact: artefacts.Artefact) -> Robot:
     """
     if artefact.contract == PAPER:
         return simulated.paper()
-    given = ((artefact.manifest.get("provenance") or {}).get("config") or {}).get("robot")
-    where, name = f"{artefact.folder}: provenance.config.robot", artefact.contract.robot
-    if isinstance(given, dict):
-        robot = checked("", simulated.from_content, given, where)
-    elif given in simulated.names():
-        robot = simulated.load_shipped(given)
-    else:
-        raise ConfigError(f"{where}: got {given!r}; allowed: the content of a robot's YAML, that of {name}")
+    where = f"{artefact.folder}: {RECORDED}"
+    robot = checked("", simulated.from_content, content_of(artefact), where)
     if robot.contract != artefact.contract:
+        name = artefact.contract.robot
         raise ConfigError(f"{where}: no more the {name} of the policy's contract; export the policy again")
     return robot
+
+
+def content_of(artefact: artefacts.Artefact) -> dict[str, Any]:
+    """Plain data of the robot that a policy is for, from its recorded configuration. Raises ConfigError."""
+    given = ((artefact.manifest.get("provenance") or {}).get("config") or {}).get("robot")
+    if isinstance(given, dict):
+        return given
+    if given in simulated.names():
+        return simulated.content(given)
+    name = artefact.contract.robot
+    raise ConfigError(
+        f"{artefact.folder}: {RECORDED}: got {given!r}; allowed: the content of a robot's YAML, that of {name}"
+    )
 
 
 def box_of(artefact: artefacts.Artefact) -> Box | None:

@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 
 from experiments.config import robot as robots
-from experiments.deploy import contradictions, session_report
+from experiments.deploy import contradictions, robot_attachment, session_report
 from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, RECOVER, Keyboard, View
 from experiments.deploy.recovery import Recovery
 from experiments.deploy.rig import RIG, box_of, rig_for
@@ -221,7 +221,11 @@ def run(
             name,
             box_of(loaded),
             (("git", json.dumps(git)),),
-            (("robot.yaml", text), ("calibration.yaml", robots.to_yaml(config.calibration))),
+            (
+                ("robot.yaml", text),
+                ("calibration.yaml", robots.to_yaml(config.calibration)),
+                *robot_attachment.of_policy(loaded, console),
+            ),
         )
         log_folder.mkdir(parents=True, exist_ok=True)
         session = stack.enter_context(Session(config, options, console))

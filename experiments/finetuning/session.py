@@ -13,7 +13,7 @@ from rich.console import Console
 from experiments.config import robot as robots
 from experiments.config.build import Experiment
 from experiments.config.finetuning import FineTuning
-from experiments.deploy import contradictions
+from experiments.deploy import contradictions, robot_attachment
 from experiments.deploy.operator_console import Keyboard, View
 from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session import Session
@@ -72,7 +72,11 @@ def finetune(
             time.strftime("%Y%m%d-%H%M%S"),
             box_of(artefacts.load(artefact)),
             (("git", json.dumps(run_dir.git_state())),),
-            (("robot.yaml", robots.to_yaml(config)), ("calibration.yaml", robots.to_yaml(config.calibration))),
+            (
+                ("robot.yaml", robots.to_yaml(config)),
+                ("calibration.yaml", robots.to_yaml(config.calibration)),
+                *robot_attachment.of_policy(artefacts.load(artefact), console),
+            ),
         )
         session = stack.enter_context(Session(config, options, console))
         keyboard = stack.enter_context(Keyboard())

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ballmodel.trajectory import Trajectory
-from experiments.deploy import session_logs
+from experiments.deploy import robot_attachment, session_logs
 from experiments.errors import ConfigError
 from experiments.view.film import RATE, Film, Series, next_landing
 from experiments.view.programme import Fixed
@@ -54,8 +54,15 @@ def session(path: Path, model: SimModel) -> Fixed:
 
 
 def played_by(log: SessionLog, path: Path) -> Robot:
-    """The robot of a session, to be drawn. Raises ConfigError where its MJCF did not come with the program."""
-    name = log.robot.robot
+    """The robot of a session, to be drawn: that in its log, or one that comes with the program. Raises ConfigError."""
+    name, kept = log.robot.robot, log.attachments.get(robot_attachment.NAME)
+    if kept is not None:
+        robot = robot_attachment.unpack(kept, str(path))
+        if robot.contract.joints != log.robot.joints:
+            joints, wanted = ", ".join(robot.contract.joints), ", ".join(log.robot.joints)
+            where = f"{path}: {robot_attachment.NAME}"
+            raise ConfigError(f"{where}: a robot with the joints {joints}; allowed: the session's, {wanted}")
+        return robot
     if name not in robots.names():
         raise ConfigError(
             f"{path}: a session of {name}, whose MJCF is not in the log; shown are {', '.join(robots.names())} only; "

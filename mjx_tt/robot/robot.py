@@ -14,7 +14,7 @@ import json
 import shutil
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -205,8 +205,28 @@ def _court() -> str:
     return ElementTree.tostring(scene, encoding="unicode")
 
 
+def rename_files(spec: mujoco.MjSpec, name: Callable[[Path], str]) -> None:
+    """Give every mesh, height field, skin and texture that a spec reads from a file the name of its path."""
+    base, stripped = Path(spec.modelfiledir), spec.strippath
+    meshes, textures = base / spec.meshdir, base / spec.texturedir
+
+    def renamed(folder: Path, file: str) -> str:
+        return name(folder / (Path(file).name if stripped else file)) if file else file
+
+    for elements, folder in ((spec.meshes, meshes), (spec.hfields, meshes), (spec.skins, meshes)):
+        for element in elements:
+            element.file = renamed(folder, element.file)
+    for texture in spec.textures:
+        texture.file = renamed(textures, texture.file)
+        texture.cubefiles = [renamed(textures, file) for file in texture.cubefiles]
+    spec.meshdir = spec.texturedir = ""
+    spec.strippath = False
+
+
 def _assembled(robot: Robot) -> mujoco.MjSpec:
     scene, own = mujoco.MjSpec.from_string(_court()), robot.own_spec()
+    if robot.path is not None:  # which ``scene`` is written far away from
+        rename_files(own, str)
     for geom in own.geoms:  # of the simulation nothing collides; what the rig lets collide it says itself
         geom.contype = geom.conaffinity = 0
     for key in list(own.keys):

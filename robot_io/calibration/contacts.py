@@ -15,7 +15,6 @@ import numpy as np
 
 from ballmodel.constants import BALL_RADIUS, GRAVITY, PADDLE_RADIUS, PADDLE_THICKNESS
 from robot_io.calibrated import Calibration
-from robot_io.contract import PAPER
 from robot_io.log import LogError, SessionLog
 from robot_io.safety.clearance import RobotGeometry
 
@@ -46,11 +45,14 @@ class Contacts:
 
 
 def measure(log: SessionLog, calibration: Calibration) -> Contacts:
-    """Contacts of a log, with the robot where its calibration says. Raises LogError for another than the paper's."""
-    if log.robot != PAPER:
-        raise LogError(f"{log.path}: a session of {log.robot.robot}; contacts are measured with the paper's robot only")
-    geometry = RobotGeometry.load().moved(calibration.robot.base)
-    blade = geometry.blade
+    """Contacts of a log, with the robot where its calibration says.
+
+    Raises LogError where the robot's blade has no two capsules across each other, whose plane is the blade's.
+    """
+    geometry = RobotGeometry.of(log.robot).moved(calibration.robot.base)
+    blade, across = geometry.blade, geometry.normal
+    if np.linalg.norm(across) < 0.5:
+        raise LogError(f"{log.path}: no two capsules of {log.robot.robot}'s blade cross; its plane is not known")
     found = [turn for ball in np.unique(log.ball.id) for turn in _turns(log, log.ball.id == ball)]
     time, position = log.joints.time, log.joints.position
     known = np.isfinite(position).all(0)
@@ -65,7 +67,8 @@ def measure(log: SessionLog, calibration: Calibration) -> Contacts:
             geometry.hand(np.array([np.interp(moments + lag + dt, time, joint) for joint in position]))
             for dt in (0.0, STEP)
         )
-        centre, normal = hand[:, :3, :3] @ blade + hand[:, :3, 3], hand[:, :3, 1]
+        centre = hand[:, :3, :3] @ blade + hand[:, :3, 3]
+        normal = np.asfortranarray(hand[:, :3, :3] @ across)  # the layout decides how einsum rounds
         away = places - centre
         side = np.sign(np.einsum("ni,ni->n", before - places, normal))
         along = np.einsum("ni,ni->n", away, normal)

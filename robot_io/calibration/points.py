@@ -3,7 +3,8 @@
     table_x, table_y, table_z   where the point is in the table frame, by tape measure or gauge; a ball's centre at rest
                                 on the table has z = 0.02
     ball_x, ball_y, ball_z      what the tracker gives for the ball there, before any calibration
-    gantry_x ... joint_6        what axes and controller report while the paddle touches the point
+    gantry_x ... joint_6        what axes and controller report while the paddle touches the point; another robot's
+                                joints by their names
     paddle_x, paddle_y, paddle_z  point of the paddle that touches, in the last joint's frame; without these columns it
                                 is the blade's end
 
@@ -19,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from ballmodel.constants import PADDLE_RADIUS
-from robot_io.contract import JOINT_NAMES
+from robot_io.contract import PAPER, Contract
 from robot_io.safety.clearance import RobotGeometry
 
 TABLE = ("table_x", "table_y", "table_z")
@@ -46,11 +47,19 @@ def read(path: Path, *groups: tuple[str, ...]) -> tuple[list[int], list[np.ndarr
     return [line for line, _ in used], [np.array(n).reshape(-1, len(g)) for n, g in zip(numbers, groups, strict=True)]
 
 
-def touched(path: Path) -> tuple[list[int], np.ndarray, np.ndarray, np.ndarray]:
-    """Line numbers, table points (n, 3), joint readings (n, 8) and touching points (n, 3) of the paddle."""
+def touched(
+    path: Path, contract: Contract = PAPER, end: np.ndarray | None = None
+) -> tuple[list[int], np.ndarray, np.ndarray, np.ndarray]:
+    """Line numbers, table points (n, 3), readings (n, joints) and touching points (n, 3) of the paddle.
+
+    contract  of the robot; end: the blade's end (3,) [m] in its last joint's frame, None: the paper's robot's
+
+    Raises ValueError as ``read``.
+    """
     with_paddle = PADDLE[0] in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0]
-    lines, (table, joints, *paddle) = read(path, TABLE, JOINT_NAMES, *([PADDLE] if with_paddle else []))
-    end = RobotGeometry.load().blade + np.array([PADDLE_RADIUS, 0.0, 0.0])  # of the nominal paddle
+    lines, (table, joints, *paddle) = read(path, TABLE, contract.joints, *([PADDLE] if with_paddle else []))
+    if end is None:
+        end = RobotGeometry.load().blade + np.array([PADDLE_RADIUS, 0.0, 0.0])  # of the nominal paddle
     return lines, table, joints, paddle[0] if paddle else np.tile(end, (len(lines), 1))
 
 

@@ -155,7 +155,7 @@ class Bridge:
         self._change(BridgeState.READY, now, "armed by the operator")
 
     def jog(self, step: np.ndarray) -> None:
-        """Move on by a step, (8,) or (3,) of the blade, from where it is commanded to be. Raises RefusedError."""
+        """Move on by a step, (n,) or (3,) of the blade, from where it is commanded to be. Raises RefusedError."""
         if not self.config.jog or self.state is not BridgeState.READY:
             raise RefusedError(f"not jogged: the state is {self.state.value}; arm it first, in mjx-tt robot jog")
         self._home = self.gate.reference + jog.joints_of(step, self._geometry, self.gate.reference)

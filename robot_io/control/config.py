@@ -142,7 +142,7 @@ class RobotConfig:
         measured, zeros = self.calibration.robot, tuple(axis.zero for axis in self.axes)
         if measured.date and any(abs(a - b) > SAME_ZERO for a, b in zip(measured.axes_zero, zeros, strict=False)):
             raise ValueError(
-                f"calibration.robot.axes_zero is {measured.axes_zero}, axes[0].zero and axes[1].zero are {zeros}: the "
+                f"calibration.robot.axes_zero is {measured.axes_zero}, the zeros of axes are {zeros}: the "
                 "robot was calibrated with other zeros; take calibration out of robot.yaml, note points and "
                 "calibrate it again (mjx-tt calibrate robot)"
             )
@@ -190,11 +190,14 @@ class RobotConfig:
                 raise ValueError(
                     f"safety.following_error[{i}] is {self.safety.following_error[i]} m, allowed is 0.005 to 0.1"
                 )
-        if contract != PAPER and self.calibration.robot.date:
-            raise ValueError(
-                f"calibration.robot: base and zeros of {contract.robot} cannot be calibrated; allowed with the paper's "
-                "robot only, leave it out"
-            )
+        measured = self.calibration.robot
+        for key, wanted in (("joint_zeros", [contract.joints[i] for i in contract.arm]), ("axes_zero", names)):
+            given = getattr(measured, key)
+            if measured.date and len(given) != len(wanted):
+                raise ValueError(
+                    f"calibration.robot.{key}: got {len(given)} entries; allowed: {len(wanted)} for {contract.robot}, "
+                    f"{', '.join(wanted) or 'which has no linear axes'}"
+                )
 
 
 def axis_range(i: int, safety: SafetyConfig, limits: JointLimits = LIMITS) -> tuple[float, float]:

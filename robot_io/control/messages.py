@@ -55,7 +55,7 @@ class Pause:
 
 @dataclass(frozen=True)
 class Jog:
-    """Move the joints by a step (8,) [m], [rad], or the blade by (3,) [m] in the table frame, without turning it."""
+    """Move the joints by a step (n,) [m], [rad], or the blade by (3,) [m] in the table frame, without turning it."""
 
     step: tuple[float, ...]
 
@@ -124,7 +124,7 @@ class RallyOver:
 
 @dataclass(frozen=True)
 class Marked:
-    """Stays of the ball (3,) [m] in the table frame, the axes (2,) [m] and the arm (6,) [rad]."""
+    """Stays of the ball (3,) [m] in the table frame, the linear axes [m] and the arm's joints [rad]."""
 
     ball: Stay
     axes: Stay
@@ -161,7 +161,7 @@ class Status:
     state           value of the ``BridgeState``
     present         sentences of conditions that keep the robot from being armed, by cause
     arm, axes, tracker  the reason why each cannot be used, or None
-    joints          name, measured position, commanded velocity of each joint
+    joints          name, unit, measured position, commanded velocity of each joint
     ball            (3) [m] where the tracker's newest frame shows it, in the table frame; None: nowhere
     clock           ``Clock.report`` of the tracker's
     dry             nothing is sent: arm and axes move in thought
@@ -181,7 +181,7 @@ class Status:
     arm: str | None
     axes: str | None
     tracker: str | None
-    joints: list[tuple[str, float, float]]
+    joints: list[tuple[str, str, float, float]]
     ball: tuple[float, ...] | None = None
     clock: dict[str, float] = field(default_factory=dict)
     dry: bool = False
@@ -212,6 +212,7 @@ class Status:
     ) -> Status:
         """The state at ``now``; ``dropped``: records that the log lost."""
         counts, tracker, session = bridge.counts, bridge.tracker, bridge.arm_session
+        contract = bridge.config.contract
         seen, heard = tracker.newest, tracker.received
         positions, velocities = bridge.measured.tolist(), bridge.gate.velocity.tolist()
         return cls(
@@ -224,7 +225,7 @@ class Status:
             arm=session.problem(now),
             axes=axes.problem(now),
             tracker="silent" if heard is None or now - heard >= 0.5 else None,
-            joints=list(zip(bridge.config.contract.joints, positions, velocities, strict=True)),
+            joints=list(zip(contract.joints, contract.units, positions, velocities, strict=True)),
             ball=None if seen is None or seen.position is None else tuple(seen.position.tolist()),
             clock=tracker.clock.report(),
             dry=dry,

@@ -21,7 +21,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from robot_io import log
-from robot_io.contract import PAPER, n_parameters
+from robot_io.contract import PAPER, Contract, n_parameters
 from robot_io.control import messages, realtime
 from robot_io.control.bridge import Bridge, BridgeConfig
 from robot_io.control.bridge import Policy as StepPolicy
@@ -58,7 +58,7 @@ Closing = TypeVar("Closing", bound=Closable)
 
 @dataclass(frozen=True)
 class ControlOptions:
-    """artefact: folder, None: a policy that stands still.
+    """artefact: folder, None: a policy that stands still, on a robot with the joints of ``contract``.
 
     backend: of ``robot_io.policy.backends``; log_folder and log_name of the MCAP, None: no log.
     box: balls that the policy was trained for; None: nothing is out of distribution
@@ -71,9 +71,10 @@ class ControlOptions:
     log_name: str = "session"
     box: Box | None = None
     metadata: tuple[tuple[str, str], ...] = ()
-    attachments: tuple[tuple[str, str], ...] = ()
+    attachments: tuple[tuple[str, str | bytes], ...] = ()
     dry: bool = False
     jog: bool = False
+    contract: Contract = PAPER
 
 
 def start(config: RobotConfig, options: ControlOptions) -> tuple[BaseProcess, Connection]:
@@ -105,7 +106,7 @@ class Control:
         self._config, self._options, self._pipe = config, options, pipe
         arm, found = config.arm, config.calibration.robot
         loaded = None if options.artefact is None else artefacts.load(options.artefact)
-        self._contract = contract = PAPER if loaded is None else loaded.contract
+        self._contract = contract = options.contract if loaded is None else loaded.contract
         config.check_joints(contract)
         if loaded is None:
             seen = contract.n_observation
@@ -139,7 +140,7 @@ class Control:
             self._recorder = self._open(recorder)
             geometry = RobotGeometry.of(contract).moved(found.base)
             gate = SafetyGate(contract.limits, geometry=geometry, config=config.safety)
-            zeros = found.joint_zeros if contract == PAPER else (0.0,) * len(contract.arm)
+            zeros = found.zeros(len(contract.arm))
             egm = EgmConfig(arm.controller, arm.controller_port, timeout=arm.timeout, zeros=zeros)
             home = gate.geometry.home
             self._session = DryArm(egm, home[list(contract.arm)]) if options.dry else EgmSession(egm)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from robot_io.contract import PAPER, Contract
+from robot_io.contract import Contract
 from robot_io.devices.festo import AxesConfig
 from robot_io.emulator import arm as arms
 from robot_io.emulator.arm import ArmParams
@@ -12,7 +12,7 @@ from robot_io.emulator.axis_drive import DriveParams
 from robot_io.emulator.network import FAULT_RANGES, NetworkFaults
 from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.tracker.cameras import RANGES as CAMERA_RANGES
-from robot_io.emulator.tracker.hidden import HiddenErrors
+from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
 from robot_io.emulator.world import WorldParams
 from robot_io.ranges import check_ranges
 
@@ -97,10 +97,11 @@ STANDARD_RIG = RigParams()
 
 
 def for_robot(params: RigParams, contract: Contract) -> RigParams:
-    """The rig with a contract's joints. Raises ValueError naming what belongs to the paper's robot only."""
-    if contract != PAPER and any(params.hidden.joint_zeros):
+    """The rig with a contract's joints. Raises ValueError naming what does not fit them."""
+    zeros, names = params.hidden.joint_zeros, [contract.joints[i] for i in contract.arm]
+    if zeros != NOTHING_HIDDEN.joint_zeros and len(zeros) != len(names):
         raise ValueError(
-            f"hidden.joint_zeros is {params.hidden.joint_zeros}, allowed for {contract.robot} are zeros: they are the "
-            "paper's robot's"
+            f"hidden.joint_zeros: got {len(zeros)} entries; allowed: {len(names)} for {contract.robot}, "
+            f"{', '.join(names)}"
         )
     return replace(params, arm=arms.for_robot(params.arm, contract))

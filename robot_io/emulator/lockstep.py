@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from robot_io.calibrated import UNCALIBRATED, Calibration
-from robot_io.contract import PAPER
 from robot_io.control.bridge import Bridge, BridgeConfig, BridgeState, Policy
 from robot_io.control.config import PROFILES, axis_range
 from robot_io.control.episode import EpisodeSummary
@@ -100,8 +99,7 @@ class LockStep:
         self.rallies: list[RallySummary] = []
         self.track = np.zeros((0, 4))  # t [s], x, y, z [m] of the newest ball with an outcome, on its way to the robot
         found = calibration.robot
-        zeros = found.joint_zeros if contract == PAPER else (0.0,) * len(contract.arm)
-        session = EgmSession(EgmConfig(controller_address=CONTROLLER[0], zeros=zeros))
+        session = EgmSession(EgmConfig(controller_address=CONTROLLER[0], zeros=found.zeros(len(contract.arm))))
         self.bridge = Bridge(
             session,
             self.axes,

@@ -216,8 +216,14 @@ class RobotGeometry:
 
     @property
     def blade(self) -> np.ndarray:
-        """The blade's centre (3,) [m] in the last joint's frame; of the paper's robot the normal is y."""
+        """The blade's centre (3,) [m] in the last joint's frame."""
         return self._local[self._names.index(self.tip), 0, :3].mean(axis=1)
+
+    @property
+    def normal(self) -> np.ndarray:
+        """The blade's normal (3,) in the last joint's frame, either way; almost 0 where its capsules are parallel."""
+        a, b = np.diff(self._local[self._table_rows[self._blade_rows[[0, -1]]], 0, :3])[..., 0]
+        return np.cross(a, b) / max(float(np.linalg.norm(np.cross(a, b))), _TINY)
 
     def blade_points(self, q: np.ndarray) -> np.ndarray:
         """World end points (3, 4, B) [m] of the blade's capsules at joint positions q (n, B)."""

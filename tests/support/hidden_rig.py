@@ -29,14 +29,20 @@ def grid(hidden=HIDDEN, noise=0.003, frames=125, seed=0, spread=None):
     return table, np.array(seen)
 
 
-def touches(hidden=HIDDEN, count=40, noise=5e-4, seed=0):
-    """Pins that a tip clamped to the paddle touches: places, what axes and controller report, the tip's place."""
-    random, rig = np.random.default_rng(seed), world()
-    tips = np.array([[0.3263, 0.0, 0.0], [0.25, 0.0, 0.08], [0.25, 0.05, -0.08]])
+TIPS = np.array([[0.3263, 0.0, 0.0], [0.25, 0.0, 0.08], [0.25, 0.05, -0.08]])  # [m] in the paper's last joint's frame
+SPREAD = np.array([0.5, 0.25, 0.6, 0.4, 0.5, 1.0, 0.7, 1.2])  # [m], [rad] of the poses around home
+
+
+def touches(hidden=HIDDEN, count=40, noise=5e-4, seed=0, rig=None, arm=ABB_JOINTS, spread=SPREAD, tips=TIPS):
+    """Pins that a tip clamped to the paddle touches: places, what axes and controller report, the tip's place.
+
+    rig  the world of another robot, with the indices of its arm's joints, spread of its poses and tips
+    """
+    random, rig = np.random.default_rng(seed), rig or world()
     data, site = mujoco.MjData(rig.model), rig.model.site("paddle")
     table, joints, paddle = [], [], []
     while len(table) < count:
-        q = rig.home + random.uniform(-1, 1, 8) * [0.5, 0.25, 0.6, 0.4, 0.5, 1.0, 0.7, 1.2]
+        q = rig.home + random.uniform(-1, 1, len(spread)) * spread
         data.qpos[rig._q] = q
         mujoco.mj_kinematics(rig.model, data)
         hand = data.xmat[site.bodyid[0]].reshape(3, 3), data.xpos[site.bodyid[0]]
@@ -45,7 +51,7 @@ def touches(hidden=HIDDEN, count=40, noise=5e-4, seed=0):
         if place[2] < 0.05:
             continue
         reported = q.copy()
-        reported[list(ABB_JOINTS)] = hidden.counted(q[list(ABB_JOINTS)])
+        reported[list(arm)] = hidden.counted(q[list(arm)])
         table.append(place + noise * random.normal(size=3))
         joints.append(reported)
         paddle.append(tip)

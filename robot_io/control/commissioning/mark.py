@@ -42,6 +42,6 @@ class Stay:
         if not np.isfinite(self.mean).all():
             return f"{self.count} samples in the last second, at least {FEWEST} are needed"
         for what, values, allowed in (("moves by", self.moved, moved), ("scatters by", self.noise, noise)):
-            if not np.abs(values).max() <= allowed:
+            if not np.abs(values).max(initial=0.0) <= allowed:  # a robot without linear axes has none of them
                 return f"{what} {1e3 * np.abs(values).max():.1f}e-3, allowed is {1e3 * allowed:g}e-3 [m, rad]"
         return ""

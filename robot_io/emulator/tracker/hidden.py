@@ -16,14 +16,14 @@ class HiddenErrors:
 
     camera_position  [m] of the tracker's origin in the table frame
     camera_angles    [rad] by which its axes are turned about the table's x, then y, then z axis
-    joint_zeros      (6) [rad] true angle where the arm's controller reports 0
+    joint_zeros      [rad] of the arm's joints, six of the paper's robot: true angle where its controller reports 0
     clock_offset     [s] that the tracker's clock shows when the bridge's shows 0
     clock_drift      seconds per second that the tracker's clock gains
     """
 
     camera_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     camera_angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    joint_zeros: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    joint_zeros: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     clock_offset: float = 0.0
     clock_drift: float = 0.0
 
@@ -41,7 +41,7 @@ class HiddenErrors:
         return now + self.clock_offset + self.clock_drift * now if self.clock_offset or self.clock_drift else now
 
     def counted(self, angles: np.ndarray) -> np.ndarray:
-        """Angles (6,) [rad] of which the arm's controller knows where the joints are at ``angles``."""
+        """Angles (n,) [rad] of which the arm's controller knows where the joints are at ``angles``."""
         return angles - np.array(self.joint_zeros) if any(self.joint_zeros) else angles
 
 

@@ -168,7 +168,7 @@ def test_qt_opt_fits_the_clipped_double_target():
 
 def test_the_buffer_holds_the_last_transitions():
     capacity, batch = 12, 4
-    buffer = off_policy.Buffer(jnp.zeros((capacity, off_policy.WIDTH)), jnp.int32(0))
+    buffer = off_policy.Buffer(jnp.zeros((capacity, off_policy.width(OBSERVATION_SIZE, N_JOINTS))), jnp.int32(0))
     kept = deque(maxlen=capacity)
     for i in range(5):
         number = np.arange(i * batch, (i + 1) * batch, dtype=np.float32)
@@ -235,11 +235,42 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
     assert missing("algorithms.P={kind: ppo}") == {"ES": [], "P": [0]}
     assert missing("reality.ball_spin.mean_x=100.0") == {"ES": [0]}  # to be evaluated again
     assert missing("algorithms.ES.balls=narrow", "seeds=[3]") == {"ES": [3]}
-    with pytest.raises(RunError, match="ES/seed0.*other settings of (balls, )?.*algorithm"):
+    with pytest.raises(RunError, match="ES/seed0.*other settings of model;"):
         missing("algorithms.ES.model={sensing: {ball_noise: 0}}")
     for override in ("budget.episodes=80", "algorithms.ES.optimiser.num_directions=3", "experiment.balls=narrow"):
         with pytest.raises(RunError, match="ES/seed0.*other settings of (budget|algorithm|balls);"):
             missing(override)
+
+
+@pytest.mark.parametrize("settings", [{"kind": "ppo"}, {"kind": "sac"}, {"kind": "qt_opt"}, {"kind": "bgs"}])
+def test_every_algorithm_has_the_joints_of_the_robot(tmp_path, settings):
+    """Traced, not compiled: shapes of states, transitions and actions."""
+    path = write(tmp_path, SMALL | {"robot": "fr3_pedestal"})
+    comparison, config = baselines.load(path, (f"algorithms.X={settings}",))
+    common = compare.prepare(comparison, config, str(path), tmp_path, Console())
+    assert common.conditions("X")["robot"] == "fr3_pedestal" == common.comparison.to_dict()["robot"]
+    learner = compare.learner(common.comparison.algorithms["X"], common.experiment)
+    state = jax.eval_shape(learner.init, jax.random.key(0))
+    if settings["kind"] != "bgs":  # whose update the trainer lowers itself
+        after, measured = jax.eval_shape(learner._advance, state)
+        assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state) and "returned" in measured
+    controller = jax.eval_shape(learner.controller, state)
+    seen = jax.ShapeDtypeStruct((10, 5), jnp.float32)
+    action = jax.eval_shape(lambda c, o: c.act(jnp.int32(0), c.start(o), o)[0], controller, seen)
+    assert action.shape == (7, 5) and controller.mean.shape == (10,)
+
+
+@pytest.mark.slow
+def test_a_comparison_on_another_robot_runs(tmp_path):
+    path = write(tmp_path, SMALL | {"robot": "fr3_pedestal"})
+    folder = compare.compare(*baselines.load(path), str(path), tmp_path, Console())
+    report = json.loads((folder / "comparison.json").read_text())["algorithms"]["ES"]
+    assert np.isfinite(report["simulation"]["mean_return"])
+    assert compare.unfinished(compare.prepare(*baselines.load(path), str(path), tmp_path, Console())) == {"ES": []}
+    with pytest.raises(RunError, match="ES/seed0.*other settings of robot"):
+        compare.unfinished(
+            compare.prepare(*baselines.load(path, ("robot=ur10e_rail",)), str(path), tmp_path, Console())
+        )
 
 
 @pytest.mark.parametrize(

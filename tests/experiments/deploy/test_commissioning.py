@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from rich.console import Console
 from experiments.config import robot as robots
 from experiments.deploy import commissioning
 from experiments.deploy.commissioning import Jogger
+from mjx_tt.robot import robot as simulated
 from robot_io import log
 from robot_io.calibrated import Calibration
-from robot_io.contract import JOINT_NAMES
+from robot_io.contract import JOINT_NAMES, PAPER
 from robot_io.control import messages, process
 from robot_io.control.commissioning.mark import Stay
 from robot_io.control.config import ArmConfig, AxisConfig, RobotConfig
@@ -30,7 +32,7 @@ from robot_io.history import History
 from robot_io.safety.clearance import BLADE
 from tests.support.simulated_control import Simulated
 
-ARM_HEARD = np.array([-1.4, 0.1, -0.5, 0.05, 0.9, 0.2])
+ARM_HEARD = np.array([-1.4, 0.1, -0.5, 0.05, 0.9, 0.2, 0.3])
 
 
 class Keys:
@@ -52,8 +54,11 @@ class Keys:
 
 
 @pytest.mark.realtime
-def test_a_dry_run_hears_everything_notes_the_ball_and_sends_nothing(tmp_path, monkeypatch):
-    ports, got, finish = free_ports(), [], threading.Event()
+@pytest.mark.parametrize("own", [None, "fr3_pedestal", "ur10e_rail"])
+def test_a_dry_run_hears_everything_notes_the_ball_and_sends_nothing(tmp_path, monkeypatch, own):
+    contract = PAPER if own is None else simulated.load_shipped(own).contract
+    ports, got, finish = free_ports(len(contract.carrying)), [], threading.Event()
+    heard = ARM_HEARD[: len(contract.arm)]
     listeners = [socket.create_server((HOST, port)) for port in ports.axes]
     controller, tracker = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     for wire in (*listeners, controller):
@@ -63,7 +68,7 @@ def test_a_dry_run_hears_everything_notes_the_ball_and_sends_nothing(tmp_path, m
         count = 0
         while not finish.wait(0.004):
             count, now = count + 1, time.monotonic()
-            controller.sendto(encode_robot(count, 4 * count, ARM_HEARD, ARM_HEARD, True, True, True), (HOST, ports.arm))
+            controller.sendto(encode_robot(count, 4 * count, heard, heard, True, True, True), (HOST, ports.arm))
             if count % 2:
                 frame = encode(BallSample(count // 2, 1, now - 0.015, np.array([0.1, 0.2, 0.3])))
                 tracker.sendto(frame, (HOST, ports.tracker))
@@ -76,13 +81,14 @@ def test_a_dry_run_hears_everything_notes_the_ball_and_sends_nothing(tmp_path, m
     thread = threading.Thread(target=devices)
     thread.start()
     path = tmp_path / "robot.yaml"
-    axes = AxisConfig(HOST, ports.axes[0]), AxisConfig(HOST, ports.axes[1])
-    config = RobotConfig(arm=ArmConfig(HOST, ports.arm), axes=axes, tracker=TrackerConfig(HOST, ports.tracker))
+    axes = tuple(AxisConfig(HOST, port) for port in ports.axes)
+    devices_of = {"arm": ArmConfig(HOST, ports.arm), "axes": axes, "tracker": TrackerConfig(HOST, ports.tracker)}
+    config = replace(RobotConfig.of(contract), **devices_of)
     path.write_text(robots.to_yaml(config))
     console = Console(record=True, width=300)
     monkeypatch.setattr(commissioning, "Keyboard", lambda: Keys((1.5, "m"), (2.0, "q")))
     try:
-        assert commissioning.check(path, None, tmp_path, tmp_path / "points.csv", 20.0, console) == 0
+        assert commissioning.check(path, None, tmp_path, tmp_path / "points.csv", 20.0, console, own) == 0
     finally:
         finish.set()
         thread.join()
@@ -91,10 +97,11 @@ def test_a_dry_run_hears_everything_notes_the_ball_and_sends_nothing(tmp_path, m
     text = console.export_text()
     assert not got and "ball at +0.100 +0.200 +0.300 m in the table frame" in text and " 0 answered" in text
     session = log.read(next(tmp_path.glob("*-check.mcap")))
-    np.testing.assert_allclose(session.joints.position[2:, -1], ARM_HEARD, atol=1e-6)
+    assert session.robot == contract
+    np.testing.assert_allclose(session.joints.position[list(contract.arm), -1], heard, atol=1e-6)
     assert session.ball.id.size > 100 and session.ticks.tick.size > 50
     (line,) = csv.DictReader(open(tmp_path / "points.csv", encoding="utf-8"))
-    assert [float(line[f"ball_{axis}"]) for axis in "xyz"] == [0.1, 0.2, 0.3] and line["joint_1"] == ""
+    assert [float(line[f"ball_{axis}"]) for axis in "xyz"] == [0.1, 0.2, 0.3] and line[contract.joints[-1]] == ""
 
 
 def test_keys_move_the_blade_only_once_armed_and_note_where_it_is(tmp_path, monkeypatch):

@@ -216,8 +216,15 @@ def test_a_rig_reacts_as_late_as_the_robots_yaml_says_unless_rig_yaml_does(tmp_p
     path.write_text("arm: {dead_time: 0.03}\n")
     assert robots.load_rig(path, robot).arm.dead_time == 0.03
     path.write_text("hidden: {joint_zeros: [0.01, 0, 0, 0, 0, 0]}\n")
-    with pytest.raises(ConfigError, match="rig.yaml: hidden.joint_zeros .* allowed for fr3_pedestal are zeros"):
+    with pytest.raises(
+        ConfigError, match="rig.yaml: hidden.joint_zeros: got 6 entries; allowed: 7 for fr3_pedestal, joi"
+    ):
         robots.load_rig(path, robot)
+    assert robots.load_rig(path).hidden.joint_zeros[0] == 0.01
+    path.write_text("hidden: {joint_zeros: [0.01, 0, 0, 0, 0, 0, 0]}\n")
+    assert robots.load_rig(path, robot).hidden.joint_zeros == (0.01, *(0.0,) * 6)
+    with pytest.raises(ConfigError, match="hidden.joint_zeros: got 7 entries; allowed: 6 for irb120_gantry, joint_1"):
+        robots.load_rig(path)
     params = replace(RigParams().arm, max_speed=(1.0,) * 6)
     with pytest.raises(ValueError, match="arm.max_speed is .* those of fr3_pedestal are its YAML's"):
         for_robot(replace(RigParams(), arm=params), robot.contract)

@@ -1,0 +1,162 @@
+"""``mjx-tt calibrate`` for robots with other joints than the paper's, on rigs with hidden errors."""
+
+from __future__ import annotations
+
+import csv
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+
+from experiments import cli
+from experiments.config import robot as robots
+from experiments.errors import ConfigError
+from mjx_tt.robot import robot as simulated
+from robot_io.calibrated import UNCALIBRATED
+from robot_io.calibration import contacts
+from robot_io.control.interfaces import BridgeConfig
+from robot_io.emulator.config import RigParams
+from robot_io.emulator.lockstep import LockStep
+from robot_io.emulator.tracker.hidden import HiddenErrors
+from robot_io.emulator.world import World
+from tests.support.contact_log import made_up
+from tests.support.hidden_rig import touches
+from tests.support.lockstep_play import throws
+
+FR3, UR10E = "fr3_pedestal", "ur10e_rail"
+ZEROS = {
+    FR3: (0.012, -0.012, 0.012, -0.012, 0.012, -0.012, 0.012),
+    UR10E: (0.012, -0.012, 0.012, -0.012, 0.012, -0.012),
+}
+BLADE = 0.076  # [m]
+SPREAD = {FR3: [0.6, 0.5, 0.5, 0.5, 1.0, 0.7, 1.2], UR10E: [0.5, 0.6, 0.4, 0.5, 1.0, 0.7, 1.2]}
+
+
+@cache
+def standing(name):
+    """A robot that comes with the program, and a world of its own."""
+    robot = simulated.load_shipped(name)
+    return robot, World(robot.scene(), contract=robot.contract)
+
+
+def touched(name, count=40, seed=0):
+    """Touches with the blade's end, a clamp beside it and one in front; both in the frame of its flange, along z."""
+    robot, world = standing(name)
+    centre = world.model.site("paddle").pos
+    tips = centre + np.array([[0.0, 0.0, BLADE], [0.0, 0.08, 0.0], [0.05, -0.08, 0.0]])
+    hidden = HiddenErrors(joint_zeros=ZEROS[name])
+    return touches(hidden, count, seed=seed, rig=world, arm=robot.contract.arm, spread=SPREAD[name], tips=tips)
+
+
+def write(path, names, rows):
+    with open(path, "w", encoding="utf-8", newline="") as stream:
+        csv.writer(stream).writerows([names, *rows])
+    return path
+
+
+TABLE, PADDLE = ([f"{what}_{axis}" for axis in "xyz"] for what in ("table", "paddle"))
+
+
+class Hold:
+    def __init__(self, joints):
+        self.joints = joints
+
+    def reset(self):
+        pass
+
+    def step(self, observation):
+        return np.zeros(self.joints)
+
+
+@pytest.fixture(params=[FR3, UR10E])
+def calibrated(request, tmp_path, monkeypatch, capsys):
+    """A robot's name and what was found and told, with one wrong touch among 40."""
+    monkeypatch.chdir(tmp_path)
+    robot, _ = standing(request.param)
+    table, joints, paddle = touched(request.param)
+    table[7] += [0.0, 0.04, 0.0]
+    write("touches.csv", [*TABLE, *robot.contract.joints, *PADDLE], np.concatenate([table, joints, paddle], axis=1))
+    axes = [{"zero": -1.0}] * len(robot.contract.carrying)
+    (tmp_path / "robot.yaml").write_text(f"name: lab\naxes: {axes}\n")
+    assert cli.main(["calibrate", "robot", "touches.csv", request.param, "--robot", "robot.yaml"]) == 0
+    (tmp_path / "robot.yaml").write_text(f"name: lab\naxes: {axes}\ncalibration: calibration.yaml\n")
+    return robot, robots.load_robot("robot.yaml", contract=robot.contract).calibration, capsys.readouterr().out
+
+
+def test_hidden_zeros_are_found_said_and_kept_with_those_of_the_axes(calibrated):
+    robot, found, told = calibrated
+    assert "touches.csv: line 9: " in told and "39 of 40 points used" in told
+    assert all(f"zero of {robot.contract.joints[i]}" in told for i in robot.contract.arm)
+    assert len(found.robot.joint_zeros) == len(robot.contract.arm)
+    assert found.robot.axes_zero == (-1.0,) * len(robot.contract.carrying) and found.robot.residual < 0.002
+    np.testing.assert_allclose(found.robot.joint_zeros, ZEROS[robot.name], atol=0.003)
+
+
+def test_the_bridge_then_knows_where_the_joints_and_the_blade_are(calibrated):
+    robot, found, _ = calibrated
+    params = RigParams(pause=0.05, hidden=HiddenErrors(joint_zeros=ZEROS[robot.name]))
+    _, world = standing(robot.name)
+    missed = {}
+    for calibration in (UNCALIBRATED, found):
+        config = BridgeConfig(contract=robot.contract, base=calibration.robot.base)
+        policy = Hold(robot.contract.n_joints)
+        rig = LockStep(robot.scene(), throws(), policy, params, config, world=world, calibration=calibration, first=0)
+        rig.run(1.5)
+        rig.start()
+        rig.run(1.0)
+        known, true = rig.bridge.measured, rig.world.qpos
+        blade = rig.bridge.gate.geometry.middle(rig.bridge.gate.geometry.tip, known)
+        missed[calibration is found] = np.abs(known - true).max(), np.linalg.norm(blade - site(rig.world, true))
+    assert missed[False][0] > 0.01 and missed[False][1] > 0.005
+    assert missed[True][0] < 0.004 and missed[True][1] < 0.003
+
+
+def site(world, qpos):
+    """The blade's centre (3,) [m] by MuJoCo."""
+    data = mujoco.MjData(world.model)
+    data.qpos[world._q] = qpos
+    mujoco.mj_kinematics(world.model, data)
+    return data.site("paddle").xpos
+
+
+def test_without_columns_of_the_paddle_it_is_the_blades_end(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    robot, _ = standing(UR10E)
+    table, joints, _ = (values[::3] for values in touched(UR10E, 60))  # every third touch is the blade's end
+    write("ends.csv", [*TABLE, *robot.contract.joints], np.concatenate([table, joints], axis=1))
+    assert cli.main(["calibrate", "robot", "ends.csv", UR10E]) == 0
+    found = robots.load_calibration("calibration.yaml").robot
+    assert found.residual < 0.001 and np.linalg.norm(found.tip) < 0.003
+
+
+def test_points_calibrations_and_parts_of_another_robot_are_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    fr3, ur10e = (standing(name)[0].contract for name in (FR3, UR10E))
+    write("touches.csv", [*TABLE, *fr3.joints], np.zeros((9, 10)))
+    assert cli.main(["calibrate", "robot", "touches.csv", UR10E]) == 1
+    assert "touches.csv: no columns rail, shoulder_pan" in capsys.readouterr().err
+    assert cli.main(["calibrate", "tracker", "touches.csv", UR10E]) == 1
+    assert "ur10e_rail: the tracker's calibration is of no robot" in capsys.readouterr().err
+    path = tmp_path / "robot.yaml"
+    path.write_text(
+        f"axes: []\ncalibration: {{robot: {{joint_zeros: {[0.01] * 6}, axes_zero: [], date: '2026-11-22'}}}}"
+    )
+    with pytest.raises(ConfigError, match="calibration.robot.joint_zeros: got 6 entries; allowed: 7 for fr3_pedestal"):
+        robots.load_robot(path, contract=fr3)
+    path.write_text(f"axes: [{{}}]\ncalibration: {{robot: {{joint_zeros: {[0.01] * 6}, date: '2026-11-22'}}}}")
+    with pytest.raises(
+        ConfigError, match="calibration.robot.axes_zero: got 2 entries; allowed: 1 for ur10e_rail, rail"
+    ):
+        robots.load_robot(path, contract=ur10e)
+    path.write_text(f"calibration: {{robot: {{joint_zeros: {[0.01] * 7}, date: '2026-11-22'}}}}")
+    with pytest.raises(ConfigError, match="joint_zeros: got 7 entries; allowed: 6 for irb120_gantry, joint_1"):
+        robots.load_robot(path)
+
+
+@pytest.mark.parametrize("name", [FR3, UR10E])
+def test_contacts_tell_the_lag_of_its_joints(name):
+    robot, world = standing(name)
+    found = contacts.measure(made_up(0.03, rig=world, robot=robot.contract, swing=2.5), UNCALIBRATED)
+    assert found.count >= 25 and found.lag == pytest.approx(0.03, abs=3 * found.lag_deviation)
+    assert found.lag_deviation < 0.002 and found.spread < 0.006

@@ -1,0 +1,260 @@
+"""``mjx-tt robot jog`` for robots with other joints than the paper's, on the emulated robot over real sockets."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections import deque
+
+import mujoco
+import numpy as np
+import pytest
+from rich.console import Console
+
+from experiments.config import build
+from experiments.config import robot as robots
+from experiments.deploy import commissioning
+from experiments.deploy.commissioning import Jogger
+from experiments.errors import ConfigError
+from mjx_tt.robot import robot as simulated
+from mjx_tt.sim.model import SimModel
+from robot_io import log
+from robot_io.contract import Contract, JointLimits
+from robot_io.control import messages
+from robot_io.emulator.processes import Rig
+from tests.experiments.deploy.test_session_other_robots import exported
+
+FR3, UR10E = "fr3_pedestal", "ur10e_rail"
+REST = 0.4  # [s] over which a robot that stands does not move
+
+
+def blade(robot, qpos):
+    """The blade's centre (3,) [m] by MuJoCo's own kinematics."""
+    model = robot.model()
+    data = mujoco.MjData(model)
+    data.qpos[: len(qpos)] = qpos
+    mujoco.mj_kinematics(model, data)
+    return data.site("paddle").xpos.copy()
+
+
+class Operator:
+    """Keyboard and View of one who presses keys, each as soon as its condition holds, and hears what is shown."""
+
+    def __init__(self, *steps):
+        self.steps, self.said, self.status = deque(steps), [], None
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def pressed(self):
+        if not self.steps or not self.steps[0][0]():
+            return None
+        key = self.steps.popleft()[1]
+        return key() if callable(key) else key
+
+    def say(self, text):
+        self.said.append(text)
+
+    def take(self, message):
+        if isinstance(message, messages.Status):
+            self.status = message
+        elif isinstance(message, messages.Refused):
+            self.say(message.sentence)
+
+    def in_state(self, state):
+        return lambda: self.status is not None and self.status.state == state
+
+    def heard(self, text):
+        return lambda: any(text in said for said in self.said)
+
+
+@pytest.fixture(scope="module", params=[FR3, UR10E])
+def rig(request):
+    robot = simulated.load_shipped(request.param)
+    balls = robots.throws_of(build.distribution("narrow", "test"), SimModel(), 8, 0)
+    with Rig(str(robot.scene()), balls, robots.load_rig(None, robot), None, robot.contract) as running:
+        yield robot, running
+
+
+def jog(robot, rig, operator, folder, monkeypatch):
+    """The exit status of a session of ``mjx-tt robot jog``."""
+    path = folder / "robot.yaml"
+    path.write_text(robots.to_yaml(rig.robot))
+    monkeypatch.setattr(commissioning, "Keyboard", lambda: operator)
+    monkeypatch.setattr(commissioning, "View", lambda *_: operator)
+    console = Console(record=True, width=300)
+    assert commissioning.jog(path, folder, folder / "points.csv", 40.0, console, robot.name) == 0
+    assert not operator.steps, f"never came to {len(operator.steps)} keys: {operator.said}, {operator.status}"
+    return console.export_text()
+
+
+def switched_on(rig, operator):
+    """True when EGM runs, which somebody at the arm's controller starts, again where it timed out without a bridge."""
+    asked = 0.0
+
+    def running():
+        nonlocal asked
+        if operator.status.arm is not None and time.monotonic() > asked + 1.0:
+            rig.switch_on()
+            asked = time.monotonic()
+        return operator.status.arm is None
+
+    return running
+
+
+def at_rest(rig):
+    before = rig.state()[0]
+    time.sleep(REST)
+    return np.abs(rig.state()[0] - before).max() < 1e-3
+
+
+@pytest.mark.realtime
+def test_it_moves_armed_and_in_small_steps_only(rig, tmp_path, monkeypatch):
+    robot, running = rig
+    n, first, places = robot.contract.n_joints, running.state()[0], []
+    step = 0.02 if robot.contract.units[0] == "m" else 0.05
+    fastest = np.zeros(n)
+
+    def look(key):
+        def now():
+            places.append(running.state()[0])
+            return key
+
+        return now
+
+    def moved(check):
+        def there():
+            nonlocal fastest
+            fastest = np.maximum(fastest, np.abs(running.state()[1]))
+            return check(running.state()[0] - places[-1])
+
+        return there
+
+    stepped = lambda away: abs(away[0] - step) < 2e-3 and np.abs(away[1:]).max() < 2e-3  # noqa: E731
+    raised = lambda _: (  # noqa: E731
+        np.abs(blade(robot, running.state()[0]) - blade(robot, places[-1]) - [0, 0, 0.005]).max() < 2e-3
+    )
+    operator = Operator()
+    operator.steps.extend(
+        [
+            (operator.in_state("disarmed"), "1"),
+            (lambda: True, "+"),
+            (operator.heard("arm it first"), ""),
+            (switched_on(running, operator), "p"),
+            (lambda: not operator.status.missing, look("a")),
+            (operator.in_state("ready"), "s"),
+            (lambda: True, "s"),
+            (lambda: True, "+"),
+            (moved(stepped), "z"),
+            (lambda: at_rest(running), look("")),
+            (lambda: True, "s"),
+            (lambda: True, "s"),
+            (lambda: True, "+"),
+            (moved(raised), "x"),
+            (lambda: at_rest(running), "m"),
+            (lambda: time.sleep(1.1) or True, "m"),
+            (operator.heard("noted in"), look(" ")),
+            (operator.in_state("disarmed"), "q"),
+        ]
+    )
+    shown = jog(robot, running, operator, tmp_path, monkeypatch)
+    assert "answered" in shown and " 0 answered" not in shown
+    np.testing.assert_allclose(places[0], first, atol=2e-3)  # nothing moved before it was armed
+    pace = 0.03 * np.array(robot.contract.limits.policy_velocity)
+    assert (fastest < 1.5 * pace + 0.02).all() and (fastest > 0).all()
+    lines = list(csv.DictReader(open(tmp_path / "points.csv", encoding="utf-8")))
+    noted = np.array([float(lines[-1][name]) for name in robot.contract.joints])
+    np.testing.assert_allclose(noted, places[-1], atol=2e-3)
+    session = log.read(next(tmp_path.glob("*-jog.mcap")))
+    assert session.robot == robot.contract
+    sent = np.abs(session.commands.sent).max(axis=1)
+    assert (sent <= pace * (1 + 1e-9)).all() and (sent > 0).any()
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("doubt", ["cable", "motors", "axis"])
+def test_in_doubt_it_slows_down_and_holds(rig, tmp_path, monkeypatch, doubt):
+    robot, running = rig
+    if doubt == "axis" and not robot.contract.carrying:
+        pytest.skip("it has no linear axes")
+    operator, places = Operator(), []
+
+    def begin():
+        places.append(running.state()[0])
+        return "+"
+
+    def cause():
+        {
+            "cable": lambda: running.connect_arm(False),
+            "motors": running.motors_off,
+            "axis": lambda: running.connect_axis(0, False),
+        }[doubt]()
+        return "x"
+
+    def held():
+        time.sleep(0.5)
+        places.append(running.state()[0])
+        return "+"
+
+    def after():
+        time.sleep(REST)
+        places.append(running.state()[0])
+        return "q"
+
+    operator.steps.extend(
+        [
+            (operator.in_state("disarmed"), ""),
+            (switched_on(running, operator), "p"),
+            (lambda: not operator.status.missing, "a"),
+            (operator.in_state("ready"), "2"),
+            (lambda: True, "s"),
+            (lambda: True, "s"),
+            (lambda: True, begin),
+            (lambda: np.abs(running.state()[0] - places[0]).max() > 0.005, cause),
+            (operator.in_state("fault"), "2"),
+            (lambda: True, held),
+            (operator.heard("the state is fault; arm it first"), after),
+        ]
+    )
+    jog(robot, running, operator, tmp_path, monkeypatch)
+    start, stopped, later = places
+    assert 0.005 < np.abs(stopped - start).max() < 0.04  # of a step of 0.05
+    np.testing.assert_allclose(later, stopped, atol=1e-3)
+    session = log.read(next(tmp_path.glob("*-jog.mcap")))
+    limits = robot.contract.limits
+    change = np.abs(np.diff(session.commands.sent, axis=1)).max(axis=1)
+    assert (change <= np.array(limits.acceleration) / 75.0 * (1 + 1e-9)).all()
+    assert not session.commands.sent[:, -1].any()
+    running.connect_arm(True)
+    if doubt == "axis":
+        running.connect_axis(0, True)
+
+
+def test_keys_of_many_joints():
+    """A tenth joint has no digit of its own."""
+    names = tuple(f"j{i}" for i in range(10))
+    limits = JointLimits(*((-1.0,) * 10, *((1.0,) * 10,) * 3, (0.01,) * 10, (1.0,) * 10), joints=names)
+    contract = Contract("long", ("m",) * 3 + ("rad",) * 7, (0, 1, 2), limits)
+    jogger = Jogger(contract)
+    jogger.pressed("9")
+    assert jogger.pressed("n") is None and str(jogger) == "j9, 2 mrad a step"
+    assert jogger.pressed("+") == messages.Jog((0,) * 9 + (0.002,))
+    jogger.pressed("n")
+    assert str(jogger) == "j0, 1 mm a step" and jogger.pressed("-") == messages.Jog((-0.001,) + (0,) * 9)
+    assert "1..9" in commissioning.jog_keys(contract) and "n" in commissioning.jog_keys(contract)
+    fr3 = simulated.load_shipped(FR3).contract
+    assert "1..7" in commissioning.jog_keys(fr3) and Jogger(fr3).pressed("8") is None
+
+
+def test_a_policy_for_another_robot_and_a_file_of_other_points_are_refused(tmp_path):
+    policy = exported(tmp_path / "artefact", FR3)
+    with pytest.raises(ConfigError, match="a policy for another robot than ur10e_rail as it is now"):
+        commissioning.check(tmp_path / "robot.yaml", policy, tmp_path, tmp_path / "p.csv", 1.0, Console(), UR10E)
+    with pytest.raises(ConfigError, match="nowhere: no robot; allowed: a folder"):
+        commissioning.jog(tmp_path / "robot.yaml", tmp_path, tmp_path / "p.csv", 1.0, Console(), "nowhere")
+    (tmp_path / "robot.yaml").write_text("axes: [{}, {}]\n")
+    with pytest.raises(ConfigError, match="robot.yaml: axes: got 2 entries; allowed: 1 for ur10e_rail, rail"):
+        commissioning.jog(tmp_path / "robot.yaml", tmp_path, tmp_path / "p.csv", 1.0, Console(), UR10E)

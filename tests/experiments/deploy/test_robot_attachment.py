@@ -1,0 +1,169 @@
+"""A robot of one's own in the log of its session, which is then drawn where its folder is gone."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import struct
+import zipfile
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from rich.console import Console
+
+from experiments.deploy import rig as deploy_rig
+from experiments.deploy import robot_attachment, session
+from experiments.errors import ConfigError
+from experiments.view import measured, scene, show
+from mjx_tt.robot import robot as robots
+from mjx_tt.sim.model import SimModel
+from robot_io import log
+from robot_io.contract import n_parameters
+from robot_io.policy import export
+from robot_io.policy.policy import Policy
+
+CORNERS = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+FACES = ((0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2))
+
+
+def tetrahedron(path):
+    """Writes a binary STL."""
+    triangles = [struct.pack("<12fH", 0, 0, 0, *CORNERS[list(face)].ravel(), 0) for face in FACES]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"\0" * 80 + struct.pack("<I", len(triangles)) + b"".join(triangles))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A robot named mine, with a mesh in a folder of its own, another outside, and an include."""
+    folder = Path(shutil.copytree(robots.SHIPPED / "ur10e_rail", tmp_path / "elsewhere" / "mine"))
+    tetrahedron(folder / "looks" / "hood.stl")
+    tetrahedron(tmp_path / "elsewhere" / "shared" / "hood.stl")
+    (folder / "meshes.xml").write_text(
+        '<mujoco><asset><mesh name="hood" file="hood.stl"/><mesh name="cap" file="../../shared/hood.stl"/></asset>'
+        "</mujoco>"
+    )
+    text = (folder / "robot.xml").read_text()
+    body = '<body name="carriage" childclass="ur10e" gravcomp="1">'
+    geoms = "".join(f'<geom type="mesh" mesh="{name}" contype="0" conaffinity="0"/>' for name in ("hood", "cap"))
+    assert body in text and "<compiler " in text
+    text = text.replace("<compiler ", '<include file="meshes.xml"/><compiler meshdir="looks" ')
+    text = text.replace(body, body + geoms)
+    (folder / "robot.xml").write_text(text)
+    description = (folder / robots.YAML).read_text()
+    assert "name: ur10e_rail" in description
+    (folder / robots.YAML).write_text(description.replace("name: ur10e_rail", "name: mine"))
+    return folder
+
+
+def drawn(robot):
+    """The scene of the viewer, and its corners of meshes."""
+    model = scene.tables(1, robot)
+    return model, [model.mesh(name).vertnum[0] for name in ("hood", "cap")]
+
+
+def test_a_robot_with_meshes_and_includes_is_made_anew_from_the_attachment(folder):
+    before = robots.load(folder)
+    contract, model = before.contract, before.model()
+    data = robot_attachment.pack(robots.content(folder), "mine")
+    shutil.rmtree(folder.parent)
+    robot = robot_attachment.unpack(data, "a.mcap")
+    assert robot.contract == contract and robot.path is not None
+    assert drawn(robot)[1] == [4, 4]
+    again = robot.model()
+    for qpos in (robot.home, robot.home + 0.3):
+        places = []
+        for one in (model, again):
+            state = mujoco.MjData(one)
+            state.qpos[: len(qpos)] = qpos
+            mujoco.mj_kinematics(one, state)
+            places.append(state.geom_xpos)
+        np.testing.assert_allclose(*places, atol=1e-9)
+
+
+def test_a_robot_without_files_is_kept_as_it_is():
+    robot = robots.load_shipped("fr3_pedestal")
+    assert robot_attachment.unpack(robot_attachment.pack(robots.content(robot.name), "fr3"), "a.mcap") == robot
+
+
+def test_what_is_too_large_is_left_out_and_said(folder, monkeypatch):
+    console, content = Console(record=True, width=300), robots.content(folder)
+    monkeypatch.setattr(robot_attachment, "LARGEST", 1000)
+    assert robot_attachment.of_content(content, "mine", console) == ()
+    monkeypatch.setattr(robot_attachment, "LARGEST", 1 << 20)
+    monkeypatch.setattr(robot_attachment, "UNPACKED", 300)
+    assert robot_attachment.of_content(content, "mine", console) == ()
+    shutil.rmtree(folder.parent)
+    assert robot_attachment.of_content(content, "mine", console) == ()
+    said = console.export_text().splitlines()
+    assert [line.startswith("the log will not hold the robot for mjx-tt view: mine: ") for line in said] == [True] * 3
+    assert "with its meshes; allowed: 0 MiB" in said[0] and "of files; allowed: 0 MiB" in said[1]
+    assert "robot.xml is missing or was changed since" in said[2]
+
+
+def zipped(**files):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data, why",
+    [
+        (b"nothing", "no robot in it: File is not a zip file"),
+        (zipped(other="1"), "no robot in it: .*robot.json"),
+        (zipped(**{"robot.json": "{}", "../outside": "1"}), "'../outside' is no name of a file in it"),
+        (zipped(**{"robot.json": "{}", "a.stl": "1"}), "no robot in it: 'mjcf'"),
+        (zipped(**{"robot.json": '{"name": "a"}'}), "a.mcap: robot.zip: mjcf: missing; allowed: the MJCF's file"),
+        (zipped(**{"robot.json": " " * 5000}), "no robot in it: more than"),
+    ],
+)
+def test_an_attachment_that_is_no_robot_is_refused(data, why, monkeypatch, tmp_path):
+    monkeypatch.setattr(robot_attachment, "UNPACKED", 4000)
+    with pytest.raises(ConfigError, match=why):
+        robot_attachment.unpack(data, "a.mcap")
+    assert not (tmp_path / "outside").exists()
+
+
+def test_another_robot_than_the_sessions_is_refused(tmp_path):
+    contract = robots.load_shipped("fr3_pedestal").contract
+    other = robot_attachment.pack(robots.content("ur10e_rail"), "other")
+    with log.FileRecorder.start(tmp_path, "a", {}, {robot_attachment.NAME: other}, robot=contract) as recorder:
+        for k in range(2):
+            recorder.put(log.Joints(k / 75, np.zeros(7), np.zeros(7)))
+    with pytest.raises(ConfigError, match="robot.zip: a robot with the joints rail, .* allowed: the session's, joint1"):
+        measured.session(tmp_path / "a.mcap", SimModel())
+
+
+@pytest.mark.realtime
+def test_a_session_on_the_rig_is_shown_when_the_robots_folder_is_gone(folder, tmp_path):
+    robot = robots.load(folder)
+    n, seen = robot.contract.n_joints, robot.contract.n_observation
+    theta = 0.05 * np.random.default_rng(0).standard_normal(n_parameters(n))
+    config = {"balls": "narrow", "robot": robots.content(folder)}
+    export.write(
+        tmp_path / "artefact", Policy(theta, np.zeros(seen), np.ones(seen)), {"config": config}, robot=robot.contract
+    )
+    console = Console(record=True, width=200)
+    status = session.run(
+        tmp_path / "artefact", deploy_rig.RIG, 1, None, "numpy", tmp_path / "log", None, 0, None, console
+    )
+    assert status == 0, console.export_text()
+    contract, home = robot.contract, robot.home
+    shutil.rmtree(folder.parent)
+    shutil.rmtree(tmp_path / "artefact")
+    (path,) = (tmp_path / "log").glob("*.mcap")
+    films = measured.session(path, SimModel())
+    shown = show.robot_of(films)
+    assert shown.name == "mine" and shown.contract == contract and films.count == 1
+    model, corners = drawn(shown)
+    assert corners == [4, 4] and model.nq == n
+    (film,) = films.films(0)
+    np.testing.assert_allclose(film.qpos[0], home, atol=0.05)
+    kept = json.loads(zipfile.ZipFile(io.BytesIO(log.read(path).attachments["robot.zip"])).read("robot.json"))
+    assert str(tmp_path) not in json.dumps(kept)  # nothing of where it was
