@@ -281,7 +281,7 @@ def show(report: dict, console: Console) -> None:
 def show_roofline(parts: list[dict], roofline: dict, console: Console) -> None:
     """Operations and bytes of each part per episode and control step, and the share of one core's peaks reached."""
     peaks = roofline["peaks"]
-    counts, rates = ("op", "transc.", "kB", "op/byte"), ("Gop/s", "of peak", "GB/s", "of cache", "of roof")
+    counts, rates = ("kernels", "op", "transc.", "kB", "op/byte"), ("Gop/s", "of peak", "GB/s", "of cache", "of roof")
     table = _table("Roofline: an episode's control step, one core", "part", *counts, *rates)
     for row in parts:
         if "operations" not in row:
@@ -291,6 +291,7 @@ def show_roofline(parts: list[dict], roofline: dict, console: Console) -> None:
         roof = min(peak, row["operations"] / row["bytes"] * cache)
         table.add_row(
             row["part"],
+            f"{row['kernels']:,.0f}",
             f"{row['operations']:,.0f}",
             f"{row['transcendentals']:,.0f}",
             f"{row['bytes'] / 1e3:.1f}",

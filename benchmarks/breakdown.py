@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import jax
@@ -37,13 +37,15 @@ def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], dict]:
     """Compiles the parts for a block of rows x columns episodes; the function returned measures them.
 
     "parts", each: part, calls per control step, ns per episode and control step, share of the whole; operations,
-    transcendentals and bytes of the compiled program, likewise. "rest" is the whole less the parts, and can be negative
-    where a part alone costs more than in its place. "peaks": what the core reaches at best, see ``roofline.measure``.
+    transcendentals and bytes of the compiled program, likewise; its kernels per control step of the block. "rest" is
+    the whole less the parts, and can be negative where a part alone costs more than in its place. "peaks": what the
+    core reaches at best, see ``roofline.measure``; "working_set_mb": arguments and temporaries of the whole.
     """
     parts = _parts(TaskConfig(), rows, columns)
     loops = {name: (calls, *_compiled(step, start, ticks)) for name, (calls, step, start) in parts.items()}
 
     counts = {name: calls / ticks / (rows * columns) * count(run) for name, (calls, run, _) in loops.items()}
+    counts = {name: replace(each, kernels=each.kernels * rows * columns) for name, each in counts.items()}
     memory = loops[WHOLE][1].memory_analysis()
     working_set = memory.argument_size_in_bytes + memory.temp_size_in_bytes
     peaks = roofline.measure(working_set)

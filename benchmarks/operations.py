@@ -15,6 +15,8 @@ from jax._src.lib import hlo, xla_client  # the parser and the analysis have no 
 from jax.stages import Compiled
 
 _COMPUTATION = re.compile(r"^(?:ENTRY )?%(\S+) \(.*?^}", re.MULTILINE | re.DOTALL)
+_OPCODE = re.compile(r"^ +(?:ROOT )?%\S+ = .*? ([a-z][\w-]*)\(", re.MULTILINE)
+_NOT_STARTED = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "while", "call"}
 _CALL = re.compile(r" call\(.*to_apply=%([^\s,]+)")
 _LOOP = re.compile(r" while\(.*condition=%([^\s,]+), body=%([^\s,]+)(?:.*\"known_trip_count\":\{\"n\":\"(\d+)\"\})?")
 
@@ -26,22 +28,26 @@ class Counts:
     operations       additions, multiplications, comparisons, selections, ...: one for each number computed, two for a
                      multiplication and addition in one
     transcendentals  square roots, exponentials, hyperbolic tangents, ...
-    bytes            read and written by the program's fused loops, wherever they are kept
+    bytes            read and written by the program's kernels, wherever they are kept
+    kernels          loops of fused operations, copies and the like, each of which is started by itself
     """
 
     operations: float
     transcendentals: float
     bytes: float
+    kernels: float
 
     def __add__(self, other: Counts) -> Counts:
         return Counts(
             self.operations + other.operations,
             self.transcendentals + other.transcendentals,
             self.bytes + other.bytes,
+            self.kernels + other.kernels,
         )
 
     def __rmul__(self, factor: float) -> Counts:
-        return Counts(factor * self.operations, factor * self.transcendentals, factor * self.bytes)
+        values = (self.operations, self.transcendentals, self.bytes, self.kernels)
+        return Counts(*(factor * value for value in values))
 
 
 def count(compiled: Compiled) -> Counts:
@@ -71,10 +77,20 @@ def _loops(name: str, bodies: dict[str, str]) -> list[tuple[str, str, str]]:
     return [*_LOOP.findall(bodies[name]), *called]
 
 
+def _kernels(name: str, bodies: dict[str, str]) -> int:
+    """Kernels of a computation in which loops run once."""
+    inner = _CALL.findall(bodies[name])
+    for condition, body, _ in _LOOP.findall(bodies[name]):
+        inner += [condition, body]
+    own = sum(opcode not in _NOT_STARTED for opcode in _OPCODE.findall(bodies[name]))
+    return own + sum(_kernels(other, bodies) for other in inner)
+
+
 def _once(name: str, bodies: dict[str, str]) -> Counts:
     """XLA's analysis of a computation as a program of its own."""
     before = list(bodies)[: list(bodies).index(name)]  # a computation stands behind those that it calls
     text = "\n\n".join([*(bodies[other] for other in before), f"ENTRY {bodies[name].removeprefix('ENTRY ')}"])
     module = hlo.hlo_module_from_text(f"HloModule part\n\n{text}\n")
     found = xla_client._xla.hlo_module_cost_analysis(jax.devices()[0].client, module)
-    return Counts(*(float(found.get(key, 0.0)) for key in ("flops", "transcendentals", "bytes accessed")))
+    amounts = (float(found.get(key, 0.0)) for key in ("flops", "transcendentals", "bytes accessed"))
+    return Counts(*amounts, kernels=_kernels(name, bodies))

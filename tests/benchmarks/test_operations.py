@@ -26,6 +26,7 @@ def test_loops_count_as_often_as_they_run():
     assert counts.operations == pytest.approx(10 * 4 * 2 * N, rel=0.01)  # and the loops' own counters
     assert counts.transcendentals == 10 * N
     assert counts.bytes == pytest.approx(10 * (4 + 1) * 2 * 4 * N, rel=0.1)  # and the copy of the argument
+    assert 10 * (4 + 1) <= counts.kernels <= 10 * (4 * 4 + 5)  # and those of the counters, fused or not
     assert compiled.cost_analysis()["flops"] == pytest.approx(2 * N, rel=0.01)
 
 
