@@ -281,26 +281,23 @@ def show(report: dict, console: Console) -> None:
 def show_roofline(parts: list[dict], roofline: dict, console: Console) -> None:
     """Operations and bytes of each part per episode and control step, and the share of one core's peaks reached."""
     peaks = roofline["peaks"]
-    counts, rates = ("kernels", "op", "transc.", "kB", "op/byte"), ("Gop/s", "of peak", "GB/s", "of cache", "of roof")
-    table = _table("Roofline: an episode's control step, one core", "part", *counts, *rates)
+    title = "Roofline: an episode's control step, one core; shares of the peak and of the roof"
+    table = _table(title, "part", "kernels", "op", "kB", "op/B", "Gop/s", "peak", "roof")
     for row in parts:
         if "operations" not in row:
             continue
-        operations, moved = row["operations"] / row["ns"], row["bytes"] / row["ns"]  # in 1e9 a second
-        peak, cache = peaks["fma_peak"] / 1e9, peaks["cache_bandwidth"] / 1e9
-        roof = min(peak, row["operations"] / row["bytes"] * cache)
+        rate, intensity = row["operations"] / row["ns"], row["operations"] / row["bytes"]
+        peak = peaks["fma_peak"] / 1e9
+        roof = min(peak, intensity * peaks["cache_bandwidth"] / 1e9)
         table.add_row(
             row["part"],
             f"{row['kernels']:,.0f}",
             f"{row['operations']:,.0f}",
-            f"{row['transcendentals']:,.0f}",
             f"{row['bytes'] / 1e3:.1f}",
-            f"{row['operations'] / row['bytes']:.2f}",
-            f"{operations:.1f}",
-            f"{operations / peak:.0%}",
-            f"{moved:.1f}",
-            f"{moved / cache:.0%}",
-            f"{operations / roof:.0%}",
+            f"{intensity:.2f}",
+            f"{rate:.1f}",
+            f"{rate / peak:.0%}",
+            f"{rate / roof:.0%}",
         )
     console.print(table)
     best = {name: f"{value / 1e9:.1f}" for name, value in peaks.items()}
