@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, TypeAlias, get_args
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ import numpy as np
 
 from ballmodel.distribution import BallDistribution, DistributionReport, fit_distribution
 from ballmodel.flight import BallParams, step
-from ballmodel.initial_state import MIN_SAMPLES, fit_gauss_newton
+from ballmodel.initial_state import MIN_SAMPLES, fit_all_nelder_mead, fit_gauss_newton
 from ballmodel.io import MeasuredStates
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import DT, KEPT, OUTCOMES, OWN_SIDE, ROBOT_SIDE, SECOND_BOUNCE, Throw, throw
@@ -20,6 +22,7 @@ from ballmodel.trajectory import Dataset, free_flight
 LANDED_TOGETHER = 512  # flights are simulated in multiples of it
 AFTER_BOUNCE = 6  # steps after a serve's bounce on the server's side at which its ball starts: 20 ms
 LONGEST_SERVE = 300  # steps until that bounce
+Fit: TypeAlias = Literal["gauss-newton", "nelder-mead"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,8 @@ def fit_human(
     min_samples: int = 5,
     name: str = "",
     serves: bool = False,
+    fit: Fit = "gauss-newton",
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[BallDistribution, HumanReport]:
     """The 16 numbers of a person's balls, from trajectories or from start states.
 
@@ -77,13 +82,23 @@ def fit_human(
     flies towards the robot, clears the net and lands on the robot's side. eps, min_samples: see ``fit_distribution``.
     serves: balls that bounce on the human's side first count as well, from 20 ms after that bounce. Start states of a
     recording may spin; trajectories are taken not to (mjx_tt.prediction.state_fit estimates their spins).
-    Raises ValueError when no ball is left.
+    fit: of trajectories. Both minimise the same distance, "nelder-mead" as the paper does, "gauss-newton" all at once.
+    progress: called with (flights fitted so far, all of them) by Nelder-Mead, which takes a tenth of a second for each.
+    Raises ValueError for another fit, for Nelder-Mead on start states and when no ball is left.
     """
+    if fit not in get_args(Fit):
+        raise ValueError(f"fit {fit!r} is not one of {get_args(Fit)}")
     if isinstance(measured, Dataset):
         flights = [free_flight(t) for t in measured]
         long_enough = [t for t in flights if len(t) >= MIN_SAMPLES]
-        fitted = fit_gauss_newton(long_enough, params.flight)
-        state, rms, too_short = fitted.state, fitted.rms, len(flights) - len(long_enough)
+        too_short = len(flights) - len(long_enough)
+        if fit == "nelder-mead":
+            state, rms = fit_all_nelder_mead(long_enough, params.flight, progress)
+        else:
+            fitted = fit_gauss_newton(long_enough, params.flight)
+            state, rms = fitted.state, fitted.rms
+    elif fit == "nelder-mead":
+        raise ValueError(f"{measured.source}: holds start states; {fit} fits trajectories")
     else:
         state, rms, too_short = measured.state, np.zeros(0), 0
     state = jax.tree.map(np.asarray, state)

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ballmodel.io.atomic_files import replacing
-from benchmarks.worker import Worker, summary, take_turns
+from benchmarks.worker import Worker, WorkerError, summary, take_turns
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ class Sizes:
     rollout      (robots, physics steps) of MuJoCo C
     pybullet     physics steps of one robot per core
     pairs, repeats   of the update
+    engines, turns   (pairs, repeats) of an update with each engine, and its runs
     scaling      (pairs, repeats) of updates from small to large
     block, ticks     rows x columns of episodes and control steps of the breakdown
     """
@@ -47,6 +48,8 @@ class Sizes:
     pybullet: int = 20_000
     pairs: int = 200
     repeats: int = 15
+    engines: tuple[int, int] = (200, 15)
+    turns: int = 2
     scaling: tuple[tuple[int, int], ...] = ((2, 15), (8, 15), (20, 15), (50, 15), (200, 15), (800, 15))
     block: tuple[int, int] = (3, 200)  # as two devices run the update
     ticks: int = 100
@@ -59,9 +62,12 @@ QUICK = Sizes(
     mjx=(256, 1, 40),
     rollout=(256, 100),
     pybullet=4_000,
+    engines=(20, 15),
+    turns=1,
     scaling=((2, 15), (20, 15)),
     ticks=20,
 )
+MJX_LIMIT = 1800.0  # [s] for compilation and first update with MJX, and for each further one
 TRAINED = Path("runs/quickstart")  # measured too when it is there
 
 
@@ -84,11 +90,16 @@ def measure(sizes: Sizes, console: Console) -> dict:
     report |= measure_physics(sizes, len(cores))
     console.print(f"one update: {2 * sizes.pairs} perturbations x {sizes.repeats} episodes ...")
     report |= measure_update(sizes, cores)
+    pairs, repeats = sizes.engines
+    console.print(f"one update of {2 * pairs * repeats:,} episodes with each engine (MJX takes minutes) ...")
+    report |= measure_engines(pairs, repeats, sizes.turns, console)
     console.print("parts of a control step ...")
     rows, columns = sizes.block
     with Worker("breakdown", {cores[0]}, rows=rows, columns=columns, ticks=sizes.ticks) as worker:
         worker.wait_ready()
-        report["breakdown"] = _run(worker)
+        found = _run(worker)
+    report["breakdown"] = found.pop("parts")
+    report["roofline"] = found
     report["batch_scaling"] = []
     for pairs, repeats in sizes.scaling:
         console.print(f"updates of {2 * pairs * repeats:,} episodes ...")
@@ -160,6 +171,32 @@ def measure_update(sizes: Sizes, cores: list[int]) -> dict:
     }
 
 
+def measure_engines(pairs: int, repeats: int, rounds: int, console: Console) -> dict:
+    """Time and memory of an update with each engine, all devices; None where MJX exceeds MJX_LIMIT or the memory."""
+    scale = [f"optimiser.num_directions={pairs}", f"optimiser.repeats={repeats}"]
+    try:
+        with ExitStack() as stack:
+            sides = {
+                engine: [
+                    stack.enter_context(Worker("update", limit=MJX_LIMIT, changes=[*scale, f"task.engine={engine}"]))
+                ]
+                for engine in ("fused", "mjx")
+            }
+            for (worker,) in sides.values():
+                worker.wait_ready()
+            measured = take_turns(sides, rounds)
+    except WorkerError as error:
+        console.print(str(error), highlight=False)
+        return {"engines": None}
+    return {
+        "engines": {
+            "episodes": 2 * pairs * repeats,
+            "update_s": {name: summary([s for s, _ in runs]) for name, runs in measured.items()},
+            "peak_memory_mb": {name: round(worker.peak_memory, 1) for name, (worker,) in sides.items()},
+        }
+    }
+
+
 def measure_batch(pairs: int, repeats: int, rounds: int) -> dict:
     """Time of an update and of its roll-outs, all devices, by the number of episodes."""
     changes = [f"optimiser.num_directions={pairs}", f"optimiser.repeats={repeats}"]
@@ -213,10 +250,21 @@ def show(report: dict, console: Console) -> None:
         highlight=False,
     )
 
+    if report["engines"]:
+        engines = report["engines"]
+        title = f"One update of {engines['episodes']:,} episodes by engine"
+        table = _table(title, "engine", "median [s]", "min", "max", "peak memory [MB]")
+        for name, seconds in engines["update_s"].items():
+            figures = (f"{seconds[key]:.3f}" for key in ("median", "min", "max"))
+            table.add_row(name, *figures, f"{engines['peak_memory_mb'][name]:,.0f}")
+        console.print(table)
+
     table = _table("Parts of a control step, one core", "part", "calls", "ns per episode", "share")
     for row in report["breakdown"]:
         table.add_row(row["part"], str(row["calls"]), f"{row['ns']:.0f}", f"{row['share']:.0%}")
     console.print(table)
+
+    show_roofline(report["breakdown"], report["roofline"], console)
 
     table = _table("Batch", "episodes", "update [s]", "roll-outs [s]", "us per episode", "peak memory [MB]")
     for row in report["batch_scaling"]:
@@ -228,6 +276,37 @@ def show(report: dict, console: Console) -> None:
             f"{row['peak_memory_mb']:,.0f}",
         )
     console.print(table)
+
+
+def show_roofline(parts: list[dict], roofline: dict, console: Console) -> None:
+    """Operations and bytes of each part per episode and control step, and the share of one core's peaks reached."""
+    peaks = roofline["peaks"]
+    title = "Roofline: an episode's control step, one core; shares of the peak and of the roof"
+    table = _table(title, "part", "kernels", "op", "kB", "op/B", "Gop/s", "peak", "roof")
+    for row in parts:
+        if "operations" not in row:
+            continue
+        rate, intensity = row["operations"] / row["ns"], row["operations"] / row["bytes"]
+        peak = peaks["fma_peak"] / 1e9
+        roof = min(peak, intensity * peaks["cache_bandwidth"] / 1e9)
+        table.add_row(
+            row["part"],
+            f"{row['kernels']:,.0f}",
+            f"{row['operations']:,.0f}",
+            f"{row['bytes'] / 1e3:.1f}",
+            f"{intensity:.2f}",
+            f"{rate:.1f}",
+            f"{rate / peak:.0%}",
+            f"{rate / roof:.0%}",
+        )
+    console.print(table)
+    best = {name: f"{value / 1e9:.1f}" for name, value in peaks.items()}
+    console.print(
+        f"peaks: {best['fma_peak']} Gop/s in multiply-adds of float32 (XLA {best['fma_xla']}, NumPy's matrix product "
+        f"{best['fma_blas']}); {best['cache_bandwidth']} GB/s at the {roofline['working_set_mb']:.1f} MB that a block "
+        f"of episodes uses, {best['memory_bandwidth']} GB/s in memory",
+        highlight=False,
+    )
 
 
 def _table(title: str, first: str, *columns: str) -> Table:

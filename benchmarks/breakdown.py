@@ -1,4 +1,4 @@
-"""Cost of a control step: its parts one by one, on one core, at the size of a block of episodes.
+"""Cost of a control step: its parts one by one, at the size of a block of episodes, beside the peaks of the core.
 
 Each part runs in a loop of its own whose state depends on its results, so that nothing is hoisted or dropped.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from typing import Any
 
 import jax
@@ -17,6 +18,8 @@ from ballmodel import flight, registry
 from ballmodel.flight import PaddlePose, ball_params
 from ballmodel.sampling import sample_pool
 from ballmodel.state import BallState
+from benchmarks import roofline
+from benchmarks.operations import count
 from mjx_tt.env.policy import PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import EpisodeState, TaskConfig
@@ -30,27 +33,37 @@ WHOLE = "control step"
 RUNS = 5  # of each part, of which the fastest counts: the others were disturbed
 
 
-def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], list[dict]]:
+def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], dict]:
     """Compiles the parts for a block of rows x columns episodes; the function returned measures them.
 
-    Each line: part, calls per control step, ns per episode and control step, share of the whole. "rest" is the whole
-    less the parts, and can be negative where a part alone costs more than in its place.
+    "parts", each: part, calls per control step, ns per episode and control step, share of the whole; operations,
+    transcendentals and bytes of the compiled program, likewise; its kernels per control step of the block. "rest" is
+    the whole less the parts, and can be negative where a part alone costs more than in its place. "peaks": what the
+    core reaches at best, see ``roofline.measure``; "working_set_mb": arguments and temporaries of the whole.
     """
     parts = _parts(TaskConfig(), rows, columns)
     loops = {name: (calls, *_compiled(step, start, ticks)) for name, (calls, step, start) in parts.items()}
 
-    def measure() -> list[dict]:
+    counts = {name: calls / ticks / (rows * columns) * count(run) for name, (calls, run, _) in loops.items()}
+    counts = {name: replace(each, kernels=each.kernels * rows * columns) for name, each in counts.items()}
+    memory = loops[WHOLE][1].memory_analysis()
+    working_set = memory.argument_size_in_bytes + memory.temp_size_in_bytes
+    peaks = roofline.measure(working_set)
+
+    def measure() -> dict:
         nanoseconds = {}
         for name, (calls, run, start) in loops.items():
             fastest = min(_seconds(run, start) for _ in range(RUNS))
             nanoseconds[name] = calls * fastest / ticks / (rows * columns) * 1e9
         whole = nanoseconds.pop(WHOLE)
         table: list[dict[str, Any]] = [
-            {"part": name, "calls": loops[name][0], "ns": ns} for name, ns in nanoseconds.items()
+            {"part": name, "calls": loops[name][0], "ns": ns, **asdict(counts[name])}
+            for name, ns in nanoseconds.items()
         ]
         table.append({"part": "rest", "calls": 1, "ns": whole - sum(nanoseconds.values())})
-        table.append({"part": WHOLE, "calls": 1, "ns": whole})
-        return [row | {"share": row["ns"] / whole} for row in table]
+        table.append({"part": WHOLE, "calls": 1, "ns": whole, **asdict(counts[WHOLE])})
+        parts = [row | {"share": row["ns"] / whole} for row in table]
+        return {"parts": parts, "peaks": peaks(), "working_set_mb": working_set / 1e6}
 
     return measure
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # a side without JAX does not load it
 
     State: TypeAlias = tuple[Array, Array]  # qpos, qvel
 
-Side = tuple[dict, Callable[[], float | list]]
+Side = tuple[dict, Callable[[], float | dict]]
 
 SIM_RATE = 300.0
 SUBSTEPS = 4  # physics steps per command
@@ -186,7 +186,7 @@ def _paper_trainer(changes: list[str]) -> tuple[Trainer, TrainState]:
 
 
 def breakdown(rows: int, columns: int, ticks: int) -> Side:
-    """The parts of a control step one by one; the work returns their times instead of an amount."""
+    """The parts of a control step one by one; the work returns times, counts and peaks instead of an amount."""
     from mjx_tt import platform
 
     platform.configure(1)

@@ -13,6 +13,7 @@ import os
 import resource
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from statistics import median
@@ -28,11 +29,17 @@ class WorkerError(RuntimeError):
 class Worker:
     """A process that runs ``side`` with the given sizes on ``cpus`` (all cores when None).
 
+    limit: seconds after which the process is ended while one waits for its answer; None: never.
     After ``close``, ``peak_memory`` [MB] holds its largest resident memory.
     """
 
     def __init__(
-        self, side: str, cpus: set[int] | None = None, environment: dict[str, str] | None = None, **sizes: Any
+        self,
+        side: str,
+        cpus: set[int] | None = None,
+        environment: dict[str, str] | None = None,
+        limit: float | None = None,
+        **sizes: Any,
     ) -> None:
         request = json.dumps({"side": side, "cpus": sorted(cpus) if cpus else None, "sizes": sizes})
         path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
@@ -46,7 +53,7 @@ class Worker:
         if self._process.stdin is None or self._process.stdout is None:
             raise WorkerError(f"{side}: its process has no pipes")
         self._orders, self._answers = self._process.stdin, self._process.stdout
-        self.side = side
+        self.side, self._limit = side, limit
         self.peak_memory = math.nan
 
     def wait_ready(self) -> dict:
@@ -79,7 +86,14 @@ class Worker:
             self._process.wait()
 
     def _answer(self) -> dict:
+        timer = threading.Timer(self._limit or threading.TIMEOUT_MAX, self._process.kill)
+        timer.daemon = True
+        timer.start()
         line = self._answers.readline()
+        late = not timer.is_alive()
+        timer.cancel()
+        if not line and late:
+            raise WorkerError(f"{self.side}: no answer within {self._limit:g} s")
         if not line:
             raise WorkerError(f"{self.side}: its process ended with status {self._process.wait()}; see above for why")
         return json.loads(line)

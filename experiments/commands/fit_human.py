@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -26,6 +30,8 @@ if TYPE_CHECKING:
     from ballmodel.fit_distribution import HumanReport
     from ballmodel.flight import BallParams
 
+PLAIN_SECONDS = 10.0  # between lines of progress when the output is no terminal
+
 app = command(
     "fit-human",
     "a human ball distribution from measured balls",
@@ -33,6 +39,7 @@ app = command(
   mjx-tt fit-human rallies.csv --out anna.yaml
   mjx-tt fit-human monday.mcap tuesday.mcap --out anna.yaml --name anna
   mjx-tt fit-human rallies.json --out deepmind.yaml          (DeepMind's ball states)
+  mjx-tt fit-human rallies.csv --fit nelder-mead --out anna.yaml     (the paper's fit: a tenth of a second a flight)
   mjx-tt fit-human rallies.csv --model world.yaml --serves --out anna.yaml --mixture anna_mixture.yaml
 
 Then write "balls: anna.yaml" in an experiment, or "balls: anna_mixture.yaml" for balls with spin that keep together
@@ -62,6 +69,10 @@ def fit_human(
     ] = None,
     min_samples: Annotated[int, count("balls that make a cluster (default: 5)")] = 5,
     format: Format = None,
+    fit: Annotated[
+        Literal["gauss-newton", "nelder-mead"],
+        Parameter(help="of the flights: all at once, or one by one as the paper's; both minimise the same distance"),
+    ] = "gauss-newton",
     model: Annotated[
         str | None, option("YAML", "simulation model in which the balls fly; one with lift finds each ball's spin")
     ] = None,
@@ -80,11 +91,16 @@ def fit_human(
     if eps is not None and not 0.0 < eps < float("inf"):
         raise ConfigError(f"--eps {eps:g}: a positive number is wanted")
     existing(*data, model)
+    if fit == "nelder-mead" and model is not None:
+        raise ConfigError(
+            f"--fit {fit} --model {model}: in a model, strokes are fitted together with their spins, which Nelder-Mead "
+            "does not find; leave one of the two out"
+        )
     if mixture is not None:
         suffix(mixture, ".yaml", ".yml")
     start_jax(None)
     from ballmodel.distribution import save_distribution
-    from ballmodel.fit_distribution import fit_human as fit
+    from ballmodel.fit_distribution import fit_human as fitted_box
     from ballmodel.flight import ball_params
     from ballmodel.trajectory import Dataset
     from experiments.measurements import read_all, start_states
@@ -93,6 +109,10 @@ def fit_human(
 
     screen, path = console(), Path(out)
     measured = read_all(list(data), format)
+    if fit == "nelder-mead" and not isinstance(measured, Dataset):
+        raise ConfigError(
+            f"{', '.join(data)}: holds start states, which need no fit; --fit {fit} is for trajectories, leave it out"
+        )
     world = checked("--model", ModelFile.load, model).model if model else None
     if world is not None and isinstance(measured, Dataset):
         checked("", diagnosis.check, measured.trajectories, measured.source)
@@ -100,7 +120,10 @@ def fit_human(
         screen.print(*lines, sep="\n", highlight=False)
     try:
         ball = world.ball if world is not None else ball_params()
-        distribution, report = fit(measured, ball, eps, min_samples, name or path.stem, serves)
+        with _progress(screen) as progress:
+            distribution, report = fitted_box(
+                measured, ball, eps, min_samples, name or path.stem, serves, fit, progress
+            )
     except ValueError as error:
         if isinstance(measured, Dataset):
             checked("", diagnosis.check, measured.trajectories, measured.source)
@@ -112,6 +135,35 @@ def fit_human(
     screen.print(f"distribution: {path}  (use it in an experiment as  balls: {path.name})", highlight=False)
     if mixture is not None:
         _fit_mixture(report, distribution, ball, Path(mixture), screen)
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[int, int], None]]:
+    """Display of flights fitted one by one: a live line in a terminal, plain lines elsewhere; at first nothing."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    columns = (TextColumn("flights fitted"), BarColumn(None), MofNCompleteColumn(), TextColumn("{task.description}"))
+    live = Progress(*columns, console=console, expand=True, disable=not console.is_terminal)
+    bar, began, last = None, time.monotonic(), time.monotonic()
+
+    def show(done: int, flights: int) -> None:
+        nonlocal bar, last
+        now = time.monotonic()
+        rate = done / max(now - began, 1e-3)
+        text = f"{rate:.0f} flights/s  {timedelta(seconds=round((flights - done) / rate))} left"
+        if console.is_terminal:
+            if bar is None:
+                live.start()
+                bar = live.add_task("", total=flights)
+            live.update(bar, completed=done, description=text)
+        elif now - last >= PLAIN_SECONDS or done == flights:
+            last = now
+            console.print(f"flights fitted: {done:,}/{flights:,}  {text}", highlight=False)
+
+    try:
+        yield show
+    finally:
+        live.stop()
 
 
 def _fit_mixture(report: HumanReport, box: BallDistribution, ball: BallParams, path: Path, console: Console) -> None:

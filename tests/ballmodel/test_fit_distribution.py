@@ -1,14 +1,18 @@
-"""Serves count from their bounce on the own side."""
+"""Serves count from their bounce on the own side; the paper's fit finds the numbers that Gauss-Newton finds."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from ballmodel.distribution import AXES, BallDistribution
 from ballmodel.fit_distribution import fit_human
 from ballmodel.flight import ball_params
-from ballmodel.io import MeasuredStates
+from ballmodel.io import MeasuredStates, read
 from ballmodel.state import BallState
+from ballmodel.trajectory import Dataset, Trajectory
+from tests.ballmodel.test_initial_state import flight
+from tests.support.paths import MEASURED
 
 
 def test_serves_start_behind_their_bounce():
@@ -27,3 +31,52 @@ def test_serves_start_behind_their_bounce():
     np.testing.assert_allclose(report.landed.position[1], bounce - 4.0 * 0.02, atol=0.06)
     assert np.all(report.landed.velocity[2] > 1.5) and box.velocity_min[2] > 1.5
     assert np.all(report.landing[1] < 0.0)
+
+
+def sixteen(box: BallDistribution) -> np.ndarray:
+    return np.concatenate([getattr(box, f"{part}_{end}") for part in AXES for end in ("min", "max")])
+
+
+def recording(n=12, noise=0.002):
+    """Throws of the paper's step in NumPy with tracker noise; their start states (6, n)."""
+    rng = np.random.default_rng(0)
+    starts = np.array([0.3, 1.3, 0.3, 0.0, -5.5, 1.2])[:, None] + rng.uniform(-0.05, 0.05, (6, n))
+    time = np.arange(0, 0.3, 1 / 125)
+    tracks = [flight(start, time) + rng.normal(0.0, noise, (3, len(time))) for start in starts.T]
+    return Dataset(tuple(Trajectory("s", str(i), time, x) for i, x in enumerate(tracks)), "throws"), starts
+
+
+def test_both_fits_find_the_same_sixteen_numbers():
+    """Within the tolerances of the simplex, and the box of the throws within the noise; one report of each flight."""
+    measured, starts = recording()
+    seen = []
+    newton, by_newton = fit_human(measured, ball_params())
+    simplex, by_simplex = fit_human(measured, ball_params(), fit="nelder-mead", progress=lambda *p: seen.append(p))
+    assert seen == [(i + 1, 12) for i in range(12)]
+    np.testing.assert_allclose(sixteen(simplex), sixteen(newton), atol=1e-4)
+    assert not np.array_equal(by_simplex.fit_rms, by_newton.fit_rms)  # two algorithms
+    assert np.all(by_newton.fit_rms <= by_simplex.fit_rms + 1e-12)
+    box = np.concatenate([simplex.position_min, simplex.velocity_min, simplex.position_max, simplex.velocity_max])
+    np.testing.assert_allclose(box, np.concatenate([starts.min(axis=1), starts.max(axis=1)]), atol=0.02)
+
+
+@pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")
+def test_both_fits_agree_on_a_ball_launcher():
+    measured = read(MEASURED / "aimy_launcher" / "mn5008_topspin.hdf5")
+    newton, _ = fit_human(measured, ball_params(), eps=100.0)
+    simplex, report = fit_human(measured, ball_params(), eps=100.0, fit="nelder-mead")
+    assert report.landing.shape[1] > 10
+    np.testing.assert_allclose(sixteen(simplex), sixteen(newton), atol=1e-4)
+
+
+def test_what_nelder_mead_cannot_fit_is_named():
+    measured, _ = recording(2)
+    with pytest.raises(ValueError, match=r"fit 'simplex' is not one of \('gauss-newton', 'nelder-mead'\)"):
+        fit_human(measured, ball_params(), fit="simplex")
+    short = Dataset(tuple(t.part(0, 3) for t in measured), "short")
+    with pytest.raises(ValueError, match="no trajectory to fit"):
+        fit_human(short, ball_params(), fit="nelder-mead")
+    still = np.zeros((3, 2))
+    states = MeasuredStates(np.arange(2), BallState(still, still, still), "states")
+    with pytest.raises(ValueError, match="states: holds start states; nelder-mead fits trajectories"):
+        fit_human(states, ball_params(), fit="nelder-mead")

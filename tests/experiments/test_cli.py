@@ -84,8 +84,9 @@ def test_help_and_refusals_do_not_wait_for_jax(tmp_path):
         --out a.png; render . --out a.txt; fit-human a.csv --out a.txt; fit-human a.csv --out a.yaml; import a.csv
         --out a.csv; run nowhere --robot rig; finetune nowhere --robot rig; is2r nowhere.yaml; compare nowhere.yaml;
         study-report nowhere; evaluate . --model nowhere.yaml; curves nowhere; pack nowhere; unpack nowhere.zip;
-        log lerobot nowhere --out a""",
-        2: "trian; train; evaluate . --episodes 0; rig --ports 1; log close a.mcap; run . --robot rig --backend tpu",
+        log lerobot nowhere --out a; fit-human file --fit nelder-mead --model file --out a.yaml""",
+        2: """trian; train; evaluate . --episodes 0; rig --ports 1; log close a.mcap; run . --robot rig --backend tpu;
+        fit-human file --fit simplex --out a.yaml""",
         0: "--version; --help",
     }
     lines = [([command, "--help"], 0) for command in COMMANDS]
@@ -270,8 +271,29 @@ def test_import_and_fit_human(tmp_path):
         [distribution.position_min + distribution.velocity_min, distribution.position_max + distribution.velocity_max]
     )
     np.testing.assert_allclose(box, [starts.min(axis=0), starts.max(axis=0)], atol=0.01)
+    paper = mjx_tt("fit-human", tmp_path / "b.csv", "--fit", "nelder-mead", "--out", tmp_path / "paper.yaml")
+    assert paper.returncode == 0, paper.stdout + paper.stderr
+    assert f"flights fitted: {n}/{n}" in paper.stdout and "flights/s" in paper.stdout
+    ours, theirs = (load_distribution(tmp_path / f"{name}.yaml") for name in ("anna", "paper"))
+    np.testing.assert_allclose(
+        theirs.velocity_min + theirs.landing_max, ours.velocity_min + ours.landing_max, atol=1e-4
+    )
     malformed = mjx_tt("import", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
     assert malformed.returncode == 1 and ".csv, .mcap" in malformed.stderr
+
+
+def test_what_nelder_mead_cannot_fit_is_refused(tmp_path, capsys):
+    fields = ("id", "pos_x", "pos_y", "pos_z", "vel_x", "vel_y", "vel_z", "w_vel_x", "w_vel_y", "w_vel_z")
+    ball = dict(zip(fields, (1, 0.0, 1.0, 0.3, 0.0, -5.0, 1.0, 0.0, 0.0, 0.0), strict=True))
+    (tmp_path / "states.json").write_text(json.dumps([ball]))
+    given = ["fit-human", str(tmp_path / "states.json"), "--fit", "nelder-mead", "--out", str(tmp_path / "a.yaml")]
+    assert cli.main([*given, "--model", str(tmp_path / "states.json")]) == 1
+    assert "leave one of the two out" in " ".join(capsys.readouterr().err.split())
+    assert cli.main(given) == 1
+    assert "holds start states, which need no fit" in " ".join(capsys.readouterr().err.split())
+    given[3] = "simplex"
+    assert cli.main(given) == 2
+    assert "gauss-newton" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -253,7 +253,10 @@ def test_paper_settings_are_the_papers():
         True,
         0.0,
     )
-    assert config.load(config.shipped()["paper"]).optimiser.repeats == 15
+    paper = config.load(config.shipped()["paper"])
+    assert paper.optimiser.repeats == 15
+    assert config.load(config.shipped()["paper_mjx"], ("task.engine=fused", "name=paper")) == paper
+    assert config.load(config.shipped()["paper_mjx"]).task.engine == "mjx"
     falling = config.load(config.shipped()["player3_m2"])
     sigma = build.experiment(falling, "player3_m2").bgs.sigma
     end = falling.training.updates

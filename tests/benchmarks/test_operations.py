@@ -1,0 +1,45 @@
+"""Operations of compiled programs against counts by hand."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from benchmarks import operations
+
+N = 4096
+
+
+@pytest.mark.optimised
+def test_loops_count_as_often_as_they_run():
+    """Ten times: four times a square and a sum, each stored; then a sine. XLA's own analysis has each of them once."""
+
+    def square(_, x):
+        return jax.lax.optimization_barrier(x * x + 0.1)
+
+    def outer(_, x):
+        return jax.lax.optimization_barrier(jnp.sin(jax.lax.fori_loop(0, 4, square, x)))
+
+    compiled = jax.jit(lambda x: jax.lax.fori_loop(0, 10, outer, x)).lower(jnp.ones(N)).compile()
+    counts = operations.count(compiled)
+    assert counts.operations == pytest.approx(10 * 4 * 2 * N, rel=0.01)  # and the loops' own counters
+    assert counts.transcendentals == 10 * N
+    assert counts.bytes == pytest.approx(10 * (4 + 1) * 2 * 4 * N, rel=0.1)  # and the copy of the argument
+    assert 10 * (4 + 1) <= counts.kernels <= 10 * (4 * 4 + 5)  # and those of the counters, fused or not
+    assert compiled.cost_analysis()["flops"] == pytest.approx(2 * N, rel=0.01)
+
+
+@pytest.mark.optimised
+def test_a_product_of_matrices():
+    compiled = jax.jit(jnp.matmul).lower(jnp.ones((8, 16)), jnp.ones((16, 32))).compile()
+    assert operations.count(compiled).operations == 2 * 8 * 16 * 32
+
+
+def test_a_loop_of_unknown_length_is_refused():
+    def double(x):
+        return jax.lax.while_loop(lambda x: x.sum() < 100.0, lambda x: 2.0 * x, x)
+
+    compiled = jax.jit(double).lower(jnp.ones(4)).compile()
+    with pytest.raises(ValueError, match="does not say how often its loop .* runs"):
+        operations.count(compiled)
