@@ -46,8 +46,9 @@ test: $(READY)
 	$(PYTEST) $(REALTIME) -m "not slow and realtime"
 
 test-slow: $(READY)
-	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m slow
+	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m "slow and not realtime"
 	USERS_FUSION=1 $(PYTEST) tests/experiments/study -m slow
+	$(PYTEST) $(REALTIME) -m "slow and realtime"
 
 test-all: test test-slow
 

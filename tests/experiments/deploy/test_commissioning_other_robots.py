@@ -175,6 +175,7 @@ def test_it_moves_armed_and_in_small_steps_only(rig, tmp_path, monkeypatch):
 
 
 @pytest.mark.realtime
+@pytest.mark.slow
 @pytest.mark.parametrize("doubt", ["cable", "motors", "axis"])
 def test_in_doubt_it_slows_down_and_holds(rig, tmp_path, monkeypatch, doubt):
     robot, running = rig

@@ -141,6 +141,7 @@ def test_another_robot_than_the_sessions_is_refused(tmp_path):
 
 
 @pytest.mark.realtime
+@pytest.mark.slow
 def test_a_session_on_the_rig_is_shown_when_the_robots_folder_is_gone(folder, tmp_path):
     robot = robots.load(folder)
     n, seen = robot.contract.n_joints, robot.contract.n_observation
