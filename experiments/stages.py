@@ -83,6 +83,30 @@ def interruptible() -> Iterator[None]:
         os.close(reading)
 
 
+@contextmanager
+def orderly() -> Iterator[threading.Event]:
+    """The event that the first Ctrl-C inside sets, for a loop that looks at it; a second one raises KeyboardInterrupt.
+
+    An exception would come between any two instructions: within Rich it leaves a console that prints nothing any more.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():  # where nobody may set handlers
+        yield asked
+        return
+    handler = signal.getsignal(signal.SIGINT)
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        if asked.is_set() and callable(handler):
+            handler(number, frame)
+        asked.set()
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
 def say(text: str) -> None:
     """A line on stderr, from a signal's handler too."""
     with contextlib.suppress(OSError):

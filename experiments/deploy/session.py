@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from typing import Any
 
 from rich.console import Console
 
+from experiments import stages
 from experiments.config import robot as robots
 from experiments.deploy import contradictions, robot_attachment, session_report
 from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, RECOVER, Keyboard, View
@@ -239,8 +241,14 @@ def run(
             console.print("press p to prepare the axes, a to arm; space stops", highlight=False)
         played = PlayedSession()
         try:
-            with Keyboard() as keyboard, View(console, f"{artefact} on {config.name}") as view:
-                problem = _watch(session, rig, keyboard, view, balls, rallies, seconds, console, played)
+            with (
+                stages.orderly() as asked,
+                Keyboard() as keyboard,
+                View(console, f"{artefact} on {config.name}") as view,
+            ):
+                problem = _watch(session, rig, keyboard, view, balls, rallies, seconds, console, played, asked)
+            if asked.is_set():
+                raise KeyboardInterrupt
             status = 1 if problem else 0
         except KeyboardInterrupt:
             status, problem = INTERRUPTED, "stopped by Ctrl-C"
@@ -282,13 +290,14 @@ def _watch(
     seconds: float | None,
     console: Console,
     played: PlayedSession,
+    asked: threading.Event,
 ) -> str | None:
-    """Play, adding to what was played; the reason why it ended early."""
+    """Play until the end or until it is ``asked`` for, adding to what was played; the reason why it ended early."""
     in_a_row = 0
     end = time.monotonic() + (float("inf") if seconds is None else seconds)
     heard = time.monotonic()
     recovery: Recovery | None = None
-    while time.monotonic() < end:
+    while time.monotonic() < end and not asked.is_set():
         if len(played.episodes) >= (balls or math.inf) or len(played.counted) >= (rallies or math.inf):
             break
         for message in session.messages(0.1):

@@ -63,3 +63,29 @@ def test_ctrl_c_where_python_runs_is_an_interruption_as_ever():
         time.sleep(5.0)
     assert signal.getsignal(signal.SIGINT) is before
     signal.signal(signal.SIGINT, outside)
+
+
+def test_an_orderly_end_is_asked_for_by_the_first_ctrl_c_and_forced_by_the_second():
+    """Signals come while Rich prints, where an exception could leave a console that is silent from then on."""
+    outside = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        text = io.StringIO()
+
+        class Interrupting(io.StringIO):
+            def write(self, words):
+                if not asked.is_set():
+                    signal.raise_signal(signal.SIGINT)
+                return text.write(words)
+
+        with stages.orderly() as asked:
+            assert not asked.is_set()
+            console = Console(file=Interrupting())
+            console.print("played")
+            assert asked.is_set()
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        console.print("summary")
+        assert text.getvalue() == "played\nsummary\n"
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, outside)

@@ -68,12 +68,13 @@ REPLAY = Replay(environments=16, capacity=20_000, random_steps=2_000, gradient_s
 @pytest.mark.parametrize(
     "learner, calls, left",
     [
-        (
+        pytest.param(
             PpoLearner(
                 Ppo(kind="ppo", environments=256, unroll=4, minibatches=4, learning_rate=1e-3, gae_lambda=1.0), Aim()
             ),
             120,
             0.4,
+            marks=pytest.mark.slow,
         ),
         pytest.param(
             OffPolicyLearner(REPLAY, Aim(), SacAgent(Sac(kind="sac", learning_rate=1e-3, layers=[64, 64]))),

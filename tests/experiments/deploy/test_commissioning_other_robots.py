@@ -71,7 +71,7 @@ class Operator:
         return lambda: any(text in said for said in self.said)
 
 
-@pytest.fixture(scope="module", params=[FR3, UR10E])
+@pytest.fixture(scope="module", params=[pytest.param(FR3, marks=pytest.mark.slow), UR10E])
 def rig(request):
     robot = simulated.load_shipped(request.param)
     balls = robots.throws_of(build.distribution("narrow", "test"), SimModel(), 8, 0)

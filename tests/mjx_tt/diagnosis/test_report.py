@@ -220,7 +220,7 @@ def test_page_starts_with_the_verdict_and_the_picture_that_shows_it(windy, windy
         body = (tmp_path / "report.html").read_text(encoding="utf-8").partition("<main>")[2]
         paragraph, _, rest = body.partition("</p>")
         assert unescape(re.sub("<[^>]*>", "", paragraph)).split("Verdict")[1].strip() == sentence
-        assert rest.lstrip().startswith("<figure><img")
+        assert rest.lstrip().startswith('<figure><div class="wide"><img')
     figure, caption = headline.picture(windy)
     assert "in x, across the table" in figure.axes[0].get_ylabel()
     low, high = (float(n) for n in re.findall(r"by ([+-][0-9.]+) mm", caption))

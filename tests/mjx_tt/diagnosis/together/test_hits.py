@@ -34,6 +34,7 @@ def fitted(rubber: Rubber, seed: int):
     return measured, JointPath(path.time, tuple(moved))
 
 
+@pytest.mark.slow
 def test_all_of_it_is_found_together_within_its_errors():
     measured, path = fitted(TRUTH, 7)
     found = hits.fit(balls.fit(measured, MODEL, FLIGHTS), measured, path, PRIOR)
