@@ -223,7 +223,9 @@ class Scene:
         name = film.title if self.count <= NAMED else str(table + 1)
         if not film.outcome or t < film.decided:
             return name
-        return f"{name}: {film.outcome if self.count == 1 else film.outcome.partition(',')[0]}"
+        if self.count == 1:
+            return f"{name}\n{film.outcome}"  # a line each: a phone has no room for both in one
+        return f"{name}: {film.outcome.partition(',')[0]}"
 
     def _at(self, table: int, position: np.ndarray) -> np.ndarray:
         return np.asarray(position) + np.array([self.offset(table), 0.0, 0.0])
