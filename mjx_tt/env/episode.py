@@ -42,6 +42,7 @@ class TaskConfig:
     reward_weights: tuple[float, ...] = field(default=tuple(rewards.SIM_WEIGHTS.values()))  # of ``terms``
     own_terms: tuple[Term, ...] = ()  # the user's, after the eleven
     robot: Robot = field(default_factory=robot.paper)
+    lanes: bool = True  # compile control steps lane by lane on processors (``mjx_tt.lanes``); else XLA does
 
     def __post_init__(self) -> None:
         if self.engine not in ENGINES:

@@ -24,6 +24,7 @@ from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import BallPool
 from ballmodel.state import BallState
 from mjx_tt.env.outgoing_ball import fly_out
+from mjx_tt.env.play import play
 from mjx_tt.env.policy import controller
 from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, EpisodeState, Task, TaskConfig
@@ -196,18 +197,7 @@ class Simulator:
 
     def _block(self, episodes: Episodes, controller: Controller) -> tuple[dict[str, Array], Array, Array]:
         task, config = self.task, self.config
-        prepared = task.prepare(episodes)
-
-        def running(carry: tuple[Array, EpisodeState]) -> Array:
-            tick, state = carry
-            return (tick < config.max_steps) & jnp.any(state.live)
-
-        def advance(carry: tuple[Array, EpisodeState]) -> tuple[Array, EpisodeState]:
-            tick, state = carry
-            return tick + 1, task.control_step(tick, state, episodes, prepared, controller)
-
-        state = task.reset(episodes, controller)
-        _, state = jax.lax.while_loop(running, advance, (jnp.int32(0), state))
+        state = play(task, controller, episodes)
         back = fly_out(config, state.ball, state.hit & state.finite, episodes.model)
         terms = reward_terms(state, back, config.own_terms)
         weights = np.asarray(config.reward_weights, terms.dtype)

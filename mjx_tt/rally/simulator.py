@@ -275,18 +275,7 @@ class RallySimulator:
     ) -> EpisodeState:
         """The robot's part of one episode: its last state."""
         episodes = self._episodes(key, model, ball, start)
-        task, controller = self.task, controller_of(policy)
-        prepared = task.prepare(episodes)
-
-        def running(carry: tuple[Array, EpisodeState]) -> Array:
-            tick, state = carry
-            return (tick < self.config.max_steps) & jnp.any(state.live)
-
-        def advance(carry: tuple[Array, EpisodeState]) -> tuple[Array, EpisodeState]:
-            tick, state = carry
-            return tick + 1, task.control_step(tick, state, episodes, prepared, controller)
-
-        return jax.lax.while_loop(running, advance, (jnp.int32(0), task.reset(episodes, controller)))[1]
+        return play(self.task, controller_of(policy), episodes)
 
     def _episodes(
         self, key: PRNGKeyArray, model: SimModel, ball: BallState, start: Float[Array, "joints L"]
