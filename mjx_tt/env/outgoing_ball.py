@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool
@@ -13,6 +12,7 @@ from ballmodel import flight
 from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
 from mjx_tt.env.episode import Return, TaskConfig
+from mjx_tt.lanes.loop import while_any
 from mjx_tt.robot.scalar_algebra import materialise
 from mjx_tt.sim.model import SimModel
 
@@ -29,16 +29,14 @@ def fly_out(config: TaskConfig, ball: BallState, hit: Bool[Array, "*batch"], mod
     zero = jnp.zeros_like(ball.position[0])
     outcome = Return(zero > 1.0, zero, zero > 1.0, jnp.asarray(ball.position[:2]))
 
-    def flying(carry: tuple) -> Array:
-        tick, _, live, _ = carry
-        return (tick < config.max_steps) & jnp.any(live)
+    def step(_: Array, state: tuple, params: BallParams, __: tuple) -> tuple:
+        ball, live, outcome = state
+        ball, outcome, live = fly_out_step(config, params, ball, live, outcome)
+        return ball, live, outcome
 
-    def advance(carry: tuple) -> tuple:
-        tick, ball, live, outcome = carry
-        new, outcome, live = fly_out_step(config, params, ball, live, outcome)
-        return tick + 1, new, live, outcome
-
-    return jax.lax.while_loop(flying, advance, (0, ball, hit, outcome))[3]
+    start = (ball, hit, outcome)
+    lanes = config.lanes and hit.ndim == 1
+    return while_any(lambda s: s[1], step, start, params, limit=config.max_steps, lanes=lanes)[2]
 
 
 def fly_out_step(

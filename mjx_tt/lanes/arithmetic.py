@@ -1,17 +1,20 @@
-"""Element-wise operations of JAX as LLVM's instructions."""
+"""JAX's element-wise operations as LLVM's instructions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from mjx_tt.lanes.emitter import FLOAT, Element, Emitter, Kind, Unsupported, constant
+from mjx_tt.lanes.emitter import CONTRACT, Element, Emitter, Kind, Unsupported, constant, is_float, is_signed
 
-Rule = Callable[[Emitter, list[Element], list[Any], Any, dict], Element]
+Elements = Sequence[Element]
+Dtypes = Sequence[Any]
 
-_COMPARE = {
+_BOOL = np.dtype(bool)
+# LLVM's conditions for floats, signed and unsigned numbers. With NaN only "ne" is true.
+_COMPARISONS: dict[str, tuple[str, str, str, Callable]] = {
     "eq": ("oeq", "eq", "eq", np.equal),
     "ne": ("une", "ne", "ne", np.not_equal),
     "lt": ("olt", "slt", "ult", np.less),
@@ -19,88 +22,111 @@ _COMPARE = {
     "gt": ("ogt", "sgt", "ugt", np.greater),
     "ge": ("oge", "sge", "uge", np.greater_equal),
 }
-_ARITHMETIC = {
+_SUMS: dict[str, tuple[str, str, Callable]] = {
     "add": ("fadd", "add", np.add),
     "add_any": ("fadd", "add", np.add),
     "sub": ("fsub", "sub", np.subtract),
     "mul": ("fmul", "mul", np.multiply),
 }
-_BITS = {
+_BITS: dict[str, tuple[str, Callable]] = {
     "and": ("and", np.bitwise_and),
     "or": ("or", np.bitwise_or),
     "xor": ("xor", np.bitwise_xor),
+}
+_SHIFTS: dict[str, tuple[str, Callable]] = {
     "shift_left": ("shl", np.left_shift),
     "shift_right_arithmetic": ("ashr", np.right_shift),
+    "shift_right_logical": ("lshr", lambda x, y: np.right_shift(x.view(np.uint32), y.view(np.uint32)).view(x.dtype)),
 }
-_FUNCTIONS = {
+_ROUNDINGS: dict[str, tuple[str, Callable]] = {
     "sqrt": ("sqrt", np.sqrt),
     "abs": ("fabs", np.abs),
     "floor": ("floor", np.floor),
     "ceil": ("ceil", np.ceil),
     "round": ("roundeven", np.rint),
 }
+_TO_EVEN = 1  # jax.lax.RoundingMethod.TO_NEAREST_EVEN
 
 
-def is_float(dtype: Any) -> bool:
-    return np.issubdtype(dtype, np.floating)
+def elementwise(e: Emitter, name: str, a: Elements, d: Dtypes, out: Any, params: dict | None = None) -> Element:
+    """The result, of dtype ``out``, of JAX's primitive ``name`` for one element of each operand. Raises Unsupported.
+
+    d: the operands' dtypes; params: the primitive's.
+    """
+    if name in _COMPARISONS:
+        real, signed, unsigned, fold = _COMPARISONS[name]
+        code = f"fcmp {real}" if is_float(d[0]) else f"icmp {signed if is_signed(d[0]) else unsigned}"
+        return e.apply(code + " {t0} {0}, {1}", fold, a, d, _BOOL)
+    if name in _SUMS:
+        real, whole, fold = _SUMS[name]
+        return e.apply((f"{real} {CONTRACT}" if is_float(out) else whole) + " {t} {0}, {1}", fold, a, d, out)
+    if name in _BITS:
+        code, fold = _BITS[name]
+        return e.apply(code + " {t} {0}, {1}", fold, a, d, out)
+    if name in _SHIFTS:
+        return _shift(e, name, a, d, out)
+    if name in _ROUNDINGS and is_float(out):
+        if name == "round" and int((params or {}).get("rounding_method", _TO_EVEN)) != _TO_EVEN:
+            raise Unsupported("rounding halves away from zero")
+        code, fold = _ROUNDINGS[name]
+        return e.apply("call {t} @llvm." + code + ".{s}({t} {0})", fold, a, d, out)
+    if name not in _OTHERS:
+        raise Unsupported(f"the operation {name}")
+    return _OTHERS[name](e, a, d, out, params or {})
 
 
-def _compare(e: Emitter, name: str, a: list[Element], d: list[Any]) -> Element:
-    real, signed, unsigned, fold = _COMPARE[name]
-    if is_float(d[0]):
-        code = f"fcmp {real}"
-    else:
-        code = f"icmp {signed if np.issubdtype(d[0], np.signedinteger) else unsigned}"
-    return e.apply(code + " {t0} {0}, {1}", fold, a, d, np.bool_)
-
-
-def _arithmetic(e: Emitter, name: str, a: list[Element], d: list[Any], out: Any) -> Element:
-    real, whole, fold = _ARITHMETIC[name]
-    code = f"{real} {FLOAT}" if is_float(out) else whole
+def _shift(e: Emitter, name: str, a: Elements, d: Dtypes, out: Any) -> Element:
+    by = e.forced(a[1])
+    if by.kind is not Kind.CONSTANT or not 0 <= by.value < 32 or np.dtype(out).itemsize != 4:
+        raise Unsupported(f"{name} by anything but a constant below 32")
+    code, fold = _SHIFTS[name]
     return e.apply(code + " {t} {0}, {1}", fold, a, d, out)
 
 
-def _divide(e: Emitter, a: list[Element], d: list[Any], out: Any) -> Element:
+def _divide(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
     if is_float(out):
-        return e.apply(f"fdiv {FLOAT}" + " {t} {0}, {1}", np.divide, a, d, out)
-    code = "sdiv" if np.issubdtype(out, np.signedinteger) else "udiv"
-    return e.apply(code + " {t} {0}, {1}", lambda x, y: np.fix(x / y), a, d, out)
+        return e.apply(f"fdiv {CONTRACT}" + " {t} {0}, {1}", np.divide, a, d, out)
+    _safe_divisor(e, a[1])
+    return e.apply(("sdiv" if is_signed(out) else "udiv") + " {t} {0}, {1}", lambda x, y: np.trunc(x / y), a, d, out)
 
 
-def _remainder(e: Emitter, a: list[Element], d: list[Any], out: Any) -> Element:
+def _remainder(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
     if is_float(out):
-        raise Unsupported("rem of floats")
-    divisor = e.forced(a[1])
-    if np.issubdtype(out, np.signedinteger) and divisor.kind is Kind.CONSTANT and e.forced(a[0]).kind is Kind.VECTOR:
-        return _small_remainder(e, a[0], divisor, d, out)
-    code = "srem" if np.issubdtype(out, np.signedinteger) else "urem"
-    return e.apply(code + " {t} {0}, {1}", np.fmod, a, d, out)
+        raise Unsupported("the remainder of floats")
+    _safe_divisor(e, a[1])
+    return e.apply(("srem" if is_signed(out) else "urem") + " {t} {0}, {1}", np.fmod, a, d, out)
 
 
-def _small_remainder(e: Emitter, a: Element, divisor: Element, d: list[Any], out: Any) -> Element:
-    return e.apply("srem {t} {0}, {1}", np.fmod, [a, divisor], d, out)
+def _safe_divisor(e: Emitter, divisor: Element) -> None:
+    """The processor stops at whole divisions by 0, and by -1 of the least number."""
+    divisor = e.forced(divisor)
+    if divisor.kind is not Kind.CONSTANT or divisor.value in (0, -1):
+        raise Unsupported("a whole division by anything but a constant")
 
 
-def _extreme(e: Emitter, name: str, a: list[Element], d: list[Any], out: Any) -> Element:
-    """min or max; NaN if one of both is."""
-    least = name == "min"
-    fold = np.minimum if least else np.maximum
-    a = [e.forced(x) for x in a]
-    if not is_float(out):
-        code = {True: ("smin", "smax"), False: ("umin", "umax")}[bool(np.issubdtype(out, np.signedinteger))][not least]
-        if out == np.bool_:
+def _extreme(least: bool) -> Callable:
+    """min or max; NaN if one of both is NaN."""
+    fold, test = (np.minimum, "olt") if least else (np.maximum, "ogt")
+
+    def rule(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+        if out == _BOOL:
             return e.apply(("and" if least else "or") + " {t} {0}, {1}", fold, a, d, out)
-        return e.apply("call {t} @llvm." + code + ".{s}({t} {0}, {t} {1})", fold, a, d, out)
-    if a[1].kind is Kind.CONSTANT:
-        a = a[::-1]
-    # The processor's own instruction: the second operand where one is NaN.
-    test = e.apply(f"fcmp {'olt' if least else 'ogt'}" + " {t0} {0}, {1}", np.less if least else np.greater, a, d, np.bool_)
-    best = _select(e, test, a[0], a[1], out)
-    if a[0].kind is Kind.CONSTANT:
-        if a[1].kind is Kind.CONSTANT:
-            return constant(fold(a[0].value, a[1].value), out)
-        return best
-    return _select(e, e.apply("fcmp uno {t0} {0}, {0}", np.isnan, a[:1], d[:1], np.bool_), a[0], best, out)
+        if not is_float(out):
+            code = ("s" if is_signed(out) else "u") + ("min" if least else "max")
+            return e.apply("call {t} @llvm." + code + ".{s}({t} {0}, {t} {1})", fold, a, d, out)
+        one, other = (e.forced(x) for x in a)
+        if other.kind is Kind.CONSTANT:
+            one, other = other, one
+        if other.kind is Kind.CONSTANT:
+            return constant(fold(one.value, other.value), out)
+        # Compare and select are the processor's own min and max, which give the second operand where one is NaN.
+        first = e.apply(f"fcmp {test}" + " {t0} {0}, {1}", fold, [one, other], d, _BOOL)
+        best = _select(e, first, one, other, out)
+        if one.kind is Kind.CONSTANT:
+            return best
+        return _select(e, e.apply("fcmp uno {t0} {0}, {0}", np.isnan, [one], d[:1], _BOOL), one, best, out)
+
+    return rule
 
 
 def _select(e: Emitter, test: Element, yes: Element, no: Element, out: Any) -> Element:
@@ -109,132 +135,116 @@ def _select(e: Emitter, test: Element, yes: Element, no: Element, out: Any) -> E
         return e.forced(yes if test.value else no)
     yes, no = e.forced(yes), e.forced(no)
     if test.kind is Kind.SCALAR and Kind.VECTOR in (yes.kind, no.kind):
-        kind = e.vector_type(out)
-        return Element(
-            Kind.VECTOR, e.emit(f"select i1 {test.value}, {kind} {e.vector(yes, out)}, {kind} {e.vector(no, out)}")
-        )
-    return e.apply("select {t0} {0}, {t} {1}, {t} {2}", np.where, [test, yes, no], [np.bool_, out, out], out)
+        t = e.vector_type(out)
+        made = e.emit(f"select i1 {test.value}, {t} {e.vector(yes, out)}, {t} {e.vector(no, out)}")
+        return Element(Kind.VECTOR, made)
+    return e.apply("select {t0} {0}, {t1} {1}, {t2} {2}", np.where, [test, yes, no], [_BOOL, out, out], out)
 
 
-def _convert(e: Emitter, a: Element, source: Any, target: Any) -> Element:
-    if source == target:
-        return a
-    a = e.forced(a)
-
-    def apply(code: str) -> Element:
-        return e.apply(code + " {t0} {0} to {t}", lambda x: np.asarray(x).astype(target), [a], [source], target)
-
-    if target == np.bool_:
-        code = "fcmp une {t0} {0}, zeroinitializer" if is_float(source) else "icmp ne {t0} {0}, zeroinitializer"
-        if a.kind is not Kind.VECTOR:
-            code = code.replace("zeroinitializer", "0.0" if is_float(source) else "0")
-        return e.apply(code, lambda x: x != 0, [a], [source], target)
-    if is_float(source):
-        signed = np.issubdtype(target, np.signedinteger)
-        return e.apply(
-            "call {t} @llvm." + ("fptosi" if signed else "fptoui") + ".sat.{r}({t0} {0})"
-            if False
-            else ("fptosi" if signed else "fptoui") + " {t0} {0} to {t}",
-            lambda x: np.asarray(x).astype(target),
-            [a],
-            [source],
-            target,
-        )
-    if is_float(target):
-        signed = np.issubdtype(source, np.signedinteger)
-        return apply("sitofp" if signed else "uitofp")
-    here, there = np.dtype(source).itemsize, np.dtype(target).itemsize
-    if source == np.bool_:
-        return apply("zext")
-    if here == there:
-        return Element(a.kind, a.value if a.kind is not Kind.CONSTANT else np.asarray(a.value).astype(target)[()])
-    if here > there:
-        return apply("trunc")
-    return apply("sext" if np.issubdtype(source, np.signedinteger) else "zext")
+def _select_n(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+    if len(a) != 3 or d[0] != _BOOL:
+        raise Unsupported("a selection between more than two")
+    return _select(e, a[0], a[2], a[1], out)
 
 
-def _sign(e: Emitter, a: list[Element], d: list[Any], out: Any) -> Element:
-    zero, one = constant(0, out), constant(1, out)
-    up = _select(e, _compare(e, "gt", [a[0], zero], [out, out]), one, a[0], out)
-    return _select(e, _compare(e, "lt", [a[0], zero], [out, out]), constant(-1, out), up, out)
+def _convert(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+    source, x = d[0], e.forced(a[0])
+    if source == out:
+        return x
+    if x.kind is Kind.CONSTANT:
+        return constant(x.value, out)
+    if out == _BOOL:
+        return elementwise(e, "ne", [x, constant(0, source)], [source, source], _BOOL)
+    if is_float(source) and is_float(out):
+        raise Unsupported(f"a conversion from {source} to {out}")
+    if is_float(source):  # as XLA: the nearest number that exists, 0 for NaN
+        code = "fptosi" if is_signed(out) else "fptoui"
+        template = "call {t} @llvm." + code + ".sat.{s}.{s0}({t0} {0})"
+    elif is_float(out):
+        template = ("sitofp" if is_signed(source) else "uitofp") + " {t0} {0} to {t}"
+    elif source != _BOOL and np.dtype(source).itemsize == np.dtype(out).itemsize:
+        return x
+    elif source != _BOOL and np.dtype(source).itemsize > np.dtype(out).itemsize:
+        template = "trunc {t0} {0} to {t}"
+    else:
+        template = ("sext" if is_signed(source) else "zext") + " {t0} {0} to {t}"
+    return e.apply(template, lambda v: v, [x], [source], out)
 
 
-def elementwise(e: Emitter, name: str, a: list[Element], d: list[Any], out: Any, params: dict) -> Element:
-    """The result of the primitive ``name`` for one element of each operand. Raises Unsupported.
-
-    d: the operands' dtypes; out: the result's.
-    """
-    if name in _COMPARE:
-        return _compare(e, name, a, d)
-    if name in _ARITHMETIC:
-        return _arithmetic(e, name, a, d, out)
-    if name in _BITS:
-        code, fold = _BITS[name]
-        return e.apply(code + " {t} {0}, {1}", fold, a, d, out)
-    if name == "abs" and not is_float(out):
-        return e.apply("call {t} @llvm.abs.{s}({t} {0}, i1 false)", np.abs, a, d, out)
-    if name in _FUNCTIONS and is_float(out):
-        if name == "round" and int(params.get("rounding_method", 1)) != 1:
-            raise Unsupported("rounding away from zero")
-        code, fold = _FUNCTIONS[name]
-        return e.apply("call {t} @llvm." + code + ".{s}({t} {0})", fold, a, d, out)
-    match name:
-        case "div":
-            return _divide(e, a, d, out)
-        case "rem":
-            return _remainder(e, a, d, out)
-        case "min" | "max":
-            return _extreme(e, name, a, d, out)
-        case "neg":
-            if is_float(out):
-                return e.apply("fneg {t} {0}", np.negative, a, d, out)
-            return _arithmetic(e, "sub", [constant(0, out), a[0]], [out, out], out)
-        case "not":
-            return e.apply("xor {t} {0}, {1}", lambda x, y: np.invert(x), [a[0], constant(-1 if out != np.bool_ else 1, out)], [out, out], out)
-        case "select_n":
-            if len(a) != 3 or d[0] != np.bool_:
-                raise Unsupported("select_n of more than two")
-            return _select(e, a[0], a[2], a[1], out)
-        case "convert_element_type":
-            return _convert(e, a[0], d[0], out)
-        case "bitcast_convert_type":
-            if is_float(out) == is_float(d[0]):
-                return a[0]
-            return e.apply("bitcast {t0} {0} to {t}", lambda x: np.asarray(x).view(out)[()], a, d, out)
-        case "is_finite":
-            size = e.apply("call {t0} @llvm.fabs.{s}({t0} {0})", np.abs, a, d, d[0])
-            return e.apply("fcmp olt {t0} {0}, {1}", np.less, [size, constant(np.inf, d[0])], [d[0]] * 2, np.bool_)
-        case "square":
-            return _arithmetic(e, "mul", [a[0], a[0]], [out, out], out)
-        case "rsqrt":
-            root = elementwise(e, "sqrt", a, d, out, {})
-            return _divide(e, [constant(1, out), root], [out, out], out)
-        case "integer_pow":
-            return _power(e, a[0], int(params["y"]), out)
-        case "sign":
-            return _sign(e, a, d, out)
-        case "clamp":
-            low = _extreme(e, "max", [a[0], a[1]], [out, out], out)
-            return _extreme(e, "min", [low, a[2]], [out, out], out)
-        case "shift_right_logical":
-            return e.apply("lshr {t} {0}, {1}", _logical_shift, a, d, out)
-        case "copy" | "copy_p" | "stop_gradient":
-            return a[0]
-    raise Unsupported(f"the operation {name}")
+def _bitcast(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+    x = e.forced(a[0])
+    if x.kind is Kind.CONSTANT:
+        return Element(Kind.CONSTANT, np.asarray(x.value).view(out)[()])
+    if is_float(out) == is_float(d[0]):
+        return x
+    return e.apply("bitcast {t0} {0} to {t}", lambda v: v, [x], d, out)
 
 
-def _logical_shift(x: Any, y: Any) -> Any:
-    return np.right_shift(np.asarray(x).astype(np.uint32), np.asarray(y).astype(np.uint32)).astype(np.asarray(x).dtype)
-
-
-def _power(e: Emitter, x: Element, n: int, out: Any) -> Element:
-    if n < 0:
-        return _divide(e, [constant(1, out), _power(e, x, -n, out)], [out, out], out)
-    result, square = None, x
+def _power(e: Emitter, a: Elements, d: Dtypes, out: Any, params: dict) -> Element:
+    n, square, result = abs(int(params["y"])), a[0], constant(1, out)
     while n:
         if n & 1:
-            result = square if result is None else _arithmetic(e, "mul", [result, square], [out, out], out)
+            result = square if e.forced(result).kind is Kind.CONSTANT else _times(e, result, square, out)
         n >>= 1
-        if n:
-            square = _arithmetic(e, "mul", [square, square], [out, out], out)
-    return constant(1, out) if result is None else result
+        square = _times(e, square, square, out) if n else square
+    return result if int(params["y"]) >= 0 else _divide(e, [constant(1, out), result], [out, out], out, {})
+
+
+def _times(e: Emitter, x: Element, y: Element, out: Any) -> Element:
+    return elementwise(e, "mul", [x, y], [out, out], out)
+
+
+def _clamp(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+    low, x, high = a
+    return elementwise(e, "min", [elementwise(e, "max", [low, x], [out] * 2, out), high], [out] * 2, out)
+
+
+def _sign(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+    zero = constant(0, out)
+    above, below = (elementwise(e, test, [a[0], zero], [out, out], _BOOL) for test in ("gt", "lt"))
+    return _select(e, above, constant(1, out), _select(e, below, constant(-1, out), a[0], out), out)
+
+
+def _is_finite(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+    size = elementwise(e, "abs", a, d, d[0])
+    return elementwise(e, "lt", [size, constant(np.inf, d[0])], [d[0], d[0]], _BOOL)
+
+
+def _negate(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+    if is_float(out):
+        return e.apply("fneg {t} {0}", np.negative, a, d, out)
+    return elementwise(e, "sub", [constant(0, out), a[0]], [out, out], out)
+
+
+def _not(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+    ones = constant(True if out == _BOOL else np.invert(np.zeros((), out)), out)
+    return elementwise(e, "xor", [a[0], ones], [out, out], out)
+
+
+def _absolute(e: Emitter, a: Elements, d: Dtypes, out: Any, _: dict) -> Element:
+    return e.apply("call {t} @llvm.abs.{s}({t} {0}, i1 false)", np.abs, a, d, out)
+
+
+_OTHERS: dict[str, Callable[[Emitter, Elements, Dtypes, Any, dict], Element]] = {
+    "div": _divide,
+    "rem": _remainder,
+    "min": _extreme(True),
+    "max": _extreme(False),
+    "select_n": _select_n,
+    "convert_element_type": _convert,
+    "bitcast_convert_type": _bitcast,
+    "integer_pow": _power,
+    "clamp": _clamp,
+    "sign": _sign,
+    "is_finite": _is_finite,
+    "neg": _negate,
+    "not": _not,
+    "abs": _absolute,
+    "square": lambda e, a, d, out, _: _times(e, a[0], a[0], out),
+    "rsqrt": lambda e, a, d, out, _: _divide(
+        e, [constant(1, out), elementwise(e, "sqrt", a, d, out)], [out, out], out, {}
+    ),
+    "copy": lambda e, a, d, out, _: a[0],
+    "copy_p": lambda e, a, d, out, _: a[0],
+    "stop_gradient": lambda e, a, d, out, _: a[0],
+}

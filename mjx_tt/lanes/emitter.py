@@ -1,14 +1,14 @@
-"""LLVM instructions for the lanes of a batch: one vector register holds one number of ``width`` episodes.
+"""LLVM's instructions for the lanes of a batch: a vector register holds one number of each of ``width`` lanes.
 
-An element is a number of a batch's array: a constant, a scalar that all lanes share, a vector over the lanes, or
-something that is made only if it is asked for. Arithmetic on constants is done here, on scalars once for all lanes;
-what was computed once is not computed again.
+An element is one number of an array for every lane: a constant, a scalar that all lanes share, a vector over the lanes,
+or something that is made only if it is asked for. Arithmetic on constants is done here and on scalars once for all
+lanes; what was computed is not computed again.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -17,34 +17,43 @@ import numpy as np
 
 
 class Unsupported(Exception):
-    """A program that cannot be compiled lane by lane; the message names the operation."""
+    """The program cannot be compiled lane by lane; the message names what is in the way."""
 
 
 class Kind(Enum):
     CONSTANT = 0  # value: a NumPy scalar
     SCALAR = 1  # value: the name of an instruction's result
-    VECTOR = 2  # the same
-    LAZY = 3  # value: a function that returns an element
+    VECTOR = 2  # likewise
+    LAZY = 3  # value: a function without arguments that returns an element
 
 
 @dataclass(eq=False, slots=True)
 class Element:
-    """A number of each lane."""
+    """One number of an array, for every lane."""
 
     kind: Kind
     value: Any
 
 
-TYPES = {"float32": "float", "int32": "i32", "uint32": "i32", "bool": "i1", "int8": "i8", "uint8": "i8"}
-FLOAT = "contract"  # a product and a sum may be rounded once
+_TYPES = {"float32": "float", "int32": "i32", "uint32": "i32", "bool": "i1", "int8": "i8", "uint8": "i8"}
+_SUFFIXES = {"float": "f32"}  # of intrinsics' names
+CONTRACT = "contract"  # a product and a sum may be rounded once
 
 
 def type_of(dtype: Any) -> str:
     """LLVM's type of a number. Raises Unsupported."""
     name = np.dtype(dtype).name
-    if name not in TYPES:
+    if name not in _TYPES:
         raise Unsupported(f"numbers of type {name}")
-    return TYPES[name]
+    return _TYPES[name]
+
+
+def is_float(dtype: Any) -> bool:
+    return bool(np.issubdtype(dtype, np.floating))
+
+
+def is_signed(dtype: Any) -> bool:
+    return bool(np.issubdtype(dtype, np.signedinteger))
 
 
 def constant(value: Any, dtype: Any) -> Element:
@@ -52,7 +61,7 @@ def constant(value: Any, dtype: Any) -> Element:
 
 
 def literal(value: Any) -> str:
-    """A NumPy scalar as LLVM writes it: floats by the bits of the double of the same value."""
+    """A NumPy scalar as LLVM writes it; floats by the bits of the double of the same value."""
     if isinstance(value, np.bool_):
         return "true" if value else "false"
     if isinstance(value, np.floating):
@@ -61,25 +70,30 @@ def literal(value: Any) -> str:
 
 
 class Emitter:
-    """Instructions of one function, in order."""
+    """The instructions of one function, in order.
+
+    width: lanes of a vector; entry: reservations on the stack; lines: the rest.
+    """
 
     def __init__(self, width: int) -> None:
         self.width = width
-        self.entry: list[str] = []  # reservations on the stack
+        self.entry: list[str] = []
         self.lines: list[str] = []
         self._names = 0
-        self._known: dict[tuple, str] = {}
+        self._known: dict[str, str] = {}
 
     def name(self) -> str:
         self._names += 1
         return f"%v{self._names}"
 
     def emit(self, instruction: str) -> str:
-        """Name of the instruction's result; the same instruction is emitted once."""
-        return self._emit(("", instruction), instruction)
+        """The name of a result that depends on the operands alone: the same instruction is emitted once."""
+        if instruction not in self._known:
+            self._known[instruction] = self.again(instruction)
+        return self._known[instruction]
 
     def again(self, instruction: str) -> str:
-        """The same for an instruction whose result may differ from time to time."""
+        """The name of a result that may differ from time to time."""
         name = self.name()
         self.lines.append(f"{name} = {instruction}")
         return name
@@ -89,31 +103,26 @@ class Emitter:
         self.lines.append(instruction)
 
     def reserve(self, size: int, align: int = 64) -> str:
-        """Bytes on the stack for the whole function."""
+        """A pointer to bytes on the stack, for the whole function."""
         name = self.name()
-        self.entry.append(f"{name} = alloca [{size} x i8], align {align}")
+        self.entry.append(f"{name} = alloca [{max(size, 1)} x i8], align {align}")
         return name
-
-    def _emit(self, key: tuple, instruction: str) -> str:
-        if key not in self._known:
-            self._known[key] = self.again(instruction)
-        return self._known[key]
 
     def vector_type(self, dtype: Any) -> str:
         return f"<{self.width} x {type_of(dtype)}>"
 
     def forced(self, element: Element) -> Element:
-        """The element, made if it was not yet."""
+        """The element, made now if it was not yet."""
         while element.kind is Kind.LAZY:
             made = self.forced(element.value())
             element.kind, element.value = made.kind, made.value
         return element
 
-    def scalar(self, element: Element, dtype: Any) -> str:
+    def scalar(self, element: Element) -> str:
         """An operand of the scalar type. Raises Unsupported for a vector."""
         element = self.forced(element)
         if element.kind is Kind.VECTOR:
-            raise Unsupported("a number of a lane where one for all is needed")
+            raise Unsupported("a number of each lane where one for all of them is needed")
         return literal(element.value) if element.kind is Kind.CONSTANT else element.value
 
     def vector(self, element: Element, dtype: Any) -> str:
@@ -129,21 +138,28 @@ class Emitter:
         return self.emit(f"shufflevector {kind} {first}, {kind} poison, <{self.width} x i32> zeroinitializer")
 
     def apply(
-        self, template: str, fold: Callable, elements: list[Element], dtypes: list[Any], out: Any
+        self, template: str, fold: Callable, elements: Sequence[Element], dtypes: Sequence[Any], out: Any
     ) -> Element:
-        """``template`` with {0}, {1}, ... for the operands, {t0}, ... for their types and {t} for the result's.
+        """The result of an instruction of dtype ``out``.
 
-        fold: what does the same to NumPy scalars.
+        template: with {0}, {1}, ... for the operands, {t0}, {t1}, ... for their types, {t} for the result's, {s} and {s0}
+        for the result's and the first operand's in the name of an intrinsic
+        fold: does the same to NumPy scalars
         """
         elements = [self.forced(e) for e in elements]
         if all(e.kind is Kind.CONSTANT for e in elements):
             with np.errstate(all="ignore"):
                 return constant(fold(*(e.value for e in elements)), out)
         vector = any(e.kind is Kind.VECTOR for e in elements)
-        operand = self.vector if vector else self.scalar
-        kind = self.vector_type if vector else type_of
-        names = [operand(e, d) for e, d in zip(elements, dtypes, strict=True)]
-        types = {f"t{i}": kind(d) for i, d in enumerate(dtypes)} | {"t": kind(out)}
-        suffix = {"float": "f32", "i32": "i32"}.get(type_of(dtypes[-1]), "")
-        types["s"] = f"v{self.width}{suffix}" if vector else suffix
-        return Element(Kind.VECTOR if vector else Kind.SCALAR, self.emit(template.format(*names, **types)))
+        if vector:
+            names = [self.vector(e, d) for e, d in zip(elements, dtypes, strict=True)]
+        else:
+            names = [self.scalar(e) for e in elements]
+        kind, prefix = (self.vector_type, f"v{self.width}") if vector else (type_of, "")
+
+        def suffix(dtype: Any) -> str:
+            return prefix + _SUFFIXES.get(type_of(dtype), type_of(dtype))
+
+        fields = {f"t{i}": kind(d) for i, d in enumerate(dtypes)}
+        fields |= {"t": kind(out), "s": suffix(out), "s0": suffix(dtypes[0])}
+        return Element(Kind.VECTOR if vector else Kind.SCALAR, self.emit(template.format(*names, **fields)))

@@ -1,4 +1,4 @@
-"""Machine code of this processor from LLVM's instructions, kept for the next process."""
+"""Machine code for this processor from LLVM's text, kept on disk for the next process."""
 
 from __future__ import annotations
 
@@ -11,51 +11,74 @@ from pathlib import Path
 
 import llvmlite.binding as llvm
 
-_ENGINES: list[llvm.ExecutionEngine] = []  # the code lives as long as its engine
-
-
-@cache
-def target() -> llvm.TargetMachine:
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    features = llvm.get_host_cpu_features().flatten()
-    chosen = llvm.Target.from_default_triple()
-    return chosen.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=2, jit=True)
+_ENGINES: list[llvm.ExecutionEngine] = []  # machine code lives as long as its engine
 
 
 @cache
 def width() -> int:
-    """Numbers of 4 bytes in a register, times what keeps its units busy."""
-    features = llvm.get_host_cpu_features()
-    import os
-    return int(os.environ.get("LW", 16 if features.get("avx512f") else 8))
+    """Lanes of a vector: 16 with AVX-512, whose registers hold as many float32; 8 elsewhere."""
+    return 16 if llvm.get_host_cpu_features().get("avx512f") else 8
 
 
-def compile(text: str, function: str, kept: Path | None) -> ctypes.c_void_p:
-    """Address of ``function`` in a module of LLVM's text."""
-    machine = target()
-    module = llvm.parse_assembly(text)
-    module.verify()
-    key = hashlib.sha256("\0".join([text, str(llvm.llvm_version_info), llvm.get_host_cpu_name()]).encode()).hexdigest()
-    path = kept / f"{key}.o" if kept else None
-    if path and path.exists():
-        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(path.read_bytes()))
-    else:
-        options = llvm.create_pipeline_tuning_options(speed_level=2)
-        options.loop_unrolling = False
-        options.slp_vectorization = False
-        options.loop_vectorization = False
-        builder = llvm.create_pass_builder(machine, options)
-        builder.getModulePassManager().run(module, builder)
-        code = machine.emit_object(module)
+@cache
+def _machine() -> llvm.TargetMachine:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    features = llvm.get_host_cpu_features().flatten()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=features, opt=2, jit=True
+    )
+
+
+def compiled(text: str, function: str, folder: Path | None) -> ctypes.c_void_p:
+    """The address of ``function`` of a module in LLVM's text.
+
+    folder: where machine code is kept, by a digest of the text, the processor and LLVM's version.
+    """
+    built_for = (llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(), str(llvm.llvm_version_info))
+    path = folder / f"{_digest('|'.join((text, *built_for)).encode())}.o" if folder else None
+    code = _kept(path) if path else None
+    if code is None:
+        code = _built(text)
         if path:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-                file.write(code)
-            os.replace(file.name, path)
-        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(code))
+            _keep(path, code)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _ENGINES.append(engine)
     return ctypes.c_void_p(engine.get_function_address(function))
+
+
+def _built(text: str) -> bytes:
+    module = llvm.parse_assembly(text)
+    module.verify()
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    # Every number is a vector already, and what is a loop shall stay one.
+    options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
+    builder = llvm.create_pass_builder(_machine(), options)
+    builder.getModulePassManager().run(module, builder)
+    return _machine().emit_object(module)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _kept(path: Path) -> bytes | None:
+    """A file begins with the digest of what follows: LLVM would end the process over a damaged one."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    return data[64:] if _digest(data[64:]).encode() == data[:64] else None
+
+
+def _keep(path: Path, code: bytes) -> None:
+    """Whole or not at all; a folder that cannot be written costs the next process some seconds, nothing else."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+            file.write(_digest(code).encode() + code)
+        os.replace(file.name, path)
+    except OSError:
+        return
