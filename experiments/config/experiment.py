@@ -83,6 +83,8 @@ class Task(Section):
 
     engine: Literal["fused", "mjx"] = "fused"
     """Robot dynamics: fused is fast, mjx is the reference."""
+    lanes: bool = True
+    """On processors, fused only: control steps run for a few episodes at a time; false leaves them to XLA."""
     control_rate: Positive = 75.0
     """[Hz] of the policy."""
     sim_rate: Positive = 300.0

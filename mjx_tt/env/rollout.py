@@ -24,10 +24,9 @@ from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import BallPool
 from ballmodel.state import BallState
 from mjx_tt.env.outgoing_ball import fly_out
-from mjx_tt.env.play import play
 from mjx_tt.env.policy import controller
 from mjx_tt.env.reward_sums import reward_terms
-from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, EpisodeState, Task, TaskConfig
+from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, Task, TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
@@ -197,7 +196,7 @@ class Simulator:
 
     def _block(self, episodes: Episodes, controller: Controller) -> tuple[dict[str, Array], Array, Array]:
         task, config = self.task, self.config
-        state = play(task, controller, episodes)
+        state = task.play(controller, episodes)
         back = fly_out(config, state.ball, state.hit & state.finite, episodes.model)
         terms = reward_terms(state, back, config.own_terms)
         weights = np.asarray(config.reward_weights, terms.dtype)

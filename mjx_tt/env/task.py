@@ -31,6 +31,7 @@ from mjx_tt.env.episode import TaskConfig as TaskConfig
 from mjx_tt.env.episode import Tick as Tick
 from mjx_tt.env.own import ControlStep
 from mjx_tt.env.reward_sums import accumulate
+from mjx_tt.lanes.loop import while_any
 from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.clearance import CapsuleClearance
 from mjx_tt.robot.dynamics_fused import FusedEngine
@@ -150,6 +151,28 @@ class Task:
                 observation_sq=full(0.0, self.contract.n_observation),
                 own=tuple(zero for term in self.config.own_terms if term.per == "step"),
             ),
+        )
+
+    def play(self, controller: Controller, episodes: Episodes) -> EpisodeState:
+        """The last state of episodes with one batch axis (L,).
+
+        Of an episode that ended before others the robot may have moved on; ball, outcome and sums are those of its end.
+        """
+        prepared = self.prepare(episodes)
+
+        def step(
+            tick: Array, s: EpisodeState, by_lane: tuple[Episodes, Prepared], by_column: Controller
+        ) -> EpisodeState:
+            return self.control_step(tick, s, *by_lane, by_column)
+
+        return while_any(
+            lambda s: s.live,
+            step,
+            self.reset(episodes, controller),
+            (episodes, prepared),
+            controller,
+            limit=self.config.max_steps,
+            lanes=self.config.lanes and self.config.engine == "fused",
         )
 
     def control_step(

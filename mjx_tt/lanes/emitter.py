@@ -142,8 +142,8 @@ class Emitter:
     ) -> Element:
         """The result of an instruction of dtype ``out``.
 
-        template: with {0}, {1}, ... for the operands, {t0}, {t1}, ... for their types, {t} for the result's, {s} and {s0}
-        for the result's and the first operand's in the name of an intrinsic
+        template: with {0}, {1}, ... for the operands, {t0}, {t1}, ... for their types, {t} for the result's, {s} for
+        the result's in the name of an intrinsic
         fold: does the same to NumPy scalars
         """
         elements = [self.forced(e) for e in elements]
@@ -161,5 +161,5 @@ class Emitter:
             return prefix + _SUFFIXES.get(type_of(dtype), type_of(dtype))
 
         fields = {f"t{i}": kind(d) for i, d in enumerate(dtypes)}
-        fields |= {"t": kind(out), "s": suffix(out), "s0": suffix(dtypes[0])}
+        fields |= {"t": kind(out), "s": suffix(out)}
         return Element(Kind.VECTOR if vector else Kind.SCALAR, self.emit(template.format(*names, **fields)))

@@ -24,7 +24,7 @@ def _horner(x: Array, *coefficients: float) -> Array:
 
 
 def exp(x: Array) -> Array:
-    """To 2 units of the last place (Moshier, Cephes, expf.c); 0 where the result would be below the least normal one."""
+    """To 2 units of the last place (Moshier, Cephes, expf.c); 0 in place of what is below the least normal number."""
     c = jnp.clip(x, _F(-87.33654), _F(88.72283))
     n = jnp.floor(c * _F(1.44269504088896341) + _F(0.5))
     r = c - n * _F(0.693359375) + n * _F(2.12194440e-4)

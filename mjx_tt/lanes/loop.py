@@ -47,8 +47,8 @@ def while_any(
     """``state`` after ``step(tick, state, by_lane, by_column)`` for tick 0, 1, ... while any lane is ``live``.
 
     state: a pytree of arrays (..., L) of one number of lanes L
-    by_lane: likewise, or scalars that all lanes share; by_column: arrays (..., P), of which lane l gets column l mod P, or
-    arrays of one axis that all lanes share
+    by_lane: likewise, or scalars that all lanes share
+    by_column: arrays (..., P), of which lane l gets column l mod P, or arrays of one axis that all lanes share
     live: picks a Boolean array of the state, without computing anything
     limit: most ticks
     lanes: False leaves the loop to XLA, as accelerators do, and programs with an operation that the compiler for lanes
@@ -85,7 +85,7 @@ def _by_lanes(live: Callable, step: Step, state: S, by_lane: Any, by_column: Any
         for tree, kind in zip(trees, ("state", "lane", "column"), strict=True)
         for x in jax.tree.leaves(tree)
     ]
-    _check(arrays, kinds, jax.tree.structure(state).num_leaves)
+    _check(arrays, kinds, len(jax.tree.leaves(state)))
     shapes = [
         jax.ShapeDtypeStruct(x.shape if kind == "shared" else (*x.shape[:-1], LANES), x.dtype)
         for x, kind in zip(arrays, kinds, strict=True)

@@ -26,7 +26,7 @@ def emit(e: Emitter, jaxpr: core.Jaxpr, constants: list[Any], arguments: list[Va
 
     def read(atom: Any) -> Value:
         if isinstance(atom, core.Literal):
-            return of_constants(np.asarray(atom.val, atom.aval.dtype))
+            return of_constants(np.asarray(atom.val, Form.of(atom.aval).dtype))
         return known[atom]
 
     for equation in jaxpr.eqns:
@@ -53,8 +53,7 @@ def _apply(e: Emitter, equation: core.JaxprEqn, operands: list[Value]) -> list[V
     if name in EXPANSIONS:
         if out.dtype != np.float32:
             raise Unsupported(f"{name} of {out.dtype}")
-        shape = jax.ShapeDtypeStruct(equation.outvars[0].aval.shape, out.dtype)
-        traced = jax.make_jaxpr(EXPANSIONS[name])(shape)
+        traced = jax.make_jaxpr(EXPANSIONS[name])(jax.ShapeDtypeStruct(out.whole, out.dtype))
         return emit(e, traced.jaxpr, list(traced.consts), operands)
     dtypes = [x.dtype for x in operands]
     rows = zip(*(spread(x, form, out) for x, form in zip(operands, forms, strict=True)), strict=True)

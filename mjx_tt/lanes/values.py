@@ -63,6 +63,11 @@ class Form:
         return self.axis is not None
 
     @property
+    def whole(self) -> tuple[int, ...]:
+        """The shape with the lanes' axis."""
+        return self.shape if self.axis is None else (*self.shape[: self.axis], LANES, *self.shape[self.axis :])
+
+    @property
     def size(self) -> int:
         return math.prod(self.shape)
 
@@ -146,7 +151,7 @@ def _transpose(e: Emitter, operands: list[Value], forms: list[Form], to: Form, p
 
 
 def _reverse(e: Emitter, operands: list[Value], forms: list[Form], to: Form, params: dict) -> Value:
-    return operands[0].pick(np.flip(operands[0].places, [to.without(d) for d in params["dimensions"]]))
+    return operands[0].pick(np.flip(operands[0].places, tuple(to.without(d) for d in params["dimensions"])))
 
 
 def _iota(e: Emitter, operands: list[Value], forms: list[Form], to: Form, params: dict) -> Value:

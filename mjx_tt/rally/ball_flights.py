@@ -5,6 +5,7 @@ Batch axis last; (L,) unless noted.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import jax
@@ -19,6 +20,7 @@ from ballmodel import flight
 from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
 from mjx_tt.env.outgoing_ball import FLOOR
+from mjx_tt.lanes.loop import while_any
 from mjx_tt.rally.human_player import OVER_TABLE, Incoming
 from robot_io.contract import LIMITS, JointLimits
 
@@ -54,17 +56,18 @@ def _alone(params: BallParams) -> BallParams:
     return replace(params, flight=replace(params.flight, integrator="midpoint"))
 
 
+def _ticks(period: float) -> int:
+    """Control periods that a ball is followed."""
+    return math.ceil(LONGEST / period)
+
+
 def sent(params: BallParams, ball: BallState, period: float) -> Sent:
     """Flies balls (3, L) until they come down, in steps of ``period`` [s]."""
     params, false = _alone(params), jnp.zeros(ball.position.shape[1:], bool)
     start = Sent(false, false, false, jnp.zeros((2, *false.shape)))
 
-    def flying(carry: tuple) -> Array:
-        tick, _, live, _ = carry
-        return (tick < LONGEST / period) & jnp.any(live)
-
-    def advance(carry: tuple) -> tuple:
-        tick, ball, live, found = carry
+    def step(_: Array, state: tuple, params: BallParams, __: tuple) -> tuple:
+        ball, live, found = state
         new, events = flight.step(params, ball, period)
         own = live & events.table & (events.position[1] > 0.0)
         valid = live & events.table & (events.position[1] <= 0.0) & (events.position[2] > 0.0)
@@ -75,9 +78,9 @@ def sent(params: BallParams, ball: BallState, period: float) -> Sent:
             landing=jnp.where(valid, events.position[:2], found.landing),
         )
         live = live & ~valid & ~own & (new.position[2] > FLOOR)
-        return tick + 1, where(live, new, ball), live, found
+        return where(live, new, ball), live, found
 
-    return jax.lax.while_loop(flying, advance, (0, ball, ~false, start))[3]
+    return while_any(lambda s: s[1], step, (ball, ~false, start), params, limit=_ticks(period))[2]
 
 
 def meeting(
@@ -95,12 +98,9 @@ def meeting(
     params, zero = _alone(params), jnp.zeros_like(ball.position[0])
     start = Meeting(Incoming(ball, jnp.zeros_like(ball.position[:2]), zero), zero > 1.0, zero > 1.0)
 
-    def flying(carry: tuple) -> Array:
-        tick, _, live, _, _ = carry
-        return (tick < LONGEST / period) & jnp.any(live)
-
-    def advance(carry: tuple) -> tuple:
-        tick, ball, live, since, met = carry
+    def step(tick: Array, state: tuple, by_lane: tuple, _: tuple) -> tuple:
+        ball, live, since, met = state
+        params, plane, height = by_lane
         new, events = flight.step(params, ball, period)
         net = met.net | (live & events.net)
         bounced = since > 0.0
@@ -117,9 +117,10 @@ def meeting(
         live = live & ~contact & ~lost
         seconds = jnp.where(live | contact, (tick + 1) * period, met.incoming.seconds)
         incoming = Incoming(where(contact, new, met.incoming.ball), landing, seconds)
-        return tick + 1, where(live, new, ball), live, since, Meeting(incoming, met.reached | contact, net)
+        return where(live, new, ball), live, since, Meeting(incoming, met.reached | contact, net)
 
-    return jax.lax.while_loop(flying, advance, (0, ball, returned, zero, start))[4]
+    by_lane = (params, plane, height)
+    return while_any(lambda s: s[1], step, (ball, returned, zero, start), by_lane, limit=_ticks(period))[3]
 
 
 def homeward(

@@ -275,7 +275,7 @@ class RallySimulator:
     ) -> EpisodeState:
         """The robot's part of one episode: its last state."""
         episodes = self._episodes(key, model, ball, start)
-        return play(self.task, controller_of(policy), episodes)
+        return self.task.play(controller_of(policy), episodes)
 
     def _episodes(
         self, key: PRNGKeyArray, model: SimModel, ball: BallState, start: Float[Array, "joints L"]
