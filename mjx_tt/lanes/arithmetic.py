@@ -48,6 +48,11 @@ _ROUNDINGS: dict[str, tuple[str, Callable]] = {
 _TO_EVEN = 1  # jax.lax.RoundingMethod.TO_NEAREST_EVEN
 
 
+def known(name: str) -> bool:
+    """Whether it is a primitive of ``elementwise``."""
+    return any(name in table for table in (_COMPARISONS, _SUMS, _BITS, _SHIFTS, _ROUNDINGS, _OTHERS))
+
+
 def elementwise(e: Emitter, name: str, a: Elements, d: Dtypes, out: Any, params: dict | None = None) -> Element:
     """The result, of dtype ``out``, of JAX's primitive ``name`` for one element of each operand. Raises Unsupported.
 
@@ -70,8 +75,6 @@ def elementwise(e: Emitter, name: str, a: Elements, d: Dtypes, out: Any, params:
             raise Unsupported("rounding halves away from zero")
         code, fold = _ROUNDINGS[name]
         return e.apply("call {t} @llvm." + code + ".{s}({t} {0})", fold, a, d, out)
-    if name not in _OTHERS:
-        raise Unsupported(f"the operation {name}")
     return _OTHERS[name](e, a, d, out, params or {})
 
 

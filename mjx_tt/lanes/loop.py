@@ -81,7 +81,7 @@ def _by_lanes(live: Callable, step: Step, state: S, by_lane: Any, by_column: Any
     arrays = [jnp.asarray(x) for x in jax.tree.leaves(trees)]
     structure = jax.tree.structure(trees)
     kinds = [
-        "shared" if x.ndim == 0 or (kind == "column" and x.ndim == 1) else kind
+        "shared" if jnp.ndim(x) == 0 or (kind == "column" and jnp.ndim(x) == 1) else kind
         for tree, kind in zip(trees, ("state", "lane", "column"), strict=True)
         for x in jax.tree.leaves(tree)
     ]
@@ -94,7 +94,10 @@ def _by_lanes(live: Callable, step: Step, state: S, by_lane: Any, by_column: Any
     def flat(tick: Array, *leaves: Array) -> list[Array]:
         return jax.tree.leaves(step(tick, *jax.tree.unflatten(structure, leaves)))
 
-    traced = jax.make_jaxpr(flat)(jax.ShapeDtypeStruct((), jnp.int32), *shapes)
+    try:
+        traced = jax.make_jaxpr(flat)(jax.ShapeDtypeStruct((), jnp.int32), *shapes)
+    except (TypeError, ValueError) as error:  # such as a sum with an array of L lanes that the step closes over
+        raise Unsupported(f"tracing with {LANES} lanes: {error}") from error
     n = kinds.count("state")
     if [(x.shape, x.dtype) for x in traced.out_avals] != [(x.shape, x.dtype) for x in shapes[:n]]:
         raise Unsupported("a step that changes the state's form")

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
-from mjx_tt.lanes.arithmetic import elementwise
+from mjx_tt.lanes.arithmetic import elementwise, known
 from mjx_tt.lanes.emitter import Emitter, Unsupported
 from mjx_tt.lanes.functions import EXPANSIONS
 from mjx_tt.lanes.memory import Slots, begins_of
@@ -21,17 +21,17 @@ _INERT = {"optimization_barrier", "reshard", "sharding_constraint", "pvary", "pc
 
 def emit(e: Emitter, jaxpr: core.Jaxpr, constants: list[Any], arguments: list[Value]) -> list[Value]:
     """The program's results for its arguments. Raises Unsupported."""
-    known: dict[Any, Value] = dict(zip(jaxpr.constvars, map(of_constants, constants), strict=True))
-    known |= zip(jaxpr.invars, arguments, strict=True)
+    values: dict[Any, Value] = dict(zip(jaxpr.constvars, map(of_constants, constants), strict=True))
+    values |= zip(jaxpr.invars, arguments, strict=True)
 
     def read(atom: Any) -> Value:
         if isinstance(atom, core.Literal):
             return of_constants(np.asarray(atom.val, Form.of(atom.aval).dtype))
-        return known[atom]
+        return values[atom]
 
     for equation in jaxpr.eqns:
         results = _apply(e, equation, [read(atom) for atom in equation.invars])
-        known |= zip(equation.outvars, results, strict=True)
+        values |= zip(equation.outvars, results, strict=True)
     return [read(atom) for atom in jaxpr.outvars]
 
 
@@ -55,6 +55,8 @@ def _apply(e: Emitter, equation: core.JaxprEqn, operands: list[Value]) -> list[V
             raise Unsupported(f"{name} of {out.dtype}")
         traced = jax.make_jaxpr(EXPANSIONS[name])(jax.ShapeDtypeStruct(out.whole, out.dtype))
         return emit(e, traced.jaxpr, list(traced.consts), operands)
+    if not known(name):
+        raise Unsupported(f"the operation {name}")
     dtypes = [x.dtype for x in operands]
     rows = zip(*(spread(x, form, out) for x, form in zip(operands, forms, strict=True)), strict=True)
     return [Value(out.dtype, out.shape, [elementwise(e, name, row, dtypes, out.dtype, params) for row in rows])]

@@ -209,26 +209,45 @@ def _dot(e: Emitter, operands: list[Value], forms: list[Form], to: Form, params:
     return Value(d, to.shape, made)
 
 
+_INDEX, _BOOL = np.dtype(np.int32), np.dtype(bool)
+
+
+def _row(e: Emitter, x: Value, part: tuple[int, ...], starts: Sequence[Value]) -> Element:
+    """The number of a row, of shape ``part``, that a program reads or writes by its number."""
+    if not x.shape or part != (1, *x.shape[1:]) or any(s.dtype != _INDEX for s in starts):
+        raise Unsupported("a part of an array, by its number, that is not one row")
+    first, *others = (e.forced(s.elements[0]) for s in starts)
+    if any(s.kind is not Kind.CONSTANT or s.value for s in others):
+        raise Unsupported("a part of an array by several numbers")
+    bounds = [constant(0, _INDEX), first, constant(x.shape[0] - 1, _INDEX)]
+    return elementwise(e, "clamp", bounds, [_INDEX] * 3, _INDEX)
+
+
+def _chosen(e: Emitter, at: Element, row: int, there: Element, else_: Element, d: Any) -> Element:
+    here = elementwise(e, "eq", [at, constant(row, _INDEX)], [_INDEX, _INDEX], _BOOL)
+    return elementwise(e, "select_n", [here, else_, there], [_BOOL, d, d], d)
+
+
+def _read(e: Emitter, operands: list[Value], forms: list[Form], to: Form, params: dict) -> Value:
+    """dynamic_slice of one row."""
+    x, *starts = operands
+    at, size = _row(e, x, to.shape, forms[0].kept(starts)), to.size
+    elements = x.elements[:size]
+    for row in range(1, x.shape[0]):
+        rows = zip(x.elements[row * size : (row + 1) * size], elements, strict=True)
+        elements = [_chosen(e, at, row, there, before, to.dtype) for there, before in rows]
+    return Value(to.dtype, to.shape, elements)
+
+
 def _update(e: Emitter, operands: list[Value], forms: list[Form], to: Form, params: dict) -> Value:
     x, new, *starts = operands
-    first, *others = to.kept([e.forced(s.elements[0]) for s in starts])
-    if not x.shape or new.shape != (1, *x.shape[1:]) or any(s.kind is not Kind.CONSTANT or s.value for s in others):
-        raise Unsupported("an update of anything but one row")
-    size, d, index = len(new.elements), to.dtype, np.dtype(np.int32)
-    if any(np.dtype(s.dtype) != index for s in starts):
-        raise Unsupported("an update at a place that is no int32")
-    bounds = [constant(0, index), first, constant(x.shape[0] - 1, index)]
-    at = elementwise(e, "clamp", bounds, [index] * 3, index)
+    at = _row(e, x, new.shape, to.kept(starts))
+    size = len(new.elements)
 
     def element(i: int) -> Element:
-        def made() -> Element:
-            here = elementwise(e, "eq", [at, constant(i // size, index)], [index, index], np.dtype(bool))
-            operands = [here, x.elements[i], new.elements[i % size]]
-            return elementwise(e, "select_n", operands, [np.dtype(bool), d, d], d)
+        return Element(Kind.LAZY, lambda: _chosen(e, at, i // size, new.elements[i % size], x.elements[i], to.dtype))
 
-        return Element(Kind.LAZY, made)
-
-    return Value(d, to.shape, [element(i) for i in range(len(x.elements))], (x, at, new.elements))
+    return Value(to.dtype, to.shape, [element(i) for i in range(len(x.elements))], (x, at, new.elements))
 
 
 RULES: dict[str, Rule] = {
@@ -249,5 +268,6 @@ RULES: dict[str, Rule] = {
     "reduce_and": _reduce("and"),
     "reduce_or": _reduce("or"),
     "dot_general": _dot,
+    "dynamic_slice": _read,
     "dynamic_update_slice": _update,
 }

@@ -1,0 +1,225 @@
+"""Every operation by lanes against what JAX's own operations, or SciPy, make of the same numbers."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+
+from mjx_tt.lanes.emitter import Unsupported
+from mjx_tt.lanes.loop import _by_lanes, while_any
+
+L = 37  # two vectors and a part of one
+ODD = [0.0, -0.0, 1.0, -1.0, 0.5, 2.5, -2.5, 3.4e38, -3.4e38, 1.2e-38, np.inf, -np.inf, np.nan]
+
+
+def numbers(low: float = -5.0, high: float = 5.0, odd: bool = True) -> np.ndarray:
+    drawn = np.random.default_rng(0).uniform(low, high, L).astype(np.float32)
+    if odd:
+        drawn[: len(ODD)] = ODD
+    return drawn
+
+
+def by_lanes(function, *arrays):
+    """The function's result for arrays (..., L), computed by lanes. Raises Unsupported."""
+    out = jax.eval_shape(function, *arrays)
+    state = (jnp.ones(L, bool), jnp.zeros(out.shape, out.dtype))
+
+    def step(tick, now, lanes, columns):
+        return now[0], function(*lanes)
+
+    return np.asarray(jax.jit(lambda s, a: _by_lanes(lambda s: s[0], step, s, a, (), 1))(state, arrays)[1])
+
+
+A, B = numbers(), np.roll(numbers(), 3)
+M = np.random.default_rng(1).normal(size=(3, 4, L)).astype(np.float32)
+K, J = (np.random.default_rng(k).integers(-1000, 1000, L).astype(np.int32) for k in (2, 3))
+U = np.random.default_rng(4).integers(0, 2**32, L, dtype=np.uint32)
+T = np.random.default_rng(5).integers(0, 2, L).astype(bool)
+
+
+@pytest.mark.parametrize(
+    "function, arrays",
+    [
+        (jnp.add, (A, B)),
+        (jnp.subtract, (A, B)),
+        (jnp.multiply, (A, B)),
+        (jnp.divide, (A, B)),
+        (jnp.minimum, (A, B)),
+        (jnp.maximum, (A, B)),
+        (lambda x: jnp.minimum(x, 1.0), (A,)),
+        (lambda x: jnp.maximum(0.5, x), (A,)),
+        (lambda x: jnp.clip(x, -1.0, 2.0), (A,)),
+        (jnp.negative, (A,)),
+        (jnp.abs, (A,)),
+        (jnp.sign, (A,)),
+        (jnp.sqrt, (A,)),
+        (jnp.floor, (A,)),
+        (jnp.ceil, (A,)),
+        (jnp.round, (A,)),
+        (jnp.isfinite, (A,)),
+        (jnp.square, (A,)),
+        (lambda x: x**3, (A,)),
+        (lambda x: x**-2, (A,)),
+        (jnp.equal, (A, B)),
+        (jnp.not_equal, (A, A)),
+        (jnp.less, (A, B)),
+        (jnp.less_equal, (A, B)),
+        (jnp.greater, (A, B)),
+        (jnp.greater_equal, (A, B)),
+        (jnp.where, (T, A, B)),
+        (jnp.add, (K, J)),
+        (jnp.multiply, (U, U)),
+        (lambda x: x % 7, (K,)),
+        (lambda x: x // 7, (K,)),
+        (lambda x: jax.lax.rem(x, jnp.int32(7)), (K,)),
+        (lambda x: x >> 3, (K,)),
+        (lambda x: x >> 3, (U,)),
+        (lambda x: x << 5, (U,)),
+        (lambda x: x ^ 0x5555, (U,)),
+        (jnp.bitwise_and, (K, J)),
+        (jnp.bitwise_or, (K, J)),
+        (jnp.invert, (K,)),
+        (jnp.minimum, (K, J)),
+        (jnp.maximum, (U, U[::-1])),
+        (jnp.less, (K, J)),
+        (jnp.less, (U, U[::-1])),
+        (jnp.abs, (K,)),
+        (jnp.logical_and, (T, T[::-1])),
+        (jnp.logical_not, (T,)),
+        (lambda x: x.astype(jnp.float32), (K,)),
+        (lambda x: x.astype(jnp.float32), (U,)),
+        (lambda x: x.astype(jnp.float32), (T,)),
+        (lambda x: x.astype(jnp.int32), (T,)),
+        (lambda x: x.astype(jnp.int32), (numbers(odd=False),)),
+        (lambda x: x.astype(bool), (A,)),
+        (lambda x: x.astype(jnp.uint32), (K,)),
+        (lambda x: jax.lax.bitcast_convert_type(x, jnp.int32), (A,)),
+    ],
+)
+def test_an_operation_gives_the_same_bits(function, arrays):
+    wanted = np.asarray(function(*map(jnp.asarray, arrays)))
+    np.testing.assert_array_equal(by_lanes(function, *arrays), wanted)
+
+
+@pytest.mark.parametrize(
+    "function, oracle, low, high, units",
+    [
+        (jnp.exp, np.exp, -80.0, 80.0, 3),
+        (jnp.exp2, np.exp2, -100.0, 100.0, 100),
+        (jnp.log, np.log, 1e-6, 100.0, 4),
+        (jnp.log1p, np.log1p, -0.99, 10.0, 6),
+        (jnp.tanh, np.tanh, -9.0, 9.0, 6),
+        (jax.nn.sigmoid, scipy.special.expit, -20.0, 20.0, 6),
+        (jax.scipy.special.erfinv, scipy.special.erfinv, -0.999, 0.999, 20),
+        (jnp.sin, np.sin, -1.5, 1.5, 4),
+        (jnp.cos, np.cos, -1.5, 1.5, 4),
+    ],
+)
+def test_a_function_is_right_to_some_units_of_the_last_place(function, oracle, low, high, units):
+    x = numbers(low, high, odd=False)
+    wanted = oracle(x.astype(np.float64))
+    error = np.abs(by_lanes(function, x) - wanted) / np.spacing(np.abs(wanted).astype(np.float32))
+    assert error.max() < units
+
+
+@pytest.mark.parametrize(
+    "function, at",
+    [
+        (jnp.exp, [np.nan, np.inf, -np.inf, 0.0, 200.0, -200.0, 88.7]),
+        (jnp.log, [np.nan, np.inf, 0.0, -1.0, 1.0]),
+        (jnp.log1p, [np.nan, np.inf, 0.0, -1.0, -2.0, 1e-30]),
+        (jnp.tanh, [np.nan, np.inf, -np.inf, 0.0, 1e-20]),
+        (jax.nn.sigmoid, [np.nan, np.inf, -np.inf, 0.0]),
+        (jax.scipy.special.erfinv, [np.nan, 1.0, -1.0, 0.0, 2.0]),
+        (jnp.sin, [np.nan, 0.0]),
+    ],
+)
+def test_a_function_at_its_ends(function, at):
+    x = np.resize(np.float32(at), L)
+    np.testing.assert_allclose(by_lanes(function, x), function(jnp.asarray(x)), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda m: m[1],
+        lambda m: m[:, 1:3],
+        lambda m: m[::2, ::-1],
+        lambda m: m.transpose(1, 0, 2),
+        lambda m: m.reshape(12, L if m.shape[-1] == L else m.shape[-1]),
+        lambda m: m.reshape(2, 6, -1),
+        lambda m: jnp.moveaxis(jnp.moveaxis(m, -1, 0)[:, ::2], 0, -1),
+        lambda m: jnp.concatenate([m[:1], m[2:], m], axis=0),
+        lambda m: jnp.stack([m[0], m[2]], axis=1),
+        lambda m: m[:, None] * jnp.arange(5.0)[:, None, None],
+        lambda m: jnp.broadcast_to(m[0, 0], (2, 3, m.shape[-1])),
+        lambda m: m + jnp.array([1.0, 2.0, 3.0])[:, None, None],
+        lambda m: m.max(axis=(0, 1)),
+        lambda m: jnp.any(m > 2.0, axis=0),
+        lambda m: jnp.all(m > -2.0, axis=1),
+        lambda m: jax.lax.dynamic_update_index_in_dim(m, 2.0 * m[0], jnp.int32(2), 0),
+        lambda m: jax.lax.scan(lambda c, x: (c + x * m[0, 0], None), m[1], jnp.arange(1.0, 4.0))[0],
+        lambda m: jax.lax.fori_loop(0, 5, lambda i, c: jnp.where(i > 2, c * 0.5, c + m[i * 0]), m[0]),
+    ],
+)
+def test_moving_elements_about_gives_the_same_bits(function):
+    wanted = np.asarray(jax.jit(function)(jnp.asarray(M)))
+    np.testing.assert_array_equal(by_lanes(function, M), wanted)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda m: m.sum(axis=0),
+        lambda m: m.mean(axis=(0, 1)),
+        lambda m: jnp.prod(m, axis=1),
+        lambda m: jnp.einsum("ijl,jk->ikl", m, jnp.arange(12.0).reshape(4, 3) / 7.0),
+        lambda m: jnp.einsum("ijl,ikl->jkl", m, m),
+        lambda m: jax.vmap(lambda x: x @ x.T, in_axes=-1, out_axes=-1)(m),
+        lambda m: jnp.linalg.norm(m, axis=1),
+    ],
+)
+def test_sums_and_products_agree_to_rounding(function):
+    with jax.enable_x64(True):
+        wanted = np.asarray(function(jnp.asarray(M, jnp.float64)))
+    np.testing.assert_allclose(by_lanes(function, M), wanted, rtol=3e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "function, said",
+    [
+        (lambda m: jnp.sort(m, axis=0), "sort"),
+        (lambda m: m - m.mean(axis=-1, keepdims=True), "along the lanes"),
+        (lambda m: m.reshape(3, -1)[:, : m.shape[-1]], "not one axis"),
+        (lambda m: m[..., ::-1], "along the lanes"),
+        (lambda m: jnp.cumsum(m, axis=0), "cumsum"),
+        (lambda m: m * jnp.asarray(np.zeros((5000, 1), np.float32)).sum(), "5000 numbers"),
+        (lambda m: m.astype(jnp.int32) // m.astype(jnp.int32), "whole division"),
+    ],
+)
+def test_what_is_not_known_is_named(function, said):
+    with pytest.raises(Unsupported, match=said):
+        by_lanes(function, M)
+
+
+def test_what_is_not_known_is_left_to_xla(caplog):
+    state = (jnp.ones(L, bool), jnp.asarray(M))
+    caplog.set_level("INFO")
+    done = while_any(lambda s: s[0], lambda t, s, lanes, columns: (s[0], jnp.sort(s[1], axis=0)), state, limit=3)
+    np.testing.assert_array_equal(done[1], np.sort(M, axis=0))
+    assert "a loop is left to XLA: the operation sort" in caplog.text
+
+
+@pytest.mark.parametrize("x, said", [(2.0, "not among its arguments"), (np.ones(L, np.float32), "tracing with")])
+def test_an_array_that_the_step_closes_over_is_no_constant(x, said):
+    def run(x):
+        def step(tick, s, lanes, columns):
+            return s[0], s[1] + x
+
+        return _by_lanes(lambda s: s[0], step, (jnp.ones(L, bool), jnp.ones(L)), (), (), 1)
+
+    with pytest.raises(Unsupported, match=said):
+        jax.jit(run)(jnp.asarray(x))
