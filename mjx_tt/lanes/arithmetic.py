@@ -49,7 +49,7 @@ _TO_EVEN = 1  # jax.lax.RoundingMethod.TO_NEAREST_EVEN
 
 
 def known(name: str) -> bool:
-    """Whether it is a primitive of ``elementwise``."""
+    """True for a primitive of ``elementwise``."""
     return any(name in table for table in (_COMPARISONS, _SUMS, _BITS, _SHIFTS, _ROUNDINGS, _OTHERS))
 
 

@@ -46,7 +46,7 @@ def while_any(
 ) -> S:
     """``state`` after ``step(tick, state, by_lane, by_column)`` for tick 0, 1, ... while any lane is ``live``.
 
-    state: a pytree of arrays (..., L) of one number of lanes L
+    state: a pytree of arrays (..., L) of one number of lanes L, or (..., R, P) with R x P = L
     by_lane: likewise, or scalars that all lanes share
     by_column: arrays (..., P), of which lane l gets column l mod P, or arrays of one axis that all lanes share
     live: picks a Boolean array of the state, without computing anything
@@ -77,15 +77,18 @@ def _by_xla(live: Callable, step: Step, state: S, by_lane: Any, by_column: Any, 
 
 def _by_lanes(live: Callable, step: Step, state: S, by_lane: Any, by_column: Any, limit: int) -> S:
     """Raises Unsupported."""
+    lanes = live(state).shape[-1]
     trees = (state, by_lane, by_column)
-    arrays = [jnp.asarray(x) for x in jax.tree.leaves(trees)]
+    whole = [jnp.asarray(x) for x in jax.tree.leaves(trees)]
+    n = len(jax.tree.leaves(state))
+    arrays = [_in_one_row(x, lanes) if i < n else x for i, x in enumerate(whole)]
     structure = jax.tree.structure(trees)
     kinds = [
         "shared" if jnp.ndim(x) == 0 or (kind == "column" and jnp.ndim(x) == 1) else kind
         for tree, kind in zip(trees, ("state", "lane", "column"), strict=True)
         for x in jax.tree.leaves(tree)
     ]
-    _check(arrays, kinds, len(jax.tree.leaves(state)))
+    _check(arrays, kinds, n)
     shapes = [
         jax.ShapeDtypeStruct(x.shape if kind == "shared" else (*x.shape[:-1], LANES), x.dtype)
         for x, kind in zip(arrays, kinds, strict=True)
@@ -98,15 +101,20 @@ def _by_lanes(live: Callable, step: Step, state: S, by_lane: Any, by_column: Any
         traced = jax.make_jaxpr(flat)(jax.ShapeDtypeStruct((), jnp.int32), *shapes)
     except (TypeError, ValueError) as error:  # such as a sum with an array of L lanes that the step closes over
         raise Unsupported(f"tracing with {LANES} lanes: {error}") from error
-    n = kinds.count("state")
     if [(x.shape, x.dtype) for x in traced.out_avals] != [(x.shape, x.dtype) for x in shapes[:n]]:
         raise Unsupported("a step that changes the state's form")
     numbers = jax.tree.unflatten(structure, range(len(arrays)))
     name = _registered(_module(traced, shapes, kinds, int(live(numbers[0])), limit))
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays[:n]]
-    return jax.tree.unflatten(
-        jax.tree.structure(state), jax.ffi.ffi_call(name, results, vmap_method="sequential")(*arrays)
-    )
+    done = jax.ffi.ffi_call(name, results, vmap_method="sequential")(*arrays)
+    shaped = [x.reshape(was.shape) for x, was in zip(done, whole, strict=False)]
+    return jax.tree.unflatten(jax.tree.structure(state), shaped)
+
+
+def _in_one_row(x: Array, lanes: int) -> Array:
+    """(..., R, P) with R x P lanes as (..., 1, L)."""
+    folded = x.ndim > 1 and x.shape[-1] != lanes and x.shape[-2] * x.shape[-1] == lanes
+    return x.reshape(*x.shape[:-2], 1, lanes) if folded else x
 
 
 def _check(arrays: list[Array], kinds: list[str], n_state: int) -> None:

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_tt.lanes import machine
 from mjx_tt.lanes.emitter import Unsupported
 from mjx_tt.lanes.loop import _by_lanes, while_any
 
@@ -44,6 +43,18 @@ def test_a_lane_has_the_column_of_its_number():
     w, (_, x, _) = oscillate(60, 50, columns=20)
     _, (_, alone, _) = oscillate(20, 50)
     np.testing.assert_array_equal(np.reshape(x, (3, 20)), np.tile(alone, (3, 1)))
+
+
+def test_a_state_may_keep_repeats_and_columns_apart():
+    def step(tick, s, by_lane, by_column):
+        live, x, apart = s
+        return live, x + 1.0, 2.0 * apart + x.reshape(1, -1, by_column.shape[-1]) * by_column
+
+    start = (jnp.ones(60, bool), jnp.arange(60.0), jnp.zeros((1, 3, 20)))
+    columns = jnp.arange(20.0)[None]
+    both = [while_any(lambda s: s[0], step, start, (), columns, limit=3, lanes=lanes) for lanes in (True, False)]
+    assert both[0][2].shape == (1, 3, 20)
+    np.testing.assert_array_equal(both[0][2], both[1][2])
 
 
 def countdown(lanes: bool):
@@ -122,33 +133,7 @@ def test_a_form_that_does_not_fit_is_named(state, columns, said):
         _by_lanes(lambda s: s[0], lambda t, s, lanes, columns: s, state, (), columns, 1)
 
 
-TEXT = "define i32 @answer() {\n ret i32 42\n}\n"
-
-
-def called(folder):
-    import ctypes
-
-    return ctypes.CFUNCTYPE(ctypes.c_int32)(machine.compiled(TEXT, "answer", folder).value)()
-
-
-def test_machine_code_is_kept_and_a_damaged_file_is_built_again(tmp_path, caplog):
-    folder = tmp_path / "lanes"
-    assert called(folder) == 42
-    (kept,) = folder.iterdir()
-    whole = kept.read_bytes()
-    assert called(folder) == 42 and kept.read_bytes() == whole
-    for damaged in (whole[:-1], b"", whole[:200] + b"x" + whole[201:]):
-        kept.write_bytes(damaged)
-        assert called(folder) == 42
-        assert kept.read_bytes() == whole
-
-
-def test_a_folder_that_cannot_be_written_is_no_obstacle(tmp_path):
-    (tmp_path / "lanes").write_text("a file where the folder should be")
-    assert called(tmp_path / "lanes") == 42
-
-
-def test_accelerators_and_the_key_leave_loops_to_xla(caplog):
+def test_a_loop_that_is_known_is_not_left_to_xla(caplog):
     caplog.set_level(logging.INFO)
     done = while_any(lambda s: s[0], lambda t, s, a, b: (s[0], s[1] + 1.0), (jnp.ones(3, bool), jnp.zeros(3)), limit=4)
     np.testing.assert_array_equal(done[1], [4.0] * 3)
