@@ -67,6 +67,7 @@ QUICK = Sizes(
     scaling=((2, 15), (20, 15)),
     ticks=20,
 )
+PHYSICS = ("fused", "fused_by_xla", "mjx", "mujoco_rollout", "mujoco_batch", "pybullet")
 MJX_LIMIT = 1800.0  # [s] for compilation and first update with MJX, and for each further one
 TRAINED = Path("runs/quickstart")  # measured too when it is there
 
@@ -120,11 +121,13 @@ def measure_physics(sizes: Sizes, cores: int) -> dict:
             return [stack.enter_context(Worker(name, **arguments)) for _ in range(copies)]
 
         lanes, chunks, steps = sizes.fused
-        sides = {"fused": side("fused", lanes=lanes, chunks=chunks, steps=steps)}
+        sides = {name: side(name, lanes=lanes, chunks=chunks, steps=steps) for name in ("fused", "fused_by_xla")}
         lanes, chunks, steps = sizes.mjx
         sides["mjx"] = side("mjx", lanes=lanes, chunks=chunks, steps=steps)
         robots, steps = sizes.rollout
         sides["mujoco_rollout"] = side("mujoco_rollout", robots=robots, steps=steps, threads=cores)
+        if importlib.util.find_spec("mujoco.batch"):  # since MuJoCo 3.17
+            sides["mujoco_batch"] = side("mujoco_batch", robots=robots, steps=steps, threads=cores)
         if importlib.util.find_spec("pybullet"):
             sides["pybullet"] = side("pybullet", cores, steps=sizes.pybullet, seed=0)
         about = {name: [worker.wait_ready() for worker in workers][0] for name, workers in sides.items()}
@@ -133,7 +136,7 @@ def measure_physics(sizes: Sizes, cores: int) -> dict:
     return {
         "device": about["fused"]["device"],
         "versions": {name: content["version"] for name, content in about.items()},
-        "physics_steps_per_s": {name: speed.get(name) for name in ("fused", "mjx", "mujoco_rollout", "pybullet")},
+        "physics_steps_per_s": {name: speed.get(name) for name in PHYSICS},
         "ratios": {f"fused/{name}": speed["fused"] / speed[name] for name in speed if name != "fused"},
     }
 
@@ -144,6 +147,7 @@ def measure_update(sizes: Sizes, cores: list[int]) -> dict:
     n, common = len(cores), "optimiser.common_random_numbers=true"
     asked: dict[str, tuple[set[int] | None, dict[str, Any]]] = {
         "all_devices": (None, dict(changes=scale, devices=n)),
+        "by_xla": (None, dict(changes=[*scale, "task.lanes=false"], devices=n)),
         "common_random_numbers": (None, dict(changes=[*scale, common], devices=n)),
         "one_device_all_cores": (None, dict(changes=scale, devices=1)),
         "one_device_one_core": ({cores[0]}, dict(changes=scale, devices=1)),
@@ -163,6 +167,8 @@ def measure_update(sizes: Sizes, cores: list[int]) -> dict:
     return {
         "update_episodes": 2 * sizes.pairs * sizes.repeats,
         "update_s": seconds["all_devices"],
+        "update_by_xla_s": seconds["by_xla"],
+        "lanes_speedup": seconds["by_xla"]["median"] / seconds["all_devices"]["median"],
         "update_common_random_numbers_s": seconds["common_random_numbers"],
         "update_trained_policy_s": seconds.get("trained_policy"),
         "devices_s": devices,
@@ -235,6 +241,7 @@ def show(report: dict, console: Console) -> None:
     table = _table(f"One update, {report['update_episodes']:,} episodes", "", "median [s]", "min", "max")
     rows = {
         "start of training": report["update_s"],
+        "control steps by XLA": report["update_by_xla_s"],
         "common random numbers": report["update_common_random_numbers_s"],
         "trained policy": report["update_trained_policy_s"],
     }
@@ -244,6 +251,7 @@ def show(report: dict, console: Console) -> None:
     for name, seconds in report["devices_s"].items():
         table.add_row(name.replace("_", " "), f"{seconds:.3f}")
     console.print(table)
+    console.print(f"lane by lane against by XLA: {report['lanes_speedup']:.2f} x", highlight=False)
     console.print(
         f"all devices against one device on one core: {report['devices_speedup']:.2f} x; "
         f"peak memory {report['peak_memory_mb']:,.0f} MB",

@@ -32,16 +32,21 @@ COMMAND = 0.2  # largest command, as a share of each joint's speed limit: no joi
 
 
 def fused(lanes: int, chunks: int, steps: int) -> Side:
-    """The fused engine in float32: on every device ``chunks`` batches of ``lanes`` robots, one after the other."""
+    """The fused engine lane by lane in float32: on every device ``chunks`` batches of ``lanes`` robots in turn."""
     return _jax_engine("fused", lanes, chunks, steps)
+
+
+def fused_by_xla(lanes: int, chunks: int, steps: int) -> Side:
+    """The same compiled by XLA."""
+    return _jax_engine("fused", lanes, chunks, steps, by_lanes=False)
 
 
 def mjx(lanes: int, chunks: int, steps: int) -> Side:
     """MuJoCo MJX in float32, likewise."""
-    return _jax_engine("mjx", lanes, chunks, steps)
+    return _jax_engine("mjx", lanes, chunks, steps, by_lanes=False)
 
 
-def _jax_engine(name: str, lanes: int, chunks: int, steps: int) -> Side:
+def _jax_engine(name: str, lanes: int, chunks: int, steps: int, by_lanes: bool = True) -> Side:
     from mjx_tt import platform
 
     platform.configure()
@@ -50,20 +55,23 @@ def _jax_engine(name: str, lanes: int, chunks: int, steps: int) -> Side:
     from jax.sharding import Mesh, PartitionSpec
 
     from mjx_tt.env.task import Task, TaskConfig
+    from mjx_tt.lanes.loop import while_any
     from mjx_tt.robot.scalar_algebra import materialise
 
     task = Task(TaskConfig(engine=name, sim_rate=SIM_RATE))
     devices = jax.devices()
     home = jnp.broadcast_to(jnp.asarray(task.home, jnp.float32)[:, None], (8, lanes))
 
-    def period(state: State, control: Array) -> tuple[State, None]:
+    def period(tick: Array, state: tuple[Array, State], controls: Array, _: tuple) -> tuple[Array, State]:
         def step(_: int, s: State) -> State:
             return materialise(task.engine.step(*s, control))
 
-        return jax.lax.fori_loop(0, SUBSTEPS, step, state), None
+        control = jax.lax.dynamic_index_in_dim(controls, tick, keepdims=False)
+        return state[0], jax.lax.fori_loop(0, SUBSTEPS, step, state[1])
 
     def chunk(controls: Array) -> State:  # (steps / SUBSTEPS, 8, lanes)
-        return jax.lax.scan(period, (home, jnp.zeros_like(home)), controls)[0]
+        start = (jnp.ones(lanes, bool), (home, jnp.zeros_like(home)))
+        return while_any(lambda s: s[0], period, start, controls, limit=steps // SUBSTEPS, lanes=by_lanes)[1]
 
     def device(controls: Array) -> State:  # (chunks, steps / SUBSTEPS, 8, lanes)
         return jax.lax.map(chunk, controls)
@@ -103,6 +111,29 @@ def mujoco_rollout(robots: int, steps: int, threads: int) -> Side:
 
     def work() -> float:
         pool.rollout(model, data, start, controls, nstep=steps, state=states, sensordata=sensors)
+        return robots * steps
+
+    return {"version": mujoco.__version__}, work
+
+
+def mujoco_batch(robots: int, steps: int, threads: int) -> Side:
+    """MuJoCo C's batch API in float64: its own threads, a command written 75 times per second."""
+    import mujoco
+    from mujoco import batch
+
+    from mjx_tt.robot import model as robot
+
+    model = robot.load_model()
+    model.opt.timestep = 1.0 / SIM_RATE
+    simulations = batch.Batch(model, nsim=robots, nthread=threads)
+    control = simulations.bind("ctrl")
+    controls = commands((steps // SUBSTEPS, robots, 8), axis=2).astype(float)
+
+    def work() -> float:
+        simulations.reset(keyframe=0)
+        for command in controls:
+            control[:] = command
+            simulations.step(nstep=SUBSTEPS)
         return robots * steps
 
     return {"version": mujoco.__version__}, work
