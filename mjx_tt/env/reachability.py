@@ -9,7 +9,7 @@ better motion, so the rate is a lower bound on the best, and no policy is promis
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import jax
@@ -33,22 +33,22 @@ ITERATIONS = 150
 FIRST_STD = 0.5  # of an action
 
 
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class MotionController:
-    """Open-loop motions: knots (KNOTS, 8, P) of actions, evenly spaced over ``duration`` (P,) seconds."""
+    """Open-loop motions: knots (KNOTS, 8, P) of actions, evenly spaced over ``duration`` (1, P) seconds."""
 
     knots: Float[Array, "knots joints P"]
-    duration: Float[Array, " P"]  # [s]
-    period: float  # [s]
+    duration: Float[Array, "1 P"]  # [s]
+    period: float = field(metadata={"static": True})  # [s]
     mean: Float[Array, "observed"]
 
     def start(self, observation: Array) -> tuple[()]:
         return ()
 
     def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Float[Array, "joints P"], tuple[()]]:
-        place = jnp.clip(jnp.asarray(tick).astype(self.duration.dtype) * self.period / self.duration, 0.0, 1.0) * (
-            KNOTS - 1
-        )
+        seconds = jnp.asarray(tick).astype(self.duration.dtype) * self.period
+        place = jnp.clip(seconds / self.duration[0], 0.0, 1.0) * (KNOTS - 1)
         action = jnp.zeros_like(self.knots[0])
         for i in range(KNOTS):
             action = action + jnp.maximum(1.0 - jnp.abs(place - i), 0.0)[None] * self.knots[i]
@@ -141,7 +141,7 @@ def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Bool
         knots = jnp.clip(knots, -1.0, 1.0).at[:, :, 0].set(mean)
         controller = MotionController(
             knots.reshape(KNOTS, n, -1),
-            jnp.tile(duration, CANDIDATES),
+            jnp.tile(duration, CANDIDATES)[None],
             simulator.config.period,
             jnp.zeros(contract.n_observation),
         )

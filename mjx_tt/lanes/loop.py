@@ -79,7 +79,10 @@ def _by_lanes(live: Callable, step: Step, state: S, by_lane: Any, by_column: Any
     """Raises Unsupported."""
     lanes = live(state).shape[-1]
     trees = (state, by_lane, by_column)
-    whole = [jnp.asarray(x) for x in jax.tree.leaves(trees)]
+    try:
+        whole = [jnp.asarray(x) for x in jax.tree.leaves(trees)]
+    except TypeError as error:
+        raise Unsupported(f"an argument that is no array: {error}") from error
     n = len(jax.tree.leaves(state))
     arrays = [_in_one_row(x, lanes) if i < n else x for i, x in enumerate(whole)]
     structure = jax.tree.structure(trees)

@@ -119,6 +119,16 @@ def test_a_loop_within_a_loop_and_a_map():
     np.testing.assert_allclose(jax.jit(lambda x: jax.lax.map(block, x))(x), wanted, rtol=1e-6)
 
 
+def test_an_argument_that_is_no_array_is_left_to_xla():
+    class Doubler:
+        def __call__(self, x):
+            return 2.0 * x
+
+    start = (jnp.ones(3, bool), jnp.ones(3))
+    done = while_any(lambda s: s[0], lambda t, s, lanes, twice: (s[0], twice(s[1])), start, (), Doubler(), limit=3)
+    np.testing.assert_array_equal(done[1], [8.0] * 3)
+
+
 @pytest.mark.parametrize(
     "state, columns, said",
     [
