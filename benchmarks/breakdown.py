@@ -19,10 +19,12 @@ from ballmodel.flight import PaddlePose, ball_params
 from ballmodel.sampling import sample_pool
 from ballmodel.state import BallState
 from benchmarks import roofline
-from benchmarks.operations import count
+from benchmarks.operations import count, count_lanes
 from mjx_tt.env.policy import PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import EpisodeState, TaskConfig
+from mjx_tt.env.task import Episodes, EpisodeState, Prepared, Task, TaskConfig
+from mjx_tt.lanes import loop, machine
+from mjx_tt.lanes.loop import while_any
 from mjx_tt.robot.scalar_algebra import materialise
 from mjx_tt.sim import latency, noise
 from mjx_tt.sim.model import SimModel
@@ -30,6 +32,7 @@ from robot_io.contract import LIMITS, N_JOINTS, N_OBSERVATION, unflatten
 from robot_io.limits import limit_velocity
 
 WHOLE = "control step"
+BY_LANES = "control step by lanes"
 RUNS = 5  # of each part, of which the fastest counts: the others were disturbed
 
 
@@ -39,13 +42,17 @@ def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], dict]:
     "parts", each: part, calls per control step, ns per episode and control step, share of the whole; operations,
     transcendentals and bytes of the compiled program, likewise; its kernels per control step of the block. "rest" is
     the whole less the parts, and can be negative where a part alone costs more than in its place. "peaks": what the
-    core reaches at best, see ``roofline.measure``; "working_set_mb": arguments and temporaries of the whole.
+    core reaches at best, see ``roofline.measure``; "working_set_mb": arguments and temporaries of the whole. All of
+    them are compiled by XLA but for the last row, the whole compiled lane by lane.
     """
-    parts = _parts(TaskConfig(), rows, columns)
+    config = TaskConfig()
+    parts = _parts(config, rows, columns)
     loops = {name: (calls, *_compiled(step, start, ticks)) for name, (calls, step, start) in parts.items()}
 
     counts = {name: calls / ticks / (rows * columns) * count(run) for name, (calls, run, _) in loops.items()}
     counts = {name: replace(each, kernels=each.kernels * rows * columns) for name, each in counts.items()}
+    by_lanes = _by_lanes(config, rows, columns, ticks)
+    lane_counts = count_lanes(str(machine.optimised(loop.compiled()[-1])), rounds=config.substeps)
     memory = loops[WHOLE][1].memory_analysis()
     working_set = memory.argument_size_in_bytes + memory.temp_size_in_bytes
     peaks = roofline.measure(working_set)
@@ -62,6 +69,9 @@ def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], dict]:
         ]
         table.append({"part": "rest", "calls": 1, "ns": whole - sum(nanoseconds.values())})
         table.append({"part": WHOLE, "calls": 1, "ns": whole, **asdict(counts[WHOLE])})
+        fastest = min(_seconds(*by_lanes) for _ in range(RUNS))
+        ns = fastest / ticks / (rows * columns) * 1e9
+        table.append({"part": BY_LANES, "calls": 1, "ns": ns, **asdict(lane_counts)})
         parts = [row | {"share": row["ns"] / whole} for row in table]
         return {"parts": parts, "peaks": peaks(), "working_set_mb": working_set / 1e6}
 
@@ -84,10 +94,12 @@ def _seconds(run: Callable, start: Any) -> float:
     return time.perf_counter() - began
 
 
-def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, Callable, object]]:
-    """By name: calls per control step, a step (tick, state) -> state, its first state."""
+def _block(
+    config: TaskConfig, rows: int, columns: int
+) -> tuple[Task, Episodes, Prepared, PolicyController, EpisodeState]:
+    """A block of episodes of random policies: what the loop over time needs, and their first state."""
     simulator, lanes = Simulator(config), rows * columns
-    task, timestep = simulator.task, 1.0 / config.sim_rate
+    task = simulator.task
     pool = sample_pool(jax.random.key(0), registry.resolve("player3/M0"), ball_params(), 1024)
     episodes = jax.tree.map(
         lambda x: x.reshape(*x.shape[:-2], lanes) if x.ndim >= 2 else x,
@@ -95,7 +107,31 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
     )
     theta = jnp.stack([initial_theta(key) for key in jax.random.split(jax.random.key(2), columns)], axis=-1)
     controller = PolicyController(unflatten(theta), jnp.zeros(N_OBSERVATION), jnp.ones(N_OBSERVATION))
-    prepared, first = task.prepare(episodes), task.reset(episodes, controller)
+    return task, episodes, task.prepare(episodes), controller, task.reset(episodes, controller)
+
+
+def _by_lanes(config: TaskConfig, rows: int, columns: int, ticks: int) -> tuple[Callable, Any]:
+    """The whole compiled lane by lane: ``ticks`` control steps of every episode, whether it has ended or not."""
+    task, episodes, prepared, controller, first = _block(config, rows, columns)
+
+    def step(tick: Array, now: tuple, by_lane: tuple, by_column: Any) -> tuple:
+        return now[0], task.control_step(tick, now[1], *by_lane, by_column)
+
+    def run(arguments: tuple) -> Any:
+        state, by_lane, by_column = arguments
+        going = jnp.ones(rows * columns, bool)
+        return while_any(lambda now: now[0], step, (going, state), by_lane, by_column, limit=ticks)
+
+    arguments = jax.block_until_ready(jax.tree.map(jnp.asarray, (first, (episodes, prepared), controller)))
+    compiled = jax.jit(run).lower(arguments).compile()
+    _seconds(compiled, arguments)
+    return compiled, arguments
+
+
+def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, Callable, object]]:
+    """By name: calls per control step, a step (tick, state) -> state, its first state."""
+    lanes, timestep = rows * columns, 1.0 / config.sim_rate
+    task, episodes, prepared, controller, first = _block(config, rows, columns)
     speeds = 0.1 * jax.random.normal(jax.random.key(4), (N_JOINTS, lanes))
     pose = task.kinematics.pose(first.qpos, speeds)
     observation = jnp.concatenate([first.ball.position, first.qpos])

@@ -60,6 +60,45 @@ def count(compiled: Compiled) -> Counts:
     return _total(entry[1], bodies)
 
 
+_BLOCK = re.compile(r"^(\S+):.*?\n(.*?)(?=^\S+:|\Z)", re.MULTILINE | re.DOTALL)
+_VECTOR = re.compile(r"= (?:tail )?(?:call )?(.*?) ?<(\d+) x (?:float|i32|i8|i1)>(.*)")
+_NO_OPERATION = {"load", "bitcast", "shufflevector", "insertelement", "freeze", "phi", "trunc", "zext"}
+
+
+def count_lanes(text: str, rounds: int) -> Counts:
+    """Amounts of one run of @step of an optimised module of ``mjx_tt.lanes``, for one lane.
+
+    rounds: of each block that branches to itself. Bytes are those that the program itself loads and stores, without
+    what the compiler puts aside for want of registers.
+    """
+    body = re.search(r"^define internal[^\n]* @step\(.*?^}", text, re.MULTILINE | re.DOTALL)
+    if body is None:
+        raise ValueError("the module has no function @step")
+    code = re.sub(r"\A[^\n]*\n(?!\S+:)", "entry:\n", body[0])
+    total = Counts(0.0, 0.0, 0.0, 1.0)
+    for label, lines in _BLOCK.findall(code.rstrip("}\n") + "\n"):
+        again = rounds if re.search(rf"br .*%{re.escape(label)}\b", lines) else 1
+        total = total + float(again) * _vectors(lines)
+    return total
+
+
+def _vectors(lines: str) -> Counts:
+    operations = transcendentals = bytes_ = 0.0
+    for line in lines.splitlines():
+        if re.search(r"\bload <|\bstore <", line):
+            bytes_ += 1.0 if "x i8>" in line else 4.0
+        found = _VECTOR.search(line)
+        if not found:
+            continue
+        words = found[1].split()
+        operation = words[0] if words else ""
+        if operation in _NO_OPERATION:
+            continue
+        operations += 2.0 if "@llvm.fma" in line else 1.0
+        transcendentals += "@llvm.sqrt" in line
+    return Counts(operations, transcendentals, bytes_, 0.0)
+
+
 def _total(name: str, bodies: dict[str, str]) -> Counts:
     """Amounts of one run of a computation: XLA's, in which its loops run once, and their further rounds."""
     counts = _once(name, bodies)

@@ -64,6 +64,11 @@ def while_any(
     return _by_xla(live, step, state, by_lane, by_column, limit)
 
 
+def compiled() -> list[str]:
+    """LLVM's text of the loops that this process compiled lane by lane, in order."""
+    return list(_NAMES)
+
+
 def _by_xla(live: Callable, step: Step, state: S, by_lane: Any, by_column: Any, limit: int) -> S:
     def running(carry: tuple[Array, S]) -> Array:
         return (carry[0] < limit) & jnp.any(live(carry[1]))

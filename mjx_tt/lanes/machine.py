@@ -39,7 +39,7 @@ def compiled(text: str, function: str, folder: Path | None) -> ctypes.c_void_p:
     path = folder / f"{_digest('|'.join((text, *built_for)).encode())}.o" if folder else None
     code = _kept(path) if path else None
     if code is None:
-        code = _built(text)
+        code = _machine().emit_object(optimised(text))
         if path:
             _keep(path, code)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
@@ -49,7 +49,8 @@ def compiled(text: str, function: str, folder: Path | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(engine.get_function_address(function))
 
 
-def _built(text: str) -> bytes:
+def optimised(text: str) -> llvm.ModuleRef:
+    """The module as LLVM makes it better for this processor; ``str`` gives its text."""
     module = llvm.parse_assembly(text)
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=2)
@@ -57,7 +58,7 @@ def _built(text: str) -> bytes:
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
     builder = llvm.create_pass_builder(_machine(), options)
     builder.getModulePassManager().run(module, builder)
-    return _machine().emit_object(module)
+    return module
 
 
 def _digest(data: bytes) -> str:

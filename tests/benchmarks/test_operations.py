@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from benchmarks import operations
+from mjx_tt.lanes import loop, machine
 
 N = 4096
 
@@ -43,3 +44,17 @@ def test_a_loop_of_unknown_length_is_refused():
     compiled = jax.jit(double).lower(jnp.ones(4)).compile()
     with pytest.raises(ValueError, match="does not say how often its loop .* runs"):
         operations.count(compiled)
+
+
+def test_a_loop_by_lanes_by_hand():
+    """Three rounds of a product and a sum, then one square root; two numbers in, one out."""
+
+    def step(tick, state, by_lane, by_column):
+        live, x = state
+        return live, jnp.sqrt(jax.lax.fori_loop(0, 3, lambda _, y: 0.5 * y + by_lane[0], x))
+
+    state = (jnp.ones(20, bool), jnp.ones(20))
+    jax.jit(lambda state, a: loop.while_any(lambda s: s[0], step, state, (a,), limit=2)).lower(state, jnp.ones(20))
+    counts = operations.count_lanes(str(machine.optimised(loop.compiled()[-1])), rounds=3)
+    assert (counts.operations, counts.transcendentals, counts.kernels) == (7.0, 1.0, 1.0)
+    assert counts.bytes in (12.0, 20.0)  # the second number once, or in every round
