@@ -115,7 +115,7 @@ def meeting(
         contact = live & bounced & (since > READY) & ~again & ((new.position[1] >= plane) | fallen)
         lost = live & ~contact & (again | (new.position[2] < FLOOR))
         live = live & ~contact & ~lost
-        seconds = jnp.where(live | contact, (tick + 1) * period, met.incoming.seconds)
+        seconds = jnp.where(live | contact, (tick + 1).astype(jnp.float32) * period, met.incoming.seconds)
         incoming = Incoming(where(contact, new, met.incoming.ball), landing, seconds)
         return where(live, new, ball), live, since, Meeting(incoming, met.reached | contact, net)
 
