@@ -22,6 +22,9 @@ def test_spindoe(tmp_path):
     (tmp_path / "index.csv").write_text("traj_file;x_spin\n001.csv;10\n")
     with pytest.raises(ValueError, match="index.csv: column y_spin, z_spin is missing"):
         read_spindoe(tmp_path)
+    (tmp_path / "index.csv").unlink()
+    with pytest.raises(FileNotFoundError, match=r"index\.csv: no such file; a folder .* has one"):
+        read_spindoe(tmp_path)
 
 
 HEAD = "player_id,rally_id,type,timestamp,ball_pos,ball_vel_out,ball_spin_out\n"
