@@ -92,12 +92,15 @@ class BGSState:
     average    (d,) moving average of theta after each update
     opt_state  state of the optax step
     updates    () int32, number of ``tell`` calls
+    factor     (d, d) L of ``metric.factor``: members are theta +/- sigma L delta, and steps are L times what the
+               optax step makes of the gradient along delta; None: the identity
     """
 
     theta: Float[Array, " d"]
     average: Float[Array, " d"]
     opt_state: optax.OptState
     updates: Int[Array, ""]
+    factor: Float[Array, "d d"] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -157,7 +160,7 @@ def perturb(state: BGSState, directions: Float[Array, "d N"], config: BGSConfig)
     """The members along given directions (d, N): ``ask`` without its sampling."""
     with jax.numpy_dtype_promotion("standard"):  # optax's schedules divide integers by floats
         sigma = config.sigma(state.updates) if callable(config.sigma) else config.sigma
-    theta, offsets = state.theta[:, None], jnp.asarray(sigma, state.theta.dtype) * directions
+    theta, offsets = state.theta[:, None], jnp.asarray(sigma, state.theta.dtype) * _in_theta(state, directions)
     return Population(jnp.concatenate([theta + offsets, theta - offsets], axis=1), directions)
 
 
@@ -182,7 +185,7 @@ def tell(
     # optax descends, returns are to rise.
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to an integer count
         change, opt_state = config.step.update(-gradient, state.opt_state, state.theta)
-    theta = optax.apply_updates(state.theta, change)
+    theta = optax.apply_updates(state.theta, _in_theta(state, change))
     average = config.ema_decay * state.average + (1 - config.ema_decay) * theta
 
     after = (theta, average, opt_state)
@@ -196,4 +199,11 @@ def tell(
         elite_std=shaped.elite_std,
         mean_return=shaped.mean_return,
     )
-    return BGSState(theta, average, opt_state, state.updates + 1), info
+    return BGSState(theta, average, opt_state, state.updates + 1, state.factor), info
+
+
+def _in_theta(state: BGSState, along: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
+    """Perturbations or a step in the parameters' own numbers."""
+    if state.factor is None:
+        return along
+    return jnp.matmul(state.factor, along, precision=jax.lax.Precision.HIGHEST)

@@ -175,9 +175,18 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner[Any]:
     if isinstance(settings, Bgs):
         optimiser = settings.optimiser
         bgs = checked("optimiser", build.bgs_config, optimiser, settings.schedule_updates)
-        common_numbers, scale = optimiser.common_random_numbers, optimiser.initial_scale
         return Evolution(
-            Trainer(simulator, bgs, pool, model.model, model.randomise, optimiser.repeats, common_numbers, scale)
+            Trainer(
+                simulator,
+                bgs,
+                pool,
+                model.model,
+                model.randomise,
+                optimiser.repeats,
+                optimiser.common_random_numbers,
+                optimiser.initial_scale,
+                metric=optimiser.action_metric,
+            )
         )
     env = TableTennis(simulator, pool, model.model, model.randomise)
     if isinstance(settings, Ppo):

@@ -164,6 +164,15 @@ class SigmaFall(Section):
     """Share of the updates before the fall."""
 
 
+class ActionMetric(Section):
+    """Perturbations and steps that change the actions alike in every direction: natural gradients (``bgs.metric``)."""
+
+    every: Count = 500
+    """Updates after which the metric is measured again, with the policy of then on balls of then."""
+    damping: Positive = 0.05
+    """Added to the metric, over its mean eigenvalue: the smaller, the wider are idle directions tried."""
+
+
 class Shaping(Section):
     """Keys of Blackbox Gradient Sensing that training and fine-tuning share with their defaults."""
 
@@ -189,6 +198,8 @@ class Optimiser(Shaping):
     """Episodes per perturbation."""
     sigma_fall: SigmaFall | None = None
     """Smaller perturbations later on: more returned in this simulation, fewer in another world; null: none."""
+    action_metric: ActionMetric | None = None
+    """Perturb by what changes in the actions; null: all parameters alike, as the paper."""
     elite_fraction: EliteFraction = 1.0
     step: Step = Step()
     """From the gradient estimate to a change of the parameters."""
