@@ -18,12 +18,14 @@ import math
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import jax
 import yaml
+from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 
 from ballmodel.io.atomic_files import replacing
@@ -36,9 +38,9 @@ from experiments.baselines.ppo import PpoLearner
 from experiments.baselines.qt_opt import QtOptAgent
 from experiments.baselines.sac import SacAgent
 from experiments.config import build
-from experiments.config.baselines import Algorithm, Bgs, Budget, Comparison, Ppo, Sac
+from experiments.config.baselines import Algorithm, Bgs, Budget, Comparison, Curve, Ppo, Sac
 from experiments.config.build import Experiment
-from experiments.config.experiment import Config
+from experiments.config.experiment import Config, Task
 from experiments.errors import RunError, checked
 from experiments.evaluation import evaluate
 from experiments.jobs import engine
@@ -52,6 +54,7 @@ from mjx_tt.env.task import Controller
 from mjx_tt.sim.model import ModelFile
 
 STARTED = "started.json"
+OWN = ("balls", "model")  # keys of the experiment that an algorithm may have values of its own for
 RELATIVE = ("velocity", "acceleration", "jerk")  # reward terms: 1 - mean over joints and steps of |value| / limit
 
 
@@ -76,7 +79,7 @@ class Common:
         if config["robot"] is not None:  # trainings of before have no such key
             shared["robot"] = config["robot"]
         given = self.comparison.to_dict()
-        algorithm = {key: value for key, value in given["algorithms"][name].items() if key not in ("balls", "model")}
+        algorithm = {key: value for key, value in given["algorithms"][name].items() if key not in OWN}
         return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
 
     def evaluation_conditions(self) -> dict[str, Any]:
@@ -273,7 +276,7 @@ def _finished(common: Common, name: str, seed: int) -> bool:
     folder = common.run_folder(name, seed)
     if not (folder / "training.json").exists():
         return False
-    before, now = json.loads((folder / "training.json").read_text())["conditions"], common.conditions(name)
+    before, now = _completed(json.loads((folder / "training.json").read_text())["conditions"]), common.conditions(name)
     differing = [key for key in now if before.get(key) != now[key]]
     if differing:
         raise RunError(
@@ -281,6 +284,17 @@ def _finished(common: Common, name: str, seed: int) -> bool:
         )
     path = folder / "evaluation.json"
     return path.exists() and json.loads(path.read_text())["conditions"] == common.evaluation_conditions()
+
+
+def _completed(conditions: dict[str, Any]) -> dict[str, Any]:
+    """Settings of an earlier training with the defaults of keys that did not exist then."""
+    completed = dict(conditions)
+    models: dict[str, Any] = {"task": Task, "budget": Budget, "curve": Curve, "algorithm": Algorithm}
+    for key, model in models.items():
+        with suppress(ValidationError):  # a key that is gone: not the settings of now
+            completed[key] = TypeAdapter(model).validate_python(conditions[key]).model_dump(mode="json")
+    completed["algorithm"] = {key: completed["algorithm"][key] for key in completed["algorithm"] if key not in OWN}
+    return completed
 
 
 def _train(

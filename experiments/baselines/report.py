@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, PercentFormatter
 
 from ballmodel.io.atomic_files import replacing
 from experiments.config.baselines import Comparison
@@ -28,6 +28,7 @@ from experiments.stats import wilson
 COLOURS = ("#1b7837", "#7fbf7b", "#762a83", "#2166ac", "#b35806", "#b2182b", "#542788", "#4d4d4d")
 WORLDS = {"simulation": "in simulation", "reality": "in a world that it has never seen"}
 CURVE = ("episodes", "steps", "seconds", "cpu_seconds", "return_rate", "low", "high", "hit_rate", "mean_return")
+NAMES_IN_A_ROW = 48  # letters of all names that fit side by side under the bars
 RESTLESSNESS = {
     "action_change": "mean square of an action's change",
     "velocity": "velocity over its limit",
@@ -136,6 +137,9 @@ def _curves(found: Runs, colours: Colours, clock: str) -> Figure:
     if known:
         grid[2, 0].set_ylim(min(known) - 2, max(known) + 1)
     grid[2, 0].set_xscale("log")
+    grid[2, 0].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    grid[2, 0].xaxis.set_major_formatter(lambda v, _: f"{v:,.0f}" if v < 1e6 else f"{v / 1e6:g} million")
+    grid[2, 0].xaxis.set_minor_formatter(NullFormatter())
     grid[2, 0].set_xlabel("episodes of training")
     grid[2, 1].set_xlabel("training time [s]" if clock == "wall" else "processor time of training [s]")
     grid[0, 1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -148,7 +152,7 @@ def _bars(axes: Axes, heights: dict[str, float], colours: Colours) -> np.ndarray
     """A bar per algorithm; returns their places."""
     place = np.arange(len(heights))
     axes.bar(place, list(heights.values()), width=0.62, color=[colours[name] for name in heights])
-    many = len(heights) > 6
+    many = len(heights) > 6 or sum(map(len, heights)) > NAMES_IN_A_ROW
     axes.set_xticks(place, list(heights), rotation=30 if many else 0, ha="right" if many else "center")
     axes.grid(axis="y", alpha=0.25)
     return place
@@ -167,9 +171,8 @@ def _transfer(summary: Summary, colours: Colours) -> Figure:
                 axes.plot(
                     np.full(len(by_seed), at + 0.2), by_seed, "o", markersize=4, color=INK, markerfacecolor="white"
                 )
-            axes.annotate(
-                f"{rate:.1%}", (at, found["high"]), (0, 4), textcoords="offset points", ha="center", fontsize=9
-            )
+            top = max(found["high"], *by_seed)
+            axes.annotate(f"{rate:.1%}", (at, top), (0, 5), textcoords="offset points", ha="center", fontsize=9)
         axes.set_title(f"Returned {title}")
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     row[0].set_ylim(0.0, max(0.05, 1.12 * row[0].get_ylim()[1]))

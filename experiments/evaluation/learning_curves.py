@@ -152,7 +152,7 @@ def _curves(curves: list[Curve]) -> Figure:
                 )
     for axes, label in zip(panels, ("training time [min]", "balls"), strict=True):
         axes.set_xscale("log")
-        axes.set_xlim(left=max(line.get_xdata()[-1] for line in axes.lines) / 100)  # the first updates say nothing
+        axes.set_xlim(left=min(line.get_xdata()[-1] for line in axes.lines) / 30)  # the first updates say nothing
         axes.xaxis.set_major_formatter(lambda v, _: f"{v:,g}" if v < 1e6 else f"{v / 1e6:g} million")
         axes.set_xlabel(label)
         axes.grid(alpha=0.25)

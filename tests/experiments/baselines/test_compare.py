@@ -232,6 +232,13 @@ def test_a_comparison_runs_resumes_and_refuses(tmp_path, capsys):
         return compare.unfinished(compare.prepare(*baselines.load(path, overrides), str(path), tmp_path, console))
 
     assert missing() == {"ES": []}
+    path_of_training = run / "training.json"
+    whole = path_of_training.read_text()
+    older = json.loads(whole)  # by a version that lacked these keys
+    del older["conditions"]["task"]["lanes"], older["conditions"]["algorithm"]["optimiser"]["sigma_fall"]
+    path_of_training.write_text(json.dumps(older))
+    assert missing() == {"ES": []}
+    path_of_training.write_text(whole)
     assert missing("seeds=[0, 3]") == {"ES": [3]}
     assert missing("algorithms.P={kind: ppo}") == {"ES": [], "P": [0]}
     assert missing("reality.ball_spin.mean_x=100.0") == {"ES": [0]}  # to be evaluated again
