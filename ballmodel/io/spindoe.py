@@ -33,7 +33,7 @@ def read_spindoe(path: str | os.PathLike) -> SpinDataset:
     """Reads a folder, or its index.csv. Raises ValueError naming file and row, FileNotFoundError for a missing file."""
     index = Path(path) / INDEX if Path(path).is_dir() else Path(path)
     if not index.is_file():
-        raise FileNotFoundError(f"{index}: no such file; a folder of flights in SpinDOE's form has one, which names them")
+        raise FileNotFoundError(f"{index}: no such file; in SpinDOE's form a folder of flights has one")
     delimiter = ";" if ";" in index.read_text(encoding="utf-8-sig").partition("\n")[0] else ","
     with open(index, newline="", encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file, delimiter=delimiter))
