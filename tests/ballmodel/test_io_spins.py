@@ -23,9 +23,7 @@ def test_spindoe(tmp_path):
     with pytest.raises(ValueError, match="index.csv: column y_spin, z_spin is missing"):
         read_spindoe(tmp_path)
     (tmp_path / "index.csv").unlink()
-    with pytest.raises(
-        FileNotFoundError, match=r"index\.csv: no such file; in SpinDOE's form"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"index\.csv: no such file; in SpinDOE's form"):
         read_spindoe(tmp_path)
 
 
