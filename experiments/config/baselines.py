@@ -13,7 +13,9 @@ from pydantic import Field, field_validator, model_validator
 
 from experiments.config import experiment as config
 from experiments.config import validation
-from experiments.config.experiment import Config, Count, Name, Optimiser, Positive, Section, Seed
+from experiments.config.experiment import Config
+from experiments.config.optimiser import Optimiser
+from experiments.config.section import Count, Name, Positive, Section, Seed
 from experiments.errors import ConfigError
 
 Layers = Annotated[list[Count], Field(min_length=1)]

@@ -15,7 +15,9 @@ from ballmodel.sampling import BallPool, sample_pool
 from bgs import optimizers
 from bgs.strategy import BGSConfig
 from experiments.config import prior
-from experiments.config.experiment import Config, Optimiser, Rewards, Section, Task, Training
+from experiments.config.experiment import Config, Rewards, Task, Training
+from experiments.config.optimiser import Optimiser
+from experiments.config.section import Section
 from experiments.errors import ConfigError, checked
 from mjx_tt.env import own as user_file
 from mjx_tt.env import rewards

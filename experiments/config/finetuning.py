@@ -8,20 +8,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from experiments.config import validation
-from experiments.config.experiment import (
-    Constant,
-    Count,
-    EliteFraction,
-    EmaDecay,
-    NumDirections,
-    Optimiser,
-    Rewards,
-    Seed,
-    Shaping,
-    Step,
-    apply_override,
-    read_yaml,
-)
+from experiments.config.experiment import Rewards, apply_override, read_yaml
+from experiments.config.optimiser import Constant, EliteFraction, EmaDecay, NumDirections, Optimiser, Shaping, Step
+from experiments.config.section import Count, Seed
 from experiments.errors import ConfigError
 
 MEASURED = ("state_transition", "net_clearance", "hit_and_land", "fault")  # terms that a real episode tells

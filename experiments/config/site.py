@@ -15,7 +15,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from experiments.config import validation
-from experiments.config.experiment import Count, Positive, Section, read_yaml
+from experiments.config.experiment import read_yaml
+from experiments.config.section import Count, Positive, Section
 from experiments.errors import ConfigError
 
 

@@ -13,21 +13,12 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, field_validator, model_validator
 
 from experiments.config import experiment, validation
-from experiments.config.experiment import (
-    Count,
-    LaterRewards,
-    Name,
-    Optimiser,
-    Positive,
-    Section,
-    Seed,
-    Step,
-    Task,
-    read_mapping,
-)
+from experiments.config.experiment import LaterRewards, Task, read_mapping
 from experiments.config.finetuning import FineTuning
 from experiments.config.finetuning import parse as parse_fine_tuning
+from experiments.config.optimiser import Optimiser, Step
 from experiments.config.prior import PRIOR
+from experiments.config.section import Count, Name, Positive, Section, Seed
 
 Player = Literal["player1", "player2", "player3", "player4", "player5"]
 PLAYERS: tuple[Player, ...] = get_args(Player)

@@ -20,7 +20,7 @@ from bgs import metric, normalizer, strategy
 from bgs.strategy import BGSConfig, BGSState
 from experiments.config import build
 from experiments.config.build import Experiment
-from experiments.config.experiment import ActionMetric
+from experiments.config.optimiser import ActionMetric
 from experiments.errors import checked
 from experiments.training import action_metric
 from mjx_tt.env.own import Network

@@ -12,7 +12,7 @@ from ballmodel import registry
 from ballmodel.sampling import sample_pool
 from bgs import normalizer, optimizers
 from bgs.strategy import BGSConfig
-from experiments.config.experiment import ActionMetric
+from experiments.config.optimiser import ActionMetric
 from experiments.training import action_metric
 from experiments.training.update import Trainer
 from mjx_tt.env.brax import TableTennis
