@@ -1,4 +1,4 @@
-"""What the sections of all YAMLs have in common: numbers that may stand in them, and mappings without unknown keys."""
+"""Common parts of the sections of all YAMLs: numbers that may stand in them, and mappings without unknown keys."""
 
 from __future__ import annotations
 
