@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 
 def factor(metric: Float[Array, "d d"], damping: float) -> Float[Array, "d d"]:
-    """L (d, d) with L L^T = c (F + e I)^-1 for the metric F (d, d), symmetric and positive semi-definite.
+    """Upper triangular L (d, d): L L^T = c (F + e I)^-1 for the metric F (d, d), symmetric and positive semi-definite.
 
     damping: e over F's mean eigenvalue, positive. c is such that L z of a standard Gaussian z changes the outputs by
     the same mean square as z itself: sigma keeps its meaning. A metric that is no number or zero (a policy that does

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
+from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int, PRNGKeyArray
 
@@ -92,8 +93,8 @@ class BGSState:
     average    (d,) moving average of theta after each update
     opt_state  state of the optax step
     updates    () int32, number of ``tell`` calls
-    factor     (d, d) L of ``metric.factor``: members are theta +/- sigma L delta, and steps are L times what the
-               optax step makes of the gradient along delta; None: the identity
+    factor     (d, d) upper triangular L of ``metric.factor``: members are theta +/- sigma L delta, and the optax step
+               climbs along delta, where theta is L^-1 theta; None: the identity
     """
 
     theta: Float[Array, " d"]
@@ -184,7 +185,7 @@ def tell(
     gradient = jnp.matmul(directions, shaped.weights, precision=jax.lax.Precision.HIGHEST)
     # optax descends, returns are to rise.
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to an integer count
-        change, opt_state = config.step.update(-gradient, state.opt_state, state.theta)
+        change, opt_state = config.step.update(-gradient, state.opt_state, _along_directions(state))
     theta = optax.apply_updates(state.theta, _in_theta(state, change))
     average = config.ema_decay * state.average + (1 - config.ema_decay) * theta
 
@@ -200,6 +201,11 @@ def tell(
         mean_return=shaped.mean_return,
     )
     return BGSState(theta, average, opt_state, state.updates + 1, state.factor), info
+
+
+def _along_directions(state: BGSState) -> Float[Array, " d"]:
+    """Parameters as the step sees them, so that a decay of weights shrinks theta itself."""
+    return state.theta if state.factor is None else solve_triangular(state.factor, state.theta, lower=False)
 
 
 def _in_theta(state: BGSState, along: Float[Array, "d ..."]) -> Float[Array, "d ..."]:

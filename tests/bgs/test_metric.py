@@ -18,7 +18,7 @@ DAMPING = 0.05
 
 @pytest.fixture(scope="module")
 def jacobian():
-    """Outputs (5,) of a linear function of 12 parameters that differ by four orders of magnitude in what they do."""
+    """Of 40 outputs of a linear function of 12 parameters, which differ by four orders of magnitude in what they do."""
     rng = np.random.default_rng(0)
     return rng.normal(size=(40, D)) * np.logspace(1, -3, D)
 
@@ -59,11 +59,13 @@ def test_damping_is_positive(damping):
 
 
 def test_update_by_hand():
-    """Members at theta +/- sigma L delta, and a step of L times the plain one."""
+    """Members at theta +/- sigma L delta, and a step of L times the plain one; weights decay as without L."""
     rng = np.random.default_rng(1)
-    factor, directions = rng.normal(size=(3, 3)), rng.normal(size=(3, 4))
+    factor, directions = np.triu(rng.normal(size=(3, 3))) + 2.0 * np.eye(3), rng.normal(size=(3, 4))
     theta, plus, minus = np.array([1.0, -2.0, 0.5]), rng.normal(size=4), rng.normal(size=4)
-    config = bgs.BGSConfig(num_directions=4, elite_fraction=1.0, sigma=0.1, step=optimizers.make("sgd", 0.2))
+    config = bgs.BGSConfig(
+        num_directions=4, elite_fraction=1.0, sigma=0.1, step=optimizers.make("sgd", 0.2, weight_decay=0.3)
+    )
     with jax.enable_x64(True):
         state = replace(bgs.init(jnp.asarray(theta), config), factor=jnp.asarray(factor))
         population = bgs.perturb(state, jnp.asarray(directions), config)
@@ -73,7 +75,7 @@ def test_update_by_hand():
     )
     np.testing.assert_allclose(population.members, members, rtol=1e-12)
     gradient = directions @ (plus - minus) / (4 * np.concatenate([plus, minus]).std())
-    np.testing.assert_allclose(after.theta, theta + 0.2 * factor @ gradient, rtol=1e-12)
+    np.testing.assert_allclose(after.theta, theta + 0.2 * factor @ gradient - 0.2 * 0.3 * theta, rtol=1e-12)
     np.testing.assert_array_equal(after.factor, factor)
 
 
