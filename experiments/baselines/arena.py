@@ -12,6 +12,7 @@ import numpy as np
 from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
+from mjx_tt.env.episode import reshaped
 from mjx_tt.env.rollout import RolloutResult, Simulator
 from mjx_tt.env.task import Controller, Episodes, EpisodeState, TaskConfig, Tick
 from mjx_tt.sim.model import ModelFile
@@ -72,7 +73,7 @@ class Arena:
 
     def _action_change(self, controller: Controller, balls: BallPool, key: jax.Array) -> jax.Array:
         task, episodes = self._simulator.task, self._draw(balls, key)
-        episodes = jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1) if x.ndim >= 2 else x, episodes)
+        episodes = reshaped(episodes, -1)
         prepared, remembered = task.prepare(episodes), Remembered(controller, controller.mean)
 
         def advance(carry: Carry, tick: Tick) -> tuple[Carry, None]:

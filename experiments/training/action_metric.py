@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from bgs.normalizer import ObservationStatistics, normaliser
+from mjx_tt.env.episode import reshaped
 from mjx_tt.env.own import Network
 from mjx_tt.env.policy import Policy, controller
 from mjx_tt.env.rollout import AXIS, Simulator
@@ -63,7 +64,7 @@ def measure(
     episodes had ended before their ticks.
     """
     mean, inv_std = normaliser(statistics)
-    local = simulator.local(jax.tree.map(lambda x: x.reshape(*x.shape[:-2], -1) if x.ndim >= 2 else x, episodes))
+    local = simulator.local(reshaped(episodes, -1))
     ticks = simulator.local(jax.random.randint(key, episodes.seed.shape, 0, simulator.task.config.max_steps))
     columns = jnp.repeat(theta[:, None], ticks.shape[-1], axis=1)
     windows, valid = _windows(simulator, Policy(columns, mean, inv_std, network), local, ticks)

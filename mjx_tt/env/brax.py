@@ -24,6 +24,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from ballmodel.sampling import BallPool
+from mjx_tt.env.episode import reshaped
 from mjx_tt.env.observation import observe
 from mjx_tt.env.outgoing_ball import fly_out
 from mjx_tt.env.reward_sums import reward_terms
@@ -110,7 +111,7 @@ class TableTennis(Env):
     def draw(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Episodes:
         """Fresh episodes of the batch shape."""
         drawn = self._simulator.draw(key, self._pool, self._model, self._randomise, 1, int(np.prod(batch)))
-        return jax.tree.map(lambda x: x.reshape(*x.shape[:-2], *batch) if x.ndim >= 2 else x, drawn)
+        return reshaped(drawn, *batch)
 
     def begin(self, episodes: Episodes, key: PRNGKeyArray) -> State:
         """The state before the first step of given episodes (...); ``key`` is for those that follow."""

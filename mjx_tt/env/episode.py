@@ -105,6 +105,11 @@ class Episodes:
     start: Float[Array, "joints *batch"] | None = None
 
 
+def reshaped(episodes: Episodes, *batch: int) -> Episodes:
+    """Episodes (..., R, P), as they are drawn, with other batch axes; scalars of the model are shared as before."""
+    return jax.tree.map(lambda x: x.reshape(*x.shape[:-2], *batch) if x.ndim >= 2 else x, episodes)
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Prepared:

@@ -15,7 +15,9 @@ from bgs.strategy import BGSConfig
 from experiments.config.optimiser import ActionMetric
 from experiments.training import action_metric
 from experiments.training.update import Trainer
+from mjx_tt.env import own
 from mjx_tt.env.brax import TableTennis
+from mjx_tt.env.episode import reshaped
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
@@ -44,12 +46,13 @@ def drawn(simulator, pool):
     return simulator.draw(jax.random.key(1), pool, SimModel(), (), 1, N)
 
 
-def measured(simulator, pool, theta):
+def measured(simulator, pool, theta, network=None, episodes=None):
     def local(theta, episodes):
-        return action_metric.measure(simulator, jax.random.key(2), theta, STATISTICS, None, episodes)
+        return action_metric.measure(simulator, jax.random.key(2), theta, STATISTICS, network, episodes)
 
     play = jax.jit(simulator.on_devices(local, out_specs=PartitionSpec()))
-    return np.asarray(play(*simulator.replicate((theta, drawn(simulator, pool)))))
+    episodes = drawn(simulator, pool) if episodes is None else episodes
+    return np.asarray(play(*simulator.replicate((theta, episodes))), np.float64)
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +66,7 @@ def test_it_is_the_mean_of_the_actions_derivatives_where_the_policy_plays(found,
     mean, inv_std = (np.asarray(x) for x in normalizer.normaliser(STATISTICS))
     # The same episodes, step by step, in the environment that shows its histories.
     env = TableTennis(simulator, pool, SimModel())
-    episodes = jax.tree.map(lambda x: x.reshape(*x.shape[:-2], N) if x.ndim >= 2 else x, drawn(simulator, pool))
-    state, advance = env.begin(episodes, jax.random.key(9)), jax.jit(env.step)
+    state, advance = env.begin(reshaped(drawn(simulator, pool), N), jax.random.key(9)), jax.jit(env.step)
     over, windows = np.zeros(N, bool), []
     for tick in range(TASK.max_steps):
         history = np.moveaxis(np.asarray(state.obs).reshape(N, 8, 11), 0, -1)
@@ -88,6 +90,36 @@ def test_devices_share_the_episodes(found, pool, theta):
     np.testing.assert_allclose(
         measured(Simulator(TASK, devices=2), pool, theta), found, rtol=0, atol=1e-5 * np.abs(found).max()
     )
+
+
+NETWORK = """
+import jax.numpy as jnp
+from mjx_tt.env.own import network
+
+@network("linear", shapes={"weights": (8, 11), "bias": (8,)})
+class Linear:
+    @staticmethod
+    def start(parameters, x):
+        return ()
+
+    @staticmethod
+    def step(parameters, state, x):
+        return parameters["weights"] @ x + parameters["bias"], state
+"""
+
+
+def test_a_network_of_ones_own(pool):
+    """A linear one: the metric joins no two joints, is the same for each, and holds the inputs' second moments."""
+    network = own.load(NETWORK, "linear.py").networks["linear"]
+    found = measured(Simulator(TASK), pool, jnp.full(network.size, 1e-3), network)
+    weights, bias = found[:88, :88].reshape(8, 11, 8, 11), found[88:, 88:]
+    np.testing.assert_allclose(bias, np.eye(8), atol=1e-6)
+    for i in range(8):
+        for j in range(8):
+            wanted = weights[0, :, 0] if i == j else np.zeros((11, 11))
+            np.testing.assert_allclose(weights[i, :, j], wanted, atol=1e-4 * np.abs(weights).max())
+    moments = weights[0, :, 0]
+    assert np.linalg.eigvalsh(moments).min() > -1e-4 * np.trace(moments) and moments[1, 1] > 0.01
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +157,6 @@ def test_members_change_the_actions_as_much_as_before(trained, pool):
     simulator = Simulator(TASK)
     episodes = simulator.draw(jax.random.key(8), pool, SimModel(), (), 1, 512)
 
-    def local(theta, episodes):
-        return action_metric.measure(simulator, jax.random.key(7), theta, STATISTICS, None, episodes)
-
-    play = jax.jit(simulator.on_devices(local, out_specs=PartitionSpec()))
-    found = np.asarray(play(*simulator.replicate((trained[0].bgs.theta, episodes))), np.float64)
+    found = measured(simulator, pool, trained[0].bgs.theta, episodes=episodes)
     factor = np.asarray(trained[1].bgs.factor, np.float64)
     assert np.trace(factor.T @ found @ factor) == pytest.approx(np.trace(found), rel=0.2)
