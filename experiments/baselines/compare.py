@@ -38,7 +38,7 @@ from experiments.baselines.ppo import PpoLearner
 from experiments.baselines.qt_opt import QtOptAgent
 from experiments.baselines.sac import SacAgent
 from experiments.config import build
-from experiments.config.baselines import Algorithm, Bgs, Budget, Comparison, Curve, Ppo, Sac
+from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison, Curve, Ppo, Sac
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config, Task
 from experiments.errors import RunError, checked
@@ -54,7 +54,6 @@ from mjx_tt.env.task import Controller
 from mjx_tt.sim.model import ModelFile
 
 STARTED = "started.json"
-OWN = ("balls", "model")  # keys of the experiment that an algorithm may have values of its own for
 RELATIVE = ("velocity", "acceleration", "jerk")  # reward terms: 1 - mean over joints and steps of |value| / limit
 
 
@@ -75,9 +74,7 @@ class Common:
     def conditions(self, name: str) -> dict[str, Any]:
         """Settings that decide a training, as plain data."""
         config = self.trains_in[name].config.to_dict()
-        shared = {key: config[key] for key in ("balls", "model", "task")} | {"pool": config["training"]["pool"]}
-        if config["robot"] is not None:  # trainings of before have no such key
-            shared["robot"] = config["robot"]
+        shared = {key: config[key] for key in ("robot", *OWN, "task")} | {"pool": config["training"]["pool"]}
         given = self.comparison.to_dict()
         algorithm = {key: value for key, value in given["algorithms"][name].items() if key not in OWN}
         return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
@@ -288,11 +285,11 @@ def _finished(common: Common, name: str, seed: int) -> bool:
 
 def _completed(conditions: dict[str, Any]) -> dict[str, Any]:
     """Settings of an earlier training with the defaults of keys that did not exist then."""
-    completed = dict(conditions)
+    completed = {"robot": None, "algorithm": {}} | conditions
     models: dict[str, Any] = {"task": Task, "budget": Budget, "curve": Curve, "algorithm": Algorithm}
     for key, model in models.items():
         with suppress(ValidationError):  # a key that is gone: not the settings of now
-            completed[key] = TypeAdapter(model).validate_python(conditions[key]).model_dump(mode="json")
+            completed[key] = TypeAdapter(model).validate_python(conditions.get(key)).model_dump(mode="json")
     completed["algorithm"] = {key: completed["algorithm"][key] for key in completed["algorithm"] if key not in OWN}
     return completed
 

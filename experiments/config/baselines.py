@@ -25,6 +25,9 @@ LearningRate = Annotated[Positive, Field(description="Of Adam, for every network
 RewardScale = Annotated[Positive, Field(description="By which rewards are multiplied before learning.")]
 
 
+OWN = ("balls", "model")  # keys of the experiment that an algorithm may have values of its own for
+
+
 class Learning(Section):
     """Settings of every algorithm."""
 
@@ -35,7 +38,7 @@ class Learning(Section):
 
     def own(self) -> dict[str, Any]:
         """Keys of the experiment that this algorithm has values of its own for, and those."""
-        return {key: value for key in ("balls", "model") if (value := getattr(self, key)) is not None}
+        return {key: value for key in OWN if (value := getattr(self, key)) is not None}
 
 
 class Bgs(Learning):
