@@ -276,3 +276,19 @@ def step(
     events = Events(hit_table, hit_net, hit_paddle, t, stack(at.position))
     new = jax.tree.map(lambda x, y: jnp.where(hit_any, x, y), after, free)
     return _stacked(new), events
+
+
+def touched(
+    params: BallParams,
+    state: BallState,
+    end: Float[jax.Array, "3 *batch"],
+    dt: Scalars,
+    paddle: tuple[PaddlePose, PaddlePose],
+) -> Bool[jax.Array, "*batch"]:
+    """Whether ``step`` has the blade touch a ball that would otherwise go from ``state`` to ``end`` [m] in ``dt`` [s].
+
+    paddle: pose at the step's start, pose at its end.
+    """
+    blade = (_mounted(params.paddle, _blade(pose)) for pose in paddle)
+    t, _ = _paddle_time(params.paddle, params.flight.radius, _ball(state), components(end), *blade, dt)
+    return t <= dt

@@ -208,11 +208,10 @@ def _paper_trainer(changes: list[str]) -> tuple[Trainer, TrainState]:
     import jax
 
     from experiments.config import build, experiment
-    from experiments.training import update as training
+    from experiments.training import trainers
 
-    trainer = training.trainer(
-        build.experiment(experiment.load(experiment.shipped()["paper"], tuple(changes)), "paper")
-    )
+    config = experiment.load(experiment.shipped()["paper"], tuple(changes))
+    trainer = trainers.trainer(build.experiment(config, "paper"))
     return trainer, trainer.init(jax.random.key(0))
 
 

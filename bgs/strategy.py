@@ -13,14 +13,13 @@ observations, and whoever evaluates the members both reads and extends them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import optax
 from jax import Array
-from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int, PRNGKeyArray
 
@@ -93,15 +92,12 @@ class BGSState:
     average    (d,) moving average of theta after each update
     opt_state  state of the optax step
     updates    () int32, number of ``tell`` calls
-    factor     (d, d) upper triangular L of ``metric.factor``: members are theta +/- sigma L delta, and the optax step
-               climbs along delta, where theta is L^-1 theta; None: the identity
     """
 
     theta: Float[Array, " d"]
     average: Float[Array, " d"]
     opt_state: optax.OptState
     updates: Int[Array, ""]
-    factor: Float[Array, "d d"] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -161,7 +157,7 @@ def perturb(state: BGSState, directions: Float[Array, "d N"], config: BGSConfig)
     """The members along given directions (d, N): ``ask`` without its sampling."""
     with jax.numpy_dtype_promotion("standard"):  # optax's schedules divide integers by floats
         sigma = config.sigma(state.updates) if callable(config.sigma) else config.sigma
-    theta, offsets = state.theta[:, None], jnp.asarray(sigma, state.theta.dtype) * _in_theta(state, directions)
+    theta, offsets = state.theta[:, None], jnp.asarray(sigma, state.theta.dtype) * directions
     return Population(jnp.concatenate([theta + offsets, theta - offsets], axis=1), directions)
 
 
@@ -183,33 +179,29 @@ def tell(
     shaped = shaping.shape(plus, minus, config.elite_fraction, config.rank, config.weighting, config.normalise)
     # Accelerators would otherwise multiply float32 in a shorter format.
     gradient = jnp.matmul(directions, shaped.weights, precision=jax.lax.Precision.HIGHEST)
-    # optax descends, returns are to rise.
-    with jax.numpy_dtype_promotion("standard"):  # optax raises floats to an integer count
-        change, opt_state = config.step.update(-gradient, state.opt_state, _along_directions(state))
-    theta = optax.apply_updates(state.theta, _in_theta(state, change))
-    average = config.ema_decay * state.average + (1 - config.ema_decay) * theta
-
-    after = (theta, average, opt_state)
-    before = (state.theta, state.average, state.opt_state)
-    theta, average, opt_state = jax.tree.map(lambda new, old: jnp.where(shaped.n_elites > 0, new, old), after, before)
+    after = climb(state, gradient, config)
+    after = jax.tree.map(lambda new, old: jnp.where(shaped.n_elites > 0, new, old), after, _later(state))
     info = BGSInfo(
         gradient_norm=jnp.linalg.norm(gradient),
-        update_norm=jnp.linalg.norm(theta - state.theta),
+        update_norm=jnp.linalg.norm(after.theta - state.theta),
         failed_pairs=shaped.failed_pairs,
         elites=shaped.n_elites,
         elite_std=shaped.elite_std,
         mean_return=shaped.mean_return,
     )
-    return BGSState(theta, average, opt_state, state.updates + 1, state.factor), info
+    return after, info
 
 
-def _along_directions(state: BGSState) -> Float[Array, " d"]:
-    """Parameters as the step sees them, so that a decay of weights shrinks theta itself."""
-    return state.theta if state.factor is None else solve_triangular(state.factor, state.theta, lower=False)
+def climb(state: BGSState, gradient: Float[Array, " d"], config: BGSConfig) -> BGSState:
+    """The state after one ascent step along a gradient, wherever that comes from."""
+    # optax descends, returns are to rise.
+    with jax.numpy_dtype_promotion("standard"):  # optax raises floats to an integer count
+        change, opt_state = config.step.update(-gradient, state.opt_state, state.theta)
+    theta = optax.apply_updates(state.theta, change)
+    average = config.ema_decay * state.average + (1 - config.ema_decay) * theta
+    return replace(_later(state), theta=theta, average=average, opt_state=opt_state)
 
 
-def _in_theta(state: BGSState, along: Float[Array, "d ..."]) -> Float[Array, "d ..."]:
-    """Perturbations or a step in the parameters' own numbers."""
-    if state.factor is None:
-        return along
-    return jnp.matmul(state.factor, along, precision=jax.lax.Precision.HIGHEST)
+def _later(state: BGSState) -> BGSState:
+    """The state after an update that changed nothing."""
+    return replace(state, updates=state.updates + 1)

@@ -185,7 +185,6 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner[Any]:
                 optimiser.repeats,
                 optimiser.common_random_numbers,
                 optimiser.initial_scale,
-                metric=optimiser.action_metric,
             )
         )
     env = TableTennis(simulator, pool, model.model, model.randomise)

@@ -87,15 +87,6 @@ class SigmaFall(Section):
     """Share of the updates before the fall."""
 
 
-class ActionMetric(Section):
-    """Perturbations and steps that change the actions alike in every direction: natural gradients (``bgs.metric``)."""
-
-    every: Count = 500
-    """Updates after which the metric is measured again, with the policy of then on balls of then."""
-    damping: Positive = 0.05
-    """Added to the metric, over its mean eigenvalue: the smaller, the wider are idle directions tried."""
-
-
 class Shaping(Section):
     """Keys of Blackbox Gradient Sensing that training and fine-tuning share with their defaults."""
 
@@ -116,13 +107,14 @@ class Shaping(Section):
 class Optimiser(Shaping):
     """Blackbox Gradient Sensing. The defaults are the recipe that trains best here; paper.yaml has the paper's."""
 
+    gradient: Literal["zeroth_order", "first_order"] = "zeroth_order"
+    """Zeroth-order: BGS, from the returns of perturbed policies. First-order: derivatives of a smooth objective through
+    the simulation at the same policies; of these keys only sigma, pairs, repeats, step and average count then."""
     num_directions: NumDirections = 100
     repeats: Count = 10
     """Episodes per perturbation."""
     sigma_fall: SigmaFall | None = None
     """Smaller perturbations later on: more returned in this simulation, fewer in another world; null: none."""
-    action_metric: ActionMetric | None = None
-    """Perturb by what changes in the actions; null: all parameters alike, as the paper."""
     elite_fraction: EliteFraction = 1.0
     step: Step = Step()
     """From the gradient estimate to a change of the parameters."""

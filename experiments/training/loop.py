@@ -29,7 +29,8 @@ from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import Run
 from experiments.training.progress import TrainingProgress
 from experiments.training.ranks import ALONE, Ranks, Watch
-from experiments.training.update import Trainer, TrainState, trainer
+from experiments.training.trainers import trainer
+from experiments.training.update import Trainer, TrainState
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import held_here

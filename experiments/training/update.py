@@ -16,13 +16,8 @@ from jax.stages import Lowered
 from jax.typing import ArrayLike
 
 from ballmodel.sampling import BallPool
-from bgs import metric, normalizer, strategy
+from bgs import normalizer, strategy
 from bgs.strategy import BGSConfig, BGSState
-from experiments.config import build
-from experiments.config.build import Experiment
-from experiments.config.optimiser import ActionMetric
-from experiments.errors import checked
-from experiments.training import action_metric
 from mjx_tt.env.own import Network
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
@@ -50,7 +45,6 @@ class Trainer:
     initial_scale          standard deviation of the random first weights
     later_weights          after how many updates the rewards get other weights, and these; None: never
     network                one of the user's own; None: the paper's
-    metric                 perturb by what changes in the actions; None: all parameters alike
     """
 
     def __init__(
@@ -65,7 +59,6 @@ class Trainer:
         initial_scale: float = 0.1,
         later_weights: tuple[int, tuple[float, ...]] | None = None,
         network: Network | None = None,
-        metric: ActionMetric | None = None,
     ) -> None:
         if repeats < 1:
             raise ValueError(f"repeats is {repeats}, at least 1 is needed")
@@ -73,7 +66,7 @@ class Trainer:
         self._model, self._randomise = model, randomise
         self._repeats, self._crn, self._initial_scale = repeats, common_random_numbers, initial_scale
         self._later = later_weights
-        self.network, self._metric = network, metric
+        self.network = network
         self._update = jax.jit(simulator.on_devices(self._update_local, out_specs=PartitionSpec()))
 
     @property
@@ -97,10 +90,7 @@ class Trainer:
         if theta.shape != (size,):
             raise ValueError(f"the first policy has {theta.shape[0]} parameters, the network has {size}")
         statistics = normalizer.empty(contract.n_observation) if statistics is None else statistics
-        first = strategy.init(theta, self.bgs_config)
-        if self._metric is not None:
-            first = replace(first, factor=jnp.eye(size, dtype=theta.dtype))  # until the first update measures it
-        return self.simulator.replicate(TrainState(first, statistics, run_key))
+        return self.simulator.replicate(TrainState(strategy.init(theta, self.bgs_config), statistics, run_key))
 
     def update(self, state: TrainState) -> tuple[TrainState, dict]:
         """One update and its metrics (scalars on the device; fetch them rarely)."""
@@ -113,9 +103,6 @@ class Trainer:
     def _update_local(self, state: TrainState, pool: BallPool) -> tuple[TrainState, dict[str, jax.Array]]:
         config, pairs = self.bgs_config, self.bgs_config.num_directions
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
-        if self._metric is not None:
-            due = state.bgs.updates % self._metric.every == 0
-            state = jax.lax.cond(due, self._measured, lambda state, *_: state, state, pool, episode_key)
         population = strategy.ask(direction_key, state.bgs, config)
         columns = pairs if self._crn else 2 * pairs
         episodes = self.simulator.draw(episode_key, pool, self._model, self._randomise, self._repeats, columns)
@@ -148,17 +135,6 @@ class Trainer:
             **means(total, self.simulator.config.terms),
         }
         return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
-
-    def _measured(self, state: TrainState, pool: BallPool, key: jax.Array) -> TrainState:
-        """The state with the metric of the actions as they are now."""
-        assert self._metric is not None
-        simulator, draw_key = self.simulator, jax.random.fold_in(key, 0)
-        n = -(-action_metric.EPISODES // simulator.devices) * simulator.devices
-        episodes = simulator.draw(draw_key, pool, self._model, self._randomise, 1, n)
-        found = action_metric.measure(
-            simulator, jax.random.fold_in(key, 1), state.bgs.theta, state.statistics, self.network, episodes
-        )
-        return replace(state, bgs=replace(state.bgs, factor=metric.factor(found, self._metric.damping)))
 
     def _weighed(self, result: RolloutResult, updates: jax.Array) -> RolloutResult:
         """The result with the returns that the weights of this update give."""
@@ -193,22 +169,3 @@ def means(total: dict, names: tuple[str, ...]) -> dict:
     over = {k: total[k] / count for k in ("mean_return", "return_rate", "hit_rate", "steps")}
     terms = {f"reward/{name}": total["terms"][i] / count for i, name in enumerate(names)}
     return {**over, "non_finite": total["non_finite"], **terms}
-
-
-def trainer(experiment: Experiment) -> Trainer:
-    """The trainer with its pool of balls drawn. Raises ConfigError."""
-    config = experiment.config
-    simulator = checked("training.devices", Simulator, experiment.task, build.device_count(config))
-    return Trainer(
-        simulator,
-        experiment.bgs,
-        build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool),
-        experiment.model.model,
-        experiment.model.randomise,
-        config.optimiser.repeats,
-        config.optimiser.common_random_numbers,
-        config.optimiser.initial_scale,
-        build.later_weights(config.training, build.definitions(config, config.name)[0]),
-        experiment.network,
-        config.optimiser.action_metric,
-    )

@@ -6,6 +6,7 @@ reach. Phase 2 flies the outgoing ball alone: as at the real robot, the policy's
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import jax
@@ -40,6 +41,7 @@ from mjx_tt.robot.model import capsules, paddle_frame
 from mjx_tt.robot.scalar_algebra import materialise
 from mjx_tt.sim import actuators as drives
 from mjx_tt.sim import latency, sensors
+from mjx_tt.sim.actuators import DriveState
 from mjx_tt.sim.sensors import Filters
 from robot_io.limits import limit_velocity
 
@@ -243,24 +245,16 @@ class Task:
     ) -> tuple[tuple, Float[Array, "captured *batch"]]:
         """Robot and ball through one control period, with what the delayed sensors capture on the way."""
         n, timestep = self.config.substeps, 1.0 / self.config.sim_rate
-        params, gain = episodes.model.ball, episodes.model.actuation.velocity_gain
-        tracker, drive_params = episodes.model.sensing, prepared.drives
-        old, new = drives.reachable(drive_params, old), drives.reachable(drive_params, new)
+        params, tracker = episodes.model.ball, episodes.model.sensing
+        old, new = (drives.reachable(prepared.drives, command) for command in (old, new))
 
         def captured_at(i: Tick, ball: BallState, filters: Filters, joints: Array) -> Array:
             return observation.capture(episodes, prepared, self.config, i, ball, filters, joints)
 
         def substep(i: Tick, carry: tuple) -> tuple:
             (qpos, qvel, pose, drive, filters, ball, (bounced, hit, live), closest), captured = carry
-            share = latency.old_command_share(prepared.action, i, timestep)
-            velocity, drive = drives.follow(drive_params, drive, new + share * (old - new), timestep)
-            control = jnp.asarray(materialise(row(gain) * velocity))
-            was, (qpos, qvel) = qvel, self.engine.step(qpos, qvel, control)
-            carried, carried_velocity, drive = drives.carry(drive_params, drive, qpos, qvel, timestep)
-            drive = drives.swung(drive_params, drive, was, qvel, timestep)
-            bent, bent_velocity = carried, carried_velocity
-            if drive.swing is not None:
-                bent, bent_velocity = carried + drive.swing[0], carried_velocity + drive.swing[1]
+            robot, carried, (bent, bent_velocity) = self.moved(i, (qpos, qvel, drive), (old, new), episodes, prepared)
+            qpos, qvel, drive = robot
             after = materialise(self.kinematics.pose(bent, bent_velocity))
             moved, events = flight.step(params, ball, timestep, (pose, after))
             moved, events = materialise((moved, events))
@@ -283,3 +277,31 @@ class Task:
         start = (s.qpos, s.qvel, s.pose, s.drive, s.filters, s.ball, (s.bounced, s.hit, s.live), s.sums.closest)
         captured = captured_at(0, s.ball, s.filters, s.qpos if s.drive.output is None else s.drive.output)
         return jax.lax.fori_loop(0, n, substep, (start, captured))
+
+    def moved(
+        self,
+        i: Tick,
+        robot: tuple[Joints, Joints, DriveState],
+        commands: tuple[Joints, Joints],
+        episodes: Episodes,
+        prepared: Prepared,
+        advance: Callable[[Joints, Joints, Joints], tuple[Joints, Joints]] | None = None,
+    ) -> tuple[tuple[Joints, Joints, DriveState], Joints, tuple[Joints, Joints]]:
+        """The robot after substep ``i`` of a control period: its state, the joints as encoders see them, and positions
+        and velocities of the joints that carry the blade.
+
+        robot: positions, velocities (n, ...) and drives; commands: the older and the newer, as ``drives.reachable``;
+        advance: other dynamics than the engine's
+        """
+        (qpos, qvel, drive), (old, new) = robot, commands
+        params, timestep = prepared.drives, 1.0 / self.config.sim_rate
+        share = latency.old_command_share(prepared.action, i, timestep)
+        velocity, drive = drives.follow(params, drive, new + share * (old - new), timestep)
+        control = jnp.asarray(materialise(row(episodes.model.actuation.velocity_gain) * velocity))
+        was, (qpos, qvel) = qvel, (advance or self.engine.step)(qpos, qvel, control)
+        carried, carried_velocity, drive = drives.carry(params, drive, qpos, qvel, timestep)
+        drive = drives.swung(params, drive, was, qvel, timestep)
+        bent, bent_velocity = carried, carried_velocity
+        if drive.swing is not None:
+            bent, bent_velocity = carried + drive.swing[0], carried_velocity + drive.swing[1]
+        return (qpos, qvel, drive), carried, (bent, bent_velocity)

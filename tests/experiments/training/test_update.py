@@ -15,7 +15,7 @@ from ballmodel.sampling import sample_pool
 from bgs import normalizer, optimizers, strategy
 from bgs.strategy import BGSConfig
 from experiments.config import build, experiment
-from experiments.training import update as training
+from experiments.training.trainers import trainer as trainer_of
 from experiments.training.update import Trainer
 from mjx_tt.env import rewards
 from mjx_tt.env.policy import Policy
@@ -156,7 +156,7 @@ def test_the_same_yaml_trains_under_both_engines():
     returns = {}
     for engine in ("fused", "mjx"):
         settings = experiment.parse(experiment.read_yaml(TINY.format(engine=engine), "tiny.yaml"), "tiny.yaml")
-        trainer = training.trainer(build.experiment(settings, "tiny.yaml"))
+        trainer = trainer_of(build.experiment(settings, "tiny.yaml"))
         state, metrics = trainer.update(trainer.init(build.key(0, build.INITIAL_STATE)))
         assert trainer.simulator.task.engine.name == engine
         assert int(state.bgs.updates) == 1 and np.isfinite(state.bgs.theta).all()
@@ -172,7 +172,7 @@ def test_at_the_papers_size_mjx_makes_the_update_of_the_fused_engine():
     change, metrics = {}, {}
     for engine in ("fused", "mjx"):
         settings = experiment.load(experiment.shipped()["paper_mjx"], (f"task.engine={engine}",))
-        trainer = training.trainer(build.experiment(settings, "paper_mjx"))
+        trainer = trainer_of(build.experiment(settings, "paper_mjx"))
         assert trainer.episodes_per_update == 6000
         start = trainer.init(build.key(0, build.INITIAL_STATE))
         after, measured = trainer.update(start)

@@ -1,0 +1,88 @@
+"""One update by first-order gradients: derivatives of a smooth objective through the simulation, compiled as a whole.
+
+The objective is averaged over the same perturbed policies as Blackbox Gradient Sensing compares, so that both climb the
+same kind of hill: a policy whose neighbours play as well. Where BGS learns one number of a policy and its balls, their
+return, here each of them tells its derivatives by all parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from ballmodel.sampling import BallPool
+from bgs import normalizer, strategy
+from experiments.training.update import Trainer, TrainState
+from mjx_tt.env.episode import reshaped
+from mjx_tt.env.policy import Policy
+from mjx_tt.env.rollout import AXIS
+from mjx_tt.gradient.objective import Objective, Played
+
+SECONDS = 1.7  # that are looked at: 99 of 100 balls of the widest boxes are out of reach by then
+LONGEST = 1.0  # norm of a gradient: a few steep episodes must not decide where a step goes
+
+
+class FirstOrderTrainer(Trainer):
+    """Updates of one training run. What a ``Trainer`` has for comparing returns (elites, pairs that meet the same
+    balls, later weights) is not used."""
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        config = self.simulator.config
+        self._objective = Objective(self.simulator.task, min(config.max_steps, math.ceil(SECONDS / config.period)))
+
+    def _update_local(self, state: TrainState, pool: BallPool) -> tuple[TrainState, dict[str, jax.Array]]:
+        config, simulator = self.bgs_config, self.simulator
+        direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
+        population = strategy.ask(direction_key, state.bgs, config)
+        shape = (self._repeats, 2 * config.num_directions)
+        episodes = simulator.draw(episode_key, pool, self._model, self._randomise, *shape)
+        mine = reshaped(simulator.local(episodes), -1)
+        mean, inv_std = normalizer.normaliser(state.statistics)
+
+        def cost(members: jax.Array) -> tuple[jax.Array, Played]:
+            played = self._objective.play(Policy(members, mean, inv_std, self.network), mine)
+            return jnp.where(jnp.isfinite(played.cost), played.cost, 0.0).sum(), played
+
+        (_, played), slopes = jax.value_and_grad(cost, has_aux=True)(simulator.local(population.members))
+        whole = jnp.isfinite(slopes).all(0)
+        finite = jnp.isfinite(played.cost) & jnp.tile(whole, self._repeats)
+        seen = (played.seen & finite)[:, None].astype(slopes.dtype)
+        centred = (jnp.where(seen > 0, played.observations, mean[None, :, None]) - mean[None, :, None]) * seen
+        shared = {
+            "slope": jnp.where(whole, slopes, 0.0).sum(1),
+            "episodes": finite.sum().astype(slopes.dtype),
+            "non_finite": (~finite).sum().astype(slopes.dtype),
+            "cost": jnp.where(finite, played.cost, 0.0).sum(),
+            "return_rate": (finite & played.returned).sum().astype(slopes.dtype),
+            "hit_rate": (finite & played.hit).sum().astype(slopes.dtype),
+            "steps": jnp.where(finite, played.ends, 0).sum().astype(slopes.dtype),
+            "seen": seen.sum(),
+            "sums": jnp.stack([centred.sum((0, 2)), (centred * centred).sum((0, 2))]),
+        }
+        flat, unravel = ravel_pytree(shared)
+        total = unravel(jax.lax.psum(flat, AXIS))  # one sum over devices: several at a time starve their threads
+        count = jnp.maximum(total["episodes"], 1.0)
+        gradient = -total["slope"] / count
+        norm = jnp.linalg.norm(gradient)
+        bgs = strategy.climb(state.bgs, gradient * jnp.minimum(1.0, LONGEST / jnp.maximum(norm, 1e-12)), config)
+        # Without one finite episode a step would move on momentum alone.
+        bgs = jax.tree.map(
+            lambda new, old: jnp.where(total["episodes"] > 0, new, old),
+            bgs,
+            replace(state.bgs, updates=bgs.updates),
+        )
+        statistics = normalizer.from_sums(total["seen"].astype(jnp.int32), mean, *total["sums"])
+        metrics = {
+            "gradient_norm": norm,
+            "update_norm": jnp.linalg.norm(bgs.theta - state.bgs.theta),
+            "mean_return": -total["cost"] / count,
+            "non_finite": total["non_finite"],
+            **{name: total[name] / count for name in ("return_rate", "hit_rate", "steps")},
+        }
+        return TrainState(bgs, normalizer.merge(state.statistics, statistics), state.key), metrics

@@ -1,0 +1,83 @@
+"""The incoming ball by itself: until the blade touches it nothing that the robot does changes it.
+
+So its flights need no derivatives, and all of them are known before the robot moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from ballmodel import flight
+from ballmodel.state import BallState, where
+from mjx_tt.env import observation
+from mjx_tt.env.task import OUT_OF_REACH, Episodes, Prepared, Task
+from mjx_tt.sim.sensors import Filters
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Incoming:
+    """Balls that nobody plays, at the S + 1 ends of S substeps; L episodes.
+
+    ball     position [m], velocity [m/s], spin [rad/s], each (3, S + 1, L); after its end a ball stays where it is
+    bounced  it came down on the robot's side
+    live     it can still be played
+    seen     what has come from the tracker by each control step: position, with jitter also velocity
+    """
+
+    ball: BallState
+    bounced: Bool[Array, "S+1 L"]
+    live: Bool[Array, "S+1 L"]
+    seen: Float[Array, "T captured L"]
+
+
+def incoming(task: Task, episodes: Episodes, prepared: Prepared, ticks: int) -> Incoming:
+    """The balls of episodes (L,) through ``ticks`` control periods."""
+    config, params, tracker = task.config, episodes.model.ball, episodes.model.sensing
+    n, timestep = config.substeps, 1.0 / config.sim_rate
+    nothing = jnp.zeros((task.contract.n_joints, *episodes.seed.shape), episodes.ball.position.dtype)
+
+    def captured(i: int, ball: BallState, filters: Filters) -> Array:
+        whole = observation.capture(episodes, prepared, config, i, ball, filters, nothing)
+        return jnp.concatenate([whole[:3], whole[3 + nothing.shape[0] :]])
+
+    def substep(ball: BallState, bounced: Array, live: Array, filters: Filters) -> tuple:
+        moved, events = flight.step(params, ball, timestep)
+        before, ball = ball, where(live, moved, ball)
+        filters = filters.stepped(tracker, before, ball, live & events.table, timestep - events.time, timestep)
+        own_side = events.table & (events.position[1] < 0.0)
+        y_min, z_min = OUT_OF_REACH
+        over = (events.table & (bounced | ~own_side)) | events.net
+        over = over | (ball.position[1] < y_min) | (ball.position[2] < z_min)
+        return ball, bounced | (live & own_side), live & ~over, filters
+
+    def period(carry: tuple, _: None) -> tuple[tuple, tuple]:
+        seen, passed = captured(0, carry[0], carry[3]), []
+        for i in range(n):
+            carry = substep(*carry)
+            seen = seen + captured(i + 1, carry[0], carry[3])
+            passed.append(carry[:3])
+        return carry, (jax.tree.map(lambda *x: jnp.stack(x), *passed), seen)
+
+    false = jnp.zeros(episodes.seed.shape, bool)
+    first = (episodes.ball, false, ~false)
+    filters = Filters.at(tracker, episodes.ball.position, timestep)
+    _, (passed, seen) = jax.lax.scan(period, (*first, filters), None, length=ticks)
+    whole = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y.reshape(-1, *y.shape[2:])]), first, passed)
+    ball, bounced, live = whole
+    at_rest = jnp.concatenate([episodes.ball.position, episodes.ball.velocity])[: seen.shape[1]]
+    return Incoming(
+        jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), ball), bounced, live, _delayed(seen, at_rest, prepared)
+    )
+
+
+def _delayed(captured: Array, first: Array, prepared: Prepared) -> Array:
+    """What has arrived at each control step of what each control period captures, (T, c, L); before, ``first``."""
+    tick = jnp.arange(captured.shape[0])[:, None] - prepared.ball.periods[None]
+    arrived = jnp.take_along_axis(captured, jnp.maximum(tick, 0)[:, None], 0)
+    return jnp.where((tick < 0)[:, None], first[None], arrived)

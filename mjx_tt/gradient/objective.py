@@ -1,0 +1,165 @@
+"""A smooth measure of play, whose derivatives lead where the paper's rewards only tell.
+
+Most of the eleven terms of ``mjx_tt.env.rewards`` are steps: a ball that is missed by a hand says nothing of where the
+blade should have been. Here a miss counts by its distance and by where the ball would have gone, a hit by where the
+ball goes. What the rewards have as means over time (jerk, acceleration, velocity) is taken over as it is. Contacts with
+table and robot, a low blade and bad style, which the rewards count by control steps, are counted as well, and weighed
+by how bad their worst moment is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from ballmodel import constants as c
+from ballmodel.flight import PaddlePose
+from mjx_tt.env import rewards
+from mjx_tt.env.task import Episodes, Task
+from mjx_tt.gradient.incoming import incoming
+from mjx_tt.gradient.motion import Motion, Servos, motion
+from mjx_tt.gradient.network import differentiable
+from mjx_tt.gradient.strike import Landing, Meeting, Strike, landing, meeting, strike
+from mjx_tt.robot.kinematics import Joints
+from robot_io.policy.policy import Policy
+
+# Lengths in metres at which a term begins to saturate: beyond, only its logarithm grows, so that no ball outshouts the
+# others. The blade's radius is 76 mm.
+NEAR = 0.06  # of the ball from the blade's middle, past it or on it
+FAR = 0.15  # from here on a miss says little about where the ball would have gone
+# Landings within these half sizes about TARGET are alike, and returns this high over the net's plane: a policy that is
+# free to choose among them touches more balls.
+TARGET, INSIDE, BEYOND = (
+    (0.0, 0.75),
+    (0.45, 0.25),
+    0.3,
+)  # [m]; a little behind the half's middle: short balls hit the net
+HIGH, LOW = 0.28, 0.1
+NO_CROSSING = 2.0  # of a ball that does not reach the net: as one 0.25 m too low
+FACING_MARGIN = 0.1  # of the normal's y component
+MARGIN = 0.03  # to table and robot, and below the blade's clearance, at which a moment begins to count
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Played:
+    """Measures of episodes (L,): cost is to be small.
+
+    substep: of the hit, or of the nearest moment; ends: control periods up to it
+    observations, seen: what the policy acted on in them
+    """
+
+    cost: Float[Array, " L"]
+    hit: Bool[Array, " L"]
+    returned: Bool[Array, " L"]
+    substep: Int[Array, " L"]
+    ends: Int[Array, " L"]
+    observations: Float[Array, "T observed L"]
+    seen: Bool[Array, "T L"]
+
+
+class Objective:
+    """The smooth measure for one task.
+
+    ticks: control periods that are looked at; a ball that takes longer counts as it stands
+    """
+
+    def __init__(self, task: Task, ticks: int) -> None:
+        self.task, self.ticks = task, ticks
+        self._servos = Servos(task)
+        self._weights = dict(zip(task.config.terms, task.config.reward_weights, strict=True))
+
+    def play(self, policy: Policy, episodes: Episodes) -> Played:
+        """Plays P policies, theta (size, P), on episodes (L,), L = R x P with P the faster index."""
+        task, params = self.task, episodes.model.ball
+        prepared = task.prepare(episodes)
+        ball = jax.lax.stop_gradient(incoming(task, episodes, prepared, self.ticks))
+        moving = motion(task, self._servos, differentiable(policy), episodes, prepared, ball)
+        met = meeting(task, moving, ball, params)
+        ends = met.substep // task.config.substeps + 1
+        worst, times = self._worst(moving, ends)
+        # Three moments in one: what has derivatives is compiled once.
+        substeps = jnp.stack([met.substep, met.substep + 1, worst])
+        joints, velocities = (_at(x, substeps) for x in (moving.joints, moving.velocities))
+        before, after, then = _split(task.kinematics.pose(joints, velocities))
+        struck = strike(met, ball, params, (before, after), 1.0 / task.config.sim_rate)
+        out = landing(params, struck.ball)
+        faults = times * self._fault(joints[:, 2], then)
+        cost = _play_cost(met, struck, out) + self._steadiness(moving, ends) + faults
+        seen = jnp.arange(self.ticks)[:, None] < ends[None]
+        return Played(cost, met.hit, met.hit & _inside(out), met.substep, ends, moving.observations, seen)
+
+    def _steadiness(self, moving: Motion, ends: Array) -> Array:
+        """The rewards' terms of jerk, acceleration and velocity of the commands until the hit."""
+        limits, period = self.task.contract.limits, self.task.config.period
+        before = jnp.concatenate([jnp.zeros_like(moving.commands[:1]), moving.commands[:-1]])
+        acceleration = (moving.commands - before) / period
+        earlier = jnp.concatenate([jnp.zeros_like(acceleration[:1]), acceleration[:-1]])
+        jerk = (acceleration - earlier) / period
+        counted = (jnp.arange(self.ticks)[:, None] < ends[None]).astype(jerk.dtype) / ends[None].astype(jerk.dtype)
+        most = {"velocity": limits.velocity, "acceleration": limits.acceleration}
+        most["jerk"] = tuple(2.0 * a / period for a in limits.acceleration)
+        values = {"velocity": moving.commands, "acceleration": acceleration, "jerk": jerk}
+        total = jnp.zeros_like(counted[0])
+        for name, value in values.items():
+            share = jnp.minimum(jnp.abs(value) / jnp.asarray(most[name], value.dtype)[None, :, None], 1.0).mean(1)
+            total = total + self._weights[name] * (share * counted).sum(0)
+        return total
+
+    def _worst(self, moving: Motion, ends: Array) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
+        """The substep of the worst fault at the end of a control period before the hit, and how many have one."""
+        every = self.task.config.substeps
+        joints, velocities = (
+            jax.lax.stop_gradient(jnp.moveaxis(x[every::every], 1, 0)) for x in (moving.joints, moving.velocities)
+        )
+        faults = self._fault(joints, self.task.kinematics.pose(joints, velocities))
+        faults = jnp.where(jnp.arange(self.ticks)[:, None] < ends[None], faults, 0.0)
+        return (jnp.argmax(faults, 0) + 1) * every, (faults > 0.0).sum(0).astype(faults.dtype)
+
+    def _fault(self, joints: Joints, blade: PaddlePose) -> Array:
+        """How far a moment is from being faultless (...): 0 with a margin, the rewards' weights where they count one.
+
+        Contact with table or robot, a low blade, one that faces backwards.
+        """
+        gaps = self.task.clearance(self.task.kinematics.links(joints), joints[0])
+
+        def short_of(value: Array, wanted: float) -> Array:
+            return jax.nn.relu(wanted + MARGIN - value) / MARGIN
+
+        return (
+            self._weights["collision"] * (short_of(gaps.table, 0.0) + short_of(gaps.own, 0.0))
+            + self._weights["paddle_height"] * short_of(gaps.blade, rewards.BLADE_CLEARANCE)
+            + self._weights["style"] * jax.nn.relu(1.0 + (rewards.FACING - blade.normal[1]) / FACING_MARGIN)
+        )
+
+
+def _at(x: Float[Array, "S+1 n L"], substeps: Int[Array, "k L"]) -> Float[Array, "n k L"]:
+    """Values at k substeps of each episode."""
+    found = jnp.take_along_axis(x, jnp.broadcast_to(substeps[:, None], (substeps.shape[0], *x.shape[1:])), 0)
+    return jnp.moveaxis(found, 1, 0)
+
+
+def _split(poses: PaddlePose) -> list[PaddlePose]:
+    """Poses (3, k, L) as k poses (3, L)."""
+    return [jax.tree.map(lambda x, i=i: x[:, i], poses) for i in range(poses.position.shape[1])]
+
+
+def _play_cost(met: Meeting, struck: Strike, out: Landing) -> Array:
+    """Nearing the ball, and where it goes."""
+    near = jnp.log1p(struck.distance / NEAR**2)
+    wide, long_ = (jax.nn.relu(jnp.abs(out.position[i] - TARGET[i]) - INSIDE[i]) / BEYOND for i in (0, 1))
+    low = jax.nn.relu(HIGH - out.height) / LOW
+    aim = jnp.log1p(wide**2 + long_**2) + jnp.where(out.crossed, jnp.log1p(low**2), NO_CROSSING)
+    told = jnp.where(met.hit, 1.0, jax.lax.stop_gradient(1.0 / (1.0 + struck.distance / FAR**2)))
+    return jnp.where(met.playable, near + told * aim, 0.0)
+
+
+def _inside(out: Landing) -> Array:
+    """Over the net and on the human's half."""
+    x, y = out.position
+    table = (jnp.abs(x) <= c.TABLE_WIDTH / 2) & (y > 0.0) & (y <= c.TABLE_LENGTH / 2)
+    return out.crossed & out.down & (out.height > c.NET_HEIGHT + c.BALL_DIAMETER / 2) & table

@@ -1,0 +1,120 @@
+"""Updates by first-order gradients: devices, failed episodes, statistics, and that they learn from few balls."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ballmodel import registry
+from ballmodel.sampling import sample_pool
+from bgs import normalizer, optimizers
+from bgs.strategy import BGSConfig
+from experiments.training.first_order import FirstOrderTrainer
+from mjx_tt.env.policy import Policy
+from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import MISSED, TaskConfig
+from mjx_tt.gradient.objective import Objective
+from mjx_tt.sim.model import SimModel
+
+PAIRS, REPEATS = 2, 4
+TASK = TaskConfig(sim_rate=75.0)  # one substep: compiles in half the time
+BGS = BGSConfig(num_directions=PAIRS, sigma=0.01, step=optimizers.make("sgd", 0.01), ema_decay=0.5)
+
+
+@pytest.fixture(scope="module")
+def pool():
+    return sample_pool(jax.random.key(0), registry.load("narrow"), SimModel().ball, 64)
+
+
+def trainer_on(devices, pool, config=BGS, repeats=REPEATS):
+    return FirstOrderTrainer(Simulator(TASK, devices), config, pool, SimModel(), repeats=repeats)
+
+
+@pytest.fixture(scope="module")
+def updated(pool):
+    """By number of devices, the state before and after one update, and its metrics."""
+    found = {}
+    for devices in (1, 2):
+        trainer = trainer_on(devices, pool)
+        before = trainer.init(jax.random.key(1))
+        after, metrics = trainer.update(before)
+        found[devices] = before, after, jax.tree.map(float, metrics)
+    return found
+
+
+def test_two_devices_learn_what_one_learns(updated):
+    (_, one, metrics), (_, two, metrics_of_two) = updated[1], updated[2]
+    np.testing.assert_allclose(two.bgs.theta, one.bgs.theta, rtol=1e-4, atol=1e-6)
+    assert metrics_of_two == pytest.approx(metrics, rel=1e-3, abs=1e-6)
+
+
+def test_an_update_climbs_the_clipped_gradient_and_averages(updated):
+    before, after, metrics = updated[1]
+    change = np.asarray(after.bgs.theta - before.bgs.theta)
+    # Plain steps of rate 0.01 along a gradient whose norm is cut to 1.
+    assert np.linalg.norm(change) == pytest.approx(0.01 * min(1.0, metrics["gradient_norm"]), rel=1e-3)
+    assert metrics["update_norm"] == pytest.approx(np.linalg.norm(change), rel=1e-4)
+    np.testing.assert_allclose(after.bgs.average, (before.bgs.theta + after.bgs.theta) / 2, rtol=1e-5, atol=1e-7)
+    assert int(after.bgs.updates) == 1
+
+
+def test_its_statistics_are_those_of_what_the_policies_saw(updated):
+    _, after, metrics = updated[1]
+    episodes = 2 * PAIRS * REPEATS
+    assert metrics["non_finite"] == 0.0
+    assert int(after.statistics.count[0]) + int(after.statistics.count[1]) == round(metrics["steps"] * episodes)
+    mean, inv_std = normalizer.normaliser(after.statistics)
+    home = np.asarray(Simulator(TASK).task.home)
+    # A ball is seen from the human's side until behind the robot's end of the table; noise for a policy hardly moves.
+    assert -1.37 < mean[1] < 1.37 and (np.abs(np.asarray(mean[3:]) - home) < 0.5).all()
+    assert np.isfinite(inv_std).all() and (np.asarray(inv_std) > 0).all()
+
+
+def test_episodes_without_a_finite_cost_are_counted_and_do_not_learn(pool, monkeypatch):
+    play = Objective.play
+
+    def broken(self, policy, episodes):
+        played = play(self, policy, episodes)
+        second = jnp.arange(played.cost.shape[0]) % (2 * PAIRS) == 1  # all episodes of the second policy
+        return replace(played, cost=played.cost * jnp.where(second, jnp.nan, 1.0))
+
+    monkeypatch.setattr(Objective, "play", broken)
+    trainer = trainer_on(1, pool)
+    before = trainer.init(jax.random.key(1))
+    after, metrics = trainer.update(before)
+    assert float(metrics["non_finite"]) == REPEATS
+    assert np.isfinite(np.asarray(after.bgs.theta)).all() and float(metrics["update_norm"]) > 0.0
+
+
+def test_without_one_finite_episode_nothing_changes(pool, monkeypatch):
+    play = Objective.play
+    monkeypatch.setattr(Objective, "play", lambda *given: replace(played := play(*given), cost=played.cost * jnp.nan))
+    trainer = trainer_on(1, pool, replace(BGS, step=optimizers.make("adam", 0.01)))
+    before = trainer.init(jax.random.key(1))
+    after, metrics = trainer.update(before)
+    np.testing.assert_array_equal(after.bgs.theta, before.bgs.theta)
+    np.testing.assert_array_equal(after.bgs.average, before.bgs.average)
+    assert float(metrics["non_finite"]) == 2 * PAIRS * REPEATS and int(after.bgs.updates) == 1
+
+
+@pytest.mark.slow
+def test_it_learns_to_hit_from_fifteen_thousand_balls(pool):
+    """From random weights; the simulator judges. BGS needs some hundred times as many."""
+    config = replace(BGS, num_directions=1, step=optimizers.make("adam", 0.01, 0.9, 0.99), ema_decay=0.9)
+    trainer = trainer_on(1, pool, config, repeats=64)
+    state = trainer.init(jax.random.key(2))
+    for _ in range(120):
+        state, _ = trainer.update(state)
+    simulator = trainer.simulator
+    episodes = simulator.draw(jax.random.key(3), pool, SimModel(), (), 200, 1)
+
+    def share(theta):
+        policy = Policy(theta[:, None], *normalizer.normaliser(state.statistics))
+        return float((np.asarray(jax.jit(simulator.rollout)(policy, episodes).outcome) != MISSED).mean())
+
+    assert share(trainer.init(jax.random.key(2)).bgs.theta) < 0.05
+    assert share(state.bgs.average) > 0.5
