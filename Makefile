@@ -36,7 +36,7 @@ PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 
 # Where arrays are computed: every annotation is checked, types and ranks of arrays change only where the code says so.
 # The longest come first, so that neither process waits for the other at the end.
-STRICT   := $(addprefix tests/mjx_tt/,rally env) tests/ballmodel tests/bgs $(addprefix tests/mjx_tt/,sim robot viz)
+STRICT   := $(addprefix tests/mjx_tt/,rally env gradient) tests/ballmodel tests/bgs $(addprefix tests/mjx_tt/,sim robot viz)
 ALL_ELSE := tests/robot_io/safety tests $(addprefix --ignore=,$(STRICT))
 REALTIME  = $(shell grep -rl --include="test_*.py" "mark.realtime" tests)
 

@@ -58,7 +58,7 @@ ROOMS = {
         ". sim robot diagnosis/description diagnosis/robust diagnosis/verdict diagnosis/joint diagnosis/tracks "
         "diagnosis/logs diagnosis/ball/effects diagnosis/ball/flights "
         "diagnosis/ball diagnosis/hits diagnosis/together diagnosis prediction "
-        "viz diagnosis/report lanes env rally"
+        "viz diagnosis/report lanes env gradient rally"
     ),
     "experiments": (
         "errors . config jobs runs view/film view/studio view/programme "

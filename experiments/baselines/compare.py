@@ -47,7 +47,7 @@ from experiments.jobs import engine
 from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import ALONE, Workers
 from experiments.runs import checkpoint, run_dir
-from experiments.training.update import Trainer
+from experiments.training.trainers import KINDS
 from mjx_tt.env.brax import TableTennis
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import Controller
@@ -176,7 +176,7 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner[Any]:
         optimiser = settings.optimiser
         bgs = checked("optimiser", build.bgs_config, optimiser, settings.schedule_updates)
         return Evolution(
-            Trainer(
+            KINDS[optimiser.gradient](
                 simulator,
                 bgs,
                 pool,

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ballmodel.io import yaml
 from experiments.config import validation
@@ -147,6 +147,18 @@ class Config(Section):
     """One of the networks in definitions; null: the paper's gated dilated CNN of 976 parameters."""
     initial_policy: str | None = None
     """A run folder or an exported artefact whose policy training starts from."""
+
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> Config:
+        if self.optimiser.gradient == "first_order":
+            own = {} if isinstance(self.task.rewards, str) else self.task.rewards.own
+            for key, given in (("training.later_rewards", self.training.later_rewards), ("task.rewards.own", own)):
+                if given:
+                    raise ValueError(
+                        f"{key}: optimiser.gradient first_order climbs an objective of its own, in which it has no "
+                        "part; leave it out, or take gradient: zeroth_order"
+                    )
+        return self
 
 
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:

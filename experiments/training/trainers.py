@@ -9,13 +9,14 @@ from experiments.training.first_order import FirstOrderTrainer
 from experiments.training.update import Trainer
 from mjx_tt.env.rollout import Simulator
 
+KINDS: dict[str, type[Trainer]] = {"zeroth_order": Trainer, "first_order": FirstOrderTrainer}  # by optimiser.gradient
+
 
 def trainer(experiment: Experiment) -> Trainer:
     """The trainer with its pool of balls drawn. Raises ConfigError."""
     config = experiment.config
-    kind = FirstOrderTrainer if config.optimiser.gradient == "first_order" else Trainer
     simulator = checked("training.devices", Simulator, experiment.task, build.device_count(config))
-    return kind(
+    return KINDS[config.optimiser.gradient](
         simulator,
         experiment.bgs,
         build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool),

@@ -119,6 +119,7 @@ def test_schema_refuses_what_the_program_refuses():
             "low must not exceed high",
         ),
         ("initial_policy", "nowhere", "initial_policy: nowhere", "a run or an artefact"),
+        ("optimiser.gradient", "firstorder", "optimiser.gradient: got 'firstorder'", "did you mean 'first_order'?"),
     ],
 )
 def test_a_mistake_is_named_with_file_path_and_hint(path, value, place, hint):
@@ -126,6 +127,18 @@ def test_a_mistake_is_named_with_file_path_and_hint(path, value, place, hint):
     assert text.startswith("my.yaml: ")
     assert place in text
     assert hint in text
+
+
+@pytest.mark.parametrize(
+    "path, value",
+    [("training.later_rewards", {"after": 0.5, "rewards": "real"}), ("task.rewards", {"own": {"mine": 1.0}})],
+)
+def test_first_order_gradients_refuse_rewards_that_they_do_not_climb(path, value):
+    data = with_value(path, value)
+    data["optimiser"] = {"gradient": "first_order"}
+    text = complaint(data)
+    assert f"{path.replace('task.rewards', 'task.rewards.own')}: optimiser.gradient first_order" in text
+    assert "leave it out, or take gradient: zeroth_order" in text
 
 
 def test_every_mistake_of_a_file_is_listed():
