@@ -285,10 +285,11 @@ def touched(
     dt: Scalars,
     paddle: tuple[PaddlePose, PaddlePose],
 ) -> Bool[jax.Array, "*batch"]:
-    """Whether ``step`` has the blade touch a ball that would otherwise go from ``state`` to ``end`` [m] in ``dt`` [s].
+    """True where ``step`` has the blade touch the ball.
 
-    paddle: pose at the step's start, pose at its end.
+    end: position [m] to which it would otherwise go from ``state`` in ``dt`` [s]
+    paddle: pose at the step's start, pose at its end
     """
-    blade = (_mounted(params.paddle, _blade(pose)) for pose in paddle)
-    t, _ = _paddle_time(params.paddle, params.flight.radius, _ball(state), components(end), *blade, dt)
+    first, last = (_mounted(params.paddle, _blade(pose)) for pose in paddle)
+    t, _ = _paddle_time(params.paddle, params.flight.radius, _ball(state), components(end), first, last, dt)
     return t <= dt

@@ -77,7 +77,7 @@ def incoming(task: Task, episodes: Episodes, prepared: Prepared, ticks: int) -> 
 
 
 def _delayed(captured: Array, first: Array, prepared: Prepared) -> Array:
-    """What has arrived at each control step of what each control period captures, (T, c, L); before, ``first``."""
+    """Captures (T, c, L), one in each control period, that have arrived at each control step; before, ``first``."""
     tick = jnp.arange(captured.shape[0])[:, None] - prepared.ball.periods[None]
     arrived = jnp.take_along_axis(captured, jnp.maximum(tick, 0)[:, None], 0)
     return jnp.where((tick < 0)[:, None], first[None], arrived)

@@ -121,7 +121,7 @@ class Objective:
         return (jnp.argmax(faults, 0) + 1) * every, (faults > 0.0).sum(0).astype(faults.dtype)
 
     def _fault(self, joints: Joints, blade: PaddlePose) -> Array:
-        """How far a moment is from being faultless (...): 0 with a margin, the rewards' weights where they count one.
+        """Faults of a moment (...): 0 with a margin, the rewards' weights where they count one.
 
         Contact with table or robot, a low blade, one that faces backwards.
         """

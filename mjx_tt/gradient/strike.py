@@ -45,7 +45,7 @@ class Meeting:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Strike:
-    """What comes of these moments.
+    """Outcomes of these moments.
 
     distance  [m^2] of the ball's centre from the blade's, squared; of a hit in the blade's plane
     ball      after the impact, that of a missed ball at the blade's middle
@@ -58,7 +58,7 @@ class Strike:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Landing:
-    """Where balls come down to the table's height, without table and net.
+    """Places where balls come down to the table's height, without table and net.
 
     crossed  over the net's plane; height [m] of the ball's centre there, with ``crossed`` only
     down     within the flight that is looked at; position [m] x and y, or the last ones
@@ -71,12 +71,12 @@ class Landing:
 
 
 def meeting(task: Task, motion: Motion, ball: Incoming, params: BallParams) -> Meeting:
-    """When the ball is hit, or is nearest to the blade. Without derivatives."""
+    """Moments at which balls are hit, or are nearest to the blade. Without derivatives."""
     joints, velocities = jax.lax.stop_gradient([jnp.moveaxis(x, 1, 0) for x in (motion.joints, motion.velocities)])
     pose = task.kinematics.pose(joints, velocities)  # (3, S + 1, L)
     start, end = jax.tree.map(lambda x: x[:, :-1], pose), jax.tree.map(lambda x: x[:, 1:], pose)
     before = jax.tree.map(lambda x: x[:, :-1], ball.ball)
-    to = ball.ball.position[:, 1:]
+    to = jnp.asarray(ball.ball.position[:, 1:])
     touched = ball.live[:-1] & flight.touched(params, before, to, 1.0 / task.config.sim_rate, (start, end))
     first = jnp.argmax(touched, 0)
     # A ball taken before its bounce is no hit; the same ball after the bounce is what should have been played.
@@ -114,13 +114,10 @@ def _nearest(
     since = jnp.clip(-dot(away, closing) / (dot(closing, closing) + SLOWEST), -timestep, timestep)
     away = away + row(since) * closing
     facing = blade.normal * row(jnp.where(dot(blade.normal, closing) < 0.0, 1.0, -1.0))
-    velocity, spin = contact.paddle_impact(
-        params.paddle,
-        *(components(x) for x in (ball.velocity, ball.spin, facing, blade.velocity)),
-        params.flight.radius,
-    )
+    speed, spin, normal, moving = (components(x) for x in (ball.velocity, ball.spin, facing, blade.velocity))
+    velocity, spin = contact.paddle_impact(params.paddle, speed, spin, normal, moving, params.flight.radius)
     position = blade.position + row(since) * blade.velocity + facing * params.flight.radius
-    return BallState(position, stack(velocity), stack(spin)), dot(away, away)
+    return BallState(position, stack(velocity), stack(spin)), jnp.asarray(dot(away, away))
 
 
 def landing(params: BallParams, ball: BallState) -> Landing:

@@ -270,10 +270,9 @@ def test_paper_settings_are_the_papers():
     assert paper.optimiser.repeats == 15
     assert config.load(config.shipped()["paper_mjx"], ("task.engine=fused", "name=paper")) == paper
     assert config.load(config.shipped()["paper_mjx"]).task.engine == "mjx"
-    falling = config.load(config.shipped()["player3_m2"])
-    sigma = build.experiment(falling, "player3_m2").bgs.sigma
-    end = falling.training.updates
-    assert (sigma(0), sigma(end)) == (0.025, pytest.approx(falling.optimiser.sigma_fall.final))
+    falling = config.load(config.shipped()["quickstart"], ("optimiser.sigma_fall={final: 0.01}",))
+    sigma = build.experiment(falling, "quickstart").bgs.sigma
+    assert (sigma(0), sigma(falling.training.updates)) == (0.025, pytest.approx(0.01))
     change, _ = bgs.step.update([1.0], bgs.step.init([0.0]))
     assert change == [pytest.approx(-0.00375)]
 
