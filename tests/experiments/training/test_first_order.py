@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from textwrap import indent
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,10 @@ from ballmodel import registry
 from ballmodel.sampling import sample_pool
 from bgs import normalizer, optimizers
 from bgs.strategy import BGSConfig
+from experiments.config import build
+from experiments.config.experiment import load
 from experiments.training.first_order import FirstOrderTrainer
+from experiments.training.trainers import trainer as trainer_of
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import MISSED, TaskConfig
@@ -106,6 +110,48 @@ def test_without_one_finite_episode_nothing_changes(pool, monkeypatch):
     np.testing.assert_array_equal(after.bgs.theta, before.bgs.theta)
     np.testing.assert_array_equal(after.bgs.average, before.bgs.average)
     assert float(metrics["non_finite"]) == 2 * PAIRS * REPEATS and int(after.bgs.updates) == 1
+
+
+NETWORK = """
+import jax.numpy as jnp
+from mjx_tt.env.own import network
+
+@network("small", shapes={"w1": (11, 16), "b1": (16,), "w2": (16, 8)})
+class Small:
+    @staticmethod
+    def start(p, x):
+        return x
+
+    @staticmethod
+    def step(p, last, x):
+        return jnp.tanh(jnp.tanh((x + 0.5 * last) @ p["w1"] + p["b1"]) @ p["w2"]), x
+"""
+OTHERS = {
+    "a network of one's own": "definitions: |\n" + indent(NETWORK, "  ") + "\nnetwork: small\nballs: player3/M0",
+    "another robot": "robot: ur10e_rail\nballs: player3/M0",
+    "MuJoCo MJX": "balls: player3/M0",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", OTHERS)
+def test_other_networks_robots_and_engines_learn_as_well(kind, tmp_path):
+    """A step along the gradient of one update plays these very balls better."""
+    file = tmp_path / "other.yaml"
+    engine = "mjx" if kind == "MuJoCo MJX" else "fused"
+    file.write_text(
+        f"name: other\n{OTHERS[kind]}\ntask: {{sim_rate: 75.0, engine: {engine}}}\n"
+        "optimiser: {gradient: first_order, num_directions: 1, repeats: 8, sigma: 1.0e-6, ema_decay: 0.0, "
+        "step: {kind: sgd, learning_rate: 0.003, schedule: {kind: constant}}}\ntraining: {pool: 32, devices: 1}\n"
+    )
+    trainer = trainer_of(build.experiment(load(file), str(file)))
+    before = trainer.init(jax.random.key(1))
+    after, metrics = trainer.update(before)
+    # The same update again, with the same balls, from the later parameters.
+    again = replace(after, bgs=replace(after.bgs, updates=before.bgs.updates), statistics=before.statistics)
+    _, better = trainer.update(again)
+    assert float(metrics["gradient_norm"]) > 0.0 and float(metrics["non_finite"]) == 0.0
+    assert float(better["mean_return"]) > float(metrics["mean_return"])
 
 
 @pytest.mark.slow
