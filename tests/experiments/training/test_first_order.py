@@ -23,6 +23,7 @@ from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import MISSED, TaskConfig
 from mjx_tt.gradient.objective import Objective
 from mjx_tt.sim.model import SimModel
+from tests.support.small_network import SMALL
 
 PAIRS, REPEATS = 2, 4
 TASK = TaskConfig(sim_rate=75.0)  # one substep: compiles in half the time
@@ -112,22 +113,8 @@ def test_without_one_finite_episode_nothing_changes(pool, monkeypatch):
     assert float(metrics["non_finite"]) == 2 * PAIRS * REPEATS and int(after.bgs.updates) == 1
 
 
-NETWORK = """
-import jax.numpy as jnp
-from mjx_tt.env.own import network
-
-@network("small", shapes={"w1": (11, 16), "b1": (16,), "w2": (16, 8)})
-class Small:
-    @staticmethod
-    def start(p, x):
-        return x
-
-    @staticmethod
-    def step(p, last, x):
-        return jnp.tanh(jnp.tanh((x + 0.5 * last) @ p["w1"] + p["b1"]) @ p["w2"]), x
-"""
 OTHERS = {
-    "a network of one's own": "definitions: |\n" + indent(NETWORK, "  ") + "\nnetwork: small\nballs: player3/M0",
+    "a network of one's own": "definitions: |\n" + indent(SMALL, "  ") + "\nnetwork: small\nballs: player3/M0",
     "another robot": "robot: ur10e_rail\nballs: player3/M0",
     "MuJoCo MJX": "balls: player3/M0",
 }

@@ -21,27 +21,21 @@ from mjx_tt.sim import model as models
 from mjx_tt.sim.actuators import DriveParams
 from mjx_tt.sim.model import Range, SimModel
 from robot_io.contract import N_OBSERVATION, n_parameters
+from tests.support.small_network import SMALL
 
 R, P = 5, 13  # 65 lanes: four vectors and one lane more
 CONFIG = TaskConfig(sim_rate=150.0)
-OWN = """
+OWN = (
+    SMALL
+    + """
 import jax.numpy as jnp
-from mjx_tt.env.own import network, reward_term
+from mjx_tt.env.own import reward_term
 
 @reward_term("reach")
 def reach(step):
     return jnp.sqrt(jnp.sum(step.blade.position**2, axis=0)) - jnp.exp(-jnp.abs(step.ball_velocity[1]))
-
-@network("small", shapes={"w1": (11, 16), "b1": (16,), "w2": (16, 8)})
-class Small:
-    @staticmethod
-    def start(p, x):
-        return x
-
-    @staticmethod
-    def step(p, last, x):
-        return jnp.tanh(jnp.tanh((x + 0.5 * last) @ p["w1"] + p["b1"]) @ p["w2"]), x
 """
+)
 
 
 def everything() -> tuple[SimModel, tuple[Range, ...]]:
