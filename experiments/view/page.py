@@ -99,7 +99,8 @@ class Viewer:
             return
         if self.playing:
             self.toggle()
-        self._seek(float(np.clip(self.t + (1.0 if button == "▶" else -1.0) / 75.0, 0.0, self.seconds)))
+        t = min(self.t, self.seconds) + (1.0 if button == "▶" else -1.0) / 75.0  # from the frame that is seen
+        self._seek(float(np.clip(t, 0.0, self.seconds)))
 
     def go(self, number: int) -> None:
         """Shows entry ``number`` of the programme from its start."""

@@ -185,12 +185,18 @@ def test_steps_balls_and_misses_are_chosen_in_the_page(shown, open_page, play):
     page = open_page(address)
     page.get_by_role("button", name="Pause").click()
     until(lambda: not viewer.playing, "paused")
-    t = viewer.t
-    page.get_by_role("button", name="▶", exact=True).click()
-    until(lambda: viewer.t == pytest.approx(t + 1 / 75, abs=1e-6), "one control tick later")
     shown_before = viewer.number
     page.get_by_role("button", name="ball ▶").click()
-    until(lambda: viewer.number == shown_before + 1, "the next ball")
+    until(lambda: viewer.number == shown_before + 1 and viewer.t == 0.0, "the next ball's start")
+    step = [page.get_by_role("button", name=name, exact=True) for name in ("▶", "◀")]
+    step[0].click()
+    until(lambda: viewer.t == pytest.approx(1 / 75, abs=1e-6), "one control tick later")
+    viewer.later("rest", lambda: setattr(viewer, "t", viewer.seconds + 0.3))  # it rests on the last frame
+    until(lambda: viewer.t > viewer.seconds, "the rest after the ball")
+    step[0].click()
+    until(lambda: viewer.t == pytest.approx(viewer.seconds, abs=1e-6), "the end")
+    step[1].click()
+    until(lambda: viewer.t == pytest.approx(viewer.seconds - 1 / 75, abs=1e-6), "one control tick before the end")
     play.values["latency.ball_observation"] = 0.09
     page.get_by_role("button", name="Give me the balls that it misses").click()
     until(lambda: play.missed, "balls that are missed")
