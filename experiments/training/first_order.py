@@ -61,7 +61,8 @@ class FirstOrderTrainer(Trainer):
             "cost": jnp.where(finite, played.cost, 0.0).sum(),
             "return_rate": (finite & played.returned).sum().astype(slopes.dtype),
             "hit_rate": (finite & played.hit).sum().astype(slopes.dtype),
-            "steps": jnp.where(finite, played.ends, 0).sum().astype(slopes.dtype),
+            "steps": jnp.where(finite, played.steps, 0).sum().astype(slopes.dtype),
+            "faults": jnp.where(finite, played.faults, 0.0).sum(),
             "seen": seen.sum(),
             "sums": jnp.stack([centred.sum((0, 2)), (centred * centred).sum((0, 2))]),
         }
@@ -83,6 +84,6 @@ class FirstOrderTrainer(Trainer):
             "update_norm": jnp.linalg.norm(bgs.theta - state.bgs.theta),
             "mean_return": -total["cost"] / count,
             "non_finite": total["non_finite"],
-            **{name: total[name] / count for name in ("return_rate", "hit_rate", "steps")},
+            **{name: total[name] / count for name in ("return_rate", "hit_rate", "steps", "faults")},
         }
         return TrainState(bgs, normalizer.merge(state.statistics, statistics), state.key), metrics

@@ -4,7 +4,8 @@ Most of the eleven terms of ``mjx_tt.env.rewards`` are steps: a ball that is mis
 blade should have been. Here a miss counts by its distance and by where the ball would have gone, a hit by where the
 ball goes. What the rewards have as means over time (jerk, acceleration, velocity) is taken over as it is. Contacts with
 table and robot, a low blade and bad style, which the rewards count by control steps, are counted as well, and weighed
-by how bad their worst moment is.
+by how bad their worst moment is. Of a missed ball until it is out of play: there is where a policy that nothing holds
+back does them.
 """
 
 from __future__ import annotations
@@ -50,7 +51,9 @@ class Played:
     """Measures of episodes (L,): cost is to be small.
 
     substep: of the hit, or of the nearest moment; ends: control periods up to it
-    observations, seen: what the policy acted on in them
+    steps: control periods of the episode, of a miss until the ball is out of play
+    faults: of these, how many have a contact, a low blade, bad style, added up
+    observations, seen: what the policy acted on up to ``ends``
     """
 
     cost: Float[Array, " L"]
@@ -58,6 +61,8 @@ class Played:
     returned: Bool[Array, " L"]
     substep: Int[Array, " L"]
     ends: Int[Array, " L"]
+    steps: Int[Array, " L"]
+    faults: Float[Array, " L"]
     observations: Float[Array, "T observed L"]
     seen: Bool[Array, "T L"]
 
@@ -80,18 +85,19 @@ class Objective:
         ball = jax.lax.stop_gradient(incoming(task, episodes, prepared, self.ticks))
         moving = motion(task, self._servos, differentiable(policy), episodes, prepared, ball)
         met = meeting(task, moving, ball, params)
-        ends = met.substep // task.config.substeps + 1
-        worst, times = self._worst(moving, ends)
+        ends, steps = (substep // task.config.substeps + 1 for substep in (met.substep, met.last))
+        worst, times, done = self._worst(moving, steps)
         # Three moments in one: what has derivatives is compiled once.
         substeps = jnp.stack([met.substep, met.substep + 1, worst])
         joints, velocities = (_at(x, substeps) for x in (moving.joints, moving.velocities))
         before, after, then = _split(task.kinematics.pose(joints, velocities))
         struck = strike(met, ball, params, (before, after), 1.0 / task.config.sim_rate)
         out = landing(params, struck.ball)
-        faults = times * self._fault(joints[:, 2], then)
+        faults = times * self._weighted(self._shortfalls(joints[:, 2], then))
         cost = _play_cost(met, struck, out) + self._steadiness(moving, ends) + faults
         seen = jnp.arange(self.ticks)[:, None] < ends[None]
-        return Played(cost, met.hit, met.hit & _inside(out), met.substep, ends, moving.observations, seen)
+        returned = met.hit & _inside(out)
+        return Played(cost, met.hit, returned, met.substep, ends, steps, done, moving.observations, seen)
 
     def _steadiness(self, moving: Motion, ends: Array) -> Array:
         """The rewards' terms of jerk, acceleration and velocity of the commands until the hit."""
@@ -110,31 +116,35 @@ class Objective:
             total = total + self._weights[name] * (share * counted).sum(0)
         return total
 
-    def _worst(self, moving: Motion, ends: Array) -> tuple[Int[Array, " L"], Float[Array, " L"]]:
-        """The substep of the worst fault at the end of a control period before the hit, and how many have one."""
+    def _worst(self, moving: Motion, steps: Array) -> tuple[Int[Array, " L"], Float[Array, " L"], Float[Array, " L"]]:
+        """The substep of the worst moment at the end of an episode's control periods, how many come near a fault, and
+        how many faults there are."""
         every = self.task.config.substeps
         joints, velocities = (
             jax.lax.stop_gradient(jnp.moveaxis(x[every::every], 1, 0)) for x in (moving.joints, moving.velocities)
         )
-        faults = self._fault(joints, self.task.kinematics.pose(joints, velocities))
-        faults = jnp.where(jnp.arange(self.ticks)[:, None] < ends[None], faults, 0.0)
-        return (jnp.argmax(faults, 0) + 1) * every, (faults > 0.0).sum(0).astype(faults.dtype)
+        counted = jnp.arange(self.ticks)[:, None] < steps[None]
+        table, own, blade, facing = self._shortfalls(joints, self.task.kinematics.pose(joints, velocities))
+        near = jnp.where(counted, self._weighted((table, own, blade, facing)), 0.0)
+        done = sum((counted & (short > 1.0)).sum(0) for short in (jnp.maximum(table, own), blade, facing))
+        dtype = near.dtype
+        return (jnp.argmax(near, 0) + 1) * every, (near > 0.0).sum(0).astype(dtype), jnp.asarray(done, dtype)
 
-    def _fault(self, joints: Joints, blade: PaddlePose) -> Array:
-        """Faults of a moment (...): 0 with a margin, the rewards' weights where they count one.
+    def _shortfalls(self, joints: Joints, blade: PaddlePose) -> tuple[Array, Array, Array, Array]:
+        """What a moment (...) is short of a margin to the table, among the links, under and behind the blade.
 
-        Contact with table or robot, a low blade, one that faces backwards.
+        From 0, with a margin, to 1 where the rewards count a fault, and on.
         """
         gaps = self.task.clearance(self.task.kinematics.links(joints), joints[0])
+        wanted = ((gaps.table, 0.0), (gaps.own, 0.0), (gaps.blade, rewards.BLADE_CLEARANCE))
+        table, own, low = (jax.nn.relu(least + MARGIN - gap) / MARGIN for gap, least in wanted)
+        return table, own, low, jax.nn.relu(1.0 + (rewards.FACING - blade.normal[1]) / FACING_MARGIN)
 
-        def short_of(value: Array, wanted: float) -> Array:
-            return jax.nn.relu(wanted + MARGIN - value) / MARGIN
-
-        return (
-            self._weights["collision"] * (short_of(gaps.table, 0.0) + short_of(gaps.own, 0.0))
-            + self._weights["paddle_height"] * short_of(gaps.blade, rewards.BLADE_CLEARANCE)
-            + self._weights["style"] * jax.nn.relu(1.0 + (rewards.FACING - blade.normal[1]) / FACING_MARGIN)
-        )
+    def _weighted(self, shortfalls: tuple[Array, Array, Array, Array]) -> Array:
+        """By the weights of the rewards that count them."""
+        names = ("collision", "collision", "paddle_height", "style")
+        terms = (self._weights[name] * short for name, short in zip(names, shortfalls, strict=True))
+        return sum(terms, jnp.zeros_like(shortfalls[0]))
 
 
 def _at(x: Float[Array, "S+1 n L"], substeps: Int[Array, "k L"]) -> Float[Array, "n k L"]:

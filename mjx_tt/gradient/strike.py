@@ -33,11 +33,13 @@ class Meeting:
     """The moments of hits, and the nearest ones of misses, in episodes (L,).
 
     substep   in which it is
+    last      in which the episode ends: that of the hit, or in which a missed ball is out of play
     playable  the ball bounced and could be reached by somebody
     hit       as the episode counts it
     """
 
     substep: Int[Array, " L"]
+    last: Int[Array, " L"]
     playable: Bool[Array, " L"]
     hit: Bool[Array, " L"]
 
@@ -84,7 +86,8 @@ def meeting(task: Task, motion: Motion, ball: Incoming, params: BallParams) -> M
     open_ = ball.live[:-1] & ball.bounced[:-1]
     away = to - end.position
     nearest = jnp.argmin(jnp.where(open_, dot(away, away), NEVER), 0)
-    return Meeting(jnp.where(hit, first, nearest), open_.any(0), hit)
+    last = jnp.where(touched.any(0), first, jnp.minimum(ball.live.sum(0), touched.shape[0]) - 1)
+    return Meeting(jnp.where(hit, first, nearest), last, open_.any(0), hit)
 
 
 def strike(

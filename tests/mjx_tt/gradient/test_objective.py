@@ -71,6 +71,14 @@ def test_it_hits_and_returns_the_balls_that_the_simulator_does(policy, pool, mod
     assert (returned != (outcome == RETURNED)).mean() < 0.04
     both = hit & (outcome != MISSED)
     np.testing.assert_array_equal(np.asarray(played.ends).reshape(R, P)[both], np.asarray(wanted.steps)[both])
+    # Also of a miss all control periods count, until the ball is out of play: most faults are there.
+    alike, misses = hit == (outcome != MISSED), outcome == MISSED
+    steps = np.minimum(np.asarray(wanted.steps), TICKS)
+    np.testing.assert_array_equal(np.asarray(played.steps).reshape(R, P)[alike], steps[alike])
+    terms = np.asarray(wanted.terms)[[CONFIG.terms.index(name) for name in FAULTS]]
+    counted, faults = -terms.sum(0)[alike], np.asarray(played.faults).reshape(R, P)[alike]
+    assert counted[misses[alike]].sum() > 20
+    assert np.abs(faults - counted).sum() <= 0.01 * counted.sum() + 1.0  # a gap of nothing may round to either side
 
 
 def test_its_observations_are_those_of_the_simulator(policy, pool):
