@@ -150,15 +150,24 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _of_one_kind(self) -> Config:
-        if self.optimiser.gradient == "first_order":
-            own = {} if isinstance(self.task.rewards, str) else self.task.rewards.own
-            for key, given in (("training.later_rewards", self.training.later_rewards), ("task.rewards.own", own)):
-                if given:
-                    raise ValueError(
-                        f"{key}: optimiser.gradient first_order climbs an objective of its own, in which it has no "
-                        "part; leave it out, or take gradient: zeroth_order"
-                    )
+        refuse_rewards(self.optimiser, self.task, "", {"training.later_rewards": self.training.later_rewards})
         return self
+
+
+def refuse_rewards(optimiser: Optimiser, task: Task, where: str, later: dict[str, LaterRewards | None]) -> None:
+    """Raises ValueError for rewards that first-order gradients do not know: own ones, and ``later`` ones by their key.
+
+    where: before the other keys in the message.
+    """
+    if optimiser.gradient != "first_order":
+        return
+    own = {} if isinstance(task.rewards, str) else task.rewards.own
+    for key, given in (*later.items(), (f"{where}task.rewards.own", own)):
+        if given:
+            raise ValueError(
+                f"{key}: {where}optimiser.gradient first_order climbs an objective of its own, in which it has no "
+                "part; leave it out, or take gradient: zeroth_order"
+            )
 
 
 def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:

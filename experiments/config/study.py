@@ -133,6 +133,10 @@ class Study(Section):
     """Also the variant whose weights are not carried back from reality to simulation."""
     identification: Identification | None = None
     """Also the variant that learns its simulation from what each round measures; null: none. Virtual reality only."""
+    randomised: bool = False
+    """Also the variant that trains in worlds drawn from the prior: that of identification, or `randomise: prior`."""
+    bound: bool = False
+    """Also the variant that trains in the reality itself, as no robot can: what is to be had. Virtual reality only."""
     ablation: Ablation | None = Ablation()
     """Hand-made ball distributions against the oracle's; null: none."""
     evaluation: Evaluation = Evaluation()
@@ -169,6 +173,11 @@ class Study(Section):
                 "identification: on a robot its measurements are not collected by a study; leave it null, and use "
                 "`mjx-tt diagnose SESSION --retrain` between the rounds"
             )
+        simulation = self.simulation
+        later = {f"simulation.rounds.{k}.later_rewards": r.later_rewards for k, r in enumerate(simulation.rounds)}
+        experiment.refuse_rewards(simulation.optimiser, simulation.task, "simulation.", later)
+        if self.robot is not None and self.bound:
+            raise ValueError("bound: nobody knows all numbers of a robot; leave it false")
         missing = [player for player in self.players if player not in self.recordings]
         if self.robot is not None and missing:
             files = ", ".join(f"{player}: FILE" for player in missing)

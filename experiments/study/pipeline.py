@@ -22,7 +22,7 @@ from ballmodel.trajectory import Dataset
 from experiments import measurements
 from experiments.config import build
 from experiments.config.experiment import read_yaml
-from experiments.config.study import Study
+from experiments.config.study import Identification, Study
 from experiments.errors import RunError, checked
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
@@ -34,6 +34,8 @@ from experiments.study.analysis.identified import estimates
 from experiments.study.blind import protocol
 from experiments.study.schedule import (
     ORACLE,
+    PRIOR,
+    REALITY,
     Human,
     Identified,
     Item,
@@ -53,6 +55,7 @@ from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.env.policy import Policy
 from mjx_tt.robot import robot as robots
 from mjx_tt.sim import model as models
+from mjx_tt.sim.model import ModelFile
 
 CONVERGENCE = "convergence.json"
 JOINTS = "joints"
@@ -92,7 +95,9 @@ class Loop:
         return self.seed_folder(seed) / player / "balls" / f"human_{name}.yaml"
 
     def world(self, seed: int, player: str, name: str) -> Path:
-        """A world that was identified, as a model YAML."""
+        """A world of the study by name, as a model YAML: the player's own where it was identified."""
+        if name == PRIOR:
+            return self.seed_folder(seed) / f"{name}.yaml"
         return self.seed_folder(seed) / player / "identified" / f"{name}.yaml"
 
     def run_of(self, seed: int, player: str, model: str) -> Path:
@@ -129,8 +134,12 @@ class Loop:
                 found.append(self._seal(seed))
                 if self.study.identification is not None:
                     found.append(self._joints(seed, self.study.identification.seconds))
+            if self.study.randomised:
+                found.append(self._prior(seed))
             for player in self.study.players:
                 found.append(self._first_balls(seed, player))
+                if self.study.bound:
+                    found.append(self._bound(seed, player))
                 for item in items(self.study, player):
                     found.append(self._step(seed, player, item))
                 found.append(self._convergence(seed, player))
@@ -168,6 +177,30 @@ class Loop:
         return Step(
             f"seed{seed}/reality opened", "seal", 1, (sealed, self.folder / evaluation.EVALUATIONS), (path,), run
         )
+
+    def _prior(self, seed: int) -> Step:
+        path = self.world(seed, "", PRIOR)
+        settings = self.study.identification or Identification()
+
+        def run() -> str:
+            before = identification.prior(settings.prior, "identification.prior")
+            plain = {key: value for key, value in self.study.simulation.model.items() if key != "randomise"}
+            believed = models.from_dict(plain, "simulation.model").model
+            path.parent.mkdir(parents=True, exist_ok=True)
+            ModelFile(believed, before).save(path)
+            return f"{len(before)} parameters drawn"
+
+        return Step(f"seed{seed}/{PRIOR}", "worlds", 1, (), (path,), run)
+
+    def _bound(self, seed: int, player: str) -> Step:
+        path, name = self.world(seed, player, REALITY), f"seed{seed}/{player}/{REALITY} as a world"
+
+        def run() -> str:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            ModelFile(self._virtual[seed].with_spin(player, name)).save(path)
+            return "for the bound alone"
+
+        return Step(name, "worlds", 1, (), (path,), run)
 
     def _first_balls(self, seed: int, player: str) -> Step:
         path, name = self.data(seed, player, "D0"), f"seed{seed}/{player}/D0"
@@ -246,7 +279,9 @@ class Loop:
 
         optimiser = self.study.simulation.optimiser
         work = updates(self.study, item) * optimiser.num_directions * optimiser.repeats * self.study.simulation.seeds
-        program = f"training of round {item.round}" if world is None else None  # an identified world is in the program
+        # An identified world is in the program.
+        own = world is not None and item.world not in (PRIOR, REALITY)
+        program = None if own else f"training of round {item.round} in {item.world or 'the world as believed'}"
         compiled = Run(folder / "training" / "seed0").metrics
         return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run, program, compiled)
 

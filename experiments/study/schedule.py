@@ -38,7 +38,7 @@ class Simulated:
     balls   a human model, or a distribution's name
     source  model whose weights it starts from; None: from scratch
     round   whose updates and recipe it has; None: the first round's recipe with the updates of all rounds
-    world   that was identified; None: the study's model
+    world   that was identified, or PRIOR or REALITY; None: the study's model
     """
 
     key: str
@@ -100,6 +100,26 @@ IDENTIFIED: tuple[Item, ...] = (
     Simulated("id-sim3", "M2-id", "id-ft65", 2, "world2"),
     Real("id-ft100", "id-sim3", 2),
 )
+PRIOR, REALITY = "prior", "reality"  # worlds that need no measurement
+
+
+def _in(world: str, prefix: str) -> tuple[Item, ...]:
+    """The loop with all its simulations in one world."""
+    sim1, sim2, sim3, ft35, ft65, ft100 = (f"{prefix}-{x}" for x in ("sim1", "sim2", "sim3", "ft35", "ft65", "ft100"))
+    d1, d2, m1, m2 = (f"{name}-{prefix}" for name in ("D1", "D2", "M1", "M2"))
+    return (
+        Simulated(sim1, "M0", None, 0, world),
+        Real(ft35, sim1, 0, d1),
+        Human(m1, ("D0", d1)),
+        Simulated(sim2, m1, ft35, 1, world),
+        Real(ft65, sim2, 1, d2),
+        Human(m2, ("D0", d1, d2)),
+        Simulated(sim3, m2, ft65, 2, world),
+        Real(ft100, sim3, 2),
+    )
+
+
+RANDOMISED, BOUND = _in(PRIOR, "prior"), _in(REALITY, "bound")
 MODELS = (
     "is2r-sim1",
     "is2r-ft35",
@@ -126,6 +146,7 @@ ORACLE = "oracle"  # the oracle's simulated policy under its name in the ablatio
 def items(study: Study, player: str) -> tuple[Item, ...]:
     """Items made for a player, in an order in which everything comes after what it needs."""
     chosen = LOOP + (FRESH if study.fresh else ()) + (IDENTIFIED if study.identification else ())
+    chosen += (RANDOMISED if study.randomised else ()) + (BOUND if study.bound else ())
     if study.ablation and study.ablation.player == player:
         chosen += tuple(Simulated(balls, balls, None, None) for balls in study.ablation.balls)
     return chosen

@@ -16,7 +16,7 @@ from ballmodel import constants as c
 from ballmodel import registry
 from ballmodel.distribution import save_distribution
 from experiments.study.analysis import effect_costs, scoring
-from experiments.study.analysis.paper import ABLATED, BY_SKILL, CROSS, FINAL, LEARNED, MODELS, VARIANT
+from experiments.study.analysis.paper import ABLATED, BY_SKILL, CROSS, FINAL, MODELS, OTHER_WORLDS, VARIANT
 from experiments.study.blind import protocol
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.sim.model import ModelFile, Range, SimModel
@@ -79,7 +79,7 @@ def make(folder: Path, seeds=(0,), names=BY_SKILL, balls: int = 60, rallies: int
             pools = _balls(folder / f"seed{seed}" / player / "balls", player, balls, rng)
             for key in ("is2r-ft35", "is2r-ft65", "is2r-ft100", "s2r-ft65", "s2r-ft100", "oracle-ft"):
                 _metrics(folder / f"seed{seed}" / player / key, 60 if key == "is2r-ft35" else 70, rng)
-            wanted = [(player, m.key) for m in (*MODELS, *VARIANT, *LEARNED)]
+            wanted = [(player, m.key) for m in (*MODELS, *VARIANT, *OTHER_WORLDS)]
             wanted += [(other, key) for other in CROSS[player] for key in FINAL] if cross else []
             wanted += [(player, m.key) for m in ABLATED] if player == ABLATION_PLAYER else []
             _world(folder / f"seed{seed}" / player / "identified" / "world0.yaml")

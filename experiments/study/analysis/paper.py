@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from ballmodel import registry
 
 IS2R, S2R, ORACLE, FRESH, ABLATION = "i-S2R", "S2R", "S2R-Oracle", "i-S2R, weights not carried back", "ablation"
-IDENTIFIED = "i-S2R with identification"
+IDENTIFIED, RANDOMISED, BOUND = "i-S2R with identification", "i-S2R in worlds of the prior", "i-S2R in reality itself"
 
 
 @dataclass(frozen=True)
@@ -48,18 +48,30 @@ VARIANT = (
     Model("fresh-ft100", "fine-tuned 100 %, weights not carried back", FRESH, 1.0, True),
 )
 """The variant that the paper leaves to future work: simulation goes on from its own weights."""
-LEARNED = (
-    Model("id-sim1", "sim 1, identified", IDENTIFIED, 0.0, False),
-    Model("id-ft35", "fine-tuned 35 %, identified", IDENTIFIED, 0.35, True),
-    Model("id-sim2", "sim 2, identified", IDENTIFIED, 0.35, False),
-    Model("id-ft65", "fine-tuned 65 %, identified", IDENTIFIED, 0.65, True),
-    Model("id-sim3", "sim 3, identified", IDENTIFIED, 0.65, False),
-    Model("id-ft100", "fine-tuned 100 %, identified", IDENTIFIED, 1.0, True),
-)
-"""The variant that learns its simulation from what each round measures, which the paper does by hand."""
+
+
+def _rounds(prefix: str, method: str, world: str) -> tuple[Model, ...]:
+    return (
+        Model(f"{prefix}-sim1", f"sim 1, {world}", method, 0.0, False),
+        Model(f"{prefix}-ft35", f"fine-tuned 35 %, {world}", method, 0.35, True),
+        Model(f"{prefix}-sim2", f"sim 2, {world}", method, 0.35, False),
+        Model(f"{prefix}-ft65", f"fine-tuned 65 %, {world}", method, 0.65, True),
+        Model(f"{prefix}-sim3", f"sim 3, {world}", method, 0.65, False),
+        Model(f"{prefix}-ft100", f"fine-tuned 100 %, {world}", method, 1.0, True),
+    )
+
+
+LEARNED = {
+    "prior": _rounds("prior", RANDOMISED, "worlds of the prior"),
+    "id": _rounds("id", IDENTIFIED, "identified"),
+    "bound": _rounds("bound", BOUND, "reality itself"),
+}
+"""The variants that train in other worlds than the one that was believed: drawn from a prior; learned from what each
+round measures, which the paper does by hand; the reality itself."""
+OTHER_WORLDS = tuple(model for rounds in LEARNED.values() for model in rounds)
 ABLATED = tuple(Model(key, key.capitalize(), ABLATION, 0.0, False) for key in ("large", "medium", "narrow", "oracle"))
 """Zero-shot policies of the ablation of the ball distribution, one player."""
-BY_KEY = {model.key: model for model in (*MODELS, *VARIANT, *LEARNED, *ABLATED)}
+BY_KEY = {model.key: model for model in (*MODELS, *VARIANT, *OTHER_WORLDS, *ABLATED)}
 TEN = tuple(model.key for model in MODELS)
 FINAL = ("is2r-ft100", "s2r-ft100", "oracle-ft")
 """The methods' final policies, in the order of the paper's figures; these are cross-evaluated."""

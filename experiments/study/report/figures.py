@@ -15,6 +15,7 @@ from experiments.study.analysis.claims import Measurements
 from experiments.study.analysis.paper import (
     ABLATED,
     ABLATION,
+    BOUND,
     BY_KEY,
     CROSS,
     FINAL,
@@ -23,6 +24,7 @@ from experiments.study.analysis.paper import (
     IS2R,
     LEVELS,
     ORACLE,
+    RANDOMISED,
     S2R,
     SHORT,
     TEN,
@@ -57,6 +59,8 @@ NAMES = {
     ORACLE: "S2R-Oracle (+FT)",
     FRESH: "weights not carried back",
     IDENTIFIED: "i-S2R with identification",
+    RANDOMISED: "i-S2R in worlds of the prior",
+    BOUND: "i-S2R in reality itself",
     ABLATION: "ablation",
 }
 STAGES = ("sim 1", "fine-tuned\n35 %", "sim 2", "fine-tuned\n65 %", "sim 3", "fine-tuned\n100 %")

@@ -17,12 +17,12 @@ from experiments.study.analysis.paper import (
     BY_KEY,
     FINAL,
     FRESH,
-    IDENTIFIED,
     IS2R,
     LEARNED,
     LEVELS,
     MODELS,
     ORACLE,
+    OTHER_WORLDS,
     S2R,
     VARIANT,
     WITHOUT,
@@ -207,39 +207,50 @@ def variant(study: Study, m: Measurements) -> Figure | None:
 
 @styled
 def identification(study: Study, m: Measurements) -> Figure | None:
-    """Rallies of i-S2R, round by round, in the world that was believed and in the worlds that were identified."""
-    if all(m.raw.mean(model.key, study.players) is None for model in LEARNED):
+    """Rallies of i-S2R, round by round, by the world of its simulations."""
+    played = [p for p, models in LEARNED.items() if any(m.raw.mean(x.key, study.players) is not None for x in models)]
+    if not played:
         return None
-    figure = Figure(figsize=(10, 3.6))
+    figure = Figure(figsize=(11, 3.4 + 0.35 * len(played)))
     left, right = figure.subplots(1, 2, width_ratios=(1.6, 1))
     stages = ("sim1", "ft35", "sim2", "ft65", "sim3", "ft100")
+    methods = {
+        "is2r": "as believed",
+        "prior": "drawn from the prior",
+        "id": "identified",
+        "bound": "the reality itself",
+    }
+    shown = [prefix for prefix in methods if prefix in ("is2r", *played)]
+    width = 0.8 / len(shown)
     for k, stage in enumerate(stages):
-        for key, offset in ((f"is2r-{stage}", -0.2), (f"id-{stage}", 0.2)):
-            bar(left, k + offset, interval_of(m.raw.mean(key, study.players)), colour(key), 0.38)
+        for i, prefix in enumerate(shown):
+            key = f"{prefix}-{stage}"
+            place = k + (i - 0.5 * (len(shown) - 1)) * width
+            bar(left, place, interval_of(m.raw.mean(key, study.players)), colour(key), 0.95 * width)
     names = ("sim 1", "fine-tuned\n35 %", "sim 2", "fine-tuned\n65 %", "sim 3", "fine-tuned\n100 %")
     left.set_xticks(range(len(stages)), names)
     left.set_ylabel("mean rally length, 95 %")
     left.set_title("All players")
     figure.legend(
-        handles=[
-            Patch(facecolor=COLOUR[IS2R], label="simulation as believed"),
-            Patch(facecolor=COLOUR[IDENTIFIED], label="identified from each round's balls and joints"),
-        ],
+        handles=[Patch(facecolor=colour(f"{prefix}-ft100"), label=methods[prefix]) for prefix in shown],
+        title="simulated world",
         loc="outside lower left",
-        ncols=2,
+        ncols=len(shown),
     )
-    pairs = [(f"id-{stage}", f"is2r-{stage}") for stage in ("sim1", "sim2", "sim3", "ft100")]
-    ratios = [interval_of(m.ratio(a, b, "all")) for a, b in pairs]
-    labels = ("sim 1", "sim 2", "sim 3", "fine-tuned 100 %")
-    forest(right, ratios, labels, [COLOUR[IDENTIFIED]] * len(labels))
-    right.set_title("Identified / believed")
+    compared = [(prefix, stage) for stage in ("sim1", "sim3", "ft100") for prefix in shown[1:]]
+    ratios = [interval_of(m.ratio(f"{prefix}-{stage}", f"is2r-{stage}", "all")) for prefix, stage in compared]
+    labels = [
+        f"{methods[prefix]}, {stage.replace('sim', 'sim ').replace('ft100', '100 %')}" for prefix, stage in compared
+    ]
+    forest(right, ratios, labels, [colour(f"{prefix}-ft100") for prefix, _ in compared])
+    right.set_title("Rally length, over that of the world as believed")
     return figure
 
 
 @styled
 def ends(study: Study, m: Measurements) -> Figure | None:
     """Ends of the rallies by robot and human, by model, over all counted rallies with the own trainer."""
-    keys = [model.key for model in (*MODELS, *VARIANT, *LEARNED) if len(study.pick(model.key, selected=False))]
+    keys = [model.key for model in (*MODELS, *VARIANT, *OTHER_WORLDS) if len(study.pick(model.key, selected=False))]
     if not keys:
         return None
     figure = Figure(figsize=(9, 0.32 * len(keys) + 1.5))

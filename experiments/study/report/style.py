@@ -1,8 +1,8 @@
 """Style of a study's pictures: colours, boxes, bars and intervals.
 
 One colour per method everywhere (Okabe and Ito's, which the colour-blind tell apart): blue i-S2R, vermilion S2R, green
-S2R-Oracle, purple i-S2R without carrying the weights back, orange the ablation. Paler: not fine-tuned. Hollow: the
-paper.
+S2R-Oracle, purple i-S2R without carrying the weights back, orange the ablation; i-S2R in other worlds light blue
+(identified), yellow (prior) and grey (reality itself). Paler: not fine-tuned. Hollow: the paper.
 Boxes as in the paper: white circle the mean, line the median, box the quartiles. Figures are made without pyplot.
 """
 
@@ -22,11 +22,13 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.study.analysis.paper import (
     ABLATION,
+    BOUND,
     BY_KEY,
     FRESH,
     IDENTIFIED,
     IS2R,
     ORACLE,
+    RANDOMISED,
     S2R,
     SHORT,
     level,
@@ -47,6 +49,8 @@ COLOUR = {
     FRESH: "#cc79a7",
     ABLATION: "#e69f00",
     IDENTIFIED: "#56b4e9",
+    RANDOMISED: "#d0c000",
+    BOUND: "#5a5a5a",
 }
 STYLE = PAGE_STYLE | {"figure.constrained_layout.use": True, "axes.titleweight": "bold", "font.size": 9.5}
 PAPER_MARK = Line2D([], [], color=INK, marker="D", markerfacecolor="white", linestyle="", label="paper")

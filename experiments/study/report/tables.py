@@ -21,8 +21,8 @@ from experiments.study.analysis.paper import (
     CROSS,
     FINAL,
     GROUPS,
-    LEARNED,
     MODELS,
+    OTHER_WORLDS,
     SHORT,
     TEN,
     VARIANT,
@@ -81,7 +81,7 @@ def models(study: Study, m: Measurements) -> Table:
     fixed, over_seeds = Measurements(study, over_seeds=False), len(study.seeds) >= FEWEST_SEEDS
     rows = []
     for group in GROUPS:
-        for model in (*MODELS, *VARIANT, *LEARNED, *ABLATED):
+        for model in (*MODELS, *VARIANT, *OTHER_WORLDS, *ABLATED):
             by_rallies, by_seeds = (b.raw.mean(model.key, of_level(group)) for b in (fixed, m))
             if by_rallies is None or by_seeds is None:
                 continue

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 import jax
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from ballmodel.io.atomic_files import replacing
@@ -22,7 +23,10 @@ from experiments.study.target_domain import hit_log, joint_log
 from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.hit_log import HitLog
 from mjx_tt.diagnosis.joint import JointRecord
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import SimModel
 
+STROKES = 512  # from which the spin of a player's strokes is known
 STUDY = 6  # purpose of a key, beside those of experiments.config.build
 
 
@@ -52,6 +56,17 @@ class VirtualWorld:
         return self.reality.first_balls(
             self.reality.player(player), self._study.first_balls, self._key(name), Path(name).name
         )
+
+    def with_spin(self, player: str, name: str) -> SimModel:
+        """The reality as a training could have it at best: with mean and spread of the spin of the player's strokes."""
+        reality = self.reality
+        state = reality.simulator.start(reality.player(player), reality.known, self._key(name), STROKES)
+        spin = np.asarray(state.ball.spin)
+        mean, std = (
+            {f"ball_spin.{kind}_{axis}": float(x) for axis, x in zip("xyz", values, strict=True)}
+            for kind, values in (("mean", spin.mean(axis=1)), ("std", spin.std(axis=1)))
+        )
+        return models.with_values(reality.model, mean | std)
 
     def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
         """Commands and measured positions of all joints in so many seconds of motion without a ball."""

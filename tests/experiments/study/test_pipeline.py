@@ -67,6 +67,8 @@ TINY = {
     "ablation": None,
     "evaluation": {"rallies": 50, "lanes": 10, "max_touches": 8},
 }
+LATER = [{"simulated": 1, "real": 1}, {"simulated": 1, "real": 1, "later_rewards": {"after": 0.5, "rewards": "sim"}}]
+LATER = [*LATER, LATER[0]]
 DRIVER = """
 import json, sys
 from pathlib import Path
@@ -118,6 +120,11 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
         ({"evaluation": {"rallies": 50, "lanes": 7}}, "multiple of its lanes 7"),
         ({"robot": "lockstep"}, "recordings of the first balls of player3"),
         ({"robot": "lockstep", "identification": {}}, "not collected by a study; leave it null"),
+        ({"robot": "lockstep", "bound": True}, "nobody knows all numbers of a robot"),
+        (
+            {"simulation": {"optimiser": {"gradient": "first_order"}, "rounds": LATER}},
+            "simulation.rounds.1.later_rewards: simulation.optimiser.gradient first_order climbs an objective of its",
+        ),
         ({"identification": {"second": 5}}, "identification.second: unknown key; did you mean 'seconds'"),
         ({"fine_tuning": {"rewards": "sim"}}, "not measure"),
     ],
@@ -185,7 +192,9 @@ def test_a_start_that_came_to_no_step_does_not_block_another(tmp_path):
 
 
 def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_there():
-    whole = study_config.load(study_config.shipped()["study_full"], ("identification={}",))
+    whole = study_config.load(
+        study_config.shipped()["study_full"], ("identification={}", "randomised=true", "bound=true")
+    )
     needs = {
         Human: lambda i: i.data,
         Identified: lambda i: i.data,
@@ -193,7 +202,7 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
         Real: lambda i: (i.source,),
     }
     for player in whole.players:
-        made: set[str] = {"D0", "large", "medium", "narrow"}
+        made: set[str] = {"D0", "large", "medium", "narrow", "prior", "reality"}
         for item in schedule.items(whole, player):
             assert {n for n in needs[type(item)](item) if n is not None} <= made, item
             made |= (
@@ -201,7 +210,7 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
                 if isinstance(item, Human | Identified)
                 else {item.key} | ({item.data} if isinstance(item, Real) else set())
             )
-        assert {"world2", "id-ft100"} <= made
+        assert {"world2", "id-ft100", "prior-ft100", "bound-ft100"} <= made
         assert set(schedule.MODELS) <= made
     # "fine-tuned for 70 updates per cycle for the last two cycles and 60 for the first": 200, oracle 35 %.
     by_key = {item.key: item for item in schedule.LOOP if not isinstance(item, Human)}
