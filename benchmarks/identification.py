@@ -29,6 +29,7 @@ from experiments.runs import load_policy, run_dir
 from experiments.runs.run_dir import Run
 from experiments.stats import wilson
 from experiments.study import identification
+from experiments.study.analysis.identified import LOGS, estimates, holds
 from experiments.study.target_domain import hidden_effects, hit_log, joint_log
 from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.training.loop import train
@@ -210,12 +211,9 @@ def intervals(world: ModelFile, reality: SimModel) -> dict[str, list[float]]:
 
     Delays as sums or differences, which is all that logs and play show.
     """
-    truth, believed = models.paths(reality), models.paths()
-    for bus in ("abb", "festo"):
-        truth[f"latency.{bus}_action"] += truth[f"latency.{bus}_observation"] - believed[f"latency.{bus}_observation"]
-    truth["latency.ball_observation"] += believed["latency.abb_observation"] - truth["latency.abb_observation"]
-    samples = world.randomise[0].ends()
-    return {path: [float(truth[path]), *ends] for path, ends in samples.items()}
+    rows = estimates(world, hidden_effects.differences(reality))
+    decided = [row for row in rows if row["decided by"] == LOGS and holds(row) is not None]
+    return {row["parameter"]: [row["truth"], row["low"], row["high"]] for row in decided}
 
 
 def summary(found: list[dict[str, Any]]) -> str:

@@ -195,6 +195,7 @@ TABLES: dict[str, Callable[[Report], tables.Table]] = {
     "cross": lambda r: tables.cross(r.study, r.measured),
     "inside": lambda r: tables.inside(r.study),
     "identified": lambda r: tables.identified(r.study),
+    "coverage": lambda r: tables.coverage(r.study),
     "ends": lambda r: tables.ends(r.study),
     "significance": lambda r: tables.significance(r.measured),
     "models": lambda r: tables.models(r.study, r.measured),

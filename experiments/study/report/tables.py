@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ballmodel import registry
 from ballmodel.io.atomic_files import replacing
-from experiments.stats import holm
+from experiments.stats import holm, wilson
 from experiments.study.analysis import effect_costs
 from experiments.study.analysis.claims import Finding, Measurements, paper_changes, show, span
-from experiments.study.analysis.identified import estimates
+from experiments.study.analysis.identified import estimates, holds
 from experiments.study.analysis.paper import (
     ABLATED,
     BY_KEY,
@@ -247,17 +248,38 @@ def ends(study: Study) -> Table:
 def identified(study: Study) -> Table:
     """Parameters that were identified, round by round: 90 % of what training draws, and the opened reality."""
     rows = []
+    for seed, player, name, row in _estimates(study):
+        held, known = holds(row), row.get("truth")
+        truth = f"{known:.4g}" if known is not None else "" if seed in study.realities else "sealed"
+        values = (f"{row[key]:.4g}" for key in ("believed", "low", "high"))
+        inside = "" if held is None else "yes" if held else "no"
+        rows.append((str(seed), player, name, row["parameter"], row["decided by"], *values, truth, inside))
+    head = ("seed", "player", "round", "parameter", "decided by", "believed", "from", "to", "truth", "holds it")
+    return Table(head, rows, (5, 6, 7, 8))
+
+
+def coverage(study: Study) -> Table:
+    """Share of the opened reality's values in the intervals of 90 %, by what decided them."""
+    found: dict[tuple[str, str], list[bool]] = {}
+    for _, _, name, row in _estimates(study):
+        if (held := holds(row)) is not None:
+            found.setdefault((name, row["decided by"]), []).append(held)
+    rows = []
+    for (name, source), held in sorted(found.items()):
+        low, high = wilson(sum(held), len(held))
+        share = f"{sum(held) / len(held):.0%} ({100 * low:.0f} to {100 * high:.0f})"
+        rows.append((name, source, f"{sum(held)} of {len(held)}", share))
+    return Table(("round", "decided by", "intervals of 90 % that hold the truth", "share"), rows, (2, 3))
+
+
+def _estimates(study: Study) -> Iterator[tuple[int, str, str, dict[str, Any]]]:
+    """Seed, player, round and each row of every world that was identified."""
     for path in sorted(study.folder.glob("seed*/player*/identified/world*.yaml")):
         seed, player = int(path.parents[2].name[4:]), path.parents[1].name
         opened = study.realities.get(seed)
         truth = None if opened is None else opened["reality"]
         for row in estimates(ModelFile.load(path), truth):
-            low, high, known = row["low"], row["high"], row.get("truth")
-            held = "" if known is None else "yes" if low <= known <= high else "no"
-            values = (f"{x:.4g}" if x is not None else "sealed" for x in (row["believed"], low, high, known))
-            rows.append((str(seed), player, path.stem, row["parameter"], *values, held))
-    head = ("seed", "player", "round", "parameter", "believed", "from", "to", "truth", "holds it")
-    return Table(head, rows, (4, 5, 6, 7))
+            yield seed, player, path.stem, row
 
 
 def cross(study: Study, m: Measurements) -> Table:

@@ -335,6 +335,9 @@ def test_identified_worlds_stand_beside_the_opened_reality(whole):
         rows = list(csv.DictReader(file))
     held = {(row["parameter"], row["truth"], row["holds it"]) for row in rows}
     assert held == {("ball.table.friction", "0.2", "yes"), ("ball.paddle.restitution", "0.97", "no")}
+    with open(whole / "report" / "coverage.csv", newline="") as file:
+        (counted,) = csv.DictReader(file)
+    assert counted["intervals of 90 % that hold the truth"] == "4 of 8" and counted["decided by"] == "prior"
     assert len(rows) == 2 * 2 * 2 and {row["round"] for row in rows} == {"world0"}  # seeds, players, parameters
     m = claims.Measurements(study_data.load(whole))
     ratio, known = m.ratio("id-sim1", "is2r-sim1", "all").interval, made_up_study.MEANS["id-sim1"] / 3.0
