@@ -243,7 +243,7 @@ def identification(study: Study, m: Measurements) -> Figure | None:
         f"{methods[prefix]}, {stage.replace('sim', 'sim ').replace('ft100', '100 %')}" for prefix, stage in compared
     ]
     forest(right, ratios, labels, [colour(f"{prefix}-ft100") for prefix, _ in compared])
-    right.set_title("Rally length, over that of the world as believed")
+    right.set_title("Over that as believed")
     return figure
 
 
