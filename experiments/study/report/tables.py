@@ -265,10 +265,10 @@ def coverage(study: Study) -> Table:
         if (held := holds(row)) is not None:
             found.setdefault((name, row["decided by"]), []).append(held)
     rows = []
-    for (name, source), held in sorted(found.items()):
-        low, high = wilson(sum(held), len(held))
-        share = f"{sum(held) / len(held):.0%} ({100 * low:.0f} to {100 * high:.0f})"
-        rows.append((name, source, f"{sum(held)} of {len(held)}", share))
+    for (name, source), inside in sorted(found.items()):
+        low, high = wilson(sum(inside), len(inside))
+        share = f"{sum(inside) / len(inside):.0%} ({100 * low:.0f} to {100 * high:.0f})"
+        rows.append((name, source, f"{sum(inside)} of {len(inside)}", share))
     return Table(("round", "decided by", "intervals of 90 % that hold the truth", "share"), rows, (2, 3))
 
 
