@@ -25,6 +25,7 @@ PLAYERS: tuple[Player, ...] = get_args(Player)
 Effect = Literal["rubber", "table", "magnus", "spin", "noise", "latency", "camera", "drives", "encoders"]
 EFFECTS: tuple[Effect, ...] = get_args(Effect)
 Outside = Literal["lift", "bounce", "blade", "mount"]
+RIG, LOCK_STEP = "rig", "lockstep"
 FEWEST_RALLIES = 50  # of each model that are reported
 
 
@@ -105,7 +106,10 @@ class Identification(Section):
     """Before each training in simulation: what the balls and joints measured so far say of the simulation."""
 
     seconds: Annotated[float, Field(ge=10.0)] = 60.0
-    """[s] of joint motion that is recorded before the first ball."""
+    """[s] of joint motion that is looked at: recorded before the first ball, on a robot during its play as well."""
+    joints: str | None = None
+    """With a robot: a folder with command.csv and state.csv of all joints in motion, from before the first ball; null:
+    until the first play the drives are drawn from the prior."""
     balls: Annotated[int, Field(ge=20)] = 400
     """Balls of all rounds so far that are looked at, drawn evenly, if there are more."""
     prior: dict[str, Any] = PRIOR
@@ -129,10 +133,13 @@ class Study(Section):
     """In reality; the number of updates is the round's."""
     reality: Reality = Reality()
     """Effects of the virtual reality that training does not know."""
+    baselines: bool = True
+    """The paper's ten models; false: the variants alone, without what they are compared with."""
     fresh: bool = True
     """Also the variant whose weights are not carried back from reality to simulation."""
     identification: Identification | None = None
-    """Also the variant that learns its simulation from what each round measures; null: none. Virtual reality only."""
+    """Also the variant that learns its simulation from what each round measures; null: none. Not with
+    the robot in lock-step, which logs no sessions."""
     randomised: bool = False
     """Also the variant that trains in worlds drawn from the prior: that of identification, or `randomise: prior`."""
     bound: bool = False
@@ -144,7 +151,8 @@ class Study(Section):
     robot: str | None = None
     """A robot.yaml, "rig" or "lockstep": reality is that robot and its operator; null: the virtual reality."""
     recordings: dict[Player, str] = {}
-    """With a robot: each player's first balls as measured, a file that `mjx-tt fit-human` reads."""
+    """With a robot: each player's first balls as measured, a file that `mjx-tt fit-human` reads. On the rig a player
+    without one serves them."""
 
     @field_validator("players", "seeds")
     @classmethod
@@ -168,18 +176,30 @@ class Study(Section):
                 f"evaluation.rallies {rallies} is no multiple of its lanes {lanes} (evaluation.lanes); "
                 f"the nearest that is allowed: {near}"
             )
-        if self.robot is not None and self.identification is not None:
+        if self.robot == LOCK_STEP and self.identification is not None:
             raise ValueError(
-                "identification: on a robot its measurements are not collected by a study; leave it null, and use "
-                "`mjx-tt diagnose SESSION --retrain` between the rounds"
+                "identification: the robot in lock-step logs no session; take robot: rig, or leave it null"
             )
+        if self.identification is not None and self.identification.joints is not None and self.robot is None:
+            raise ValueError("identification.joints: the virtual reality records its own; leave it null")
+        if not self.baselines:
+            for key, given in (
+                ("fresh", self.fresh),
+                ("ablation", self.ablation),
+                ("evaluation.cross", self.evaluation.cross),
+                ("evaluation.effects", self.evaluation.effects and self.robot is None),
+            ):
+                if given:
+                    raise ValueError(f"{key}: compares the paper's models, and baselines is false; leave it out, too")
+            if self.identification is None and not self.randomised and not self.bound:
+                raise ValueError("baselines: false leaves nothing to do without identification, randomised or bound")
         simulation = self.simulation
         later = {f"simulation.rounds.{k}.later_rewards": r.later_rewards for k, r in enumerate(simulation.rounds)}
         experiment.refuse_rewards(simulation.optimiser, simulation.task, "simulation.", later)
         if self.robot is not None and self.bound:
             raise ValueError("bound: nobody knows all numbers of a robot; leave it false")
         missing = [player for player in self.players if player not in self.recordings]
-        if self.robot is not None and missing:
+        if self.robot not in (None, RIG) and missing:
             files = ", ".join(f"{player}: FILE" for player in missing)
             raise ValueError(
                 f"with a robot, recordings of the first balls of {', '.join(missing)} are needed: "
@@ -202,10 +222,12 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Study:
 
 
 def _absolute(data: dict[str, Any], folder: Path) -> None:
-    if isinstance(data.get("robot"), str) and data["robot"] not in ("rig", "lockstep"):
+    if isinstance(data.get("robot"), str) and data["robot"] not in (RIG, LOCK_STEP):
         data["robot"] = str((folder / data["robot"]).resolve())
     if isinstance(data.get("recordings"), dict):
         data["recordings"] = {k: str((folder / str(v)).resolve()) for k, v in data["recordings"].items()}
+    if isinstance(data.get("identification"), dict) and isinstance(data["identification"].get("joints"), str):
+        data["identification"]["joints"] = str((folder / data["identification"]["joints"]).resolve())
     if isinstance(data.get("simulation"), dict):
         experiment.absolute_samples(data["simulation"].get("model"), folder)
 

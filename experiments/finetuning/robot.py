@@ -217,6 +217,11 @@ class BallRecorder(NullRecorder):
                 sample = (record.capture_time, *map(float, record.position))
                 self._samples.setdefault(record.id, []).append(sample)
 
+    @property
+    def balls(self) -> list[int]:
+        """Numbers of the balls in the order of their first samples."""
+        return list(self._samples)
+
     def trajectory(self, ball: int) -> np.ndarray:
         """Samples (n, 4) of the tracker's ball of that number: t [s], x, y, z [m], in the order of capture."""
         samples = sorted({sample[0]: sample for sample in self._samples.get(ball, [])}.values())

@@ -57,18 +57,27 @@ def prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
     return tuple(one for one in found if isinstance(one, Range))
 
 
+def unknown(model: Mapping[str, Any], ranges: Mapping[str, Any]) -> ModelFile:
+    """The world of a model YAML's content with these ranges in place of what it draws. Raises ValueError."""
+    plain = {key: value for key, value in model.items() if key != "randomise"}
+    return ModelFile(models.from_dict(plain, "simulation.model").model, prior(ranges, "identification.prior"))
+
+
 def identify(
     logs: Sequence[Path],
     most: int,
     believed: ModelFile,
     before: Sequence[Range],
     hits: Sequence[Path] = (),
+    seconds: float = 60.0,
     say: Callable[[str], None] = lambda text: None,
 ) -> Identified:
     """The world to train in after these logs.
 
     most: balls that are looked at; believed: the model so far; before: ranges of what may be wrong of it, used where
-    the logs say nothing; hits: folders that ``write_hits`` made. Raises ValueError naming the log at fault.
+    the logs say nothing, of the drives as well where no log of joints is given; hits: folders that ``write_hits`` made;
+    seconds: of the joints' motion that are looked at, in the middle of a longer log. Raises ValueError naming the log
+    at fault.
     """
     read_ = load_logs([str(path) for path in logs])
     balls = read_.balls
@@ -79,23 +88,34 @@ def identify(
     seen = {HEIGHT if path == SEEN_HIGH else path: normal for path, normal in known.items()}
     flown = of_balls.fit(balls, believed.model, seen, say)
     say("fitting the drives")
-    driven = of_joints.fit(read_.joints, believed.model, known)
+    driven = of_joints.fit(middle(read_.joints, seconds), believed.model, known) if read_.joints else None
     say("fitting the hits")
     struck = _of_hits(flown, hits, believed.model, known)
-    drawn = [driven.samples()]
+    drawn = [] if driven is None else [driven.samples()]
     lift = np.random.default_rng(1).normal(0.0, of_balls.LIFT_ERROR, of_balls.DRAWS)
     if struck is not None:
         shown, lift = struck.samples(ranges)
         drawn.append(shown)
     samples = _joined([_in_the_tables_frame(flown.samples(lift)), *drawn])
-    settled = {*samples.paths, *GAUGE}
+    settled = {*samples.paths, *(GAUGE if driven is not None else ())}
     others: list[Randomised] = [one for one in before if one.path not in settled]
     own = settled | {one.path for one in before}
     others += [one for one in believed.randomise if not set(one.paths) & own]
-    middle = dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
-    made_of = {"flights": flown.problem.grid.n, "hits": 0 if struck is None else struck.hits, "joints": driven.left}
-    world = ModelFile(models.with_values(flown.model(), middle), (samples, *others), {"identified": made_of})
-    return Identified(world, flown.problem.grid.n, 0 if struck is None else struck.hits, driven.left)
+    centre = dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
+    left = {} if driven is None else driven.left
+    made_of = {"flights": flown.problem.grid.n, "hits": 0 if struck is None else struck.hits, "joints": left}
+    world = ModelFile(models.with_values(flown.model(), centre), (samples, *others), {"identified": made_of})
+    return Identified(world, flown.problem.grid.n, 0 if struck is None else struck.hits, left)
+
+
+def middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRecord, ...]:
+    """The middle ``seconds`` of records that are longer by more than a second."""
+    first = max(r.state_time[0] for r in records)
+    last = min(r.state_time[-1] for r in records)
+    if last - first <= seconds + 1.0:
+        return tuple(records)
+    begin = 0.5 * (first + last - seconds)
+    return tuple(r.between(begin, begin + seconds) for r in records)
 
 
 def _in_the_tables_frame(drawn: Samples) -> Samples:

@@ -21,8 +21,7 @@ from ballmodel.registry import Balls
 from ballmodel.trajectory import Dataset
 from experiments import measurements
 from experiments.config import build
-from experiments.config.experiment import read_yaml
-from experiments.config.study import Identification, Study
+from experiments.config.study import RIG, Identification, Study
 from experiments.errors import RunError, checked
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
@@ -32,6 +31,7 @@ from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis import study_folder as study_data
 from experiments.study.analysis.identified import estimates
 from experiments.study.blind import protocol
+from experiments.study.places import Places
 from experiments.study.schedule import (
     ORACLE,
     PRIOR,
@@ -62,11 +62,12 @@ JOINTS = "joints"
 REPORT = Path("report") / "index.html"
 
 
-class Loop:
+class Loop(Places):
     """All steps of a study in a folder."""
 
     def __init__(self, study: Study, folder: Path, console: Console) -> None:
-        self.study, self.folder, self.console = study, folder, console
+        super().__init__(folder)
+        self.study, self.console = study, console
         self._virtual: dict[int, VirtualWorld] = {}
         self._world: dict[int, World] = {}
         if study.robot is None:
@@ -75,38 +76,6 @@ class Loop:
             self._world.update(self._virtual)
         else:
             self._world = dict.fromkeys(study.seeds, on_robot.RobotWorld(study, study.robot, console))
-
-    # -- places --------------------------------------------------------------------------------------------------------
-
-    def seed_folder(self, seed: int) -> Path:
-        return self.folder / f"seed{seed}"
-
-    def model_folder(self, seed: int, player: str, model: str) -> Path:
-        return self.seed_folder(seed) / player / model
-
-    def data(self, seed: int, player: str, name: str) -> Path:
-        return self.seed_folder(seed) / player / "balls" / f"{name}.csv"
-
-    def hits(self, seed: int, player: str, name: str) -> Path:
-        """Folder of the hits that were logged in the play of a data set."""
-        return self.seed_folder(seed) / player / "hits" / name
-
-    def human(self, seed: int, player: str, name: str) -> Path:
-        return self.seed_folder(seed) / player / "balls" / f"human_{name}.yaml"
-
-    def world(self, seed: int, player: str, name: str) -> Path:
-        """A world of the study by name, as a model YAML: the player's own where it was identified."""
-        if name == PRIOR:
-            return self.seed_folder(seed) / f"{name}.yaml"
-        return self.seed_folder(seed) / player / "identified" / f"{name}.yaml"
-
-    def run_of(self, seed: int, player: str, model: str) -> Path:
-        """The run that holds a model's policy: of several trainings the chosen one."""
-        folder = self.model_folder(seed, player, model)
-        chosen = folder / SELECTION
-        if not chosen.exists():
-            return folder
-        return folder / read_yaml(chosen.read_text(encoding="utf-8"), str(chosen))["best"]
 
     # -- steps ---------------------------------------------------------------------------------------------------------
 
@@ -142,8 +111,12 @@ class Loop:
                     found.append(self._bound(seed, player))
                 for item in items(self.study, player):
                     found.append(self._step(seed, player, item))
-                found.append(self._convergence(seed, player))
-            found += [self._evaluate(seed)] if self.study.robot is None else self._blind(seed, self.study.robot)
+                if self.study.baselines:
+                    found.append(self._convergence(seed, player))
+            if self.study.robot is None:
+                found.append(self._evaluate(seed))
+            else:
+                found += self._rallies(seed) if self.study.robot == RIG else self._blind(seed, self.study.robot)
             if self.study.robot is None and self.study.evaluation.effects:
                 found.append(self._effects(seed))
         found.append(self._collect(found))
@@ -179,16 +152,13 @@ class Loop:
         )
 
     def _prior(self, seed: int) -> Step:
-        path = self.world(seed, "", PRIOR)
-        settings = self.study.identification or Identification()
+        path, settings = self.world(seed, "", PRIOR), self.study.identification or Identification()
 
         def run() -> str:
-            before = identification.prior(settings.prior, "identification.prior")
-            plain = {key: value for key, value in self.study.simulation.model.items() if key != "randomise"}
-            believed = models.from_dict(plain, "simulation.model").model
             path.parent.mkdir(parents=True, exist_ok=True)
-            ModelFile(believed, before).save(path)
-            return f"{len(before)} parameters drawn"
+            world = identification.unknown(self.study.simulation.model, settings.prior)
+            world.save(path)
+            return f"{len(world.randomise)} parameters drawn"
 
         return Step(f"seed{seed}/{PRIOR}", "worlds", 1, (), (path,), run)
 
@@ -247,22 +217,35 @@ class Loop:
         settings = self.study.identification
         assert settings is not None  # its items are made with it alone
         path, name = self.world(seed, player, item.name), f"seed{seed}/{player}/{item.name}"
-        data, joints = tuple(self.data(seed, player, d) for d in item.data), self.seed_folder(seed) / JOINTS
-
-        hits = tuple(self.hits(seed, player, d) for d in item.hits)
+        data, hits = (
+            tuple(place(seed, player, d) for d in names)
+            for place, names in ((self.data, item.data), (self.hits, item.hits))
+        )
+        joints = self._joints_of(seed, hits, settings)
+        moved = () if joints is None else tuple(joints / file for file in ROBOT_FILES)
 
         def run() -> str:
             plain = build.with_prior(self.study.simulation.model, robots.paper(), "simulation")
             believed = models.from_dict(plain, "simulation.model")
             before = identification.prior(settings.prior, "identification.prior")
-            found = checked(name, identification.identify, [*data, joints], settings.balls, believed, before, hits)
+            found = checked(
+                name, identification.identify, [*data, *moved], settings.balls, believed, before, hits, settings.seconds
+            )
             path.parent.mkdir(parents=True, exist_ok=True)
             found.world.save(path)
             count = len(estimates(found.world))
             return f"{found.flights} flights, {found.hits} hits; {count} parameters moved or drawn"
 
-        inputs = (*data, *(joints / file for file in ROBOT_FILES), *(folder / identification.BALLS for folder in hits))
+        inputs = (*data, *moved, *(folder / identification.BALLS for folder in hits))
         return Step(name, "identification", len(data), inputs, (path,), run)
+
+    def _joints_of(self, seed: int, hits: tuple[Path, ...], settings: Identification) -> Path | None:
+        """The log of the joints for an identification: from before the first ball; on a robot the newest play's."""
+        if self.study.robot is None:
+            return self.seed_folder(seed) / JOINTS
+        if hits:
+            return hits[-1]
+        return None if settings.joints is None else Path(settings.joints)
 
     def _simulated(self, seed: int, player: str, item: Simulated) -> Step:
         folder, name = self.model_folder(seed, player, item.key), f"seed{seed}/{player}/{item.key}"
@@ -292,10 +275,10 @@ class Loop:
 
         def run() -> str:
             source = self.run_of(seed, player, item.source)
-            if hits is not None:
-                log = self._virtual[seed].hits(player, source, f"{name}/hits")
-                identification.write_hits(hits, log.balls, log.joints)
             strokes, text = self._world[seed].fine_tune(player, source, updates(self.study, item), folder, name)
+            if hits is not None:
+                log = self._world[seed].hits(player, source, folder, f"{name}/hits")
+                identification.write_hits(hits, log.balls, log.joints)
             if data is not None:
                 measurements.write_csv(data, strokes)
             load_policy.load(folder).policy.save(folder / training.POLICY)
@@ -311,15 +294,11 @@ class Loop:
         path = self.seed_folder(seed) / player / CONVERGENCE
 
         def run() -> str:
-            models = {name: load_distribution(source) for name, source in sources.items()}
-            scale = study_data.widths(models)
-            steps = {
-                f"{a}-{b}": study_data.change(models[a], models[b], scale) for a, b in (("M0", "M1"), ("M1", "M2"))
-            }
-            first, second = steps.values()
-            run_dir.write_json(
-                path, {"mean change of the 16 numbers over their ranges": steps, "converging": second < first}
-            )
+            fitted = {name: load_distribution(source) for name, source in sources.items()}
+            scale, pairs = study_data.widths(fitted), (("M0", "M1"), ("M1", "M2"))
+            first, second = (study_data.change(fitted[a], fitted[b], scale) for a, b in pairs)
+            content = {"mean change of the 16 numbers over their ranges": {"M0-M1": first, "M1-M2": second}}
+            run_dir.write_json(path, content | {"converging": second < first})
             return f"human model changed by {first:.1%}, then by {second:.1%} of its range"
 
         return Step(f"seed{seed}/{player}/convergence", "convergence", 1, tuple(sources.values()), (path,), run)
@@ -342,7 +321,8 @@ class Loop:
             lengths = ", ".join(f"{model} {length:.1f}" for model, length in evaluation.summary(rallies).items())
             return f"{len(rallies):,} rallies; mean length: {lengths}"
 
-        human = tuple(self.human(seed, player, name) for player in self.study.players for name in ("M0", "M1", "M2"))
+        boxes_of = {self._human_of(trainer, model) for trainer, _, model in pairs}
+        human = tuple(self.human(seed, *one) for one in sorted(boxes_of) if one[1].startswith("M"))
         inputs = (*dict.fromkeys(places), *human)
         return Step(f"seed{seed}/evaluation", "evaluation", len(pairs), inputs, (path,), run)
 
@@ -369,12 +349,28 @@ class Loop:
 
     def _box(self, seed: int, trainer: str, model: str) -> Balls:
         """The balls that a policy was last trained on in simulation."""
+        _, balls = self._human_of(trainer, model)
+        human = self.human(seed, trainer, balls)
+        return load_distribution(human) if balls.startswith("M") else build.distribution(balls, model)
+
+    def _human_of(self, trainer: str, model: str) -> tuple[str, str]:
+        """The trainer, and the name of the balls that a policy was last trained on in simulation."""
         made = {item.key: item for item in items(self.study, trainer) if isinstance(item, Simulated | Real)}
         item = made["oracle-sim" if model == ORACLE else model]
         while isinstance(item, Real):
             item = made[item.source]
-        human = self.human(seed, trainer, item.balls)
-        return load_distribution(human) if item.balls.startswith("M") else build.distribution(item.balls, model)
+        return trainer, item.balls
+
+    def _rallies(self, seed: int) -> list[Step]:
+        """The evaluation on the rig, by its virtual players."""
+        found = []
+        for trainer, evaluator, model in pairings(self.study):
+            policy, who = self._policy_of(seed, trainer, model), (seed, trainer, evaluator, model)
+            run_of = partial(self.run_of, seed, trainer, policy.parent.name)
+            folder = self.seed_folder(seed) / "rallies" / "-".join(who[1:])
+            rallies = self.study.evaluation.rallies
+            found.append(on_robot.rally_step(folder, who, run_of, (policy,), rallies, self.console))
+        return found
 
     def _blind(self, seed: int, robot: str) -> list[Step]:
         """The evaluation by people: for every trainer and evaluator a folder with code names and a scoring sheet."""

@@ -65,8 +65,9 @@ class Real:
 
 Item = Human | Identified | Simulated | Real
 
+M0 = Human("M0", ("D0",))
 LOOP: tuple[Item, ...] = (
-    Human("M0", ("D0",)),
+    M0,
     Simulated("is2r-sim1", "M0", None, 0),
     Real("is2r-ft35", "is2r-sim1", 0, "D1"),
     Human("M1", ("D0", "D1")),
@@ -145,7 +146,11 @@ ORACLE = "oracle"  # the oracle's simulated policy under its name in the ablatio
 
 def items(study: Study, player: str) -> tuple[Item, ...]:
     """Items made for a player, in an order in which everything comes after what it needs."""
-    chosen = LOOP + (FRESH if study.fresh else ()) + (IDENTIFIED if study.identification else ())
+    chosen = (
+        (LOOP if study.baselines else (M0,))
+        + (FRESH if study.fresh else ())
+        + (IDENTIFIED if study.identification else ())
+    )
     chosen += (RANDOMISED if study.randomised else ()) + (BOUND if study.bound else ())
     if study.ablation and study.ablation.player == player:
         chosen += tuple(Simulated(balls, balls, None, None) for balls in study.ablation.balls)

@@ -16,23 +16,33 @@ import numpy as np
 from rich.console import Console
 
 from ballmodel.io import read
-from ballmodel.trajectory import Dataset
+from ballmodel.trajectory import Dataset, Trajectory
 from experiments import measurements
 from experiments.config import robot as robots
 from experiments.config.study import Study
-from experiments.deploy import session
+from experiments.deploy import session, session_logs
 from experiments.deploy.rig import RIG
-from experiments.errors import ConfigError, checked
+from experiments.deploy.virtual_player import VirtualPlayer
+from experiments.errors import ConfigError, RunError, checked
 from experiments.finetuning import loop
 from experiments.finetuning import session as tuning
-from experiments.finetuning.robot import LockStepRobot
+from experiments.finetuning.robot import SCENE, BallRecorder, LockStepRobot
 from experiments.runs import load_policy
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
 from experiments.study.analysis import scoring
 from experiments.study.blind import protocol
+from experiments.study.target_domain.hit_log import HitLog
 from experiments.study.workflow import Step, Waiting
 from experiments.training import finalize
+from mjx_tt.diagnosis.logs import ROBOT_FILES, before_racket, load_logs
+from mjx_tt.rally.end_reasons import End
+from robot_io.emulator.config import RigParams
+from robot_io.emulator.lockstep import LockStep
+
+LEAST_SAMPLES = 20  # of a ball that is looked at
+BALLS, AROUND = 120, 1.0  # of a fine-tuning of which everything is kept; [s] of the joints before and after them
+LONGEST_SERVICE = 2.0  # [s] from ball to ball
 
 
 def look_up(study: Study, robot: str) -> None:
@@ -42,8 +52,11 @@ def look_up(study: Study, robot: str) -> None:
             robots.load_robot(robot)
         except ConfigError as error:
             raise ConfigError(f"robot: {error}") from None
-    for player in study.players:
+    for player in study.recordings:
         recording(study, player)
+    if study.identification is not None and study.identification.joints is not None:
+        given = Path(study.identification.joints)
+        checked("identification.joints", load_logs, [given / file for file in ROBOT_FILES])
 
 
 def recording(study: Study, player: str) -> Dataset:
@@ -62,7 +75,10 @@ class RobotWorld:
         self._study, self._robot, self._console = study, robot, console
 
     def first_balls(self, player: str, name: str) -> Dataset:
-        """Balls of the player recorded before the study. Raises ConfigError as ``recording`` does."""
+        """Balls of the player recorded before the study, on the rig without a recording those that the virtual player
+        serves. Raises ConfigError as ``recording`` does."""
+        if player not in self._study.recordings:
+            return served(player, self._study.first_balls, _seed(name), name.rsplit("/", 1)[-1])
         measured = recording(self._study, player)
         # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
         label = name.rsplit("/", 1)[-1]
@@ -81,13 +97,35 @@ class RobotWorld:
             soft_wrap=True,
         )
         found = tuning.finetune(
-            str(source), settings, Run(folder), self._robot, None, None, "numpy", _seed(name), self._console
+            str(source),
+            settings,
+            Run(folder),
+            self._robot,
+            None,
+            None,
+            "numpy",
+            _seed(name),
+            self._console,
+            player if self._robot == RIG else None,
         )
         if found is None:
             raise Waiting(f"{name}: fine-tuning with {player} is not finished; the same command goes on with it")
         measured = measurements.read_trajectories([folder / loop.HUMAN_BALLS])
         change = found["difference"]["mean_return"]
         return measured, f"{settings.updates} updates, {len(measured):,} balls, mean return changed by {change:+.2f}"
+
+    def hits(self, player: str, source: Path, folder: Path, name: str) -> HitLog:
+        """The last balls of the fine-tuning in ``folder``, from the longest session's log."""
+        logs = sorted(folder.glob("*.mcap"), key=lambda path: path.stat().st_size)
+        if not logs:
+            raise RunError(f"{folder}: holds no session's log (.mcap), of which the simulation is identified")
+        flights, joints = session_logs.load(logs[-1])
+        kept = sorted((t for t in flights if len(t) >= LEAST_SAMPLES), key=lambda t: t.time[0])[-BALLS:]
+        if not kept or not joints:
+            raise RunError(f"{logs[-1]}: holds {len(kept)} balls and {len(joints)} joints; both are needed")
+        begin, end = kept[0].time[0] - AROUND, max(t.time[-1] for t in kept) + AROUND
+        tracks = tuple(replace(t, session=name, name=str(i)) for i, t in enumerate(kept))
+        return HitLog(Dataset(tracks, name), tuple(r.between(begin, end) for r in joints))
 
     def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
         """Plays ``selection_episodes`` balls with each policy and counts +1 hit, +1 returned, -2 fault."""
@@ -130,6 +168,60 @@ def exported(trained: TrainedPolicy, console: Console) -> Path:
         if not finalize.export_policy(folder, trained, experiment, None, console):
             raise ConfigError(f"{trained.source}: acts at another rate than the robot")
     return folder
+
+
+class Still:
+    """A policy that stays where it is."""
+
+    def reset(self) -> None:
+        pass
+
+    def step(self, observation: np.ndarray) -> np.ndarray:
+        return np.zeros(len(observation) - 3)
+
+
+def served(player: str, count: int, seed: int, session: str) -> Dataset:
+    """Balls that a virtual player serves, as the emulated trackers measured them; the robot stands still."""
+    recorder = BallRecorder()
+    rig = LockStep(SCENE, VirtualPlayer(player, seed), Still(), RigParams(seed=seed % 2**31), recorder=recorder)
+    rig.throwing = True
+    found: tuple[Trajectory, ...] = ()
+    while len(found) < count:
+        before = len(found)
+        rig.run(LONGEST_SERVICE * (count - before))
+        tracks = (recorder.trajectory(ball) for ball in recorder.balls)
+        whole = [track for track in tracks if len(track) >= LEAST_SAMPLES]
+        found = tuple(Trajectory(session, str(i), t[:, 0], t[:, 1:].T) for i, t in enumerate(whole[:count]))
+        if len(found) == before:
+            raise RunError(f"{player} serves no ball on the rig")
+    return Dataset(tuple(before_racket(t) for t in found), f"{player} on the rig")
+
+
+def rally_step(
+    folder: Path,
+    who: tuple[int, str, str, str],
+    run_of: Callable[[], Path],
+    inputs: tuple[Path, ...],
+    rallies: int,
+    console: Console,
+) -> Step:
+    """Rallies of a virtual player with a policy on the rig. who: seed, trainer, evaluator, model."""
+    seed, trainer, evaluator, model = who
+    name, counted = f"seed{seed}/rallies/{trainer}-{evaluator}-{model}", folder / protocol.EVALUATIONS
+
+    def run() -> str:
+        artefact = exported(load_policy.load(run_of()), console)
+        session.run(artefact, RIG, None, None, "numpy", folder, None, _seed(name), None, console, rallies, evaluator)
+        report = max(folder.glob("*.json"))
+        found = json.loads(report.read_text(encoding="utf-8")).get("rallies") or {"list": []}
+        played = [(one["length"], End[one["end"]]) for one in found["list"]]
+        if sum(not one["filtered"] for one in found["list"]) < rallies:
+            raise RunError(f"{report}: {len(played)} rallies were played, {rallies} that count are needed; once more")
+        scored = scoring.scored(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
+        scoring.write(counted, scored)
+        return f"{len(played)} rallies, {scored.length[~scored.filtered].mean():.1f} touches on average"
+
+    return Step(name, "rallies", rallies, inputs, (counted,), run)
 
 
 def blind_steps(

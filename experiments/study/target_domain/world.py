@@ -39,6 +39,10 @@ class World(Protocol):
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         """Fine-tunes the policy of the run ``source`` into the run ``folder``; the player's hits and a sentence."""
 
+    def hits(self, player: str, source: Path, folder: Path, name: str) -> HitLog:
+        """Balls of rallies with the run ``source`` or, where it was just fine-tuned, ``folder``: ball and joints by one
+        clock."""
+
     def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
         """Function that scores a policy with the player; None where scores are not needed."""
 
@@ -72,8 +76,8 @@ class VirtualWorld:
         """Commands and measured positions of all joints in so many seconds of motion without a ball."""
         return joint_log.record(self.reality.simulator.task, self.reality.known, self._key(name), seconds)
 
-    def hits(self, player: str, source: Path, name: str) -> HitLog:
-        """Balls of rallies with the policy of the run ``source``: ball and joints by one clock."""
+    def hits(self, player: str, source: Path, folder: Path, name: str) -> HitLog:
+        """Balls of rallies with the policy of the run ``source``."""
         reality, policy = self.reality, load_policy.load(source).policy
         person, noise = reality.player(player), self._study.reality.camera_noise
         return hit_log.record(reality.simulator, reality.known, person, policy, self._key(name), name, noise)

@@ -92,6 +92,17 @@ class JointRecord:
         _check_size(self.joint, "position", self.state_position, WIDEST * max(-limits.lower[i], limits.upper[i]))
         _check_units(self)
 
+    def between(self, begin: float, end: float) -> JointRecord:
+        """What was sent and reported from one moment [s] of the log's clock to another."""
+        sent, reported = ((t >= begin) & (t <= end) for t in (self.command_time, self.state_time))
+        return dataclasses.replace(
+            self,
+            command_time=self.command_time[sent],
+            command_velocity=self.command_velocity[sent],
+            state_time=self.state_time[reported],
+            state_position=self.state_position[reported],
+        )
+
 
 def _check_size(joint: str, what: str, values: np.ndarray, largest: float) -> None:
     if np.abs(values).max() > largest:

@@ -119,7 +119,13 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
         ({"ablation": {"player": "player4"}}, "ablation.player 'player4'"),
         ({"evaluation": {"rallies": 50, "lanes": 7}}, "multiple of its lanes 7"),
         ({"robot": "lockstep"}, "recordings of the first balls of player3"),
-        ({"robot": "lockstep", "identification": {}}, "not collected by a study; leave it null"),
+        ({"robot": "lockstep", "identification": {}}, "logs no session; take robot: rig"),
+        ({"identification": {"joints": "logs"}}, "identification.joints: the virtual reality records its own"),
+        ({"baselines": False, "identification": {}}, "evaluation.cross: compares the paper's models"),
+        (
+            {"baselines": False, "evaluation": {"rallies": 50, "lanes": 5, "cross": False, "effects": False}},
+            "leaves nothing to do without identification, randomised or bound",
+        ),
         ({"robot": "lockstep", "bound": True}, "nobody knows all numbers of a robot"),
         (
             {"simulation": {"optimiser": {"gradient": "first_order"}, "rounds": LATER}},
