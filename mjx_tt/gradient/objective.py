@@ -94,7 +94,7 @@ class Objective:
         struck = strike(met, ball, params, (before, after), 1.0 / task.config.sim_rate)
         out = landing(params, struck.ball)
         faults = times * self._weighted(self._shortfalls(joints[:, 2], then))
-        cost = _play_cost(met, struck, out) + self._steadiness(moving, ends) + faults
+        cost = _play_cost(met, struck, out) + self._steadiness(moving, ends) + jnp.log1p(faults)
         seen = jnp.arange(self.ticks)[:, None] < ends[None]
         returned = met.hit & _inside(out)
         return Played(cost, met.hit, returned, met.substep, ends, steps, done, moving.observations, seen)
