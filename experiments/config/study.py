@@ -26,6 +26,7 @@ Effect = Literal["rubber", "table", "magnus", "spin", "noise", "latency", "camer
 EFFECTS: tuple[Effect, ...] = get_args(Effect)
 Outside = Literal["lift", "bounce", "blade", "mount"]
 RIG, LOCK_STEP = "rig", "lockstep"
+FEWEST_ON_RIG = 5  # which plays in real time
 FEWEST_RALLIES = 50  # of each model that are reported
 
 
@@ -90,8 +91,9 @@ class Ablation(Section):
 class Evaluation(Section):
     """Rallies of every model with its own player and with others."""
 
-    rallies: Annotated[int, Field(ge=FEWEST_RALLIES)] = 80
-    """Played by each player with each model; what is left after filtering is cut to the top 60, then to the top 50."""
+    rallies: Annotated[int, Field(ge=FEWEST_ON_RIG)] = 80
+    """Played by each player with each model, 50 at least, on the rig 5; what is left after filtering is cut to the top
+    60, then to the top 50."""
     lanes: Count = 8
     """Sessions side by side into which these rallies are divided."""
     max_touches: Count = 400
@@ -169,7 +171,12 @@ class Study(Section):
                 f"allowed: {', '.join(self.players)}, or no ablation at all (ablation: null)"
             )
         rallies, lanes = self.evaluation.rallies, self.evaluation.lanes
-        if rallies % lanes:
+        if rallies < FEWEST_RALLIES and self.robot != RIG:
+            raise ValueError(
+                f"evaluation.rallies {rallies} is less than {FEWEST_RALLIES}, which are reported; fewer are allowed "
+                f"with robot: {RIG} alone"
+            )
+        if rallies % lanes and self.robot is None:
             more = lanes * (rallies // lanes + 1)
             near = f"{more - lanes} or {more}" if more - lanes >= FEWEST_RALLIES else more
             raise ValueError(

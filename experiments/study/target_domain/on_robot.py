@@ -10,6 +10,7 @@ import json
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ from experiments.study.blind import protocol
 from experiments.study.target_domain.hit_log import HitLog
 from experiments.study.workflow import Step, Waiting
 from experiments.training import finalize
-from mjx_tt.diagnosis.logs import ROBOT_FILES, before_racket, load_logs
+from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, before_racket, load_logs
 from mjx_tt.rally.end_reasons import End
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
@@ -120,7 +121,8 @@ class RobotWorld:
         if not logs:
             raise RunError(f"{folder}: holds no session's log (.mcap), of which the simulation is identified")
         flights, joints = session_logs.load(logs[-1])
-        kept = sorted((t for t in flights if len(t) >= LEAST_SAMPLES), key=lambda t: t.time[0])[-BALLS:]
+        strokes = (stroke for t in flights for stroke in by_stroke(t))
+        kept = sorted((t for t in strokes if len(t) >= LEAST_SAMPLES), key=lambda t: t.time[0])[-BALLS:]
         if not kept or not joints:
             raise RunError(f"{logs[-1]}: holds {len(kept)} balls and {len(joints)} joints; both are needed")
         begin, end = kept[0].time[0] - AROUND, max(t.time[-1] for t in kept) + AROUND
@@ -168,6 +170,21 @@ def exported(trained: TrainedPolicy, console: Console) -> Path:
         if not finalize.export_policy(folder, trained, experiment, None, console):
             raise ConfigError(f"{trained.source}: acts at another rate than the robot")
     return folder
+
+
+def by_stroke(track: Trajectory) -> tuple[Trajectory, ...]:
+    """A rally's track from each stroke of the person to the next one, the robot's hit between them."""
+    cuts, away, farthest = [0], False, 0  # away from the robot; sample at which the ball was farthest that way
+    y = track.position[1]
+    for i in range(len(y)):
+        ahead = y[i] - y[farthest] if away else y[farthest] - y[i]
+        if ahead >= 0.0:
+            farthest = i
+        elif -ahead > TURN:
+            if away:
+                cuts.append(farthest)
+            away, farthest = not away, i
+    return tuple(track.part(a, b) for a, b in pairwise([*cuts, len(y)]))
 
 
 class Still:
@@ -257,11 +274,9 @@ def blind_steps(
     def count() -> str:
         left = [f"{p.code} has {p.counted} of {scoring.KEEP}" for p in protocol.progress(folder) if not p.complete]
         if left:
-            # A copy under a code name does not say on which balls it was trained, and the rig throws those.
-            thrown = f" --distribution {evaluator}/M0" if robot == RIG else ""
             raise Waiting(
                 f"{name}: {evaluator} plays rallies with "
-                f"`mjx-tt run {folder / protocol.POLICIES}/CODE --robot {robot}{thrown}` and "
+                f"`mjx-tt run {folder / protocol.POLICIES}/CODE --robot {robot}` and "
                 f"writes each down in {sheet}; rallies that count: {', '.join(left)}. Then the same command continues"
             )
         return f"{len(protocol.open_key(folder)):,} rallies"

@@ -120,6 +120,7 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
         ({"evaluation": {"rallies": 50, "lanes": 7}}, "multiple of its lanes 7"),
         ({"robot": "lockstep"}, "recordings of the first balls of player3"),
         ({"robot": "lockstep", "identification": {}}, "logs no session; take robot: rig"),
+        ({"evaluation": {"rallies": 40, "lanes": 8}}, "evaluation.rallies 40 is less than 50"),
         ({"identification": {"joints": "logs"}}, "identification.joints: the virtual reality records its own"),
         ({"baselines": False, "identification": {}}, "evaluation.cross: compares the paper's models"),
         (
