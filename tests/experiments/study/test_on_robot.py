@@ -77,10 +77,11 @@ def test_sessions_of_the_emulated_robot_show_by_how_much_it_obeys_later(tmp_path
     (tmp_path / "as_built").mkdir()
     (tmp_path / "late").mkdir()
     built, late = identified(tmp_path / "as_built", served, 0.0), identified(tmp_path / "late", served, LATE)
-    for bus in ("abb", "festo"):
-        path = f"latency.{bus}_action"
-        change = sum(late[path][end] - built[path][end] for end in ("low", "high")) / 2.0
-        assert change == pytest.approx(LATE, abs=0.004)
+    for bus, sure in (("abb", 0.003), ("festo", 0.008)):  # [s] a small part of the delay; axes lag by 20 ms besides
+        rows = [robot[f"latency.{bus}_action"] for robot in (built, late)]
+        change = sum(rows[1][end] - rows[0][end] for end in ("low", "high")) / 2.0
+        open_ = sum(row["high"] - row["low"] for row in rows)
+        assert abs(change - LATE) < open_ / 2.0 + 0.001 and open_ / 2.0 < sure, (bus, change, open_)
     assert all(row["low"] < row["high"] for row in (built["ball.paddle.restitution"], late["drives.joint_2.lag"]))
     # The rig's ball is lifted by no spin.
     lift = built["ball.flight.magnus_coefficient"]
