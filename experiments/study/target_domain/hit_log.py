@@ -112,9 +112,10 @@ def _records(task: Task, model: SimModel, states: list[_States]) -> tuple[JointR
     for i, name in enumerate(task.contract.joints):
         zero = 0.0 if model.drives is None else getattr(model.drives, name).joint_offset or 0.0
         late = 2 if i in FESTO_JOINTS else 1
-        command_time = np.concatenate([one.begin + period * np.arange(len(one.command)) for one in states])
+        # After its ball the robot is stopped: a command holds until the next one.
+        command_time = np.concatenate([one.begin + period * np.arange(len(one.command) + 1) for one in states])
         ticks = [np.arange(one.encoder.shape[1]) / ENCODER_RATE + one.begin + one.latency[late] for one in states]
-        command = np.concatenate([one.command[:, i] for one in states])
+        command = np.concatenate([np.append(one.command[:, i], 0.0) for one in states])
         position = np.concatenate([one.encoder[i] + zero for one in states])
         records.append(JointRecord(name, command_time, command, np.concatenate(ticks), position, task.config.robot))
     return tuple(records)
