@@ -1,0 +1,45 @@
+"""All of the ball's parameters at once, from flights of other code."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ballmodel.trajectory import Trajectory
+from experiments.config.study import PRIOR
+from mjx_tt.diagnosis.ball.flights.linearization import SPIN
+from mjx_tt.diagnosis.together import balls as of_balls
+from mjx_tt.sim.model import SimModel
+from tests.exam.generator.world import World, fly
+
+pytestmark = [pytest.mark.slow, pytest.mark.optimised]
+KNOWN = {path: (0.5 * (low + high), (high - low) / 12**0.5) for path, (low, high) in PRIOR.items()}
+
+
+def thrown(spin: np.ndarray) -> list[Trajectory]:
+    """Balls with spins (n,) [rad/s] across their way by the exam's physics, whose air lifts none; 3 mm of noise."""
+    rng, n = np.random.default_rng(7), len(spin)
+    position = rng.uniform([[-0.4], [1.0], [0.2]], [[0.4], [1.6], [0.4]], (3, n))
+    velocity = rng.uniform([[-0.6], [-6.0], [0.5]], [[0.6], [-4.5], [1.5]], (3, n))
+    spins = np.stack([spin, 0.0 * spin, 0.0 * spin])
+    time = np.arange(56) / 125.0
+    path = fly(World(), np.concatenate([position, velocity, spins]), time[-1] + 0.01)
+    seen = path.at(np.repeat(time[:, None], n, axis=1)) + rng.normal(0.0, 0.003, (3, time.size, n))
+    return [Trajectory("day", str(i), time, seen[:, :, i]) for i in range(n)]
+
+
+def test_balls_that_spin_faster_than_anybody_hits_are_left_out(monkeypatch):
+    """With a limit that some of these balls exceed: what is left is below it, and all else is as without the others."""
+    balls, said = thrown(np.random.default_rng(1).normal(0.0, 8.0, 80)), []
+    whole = of_balls.fit(balls, SimModel(), KNOWN)
+    fast = np.linalg.norm(whole.posterior.at.start[SPIN], axis=0)
+    limit = float(np.sort(fast)[-4:-2].mean())  # two exceed it, if the others keep their spins
+    monkeypatch.setattr(of_balls, "FASTEST", limit)
+    found = of_balls.fit(balls, SimModel(), KNOWN, said.append)
+    left_out = [text for text in said if text.startswith("left out, for no ball spins as fast")]
+    assert left_out[0].endswith(": 3") or left_out[0].endswith(": 2")
+    assert np.linalg.norm(found.posterior.at.start[SPIN], axis=0).max() <= limit
+    if len(left_out) == 1:
+        slower = [ball for ball, spin in zip(balls, fast, strict=True) if spin <= limit]
+        alone = of_balls.fit(slower, SimModel(), KNOWN)
+        np.testing.assert_array_equal(found.posterior.theta, alone.posterior.theta)
