@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from ballmodel.constants import BALL_RADIUS, TABLE_LENGTH, TABLE_WIDTH
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import posterior
 from mjx_tt.diagnosis.ball.diagnose import FEWEST_BALLS, flights
@@ -24,9 +25,12 @@ from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Samples
 
 DRAWS = 256
-# [rad/s] beyond what anybody plays: the fastest loops have some 9,000 turns a minute, 940 rad/s. A ball that seems to
-# spin faster met what the model does not have, such as the table's edge, and it alone would decide the spread of all.
-FASTEST = 1000.0
+# A ball that met what the model does not have may decide the spread of all spins by itself, and then all else. Left out
+# are bounces at the table's edge, deviations of so many medians, and spins that nobody plays: the fastest loops have
+# some 9,000 turns a minute, 940 rad/s.
+EDGE, NEAR_TABLE = 0.03, 0.06  # [m] from the edge; of the lowest sample from where a ball touches the table
+WORST = 5.0
+FASTEST = 1000.0  # [rad/s]
 LIFT = "ball.flight.magnus_coefficient"
 LIFT_ERROR = 0.2  # of the coefficient k, beside what the posterior has: see ``BallsTogether.along_lift``
 Prior = Mapping[str, tuple[float, float]]  # mean and standard deviation by dotted path
@@ -101,6 +105,10 @@ def fit(
     if not effects:
         raise ValueError(f"nothing that flights show is in the prior, which has {', '.join(prior)}")
     model = models.with_values(model, {e.path: prior[e.path][0] for e in effects})
+    edges = sum(not clear_of_the_edge(t) for t in kept)
+    if edges and len(kept) - edges >= FEWEST_BALLS:
+        say(f"left out, for they bounced at the table's edge: {edges}")
+        kept = [t for t in kept if clear_of_the_edge(t)]
     while True:
         g = grid(kept)
         problem = BallProblem(g, model, effects, heading(g))
@@ -108,9 +116,30 @@ def fit(
         if problem.nominal[LIFT] == 0.0 and LIFT not in prior:
             return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say))
         say(f"fitting the spins of {g.n} balls")
-        found = BallsTogether(problem, posterior.fit(problem, *own_spins(problem, nominal), (), say))
-        turning = np.linalg.norm(found.posterior.at.start[SPIN], axis=0) <= FASTEST
-        if turning.all() or turning.sum() < FEWEST_BALLS:
-            return found
-        say(f"left out, for no ball spins as fast: {g.n - turning.sum()}")
-        kept = [t for t, real in zip(kept, turning, strict=True) if real]
+        situation, spins = own_spins(problem, nominal)
+        deviation = _deviation(problem, situation)
+        ordinary = deviation < WORST * np.median(deviation)
+        if ordinary.all():
+            found = BallsTogether(problem, posterior.fit(problem, situation, spins, (), say))
+            ordinary = np.linalg.norm(found.posterior.at.start[SPIN], axis=0) <= FASTEST
+            if ordinary.all() or ordinary.sum() < FEWEST_BALLS:
+                return found
+        say(f"left out, for no ball flies like that: {g.n - ordinary.sum()}")
+        kept = [t for t, real in zip(kept, ordinary, strict=True) if real]
+
+
+def clear_of_the_edge(ball: Trajectory) -> bool:
+    """False for a ball whose first bounce is so near to the table's edge that the edge may have been hit."""
+    x, y, z = ball.position
+    inner = z[1:-1]
+    low = np.flatnonzero((inner <= z[:-2]) & (inner < z[2:]) & (np.abs(inner - BALL_RADIUS) < NEAR_TABLE)) + 1
+    if not low.size:
+        return True
+    inside = TABLE_WIDTH / 2 - np.abs(x[low[0]]), TABLE_LENGTH / 2 - np.abs(y[low[0]])
+    return bool(min(inside) > EDGE or min(inside) < -EDGE)
+
+
+def _deviation(problem: BallProblem, situation: Situation) -> Float[np.ndarray, " n"]:
+    """Root mean square [m] of each ball's measured positions less the model's."""
+    left = np.asarray(problem.linearise(situation).residual)
+    return np.sqrt((left**2).sum(axis=(0, 1)) / np.maximum(problem.grid.mask.sum(axis=0), 1))

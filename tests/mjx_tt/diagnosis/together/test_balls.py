@@ -36,10 +36,23 @@ def test_balls_that_spin_faster_than_anybody_hits_are_left_out(monkeypatch):
     limit = float(np.sort(fast)[-4:-2].mean())  # two exceed it, if the others keep their spins
     monkeypatch.setattr(of_balls, "FASTEST", limit)
     found = of_balls.fit(balls, SimModel(), KNOWN, said.append)
-    left_out = [text for text in said if text.startswith("left out, for no ball spins as fast")]
+    left_out = [text for text in said if text.startswith("left out, for no ball flies like that")]
     assert left_out[0].endswith(": 3") or left_out[0].endswith(": 2")
     assert np.linalg.norm(found.posterior.at.start[SPIN], axis=0).max() <= limit
     if len(left_out) == 1:
         slower = [ball for ball, spin in zip(balls, fast, strict=True) if spin <= limit]
         alone = of_balls.fit(slower, SimModel(), KNOWN)
         np.testing.assert_array_equal(found.posterior.theta, alone.posterior.theta)
+
+
+def test_a_bounce_at_the_edge_decides_nothing():
+    """One ball lands 1 cm from the end of the table: all is as if it had not been there."""
+    balls, said = thrown(np.zeros(60)), []
+    low = int(np.argmin(balls[0].position[2]))
+    moved = balls[0].position - np.array([[0.0], [balls[0].position[1, low] + 1.36], [0.0]])
+    at_edge = Trajectory("day", "edge", balls[0].time, moved)
+    assert [of_balls.clear_of_the_edge(ball) for ball in (*balls[:2], at_edge)] == [True, True, False]
+    alone = of_balls.fit(balls, SimModel(), KNOWN)
+    found = of_balls.fit([*balls, at_edge], SimModel(), KNOWN, said.append)
+    assert "left out, for they bounced at the table's edge: 1" in said
+    np.testing.assert_array_equal(found.posterior.theta, alone.posterior.theta)
