@@ -63,7 +63,7 @@ def summary(
             "list": [asdict(rally) for rally in played.rallies],
         }
     evaluation = (loaded.manifest.get("provenance") or {}).get("evaluation")
-    if evaluation:
+    if evaluation and "return_rate" in evaluation:  # a fine-tuned policy was evaluated on the robot
         report["simulation"] = {k: evaluation[k] for k in ("return_rate", "low", "high", "episodes")}
         report["simulation"]["balls"] = evaluation["balls"]["name"]
     report["timings"] = timings or (status.timings if status else {})
