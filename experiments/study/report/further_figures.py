@@ -211,8 +211,9 @@ def identification(study: Study, m: Measurements) -> Figure | None:
     played = [p for p, models in LEARNED.items() if any(m.raw.mean(x.key, study.players) is not None for x in models)]
     if not played:
         return None
-    figure = Figure(figsize=(11, 3.4 + 0.35 * len(played)))
-    left, right = figure.subplots(1, 2, width_ratios=(1.6, 1))
+    believed = m.raw.mean("is2r-sim1", study.players) is not None
+    figure = Figure(figsize=(11 if believed else 6.6, 3.4 + 0.35 * len(played)))
+    left, *right = np.atleast_1d(figure.subplots(1, 2 if believed else 1, width_ratios=(1.6, 1) if believed else None))
     stages = ("sim1", "ft35", "sim2", "ft65", "sim3", "ft100")
     methods = {
         "is2r": "as believed",
@@ -220,7 +221,7 @@ def identification(study: Study, m: Measurements) -> Figure | None:
         "id": "identified",
         "bound": "the reality itself",
     }
-    shown = [prefix for prefix in methods if prefix in ("is2r", *played)]
+    shown = [prefix for prefix in methods if prefix in (("is2r", *played) if believed else played)]
     width = 0.8 / len(shown)
     for k, stage in enumerate(stages):
         for i, prefix in enumerate(shown):
@@ -237,13 +238,15 @@ def identification(study: Study, m: Measurements) -> Figure | None:
         loc="outside lower left",
         ncols=len(shown),
     )
+    if not right:
+        return figure
     compared = [(prefix, stage) for stage in ("sim1", "sim3", "ft100") for prefix in shown[1:]]
     ratios = [interval_of(m.ratio(f"{prefix}-{stage}", f"is2r-{stage}", "all")) for prefix, stage in compared]
     labels = [
         f"{methods[prefix]}, {stage.replace('sim', 'sim ').replace('ft100', '100 %')}" for prefix, stage in compared
     ]
-    forest(right, ratios, labels, [colour(f"{prefix}-ft100") for prefix, _ in compared])
-    right.set_title("Over that as believed")
+    forest(right[0], ratios, labels, [colour(f"{prefix}-ft100") for prefix, _ in compared])
+    right[0].set_title("Over that as believed")
     return figure
 
 
