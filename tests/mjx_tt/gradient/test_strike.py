@@ -54,7 +54,7 @@ def passing(height: float) -> Incoming:
 
 @pytest.mark.parametrize("above", [0.1, 0.25])
 def test_a_missed_ball_is_as_far_as_its_line_passes_the_blade(above):
-    met = Meeting(jnp.array([0]), jnp.array([True]), jnp.array([False]))
+    met = Meeting(jnp.array([0]), jnp.array([0]), jnp.array([True]), jnp.array([False]))
     blade = still_blade([0.0, 0.0, 0.0])
     struck = strike(met, passing(above), AIRLESS, (blade, blade), STEP)
     np.testing.assert_allclose(np.sqrt(struck.distance), above, atol=2e-4)
@@ -65,7 +65,7 @@ def test_a_missed_ball_is_as_far_as_its_line_passes_the_blade(above):
 
 
 def test_a_hit_counts_from_the_blade_s_middle_in_its_plane():
-    met = Meeting(jnp.array([0]), jnp.array([True]), jnp.array([True]))
+    met = Meeting(jnp.array([0]), jnp.array([0]), jnp.array([True]), jnp.array([True]))
     blade = still_blade([0.03, 0.0, 0.0])
     ball = passing(0.04)
     struck = strike(met, ball, AIRLESS, (blade, blade), STEP)
