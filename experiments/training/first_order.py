@@ -61,7 +61,7 @@ class FirstOrderTrainer(Trainer):
             "cost": jnp.where(finite, played.cost, 0.0).sum(),
             "return_rate": (finite & played.returned).sum().astype(slopes.dtype),
             "hit_rate": (finite & played.hit).sum().astype(slopes.dtype),
-            "steps": jnp.where(finite, played.steps, 0).sum().astype(slopes.dtype),
+            "steps": jnp.where(finite, played.ends, 0).sum().astype(slopes.dtype),
             "faults": jnp.where(finite, played.faults, 0.0).sum(),
             "seen": seen.sum(),
             "sums": jnp.stack([centred.sum((0, 2)), (centred * centred).sum((0, 2))]),

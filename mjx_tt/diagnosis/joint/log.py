@@ -93,7 +93,7 @@ class JointRecord:
         _check_units(self)
 
     def between(self, begin: float, end: float) -> JointRecord:
-        """What was sent and reported from one moment [s] of the log's clock to another."""
+        """Commands and states from one moment [s] of the log's clock to another."""
         sent, reported = ((t >= begin) & (t <= end) for t in (self.command_time, self.state_time))
         return dataclasses.replace(
             self,
