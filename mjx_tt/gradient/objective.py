@@ -131,7 +131,7 @@ class Objective:
         return (jnp.argmax(near, 0) + 1) * every, (near > 0.0).sum(0).astype(dtype), jnp.asarray(done, dtype)
 
     def _shortfalls(self, joints: Joints, blade: PaddlePose) -> tuple[Array, Array, Array, Array]:
-        """Lacks of a moment (...) to a margin to the table, among the links, under and behind the blade.
+        """Shortfalls of a moment (...): of a margin to the table, among the links, under and behind the blade.
 
         From 0, with a margin, to 1 where the rewards count a fault, and on.
         """
