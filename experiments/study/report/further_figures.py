@@ -213,7 +213,8 @@ def identification(study: Study, m: Measurements) -> Figure | None:
         return None
     believed = m.raw.mean("is2r-sim1", study.players) is not None
     figure = Figure(figsize=(11 if believed else 6.6, 3.4 + 0.35 * len(played)))
-    left, *right = np.atleast_1d(figure.subplots(1, 2 if believed else 1, width_ratios=(1.6, 1) if believed else None))
+    widths = (1.6, 1.0) if believed else (1.0,)
+    left, *right = figure.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
     stages = ("sim1", "ft35", "sim2", "ft65", "sim3", "ft100")
     methods = {
         "is2r": "as believed",
