@@ -262,8 +262,7 @@ class Loop(Places):
 
         optimiser = self.study.simulation.optimiser
         work = updates(self.study, item) * optimiser.num_directions * optimiser.repeats * self.study.simulation.seeds
-        # An identified world is in the program.
-        own = world is not None and item.world not in (PRIOR, REALITY)
+        own = item.world not in (None, PRIOR)  # a world of one player is in the program
         program = None if own else f"training of round {item.round} in {item.world or 'the world as believed'}"
         compiled = Run(folder / "training" / "seed0").metrics
         return Step(name, "training", work, inputs, (folder / POLICY, folder / SELECTION), run, program, compiled)

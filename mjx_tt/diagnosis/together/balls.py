@@ -94,9 +94,10 @@ def fit(
     Raises ValueError where fewer than FEWEST_BALLS flights can be used, or where nothing of the prior shows in them.
     """
     strokes, _ = clean(balls, True)
-    kept = flights(strokes)
-    if len(kept) < FEWEST_BALLS:
-        raise ValueError(f"{len(kept)} usable flights of {len(balls)}, at least {FEWEST_BALLS} are needed")
+    flown = flights(strokes)
+    kept = [t for t in flown if clear_of_the_edge(t)]
+    if len(kept) < len(flown):
+        say(f"left out, for they bounced at the table's edge: {len(flown) - len(kept)}")
     effects = tuple(
         replace(e, scale=prior[e.path][1], express=None)
         for e in EFFECTS
@@ -105,11 +106,9 @@ def fit(
     if not effects:
         raise ValueError(f"nothing that flights show is in the prior, which has {', '.join(prior)}")
     model = models.with_values(model, {e.path: prior[e.path][0] for e in effects})
-    edges = sum(not clear_of_the_edge(t) for t in kept)
-    if edges and len(kept) - edges >= FEWEST_BALLS:
-        say(f"left out, for they bounced at the table's edge: {edges}")
-        kept = [t for t in kept if clear_of_the_edge(t)]
     while True:
+        if len(kept) < FEWEST_BALLS:
+            raise ValueError(f"{len(kept)} usable flights of {len(balls)}, at least {FEWEST_BALLS} are needed")
         g = grid(kept)
         problem = BallProblem(g, model, effects, heading(g))
         nominal = Situation(np.zeros(len(effects)), first_fit(problem))
@@ -118,11 +117,11 @@ def fit(
         say(f"fitting the spins of {g.n} balls")
         situation, spins = own_spins(problem, nominal)
         deviation = _deviation(problem, situation)
-        ordinary = deviation < WORST * np.median(deviation)
+        ordinary = deviation <= WORST * np.median(deviation)
         if ordinary.all():
             found = BallsTogether(problem, posterior.fit(problem, situation, spins, (), say))
             ordinary = np.linalg.norm(found.posterior.at.start[SPIN], axis=0) <= FASTEST
-            if ordinary.all() or ordinary.sum() < FEWEST_BALLS:
+            if ordinary.all():
                 return found
         say(f"left out, for no ball flies like that: {g.n - ordinary.sum()}")
         kept = [t for t, real in zip(kept, ordinary, strict=True) if real]
