@@ -43,7 +43,7 @@ from robot_io.emulator.lockstep import LockStep
 
 LEAST_SAMPLES = 20  # of a ball that is looked at
 BALLS, AROUND = 120, 1.0  # of a fine-tuning of which everything is kept; [s] of the joints before and after them
-LONGEST_SERVICE = 2.0  # [s] from ball to ball
+LONGEST_SERVICE, FEWEST_SERVICES = 2.0, 5  # [s] from ball to ball; one in five at least can be used
 
 
 def look_up(study: Study, robot: str) -> None:
@@ -205,7 +205,7 @@ def served(player: str, count: int, seed: int, session: str) -> Dataset:
     found: tuple[Trajectory, ...] = ()
     while len(found) < count:
         before = len(found)
-        rig.run(LONGEST_SERVICE * (count - before))
+        rig.run(LONGEST_SERVICE * max(count - before, FEWEST_SERVICES))
         tracks = (recorder.trajectory(ball) for ball in recorder.balls)
         whole = [track for track in tracks if len(track) >= LEAST_SAMPLES]
         found = tuple(Trajectory(session, str(i), t[:, 0], t[:, 1:].T) for i, t in enumerate(whole[:count]))

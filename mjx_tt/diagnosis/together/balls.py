@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ballmodel.constants import BALL_RADIUS, TABLE_LENGTH, TABLE_WIDTH
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import posterior
-from mjx_tt.diagnosis.ball.diagnose import FEWEST_BALLS, flights
+from mjx_tt.diagnosis.ball.diagnose import FEWEST_BALLS, SCATTER, flights
 from mjx_tt.diagnosis.ball.effects import EFFECTS, Numbers
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import grid
@@ -26,10 +26,10 @@ from mjx_tt.sim.randomisation import Samples
 
 DRAWS = 256
 # A ball that met what the model does not have may decide the spread of all spins by itself, and then all else. Left out
-# are bounces at the table's edge, deviations of so many medians, and spins that nobody plays: the fastest loops have
-# some 9,000 turns a minute, 940 rad/s.
+# are bounces at the table's edge, deviations of so many medians before and after all is fitted, and spins that nobody
+# plays: the fastest loops have some 9,000 turns a minute, 940 rad/s.
 EDGE, NEAR_TABLE = 0.03, 0.06  # [m] from the edge; of the lowest sample from where a ball touches the table
-WORST = 5.0
+WORST, WORST_FITTED = 5.0, 2.0
 FASTEST = 1000.0  # [rad/s]
 LIFT = "ball.flight.magnus_coefficient"
 LIFT_ERROR = 0.2  # of the coefficient k, beside what the posterior has: see ``BallsTogether.along_lift``
@@ -113,14 +113,16 @@ def fit(
         problem = BallProblem(g, model, effects, heading(g))
         nominal = Situation(np.zeros(len(effects)), first_fit(problem))
         if problem.nominal[LIFT] == 0.0 and LIFT not in prior:
-            return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say))
+            return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say, SCATTER))
         say(f"fitting the spins of {g.n} balls")
         situation, spins = own_spins(problem, nominal)
         deviation = _deviation(problem, situation)
         ordinary = deviation <= WORST * np.median(deviation)
         if ordinary.all():
-            found = BallsTogether(problem, posterior.fit(problem, situation, spins, (), say))
-            ordinary = np.linalg.norm(found.posterior.at.start[SPIN], axis=0) <= FASTEST
+            found = BallsTogether(problem, posterior.fit(problem, situation, spins, (), say, SCATTER))
+            deviation = _deviation(problem, found.posterior.at)
+            ordinary = deviation <= WORST_FITTED * np.median(deviation)
+            ordinary &= np.linalg.norm(found.posterior.at.start[SPIN], axis=0) <= FASTEST
             if ordinary.all():
                 return found
         say(f"left out, for no ball flies like that: {g.n - ordinary.sum()}")

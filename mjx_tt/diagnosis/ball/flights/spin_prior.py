@@ -17,6 +17,9 @@ MAGNUS_PRIOR = (0.6, 0.4)  # mean and deviation of the coefficient k, where the 
 MAGNUS_RANGE = (0.1, 2.0)  # that any source reports, with a margin
 ROUNDS = 120
 LEAST_STD = 1.0  # [rad/s] of a component about each axis: below it no flight shows a spread
+# Where the air hardly lifts, balls that slide through their bounce could have any spin: it shows no more than its sign.
+# The fastest strokes of professionals lie at some 900 rad/s.
+WIDEST_STD = 300.0  # [rad/s]
 MOST_COMPONENTS = 3
 FEWEST_BALLS = 40  # of a component
 NUMBERS = 10  # of a component: its share, mean and covariance
@@ -131,12 +134,20 @@ def _maximised(mixture: _Mixture, information: np.ndarray, score: np.ndarray) ->
         away = mean - middle
         spread = np.einsum("nc,nca,ncb->cab", weight, away, away) + np.einsum("nc,ncab->cab", weight, covariance)
         # As if one more ball of the least spread stood with each component: none closes in on a single ball.
-        spread = (spread + LEAST_STD**2 * np.eye(3)) / (count + 1.0)[:, None, None]
+        spread = _at_most((spread + LEAST_STD**2 * np.eye(3)) / (count + 1.0)[:, None, None])
         mixture = _Mixture(count / len(score), middle, spread)
         if likelihood - before < 1e-5 * len(score):
             break
         before = likelihood
     return mixture, likelihood
+
+
+def _at_most(covariance: Float[np.ndarray, "c 3 3"]) -> Float[np.ndarray, "c 3 3"]:
+    """The same, no deviation above WIDEST_STD."""
+    values, vectors = np.linalg.eigh(covariance)
+    if values.max() <= WIDEST_STD**2:
+        return covariance
+    return (vectors * np.minimum(values, WIDEST_STD**2)[:, None]) @ vectors.swapaxes(-1, -2)
 
 
 def _placed(mixture: _Mixture, information: np.ndarray, score: np.ndarray) -> SpinPrior:

@@ -14,7 +14,7 @@ from mjx_tt import SimModel
 from mjx_tt.diagnosis import diagnose, load_logs
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.flights import spin_prior
-from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior, learned
+from mjx_tt.diagnosis.ball.flights.spin_prior import WIDEST_STD, SpinPrior, learned
 from tests.exam.generator.sessions import draw_balls, measure, with_spin
 from tests.exam.generator.world import World
 from tests.exam.generator.write import ball_csv
@@ -168,3 +168,11 @@ def test_spins_of_any_size_are_estimated_with_their_intervals(tmp_path):
     spins.save(tmp_path / "spins.csv")
     rows = np.genfromtxt(tmp_path / "spins.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
     np.testing.assert_allclose(rows["spin_x"], spins.mean[0], atol=1e-3)
+
+
+def test_flights_that_show_nothing_do_not_widen_the_spread_without_end():
+    """Scores that want spins of thousands, with hardly any information: as wide as people play, and not more."""
+    score = 1e-4 * np.random.default_rng(0).normal(0.0, 5000.0, (100, 3))
+    found = learned(np.repeat(1e-4 * np.eye(3)[None], 100, axis=0), score, most=1)
+    np.testing.assert_array_less(found.std, WIDEST_STD * 1.0001)
+    assert found.std.min() > 0.9 * WIDEST_STD
