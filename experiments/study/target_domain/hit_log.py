@@ -1,9 +1,9 @@
 """Balls of the virtual reality from the player's paddle to the robot's and back, with the joints on the same clock.
 
-Turns of a rally are played, and each is watched: the robot's motion as the simulator of the rallies has it, the ball
-flown along it once more in finer steps, so that a camera's frame needs no control period. What comes out is what a
-laboratory logs: a tracker's positions when they arrive, encoders' positions when they arrive, each as late as that
-episode's draw of its latency, with the errors of camera and zeros.
+Turns of a rally are played, and each is watched: the robot's motion as the simulator of the rallies has it, step by
+step, the ball flown along it once more in finer steps, so that a camera's frame needs no control period. What comes out
+is what a laboratory logs: a tracker's positions when they arrive, encoders' positions when they arrive, each as late as
+that episode's draw of its latency, with the errors of camera and zeros.
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ from mjx_tt.env.policy import controller as controller_of
 from mjx_tt.env.task import Task
 from mjx_tt.rally.human_player import Player
 from mjx_tt.rally.simulator import RallySimulator
+from mjx_tt.sim import actuators as drives
+from mjx_tt.sim import latency
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import FESTO_JOINTS
 
 SECONDS = 1.4  # of each ball that are watched
 EVERY = 4.0  # [s] from ball to ball on the log's clock
-ENCODER_RATE = 250.0  # [Hz]
 SUBSTEPS = 4  # of the ball per camera frame
 AWAY = 0.3  # [m] beyond the player's contact at which a return is out of sight
 
@@ -76,16 +77,16 @@ def record(
         watched = jax.tree.map(np.asarray, _watched(policy, episodes, task=task))
         state, _ = simulator.shots(policy, player, model, state, turn_key)
         seen = hidden_effects.seen(model, watched[0], noise, jax.random.fold_in(camera_key, turn))
-        latency = np.asarray(episodes.latency)
+        late_by = np.asarray(episodes.latency)
         for lane in range(lanes):
             begin = EVERY * (turn * lanes + lane)
             # Less what the model believes: a log's stamps are put right by it when they are read.
-            late = float(latency[0, lane]) - SimModel().latency.ball_observation
+            late = float(late_by[0, lane]) - SimModel().latency.ball_observation
             count = _in_sight(watched[0][..., lane])
             time = begin + late + np.arange(count) / CAMERA_RATE
             balls.append(Trajectory(session, str(len(balls)), np.asarray(time), seen[:, :count, lane]))
             commands, encoders = (np.asarray(x)[..., lane] for x in watched[1:])
-            states.append(_States(begin, latency[:, lane], commands, encoders))
+            states.append(_States(begin, late_by[:, lane], commands, encoders))
     return HitLog(Dataset(tuple(balls), session), _records(task, model, states))
 
 
@@ -96,7 +97,7 @@ class _States:
     begin: float  # [s] on the log's clock
     latency: np.ndarray  # (5,) [s]
     command: np.ndarray  # (ticks, 8) by control period
-    encoder: np.ndarray  # (8, T) true positions at ENCODER_RATE
+    encoder: np.ndarray  # (8, T) true positions at the simulator's steps
 
 
 def _in_sight(position: np.ndarray) -> int:
@@ -114,7 +115,9 @@ def _records(task: Task, model: SimModel, states: list[_States]) -> tuple[JointR
         late = 2 if i in FESTO_JOINTS else 1
         # After its ball the robot is stopped: a command holds until the next one.
         command_time = np.concatenate([one.begin + period * np.arange(len(one.command) + 1) for one in states])
-        ticks = [np.arange(one.encoder.shape[1]) / ENCODER_RATE + one.begin + one.latency[late] for one in states]
+        ticks = [
+            np.arange(one.encoder.shape[1]) / task.config.sim_rate + one.begin + one.latency[late] for one in states
+        ]
         command = np.concatenate([np.append(one.command[:, i], 0.0) for one in states])
         position = np.concatenate([one.encoder[i] + zero for one in states])
         records.append(JointRecord(name, command_time, command, np.concatenate(ticks), position, task.config.robot))
@@ -123,25 +126,36 @@ def _records(task: Task, model: SimModel, states: list[_States]) -> tuple[JointR
 
 @partial(jax.jit, static_argnames="task")
 def _watched(policy: Policy, episodes: Episodes, task: Task) -> tuple[Array, Array, Array]:
-    """Positions of balls (3, T, L) at the camera's rate, commands (ticks, 8, L), true joints (8, T', L) by encoders."""
+    """Positions of balls (3, T, L) at the camera's rate, commands (ticks, 8, L), and what encoders see, (8, T', L), at
+    the simulator's own steps: positions between them would be another robot's."""
     controller, prepared = controller_of(policy), task.prepare(episodes)
     ticks = round(SECONDS / task.config.period) + 1
 
     def advance(s: EpisodeState, tick: Tick) -> tuple[EpisodeState, tuple]:
         after = task.control_step(tick, s, episodes, prepared, controller)
-        still = jnp.zeros((2, *after.qpos.shape)) if after.drive.swing is None else after.drive.swing
-        return after, (after.qpos, after.qvel, still, after.command)
+        sent = (
+            latency.ring_read(after.commands, tick - prepared.action.periods - 1),
+            latency.ring_read(after.commands, tick - prepared.action.periods),
+        )
+        old, new = (drives.reachable(prepared.drives, command) for command in sent)
+
+        def substep(robot: tuple, i: Tick) -> tuple[tuple, tuple]:
+            robot, carried, (bent, bent_velocity) = task.moved(i, robot, (old, new), episodes, prepared)
+            return robot, (carried, bent, bent_velocity)
+
+        _, states = jax.lax.scan(substep, (s.qpos, s.qvel, s.drive), jnp.arange(task.config.substeps))
+        return after, (states, after.command)
 
     first = task.reset(episodes, controller)
-    _, (q, v, swing, commands) = jax.lax.scan(advance, first, jnp.arange(ticks))
-    at_rest = jnp.zeros_like(first.qpos)
-    q, v = (jnp.concatenate([a[None], x]) for a, x in ((first.qpos, q), (at_rest, v)))
-    swing = jnp.concatenate([jnp.zeros((1, *swing.shape[1:])), swing])
+    _, (states, commands) = jax.lax.scan(advance, first, jnp.arange(ticks))
+    at_rest = (first.qpos, first.qpos, jnp.zeros_like(first.qpos))
+    encoders, q, v = (
+        jnp.concatenate([a[None], jnp.reshape(x, (-1, *x.shape[2:]))]) for a, x in zip(at_rest, states, strict=True)
+    )
     frames, rate = round(SECONDS * CAMERA_RATE), CAMERA_RATE * SUBSTEPS
     time = jnp.arange(frames * SUBSTEPS + 1) / rate
-    carried = (_between(q, v, time, task), _between(swing[:, 0], swing[:, 1], time, task))
-    bent = [a + b for a, b in zip(*carried, strict=True)]
-    pose = task.kinematics.pose(*(jnp.moveaxis(x, 0, 1) for x in bent))  # each (3, K, L)
+    carried = _between(q, v, time, 1.0 / task.config.sim_rate)
+    pose = task.kinematics.pose(*(jnp.moveaxis(x, 0, 1) for x in carried))  # each (3, K, L)
 
     def substep(ball: BallState, pair: tuple[PaddlePose, PaddlePose]) -> tuple[BallState, Array | np.ndarray]:
         new, _ = flight.step(episodes.model.ball, ball, 1.0 / rate, pair)
@@ -150,13 +164,11 @@ def _watched(policy: Policy, episodes: Episodes, task: Task) -> tuple[Array, Arr
     poses = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), pose)
     pairs = (jax.tree.map(lambda x: x[:-1], poses), jax.tree.map(lambda x: x[1:], poses))
     _, path = jax.lax.scan(substep, episodes.ball, pairs)
-    encoders, _ = _between(q, v, jnp.arange(round(SECONDS * ENCODER_RATE)) / ENCODER_RATE, task)
     return jnp.moveaxis(path[::SUBSTEPS], 0, 1), commands, jnp.moveaxis(encoders, 0, 1)
 
 
-def _between(q: Array, v: Array, time: ArrayLike, task: Task) -> tuple[Array, Array]:
-    """Positions and velocities (K, 8, L) at times (K,) [s] from those at control periods, by cubic pieces."""
-    h = task.config.period
+def _between(q: Array, v: Array, time: ArrayLike, h: float) -> tuple[Array, Array]:
+    """Positions and velocities (K, 8, L) at times (K,) [s] from those every ``h`` [s], by cubic pieces."""
     n = jnp.minimum((jnp.asarray(time) / h).astype(int), q.shape[0] - 2)
     s = (jnp.asarray(time) / h - n)[:, None, None]
     a, b, va, vb = q[n], q[n + 1], h * v[n], h * v[n + 1]

@@ -1,0 +1,144 @@
+"""Logs in which nothing is wrong: ``python -m benchmarks.nothing_wrong [--logs 50] [--kind joints hits session]``.
+
+``balls``: 200 balls of the nominal simulator across its table and a minute of its joints. ``hits``: 120 balls of
+rallies in it, from the player over the hit to the return, with the joints of all of them. ``session``: the MCAP of 40
+balls of rallies with the emulated robot, whose physics are MuJoCo C's and whose devices speak their protocols. Players
+and noise differ from log to log; every answer should be "none". Resumable: what is finished is kept in --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import jax
+import numpy as np
+
+from experiments.config import study as studies
+from experiments.deploy import session_logs
+from experiments.deploy.virtual_player import VirtualPlayer
+from experiments.finetuning.robot import LockStepRallies
+from experiments.runs import load_policy, run_dir
+from experiments.stats import wilson
+from experiments.study.target_domain import hidden_effects, hit_log, joint_log
+from experiments.study.target_domain.finetuning import VirtualReality
+from mjx_tt import platform
+from mjx_tt.diagnosis.diagnose import diagnose
+from mjx_tt.diagnosis.logs import Logs
+from mjx_tt.rally import human_player
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import LATENCIES, SimModel
+from robot_io import log
+from robot_io.emulator.config import RigParams
+
+QUICKSTART = Path("experiments/shipped/policies/quickstart")
+PLAYERS = ("player1", "player2", "player3", "player4", "player5")
+BALLS, SECONDS, SERVED = 200, 60.0, 40  # of the kind balls; of its joints [s]; of a session
+NOISE = 0.003  # [m] of the camera
+_lobs = jax.jit(human_player.first_ball, static_argnums=3)
+
+
+class Nominal:
+    """The nominal simulator as a laboratory sees it: one robot, so that its delays do not differ from ball to ball."""
+
+    def __init__(self) -> None:
+        rounds = [{"simulated": 1, "real": 1}] * 3
+        study = studies.parse({"name": "x", "simulation": {"rounds": rounds}, "reality": {"without": ["spin"]}}, "study")
+        self.reality = VirtualReality(study, 0)
+        self.model = models.with_values(SimModel(), {f"latency.{name}_std": 0.0 for name in LATENCIES})
+        self.policy = load_policy.load(QUICKSTART).policy
+
+    def balls(self, seed: int) -> Logs:
+        """Balls across the table and a minute of the joints."""
+        key, camera, swept = jax.random.split(jax.random.key(seed), 3)
+        player = self.reality.player(PLAYERS[seed % len(PLAYERS)])
+        thrown = _lobs(player, human_player.fresh((BALLS,)), key, (BALLS,))
+        seen = hidden_effects.measure(self.model, thrown, NOISE, camera)
+        joints = joint_log.record(self.reality.simulator.task, self.model, swept, SECONDS)
+        return Logs(tuple(seen.trajectories("nominal")), joints, {})
+
+    def hits(self, seed: int) -> Logs:
+        """Balls of rallies with the hits in them."""
+        player = self.reality.player(PLAYERS[seed % len(PLAYERS)])
+        key = jax.random.key(seed)
+        found = hit_log.record(self.reality.simulator, self.model, player, self.policy, key, "nominal", NOISE)
+        return Logs(tuple(found.balls), found.joints, {})
+
+
+def session(seed: int) -> Logs:
+    """The log of a session of rallies with the emulated robot."""
+    player = VirtualPlayer(PLAYERS[seed % len(PLAYERS)], seed)
+    policy = load_policy.load(QUICKSTART).policy.astype(np.float32)
+    player.prepare()
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        with log.FileRecorder.start(folder, "session", {}, {}, 0.0, 0) as recorder:
+            rallies = LockStepRallies(player, RigParams(seed=seed), recorder=recorder)
+            for number in range(SERVED):
+                rallies.play(policy, number)
+        balls, joints = session_logs.load(next(folder.glob("*.mcap")))
+    return Logs(balls, joints, {})
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Answers and prints; 1 where one was not "none"."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("runs/nothing_wrong"))
+    parser.add_argument("--logs", type=int, default=50, help="of each kind")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first log")
+    parser.add_argument("--kind", nargs="+", default=["balls", "hits", "session"], choices=["balls", "hits", "session"])
+    chosen = parser.parse_args(arguments)
+    platform.configure(devices=1)
+    nominal = Nominal()
+    makers: dict[str, Callable[[int], Logs]] = {"balls": nominal.balls, "hits": nominal.hits, "session": session}
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    seeds = range(chosen.first, chosen.first + chosen.logs)
+    for kind in chosen.kind:
+        left = [seed for seed in seeds if not _file(chosen.out, kind, seed).exists()]
+        began = time.monotonic()
+        for done, seed in enumerate(left, 1):
+            run_dir.write_json(_file(chosen.out, kind, seed), answer(makers[kind](seed), seed))
+            minutes = (time.monotonic() - began) / done * (len(left) - done) / 60.0
+            last = json.loads(_file(chosen.out, kind, seed).read_text(encoding="utf-8"))
+            print(f"{kind} {seed}: {last['answer']} {last['why']}; {minutes:.0f} min left", flush=True)
+    text, good = summary(chosen.out)
+    print(text)
+    return 0 if good else 1
+
+
+def answer(logs: Logs, seed: int) -> dict:
+    """The headline of the diagnosis, and what it rests on."""
+    verdict = diagnose(logs, seed=seed).verdict
+    why = [cause.name for cause in verdict.causes]
+    if verdict.unexplained is not None:
+        why.append(f"{verdict.unexplained.block}, {verdict.unexplained.where}: {verdict.unexplained.size}")
+    return {"answer": verdict.verdict, "why": "; ".join(why)}
+
+
+def summary(out: Path) -> tuple[str, bool]:
+    """A line for each kind; True where every answer is "none"."""
+    lines, good = [], True
+    for kind in ("balls", "hits", "session"):
+        found = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(out.glob(f"{kind}_*.json"))]
+        if not found:
+            continue
+        none = sum(one["answer"] == "none" for one in found)
+        low, high = wilson(none, len(found))
+        lines.append(f"{kind}: none in {none} of {len(found)} (95 % interval {low:.1%} to {high:.1%})")
+        lines += [f"  {count} x {why}" for why, count in Counter(o["why"] for o in found if o["why"]).most_common()]
+        good &= none == len(found)
+    return "\n".join(lines), good
+
+
+def _file(out: Path, kind: str, seed: int) -> Path:
+    return out / f"{kind}_{seed}.json"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
