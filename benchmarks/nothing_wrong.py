@@ -49,7 +49,9 @@ class Nominal:
 
     def __init__(self) -> None:
         rounds = [{"simulated": 1, "real": 1}] * 3
-        study = studies.parse({"name": "x", "simulation": {"rounds": rounds}, "reality": {"without": ["spin"]}}, "study")
+        study = studies.parse(
+            {"name": "x", "simulation": {"rounds": rounds}, "reality": {"without": ["spin"]}}, "study"
+        )
         self.reality = VirtualReality(study, 0)
         self.model = models.with_values(SimModel(), {f"latency.{name}_std": 0.0 for name in LATENCIES})
         self.policy = load_policy.load(QUICKSTART).policy

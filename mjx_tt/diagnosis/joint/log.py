@@ -27,6 +27,7 @@ WIDEST = 5.0  # times a joint's range beyond which a position is in other units 
 SPARSEST = 0.5  # [s] from state to state in the median, beyond which time is in other units than seconds
 WITHIN = 0.1  # share of the commands that must fall into the time of the states
 SHORTEST = 1.0  # [s] of common time of commands and states that can tell anything
+PAUSE, TIMES = 0.5, 5.0  # [s], and times the usual interval of the states, that nobody watched the joint
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,11 @@ class JointRecord:
         _check_size(self.joint, "velocity", self.command_velocity, FASTEST * limits.velocity[i])
         _check_size(self.joint, "position", self.state_position, WIDEST * max(-limits.lower[i], limits.upper[i]))
         _check_units(self)
+
+    def resumed(self) -> np.ndarray:
+        """Times (k,) [s] of the first states after pauses, in which somebody may have moved the joint."""
+        apart = np.diff(self.state_time)
+        return self.state_time[1:][apart > max(PAUSE, TIMES * float(np.median(apart)))]
 
     def between(self, begin: float, end: float) -> JointRecord:
         """Commands and states from one moment [s] of the log's clock to another."""
@@ -196,7 +202,7 @@ class JointLog:
     sizes: of the commands that are not zero; fastest: the largest of them, 0 for a joint at rest.
     rated_velocity, rated_acceleration: what the joint is built for.
     every: indices of the states after the first command; time and measured (n,) are SAMPLES of them at most.
-    starts, window: first samples of the windows (k,) and each sample's window (n,).
+    starts, window: first samples of the windows (k,) and each sample's window (n,); a pause ends one.
     """
 
     def __init__(self, record: JointRecord, nominal: JointResponse, beside: Motion | None = None):
@@ -219,12 +225,15 @@ class JointLog:
             use = use[np.round(np.linspace(0, use.size - 1, SAMPLES)).astype(int)]
         self.time, self.measured = record.state_time[use], record.state_position[use]
         self.width = min(max((self.time[-1] - self.time[0]) / 10.0, 0.3), WINDOW)
+        self._resumed = record.resumed()
         self.starts, self.window = self.windows(self.time)
 
     def windows(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """First samples of the windows (k,) and each sample's window (n,)."""
         window = np.floor((time - time[0]) / self.width).astype(int)
-        starts = np.flatnonzero(np.concatenate([[True], window[1:] != window[:-1]]))
+        watch = np.searchsorted(self._resumed, time, side="right")
+        changed = (window[1:] != window[:-1]) | (watch[1:] != watch[:-1])
+        starts = np.flatnonzero(np.concatenate([[True], changed]))
         return starts, np.repeat(np.arange(starts.size), np.diff(np.append(starts, time.size)))
 
     def response(self, values: Mapping[str, float]) -> JointResponse:
