@@ -1,9 +1,9 @@
 """Logs in which nothing is wrong: ``python -m benchmarks.nothing_wrong [--logs 50] [--kind joints hits session]``.
 
 ``balls``: 200 balls of the nominal simulator across its table and a minute of its joints. ``hits``: 120 balls of
-rallies in it, from the player over the hit to the return, with the joints of all of them. ``session``: the MCAP of 40
-balls of rallies with the emulated robot, whose physics are MuJoCo C's and whose devices speak their protocols. Players
-and noise differ from log to log; every answer should be "none". Resumable: what is finished is kept in --out.
+rallies in it, from the player over the hit to the return, with the joints of all of them. ``session``: such rallies as
+the robot's program records them, in an MCAP. Players and noise differ from log to log; every answer should be "none".
+Resumable: what is finished is kept in --out.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ import numpy as np
 
 from experiments.config import study as studies
 from experiments.deploy import session_logs
-from experiments.deploy.virtual_player import VirtualPlayer
-from experiments.finetuning.robot import LockStepRallies
 from experiments.runs import load_policy, run_dir
 from experiments.stats import wilson
 from experiments.study.target_domain import hidden_effects, hit_log, joint_log
@@ -35,12 +33,12 @@ from mjx_tt.rally import human_player
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import LATENCIES, SimModel
 from robot_io import log
-from robot_io.emulator.config import RigParams
 
 QUICKSTART = Path("experiments/shipped/policies/quickstart")
 PLAYERS = ("player1", "player2", "player3", "player4", "player5")
-BALLS, SECONDS, SERVED = 200, 60.0, 40  # of the kind balls; of its joints [s]; of a session
+BALLS, SECONDS = 200, 60.0  # of the kind balls; of its joints [s]
 NOISE = 0.003  # [m] of the camera
+EPOCH = 1_600_000_000_000_000_000  # [ns] since 1970 of the logs' begin
 _lobs = jax.jit(human_player.first_ball, static_argnums=3)
 
 
@@ -73,18 +71,24 @@ class Nominal:
         return Logs(tuple(found.balls), found.joints, {})
 
 
-def session(seed: int) -> Logs:
-    """The log of a session of rallies with the emulated robot."""
-    player = VirtualPlayer(PLAYERS[seed % len(PLAYERS)], seed)
-    policy = load_policy.load(QUICKSTART).policy.astype(np.float32)
-    player.prepare()
+def recorded(logs: Logs) -> Logs:
+    """The same after a session's log was written and read."""
+    records: list[log.Ball | log.Joints | log.Command] = []
+    for number, ball in enumerate(logs.balls):
+        records += [log.Ball(t, t, place, number) for t, place in zip(ball.time, ball.position.T, strict=True)]
+    unknown = np.full(len(logs.joints), np.nan)
+    for i, joint in enumerate(logs.joints):
+        for t, q in zip(joint.state_time, joint.state_position, strict=True):
+            place = unknown.copy()
+            place[i] = q
+            records.append(log.Joints(t, place, unknown))
+    sent = np.stack([joint.command_velocity for joint in logs.joints], axis=1)
+    for tick, (t, u) in enumerate(zip(logs.joints[0].command_time, sent, strict=True)):
+        records.append(log.Command(tick, t, u, u, unknown))
     with TemporaryDirectory() as name:
-        folder = Path(name)
-        with log.FileRecorder.start(folder, "session", {}, {}, 0.0, 0) as recorder:
-            rallies = LockStepRallies(player, RigParams(seed=seed), recorder=recorder)
-            for number in range(SERVED):
-                rallies.play(policy, number)
-        balls, joints = session_logs.load(next(folder.glob("*.mcap")))
+        with log.FileRecorder.start(Path(name), "session", {}, {}, 0.0, EPOCH) as recorder:
+            recorder.put(*sorted(records, key=lambda record: record.log_time))
+        balls, joints = session_logs.load(next(Path(name).glob("*.mcap")))
     return Logs(balls, joints, {})
 
 
@@ -98,7 +102,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     platform.configure(devices=1)
     nominal = Nominal()
-    makers: dict[str, Callable[[int], Logs]] = {"balls": nominal.balls, "hits": nominal.hits, "session": session}
+    makers: dict[str, Callable[[int], Logs]] = {
+        "balls": nominal.balls,
+        "hits": nominal.hits,
+        "session": lambda seed: recorded(nominal.hits(seed)),
+    }
     chosen.out.mkdir(parents=True, exist_ok=True)
     seeds = range(chosen.first, chosen.first + chosen.logs)
     for kind in chosen.kind:
