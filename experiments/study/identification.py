@@ -46,6 +46,7 @@ class Identified:
     flights: int
     hits: int  # 0: the rubber is drawn from the prior
     left: Mapping[str, float]  # [rad], [m] deviation of each joint that nothing explains
+    settled: bool  # False: the fit of the balls still moved when its rounds were over
 
 
 def prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
@@ -105,7 +106,8 @@ def identify(
     left = {} if driven is None else driven.left
     made_of = {"flights": flown.problem.grid.n, "hits": 0 if struck is None else struck.hits, "joints": left}
     world = ModelFile(models.with_values(flown.model(), centre), (samples, *others), {"identified": made_of})
-    return Identified(world, flown.problem.grid.n, 0 if struck is None else struck.hits, left)
+    hit = 0 if struck is None else struck.hits
+    return Identified(world, flown.problem.grid.n, hit, left, flown.posterior.converged)
 
 
 def middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRecord, ...]:
