@@ -31,20 +31,21 @@ def coupling(records: Sequence[JointRecord], responses: Mapping[str, JointRespon
         return {}
     mine = [by_name[name] for name in joints]
     begin, end = min(r.command_time[0] for r in mine), max(r.state_time[-1] for r in mine)
-    cuts = [begin, *(cut for cut in _rests(mine) if cut > begin), end + STEP]
-    time, beside = [], []
-    for first, last in pairwise(cuts):
-        at = np.arange(first, last, STEP)
-        driven = np.stack([_alone(r, responses[r.joint], at, **IDEAL) for r in mine], axis=1)
+    cuts = [begin, *(cut for cut in _rests(mine) if begin < cut < end - STEP), end + STEP]
+    parts = [np.arange(first, last, STEP) for first, last in pairwise(cuts)]
+    ticks, ends = np.concatenate(parts), np.cumsum([part.size for part in parts])[:-1]
+    driven, alone = (
+        np.stack([_alone(r, responses[r.joint], ticks, **changes) for r in mine], axis=1) for changes in (IDEAL, {})
+    )
+    movement = []
+    for first, velocity, own in zip(cuts, np.split(driven, ends), np.split(alone, ends), strict=False):
         start = np.array([_measured(r, first) for r in mine]) - [responses[r.joint].joint_offset for r in mine]
-        whole, step = follow(robot, start, np.diff(driven, axis=0) / STEP)
+        whole, step = follow(robot, start, np.diff(velocity, axis=0) / STEP)
         if abs(step - STEP) > 1e-9:
             raise ValueError(f"the robot's model steps by {step} s, {STEP} is wanted")
-        alone = np.stack([_alone(r, responses[r.joint], at) for r in mine], axis=1)
-        time.append(at)
-        beside.append(whole - start - (alone - alone[0]))
-    ticks, movement = np.concatenate(time), np.concatenate(beside)
-    return {r.joint: (ticks + responses[r.joint].observation_delay, movement[:, i]) for i, r in enumerate(mine)}
+        movement.append(whole - start - (own - own[0]))
+    every = np.concatenate(movement)
+    return {r.joint: (ticks + responses[r.joint].observation_delay, every[:, i]) for i, r in enumerate(mine)}
 
 
 def _alone(record: JointRecord, response: JointResponse, time: np.ndarray, **changes: float) -> np.ndarray:
