@@ -55,6 +55,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=0, help="seed of the first reality")
     parser.add_argument("--updates", type=int, default=500, help="of 2,000 balls, of each training")
     parser.add_argument("--player", default="player3")
+    parser.add_argument("--balls", type=int, default=300, help="across the table, before the first play")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of the joints' motion")
     parser.add_argument("--untrained", action="store_true", help="intervals alone: nothing is trained or played")
     parser.add_argument("--summary", action="store_true", help="only print what is finished")
     chosen = parser.parse_args(arguments)
@@ -65,6 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
             range(chosen.first, chosen.first + chosen.realities),
             0 if chosen.untrained else chosen.updates,
             chosen.player,
+            (chosen.balls, chosen.seconds),
         )
     found = [json.loads(path.read_text()) for path in sorted(chosen.out.glob("reality_*.json"))]
     if not found:
@@ -80,13 +83,13 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def measure(out: Path, seeds: range, updates: int, player: str) -> None:
-    """Everything of the realities that are not finished yet, one JSON each."""
+def measure(out: Path, seeds: range, updates: int, player: str, logged: tuple[int, float] = (300, 60.0)) -> None:
+    """What is not finished yet, a JSON for each reality. logged: balls before the first play, seconds of the joints."""
     out.mkdir(parents=True, exist_ok=True)
     left, began, spent = [s for s in seeds if not _file(out, s).exists()], time.monotonic(), 0
     for seed in left:
         # In a process of its own: a dozen compiled programs each, and a process may map only so many of them.
-        process = get_context("spawn").Process(target=_one, args=(out, seed, updates, player))
+        process = get_context("spawn").Process(target=_one, args=(out, seed, updates, player, logged))
         process.start()
         process.join()
         if process.exitcode:
@@ -102,12 +105,12 @@ def measure(out: Path, seeds: range, updates: int, player: str) -> None:
         print(f"reality {seed} {result['outside'] or 'in class'}: {rates}; {minutes:.0f} min left", flush=True)
 
 
-def _one(out: Path, seed: int, updates: int, player: str) -> None:
+def _one(out: Path, seed: int, updates: int, player: str, logged: tuple[int, float]) -> None:
     platform.configure(devices=1)
-    run_dir.write_json(_file(out, seed), of_reality(out, seed, updates, player))
+    run_dir.write_json(_file(out, seed), of_reality(out, seed, updates, player, logged))
 
 
-def of_reality(out: Path, seed: int, updates: int, player: str) -> dict[str, Any]:
+def of_reality(out: Path, seed: int, updates: int, player: str, logged: tuple[int, float]) -> dict[str, Any]:
     """Logs, identification, trainings and evaluations of one reality; without updates no trainings and evaluations."""
     outside = CLASSES[seed % len(CLASSES)]
     rounds = [{"simulated": 1, "real": 1}] * 3
@@ -116,8 +119,8 @@ def of_reality(out: Path, seed: int, updates: int, player: str) -> dict[str, Any
     )
     reality, folder = VirtualReality(study, seed), out / f"logs_{seed}"
     person, keys = reality.player(player), jax.random.split(jax.random.key(seed), 6)
-    measurements.write_csv(_made(folder) / "D0.csv", reality.first_balls(person, 300, keys[0], "D0"))
-    records = joint_log.record(reality.simulator.task, reality.known, keys[1], 60.0)
+    measurements.write_csv(_made(folder) / "D0.csv", reality.first_balls(person, logged[0], keys[0], "D0"))
+    records = joint_log.record(reality.simulator.task, reality.known, keys[1], logged[1])
     identification.write_joints(folder / "joints", records)
     policy = load_policy.load(QUICKSTART).policy
     log = hit_log.record(reality.simulator, reality.known, person, policy, keys[2], "hits", CAMERA_NOISE)
