@@ -84,7 +84,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def measure(out: Path, seeds: range, updates: int, player: str, logged: tuple[int, float] = (300, 60.0)) -> None:
-    """Makes what is not finished, a JSON for each reality. logged: balls before the first play, seconds of the joints."""
+    """Makes what is not finished, a JSON for each reality. logged: balls before the first play, seconds of joints."""
     out.mkdir(parents=True, exist_ok=True)
     left, began, spent = [s for s in seeds if not _file(out, s).exists()], time.monotonic(), 0
     for seed in left:

@@ -1,4 +1,4 @@
-"""What joints do to each other in logs with pauses, against MuJoCo C stepped by a plain loop."""
+"""Motions that joints give each other in logs with pauses, against MuJoCo C stepped by a plain loop."""
 
 from __future__ import annotations
 
