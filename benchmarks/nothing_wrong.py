@@ -1,4 +1,4 @@
-"""Logs in which nothing is wrong: ``python -m benchmarks.nothing_wrong [--logs 50] [--kind joints hits session]``.
+"""Logs in which nothing is wrong: ``python -m benchmarks.nothing_wrong [--logs 50] [--kind balls hits session]``.
 
 ``balls``: 200 balls of the nominal simulator across its table and a minute of its joints. ``hits``: 120 balls of
 rallies in it, from the player over the hit to the return, with the joints of all of them. ``session``: such rallies as

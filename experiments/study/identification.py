@@ -104,9 +104,9 @@ def identify(
     others += [one for one in believed.randomise if not set(one.paths) & own]
     centre = dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
     left = {} if driven is None else driven.left
-    made_of = {"flights": flown.problem.grid.n, "hits": 0 if struck is None else struck.hits, "joints": left}
-    world = ModelFile(models.with_values(flown.model(), centre), (samples, *others), {"identified": made_of})
     hit = 0 if struck is None else struck.hits
+    made_of = {"flights": flown.problem.grid.n, "hits": hit, "joints": left}
+    world = ModelFile(models.with_values(flown.model(), centre), (samples, *others), {"identified": made_of})
     return Identified(world, flown.problem.grid.n, hit, left, flown.posterior.converged)
 
 
