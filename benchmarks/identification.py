@@ -1,9 +1,10 @@
 """Worth of the identification: ``python -m benchmarks.identification [--out runs/identification] [--realities 10]``.
 
 In each of several hidden realities, every second one from outside of the model's class, a player's balls, a minute of
-the joints and a hundred hits are logged and the simulation is identified. The shipped quickstart is trained on in the
-nominal world, in the prior alone, in the identified worlds without and with hits, and in the reality itself; all five
-then play in the reality, on the same balls. Resumable: what is finished is kept, ``--summary`` prints it.
+the joints and a hundred hits are logged and the simulation is identified. The shipped quickstart is trained on by
+first-order gradients, as ``robust.yaml`` does it, in the nominal world, in the prior alone, in the identified worlds
+without and with hits, and in the reality itself; all five then play in the reality, on the same balls. Resumable: what
+is finished is kept, ``--summary`` prints it.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/identification"))
     parser.add_argument("--realities", type=int, default=10)
     parser.add_argument("--first", type=int, default=0, help="seed of the first reality")
-    parser.add_argument("--updates", type=int, default=500, help="of 2,000 balls, of each training")
+    parser.add_argument("--updates", type=int, default=600, help="of 512 balls, of each training")
     parser.add_argument("--player", default="player3")
     parser.add_argument("--balls", type=int, default=300, help="across the table, before the first play")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the joints' motion")
@@ -173,15 +174,11 @@ def trained(folder: Path, world: ModelFile, updates: int, player: str) -> Policy
     overrides = (
         f"balls={player}/M0",
         f"model={folder.parent / f'{folder.name}.yaml'}",
-        f"initial_policy={QUICKSTART}",
         f"training.updates={updates}",
         "training.evaluate_every=null",
-        "training.later_rewards.after=0",
-        "optimiser.step.learning_rate=0.005",
-        "optimiser.step.schedule.hold=0",
         "training.devices=1",
     )
-    config = experiment.load(experiment.shipped()["quickstart"], overrides)
+    config = experiment.load(experiment.shipped()["robust"], overrides)
     made, run = build.experiment(config, folder.name), Run(folder)
     if not run.trained(made.config):
         train(made, run, Console(quiet=True))

@@ -82,7 +82,7 @@ def record(
             begin = EVERY * (turn * lanes + lane)
             # Less what the model believes: a log's stamps are put right by it when they are read.
             late = float(late_by[0, lane]) - SimModel().latency.ball_observation
-            count = _in_sight(watched[0][..., lane])
+            count = in_sight(watched[0][..., lane])
             time = begin + late + np.arange(count) / CAMERA_RATE
             balls.append(Trajectory(session, str(len(balls)), np.asarray(time), seen[:, :count, lane]))
             commands, encoders = (np.asarray(x)[..., lane] for x in watched[1:])
@@ -100,10 +100,14 @@ class _States:
     encoder: np.ndarray  # (8, T) true positions at the simulator's steps
 
 
-def _in_sight(position: np.ndarray) -> int:
-    """Frames of a ball's positions (3, T) [m] until it lies low, passes the robot or comes back to where it was hit."""
+def in_sight(position: np.ndarray) -> int:
+    """Frames of a ball's positions (3, T) [m] until it falls low, passes the robot or comes back to where it was hit.
+
+    A person behind the table may strike below its height: such a ball rises first.
+    """
     x, y, z = position
-    gone = (z < BALL_RADIUS - 0.05) | (y < -2.3) | (y > y[0] + AWAY)
+    falls = np.diff(z, prepend=z[0]) < 0.0
+    gone = (falls & (z < BALL_RADIUS - 0.05)) | (y < -2.3) | (y > y[0] + AWAY)
     return int(np.argmax(gone)) if gone.any() else len(gone)
 
 
