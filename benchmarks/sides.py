@@ -167,7 +167,7 @@ def update(changes: list[str], devices: int | None = None) -> Side:
 
     def work() -> float:
         nonlocal state
-        state, _ = jax.block_until_ready(compiled(state, trainer.pool))
+        state, _ = jax.block_until_ready(compiled(state, trainer.inputs))
         return trainer.episodes_per_update
 
     return about_jax(), work

@@ -23,7 +23,7 @@ class Evolution(Learner[TrainState]):
         update, episodes = self._trainer.lower(state).compile(), self._trainer.episodes_per_update
 
         def advance(state: TrainState) -> tuple[TrainState, Measured]:
-            state, metrics = update(state, self._trainer.pool)
+            state, metrics = update(state, self._trainer.inputs)
             finite = episodes - metrics["non_finite"]
             means = {"hit": "hit_rate", "returned": "return_rate", "episode_return": "mean_return", "steps": "steps"}
             sums = {name: metrics[mean] * finite for name, mean in means.items()}

@@ -15,9 +15,8 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from ballmodel.sampling import BallPool
 from bgs import normalizer, strategy
-from experiments.training.update import Trainer, TrainState
+from experiments.training.update import Inputs, Trainer, TrainState
 from mjx_tt.env.episode import reshaped
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import AXIS
@@ -36,12 +35,12 @@ class FirstOrderTrainer(Trainer):
         config = self.simulator.config
         self._objective = Objective(self.simulator.task, min(config.max_steps, math.ceil(SECONDS / config.period)))
 
-    def _update_local(self, state: TrainState, pool: BallPool) -> tuple[TrainState, dict[str, jax.Array]]:
+    def _update_local(self, state: TrainState, inputs: Inputs) -> tuple[TrainState, dict[str, jax.Array]]:
         config, simulator = self.bgs_config, self.simulator
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
         population = strategy.ask(direction_key, state.bgs, config)
         shape = (self._repeats, 2 * config.num_directions)
-        episodes = simulator.draw(episode_key, pool, self._model, self._randomise, *shape)
+        episodes = simulator.draw(episode_key, inputs[0], self._model, inputs[1], *shape)
         mine = reshaped(simulator.local(episodes), -1)
         mean, inv_std = normalizer.normaliser(state.statistics)
 

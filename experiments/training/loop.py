@@ -34,6 +34,7 @@ from experiments.training.update import Trainer, TrainState
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import held_here
+from mjx_tt.sim import randomisation
 
 _programs: dict[str, Compiled] = {}  # compiled updates by what decides them
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
@@ -146,7 +147,7 @@ class Session:
         training, every = self._config.training, self._config.training.evaluate_every
         first, began, waiting = self.update + 1, time.monotonic(), []
         while True:
-            self.state, measured = compiled(self.state, self._trainer.pool)
+            self.state, measured = compiled(self.state, self._trainer.inputs)
             waiting.append(measured)
             self.update += 1
             evaluation_due = every is not None and self.update % every == 0
@@ -208,7 +209,8 @@ class Session:
 
 def program(config: Config, devices: int | str) -> str:
     """Everything that decides an update's program."""
-    sections, training = [config.to_dict()[name] for name in ("task", "model", "optimiser")], config.training
+    whole, training = config.to_dict(), config.training
+    sections = [whole["task"], randomisation.without_samples(whole["model"]), whole["optimiser"]]
     length = training.updates if config.optimiser.step.schedule.kind == "cosine" else None
     rest: list[Any] = [length, training.pool, devices, config.definitions, config.network]
     if training.later_rewards is not None:
@@ -217,7 +219,7 @@ def program(config: Config, devices: int | str) -> str:
 
 
 def _compiled(config: Config, trainer: Trainer, state: TrainState) -> Compiled:
-    """The update's program: one for all runs of this process that differ in balls, seed and first policy only."""
+    """The update's program: one for all runs of this process that differ in balls, samples, seed and first policy."""
     decides = program(config, trainer.simulator.devices)
     if decides not in _programs:
         _programs[decides] = trainer.lower(state).compile()

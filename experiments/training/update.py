@@ -7,6 +7,7 @@ statistics are one compiled call from a ``TrainState`` to the next.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +24,10 @@ from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
 from mjx_tt.env.task import MISSED, RETURNED
 from mjx_tt.sim.model import SimModel
-from mjx_tt.sim.randomisation import Randomised
+from mjx_tt.sim.randomisation import Drawing, Randomised, drawing
 from robot_io.contract import n_parameters
+
+Inputs: TypeAlias = tuple[BallPool, tuple[Drawing, ...]]  # what trainings of one program differ in: balls, samples
 
 
 @jax.tree_util.register_dataclass
@@ -63,7 +66,8 @@ class Trainer:
         if repeats < 1:
             raise ValueError(f"repeats is {repeats}, at least 1 is needed")
         self.simulator, self.bgs_config, self.pool = simulator, bgs_config, simulator.replicate(pool)
-        self._model, self._randomise = model, randomise
+        self._model = model
+        self.inputs: Inputs = self.pool, simulator.replicate(drawing(randomise))
         self._repeats, self._crn, self._initial_scale = repeats, common_random_numbers, initial_scale
         self._later = later_weights
         self.network = network
@@ -94,18 +98,18 @@ class Trainer:
 
     def update(self, state: TrainState) -> tuple[TrainState, dict]:
         """One update and its metrics (scalars on the device; fetch them rarely)."""
-        return self._update(state, self.pool)
+        return self._update(state, self.inputs)
 
     def lower(self, state: TrainState) -> Lowered:
         """The update, lowered for ahead-of-time compilation (``.compile()``)."""
-        return self._update.lower(state, self.pool)
+        return self._update.lower(state, self.inputs)
 
-    def _update_local(self, state: TrainState, pool: BallPool) -> tuple[TrainState, dict[str, jax.Array]]:
+    def _update_local(self, state: TrainState, inputs: Inputs) -> tuple[TrainState, dict[str, jax.Array]]:
         config, pairs = self.bgs_config, self.bgs_config.num_directions
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
         population = strategy.ask(direction_key, state.bgs, config)
         columns = pairs if self._crn else 2 * pairs
-        episodes = self.simulator.draw(episode_key, pool, self._model, self._randomise, self._repeats, columns)
+        episodes = self.simulator.draw(episode_key, inputs[0], self._model, inputs[1], self._repeats, columns)
         if self._crn:
             episodes = jax.tree.map(lambda x: jnp.concatenate([x, x], -1) if x.ndim >= 2 else x, episodes)
         mean, inv_std = normalizer.normaliser(state.statistics)

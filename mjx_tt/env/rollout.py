@@ -29,7 +29,7 @@ from mjx_tt.env.reward_sums import reward_terms
 from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, Task, TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
-from mjx_tt.sim.randomisation import Randomised
+from mjx_tt.sim.randomisation import Drawing, Randomised
 from robot_io.policy.policy import Policy
 
 T = TypeVar("T")
@@ -94,7 +94,7 @@ class Simulator:
         key: PRNGKeyArray,
         pool: BallPool,
         model: SimModel,
-        randomise: tuple[Randomised, ...],
+        randomise: tuple[Randomised | Drawing, ...],
         repeats: int,
         columns: int,
     ) -> Episodes:

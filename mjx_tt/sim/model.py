@@ -32,7 +32,7 @@ from ballmodel.io import yaml as yaml_file
 from ballmodel.io.atomic_files import replacing
 from mjx_tt.sim import bounds, randomisation
 from mjx_tt.sim.actuators import drive_params
-from mjx_tt.sim.randomisation import Randomised
+from mjx_tt.sim.randomisation import Drawing, Randomised
 from mjx_tt.sim.randomisation import Range as Range
 from mjx_tt.sim.randomisation import Samples as Samples
 from mjx_tt.sim.sensors import SensingParams as SensingParams
@@ -197,7 +197,9 @@ def _with_values(node: Any, values: Mapping[str, Any]) -> Any:
     return dataclasses.replace(node, **changed)
 
 
-def draw(key: Key[Array, ""], model: SimModel, randomise: tuple[Randomised, ...], shape: tuple[int, ...]) -> SimModel:
+def draw(
+    key: Key[Array, ""], model: SimModel, randomise: tuple[Randomised | Drawing, ...], shape: tuple[int, ...]
+) -> SimModel:
     """The model with all that is randomised drawn for a batch of ``shape`` episodes."""
     return with_values(model, randomisation.drawn(key, randomise, shape))
 

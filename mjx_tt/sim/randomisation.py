@@ -16,6 +16,7 @@ import csv
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -29,6 +30,7 @@ SAMPLES, WEIGHT = "samples", "weight"
 Number: TypeAlias = Callable[[Any, str, str], float]  # (value, where, dotted path) -> the number, or ValueError
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=[], meta_fields=["path", "low", "high"])
 @dataclass(frozen=True)
 class Range:
     """A parameter that is drawn uniformly per episode, by its dotted path in SimModel."""
@@ -55,6 +57,25 @@ class Range:
         return {self.path: jax.random.uniform(key, shape, minval=self.low, maxval=self.high)}
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=["values", "share"], meta_fields=["paths"])
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Samples as arrays that a program takes: compiled once, it serves all samples of these parameters."""
+
+    paths: tuple[str, ...]
+    values: Float[Array | np.ndarray, "P S"]
+    share: Float[Array | np.ndarray, " S"]  # of the weight in the rows up to each
+
+    def at(self, uniform: Float[Array, "*batch"]) -> dict[str, Array]:
+        """The rows for numbers drawn uniformly from [0, 1)."""
+        row = jnp.minimum(jnp.searchsorted(self.share, uniform, side="right"), self.share.shape[0] - 1)
+        return {path: jnp.asarray(self.values)[i, row] for i, path in enumerate(self.paths)}
+
+    def drawn(self, key: Key[Array, ""], shape: tuple[int, ...]) -> dict[str, Array]:
+        """Values of a batch of ``shape`` episodes."""
+        return self.at(jax.random.uniform(key, shape))
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Parameters that are drawn together, a row for each episode; rows in proportion to their weight."""
@@ -75,13 +96,16 @@ class Samples:
 
     def at(self, uniform: Float[Array, "*batch"]) -> dict[str, Array]:
         """The rows for numbers drawn uniformly from [0, 1)."""
-        share = jnp.asarray(np.cumsum(self.weight) / self.weight.sum(), jnp.float32)
-        row = jnp.minimum(jnp.searchsorted(share, uniform, side="right"), len(self.weight) - 1)
-        return {p: jnp.asarray(v, jnp.float32)[row] for p, v in zip(self.paths, self.values.T, strict=True)}
+        return self.rows().at(uniform)
 
     def drawn(self, key: Key[Array, ""], shape: tuple[int, ...]) -> dict[str, Array]:
         """Values of a batch of ``shape`` episodes."""
-        return self.at(jax.random.uniform(key, shape))
+        return self.rows().drawn(key, shape)
+
+    def rows(self) -> Rows:
+        """These samples as arrays of a program."""
+        share = np.cumsum(self.weight) / self.weight.sum()
+        return Rows(self.paths, self.values.T.astype(np.float32), share.astype(np.float32))
 
     def columns(self) -> dict[str, list[float]]:
         """Plain data: a list for each parameter, and the weights where they differ."""
@@ -92,9 +116,15 @@ class Samples:
 
 
 Randomised: TypeAlias = Range | Samples
+Drawing: TypeAlias = Range | Rows
 
 
-def drawn(key: Key[Array, ""], randomise: Sequence[Randomised], shape: tuple[int, ...]) -> dict[str, Array]:
+def drawing(randomise: Sequence[Randomised]) -> tuple[Drawing, ...]:
+    """All that is randomised as a program's argument: of samples the numbers, of ranges nothing but the structure."""
+    return tuple(one.rows() if isinstance(one, Samples) else one for one in randomise)
+
+
+def drawn(key: Key[Array, ""], randomise: Sequence[Randomised | Drawing], shape: tuple[int, ...]) -> dict[str, Array]:
     """Values by dotted path for a batch of ``shape`` episodes."""
     keys = jax.random.split(key, max(len(randomise), 1))  # one is left over where nothing is randomised
     values: dict[str, Array] = {}
@@ -177,6 +207,21 @@ def with_content(data: Any, folder: str | os.PathLike) -> Any:
     if not isinstance(ranges, dict) or not isinstance(ranges.get(SAMPLES), str):
         return data
     return data | {"randomise": ranges | {SAMPLES: read_columns(Path(folder) / ranges[SAMPLES])}}
+
+
+def without_samples(data: Any) -> Any:
+    """A model's plain data without what a program takes as an argument: the samples' numbers, and the values that they
+    replace; their names stay."""
+    columns = (data.get("randomise") or {}).get(SAMPLES) if isinstance(data, dict) else None
+    if not isinstance(columns, dict):
+        return data
+    rest = _without(data, {path for path in columns if path != WEIGHT})
+    return rest | {"randomise": data["randomise"] | {SAMPLES: {path: len(column) for path, column in columns.items()}}}
+
+
+def _without(data: dict, left_out: set[str], prefix: str = "") -> dict:
+    kept = {key: value for key, value in data.items() if f"{prefix}{key}" not in left_out}
+    return {k: _without(v, left_out, f"{prefix}{k}.") if isinstance(v, dict) else v for k, v in kept.items()}
 
 
 def read_columns(path: str | os.PathLike) -> dict[str, list[float]]:

@@ -244,11 +244,11 @@ def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
 
 
 def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
-    quick = study_config.load(study_config.shipped()["study_quick"])
+    night = study_config.load(study_config.shipped()["study_night"])
     by_key = {item.key: item for item in schedule.LOOP if isinstance(item, Simulated)}
-    first = training.configuration(quick, by_key["is2r-sim1"], "player3/M0", None, 5)
-    later = training.configuration(quick, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
-    oracle = training.configuration(quick, by_key["oracle-sim"], "player3/M2", None, 7)
+    first = training.configuration(night, by_key["is2r-sim1"], "player3/M0", None, 5)
+    later = training.configuration(night, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
+    oracle = training.configuration(night, by_key["oracle-sim"], "player3/M2", None, 7)
     assert first.training.updates + 2 * later.training.updates == oracle.training.updates
     assert (first.initial_policy, later.initial_policy, oracle.initial_policy) == (None, str(tmp_path), None)
     assert (

@@ -15,13 +15,15 @@ from ballmodel.sampling import sample_pool
 from bgs import normalizer, optimizers, strategy
 from bgs.strategy import BGSConfig
 from experiments.config import build, experiment
+from experiments.training import loop
 from experiments.training.trainers import trainer as trainer_of
 from experiments.training.update import Trainer
 from mjx_tt.env import rewards
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
-from mjx_tt.sim.model import SimModel
+from mjx_tt.sim import model as models
+from mjx_tt.sim.model import Samples, SimModel
 
 PAIRS, REPEATS = 4, 2
 TASK = TaskConfig(sim_rate=75.0)  # one substep: compiles in half the time
@@ -62,6 +64,45 @@ def test_several_updates_compile_once(trainer, trainer_on_two, run, run_on_two, 
         assert not [r for r in caplog.records if "compil" in r.getMessage().lower()]
         jax.jit(lambda x: x + devices)(1.0)
     assert [r for r in caplog.records if "compil" in r.getMessage().lower()], "compilations are not logged any more"
+
+
+PATH = "ball.table.restitution"
+
+
+def in_samples(pool, *restitutions: float) -> Trainer:
+    rows = Samples((PATH,), np.array(restitutions)[:, None], np.ones(len(restitutions)))
+    return Trainer(Simulator(TASK), BGS, pool, SimModel(), (rows,), REPEATS)
+
+
+def test_a_program_compiled_for_some_samples_serves_others(pool):
+    first, second = in_samples(pool, 0.9, 0.95), in_samples(pool, 0.2, 0.2)
+    state = first.init(jax.random.key(1))
+    program = first.lower(state).compile()
+    metrics = [program(state, one.inputs)[1]["mean_return"] for one in (first, second)]
+    assert metrics[0] != metrics[1]  # the samples do something
+    # All samples alike are a number of the model.
+    known = Trainer(Simulator(TASK), BGS, pool, models.with_values(SimModel(), {PATH: 0.2}), repeats=REPEATS)
+    theta, same = (x[0].bgs.theta for x in (program(state, second.inputs), known.update(state)))
+    np.testing.assert_allclose(theta, same, atol=1e-5)
+
+
+def test_samples_of_the_same_parameters_have_one_program_others_another():
+    def program(model: dict) -> str:
+        config = experiment.load(experiment.shipped()["quickstart"]).model_copy(update={"model": model})
+        return loop.program(config, 1)
+
+    def world(restitution: float, height: float, **samples: list) -> dict:
+        ball = {"table": {"restitution": restitution, "height": height}}
+        return {"ball": ball, "randomise": {"samples": samples, "ball.net.height": [0.0, 0.01]}}
+
+    one = program(world(0.9, 0.0, **{PATH: [0.9, 0.8]}))
+    assert one == program(world(0.7, 0.0, **{PATH: [0.7, 0.6]}))  # what is drawn replaces the model's number
+    others = [
+        world(0.9, 0.01, **{PATH: [0.9, 0.8]}),
+        world(0.9, 0.0, **{PATH: [0.9, 0.8, 0.7]}),
+        world(0.9, 0.0, **{"ball.table.height": [0.0, 0.0]}),
+    ]
+    assert len({one, *map(program, others)}) == 4
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +170,7 @@ def test_failed_episodes_are_counted_and_their_pairs_dropped(trainer, run, pool)
     assert 0 < pairs.sum() < PAIRS
     position = pool.state.position.at[0, poisoned].set(jnp.nan)
     bad_pool = trainer.simulator.replicate(replace(pool, state=replace(pool.state, position=position)))
-    state, metrics = trainer._update(start, bad_pool)
+    state, metrics = trainer._update(start, (bad_pool, ()))
     assert metrics["failed_pairs"] == pairs.sum()
     assert metrics["non_finite"] == (thrown == x[poisoned]).sum()
     assert np.isfinite(state.bgs.theta).all() and np.isfinite(state.statistics.mean).all()
