@@ -40,7 +40,7 @@ class FirstOrderTrainer(Trainer):
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
         population = strategy.ask(direction_key, state.bgs, config)
         shape = (self._repeats, 2 * config.num_directions)
-        episodes = simulator.draw(episode_key, inputs[0], self._model, inputs[1], *shape)
+        episodes = self._draw(episode_key, inputs, *shape)
         mine = reshaped(simulator.local(episodes), -1)
         mean, inv_std = normalizer.normaliser(state.statistics)
 

@@ -34,7 +34,7 @@ from experiments.training.update import Trainer, TrainState
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import held_here
-from mjx_tt.sim import randomisation
+from mjx_tt.sim import arguments
 
 _programs: dict[str, Compiled] = {}  # compiled updates by what decides them
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
@@ -209,17 +209,19 @@ class Session:
 
 def program(config: Config, devices: int | str) -> str:
     """Everything that decides an update's program."""
-    whole, training = config.to_dict(), config.training
-    sections = [whole["task"], randomisation.without_samples(whole["model"]), whole["optimiser"]]
+    made = build.experiment(config, config.name)
+    whole, training = made.config.to_dict(), config.training
+    numbers = arguments.structure(made.model.model, made.model.randomise)
+    sections = [whole["task"], numbers, whole["optimiser"], whole["robot"]]
     length = training.updates if config.optimiser.step.schedule.kind == "cosine" else None
-    rest: list[Any] = [length, training.pool, devices, config.definitions, config.network]
+    rest: list[Any] = [length, training.pool, devices, made.config.definitions, config.network]
     if training.later_rewards is not None:
         rest.append(training.later_rewards.to_dict())
     return json.dumps([*sections, *rest], sort_keys=True)
 
 
 def _compiled(config: Config, trainer: Trainer, state: TrainState) -> Compiled:
-    """The update's program: one for all runs of this process that differ in balls, samples, seed and first policy."""
+    """The update's program: one for all runs of this process that differ in balls, numbers, seed and first policy."""
     decides = program(config, trainer.simulator.devices)
     if decides not in _programs:
         _programs[decides] = trainer.lower(state).compile()

@@ -19,15 +19,18 @@ from jax.typing import ArrayLike
 from ballmodel.sampling import BallPool
 from bgs import normalizer, strategy
 from bgs.strategy import BGSConfig, BGSState
+from mjx_tt.env.episode import Episodes
 from mjx_tt.env.own import Network
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
 from mjx_tt.env.task import MISSED, RETURNED
+from mjx_tt.sim import model as models
+from mjx_tt.sim.arguments import Arguments, arguments
 from mjx_tt.sim.model import SimModel
-from mjx_tt.sim.randomisation import Drawing, Randomised, drawing
+from mjx_tt.sim.randomisation import Randomised
 from robot_io.contract import n_parameters
 
-Inputs: TypeAlias = tuple[BallPool, tuple[Drawing, ...]]  # what trainings of one program differ in: balls, samples
+Inputs: TypeAlias = tuple[BallPool, Arguments]  # what trainings of one program differ in: balls, numbers
 
 
 @jax.tree_util.register_dataclass
@@ -67,7 +70,7 @@ class Trainer:
             raise ValueError(f"repeats is {repeats}, at least 1 is needed")
         self.simulator, self.bgs_config, self.pool = simulator, bgs_config, simulator.replicate(pool)
         self._model = model
-        self.inputs: Inputs = self.pool, simulator.replicate(drawing(randomise))
+        self.inputs: Inputs = self.pool, simulator.replicate(arguments(model, randomise))
         self._repeats, self._crn, self._initial_scale = repeats, common_random_numbers, initial_scale
         self._later = later_weights
         self.network = network
@@ -109,7 +112,7 @@ class Trainer:
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
         population = strategy.ask(direction_key, state.bgs, config)
         columns = pairs if self._crn else 2 * pairs
-        episodes = self.simulator.draw(episode_key, inputs[0], self._model, inputs[1], self._repeats, columns)
+        episodes = self._draw(episode_key, inputs, self._repeats, columns)
         if self._crn:
             episodes = jax.tree.map(lambda x: jnp.concatenate([x, x], -1) if x.ndim >= 2 else x, episodes)
         mean, inv_std = normalizer.normaliser(state.statistics)
@@ -139,6 +142,11 @@ class Trainer:
             **means(total, self.simulator.config.terms),
         }
         return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
+
+    def _draw(self, key: jax.Array, inputs: Inputs, repeats: int, columns: int) -> Episodes:
+        pool, numbers = inputs
+        model = models.with_values(self._model, numbers.numbers)
+        return self.simulator.draw(key, pool, model, numbers.drawing, repeats, columns)
 
     def _weighed(self, result: RolloutResult, updates: jax.Array) -> RolloutResult:
         """The result with the returns that the weights of this update give."""

@@ -119,11 +119,6 @@ Randomised: TypeAlias = Range | Samples
 Drawing: TypeAlias = Range | Rows
 
 
-def drawing(randomise: Sequence[Randomised]) -> tuple[Drawing, ...]:
-    """All that is randomised as a program's argument: of samples the numbers, of ranges nothing but the structure."""
-    return tuple(one.rows() if isinstance(one, Samples) else one for one in randomise)
-
-
 def drawn(key: Key[Array, ""], randomise: Sequence[Randomised | Drawing], shape: tuple[int, ...]) -> dict[str, Array]:
     """Values by dotted path for a batch of ``shape`` episodes."""
     keys = jax.random.split(key, max(len(randomise), 1))  # one is left over where nothing is randomised
@@ -207,21 +202,6 @@ def with_content(data: Any, folder: str | os.PathLike) -> Any:
     if not isinstance(ranges, dict) or not isinstance(ranges.get(SAMPLES), str):
         return data
     return data | {"randomise": ranges | {SAMPLES: read_columns(Path(folder) / ranges[SAMPLES])}}
-
-
-def without_samples(data: Any) -> Any:
-    """A model's plain data without what a program takes as an argument: the samples' numbers, and the values that they
-    replace; their names stay."""
-    columns = (data.get("randomise") or {}).get(SAMPLES) if isinstance(data, dict) else None
-    if not isinstance(columns, dict):
-        return data
-    rest = _without(data, {path for path in columns if path != WEIGHT})
-    return rest | {"randomise": data["randomise"] | {SAMPLES: {path: len(column) for path, column in columns.items()}}}
-
-
-def _without(data: dict, left_out: set[str], prefix: str = "") -> dict:
-    kept = {key: value for key, value in data.items() if f"{prefix}{key}" not in left_out}
-    return {k: _without(v, left_out, f"{prefix}{k}.") if isinstance(v, dict) else v for k, v in kept.items()}
 
 
 def read_columns(path: str | os.PathLike) -> dict[str, list[float]]:

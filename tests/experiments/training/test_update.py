@@ -97,8 +97,9 @@ def test_samples_of_the_same_parameters_have_one_program_others_another():
 
     one = program(world(0.9, 0.0, **{PATH: [0.9, 0.8]}))
     assert one == program(world(0.7, 0.0, **{PATH: [0.7, 0.6]}))  # what is drawn replaces the model's number
+    assert program(world(0.9, 0.01, **{PATH: [0.9, 0.8]})) == program(world(0.9, 0.02, **{PATH: [0.9, 0.8]}))
     others = [
-        world(0.9, 0.01, **{PATH: [0.9, 0.8]}),
+        world(0.9, 0.01, **{PATH: [0.9, 0.8]}),  # another number is used
         world(0.9, 0.0, **{PATH: [0.9, 0.8, 0.7]}),
         world(0.9, 0.0, **{"ball.table.height": [0.0, 0.0]}),
     ]
@@ -170,7 +171,7 @@ def test_failed_episodes_are_counted_and_their_pairs_dropped(trainer, run, pool)
     assert 0 < pairs.sum() < PAIRS
     position = pool.state.position.at[0, poisoned].set(jnp.nan)
     bad_pool = trainer.simulator.replicate(replace(pool, state=replace(pool.state, position=position)))
-    state, metrics = trainer._update(start, (bad_pool, ()))
+    state, metrics = trainer._update(start, (bad_pool, trainer.inputs[1]))
     assert metrics["failed_pairs"] == pairs.sum()
     assert metrics["non_finite"] == (thrown == x[poisoned]).sum()
     assert np.isfinite(state.bgs.theta).all() and np.isfinite(state.statistics.mean).all()
