@@ -22,6 +22,7 @@ from mjx_tt.env import rewards
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
+from mjx_tt.robot import robot as robots
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Samples, SimModel
 
@@ -104,6 +105,12 @@ def test_samples_of_the_same_parameters_have_one_program_others_another():
         world(0.9, 0.0, **{"ball.table.height": [0.0, 0.0]}),
     ]
     assert len({one, *map(program, others)}) == 4
+
+
+def test_each_robot_has_a_program_of_its_own():
+    config = experiment.load(experiment.shipped()["quickstart"])
+    programs = {loop.program(config.model_copy(update={"robot": robot}), 1) for robot in (None, *robots.names())}
+    assert len(programs) >= len(robots.names()) >= 2
 
 
 @pytest.fixture(scope="module")
