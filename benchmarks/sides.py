@@ -155,14 +155,14 @@ def pybullet(steps: int, seed: int) -> Side:
     return {"version": robot.version}, work
 
 
-def update(changes: list[str], devices: int | None = None) -> Side:
-    """One training update of the paper's settings, experiments/paper.yaml, with some of its keys changed."""
+def update(changes: list[str], devices: int | None = None, name: str = "paper") -> Side:
+    """One training update of a shipped experiment, the paper's settings if none is named, with some keys changed."""
     from mjx_tt import platform
 
     platform.configure(devices)
     import jax
 
-    trainer, state = _paper_trainer(changes)
+    trainer, state = _trainer(changes, name)
     compiled = trainer.lower(state).compile()
 
     def work() -> float:
@@ -175,6 +175,24 @@ def update(changes: list[str], devices: int | None = None) -> Side:
 
 def rollout(changes: list[str], devices: int | None = None) -> Side:
     """The roll-outs of such an update alone, on episodes already drawn."""
+    import jax
+
+    compiled, arguments, episodes = _rollout(changes, devices)
+
+    def work() -> float:
+        jax.block_until_ready(compiled(*arguments))
+        return episodes
+
+    return about_jax(), work
+
+
+def played(changes: list[str]) -> RolloutResult:
+    """The results of these roll-outs."""
+    compiled, arguments, _ = _rollout(changes, None)
+    return compiled(*arguments)
+
+
+def _rollout(changes: list[str], devices: int | None) -> tuple[Callable, tuple, int]:
     from mjx_tt import platform
 
     platform.configure(devices)
@@ -184,7 +202,7 @@ def rollout(changes: list[str], devices: int | None = None) -> Side:
     from mjx_tt.env.rollout import RESULT_SPECS
     from mjx_tt.sim.model import SimModel
 
-    trainer, state = _paper_trainer(changes)
+    trainer, state = _trainer(changes)
     simulator, columns = trainer.simulator, 2 * trainer.bgs_config.num_directions
     repeats = trainer.episodes_per_update // columns
     episodes = simulator.draw(jax.random.key(2), trainer.pool, SimModel(), (), repeats, columns)
@@ -196,22 +214,17 @@ def rollout(changes: list[str], devices: int | None = None) -> Side:
 
     arguments = simulator.replicate((theta, episodes))
     compiled = jax.jit(simulator.on_devices(play, out_specs=RESULT_SPECS)).lower(*arguments).compile()
-
-    def work() -> float:
-        jax.block_until_ready(compiled(*arguments))
-        return trainer.episodes_per_update
-
-    return about_jax(), work
+    return compiled, arguments, trainer.episodes_per_update
 
 
-def _paper_trainer(changes: list[str]) -> tuple[Trainer, TrainState]:
+def _trainer(changes: list[str], name: str = "paper") -> tuple[Trainer, TrainState]:
     import jax
 
     from experiments.config import build, experiment
     from experiments.training import trainers
 
-    config = experiment.load(experiment.shipped()["paper"], tuple(changes))
-    trainer = trainers.trainer(build.experiment(config, "paper"))
+    config = experiment.load(experiment.shipped()[name], tuple(changes))
+    trainer = trainers.trainer(build.experiment(config, name))
     return trainer, trainer.init(jax.random.key(0))
 
 

@@ -72,7 +72,7 @@ def literal(value: Any) -> str:
 class Emitter:
     """The instructions of one function, in order.
 
-    width: lanes of a vector; entry: reservations on the stack; lines: the rest.
+    width: lanes of a vector, 1: plain numbers; entry: reservations on the stack; lines: the rest.
     """
 
     def __init__(self, width: int) -> None:
@@ -108,8 +108,12 @@ class Emitter:
         self.entry.append(f"{name} = alloca [{max(size, 1)} x i8], align {align}")
         return name
 
+    def packed(self, kind: str) -> str:
+        """The type of a vector of a type."""
+        return kind if self.width == 1 else f"<{self.width} x {kind}>"
+
     def vector_type(self, dtype: Any) -> str:
-        return f"<{self.width} x {type_of(dtype)}>"
+        return self.packed(type_of(dtype))
 
     def forced(self, element: Element) -> Element:
         """The element, made now if it was not yet."""
@@ -131,6 +135,8 @@ class Emitter:
         if element.kind is Kind.VECTOR:
             return element.value
         one = type_of(dtype)
+        if self.width == 1:
+            return self.scalar(element)
         if element.kind is Kind.CONSTANT:
             return f"splat ({one} {literal(element.value)})"
         kind = self.vector_type(dtype)
@@ -155,7 +161,7 @@ class Emitter:
             names = [self.vector(e, d) for e, d in zip(elements, dtypes, strict=True)]
         else:
             names = [self.scalar(e) for e in elements]
-        kind, prefix = (self.vector_type, f"v{self.width}") if vector else (type_of, "")
+        kind, prefix = (self.vector_type, f"v{self.width}" * (self.width > 1)) if vector else (type_of, "")
 
         def suffix(dtype: Any) -> str:
             return prefix + _SUFFIXES.get(type_of(dtype), type_of(dtype))

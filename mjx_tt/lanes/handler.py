@@ -1,46 +1,12 @@
 """The function that XLA calls: it brings a vector of lanes after the other into slots, runs their steps, stores them.
 
-An XLA_FFI_Handler of xla/ffi/api/c_api.h, in LLVM's text, by the offsets of that header's structures.
+An XLA_FFI_Handler of xla/ffi/api/c_api.h, in LLVM's text.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
-
-import jax
-
-from mjx_tt.lanes.emitter import type_of
-from mjx_tt.lanes.values import Form
-
-# Offsets in bytes of XLA_FFI_CallFrame: extension_start, args.args, rets.rets; of XLA_FFI_Buffer: data, dims; of
-# XLA_FFI_Metadata_Extension: metadata; of XLA_FFI_Metadata: api_version's major and minor, traits.
-_EXTENSION, _ARGS, _RETS = 8, 72, 112
-_DATA, _DIMS = 24, 40
-_METADATA, _MAJOR, _MINOR, _TRAITS = 24, 24, 28, 32
-
-
-@dataclass(frozen=True)
-class Operand:
-    """An array of the call.
-
-    kind: "state" and "lane" (lanes L as the last axis), "column" (P columns as the last, lane l has column l mod P) or
-    "shared"; begin: its first slot among those of its place ("state", "own" for lane and column, or "shared").
-    """
-
-    kind: str
-    form: Form
-    begin: int
-
-    @property
-    def place(self) -> str:
-        return {"state": "state", "shared": "shared"}.get(self.kind, "own")
-
-    @property
-    def bits(self) -> int:
-        return 8 if type_of(self.form.dtype) in ("i1", "i8") else 32
+from mjx_tt.lanes import frame
+from mjx_tt.lanes.frame import Operand
 
 
 def handler(operands: list[Operand], slots: dict[str, int], live: int, limit: int, width: int) -> str:
@@ -48,25 +14,8 @@ def handler(operands: list[Operand], slots: dict[str, int], live: int, limit: in
 
     slots: number of slots by place; live: number of the operand that says which lanes go on; limit: most ticks.
     """
-    major, minor = _api_version()
     size = width * 4
-    lines = [
-        *_field("extension", "frame", _EXTENSION),
-        "%asked = icmp ne ptr %extension, null",
-        "br i1 %asked, label %about, label %execute",
-        "about:",
-        *_field("metadata", "extension", _METADATA),
-    ]
-    for name, offset, value in (("major", _MAJOR, major), ("minor", _MINOR, minor), ("traits", _TRAITS, 0)):
-        lines += [f"%{name} = getelementptr i8, ptr %metadata, i64 {offset}", f"store i32 {value}, ptr %{name}"]
-    lines += ["ret ptr null", "execute:", *_field("args", "frame", _ARGS), *_field("rets", "frame", _RETS)]
-    for i, operand in enumerate(operands):
-        lines += _buffer(f"a{i}", "args", i)
-        if operand.kind == "state":
-            lines += _buffer(f"r{i}", "rets", i)
-    lines += _last_axis("lanes", operands, 0)
-    columns = next((i for i, o in enumerate(operands) if o.kind == "column"), 0)
-    lines += _last_axis("columns", operands, columns)
+    lines = frame.opened(operands)
     # The slots, at a multiple of 64 bytes.
     total = sum(slots.values()) * size
     lines += [
@@ -148,26 +97,6 @@ declare void @free(ptr)
 """
 
 
-def _field(name: str, structure: str, offset: int) -> list[str]:
-    at = f"%{name}_at"
-    return [f"{at} = getelementptr i8, ptr %{structure}, i64 {offset}", f"%{name} = load ptr, ptr {at}"]
-
-
-def _buffer(name: str, table: str, i: int) -> list[str]:
-    return [*_field(f"{name}_buffer", table, 8 * i), *_field(name, f"{name}_buffer", _DATA)]
-
-
-def _last_axis(name: str, operands: list[Operand], i: int) -> list[str]:
-    form = operands[i].form
-    rank = len(form.shape) + form.laned
-    at = f"%{name}_at"
-    return [
-        *_field(f"{name}_dims", f"a{i}_buffer", _DIMS),
-        f"{at} = getelementptr i64, ptr %{name}_dims, i64 {rank - 1}",
-        f"%{name} = load i64, ptr {at}",
-    ]
-
-
 # Rows of a batch's array, one for each element, from and to slots.
 _COPY = """
 define internal void @{name}(ptr noalias %slots, ptr noalias %array, i64 %n, i64 %stride, {extra}) nounwind noinline {{
@@ -222,11 +151,3 @@ def _copies(width: int) -> str:
         for bits in (8, 32)
         for name, fields in (("in", into), ("out", out))
     )
-
-
-@cache
-def _api_version() -> tuple[int, int]:
-    """Of the installed jaxlib's header: XLA refuses handlers of another one."""
-    header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
-    found = dict(re.findall(r"#define XLA_FFI_API_(MAJOR|MINOR) (\d+)", header.read_text(encoding="utf-8")))
-    return int(found["MAJOR"]), int(found["MINOR"])

@@ -2,11 +2,12 @@
 
 XLA runs each operation over all lanes of a batch before the next one, so what lies between goes to memory and back.
 Here a step of the loop is one function on a vector of lanes (``machine.width``), which run from the first tick to the
-last before the next ones begin.
+last before the next ones begin. On NVIDIA's accelerators the whole loop is one kernel with a thread for each lane.
 """
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import logging
 from collections.abc import Callable
@@ -20,9 +21,10 @@ from jax import Array
 from jax.extend import core
 from jaxtyping import Bool, Int
 
-from mjx_tt.lanes import machine
+from mjx_tt.lanes import cuda, kernel, machine
 from mjx_tt.lanes.emitter import Element, Emitter, Kind, Unsupported
-from mjx_tt.lanes.handler import Operand, handler
+from mjx_tt.lanes.frame import Operand
+from mjx_tt.lanes.handler import handler
 from mjx_tt.lanes.memory import Slots
 from mjx_tt.lanes.programs import emit
 from mjx_tt.lanes.values import LANES, Form, Value
@@ -51,12 +53,12 @@ def while_any(
     by_column: arrays (..., P), of which lane l gets column l mod P, or arrays of one axis that all lanes share
     live: picks a Boolean array of the state, without computing anything
     limit: most ticks
-    lanes: False leaves the loop to XLA, as accelerators do, and programs with an operation that the compiler for lanes
-    does not know (the log says which one)
+    lanes: False leaves the loop to XLA, as do other accelerators than NVIDIA's, and programs with an operation that the
+    compiler for lanes does not know (the log says which one)
 
     A lane that is not live any more may be stepped on, for as long as others of its batch are live.
     """
-    if lanes and jax.default_backend() == "cpu":
+    if lanes and (cuda.present() or jax.default_backend() == "cpu"):
         try:
             return _by_lanes(live, step, state, by_lane, by_column, limit)
         except Unsupported as reason:
@@ -112,7 +114,15 @@ def _by_lanes(live: Callable, step: Step, state: S, by_lane: Any, by_column: Any
     if [(x.shape, x.dtype) for x in traced.out_avals] != [(x.shape, x.dtype) for x in shapes[:n]]:
         raise Unsupported("a step that changes the state's form")
     numbers = jax.tree.unflatten(structure, range(len(arrays)))
-    name = _registered(_module(traced, shapes, kinds, int(live(numbers[0])), limit))
+    operands, used = _operands(shapes, kinds)
+    ends = int(live(numbers[0])), limit
+    if cuda.present():
+        columns = next((x.shape[-1] for x, kind in zip(arrays, kinds, strict=True) if kind == "column"), lanes)
+        text = kernel.module(traced, operands, lanes, columns, *ends)
+        name = _registered(text, lambda folder: cuda.compiled(text, operands, lanes, folder), cuda.PLATFORM)
+    else:
+        text = _module(traced, operands, used, *ends)
+        name = _registered(text, lambda folder: machine.compiled(text, "handler", folder), "cpu")
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays[:n]]
     done = jax.ffi.ffi_call(name, results, vmap_method="sequential")(*arrays)
     shaped = [x.reshape(was.shape) for x, was in zip(done, whole, strict=False)]
@@ -136,14 +146,20 @@ def _check(arrays: list[Array], kinds: list[str], n_state: int) -> None:
             raise Unsupported("no lanes")
 
 
-def _module(traced: core.ClosedJaxpr, shapes: list, kinds: list[str], live: int, limit: int) -> str:
-    """LLVM's text of a loop."""
-    e, operands = Emitter(machine.width()), []
+def _operands(shapes: list, kinds: list[str]) -> tuple[list[Operand], dict[str, int]]:
+    """The arrays of a call, and the number of slots in each place."""
+    operands = []
     used = {"state": 0, "own": 0, "shared": 0}
     for shape, kind in zip(shapes, kinds, strict=True):
         operand = Operand(kind, Form.of(shape), 0)
         operands.append(Operand(kind, operand.form, used[operand.place]))
         used[operand.place] += operand.form.size
+    return operands, used
+
+
+def _module(traced: core.ClosedJaxpr, operands: list[Operand], used: dict[str, int], live: int, limit: int) -> str:
+    """LLVM's text of a loop on this processor."""
+    e = Emitter(machine.width())
     memory = {place: Slots(e, f"%{place}") for place in used}
     values = [memory[o.place].value(o.form, o.begin) for o in operands]
     tick = Value(np.dtype(np.int32), (), [Element(Kind.SCALAR, "%tick")])
@@ -164,11 +180,12 @@ def _module(traced: core.ClosedJaxpr, shapes: list, kinds: list[str], live: int,
     return step + handler(operands, used, live, limit, e.width)
 
 
-def _registered(text: str) -> str:
+def _registered(text: str, address: Callable[[Path | None], ctypes.c_void_p], platform: str) -> str:
+    """XLA's name of a text's machine code."""
     if text not in _NAMES:
         name = f"mjx_tt_lanes_{hashlib.sha256(text.encode()).hexdigest()[:32]}"
         kept = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]  # defined where JAX starts
-        address = machine.compiled(text, "handler", Path(kept) / "lanes" if kept else None)
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
+        found = address(Path(kept) / "lanes" if kept else None)
+        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(found), platform=platform)
         _NAMES[text] = name
     return _NAMES[text]

@@ -6,6 +6,7 @@ import ctypes
 import hashlib
 import os
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -35,13 +36,8 @@ def compiled(text: str, function: str, folder: Path | None) -> ctypes.c_void_p:
 
     folder: where machine code is kept, by a digest of the text, the processor and LLVM's version.
     """
-    built_for = (llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten(), str(llvm.llvm_version_info))
-    path = folder / f"{_digest('|'.join((text, *built_for)).encode())}.o" if folder else None
-    code = _kept(path) if path else None
-    if code is None:
-        code = _machine().emit_object(optimised(text))
-        if path:
-            _keep(path, code)
+    processor = f"{llvm.get_host_cpu_name()}|{llvm.get_host_cpu_features().flatten()}"
+    code = kept(text, processor, ".o", folder, lambda: _machine().emit_object(optimised(text)))
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -49,14 +45,36 @@ def compiled(text: str, function: str, folder: Path | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(engine.get_function_address(function))
 
 
-def optimised(text: str) -> llvm.ModuleRef:
-    """The module as LLVM makes it better for this processor; ``str`` gives its text."""
+def kept(text: str, built_for: str, suffix: str, folder: Path | None, build: Callable[[], bytes]) -> bytes:
+    """What ``build`` makes of a text, from the folder if it was built there for the same before."""
+    key = "|".join((text, built_for, str(llvm.llvm_version_info)))
+    path = folder / f"{_digest(key.encode())}{suffix}" if folder else None
+    code = _kept(path) if path else None
+    if code is None:
+        code = build()
+        if path:
+            _keep(path, code)
+    return code
+
+
+def assembly(text: str, triple: str, processor: str) -> str:
+    """A module as another processor's assembly, such as PTX."""
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    target = llvm.Target.from_triple(triple).create_target_machine(cpu=processor, opt=3)
+    return target.emit_assembly(optimised(text, target))
+
+
+def optimised(text: str, target: llvm.TargetMachine | None = None) -> llvm.ModuleRef:
+    """The module as LLVM makes it better for a processor, this one if none is given; ``str`` gives its text."""
+    target = target or _machine()
     module = llvm.parse_assembly(text)
+    module.triple, module.data_layout = target.triple, str(target.target_data)
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=2)
     # Every number is a vector already, and what is a loop shall stay one.
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
-    builder = llvm.create_pass_builder(_machine(), options)
+    builder = llvm.create_pass_builder(target, options)
     builder.getModulePassManager().run(module, builder)
     return module
 

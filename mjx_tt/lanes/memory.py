@@ -31,7 +31,7 @@ class Slots:
         def made() -> Element:
             stored = "i8" if kind == "i1" else kind
             if form.laned:
-                stored = f"<{e.width} x {stored}>"
+                stored = e.packed(stored)
             name = e.again(f"load {stored}, ptr {self.address(slot)}, align {self._align(form.laned)}")
             if kind == "i1":
                 name = e.again(f"trunc {stored} {name} to {e.vector_type(form.dtype) if form.laned else 'i1'}")
@@ -44,12 +44,13 @@ class Slots:
         e, kind = self._e, type_of(dtype)
         kind, name = (e.vector_type(dtype), e.vector(element, dtype)) if laned else (kind, e.scalar(element))
         if type_of(dtype) == "i1":
-            stored = f"<{e.width} x i8>" if laned else "i8"
+            stored = e.packed("i8") if laned else "i8"
             name, kind = e.again(f"zext {kind} {name} to {stored}"), stored
         address = slot if isinstance(slot, str) else self.address(slot)
         e.do(f"store {kind} {name}, ptr {address}, align {self._align(laned)}")
 
     def _align(self, laned: bool) -> int:
+        """Of an address in bytes, at least."""
         return min(64, self._e.width * 4) if laned else 4
 
     def replace(self, old: list[Value], new: list[Value], forms: list[Form], begins: list[int]) -> None:
