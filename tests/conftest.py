@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from mjx_tt import platform
+
 # Started in the background (nohup, &) the tests ignore Ctrl-C, and so would their processes: one that is sent it would
 # never end.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -20,7 +22,7 @@ UNOPTIMISED = os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1") == "1
 # And with XLA's older code generation for fused operations in a third of that. Its rounding depends on how many
 # episodes a device holds: the slow tests that compare studies of several processes bit by bit take the code that users
 # get, which unoptimised is too slow for MJX.
-if UNOPTIMISED and os.environ.get("USERS_FUSION", "0") != "1":
+if UNOPTIMISED and os.environ.get("USERS_FUSION", "0") != "1" and platform.older_fusion():
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
 # The tests run beside each other on every core: what XLA spreads over threads to compile would only cost more.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_parallel_codegen_split_count=1".strip()
@@ -38,8 +40,6 @@ import tests.support.type_checker  # noqa: E402, F401 - found by its name
 STRICT = os.environ.get("STRICT_ARRAYS", "0") == "1"
 if STRICT:  # the hook works on modules that are imported after it
     install_import_hook(("ballmodel", "bgs", "mjx_tt"), "tests.support.type_checker.checked")
-
-from mjx_tt import platform  # noqa: E402
 
 # Two host devices, so that splitting over devices is tested everywhere.
 platform.configure(devices=2, cache=CACHE)

@@ -19,6 +19,7 @@ from ballmodel import flight
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, where
 from experiments.view.film import RATE, Film, Series, next_landing, upsampled
+from mjx_tt import platform
 from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes, TaskConfig
 from mjx_tt.env.outgoing_ball import fly_out
 from mjx_tt.env.policy import NetworkController, Policy, PolicyController
@@ -33,8 +34,7 @@ from robot_io.contract import JOINT_NAMES
 QUICKLY = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
-    "xla_cpu_use_fusion_emitters": False,
-}
+} | ({"xla_cpu_use_fusion_emitters": False} if platform.older_fusion() else {})
 LANES = 32  # episodes of one call, whatever the number of policies
 FLOOR = -0.72  # [m] of the ball's centre, where a film ends
 OUTCOMES = {MISSED: "missed", HIT: "hit, not returned", RETURNED: "returned"}

@@ -45,6 +45,9 @@ def _apply(e: Emitter, equation: core.JaxprEqn, operands: list[Value]) -> list[V
     if name == "scan":
         return _scan(e, params, operands)
     forms, outs = ([Form.of(v.aval) for v in variables] for variables in (equation.invars, equation.outvars))
+    if name == "unstack":  # from JAX 0.11 on
+        rows = np.moveaxis(operands[0].places, forms[0].without(params["axis"]), 0)
+        return [operands[0].pick(row) for row in rows]
     if len(outs) != 1:
         raise Unsupported(f"the operation {name}")
     (out,) = outs
@@ -58,13 +61,21 @@ def _apply(e: Emitter, equation: core.JaxprEqn, operands: list[Value]) -> list[V
     if not known(name):
         raise Unsupported(f"the operation {name}")
     dtypes = [x.dtype for x in operands]
-    rows = zip(*(spread(x, form, out) for x, form in zip(operands, forms, strict=True)), strict=True)
-    return [Value(out.dtype, out.shape, [elementwise(e, name, row, dtypes, out.dtype, params) for row in rows])]
+    each = zip(*(spread(x, form, out) for x, form in zip(operands, forms, strict=True)), strict=True)
+    return [Value(out.dtype, out.shape, [elementwise(e, name, one, dtypes, out.dtype, params) for one in each])]
+
+
+def _counts(params: dict) -> tuple[int, int]:
+    """Numbers of a scan's constants and of what it carries."""
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    constants, carried, _ = params["ft_in"].unpack()  # from JAX 0.11 on
+    return len(constants), len(carried)
 
 
 def _scan(e: Emitter, params: dict, operands: list[Value]) -> list[Value]:
     """A loop with a known number of rounds stays a loop: unrolled, its code would not fit the instruction cache."""
-    length, n_constants, n_carried = params["length"], params["num_consts"], params["num_carry"]
+    length, n_constants, n_carried = params["length"], *_counts(params)
     jaxpr = params["jaxpr"].jaxpr
     if len(jaxpr.outvars) > n_carried or length in (0, LANES):
         raise Unsupported("a scan that stacks results, or one of no rounds")
