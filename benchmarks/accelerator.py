@@ -1,8 +1,8 @@
 """An accelerator's updates: ``python -m benchmarks.accelerator [--out accelerator.json] [--seconds 3]``.
 
 The update of ``paper.yaml`` from small to large, with loops over time as kernels and, for some sizes, left to XLA, and
-its roll-outs alone; the update of ``robust.yaml`` by first-order gradients; the returns of the same 6,000 episodes on the
-accelerator and, in a process of its own, on the processor. Runs on whatever JAX finds, a processor as well.
+its roll-outs alone; the update of ``robust.yaml`` by first-order gradients; the returns of the same 6,000 episodes on
+the accelerator and, in a process of its own, on the processor. Runs on whatever JAX finds, a processor as well.
 """
 
 from __future__ import annotations

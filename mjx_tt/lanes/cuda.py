@@ -39,7 +39,7 @@ def compiled(loop: str, operands: list[Operand], lanes: int, folder: Path | None
 
 def ptx(loop: str, operands: list[Operand], lanes: int, architecture: str) -> bytes:
     """PTX of a loop, such as for "sm_90"."""
-    text = loop.replace("define void @lane", "define internal void @lane") + kernel.threads(operands, lanes)
+    text = loop.replace("define void @lane", "define internal void @lane") + kernel.entry(operands, lanes)
     return machine.assembly(text, _TRIPLE, architecture).encode()
 
 
@@ -78,8 +78,8 @@ def handler(operands: list[Operand], lanes: int, kernel_handle: int, launch: int
             f"%row_{i} = getelementptr ptr, ptr %table, i64 {i}",
             f"store ptr %value_{i}, ptr %row_{i}",
         ]
-    blocks = -(-lanes // kernel.THREADS)
-    grid = f"i32 {blocks}, i32 1, i32 1, i32 {kernel.THREADS}, i32 1, i32 1, i32 0"
+    threads, _ = kernel.launch(lanes)
+    grid = f"i32 {-(-lanes // threads)}, i32 1, i32 1, i32 {threads}, i32 1, i32 1, i32 0"
     lines += [
         f"%launch = inttoptr i64 {launch} to ptr",
         f"%kernel = inttoptr i64 {kernel_handle} to ptr",

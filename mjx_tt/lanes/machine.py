@@ -46,7 +46,7 @@ def compiled(text: str, function: str, folder: Path | None) -> ctypes.c_void_p:
 
 
 def kept(text: str, built_for: str, suffix: str, folder: Path | None, build: Callable[[], bytes]) -> bytes:
-    """What ``build`` makes of a text, from the folder if it was built there for the same before."""
+    """The code that ``build`` makes of a text, from the folder if it was built for the same before."""
     key = "|".join((text, built_for, str(llvm.llvm_version_info)))
     path = folder / f"{_digest(key.encode())}{suffix}" if folder else None
     code = _kept(path) if path else None
