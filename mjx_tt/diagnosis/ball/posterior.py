@@ -55,10 +55,13 @@ def fit(
     left_out: Container[int],
     say: Callable[[str], None],
     scatter: Float[np.ndarray, 3] = noise.ALIKE,
+    besides: tuple[int, float] | None = None,
 ) -> Posterior:
     """Maximum of the posterior of all effects that are not left out, from a situation with or without spins.
 
-    scatter: [m/s] of the bounces from ball to ball, to start from; zero where they are alike.
+    scatter: [m/s] of the bounces from ball to ball, to start from; zero where they are alike
+    besides: an effect and the error of it that the caller will state beside the posterior's; what moves by little of
+    that has settled
     """
     g, effects = problem.grid, problem.effects
     free = [
@@ -84,7 +87,8 @@ def fit(
         change = theta - at.theta
         # An effect that starts with a threshold has no derivative to settle on.
         smooth = [i for i in free if effects[i].step is None]
-        moved = float(np.max(np.abs(change[smooth]) / np.sqrt(np.diagonal(covariance))[smooth], initial=0.0))
+        errors = stated(covariance, besides)
+        moved = float(np.max(np.abs(change[smooth]) / errors[smooth], initial=0.0))
         at = _stepped(problem, at, theta, own, prior, mean, scale, free)
         scatter = noise.scattered(at.start[KICK], p.kick_gram, scatter)
         say(f"all effects at once, round {round_ + 1}: moved by {moved:.1f} deviations")
@@ -96,6 +100,15 @@ def fit(
         at = Situation(at.theta, fit_starts(problem, at.theta, start, g, own, prior))
     linear = problem.linearise(at)
     return Posterior(at.theta, covariance, tuple(free), at, linear, own, prior, converged)
+
+
+def stated(covariance: Float[np.ndarray, "K K"], besides: tuple[int, float] | None = None) -> Float[np.ndarray, " K"]:
+    """Standard deviations, where one effect has an error besides, along which the others go as they must."""
+    variances = np.diagonal(covariance)
+    if besides is None:
+        return np.sqrt(variances)
+    which, error = besides
+    return np.sqrt(variances + (covariance[which] / covariance[which, which] * error) ** 2)
 
 
 def _stepped(

@@ -114,12 +114,14 @@ def fit(
         nominal = Situation(np.zeros(len(effects)), first_fit(problem))
         if problem.nominal[LIFT] == 0.0 and LIFT not in prior:
             return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say, SCATTER))
+        lift = [i for i, effect in enumerate(effects) if effect.path == LIFT]
+        besides = (lift[0], LIFT_ERROR) if lift else None
         say(f"fitting the spins of {g.n} balls")
         situation, spins = own_spins(problem, nominal)
         deviation = _deviation(problem, situation)
         ordinary = deviation <= WORST * np.median(deviation)
         if ordinary.all():
-            found = BallsTogether(problem, posterior.fit(problem, situation, spins, (), say, SCATTER))
+            found = BallsTogether(problem, posterior.fit(problem, situation, spins, (), say, SCATTER, besides))
             deviation = _deviation(problem, found.posterior.at)
             ordinary = deviation <= WORST_FITTED * np.median(deviation)
             ordinary &= np.linalg.norm(found.posterior.at.start[SPIN], axis=0) <= FASTEST
