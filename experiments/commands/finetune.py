@@ -42,7 +42,8 @@ def finetune(
     *,
     robot: Annotated[str, option("YAML", 'a robot.yaml, "rig" or "lockstep"')],
     settings: Annotated[
-        str | None, option("YAML", "of the fine-tuning (default: the paper's), docs/how-to/fine-tune.md")
+        str | None,
+        option("YAML", "of the fine-tuning (default: the paper's, or nearer: docs/how-to/fine-tune.md)"),
     ] = None,
     overrides: Annotated[tuple[str, ...], changes("change one setting")] = (),
     out: Annotated[str | None, option("FOLDER", "of the run (default: POLICY-finetuned)")] = None,
@@ -55,7 +56,7 @@ def finetune(
     """Returns 130 where it was stopped."""
     from experiments.config import finetuning
 
-    chosen = finetuning.load(settings, overrides)
+    finetuning.load(settings, overrides)  # a mistake in it is told at once
     find_policy(policy)
     existing(None if robot in ("rig", "lockstep") else robot, key="--robot")
     existing(rig, key="--rig")
@@ -64,7 +65,13 @@ def finetune(
     writable(folder)
     start_jax(1)
     from experiments.finetuning import session
+    from experiments.runs import load_policy
     from experiments.runs.run_dir import Run
 
+    trained = load_policy.load(policy).config
+    chosen = finetuning.load(settings, overrides, trained)
+    if finetuning.near(trained):
+        rate = chosen.step.learning_rate
+        console().print(f"sigma {chosen.sigma}, step {rate}: the policy was trained by first-order gradients")
     report = session.finetune(policy, chosen, Run(folder), robot, distribution, rig, backend, seed, console(), player)
     return 0 if report is not None else 130

@@ -8,11 +8,14 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from experiments.config import validation
-from experiments.config.experiment import Rewards, apply_override, read_yaml
+from experiments.config.experiment import Config, Rewards, apply_override, read_yaml
 from experiments.config.optimiser import Constant, EliteFraction, EmaDecay, NumDirections, Optimiser, Shaping, Step
 from experiments.config.section import Count, Seed
 from experiments.errors import ConfigError
 
+# Policies by first-order gradients return a third of their balls where the paper's sigma moves them, and learn from
+# that where to go (docs/results/fine-tuning.md).
+NEAR = {"sigma": 0.01, "step.learning_rate": 0.0015}
 MEASURED = ("state_transition", "net_clearance", "hit_and_land", "fault")  # terms that a real episode tells
 
 
@@ -45,9 +48,19 @@ class FineTuning(Shaping):
         return Optimiser(**shared, common_random_numbers=False)
 
 
-def load(path: str | Path | None = None, overrides: tuple[str, ...] = ()) -> FineTuning:
-    """The defaults, changed by a YAML of ``FineTuning``'s keys and then by "dotted.path=value". Raises ConfigError."""
+def near(trained: Config | None) -> bool:
+    """True for a policy that NEAR's settings are for, by the experiment that trained it."""
+    return trained is not None and trained.optimiser.gradient == "first_order"
+
+
+def load(path: str | Path | None = None, overrides: tuple[str, ...] = (), trained: Config | None = None) -> FineTuning:
+    """The defaults, changed by a YAML of ``FineTuning``'s keys and then by "dotted.path=value". Raises ConfigError.
+
+    trained: the experiment that trained the policy; the defaults of one by first-order gradients are NEAR's
+    """
     data, where = FineTuning().model_dump(mode="json"), "--set"
+    for key, value in NEAR.items() if near(trained) else ():
+        apply_override(data, f"{key}={value}")
     if path is not None:
         try:
             given = read_yaml(Path(path).read_text(encoding="utf-8"), str(path))
