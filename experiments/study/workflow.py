@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -88,13 +89,13 @@ class Journal:
         return max((i for i, entry in enumerate(self.entries) if entry["step"] == step.name), default=None)
 
     def seconds_per_work(self) -> dict[str, float]:
-        """Seconds that a unit of work of each kind took so far, all sessions together."""
-        work: dict[str, list[float]] = {}
+        """Median of the seconds that a unit of work of each kind took so far, all sessions together: the first steps of
+        a kind compile besides."""
+        rates: dict[str, list[float]] = {}
         for entry in self.entries:
-            sums = work.setdefault(entry["kind"], [0.0, 0.0])
-            sums[0] += entry["seconds"]
-            sums[1] += entry["work"]
-        return {kind: seconds / size for kind, (seconds, size) in work.items() if size}
+            if entry["work"]:
+                rates.setdefault(entry["kind"], []).append(entry["seconds"] / entry["work"])
+        return {kind: statistics.median(each) for kind, each in rates.items()}
 
 
 def unfinished(steps: list[Step], journal: Journal) -> list[Step]:
