@@ -67,14 +67,14 @@ def assembly(text: str, triple: str, processor: str) -> str:
 
 def optimised(text: str, target: llvm.TargetMachine | None = None) -> llvm.ModuleRef:
     """The module as LLVM makes it better for a processor, this one if none is given; ``str`` gives its text."""
-    target = target or _machine()
     module = llvm.parse_assembly(text)
-    module.triple, module.data_layout = target.triple, str(target.target_data)
+    if target is not None:
+        module.triple, module.data_layout = target.triple, str(target.target_data)
     module.verify()
     options = llvm.create_pipeline_tuning_options(speed_level=2)
     # Every number is a vector already, and what is a loop shall stay one.
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
-    builder = llvm.create_pass_builder(target, options)
+    builder = llvm.create_pass_builder(target or _machine(), options)
     builder.getModulePassManager().run(module, builder)
     return module
 
