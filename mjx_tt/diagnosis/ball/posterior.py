@@ -16,15 +16,19 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_tt.diagnosis.ball import scores
-from mjx_tt.diagnosis.ball.flights import noise
-from mjx_tt.diagnosis.ball.flights.fit import fit_starts, fit_with_cost, refit_worst
-from mjx_tt.diagnosis.ball.flights.linearization import KICK, BallProblem, Linear, Situation, project
+from mjx_tt.diagnosis.ball.effects import FLIGHT, TABLE
+from mjx_tt.diagnosis.ball.flights import marginal, noise
+from mjx_tt.diagnosis.ball.flights.fit import fit_starts, log_evidence, refit_worst
+from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, BallProblem, Linear, Situation
+from mjx_tt.diagnosis.ball.flights.marginal import Evidence, evidence
 from mjx_tt.diagnosis.ball.flights.noise import Noise
-from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior, learned
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior
 
-ROUNDS = 7
+ROUNDS = 8
 SETTLED = 0.2  # of a standard deviation by which nothing moves any more
+NEARLY_SETTLED = 1.0  # the same, where no share of the step is any better: it was Laplace's approximation that pulled
 MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
+LIFT_HELD = 2  # rounds in which the coefficient of lift stays as it is, where the flights have spins
 SHARES = (1.0, 0.5, 0.25, 0.1)  # of a step that are tried in turn
 LONGEST_MOVE = 3.0  # scales by which an effect may change in a round
 
@@ -69,31 +73,36 @@ def fit(
         for i, e in enumerate(effects)
         if i not in left_out and not e.made_of and not (prior is None and (e.needs_spin or i == problem.coefficient))
     ]
+    physical = [i for i in free if effects[i].path.startswith((FLIGHT, TABLE))]  # all others are the cameras'
     mean, scale = np.zeros(len(effects)), np.array([e.scale for e in effects])
     if problem.coefficient is not None:
         mean[problem.coefficient], scale[problem.coefficient] = MAGNUS_PRIOR
     covariance = np.diag(scale**2)
-    converged = False
+    converged, stalled = False, 0
     for round_ in range(ROUNDS):
         linear = problem.linearise(at)
         frame = noise.flight_frame(linear.base.velocity[:, :, 0])
         own = noise.estimate(linear.residual, frame, g, 6 if prior is None else 9)
         own = replace(noise.without_memory(own, MEMORY[min(round_, len(MEMORY) - 1)]), scatter=scatter)
-        p = project(linear, at, own, noise.robust_weights(linear.residual, own, g), g)
-        if prior is not None:
-            prior = learned(p.spin_gram, p.spin_right - p.spin_effect @ at.theta)
-        rated = scores.under(p, prior)
-        theta, covariance = _solved(rated, at.theta, free, mean, scale, problem)
+        flights = marginal.starts_out(linear, at, own, noise.robust_weights(linear.residual, own, g), problem)
+        p = marginal.products(linear, flights)
+        prior, scatter = marginal.distributions(p, at.theta, prior, scatter)
+        own = replace(own, scatter=scatter)
+        more = None if prior is None else marginal.growth(problem, flights, linear, at, physical)
+        shown = evidence(p, at.theta, prior, scatter, more)
+        # Lift and spins are told apart by small differences: not before all else is about right.
+        moving = [i for i in free if round_ >= LIFT_HELD or effects[i].path != MAGNUS]
+        theta, covariance = _solved(shown, at.theta, moving, mean, scale, problem)
         change = theta - at.theta
         # An effect that starts with a threshold has no derivative to settle on.
         smooth = [i for i in free if effects[i].step is None]
         errors = stated(covariance, besides)
         moved = float(np.max(np.abs(change[smooth]) / errors[smooth], initial=0.0))
-        at = _stepped(problem, at, theta, own, prior, mean, scale, free)
-        scatter = noise.scattered(at.start[KICK], p.kick_gram, scatter)
+        before, at = at, _stepped(problem, at, theta, shown, own, prior, mean, scale, free)
         say(f"all effects at once, round {round_ + 1}: moved by {moved:.1f} deviations")
-        if moved < SETTLED:
-            converged = True
+        stalled = stalled + 1 if at is before else 0
+        if (moved < SETTLED and round_ >= LIFT_HELD) or stalled == 2:
+            converged = moved < NEARLY_SETTLED
             break
     if prior is not None:
         start = refit_worst(problem, at.theta, at.start, g, own, prior)
@@ -115,6 +124,7 @@ def _stepped(
     problem: BallProblem,
     at: Situation,
     theta: Float[np.ndarray, " K"],
+    shown: Evidence,
     own: Noise,
     prior: SpinPrior | None,
     mean: np.ndarray,
@@ -131,10 +141,12 @@ def _stepped(
         return float(scores.price((changes - mean)[free], scale[free]))
 
     g = problem.grid
-    best, least = at, float(fit_with_cost(problem, at.theta, at.start, g, own, prior, 0)[1].sum()) + price(at.theta)
+    best, least = at, float(log_evidence(problem, at.theta, at.start, g, own, prior, 0)[1].sum()) + price(at.theta)
+    reach = shown.reach(theta - at.theta)
     for share in SHARES:
-        there = at.theta + share * (theta - at.theta)
-        start, cost = fit_with_cost(problem, there, at.start, g, own, prior, 3)
+        there = at.theta + share * reach * (theta - at.theta)
+        spins, scatter = shown.followed(there - at.theta, prior, own.scatter)
+        start, cost = log_evidence(problem, there, at.start, g, replace(own, scatter=scatter), spins, 3)
         total = float(cost.sum()) + price(there)
         if total >= least and best is not at:
             break
@@ -146,43 +158,40 @@ def _stepped(
 
 
 def _solved(
-    rated: scores.Scores,
+    flights: Evidence,
     before: np.ndarray,
     free: list[int],
     mean: np.ndarray,
     scale: np.ndarray,
     problem: BallProblem,
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K K"]]:
-    """Changes of all effects from the scores, and their covariance by the sandwich over balls."""
+    """Changes of all effects from the evidence, and their covariance by the sandwich over balls."""
     count, low = len(scale), np.array([e.low for e in problem.effects])
     away = (before - mean) / scale
     precision = (scores.FREEDOM + 1.0) / (scores.FREEDOM + away**2) / scale**2
     held: list[int] = []
     while True:
         chosen = [i for i in free if i not in held]
-        every = [*chosen, *rated.always]
-        pull = np.zeros(len(every))
-        pull[: len(chosen)] = precision[chosen]
-        goal = np.zeros(len(every))
-        goal[: len(chosen)] = mean[chosen]
-        gram, right = rated.gram[np.ix_(every, every)] + np.diag(pull), rated.right[every] + pull * goal
+        pull = precision[chosen]
+        gram = flights.information(chosen, pull)
+        right = flights.right.sum(axis=0)[chosen] + pull * mean[chosen]
         size = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
         inverse = np.linalg.pinv(gram * size[:, None] * size, hermitian=True) * size[:, None] * size
         found = inverse @ right
-        below = [i for i, value in zip(chosen, found, strict=False) if value < low[i]]
+        below = [i for i, value in zip(chosen, found, strict=True) if value < low[i]]
         if not below:
             break
         held += below
-    left = rated.ball_right[:, every] - rated.ball_gram[:, every][:, :, every] @ found
+    left = flights.right[:, chosen] - flights.gram[:, chosen][:, :, chosen] @ found
     spread = left.T @ left + np.diag(pull)
     full = inverse @ spread @ inverse
     theta = np.zeros(count)
-    theta[chosen] = found[: len(chosen)]
+    theta[chosen] = found
     theta[held] = low[held]
     step = LONGEST_MOVE * scale
     theta = before + np.clip(theta - before, -step, step)
     if problem.coefficient is not None and problem.coefficient in free:
         theta[problem.coefficient] = np.clip(theta[problem.coefficient], *MAGNUS_RANGE)
     covariance = np.diag(scale**2)
-    covariance[np.ix_(chosen, chosen)] = full[: len(chosen), : len(chosen)]
+    covariance[np.ix_(chosen, chosen)] = full
     return theta, covariance

@@ -32,7 +32,7 @@ EDGE, NEAR_TABLE = 0.03, 0.06  # [m] from the edge; of the lowest sample from wh
 WORST, WORST_FITTED = 5.0, 2.0
 FASTEST = 1000.0  # [rad/s]
 LIFT = "ball.flight.magnus_coefficient"
-LIFT_ERROR = 0.2  # of the coefficient k, beside what the posterior has: see ``BallsTogether.along_lift``
+LIFT_ERROR = 0.1  # of the coefficient k, beside what the posterior has: see ``BallsTogether.along_lift``
 Prior = Mapping[str, tuple[float, float]]  # mean and standard deviation by dotted path
 
 
@@ -63,8 +63,9 @@ class BallsTogether:
     def along_lift(self, error: Numbers) -> Float[np.ndarray, "K ..."]:
         """Changes of all effects when the coefficient of lift is off by ``error``, a number or an array.
 
-        How much balls curve shows the product of k and spin; that the spins' own spread is learned under one k makes
-        the posterior too sure of it. So k has LIFT_ERROR besides, and the others go along as the flights want it.
+        How much balls curve shows the product of k and spin, and the two come apart by small differences between the
+        flight before and after the bounce, in which a law of lift or bounce that is not quite the model's shows as
+        well. So k has LIFT_ERROR besides, and the others go along as the flights want it.
         """
         paths, found = [e.path for e in self.problem.effects], self.posterior
         theta = np.reshape(found.theta, (-1,) + (1,) * np.ndim(error))

@@ -20,6 +20,7 @@ from mjx_tt.sim.model import SimModel
 SPIN, KICK = slice(6, 9), slice(9, 12)
 MAGNUS = FLIGHT + "magnus_coefficient"
 START_STEPS = np.array([1e-6] * 3 + [1e-5] * 3 + [0.1] * 3 + [1e-5] * 3)  # [m], [m/s], [rad/s], [m/s]
+COARSE = 0.1  # of an effect's scale: a step over which few balls go from sliding to rolling at once
 REFERENCE_MAGNUS = 0.6  # k used where the nominal model has none: in flight only k omega shows (PHYSICS: 0.3 to 1.5)
 
 
@@ -87,8 +88,9 @@ class BallProblem:
         for i in range(6, 12):
             start[i, 2 + k + i] += START_STEPS[i]
         values = self.values(theta[:, :, None])
-        values[MAGNUS] = values[MAGNUS].copy()
-        values[MAGNUS][7 + k : 11 + k] = np.where(np.abs(values[MAGNUS][0]) > 0.05, values[MAGNUS][0], REFERENCE_MAGNUS)
+        if self.nominal[MAGNUS] == 0.0:
+            lift = values[MAGNUS] = values[MAGNUS].copy()
+            lift[7 + k : 11 + k] = np.where(np.abs(lift[0]) > 0.05, lift[0], REFERENCE_MAGNUS)
         flown = predict(self.model, values, start, g, self.axes, states=7)
         base, bent = flown.measured[:, :, 0], flown.measured[:, :, 7 + k]
 
@@ -117,6 +119,24 @@ class BallProblem:
             )
         )
         return Linear(residual, starts, effects, one, np.moveaxis(transition, (3, 1), (0, 1)))
+
+    def spins_by_effects(self, at: Situation, which: Sequence[int], beside: np.ndarray) -> np.ndarray:
+        """(E, 3, 3, T, n) [m per rad/s and unit] by how much more each of some effects makes the spins show.
+
+        beside: (6, 3, n) by how much a start moves with each component of the spin.
+        """
+        g, count = self.grid, len(which)
+        moves = np.array([COARSE * self.effects[i].scale for i in which])
+        changes = np.repeat(at.theta[:, None], 1 + count, axis=1)  # none, and one effect at a time
+        changes[which, 1 + np.arange(count)] += moves
+        start = np.tile(at.start[:, None], (1, 4 * (1 + count), 1))  # of each: as it is, spun (3)
+        for axis in range(3):
+            start[6 + axis, 1 + axis :: 4] += START_STEPS[6 + axis]
+            start[:6, 1 + axis :: 4] += START_STEPS[6 + axis] * beside[:, None, axis]
+        flown = predict(self.model, self.values(np.repeat(changes, 4, axis=1)[:, :, None]), start, g, self.axes)
+        shown = flown.measured.reshape(*flown.measured.shape[:2], 1 + count, 4, g.n)
+        slopes = (shown[:, :, :, 1:] - shown[:, :, :, :1]) / START_STEPS[SPIN, None]
+        return np.transpose((slopes[:, :, 1:] - slopes[:, :, :1]) / moves[:, None, None], (2, 3, 0, 1, 4))
 
 
 def shifts(linear: Linear, g: Grid, effects: Sequence[Effect]) -> tuple[np.ndarray, float]:
@@ -178,7 +198,8 @@ class StartsOut:
     ) -> None:
         self._noise, self._weight, self._white = noise, weight, Whitening(noise, g)
         free, kicks = (self._white.rows(linear.starts[part], weight) for part in (slice(6), KICK))
-        self._kick_gram = kicks.swapaxes(1, 2) @ remove(np.linalg.qr(free)[0], kicks)
+        self._kicks = remove(np.linalg.qr(free)[0], kicks)
+        self._kick_gram = kicks.swapaxes(1, 2) @ self._kicks
         self._scatters = bool(noise.scatter.any())
         if self._scatters:
             known = np.broadcast_to(np.eye(3), (g.n, 3, 3))
@@ -211,6 +232,17 @@ class StartsOut:
             self._kick_gram,
             coefficient,
         )
+
+    def starts_beside_spins(self, linear: Linear) -> np.ndarray:
+        """(6, 3, n) by how much a start moves with each component of the spin where flights are to change the least."""
+        free, spins = (self._white.rows(linear.starts[part], self._weight) for part in (slice(6), SPIN))
+        basis, upper = np.linalg.qr(free)
+        return -np.moveaxis(np.linalg.solve(upper, basis.swapaxes(1, 2) @ spins), 0, 2)
+
+    def beside_spins_and_kicks(self, columns: np.ndarray) -> np.ndarray:
+        """(n, 6, k) products of the columns of spins and kicks with others (k, 3, T, n), of noise without scatter."""
+        own = np.concatenate([self._spins, self._kicks], axis=2)
+        return own.swapaxes(1, 2) @ self._left(columns)
 
 
 def remove(basis: np.ndarray, columns: np.ndarray) -> np.ndarray:

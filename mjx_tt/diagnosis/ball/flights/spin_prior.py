@@ -48,6 +48,11 @@ class SpinPrior:
         own = None if self.own_mean is None else self.own_mean + change[:, None]
         return replace(self, mean=self.mean + change, own_mean=own)
 
+    def stretched(self, factor: Float[np.ndarray, 3]) -> SpinPrior:
+        """The same distribution, wider by a factor about each axis."""
+        own = None if self.own_covariance is None else self.own_covariance * np.multiply.outer(factor, factor)
+        return replace(self, std=self.std * factor, own_covariance=own)
+
     def of_some(self, index: np.ndarray) -> SpinPrior:
         """The distribution of some of the balls."""
         if self.own_mean is None or self.own_covariance is None:
