@@ -3,7 +3,7 @@
 Real set-ups are wrong in many places by ordinary amounts, and the best change of one number depends on all others. So
 before any is named all are fitted together: Gauss-Newton on the nonlinear model, each ball's start projected out and
 its spin marginalised about its own best fit (the conditional linearisation of Lindstrom and Bates, Biometrics 46,
-1990), until nothing moves. An effect's prior is Student's with the catalogue's ``scale``: ordinary sizes cost little,
+1990), until nothing moves. An identification maximises the evidence itself, spins and kicks integrated out. An effect's prior is Student's with the catalogue's ``scale``: ordinary sizes cost little,
 a large one is not forbidden. Intervals take their spread from ball to ball.
 """
 
@@ -18,17 +18,17 @@ from jaxtyping import Float
 from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.effects import FLIGHT, TABLE
 from mjx_tt.diagnosis.ball.flights import marginal, noise
-from mjx_tt.diagnosis.ball.flights.fit import fit_starts, log_evidence, refit_worst
-from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, BallProblem, Linear, Situation
-from mjx_tt.diagnosis.ball.flights.marginal import Evidence, evidence
+from mjx_tt.diagnosis.ball.flights.fit import fit_starts, fit_with_cost, log_evidence, refit_worst
+from mjx_tt.diagnosis.ball.flights.linearization import KICK, MAGNUS, BallProblem, Linear, Projected, Situation, project
+from mjx_tt.diagnosis.ball.flights.marginal import Evidence
 from mjx_tt.diagnosis.ball.flights.noise import Noise
-from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior, learned
 
-ROUNDS = 8
+ROUNDS = 7
 SETTLED = 0.2  # of a standard deviation by which nothing moves any more
 NEARLY_SETTLED = 1.0  # the same, where no share of the step is any better: it was Laplace's approximation that pulled
 MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
-LIFT_HELD = 2  # rounds in which the coefficient of lift stays as it is, where the flights have spins
+LIFT_HELD = 2  # rounds besides in which the coefficient of lift stays as it is, where spins are integrated out
 SHARES = (1.0, 0.5, 0.25, 0.1)  # of a step that are tried in turn
 LONGEST_MOVE = 3.0  # scales by which an effect may change in a round
 
@@ -60,12 +60,15 @@ def fit(
     say: Callable[[str], None],
     scatter: Float[np.ndarray, 3] = noise.ALIKE,
     besides: tuple[int, float] | None = None,
+    integrated: bool = False,
 ) -> Posterior:
     """Maximum of the posterior of all effects that are not left out, from a situation with or without spins.
 
     scatter: [m/s] of the bounces from ball to ball, to start from; zero where they are alike
     besides: an effect and the error of it that the caller will state beside the posterior's; what moves by little of
     that has settled
+    integrated: the maximum of the evidence, spins and kicks integrated out. The diagnosis does without: it begins at
+    these sizes and compares sets of causes by thresholds that were made for the best fits.
     """
     g, effects = problem.grid, problem.effects
     free = [
@@ -73,35 +76,38 @@ def fit(
         for i, e in enumerate(effects)
         if i not in left_out and not e.made_of and not (prior is None and (e.needs_spin or i == problem.coefficient))
     ]
-    physical = [i for i in free if effects[i].path.startswith((FLIGHT, TABLE))]  # all others are the cameras'
     mean, scale = np.zeros(len(effects)), np.array([e.scale for e in effects])
     if problem.coefficient is not None:
         mean[problem.coefficient], scale[problem.coefficient] = MAGNUS_PRIOR
     covariance = np.diag(scale**2)
     converged, stalled = False, 0
-    for round_ in range(ROUNDS):
+    held = LIFT_HELD if integrated else 0
+    for round_ in range(ROUNDS + held):
         linear = problem.linearise(at)
         frame = noise.flight_frame(linear.base.velocity[:, :, 0])
         own = noise.estimate(linear.residual, frame, g, 6 if prior is None else 9)
         own = replace(noise.without_memory(own, MEMORY[min(round_, len(MEMORY) - 1)]), scatter=scatter)
-        flights = marginal.starts_out(linear, at, own, noise.robust_weights(linear.residual, own, g), problem)
-        p = marginal.products(linear, flights)
-        prior, scatter = marginal.distributions(p, at.theta, prior, scatter)
-        own = replace(own, scatter=scatter)
-        more = None if prior is None else marginal.growth(problem, flights, linear, at, physical)
-        shown = evidence(p, at.theta, prior, scatter, more)
+        if integrated:
+            shown, own, prior = _evidence(problem, linear, at, own, prior, free)
+        else:
+            p = project(linear, at, own, noise.robust_weights(linear.residual, own, g), g)
+            if prior is not None:
+                prior = learned(p.spin_gram, p.spin_right - p.spin_effect @ at.theta)
+            shown = _about_own_spins(p, prior)
         # Lift and spins are told apart by small differences: not before all else is about right.
-        moving = [i for i in free if round_ >= LIFT_HELD or effects[i].path != MAGNUS]
+        moving = [i for i in free if round_ >= held or effects[i].path != MAGNUS]
         theta, covariance = _solved(shown, at.theta, moving, mean, scale, problem)
         change = theta - at.theta
         # An effect that starts with a threshold has no derivative to settle on.
         smooth = [i for i in free if effects[i].step is None]
         errors = stated(covariance, besides)
         moved = float(np.max(np.abs(change[smooth]) / errors[smooth], initial=0.0))
-        before, at = at, _stepped(problem, at, theta, shown, own, prior, mean, scale, free)
+        cost = log_evidence if integrated else fit_with_cost
+        before, at = at, _stepped(problem, at, theta, cost, shown, own, prior, mean, scale, free)
+        scatter = own.scatter if integrated else noise.scattered(at.start[KICK], p.kick_gram, scatter)
         say(f"all effects at once, round {round_ + 1}: moved by {moved:.1f} deviations")
-        stalled = stalled + 1 if at is before else 0
-        if (moved < SETTLED and round_ >= LIFT_HELD) or stalled == 2:
+        stalled = stalled + 1 if integrated and at is before else 0
+        if (moved < SETTLED and round_ >= held) or stalled == 2:
             converged = moved < NEARLY_SETTLED
             break
     if prior is not None:
@@ -109,6 +115,23 @@ def fit(
         at = Situation(at.theta, fit_starts(problem, at.theta, start, g, own, prior))
     linear = problem.linearise(at)
     return Posterior(at.theta, covariance, tuple(free), at, linear, own, prior, converged)
+
+
+def _about_own_spins(p: Projected, prior: SpinPrior | None) -> Evidence:
+    rated = scores.under(p, prior)
+    return Evidence(rated.ball_gram, rated.ball_right, np.zeros((0, rated.gram.shape[0])), 0, rated.gram)
+
+
+def _evidence(
+    problem: BallProblem, linear: Linear, at: Situation, own: Noise, prior: SpinPrior | None, free: list[int]
+) -> tuple[Evidence, Noise, SpinPrior | None]:
+    """Evidence about all effects, with the most likely distributions of kicks, in the noise, and of spins."""
+    flights = marginal.starts_out(linear, at, own, noise.robust_weights(linear.residual, own, problem.grid), problem)
+    p = marginal.products(linear, flights)
+    prior, scatter = marginal.distributions(p, at.theta, prior, own.scatter)
+    physical = [i for i in free if problem.effects[i].path.startswith((FLIGHT, TABLE))]  # all others are the cameras'
+    more = None if prior is None else marginal.growth(problem, flights, linear, at, physical)
+    return marginal.evidence(p, at.theta, prior, scatter, more), replace(own, scatter=scatter), prior
 
 
 def stated(covariance: Float[np.ndarray, "K K"], besides: tuple[int, float] | None = None) -> Float[np.ndarray, " K"]:
@@ -124,6 +147,7 @@ def _stepped(
     problem: BallProblem,
     at: Situation,
     theta: Float[np.ndarray, " K"],
+    priced: Callable[..., tuple[np.ndarray, np.ndarray]],
     shown: Evidence,
     own: Noise,
     prior: SpinPrior | None,
@@ -141,12 +165,12 @@ def _stepped(
         return float(scores.price((changes - mean)[free], scale[free]))
 
     g = problem.grid
-    best, least = at, float(log_evidence(problem, at.theta, at.start, g, own, prior, 0)[1].sum()) + price(at.theta)
+    best, least = at, float(priced(problem, at.theta, at.start, g, own, prior, 0)[1].sum()) + price(at.theta)
     reach = shown.reach(theta - at.theta)
     for share in SHARES:
         there = at.theta + share * reach * (theta - at.theta)
         spins, scatter = shown.followed(there - at.theta, prior, own.scatter)
-        start, cost = log_evidence(problem, there, at.start, g, replace(own, scatter=scatter), spins, 3)
+        start, cost = priced(problem, there, at.start, g, replace(own, scatter=scatter), spins, 3)
         total = float(cost.sum()) + price(there)
         if total >= least and best is not at:
             break

@@ -54,6 +54,8 @@ class Evidence:
         At least LEAST_LEFT of that under given distributions is left in every direction: it is a difference of
         expectations and of sums over balls, which need not cancel as they should.
         """
+        if not self.spreads:
+            return self.alone[np.ix_(chosen, chosen)] + np.diag(before)
         alone = self.alone[np.ix_(chosen, chosen)] + np.diag(before)
         size = np.sqrt(np.diagonal(alone))
         lower = np.linalg.cholesky(alone / size[:, None] / size + 1e-12 * np.eye(len(chosen))) * size[:, None]
