@@ -3,8 +3,9 @@
 Real set-ups are wrong in many places by ordinary amounts, and the best change of one number depends on all others. So
 before any is named all are fitted together: Gauss-Newton on the nonlinear model, each ball's start projected out and
 its spin marginalised about its own best fit (the conditional linearisation of Lindstrom and Bates, Biometrics 46,
-1990), until nothing moves. An identification maximises the evidence itself, spins and kicks integrated out. An effect's prior is Student's with the catalogue's ``scale``: ordinary sizes cost little,
-a large one is not forbidden. Intervals take their spread from ball to ball.
+1990), until nothing moves. An identification maximises the evidence itself, spins and kicks integrated out. An
+effect's prior is Student's with the catalogue's ``scale``: ordinary sizes cost little, a large one is not forbidden.
+Intervals take their spread from ball to ball.
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ def fit(
         scatter = own.scatter if integrated else noise.scattered(at.start[KICK], p.kick_gram, scatter)
         say(f"all effects at once, round {round_ + 1}: moved by {moved:.1f} deviations")
         stalled = stalled + 1 if integrated and at is before else 0
-        if (moved < SETTLED and round_ >= held) or stalled == 2:
+        if round_ >= held and (moved < SETTLED or stalled >= 2):
             converged = moved < NEARLY_SETTLED
             break
     if prior is not None:
