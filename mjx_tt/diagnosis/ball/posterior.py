@@ -30,6 +30,8 @@ SETTLED = 0.2  # of a standard deviation by which nothing moves any more
 NEARLY_SETTLED = 1.0  # the same, where no share of the step is any better: it was Laplace's approximation that pulled
 MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
 LIFT_HELD = 2  # rounds besides in which the coefficient of lift stays as it is, where spins are integrated out
+# Where air lifts no ball spins hardly show, and could be of any size: no air that anybody measured lifts so little.
+LEAST_LIFT = 0.03
 SHARES = (1.0, 0.5, 0.25, 0.1)  # of a step that are tried in turn
 LONGEST_MOVE = 3.0  # scales by which an effect may change in a round
 
@@ -97,7 +99,7 @@ def fit(
             shown = _about_own_spins(p, prior)
         # Lift and spins are told apart by small differences: not before all else is about right.
         moving = [i for i in free if round_ >= held or effects[i].path != MAGNUS]
-        theta, covariance = _solved(shown, at.theta, moving, mean, scale, problem)
+        theta, covariance = _solved(shown, at.theta, moving, mean, scale, problem, LEAST_LIFT if integrated else None)
         change = theta - at.theta
         # An effect that starts with a threshold has no derivative to settle on.
         smooth = [i for i in free if effects[i].step is None]
@@ -189,6 +191,7 @@ def _solved(
     mean: np.ndarray,
     scale: np.ndarray,
     problem: BallProblem,
+    least_lift: float | None = None,
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K K"]]:
     """Changes of all effects from the evidence, and their covariance by the sandwich over balls."""
     count, low = len(scale), np.array([e.low for e in problem.effects])
@@ -207,6 +210,10 @@ def _solved(
         if not below:
             break
         held += below
+    lift = [k for k, i in enumerate(chosen) if problem.effects[i].path == MAGNUS]
+    if least_lift is not None and lift:
+        missing = max(least_lift - problem.nominal[MAGNUS] - found[lift[0]], 0.0)
+        found = found + inverse[lift[0]] / inverse[lift[0], lift[0]] * missing  # the others as is best beside it
     left = flights.right[:, chosen] - flights.gram[:, chosen][:, :, chosen] @ found
     spread = left.T @ left + np.diag(pull)
     full = inverse @ spread @ inverse

@@ -71,7 +71,10 @@ def test_bounces_that_differ_from_ball_to_ball_are_not_taken_for_spin():
     at = [effect.path for effect in found.problem.effects].index("ball.table.restitution")
     deviation = found.posterior.std[at]
     assert abs(float(values["ball.table.restitution"]) - restitution.mean()) < 3.0 * deviation and deviation < 0.005
-    assert abs(float(values[of_balls.LIFT])) < 0.05 and found.spins is not None and found.spins.std.max() < 10.0
+    # Spins that air without lift never shows may be of any size: what counts is by how much they bend a flight.
+    assert found.spins is not None
+    bent = 0.006 * 5.0 * abs(float(values[of_balls.LIFT])) * np.hypot(found.spins.mean, found.spins.std).max()
+    assert abs(float(values[of_balls.LIFT])) < 0.05 and bent < 0.05  # [m/s^2]
     # Vertical kicks: 0.03 of some 3 m/s.
     assert 0.06 < found.posterior.noise.scatter[2] < 0.15
 
