@@ -73,6 +73,8 @@ class Evidence:
         self, change: Float[np.ndarray, " K"], prior: SpinPrior | None, scatter: Float[np.ndarray, 3]
     ) -> tuple[SpinPrior | None, Float[np.ndarray, 3]]:
         """Both distributions after a change of the effects."""
+        if not self.spreads:
+            return prior, scatter
         moves = self.follow @ change
         if prior is not None:
             mean, spread, moves = moves[:3], moves[3:6], moves[6:]
