@@ -75,7 +75,10 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{chosen.out}: no reality is finished")
         return 1
     if chosen.untrained:
-        print("\n".join(coverage([one for one in found if not one["outside"]], ("identified", "hits"))))
+        for title, outside in (("in class", False), ("outside", True)):
+            some = [one for one in found if bool(one["outside"]) == outside]
+            if some:
+                print("\n".join([f"{title}, {len(some)} realities", *coverage(some, ("identified", "hits"))]))
         return 0
     text = summary(found)
     (chosen.out / "summary.txt").write_text(text + "\n", encoding="utf-8")
