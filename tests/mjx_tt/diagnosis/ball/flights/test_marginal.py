@@ -98,7 +98,7 @@ def test_density_is_scipys(balls):
 
 @pytest.mark.parametrize("theta", [TRUTH, np.array([0.45, -0.2])])
 def test_gradient_is_that_of_the_density(balls, theta):
-    """Where mean and spread are the most likely, they follow theta without a cost of first order."""
+    """At the most likely mean and spread, which follow theta without a cost of first order."""
     mean, spread, _ = balls.most_likely(theta)
     p, more = balls.products(theta, mean, spread)
     found = marginal.evidence(p, theta, one_gaussian(mean, spread[:3]), spread[3:], more)
@@ -137,7 +137,7 @@ def information(balls) -> np.ndarray:
 
 
 def test_information_is_the_curvature_of_what_is_left_when_mean_and_spread_follow(balls, information):
-    """What only the spins' unknown spread decides is not counted as known."""
+    """Nothing that only the spins' unknown spread decides is counted as known."""
     mean, spread, _ = balls.most_likely(TRUTH)
     p, more = balls.products(TRUTH, mean, spread)
     found = marginal.evidence(p, TRUTH, one_gaussian(mean, spread[:3]), spread[3:], more)
