@@ -16,12 +16,11 @@ from jaxtyping import Float
 
 from mjx_tt.diagnosis.ball.effects import Effect
 from mjx_tt.diagnosis.ball.flights.linearization import Projected
-from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, SpinPrior, learned
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, TINY, SpinPrior, learned
 
 LARGEST_SUBSET = 3  # of which every set is tried
 MOST_CAUSES = 8
 SPIN_ROUNDS = 8
-TINY = 1e-3  # [rad/s] spread of balls that do not spin
 FREEDOM = 4.0  # degrees of Student's distribution of an effect's size
 Subset = tuple[int, ...]  # columns of a Gram matrix, of effects or of all
 

@@ -24,7 +24,7 @@ from mjx_tt.diagnosis.ball.flights.linearization import (
     shifts,
 )
 from mjx_tt.diagnosis.ball.flights.noise import Noise
-from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE, SpinPrior, learned
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_RANGE, TINY, SpinPrior, learned
 from mjx_tt.diagnosis.ball.scores import LARGEST_SUBSET, Scores, Subset
 
 FLOOR = 0.003  # [m] shift of the last sample below which an effect is of no practical interest
@@ -342,7 +342,7 @@ def fitted_spins(p: Projected, choice: Choice) -> Float[np.ndarray, "3 n"]:
     prior = choice.prior
     if prior is None:
         return np.zeros((3, len(p.gram)))
-    middle, precision = prior.of_balls(len(p.gram), scores.TINY)
+    middle, precision = prior.of_balls(len(p.gram), TINY)
     left = p.spin_right - p.spin_effect @ _theta(p, choice) - np.einsum("nab,bn->na", p.spin_gram, middle)
     return middle + np.linalg.solve(p.spin_gram + precision, left[..., None])[..., 0].T
 

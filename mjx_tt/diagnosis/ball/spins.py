@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem
+from mjx_tt.diagnosis.ball.flights.spin_prior import TINY
 from mjx_tt.diagnosis.ball.selection import Settled, fitted_spins
 
 HEADER = ("session", "trajectory", "t", *(f"{kind}_{axis}" for kind in ("spin", "std") for axis in "xyz"))
@@ -44,7 +44,7 @@ def estimate(problem: BallProblem, settled: Settled, balls: Sequence[Trajectory]
     prior, p = settled.choice.prior, settled.projected
     if prior is None:
         return None
-    precision = prior.of_balls(len(balls), scores.TINY)[1]
+    precision = prior.of_balls(len(balls), TINY)[1]
     mean = settled.at.start[SPIN] if prior.conditional else fitted_spins(p, settled.choice)
     covariance = np.linalg.inv(p.spin_gram + precision)
     variance = np.einsum("can,nab,cbn->cn", problem.axes, covariance, problem.axes)

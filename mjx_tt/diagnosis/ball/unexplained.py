@@ -13,6 +13,7 @@ from mjx_tt.diagnosis.ball import basis_functions, scores, selection
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.ball.flights.linearization import Linear, Projected, StartsOut
+from mjx_tt.diagnosis.ball.flights.spin_prior import TINY
 from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial
 
 BLOCK_LEVEL = 2e-5  # chance of one block's false alarm
@@ -231,7 +232,7 @@ def _odd_balls(linear: Linear, flights: StartsOut, choice: Choice, g: Grid) -> F
     both = flights.project(np.stack(columns))
     gram, right = both.gram, both.right
     if choice.prior is not None:
-        middle, precision = choice.prior.of_balls(g.n, scores.TINY)
+        middle, precision = choice.prior.of_balls(g.n, TINY)
         if choice.prior.conditional:
             precision = scores.loosened(precision, both.spin_gram)
         inner = both.spin_gram + precision

@@ -114,7 +114,7 @@ def fit(
         problem = BallProblem(g, model, effects, heading(g))
         nominal = Situation(np.zeros(len(effects)), first_fit(problem))
         if problem.nominal[LIFT] == 0.0 and LIFT not in prior:
-            return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say, SCATTER, None, True))
+            return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say, SCATTER, integrated=True))
         lift = [i for i, effect in enumerate(effects) if effect.path == LIFT]
         besides = (lift[0], LIFT_ERROR) if lift else None
         say(f"fitting the spins of {g.n} balls")
@@ -122,7 +122,7 @@ def fit(
         deviation = _deviation(problem, situation)
         ordinary = deviation <= WORST * np.median(deviation)
         if ordinary.all():
-            whole = posterior.fit(problem, situation, spins, (), say, SCATTER, besides, True)
+            whole = posterior.fit(problem, situation, spins, (), say, SCATTER, besides, integrated=True)
             found = BallsTogether(problem, whole)
             deviation = _deviation(problem, found.posterior.at)
             ordinary = deviation <= WORST_FITTED * np.median(deviation)

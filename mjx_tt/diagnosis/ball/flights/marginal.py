@@ -14,8 +14,8 @@ from jaxtyping import Float
 from scipy.optimize import minimize
 
 from mjx_tt.diagnosis.ball.flights.linearization import KICK, BallProblem, Linear, Situation, StartsOut
-from mjx_tt.diagnosis.ball.flights.noise import ALIKE, Noise
-from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior, learned
+from mjx_tt.diagnosis.ball.flights.noise import ALIKE, LEAST_SCATTER, Noise
+from mjx_tt.diagnosis.ball.flights.spin_prior import TINY, SpinPrior, learned
 
 ALTERNATIONS = 3
 LEAST_LEFT = 0.03  # of the information, when the distributions' unknowns are projected out
@@ -24,7 +24,6 @@ FARTHEST = 4.0  # deviations at which a kick counts that lies farther off
 LEAST_KICK, MOST_KICK = 1e-3, 1.0  # [m/s] deviations of kicks: a flight shows its own within some 10 mm/s
 WIDE_MEAN = 100.0  # [rad/s] within which the mean of all spins lies anyway
 WIDE_LOG = 1.0  # of the logarithm of a spread, about the one that was found last
-TINY = 1e-3  # [rad/s] deviation that no spin's falls below
 
 
 @dataclass(frozen=True)
@@ -54,9 +53,9 @@ class Evidence:
         At least LEAST_LEFT of that under given distributions is left in every direction: it is a difference of
         expectations and of sums over balls, which need not cancel as they should.
         """
-        if not self.spreads:
-            return self.alone[np.ix_(chosen, chosen)] + np.diag(before)
         alone = self.alone[np.ix_(chosen, chosen)] + np.diag(before)
+        if not self.spreads:
+            return alone
         size = np.sqrt(np.diagonal(alone))
         lower = np.linalg.cholesky(alone / size[:, None] / size + 1e-12 * np.eye(len(chosen))) * size[:, None]
         rest = self.gram.sum(axis=0)[np.ix_(chosen, chosen)] + np.diag(before)
@@ -131,7 +130,7 @@ def distributions(
 
 def _of_kicks(scatter: Float[np.ndarray, 3]) -> Float[np.ndarray, "3 3"]:
     """Precision of the kicks."""
-    return np.diag(np.maximum(scatter, LEAST_KICK * 1e-3) ** -2.0)
+    return np.diag(np.maximum(scatter, LEAST_SCATTER) ** -2.0)
 
 
 def _alone(

@@ -16,6 +16,7 @@ from jaxtyping import Float
 MAGNUS_PRIOR = (0.6, 0.4)  # mean and deviation of the coefficient k, where the nominal model has none
 MAGNUS_RANGE = (0.1, 2.0)  # that any source reports, with a margin
 ROUNDS = 120
+TINY = 1e-3  # [rad/s] spread of balls that do not spin
 LEAST_STD = 1.0  # [rad/s] of a component about each axis: below it no flight shows a spread
 # Where the air hardly lifts, balls that slide through their bounce could have any spin: it shows no more than its sign.
 # The fastest strokes of professionals lie at some 900 rad/s.

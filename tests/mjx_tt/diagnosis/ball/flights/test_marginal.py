@@ -7,9 +7,17 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
+from ballmodel.trajectory import Trajectory
+from mjx_tt.diagnosis.ball.effects import EFFECTS
 from mjx_tt.diagnosis.ball.flights import marginal
+from mjx_tt.diagnosis.ball.flights.fit import heading
+from mjx_tt.diagnosis.ball.flights.forward_model import grid
+from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, BallProblem, Situation
 from mjx_tt.diagnosis.ball.flights.marginal import Products
+from mjx_tt.diagnosis.ball.flights.noise import nominal_noise
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
+from mjx_tt.sim.model import SimModel, with_values
+from tests.exam.generator.world import World, fly
 
 BALLS, ROWS, STARTS = 500, 14, 2
 TRUTH = np.array([0.6, -0.4])  # by how much spins show; of a column without spin
@@ -171,3 +179,36 @@ def test_kicks_that_are_none_are_seen_at_once():
     )
     _, scatter = marginal.distributions(p, np.zeros(1), None, np.full(3, 0.1))
     assert np.all(scatter < 0.008)  # one step of expectation-maximisation leaves half of what one flight shows: 0.016
+
+
+def test_growth_is_the_derivative_of_what_flights_say_about_spins():
+    """By differences of the information itself, starts projected out at each place, on flights of other code."""
+    rng = np.random.default_rng(5)
+    position = rng.uniform([[-0.4], [1.0], [0.2]], [[0.4], [1.6], [0.4]], (3, 24))
+    velocity = rng.uniform([[-0.6], [-5.0], [0.5]], [[0.6], [-4.0], [1.5]], (3, 24))
+    spins = rng.normal(0.0, 20.0, (3, 24))
+    time = np.arange(60) / 125.0
+    path = fly(World(magnus_coefficient=0.6), np.concatenate([position, velocity, spins]), time[-1] + 0.01)
+    seen = path.at(np.repeat(time[:, None], 24, axis=1))
+    effects = tuple(e for e in EFFECTS if e.name in ("magnus_coefficient", "drag_coefficient"))
+    g = grid([Trajectory("day", str(i), time, seen[:, :, i]) for i in range(24)])
+    problem = BallProblem(g, with_values(SimModel(), {MAGNUS: 0.6}), effects, heading(g))
+    start = np.concatenate([position, velocity, spins, np.zeros((3, 24))])
+    weight = np.ones((24, len(time)))
+
+    def flights(theta: np.ndarray):
+        at = Situation(theta, start)
+        linear = problem.linearise(at)
+        return at, linear, marginal.starts_out(linear, at, nominal_noise(g), weight, problem)
+
+    at, linear, out = flights(np.zeros(2))
+    more = marginal.growth(problem, out, linear, at, [0, 1])
+    precision = np.eye(3) / 20.0**2
+    known = np.linalg.inv(marginal.products(linear, out).own[:, :3, :3] + precision)
+    for k, effect in enumerate(effects):
+        step = 0.05 * effect.scale * np.eye(2)[k]
+        up, down = (marginal.products(*flights(s)[1:]).own[:, :3, :3] for s in (step, -step))
+        size = [np.linalg.slogdet(m + precision)[1] for m in (up, down)]
+        expected = (size[0] - size[1]) / (2.0 * step[k])
+        found = 2.0 * np.einsum("nab,nba->n", known, more[:, :3, :, k])
+        assert np.median(np.abs(found - expected)) < 0.03 * np.median(np.abs(expected))
