@@ -30,9 +30,11 @@ rig-demo: $(READY)
 study-quick: $(READY)
 	$(BIN)/mjx-tt is2r study_quick.yaml --out runs
 
-# Files of tests are spread over two processes; tests in real time run after them, one by one.
+# Files of tests are spread over processes, two unless WORKERS says otherwise; tests in real time run after them, one by
+# one.
+WORKERS  ?= 2
 PYTEST   := $(BIN)/python -m pytest
-PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
+PARALLEL := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # Where arrays are computed: every annotation is checked, types and ranks of arrays change only where the code says so.
 # The longest come first, so that neither process waits for the other at the end.
@@ -47,7 +49,7 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m "slow and not realtime"
-	USERS_FUSION=1 $(PYTEST) tests/experiments/study -m slow
+	USERS_FUSION=1 $(PYTEST) $(PARALLEL) tests/experiments/study -m slow
 	$(PYTEST) $(REALTIME) -m "slow and realtime"
 
 test-all: test test-slow

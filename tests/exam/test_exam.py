@@ -512,7 +512,7 @@ FIXED = [
     pytest.param(Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",), marks=SLOW),
     pytest.param(Case("invented", ("air_jet",), 20.0, "iid", 17, count=200), ("flagged",), marks=SLOW),
     pytest.param(
-        Case("deleted", ("table_friction",), 20.0, "iid", 18, without=("table_friction",), count=200),
+        Case("deleted", ("table_friction",), 20.0, "iid", 18, without=("table_friction",), count=100),
         ("flagged",),
         marks=SLOW,
     ),

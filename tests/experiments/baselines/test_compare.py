@@ -343,19 +343,18 @@ def test_a_shipped_comparison_is_valid(name):
 @pytest.mark.slow
 def test_a_site_trains_the_same(tmp_path):
     """One after the other in this process, and by a worker of Parsl's: the same policies, curves and evaluations."""
-    path = write(tmp_path, SMALL | {"seeds": [0, 1]})
+    path = write(tmp_path, SMALL | {"seeds": [1]})
     here = Site.model_validate({"provider": {"kind": "local"}, "workers_per_node": 1, "memory_per_worker": 1.0})
     for out, workers in (("alone", ALONE), ("site", Workers(1, here, "here.yaml"))):
         compare.compare(*baselines.load(path), str(path), tmp_path / out, Console(), workers)
-    for seed in (0, 1):
-        alone, site = (tmp_path / out / "small" / "ES" / f"seed{seed}" for out in ("alone", "site"))
-        arrays, others = (checkpoint.read_latest(folder / "policy")[0] for folder in (alone, site))
-        assert arrays.keys() == others.keys() and len(arrays) > 0
-        assert all(arrays[name].tobytes() == others[name].tobytes() for name in arrays)
-        assert (alone / "evaluation.json").read_bytes() == (site / "evaluation.json").read_bytes()
-        curves = [json.loads((folder / "training.json").read_text())["curve"] for folder in (alone, site)]
-        timeless = [[p | {"seconds": 0, "cpu_seconds": 0} for p in curve] for curve in curves]
-        assert timeless[0] == timeless[1]
+    alone, site = (tmp_path / out / "small" / "ES" / "seed1" for out in ("alone", "site"))
+    arrays, others = (checkpoint.read_latest(folder / "policy")[0] for folder in (alone, site))
+    assert arrays.keys() == others.keys() and len(arrays) > 0
+    assert all(arrays[name].tobytes() == others[name].tobytes() for name in arrays)
+    assert (alone / "evaluation.json").read_bytes() == (site / "evaluation.json").read_bytes()
+    curves = [json.loads((folder / "training.json").read_text())["curve"] for folder in (alone, site)]
+    timeless = [[p | {"seconds": 0, "cpu_seconds": 0} for p in curve] for curve in curves]
+    assert timeless[0] == timeless[1]
 
 
 def test_trainings_at_a_time():
