@@ -47,6 +47,7 @@ from experiments.study.schedule import (
 )
 from experiments.study.target_domain import hidden_effects as realities
 from experiments.study.target_domain import on_robot
+from experiments.study.target_domain.evaluation_on_robot import blind_steps, rally_step
 from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.world import VirtualWorld, World
 from experiments.study.training import POLICY
@@ -369,7 +370,7 @@ class Loop(Places):
             run_of = partial(self.run_of, seed, trainer, policy.parent.name)
             folder = self.seed_folder(seed) / "rallies" / "-".join(who[1:])
             rallies = self.study.evaluation.rallies
-            found.append(on_robot.rally_step(folder, who, run_of, (policy,), rallies, self.console))
+            found.append(rally_step(folder, who, run_of, (policy,), rallies, self.console))
         return found
 
     def _blind(self, seed: int, robot: str) -> list[Step]:
@@ -384,7 +385,7 @@ class Loop(Places):
             }
             folder = self.seed_folder(seed) / "blind" / f"{trainer}-{evaluator}"
             inputs = tuple(dict.fromkeys(places.values()))
-            found += on_robot.blind_steps(folder, seed, trainer, evaluator, runs_of, inputs, robot, self.console)
+            found += blind_steps(folder, seed, trainer, evaluator, runs_of, inputs, robot, self.console)
         return found
 
     def _collect(self, before: list[Step]) -> Step:

@@ -1,4 +1,4 @@
-"""A study on a robot: the loop waits for its operator, who fine-tunes by ``mjx-tt finetune``, counts rallies blindly.
+"""A study on a robot: the loop waits for its operator, who fine-tunes by ``mjx-tt finetune``.
 
 A step that people do is started here with the same code as the command of its own, and goes on where it was left. What
 they have not finished ends the program with a sentence that says what to do; the same command then continues the study.
@@ -7,7 +7,6 @@ they have not finished ends the program with a sentence that says what to do; th
 from __future__ import annotations
 
 import json
-import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -23,27 +22,19 @@ from experiments.config import robot as robots
 from experiments.config.study import Study
 from experiments.deploy import session, session_logs
 from experiments.deploy.rig import RIG
-from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.errors import ConfigError, RunError, checked
 from experiments.finetuning import loop
 from experiments.finetuning import session as tuning
-from experiments.finetuning.robot import SCENE, BallRecorder, LockStepRobot
-from experiments.runs import load_policy
+from experiments.finetuning.robot import LockStepRobot
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
-from experiments.study.analysis import scoring
-from experiments.study.blind import protocol
+from experiments.study.target_domain.evaluation_on_robot import exported, seed_of
 from experiments.study.target_domain.hit_log import HitLog
-from experiments.study.workflow import Step, Waiting
-from experiments.training import finalize
-from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, before_racket, load_logs
-from mjx_tt.rally.end_reasons import End
-from robot_io.emulator.config import RigParams
-from robot_io.emulator.lockstep import LockStep
+from experiments.study.target_domain.served_balls import LEAST_SAMPLES, served
+from experiments.study.workflow import Waiting
+from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, load_logs
 
-LEAST_SAMPLES = 20  # of a ball that is looked at
 BALLS, AROUND = 120, 1.0  # of a fine-tuning of which everything is kept; [s] of the joints before and after them
-LONGEST_SERVICE, FEWEST_SERVICES = 2.0, 5  # [s] from ball to ball; one in five at least can be used
 
 
 def look_up(study: Study, robot: str) -> None:
@@ -79,7 +70,7 @@ class RobotWorld:
         """Balls of the player recorded before the study, on the rig without a recording those that the virtual player
         serves. Raises ConfigError as ``recording`` does."""
         if player not in self._study.recordings:
-            return served(player, self._study.first_balls, _seed(name), name.rsplit("/", 1)[-1])
+            return served(player, self._study.first_balls, seed_of(name), name.rsplit("/", 1)[-1])
         measured = recording(self._study, player)
         # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
         label = name.rsplit("/", 1)[-1]
@@ -89,7 +80,7 @@ class RobotWorld:
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         """``mjx-tt finetune``; raises Waiting when the operator stopped it."""
         study = self._study
-        settings = study.fine_tuning.model_copy(update={"updates": real_updates, "seed": _seed(name)})
+        settings = study.fine_tuning.model_copy(update={"updates": real_updates, "seed": seed_of(name)})
         balls = settings.updates * settings.episodes_per_update
         self._console.print(
             f"{name}: {player} to the table, {balls:,} balls for {settings.updates} updates and twice "
@@ -105,7 +96,7 @@ class RobotWorld:
             None,
             None,
             "numpy",
-            _seed(name),
+            seed_of(name),
             self._console,
             player if self._robot == RIG else None,
         )
@@ -139,12 +130,12 @@ class RobotWorld:
         balls, robot = self._study.simulation.selection_episodes, self._robot
         experiment = loop.experiment_of(trained.source)
         if robot == tuning.LOCK_STEP:
-            emulated = loop.lock_step_robot(experiment, seed=_seed(name))
+            emulated = loop.lock_step_robot(experiment, seed=seed_of(name))
             return float(np.mean([_lock_step(emulated, trained, n) for n in range(balls)]))
         artefact = exported(trained, self._console)
         logs = trained.source / "selection"
         self._console.print(f"{name}: {player} plays {balls} balls with {trained.source.name}", highlight=False)
-        session.run(artefact, robot, balls, None, "numpy", logs, None, _seed(name), None, self._console)
+        session.run(artefact, robot, balls, None, "numpy", logs, None, seed_of(name), None, self._console)
         found = json.loads(max(logs.glob("*.json")).read_text(encoding="utf-8"))
         if found["episodes"] < balls:
             raise Waiting(
@@ -156,20 +147,6 @@ class RobotWorld:
 def _lock_step(robot: LockStepRobot, trained: TrainedPolicy, number: int) -> float:
     summary = robot.play(trained.policy.astype(np.float32), number).summary
     return -2.0 if summary.fault else float(summary.outcome != "missed") + float(summary.outcome == "returned")
-
-
-def _seed(name: str) -> int:
-    return zlib.crc32(name.encode()) >> 1
-
-
-def exported(trained: TrainedPolicy, console: Console) -> Path:
-    """The artefact of a run, exported if it has none. Raises ConfigError for a policy that the robot cannot run."""
-    folder = Run(trained.source).artefact
-    if not (folder / "manifest.json").exists():
-        experiment = loop.experiment_of(trained.source)
-        if not finalize.export_policy(folder, trained, experiment, None, console):
-            raise ConfigError(f"{trained.source}: acts at another rate than the robot")
-    return folder
 
 
 def by_stroke(track: Trajectory) -> tuple[Trajectory, ...]:
@@ -185,103 +162,3 @@ def by_stroke(track: Trajectory) -> tuple[Trajectory, ...]:
                 cuts.append(farthest)
             away, farthest = not away, i
     return tuple(track.part(a, b) for a, b in pairwise([*cuts, len(y)]))
-
-
-class Still:
-    """A policy that stays where it is."""
-
-    def reset(self) -> None:
-        pass
-
-    def step(self, observation: np.ndarray) -> np.ndarray:
-        return np.zeros(len(observation) - 3)
-
-
-def served(player: str, count: int, seed: int, session: str) -> Dataset:
-    """Balls that a virtual player serves, as the emulated trackers measured them; the robot stands still."""
-    recorder = BallRecorder()
-    rig = LockStep(SCENE, VirtualPlayer(player, seed), Still(), RigParams(seed=seed % 2**31), recorder=recorder)
-    rig.throwing = True
-    found: tuple[Trajectory, ...] = ()
-    while len(found) < count:
-        before = len(found)
-        rig.run(LONGEST_SERVICE * max(count - before, FEWEST_SERVICES))
-        tracks = (recorder.trajectory(ball) for ball in recorder.balls)
-        whole = [track for track in tracks if len(track) >= LEAST_SAMPLES]
-        found = tuple(Trajectory(session, str(i), t[:, 0], t[:, 1:].T) for i, t in enumerate(whole[:count]))
-        if len(found) == before:
-            raise RunError(f"{player} serves no ball on the rig")
-    return Dataset(tuple(before_racket(t) for t in found), f"{player} on the rig")
-
-
-def rally_step(
-    folder: Path,
-    who: tuple[int, str, str, str],
-    run_of: Callable[[], Path],
-    inputs: tuple[Path, ...],
-    rallies: int,
-    console: Console,
-) -> Step:
-    """Rallies of a virtual player with a policy on the rig. who: seed, trainer, evaluator, model."""
-    seed, trainer, evaluator, model = who
-    name, counted = f"seed{seed}/rallies/{trainer}-{evaluator}-{model}", folder / protocol.EVALUATIONS
-
-    def run() -> str:
-        artefact = exported(load_policy.load(run_of()), console)
-        session.run(artefact, RIG, None, None, "numpy", folder, None, _seed(name), None, console, rallies, evaluator)
-        report = max(folder.glob("*.json"))
-        found = json.loads(report.read_text(encoding="utf-8")).get("rallies") or {"list": []}
-        played = [(one["length"], End[one["end"]]) for one in found["list"]]
-        if sum(not one["filtered"] for one in found["list"]) < rallies:
-            raise RunError(f"{report}: {len(played)} rallies were played, {rallies} that count are needed; once more")
-        scored = scoring.scored(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
-        scoring.write(counted, scored)
-        return f"{len(played)} rallies, {scored.length[~scored.filtered].mean():.1f} touches on average"
-
-    return Step(name, "rallies", rallies, inputs, (counted,), run)
-
-
-def blind_steps(
-    folder: Path,
-    seed: int,
-    trainer: str,
-    evaluator: str,
-    runs_of: dict[str, Callable[[], Path]],
-    inputs: tuple[Path, ...],
-    robot: str,
-    console: Console,
-) -> list[Step]:
-    """Two steps: policies under code names with a scoring sheet; then, the sheet filled in, its rallies.
-
-    folder: of this evaluation; runs_of: each model's run. What is played is ``mjx-tt run FOLDER/policies/CODE``.
-    """
-    name, sheet, counted = (
-        f"seed{seed}/blind/{trainer}-{evaluator}",
-        folder / protocol.SHEET,
-        folder / protocol.EVALUATIONS,
-    )
-
-    def make() -> str:
-        if (folder / protocol.KEY).exists() and not sheet.exists():  # killed in between
-            protocol.progress(folder)
-        elif not (folder / protocol.KEY).exists():
-            policies = {model: exported(load_policy.load(run()), console) for model, run in runs_of.items()}
-            # The ablation's oracle is a model of the loop under a second name.
-            codes = protocol.make(folder, policies, trainer, evaluator, seed, twice=True)
-            return f"{len(codes)} policies as {', '.join(codes)}"
-        return "policies under code names"
-
-    def count() -> str:
-        left = [f"{p.code} has {p.counted} of {scoring.KEEP}" for p in protocol.progress(folder) if not p.complete]
-        if left:
-            raise Waiting(
-                f"{name}: {evaluator} plays rallies with "
-                f"`mjx-tt run {folder / protocol.POLICIES}/CODE --robot {robot}` and "
-                f"writes each down in {sheet}; rallies that count: {', '.join(left)}. Then the same command continues"
-            )
-        return f"{len(protocol.open_key(folder)):,} rallies"
-
-    return [
-        Step(name, "blind", 1, inputs, (folder / protocol.KEY, sheet), make),
-        Step(f"{name} counted", "blind", 1, (folder / protocol.KEY,), (counted,), count),
-    ]

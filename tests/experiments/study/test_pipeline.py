@@ -37,8 +37,8 @@ from experiments.study.analysis import effect_costs, scoring
 from experiments.study.blind import protocol
 from experiments.study.schedule import Human, Identified, Real, Simulated
 from experiments.study.target_domain import hidden_effects
+from experiments.study.target_domain.evaluation_on_robot import blind_steps
 from experiments.study.target_domain.finetuning import VirtualReality
-from experiments.study.target_domain.on_robot import blind_steps
 from experiments.study.workflow import Journal, Step, Waiting, remaining, run_all, unfinished
 from mjx_tt.env import rewards
 from mjx_tt.env.policy import Policy, initial_theta

@@ -15,7 +15,7 @@ from experiments.finetuning.robot import LockStepRallies
 from experiments.runs import load_policy
 from experiments.study import identification
 from experiments.study.analysis.identified import LOGS, estimates
-from experiments.study.target_domain import on_robot
+from experiments.study.target_domain import on_robot, served_balls
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io import log
@@ -50,7 +50,7 @@ def test_a_fine_tuning_without_a_log_is_told_so(tmp_path):
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     path = tmp_path_factory.mktemp("served") / "D0.csv"
-    balls = on_robot.served("player3", 60, 3, "D0")
+    balls = served_balls.served("player3", 60, 3, "D0")
     assert len(balls) == 60 and all(t.position[1, 0] > 0.5 and t.position[1].min() < 0.0 for t in balls)
     measurements.write_csv(path, balls)
     return path

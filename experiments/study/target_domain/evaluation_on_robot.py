@@ -1,0 +1,111 @@
+"""Final evaluation on a robot: a virtual player's rallies on the rig, or people's with policies under code names."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from experiments.deploy import session
+from experiments.deploy.rig import RIG
+from experiments.errors import ConfigError, RunError
+from experiments.finetuning import loop
+from experiments.runs import load_policy
+from experiments.runs.load_policy import TrainedPolicy
+from experiments.runs.run_dir import Run
+from experiments.study.analysis import scoring
+from experiments.study.blind import protocol
+from experiments.study.workflow import Step, Waiting
+from experiments.training import finalize
+from mjx_tt.rally.end_reasons import End
+
+
+def seed_of(name: str) -> int:
+    """Seed of a step of that name."""
+    return zlib.crc32(name.encode()) >> 1
+
+
+def exported(trained: TrainedPolicy, console: Console) -> Path:
+    """The artefact of a run, exported if it has none. Raises ConfigError for a policy that the robot cannot run."""
+    folder = Run(trained.source).artefact
+    if not (folder / "manifest.json").exists():
+        experiment = loop.experiment_of(trained.source)
+        if not finalize.export_policy(folder, trained, experiment, None, console):
+            raise ConfigError(f"{trained.source}: acts at another rate than the robot")
+    return folder
+
+
+def rally_step(
+    folder: Path,
+    who: tuple[int, str, str, str],
+    run_of: Callable[[], Path],
+    inputs: tuple[Path, ...],
+    rallies: int,
+    console: Console,
+) -> Step:
+    """Rallies of a virtual player with a policy on the rig. who: seed, trainer, evaluator, model."""
+    seed, trainer, evaluator, model = who
+    name, counted = f"seed{seed}/rallies/{trainer}-{evaluator}-{model}", folder / protocol.EVALUATIONS
+
+    def run() -> str:
+        artefact = exported(load_policy.load(run_of()), console)
+        session.run(artefact, RIG, None, None, "numpy", folder, None, seed_of(name), None, console, rallies, evaluator)
+        report = max(folder.glob("*.json"))
+        found = json.loads(report.read_text(encoding="utf-8")).get("rallies") or {"list": []}
+        played = [(one["length"], End[one["end"]]) for one in found["list"]]
+        if sum(not one["filtered"] for one in found["list"]) < rallies:
+            raise RunError(f"{report}: {len(played)} rallies were played, {rallies} that count are needed; once more")
+        scored = scoring.scored(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
+        scoring.write(counted, scored)
+        return f"{len(played)} rallies, {scored.length[~scored.filtered].mean():.1f} touches on average"
+
+    return Step(name, "rallies", rallies, inputs, (counted,), run)
+
+
+def blind_steps(
+    folder: Path,
+    seed: int,
+    trainer: str,
+    evaluator: str,
+    runs_of: dict[str, Callable[[], Path]],
+    inputs: tuple[Path, ...],
+    robot: str,
+    console: Console,
+) -> list[Step]:
+    """Two steps: policies under code names with a scoring sheet; then, the sheet filled in, its rallies.
+
+    folder: of this evaluation; runs_of: each model's run. What is played is ``mjx-tt run FOLDER/policies/CODE``.
+    """
+    name, sheet, counted = (
+        f"seed{seed}/blind/{trainer}-{evaluator}",
+        folder / protocol.SHEET,
+        folder / protocol.EVALUATIONS,
+    )
+
+    def make() -> str:
+        if (folder / protocol.KEY).exists() and not sheet.exists():  # killed in between
+            protocol.progress(folder)
+        elif not (folder / protocol.KEY).exists():
+            policies = {model: exported(load_policy.load(run()), console) for model, run in runs_of.items()}
+            # The ablation's oracle is a model of the loop under a second name.
+            codes = protocol.make(folder, policies, trainer, evaluator, seed, twice=True)
+            return f"{len(codes)} policies as {', '.join(codes)}"
+        return "policies under code names"
+
+    def count() -> str:
+        left = [f"{p.code} has {p.counted} of {scoring.KEEP}" for p in protocol.progress(folder) if not p.complete]
+        if left:
+            raise Waiting(
+                f"{name}: {evaluator} plays rallies with "
+                f"`mjx-tt run {folder / protocol.POLICIES}/CODE --robot {robot}` and "
+                f"writes each down in {sheet}; rallies that count: {', '.join(left)}. Then the same command continues"
+            )
+        return f"{len(protocol.open_key(folder)):,} rallies"
+
+    return [
+        Step(name, "blind", 1, inputs, (folder / protocol.KEY, sheet), make),
+        Step(f"{name} counted", "blind", 1, (folder / protocol.KEY,), (counted,), count),
+    ]
