@@ -5,7 +5,7 @@ before any is named all are fitted together: Gauss-Newton on the nonlinear model
 its spin marginalised about its own best fit (the conditional linearisation of Lindstrom and Bates, Biometrics 46,
 1990), until nothing moves. An identification maximises the evidence itself, spins and kicks integrated out. An
 effect's prior is Student's with the catalogue's ``scale``: ordinary sizes cost little, a large one is not forbidden.
-Intervals take their spread from ball to ball; of an identification that did not settle, its last step as well.
+Intervals take their spread from ball to ball.
 """
 
 from __future__ import annotations
