@@ -113,8 +113,6 @@ def fit(
         if round_ >= held and (moved < SETTLED or stalled >= 2):
             converged = moved < NEARLY_SETTLED
             break
-    if integrated and not converged:
-        covariance += np.outer(change, change)  # where it would go on to it may be as well
     if prior is not None:
         start = refit_worst(problem, at.theta, at.start, g, own, prior)
         at = Situation(at.theta, fit_starts(problem, at.theta, start, g, own, prior))
