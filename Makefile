@@ -2,7 +2,8 @@
 # make demo   set up, train the quickstart, evaluate it, export it
 # make rig-demo  the same policy plays 20 rallies with a virtual player on the emulated robot, over real sockets in
 #             real time (trains it first if need be)
-# make study-quick  the whole study in small: five virtual players, all methods, a report (16 to 30 minutes on two cores; resumable)
+# make study-quick  the whole study in small: five virtual players, all methods, a report (16 to 30 minutes on two
+#             cores; resumable)
 # make test   set up and run the tests but for the slow ones (docs/how-to/run-the-tests.md)
 # make test-all  the slow ones as well
 # make check  set up and check style, types and imports

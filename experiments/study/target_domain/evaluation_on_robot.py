@@ -6,6 +6,7 @@ import json
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -22,7 +23,7 @@ from experiments.study.workflow import Step, Waiting
 from experiments.training import finalize
 from mjx_tt.rally.end_reasons import End
 
-SESSIONS = 3  # on the rig at most, until one brings all rallies: a busy machine ends some by faults of its own
+SESSIONS = 3  # on the rig at most, until all rallies are played: a busy machine ends some by faults of its own
 
 
 def seed_of(name: str) -> int:
@@ -54,19 +55,22 @@ def rally_step(
 
     def run() -> str:
         artefact = exported(load_policy.load(run_of()), console)
+        found: list[dict[str, Any]] = []
+        left = rallies
         for attempt in range(SESSIONS):
             chance = seed_of(name) + attempt
-            session.run(artefact, RIG, None, None, "numpy", folder, None, chance, None, console, rallies, evaluator)
+            session.run(artefact, RIG, None, None, "numpy", folder, None, chance, None, console, left, evaluator)
             report = max(folder.glob("*.json"))
-            found = (json.loads(report.read_text(encoding="utf-8")).get("rallies") or {"list": []})["list"]
-            whole = sum(not one["filtered"] for one in found)
-            if whole >= rallies:
+            # What was played counts, however the session ended: to drop it would choose among a policy's sessions.
+            found += (json.loads(report.read_text(encoding="utf-8")).get("rallies") or {"list": []})["list"]
+            left = rallies - sum(not one["filtered"] for one in found)
+            if left <= 0:
                 break
-            console.print(f"{report}: {whole} of {rallies} rallies count", highlight=False, soft_wrap=True)
+            console.print(f"{report}: {left} of {rallies} rallies are left to play", highlight=False, soft_wrap=True)
         else:
             raise RunError(
-                f"{name}: {rallies} rallies that count are needed, and none of {SESSIONS} sessions brought them, the "
-                f"last of which is {report}. Make the machine quiet; the same command goes on here"
+                f"{name}: {rallies} rallies that count are needed, {left} are missing after {SESSIONS} sessions, the "
+                f"last of which is {report}. Make the machine quiet; the same command starts this evaluation again"
             )
         played = [(one["length"], End[one["end"]]) for one in found]
         scored = scoring.scored(seed, trainer, evaluator, model, "", *zip(*played, strict=True))

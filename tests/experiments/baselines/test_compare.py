@@ -342,7 +342,7 @@ def test_a_shipped_comparison_is_valid(name):
 
 @pytest.mark.slow
 def test_a_site_trains_the_same(tmp_path):
-    """One after the other in this process, and by a worker of Parsl's: the same policies, curves and evaluations."""
+    """In this process, and by a worker of Parsl's: the same policies, curves and evaluations."""
     path = write(tmp_path, SMALL | {"seeds": [1]})
     here = Site.model_validate({"provider": {"kind": "local"}, "workers_per_node": 1, "memory_per_worker": 1.0})
     for out, workers in (("alone", ALONE), ("site", Workers(1, here, "here.yaml"))):
