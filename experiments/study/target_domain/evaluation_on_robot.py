@@ -59,18 +59,22 @@ def rally_step(
         left = rallies
         for attempt in range(SESSIONS):
             chance = seed_of(name) + attempt
-            session.run(artefact, RIG, None, None, "numpy", folder, None, chance, None, console, left, evaluator)
+            status = session.run(
+                artefact, RIG, None, None, "numpy", folder, None, chance, None, console, left, evaluator
+            )
+            if status == session.INTERRUPTED:
+                raise KeyboardInterrupt(f"{name}: stopped")
             report = max(folder.glob("*.json"))
             # What was played counts, however the session ended: to drop it would choose among a policy's sessions.
             found += (json.loads(report.read_text(encoding="utf-8")).get("rallies") or {"list": []})["list"]
             left = rallies - sum(not one["filtered"] for one in found)
-            if left <= 0:
+            if left <= 0 or status == 0:  # all are played, or somebody ended it by a key
                 break
             console.print(f"{report}: {left} of {rallies} rallies are left to play", highlight=False, soft_wrap=True)
-        else:
+        if left > 0:
             raise RunError(
-                f"{name}: {rallies} rallies that count are needed, {left} are missing after {SESSIONS} sessions, the "
-                f"last of which is {report}. Make the machine quiet; the same command starts this evaluation again"
+                f"{name}: {rallies} rallies that count are needed, {left} are missing; the last session is {report}. "
+                "Make the machine quiet; the same command starts this evaluation again"
             )
         played = [(one["length"], End[one["end"]]) for one in found]
         scored = scoring.scored(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
