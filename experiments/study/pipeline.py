@@ -235,7 +235,7 @@ class Loop(Places):
             path.parent.mkdir(parents=True, exist_ok=True)
             found.world.save(path)
             count = len(estimates(found.world))
-            doubt = "" if found.settled else "; the balls' fit did not settle: its intervals may be too narrow"
+            doubt = "" if found.settled else "; the balls' fit did not settle: its intervals are wider by its last step"
             return f"{found.flights} flights, {found.hits} hits; {count} parameters moved or drawn{doubt}"
 
         inputs = (*data, *moved, *(folder / identification.BALLS for folder in hits))

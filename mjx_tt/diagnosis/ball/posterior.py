@@ -5,7 +5,7 @@ before any is named all are fitted together: Gauss-Newton on the nonlinear model
 its spin marginalised about its own best fit (the conditional linearisation of Lindstrom and Bates, Biometrics 46,
 1990), until nothing moves. An identification maximises the evidence itself, spins and kicks integrated out. An
 effect's prior is Student's with the catalogue's ``scale``: ordinary sizes cost little, a large one is not forbidden.
-Intervals take their spread from ball to ball.
+Intervals take their spread from ball to ball; of an identification that did not settle, its last step as well.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.effects import FLIGHT, TABLE
 from mjx_tt.diagnosis.ball.flights import marginal, noise
 from mjx_tt.diagnosis.ball.flights.fit import fit_starts, fit_with_cost, log_evidence, refit_worst
+from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.ball.flights.linearization import KICK, MAGNUS, BallProblem, Linear, Projected, Situation, project
 from mjx_tt.diagnosis.ball.flights.marginal import Evidence
 from mjx_tt.diagnosis.ball.flights.noise import Noise
@@ -29,7 +30,6 @@ ROUNDS = 7
 SETTLED = 0.2  # of a standard deviation by which nothing moves any more
 NEARLY_SETTLED = 1.0  # the same, where no share of the step is any better: it was Laplace's approximation that pulled
 MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
-LIFT_HELD = 2  # rounds besides in which the coefficient of lift stays as it is, where spins are integrated out
 # Where air lifts no ball spins hardly show, and could be of any size: no air that anybody measured lifts so little.
 LEAST_LIFT = 0.03
 SHARES = (1.0, 0.5, 0.25, 0.1)  # of a step that are tried in turn
@@ -64,6 +64,8 @@ def fit(
     scatter: Float[np.ndarray, 3] = noise.ALIKE,
     besides: tuple[int, float] | None = None,
     integrated: bool = False,
+    held: int = 0,
+    near: bool = False,
 ) -> Posterior:
     """Maximum of the posterior of all effects that are not left out, from a situation with or without spins.
 
@@ -72,6 +74,8 @@ def fit(
     that has settled
     integrated: the maximum of the evidence, spins and kicks integrated out. The diagnosis does without: it begins at
     these sizes and compares sets of causes by thresholds that were made for the best fits.
+    held: rounds besides in which the coefficient of lift stays as it is
+    near: the situation is a maximum already, of nearly the same balls: all of the noise's memory counts
     """
     g, effects = problem.grid, problem.effects
     free = [
@@ -84,12 +88,10 @@ def fit(
         mean[problem.coefficient], scale[problem.coefficient] = MAGNUS_PRIOR
     covariance = np.diag(scale**2)
     converged, stalled = False, 0
-    held = LIFT_HELD if integrated else 0
     for round_ in range(ROUNDS + held):
         linear = problem.linearise(at)
-        frame = noise.flight_frame(linear.base.velocity[:, :, 0])
-        own = noise.estimate(linear.residual, frame, g, 6 if prior is None else 9)
-        own = replace(noise.without_memory(own, MEMORY[min(round_, len(MEMORY) - 1)]), scatter=scatter)
+        most = MEMORY[-1] if near else MEMORY[min(round_, len(MEMORY) - 1)]
+        own = _noise(linear, g, prior, most, scatter)
         if integrated:
             shown, own, prior = _evidence(problem, linear, at, own, prior, free)
         else:
@@ -113,11 +115,30 @@ def fit(
         if round_ >= held and (moved < SETTLED or stalled >= 2):
             converged = moved < NEARLY_SETTLED
             break
+    if integrated and not converged:
+        covariance += np.outer(change, change)  # where it would go on to it may be as well
     if prior is not None:
         start = refit_worst(problem, at.theta, at.start, g, own, prior)
         at = Situation(at.theta, fit_starts(problem, at.theta, start, g, own, prior))
     linear = problem.linearise(at)
     return Posterior(at.theta, covariance, tuple(free), at, linear, own, prior, converged)
+
+
+def misfit(problem: BallProblem, at: Situation, spins: SpinPrior, scatter: Float[np.ndarray, 3]) -> float:
+    """-2 log of all flights' evidence and the effects' price, but for a constant, under the noise that they show."""
+    g, linear = problem.grid, problem.linearise(at)
+    own = _noise(linear, g, spins, 0.0, scatter)
+    flights = marginal.starts_out(linear, at, own, noise.robust_weights(linear.residual, own, g), problem)
+    prior, scatter = marginal.distributions(marginal.products(linear, flights), at.theta, spins, scatter)
+    cost = log_evidence(problem, at.theta, at.start, g, replace(own, scatter=scatter), prior, 2)[1]
+    spread = 2.0 * np.log(own.scale).sum(axis=0) * g.mask.sum(axis=0)
+    return float((cost + spread).sum() + scores.price(at.theta, np.array([e.scale for e in problem.effects])))
+
+
+def _noise(linear: Linear, g: Grid, spins: SpinPrior | None, memory: float, scatter: Float[np.ndarray, 3]) -> Noise:
+    frame = noise.flight_frame(linear.base.velocity[:, :, 0])
+    own = noise.estimate(linear.residual, frame, g, 6 if spins is None else 9)
+    return replace(noise.without_memory(own, memory), scatter=scatter)
 
 
 def _about_own_spins(p: Projected, prior: SpinPrior | None) -> Evidence:

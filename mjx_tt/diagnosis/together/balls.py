@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from ballmodel.constants import BALL_RADIUS, TABLE_LENGTH, TABLE_WIDTH
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import posterior
 from mjx_tt.diagnosis.ball.diagnose import FEWEST_BALLS, SCATTER, flights
 from mjx_tt.diagnosis.ball.effects import EFFECTS, Numbers
-from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading, own_spins
+from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading, of_some, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import grid
 from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem, Situation
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
@@ -31,6 +31,9 @@ DRAWS = 256
 EDGE, NEAR_TABLE = 0.03, 0.06  # [m] from the edge; of the lowest sample from where a ball touches the table
 WORST, WORST_FITTED = 5.0, 2.0
 FASTEST = 1000.0  # [rad/s]
+LEFT_OUT = "left out, for no ball flies like that: {}"
+FEW = 60  # balls, at most, that say where to begin
+LIFT_HELD = 2  # rounds in which the coefficient of lift stays as it is believed, until all else is about right
 LIFT = "ball.flight.magnus_coefficient"
 LIFT_ERROR = 0.1  # of the coefficient k, beside what the posterior has: see ``BallsTogether.along_lift``
 Prior = Mapping[str, tuple[float, float]]  # mean and standard deviation by dotted path
@@ -65,7 +68,7 @@ class BallsTogether:
 
         How much balls curve shows the product of k and spin, and the two come apart by small differences between the
         flight before and after the bounce, in which a law of lift or bounce that is not quite the model's shows as
-        well. So k has LIFT_ERROR besides, and the others go along as the flights want it.
+        well. So k has LIFT_ERROR besides, and the others go along as the flights want it, as far as air lifts at all.
         """
         paths, found = [e.path for e in self.problem.effects], self.posterior
         theta = np.reshape(found.theta, (-1,) + (1,) * np.ndim(error))
@@ -73,7 +76,7 @@ class BallsTogether:
             return theta + np.zeros_like(error)
         lift = paths.index(LIFT)
         way = found.covariance[lift] / found.covariance[lift, lift]
-        return theta + np.multiply.outer(way, error)
+        return theta + np.multiply.outer(way, np.maximum(error, -self.problem.nominal[LIFT] - found.theta[lift]))
 
     def samples(self, lift: Float[np.ndarray, " S"], seed: int = 0) -> Samples:
         """Draws of the parameters by dotted path. lift: error of the coefficient in each of them."""
@@ -107,30 +110,89 @@ def fit(
     if not effects:
         raise ValueError(f"nothing that flights show is in the prior, which has {', '.join(prior)}")
     model = models.with_values(model, {e.path: prior[e.path][0] for e in effects})
+    first: Posterior | None = None  # of a few balls
     while True:
         if len(kept) < FEWEST_BALLS:
             raise ValueError(f"{len(kept)} usable flights of {len(balls)}, at least {FEWEST_BALLS} are needed")
         g = grid(kept)
         problem = BallProblem(g, model, effects, heading(g))
-        nominal = Situation(np.zeros(len(effects)), first_fit(problem))
+        theta = np.zeros(len(effects))
         if problem.nominal[LIFT] == 0.0 and LIFT not in prior:
+            nominal = Situation(theta, first_fit(problem))
             return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say, SCATTER, integrated=True))
         lift = [i for i, effect in enumerate(effects) if effect.path == LIFT]
         besides = (lift[0], LIFT_ERROR) if lift else None
+        if lift and first is None:
+            first = _of_few(problem, lift[0], say)
         say(f"fitting the spins of {g.n} balls")
-        situation, spins = own_spins(problem, nominal)
-        deviation = _deviation(problem, situation)
-        ordinary = deviation <= WORST * np.median(deviation)
+        situation, spins, ordinary = _begun(problem, theta if first is None else first.theta)
+        if not ordinary.all():
+            say(LEFT_OUT.format(g.n - ordinary.sum()))
+            kept = [t for t, real in zip(kept, ordinary, strict=True) if real]
+            continue
+        found, index = _fitted(problem, situation, spins, besides, first, say)
+        if found is not None:
+            return found
+        kept = [kept[i] for i in index]
+
+
+def _begun(problem: BallProblem, theta: Float[np.ndarray, " K"]) -> tuple[Situation, SpinPrior, Bool[np.ndarray, " n"]]:
+    """Balls with spins of their own under changes theta, the distribution of these, and which balls are ordinary."""
+    situation, spins = own_spins(problem, Situation(theta, first_fit(problem, theta)))
+    deviation = _deviation(problem, situation)
+    return situation, spins, deviation <= WORST * np.median(deviation)
+
+
+def _of_few(problem: BallProblem, lift: int, say: Callable[[str], None]) -> Posterior:
+    """The posterior of a few of the balls: the better of two fits, from the lift that is believed and from hardly any.
+
+    Under a lift that the air does not have the balls' own spins come out as no ball spins, all else goes astray with
+    them, and Gauss-Newton does not find back.
+    """
+    few = of_some(problem, np.unique(np.linspace(0, problem.grid.n - 1, FEW).round().astype(int)))
+    say(f"{few.grid.n} balls first, as if air lifted them and as if it did not")
+    hardly = np.zeros(len(problem.effects))
+    hardly[lift] = posterior.LEAST_LIFT - problem.nominal[LIFT]
+    fits = []
+    for theta, held in ((np.zeros_like(hardly), LIFT_HELD), (hardly, 0)):
+        at, spins, ordinary = _begun(few, theta)
+        stay = np.flatnonzero(ordinary)
+        some = of_some(few, stay)
+        at = Situation(theta, at.start[:, stay])
+        found = posterior.fit(some, at, spins.of_some(stay), (), say, SCATTER, (lift, LIFT_ERROR), True, held)
+        of_all = posterior.misfit(some, found.at, found.prior or spins, found.noise.scatter)
+        fits.append((of_all / some.grid.mask.sum(), found))
+    return min(fits, key=lambda one: one[0])[1]
+
+
+def _fitted(
+    problem: BallProblem,
+    at: Situation,
+    spins: SpinPrior,
+    besides: tuple[int, float] | None,
+    first: Posterior | None,
+    say: Callable[[str], None],
+) -> tuple[BallsTogether | None, Int[np.ndarray, " m"]]:
+    """The posterior of the balls with these indices, which fly like each other; None where all has to begin anew.
+
+    first: of a few of them, where the fit begins. A fit that settled is gone on with when some of its balls are left
+    out; one that did not is no place to begin.
+    """
+    index, near = np.arange(problem.grid.n), first is not None
+    scatter = SCATTER if first is None else first.noise.scatter
+    while True:
+        whole = posterior.fit(problem, at, spins, (), say, scatter, besides, integrated=True, near=near)
+        deviation = _deviation(problem, whole.at)
+        ordinary = deviation <= WORST_FITTED * np.median(deviation)
+        ordinary &= np.linalg.norm(whole.at.start[SPIN], axis=0) <= FASTEST
         if ordinary.all():
-            whole = posterior.fit(problem, situation, spins, (), say, SCATTER, besides, integrated=True)
-            found = BallsTogether(problem, whole)
-            deviation = _deviation(problem, found.posterior.at)
-            ordinary = deviation <= WORST_FITTED * np.median(deviation)
-            ordinary &= np.linalg.norm(found.posterior.at.start[SPIN], axis=0) <= FASTEST
-            if ordinary.all():
-                return found
-        say(f"left out, for no ball flies like that: {g.n - ordinary.sum()}")
-        kept = [t for t, real in zip(kept, ordinary, strict=True) if real]
+            return BallsTogether(problem, whole), index
+        say(LEFT_OUT.format(np.sum(~ordinary)))
+        index, stay = index[ordinary], np.flatnonzero(ordinary)
+        if not whole.converged or whole.prior is None or len(index) < FEWEST_BALLS:
+            return None, index
+        problem, spins = of_some(problem, stay), whole.prior.of_some(stay)
+        at, scatter, near = Situation(whole.at.theta, whole.at.start[:, stay]), whole.noise.scatter, True
 
 
 def clear_of_the_edge(ball: Trajectory) -> bool:

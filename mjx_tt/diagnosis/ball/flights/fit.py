@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Int
 
 from mjx_tt.diagnosis.ball.flights import noise
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid, picked, predict
@@ -184,14 +185,20 @@ def refit_worst(
     worst = np.flatnonzero(per_sample > WORST * np.median(per_sample))
     if not worst.size:
         return start
-    few = picked(g, worst)
+    some = of_some(problem, worst)
+    few = some.grid
     own = replace(noise, frame=noise.frame[..., worst], scale=noise.scale[:, worst])
-    some = BallProblem(few, problem.model, problem.effects, heading(few))
     again = fit_spins(some, theta, start[:, worst], few, own, prior.of_some(worst), OTHER_SPINS)
     again, new = fit_with_cost(some, theta, again, few, own, prior.of_some(worst), rounds=4)
     out = start.copy()
     out[:, worst] = np.where(new < cost[worst], again, start[:, worst])
     return out
+
+
+def of_some(problem: BallProblem, index: Int[np.ndarray, " m"]) -> BallProblem:
+    """The problem of the balls with these indices alone, which may repeat."""
+    g = picked(problem.grid, index)
+    return BallProblem(g, problem.model, problem.effects, heading(g))
 
 
 def heading(g: Grid) -> np.ndarray:
