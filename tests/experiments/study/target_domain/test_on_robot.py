@@ -73,6 +73,7 @@ def identified(folder, served, late: float):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_sessions_of_the_emulated_robot_show_by_how_much_it_obeys_later(tmp_path, served):
     (tmp_path / "as_built").mkdir()
     (tmp_path / "late").mkdir()
@@ -90,6 +91,7 @@ def test_sessions_of_the_emulated_robot_show_by_how_much_it_obeys_later(tmp_path
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_without_a_log_of_the_joints_the_drives_are_drawn_from_the_prior(served):
     before = identification.prior(PRIOR, "prior")
     made = identification.identify([served], 60, ModelFile(SimModel()), before)
