@@ -162,7 +162,7 @@ def _of_few(problem: BallProblem, lift: int, say: Callable[[str], None]) -> Post
         found = posterior.fit(some, at, spins.of_some(stay), (), say, SCATTER, (lift, LIFT_ERROR), True, held)
         of_all = posterior.misfit(some, found.at, found.prior or spins, found.noise.scatter)
         fits.append((of_all / some.grid.mask.sum(), found))
-    return min(fits, key=lambda one: one[0])[1]
+    return min(fits, key=lambda one: np.nan_to_num(one[0], nan=np.inf))[1]
 
 
 def _fitted(
