@@ -160,8 +160,8 @@ def fit_spins(
     is not always found. prior: wide, so that only what the flight does not show is drawn to it.
     """
     count = len(tries)
-    many = picked(g, np.tile(np.arange(g.n), count))
-    tried = BallProblem(many, problem.model, problem.effects, heading(many))
+    tried = of_some(problem, np.tile(np.arange(g.n), count))
+    many = tried.grid
     begin = np.tile(start, count)
     begin[SPIN] = np.repeat(np.array(tries, float).T, g.n, axis=1)
     changes = theta if theta.ndim == 1 else np.tile(theta, count)
