@@ -24,14 +24,13 @@ from robot_io.emulator.axis_server import serve
 from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
-from robot_io.emulator.shared_state import Motion, Shared
+from robot_io.emulator.shared_state import ASLEEP, START_TIME, Motion, Shared
 from robot_io.emulator.tracker import TrackerEmulator
 from robot_io.emulator.world import World
 from robot_io.errors import DeviceError
 
 HOST = "127.0.0.1"
-WORLD_STEP = 0.002  # [s]
-START_TIME = 60.0  # [s] of a process, an opponent's compilations included
+WORLD_STEP, AXIS_CYCLE = 0.002, 0.004  # [s]
 PORT_RANGE = 20000, 32000
 PRIORITY = 40  # of SCHED_FIFO, where it is allowed
 
@@ -230,7 +229,7 @@ def _paced(shared: Shared, pipe: Connection, period: float) -> Iterator[float]:
         wait = deadline - time.monotonic()
         if wait > 0:
             time.sleep(wait)
-        elif wait < -0.5:
+        elif wait < -ASLEEP:
             deadline = time.monotonic()  # the machine was asleep
         if count % 256 == 0 and parent is not None and not parent.is_alive():
             return
@@ -273,8 +272,8 @@ def _arm(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pi
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.bind((HOST, 0))
         wire.setblocking(False)
-        pipe.send("ready")
         rows, connected, motion = list(contract.arm), True, Motion(shared)
+        pipe.send("ready")
         for now in _paced(shared, pipe, params.arm.cycle):
             while pipe.poll():
                 request = pipe.recv()[0]
@@ -282,6 +281,7 @@ def _arm(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pi
                     connected = request == "reconnect"
                 else:
                     _operate(controller, request)
+            shared["driven"][0] = now - params.arm.cycle  # the last set-point's time, also if this process was asleep
             qpos, qvel = motion.at(now)
             setpoint, datagram = controller.step(now, params.hidden.counted(qpos[rows]), qvel[rows])
             shared["setpoint"][rows] = setpoint
@@ -325,9 +325,9 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, contract: Contract, p
     ]
     servers = [serve(emulator, HOST, port) for emulator, port in zip(emulators, ports.axes, strict=True)]
     try:
-        pipe.send("ready")
         motion = Motion(shared)
-        for now in _paced(shared, pipe, 0.004):
+        pipe.send("ready")
+        for now in _paced(shared, pipe, AXIS_CYCLE):
             while pipe.poll():
                 kind, axis, *rest = pipe.recv()
                 {
@@ -335,6 +335,7 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, contract: Contract, p
                     "reconnect": emulators[axis].reconnect,
                     "fault": emulators[axis].inject_fault,
                 }[kind](*rest)
+            shared["driven"][1] = now - AXIS_CYCLE
             qpos, qvel = motion.at(now)
             for i, emulator in zip(contract.carrying, emulators, strict=True):
                 shared["setpoint"][i] = emulator.step(now, float(qpos[i]), float(qvel[i]))

@@ -6,6 +6,7 @@ has read half of two states knows and reads again.
 
 from __future__ import annotations
 
+import math
 import time as clock
 from multiprocessing import shared_memory
 
@@ -33,10 +34,12 @@ _FIELDS = {
     "driven": 2,  # time [s] up to which arm and axes have given their set-points
 }
 
+START_TIME = 60.0  # [s] of a process of the rig, an opponent's compilations included
 AHEAD = 0.004  # [s] by which positions are told ahead of the world's newest state: two of its steps
 LATE = 0.01  # [s] from which on a world catches up in step with arm and axes
 LOOK = 0.0005  # [s] between looks at a late world
-PATIENCE = 0.4  # [s]; a world that is later was stopped
+ASLEEP = 0.5  # [s] from which on a process that is late makes up for nothing
+PATIENCE = 0.6  # [s] of looks at a process that does nothing until it counts as stopped: it will have been ASLEEP
 
 
 class Shared:
@@ -46,6 +49,7 @@ class Shared:
         counts = {field: joints if count == JOINTS else count for field, count in _FIELDS.items()}
         size = 8 * sum(counts.values())
         self._owner = name is None
+        self._patience = Patience()
         self._memory = shared_memory.SharedMemory(name=name, create=name is None, size=size, **_untracked(name))
         self._block = np.ndarray((sum(counts.values()),), np.float64, self._memory.buf)
         if self._owner:
@@ -96,10 +100,11 @@ class Shared:
     def await_drives(self, time: float) -> None:
         """Wait, while the world is late, for the set-points of arm and axes: it must not run on at old ones.
 
-        time: [s] that the world is going to; after PATIENCE it goes on without them, as when they stand still.
+        time: [s] that the world is going to; it goes on without them once they have done nothing for PATIENCE.
         """
-        while time + LATE < clock.monotonic() < time + PATIENCE and not self["finish"][0]:
-            if self["driven"].min() >= time - 2.0 * AHEAD:
+        while time + LATE < clock.monotonic() and not self["finish"][0]:
+            driven = float(self["driven"].min())
+            if driven >= time - 2.0 * AHEAD or not self._patience.lasts(driven):
                 return
             clock.sleep(LOOK)
 
@@ -111,6 +116,25 @@ class Shared:
             self._memory.unlink()
 
 
+class Patience:
+    """With another process, by looks at how far it is: it lasts while that one gets on, however late it is.
+
+    Seconds would not do. Where the whole machine stands still they pass for the one that waits and the one that is
+    waited for alike, and on a busy machine the waited-for gets on, but slowly.
+    """
+
+    LOOKS = round(PATIENCE / LOOK)
+
+    def __init__(self) -> None:
+        self._seen, self._left = -math.inf, self.LOOKS
+
+    def lasts(self, time: float) -> bool:
+        """One look at the ``time`` [s] that the other process has got to."""
+        self._left = self.LOOKS if time > self._seen else max(self._left - 1, 0)
+        self._seen = time
+        return self._left > 0
+
+
 class Motion:
     """The joints' motion as one emulator sees it, at the times of its own cycles.
 
@@ -119,14 +143,22 @@ class Motion:
     """
 
     def __init__(self, shared: Shared) -> None:
-        self._shared = shared
+        """Waits for the world's first state; raises TimeoutError after START_TIME."""
+        self._shared, began = shared, clock.monotonic()
+        while not shared["version"][0] and not shared["finish"][0]:
+            if clock.monotonic() > began + START_TIME:
+                raise TimeoutError(f"the world has not begun within {START_TIME:g} s")
+            clock.sleep(LOOK)
         self._newest = self._before = self._look()
+        self._patience = Patience()
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities (n,) at ``time`` [s]; as they were last when the world is late by PATIENCE."""
+        """Positions and velocities (n,) at ``time`` [s]; as they were last when the world stands still."""
         if time > self._newest[0]:
             self._before, self._newest = self._newest, self._look()
-        while self._newest[0] < time - AHEAD and clock.monotonic() < time + PATIENCE and not self._shared["finish"][0]:
+        while (
+            self._newest[0] < time - AHEAD and self._patience.lasts(self._newest[0]) and not self._shared["finish"][0]
+        ):
             clock.sleep(LOOK)
             self._newest = self._look()
         (start, qpos, qvel), (end, following, faster) = self._before, self._newest
