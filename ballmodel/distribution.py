@@ -23,7 +23,9 @@ from ballmodel.io.yaml import read as read_yaml
 from ballmodel.state import BallState
 
 AXES = {"position": ("x", "y", "z"), "velocity": ("x", "y", "z"), "landing": ("x", "y")}
+SHORT_BALLS = "short_balls"
 NOTES = ("name", "source", "paper")
+OPTIONAL = (*NOTES, SHORT_BALLS)
 EPS_FACTOR = 2.0
 
 
@@ -42,6 +44,7 @@ class BallDistribution:
     landing_max: tuple[float, float]  # [m]
     name: str = ""
     source: str = ""
+    short_balls: bool = False  # balls are drawn as well that would bounce a second time before the robot's end line
 
     def __post_init__(self) -> None:
         for part, axes in AXES.items():
@@ -67,25 +70,29 @@ class BallDistribution:
             }
             for part, axes in AXES.items()
         }
-        return {"name": self.name, "source": self.source, **intervals}
+        short = {SHORT_BALLS: True} if self.short_balls else {}
+        return {"name": self.name, "source": self.source, **intervals, **short}
 
 
 def check_keys(data: Any, allowed: Iterable[str], where: str) -> None:
-    """Raises ValueError where ``data`` is no mapping of exactly the keys ``allowed``; notes (NOTES) may be absent."""
+    """Raises ValueError where ``data`` is no mapping of exactly the keys ``allowed``; optional ones may be absent."""
     if not isinstance(data, dict):
         raise ValueError(f"{where}: a mapping with the keys {', '.join(allowed)} is wanted, got {data!r}")
     for key in data:
         if key not in allowed:
             near = difflib.get_close_matches(str(key), allowed, n=1, cutoff=0.0)
             raise ValueError(f"{where}: unknown key {key!r}; did you mean {near[0]!r}? Allowed: {', '.join(allowed)}")
-    missing = [key for key in allowed if key not in data and key not in NOTES]
+    missing = [key for key in allowed if key not in data and key not in OPTIONAL]
     if missing:
         raise ValueError(f"{where}: missing key {', '.join(missing)}; wanted: {', '.join(allowed)}")
 
 
 def parse_distribution(data: Any, where: str, name: str = "", source: str = "") -> BallDistribution:
     """Builds a distribution from its YAML form; ``where`` (file and key) opens every message. Raises ValueError."""
-    check_keys(data, (*NOTES, *AXES), where)
+    check_keys(data, (*OPTIONAL, *AXES), where)
+    short = data.get(SHORT_BALLS, False)
+    if not isinstance(short, bool):
+        raise ValueError(f"{where}: {SHORT_BALLS} is {short!r}; true or false is allowed")
     ends = {}
     for part, axes in AXES.items():
         check_keys(data[part], axes, f"{where}: {part}")
@@ -97,7 +104,8 @@ def parse_distribution(data: Any, where: str, name: str = "", source: str = "") 
         ends[f"{part}_min"] = tuple(data[part][axis][0] for axis in axes)
         ends[f"{part}_max"] = tuple(data[part][axis][1] for axis in axes)
     try:
-        return BallDistribution(**ends, name=str(data.get("name", name)), source=str(data.get("source", source)))
+        name, source = str(data.get("name", name)), str(data.get("source", source))
+        return BallDistribution(**ends, name=name, source=source, short_balls=short)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 

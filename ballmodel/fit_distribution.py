@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, get_args
 
 import jax
@@ -75,6 +75,7 @@ def fit_human(
     serves: bool = False,
     fit: Fit = "gauss-newton",
     progress: Callable[[int, int], None] | None = None,
+    short_balls: bool = False,
 ) -> tuple[BallDistribution, HumanReport]:
     """The 16 numbers of a person's balls, from trajectories or from start states.
 
@@ -83,6 +84,8 @@ def fit_human(
     serves: balls that bounce on the human's side first count as well, from 20 ms after that bounce. Start states of a
     recording may spin; trajectories are taken not to (mjx_tt.prediction.state_fit estimates their spins).
     fit: of trajectories. Both minimise the same distance, "nelder-mead" as the paper does, "gauss-newton" all at once.
+    short_balls: the distribution draws balls as well that would bounce twice on the robot's side, if the person played
+    any; without, those set its bounds only, and none of them is drawn.
     progress: called with (flights fitted so far, all of them) by Nelder-Mead, which takes a tenth of a second for each.
     Raises ValueError for another fit, for Nelder-Mead on start states and when no ball is left.
     """
@@ -125,6 +128,8 @@ def fit_human(
         raise ValueError(f"{measured.source}: none of {towards.size} balls lands on the robot's side: {outcomes}{hint}")
     landed, landing = jax.tree.map(lambda a: a[:, good], state), landing[:, good]
     distribution, outliers = fit_distribution(landed, landing, eps, min_samples, name, measured.source)
+    twice = (outcome == SECOND_BOUNCE)[good] & ~outliers.outlier
+    distribution = replace(distribution, short_balls=bool(short_balls and twice.any()))
     report = HumanReport(
         len(measured), too_short, int((~towards).sum()), outcomes, landed, landing, rms, outliers, served
     )

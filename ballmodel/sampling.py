@@ -4,7 +4,8 @@ A proposal is uniform in the box of start positions and velocities, without spin
 simulation, it clears the net, bounces exactly once on the table, inside the landing box on the robot's side, and then
 crosses the robot's end line. "Bounces once" ends there: a second bounce on the table rejects the ball, the floor
 behind it does not count. A ball that leaves over the side after its bounce is kept, and arrives when it meets the
-floor.
+floor. A distribution with ``short_balls`` keeps balls that bounce a second time as well: people play them, and the
+robot has to take them over the table.
 
 Wide distributions keep few proposals, so a coarse flight first throws out those that miss net or landing box by a
 margin larger than its own error; the full simulation alone decides about all others. Keeping the first n accepted
@@ -69,7 +70,7 @@ class Throw:
 
     outcome: Int[Array, " n"]  # index into OUTCOMES
     landing: Float[Array, "2 n"]  # [m] x, y of the first bounce; zero where there was none
-    arrival: Float[Array, " n"]  # [s] from the start to the robot's end line (or the floor); zero unless kept
+    arrival: Float[Array, " n"]  # [s] to the robot's end line, the floor or the second bounce; zero for other outcomes
 
 
 @jax.tree_util.register_dataclass
@@ -131,7 +132,8 @@ def throw(
         x, y = (jnp.where(first, now, before) for now, before in zip(events.position, (x, y), strict=False))
         in_box = (x >= landing_min[0]) & (x <= landing_max[0]) & (y >= landing_min[1]) & (y <= landing_max[1])
         outcome = jnp.where(active & events.net, HITS_NET, outcome)
-        outcome = jnp.where(active & events.table & bounced, SECOND_BOUNCE, outcome)
+        again = active & events.table & bounced
+        outcome, arrival = jnp.where(again, SECOND_BOUNCE, outcome), jnp.where(again, time + dt, arrival)
         outcome = jnp.where(first & ~in_box, jnp.where(y < 0.0, OUTSIDE_BOX, OWN_SIDE), outcome)
         from_below = elevation(params.table, events.position) < 0.0  # underside or side face
         outcome = jnp.where(first & from_below, MISSES, outcome)
@@ -215,6 +217,7 @@ def sample_pool(
     """Draws ``n`` balls; the same key gives the same balls, and a larger n the same first ones.
 
     params: scalars (one ball model for the whole pool); dt [s] of the full simulation.
+    Of a distribution with ``short_balls``, those count as kept, and arrive at their second bounce.
     Raises ValueError when fewer than ``min_acceptance`` of the proposals are kept, with the share that each constraint
     rejected.
     """
@@ -253,6 +256,8 @@ def sample_pool(
             padded = np.pad(chunk, ((0, 0), (0, CHUNK - size)), mode="edge")
             result = throw(params, ball_state(padded[:3], padded[3:]), *landing_box, dt)
             outcome = np.asarray(result.outcome)[:size]
+            if distribution.short_balls:
+                outcome = np.where(outcome == SECOND_BOUNCE, KEPT, outcome)
             good = outcome == KEPT
             full_counts += np.bincount(outcome, minlength=len(OUTCOMES))
             rows = [chunk, np.asarray(result.arrival)[None, :size], np.asarray(result.landing)[:, :size]]

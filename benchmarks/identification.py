@@ -3,8 +3,9 @@
 In each of several hidden realities, every second one from outside of the model's class, a player's balls, a minute of
 the joints and a hundred hits are logged and the simulation is identified. The shipped quickstart is trained on by
 first-order gradients, as ``robust.yaml`` does it, in the nominal world, in the prior alone, in the identified worlds
-without and with hits, and in the reality itself; all five then play in the reality, on the same balls. Resumable: what
-is finished is kept, ``--summary`` prints it.
+without and with hits, and in the reality itself, on balls of the human model that is fitted to the logged balls, short
+ones included; all five then play in the reality, on the same balls. Resumable: what is finished is kept, ``--summary``
+prints it.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
+from ballmodel.distribution import save_distribution
+from ballmodel.fit_distribution import fit_human
+from ballmodel.flight import ball_params
 from ballmodel.partial_params import without_nominal
 from experiments import measurements
 from experiments.config import build, experiment
@@ -58,6 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--player", default="player3")
     parser.add_argument("--balls", type=int, default=300, help="across the table, before the first play")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the joints' motion")
+    parser.add_argument("--worlds", nargs="+", choices=WORLDS, default=WORLDS, help="to train in")
     parser.add_argument("--untrained", action="store_true", help="intervals alone: nothing is trained or played")
     parser.add_argument("--summary", action="store_true", help="only print what is finished")
     chosen = parser.parse_args(arguments)
@@ -69,6 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
             0 if chosen.untrained else chosen.updates,
             chosen.player,
             (chosen.balls, chosen.seconds),
+            tuple(world for world in WORLDS if world in chosen.worlds),
         )
     found = [json.loads(path.read_text()) for path in sorted(chosen.out.glob("reality_*.json"))]
     if not found:
@@ -87,13 +93,18 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def measure(out: Path, seeds: range, updates: int, player: str, logged: tuple[int, float] = (300, 60.0)) -> None:
-    """Makes what is not finished, a JSON for each reality. logged: balls before the first play, seconds of joints."""
+def measure(
+    out: Path, seeds: range, updates: int, player: str, logged: tuple[int, float], worlds: tuple[str, ...]
+) -> None:
+    """Makes what is not finished, a JSON for each reality.
+
+    logged: balls before the first play, seconds of joints; worlds: to train in.
+    """
     out.mkdir(parents=True, exist_ok=True)
     left, began, spent = [s for s in seeds if not _file(out, s).exists()], time.monotonic(), 0
     for seed in left:
         # In a process of its own: a dozen compiled programs each, and a process may map only so many of them.
-        process = get_context("spawn").Process(target=_one, args=(out, seed, updates, player, logged))
+        process = get_context("spawn").Process(target=_one, args=(out, seed, updates, player, logged, worlds))
         process.start()
         process.join()
         if process.exitcode:
@@ -103,18 +114,20 @@ def measure(out: Path, seeds: range, updates: int, player: str, logged: tuple[in
         rates = (
             "intervals"
             if not updates
-            else ", ".join(f"{world} {result['returned'][world]['rate']:.1%}" for world in WORLDS)
+            else ", ".join(f"{world} {result['returned'][world]['rate']:.1%}" for world in worlds)
         )
         minutes = (time.monotonic() - began) / spent * (len(left) - spent) / 60.0
         print(f"reality {seed} {result['outside'] or 'in class'}: {rates}; {minutes:.0f} min left", flush=True)
 
 
-def _one(out: Path, seed: int, updates: int, player: str, logged: tuple[int, float]) -> None:
+def _one(out: Path, seed: int, updates: int, player: str, logged: tuple[int, float], worlds: tuple[str, ...]) -> None:
     platform.configure(devices=1)
-    run_dir.write_json(_file(out, seed), of_reality(out, seed, updates, player, logged))
+    run_dir.write_json(_file(out, seed), of_reality(out, seed, updates, player, logged, worlds))
 
 
-def of_reality(out: Path, seed: int, updates: int, player: str, logged: tuple[int, float]) -> dict[str, Any]:
+def of_reality(
+    out: Path, seed: int, updates: int, player: str, logged: tuple[int, float], trained_in: tuple[str, ...]
+) -> dict[str, Any]:
     """Logs, identification, trainings and evaluations of one reality; without updates no trainings and evaluations."""
     outside = CLASSES[seed % len(CLASSES)]
     rounds = [{"simulated": 1, "real": 1}] * 3
@@ -151,31 +164,31 @@ def of_reality(out: Path, seed: int, updates: int, player: str, logged: tuple[in
     }
     if not updates:
         return base
-    policies = {}
-    for name, world in worlds.items():
-        shared = name in ("nominal", "prior")
-        policies[name] = trained(out / "runs" / (name if shared else f"{name}_{seed}"), world, updates, player)
+    human, _ = fit_human(measurements.read_trajectories([folder / "D0.csv"]), ball_params(), short_balls=True)
+    save_distribution(folder / "M0.yaml", human)
+    policies = {
+        name: trained(out / "runs" / f"{name}_{seed}", worlds[name], updates, folder / "M0.yaml") for name in trained_in
+    }
     policies["quickstart"] = policy
     played = {name: returned(reality, person, reality.known, p, keys[3]) for name, p in policies.items()}
     believed = without_nominal(models.draw(keys[4], worlds["hits"].model, worlds["hits"].randomise, (BALLS,)))
     predicted = {name: returned(reality, person, believed, p, keys[3]) for name, p in policies.items()}
     nominal = {name: returned(reality, person, without_nominal(SimModel()), p, keys[3]) for name, p in policies.items()}
-    best = played["truth"]
     return base | {
         "returned": {name: _rate(x) for name, x in played.items()},
-        "below_truth": {name: _paired(best, x) for name, x in played.items()},
+        "below_truth": {name: _paired(played["truth"], x) for name, x in played.items() if "truth" in played},
         "predicted": {name: float(x.mean()) for name, x in predicted.items()},
         "predicted_nominal": {name: float(x.mean()) for name, x in nominal.items()},
         "rally": rallies(reality, person, policies, keys[5]),
     }
 
 
-def trained(folder: Path, world: ModelFile, updates: int, player: str) -> Policy:
-    """The quickstart after so many updates in a world."""
+def trained(folder: Path, world: ModelFile, updates: int, human: Path) -> Policy:
+    """The quickstart after so many updates in a world, on balls of a human model."""
     _made(folder)
     world.save(folder.parent / f"{folder.name}.yaml")
     overrides = (
-        f"balls={player}/M0",
+        f"balls={human}",
         f"model={folder.parent / f'{folder.name}.yaml'}",
         f"training.updates={updates}",
         "training.evaluate_every=null",
@@ -221,16 +234,17 @@ def intervals(world: ModelFile, reality: SimModel) -> dict[str, list[float]]:
 
 def summary(found: list[dict[str, Any]]) -> str:
     """The bars of the issue in words and numbers."""
-    lines = ["seed class " + " ".join(f"{w:>16s}" for w in WORLDS) + "   rally of the same"]
+    worlds = [w for w in WORLDS if all(w in one["returned"] for one in found)]
+    lines = ["seed class " + " ".join(f"{w:>16s}" for w in worlds) + "   rally of the same"]
     for one in found:
-        rates = [one["returned"][world] for world in WORLDS]
+        rates = [one["returned"][world] for world in worlds]
         cells = " ".join(f"{100 * r['rate']:5.1f} ({100 * r['low']:4.1f}-{100 * r['high']:4.1f})" for r in rates)
-        rally = " ".join(f"{one['rally'][w]['mean']:4.1f}" for w in WORLDS)
+        rally = " ".join(f"{one['rally'][w]['mean']:4.1f}" for w in worlds)
         lines.append(f"{one['seed']:4d} {'+'.join(one['outside']) or 'in':24s} {cells}   {rally}")
     for title, outside in (("in class", False), ("outside", True)):
         some = [one for one in found if bool(one["outside"]) == outside]
         if some:
-            lines += _of_class(title, some)
+            lines += _of_class(title, some, worlds)
     for name, key in (("identified with hits", "predicted"), ("nominal", "predicted_nominal")):
         errors = np.array([100 * abs(f[key][w] - f["returned"][w]["rate"]) for f in found for w in f["returned"]])
         close, middle = int((errors <= 5).sum()), float(np.median(errors))
@@ -241,11 +255,11 @@ def summary(found: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _of_class(title: str, some: list[dict[str, Any]]) -> list[str]:
-    rate = {w: np.array([100 * f["returned"][w]["rate"] for f in some]) for w in (*WORLDS, "quickstart")}
+def _of_class(title: str, some: list[dict[str, Any]], worlds: list[str]) -> list[str]:
+    rate = {w: np.array([100 * f["returned"][w]["rate"] for f in some]) for w in (*worlds, "quickstart")}
     medians = ", ".join(f"{w} {np.median(x):.1f}" for w, x in rate.items())
     lines = [f"{title}, {len(some)} realities, median returned [%]: {medians}"]
-    for w in ("identified", "hits"):
+    for w in ("identified", "hits") if {"identified", "hits", "truth", "prior"} <= set(worlds) else ():
         gap, gain = rate["truth"] - rate[w], rate[w] - rate["prior"]
         lines.append(
             f"  {w}: {np.median(gap):.1f} points below the true world in the median ({gap.min():.1f} to "
@@ -283,9 +297,10 @@ def plot(found: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained")
+    worlds = [w for w in WORLDS if all(w in one["returned"] for one in found)]
     for one in found:
-        rates = [100 * one["returned"][w]["rate"] for w in WORLDS]
-        left.plot(WORLDS, rates, "o--" if one["outside"] else "o-", label=f"{one['seed']} {'+'.join(one['outside'])}")
+        rates = [100 * one["returned"][w]["rate"] for w in worlds]
+        left.plot(worlds, rates, "o--" if one["outside"] else "o-", label=f"{one['seed']} {'+'.join(one['outside'])}")
         measured = [100 * one["returned"][w]["rate"] for w in one["returned"]]
         right.plot(measured, [100 * one["predicted"][w] for w in one["returned"]], "o" if one["outside"] else "s")
     left.set_ylabel("returned in the reality [%]")

@@ -79,6 +79,9 @@ def fit_human(
     serves: Annotated[
         bool, Parameter(help="count balls that bounce on the person's own side first, from that bounce on")
     ] = False,
+    short_balls: Annotated[
+        bool, Parameter(help="draw balls that would bounce twice on the robot's side as well, as the person plays them")
+    ] = False,
     mixture: Annotated[
         str | None, option("YAML", "file for a mixture over start states with spin, beside the box; with its picture")
     ] = None,
@@ -122,7 +125,7 @@ def fit_human(
         ball = world.ball if world is not None else ball_params()
         with _progress(screen) as progress:
             distribution, report = fitted_box(
-                measured, ball, eps, min_samples, name or path.stem, serves, fit, progress
+                measured, ball, eps, min_samples, name or path.stem, serves, fit, progress, short_balls
             )
     except ValueError as error:
         if isinstance(measured, Dataset):

@@ -129,6 +129,9 @@ class Study(Section):
     """Repetitions of the whole study, each with another reality, other initial policies and other chance."""
     first_balls: Annotated[int, Field(ge=20)] = 200
     """Balls of D0: across the table, without a robot."""
+    short_balls: bool = False
+    """The human models draw balls as well that bounce twice on the robot's side, as people play them; false: balls that
+    bounce once, as everywhere else."""
     simulation: Simulation
     """Training in simulation."""
     fine_tuning: FineTuning = FineTuning()

@@ -197,8 +197,8 @@ class Loop(Places):
         def run() -> str:
             found = measurements.read_trajectories(list(sources))
             measured = Dataset(found.trajectories, " + ".join(item.data))  # wherever the study's folder lies
-            title = f"{player}/{item.name}, seed {seed}"
-            distribution, report = checked(str(path), fit_human, measured, ball_params(), None, 5, title)
+            fit = partial(fit_human, name=f"{player}/{item.name}, seed {seed}", short_balls=self.study.short_balls)
+            distribution, report = checked(str(path), fit, measured, ball_params())
             save_distribution(path, distribution)
             return f"fitted to {report.landing.shape[1]:,} of {report.measured:,} balls"
 

@@ -13,7 +13,7 @@ from scipy.stats import binomtest, ks_2samp
 from ballmodel import registry
 from ballmodel.distribution import BallDistribution, fit_distribution, load_distribution, save_distribution
 from ballmodel.flight import ball_params
-from ballmodel.sampling import KEPT, OUTCOMES, UNDECIDED, coarse_outcome, sample_pool, throw
+from ballmodel.sampling import KEPT, OUTCOMES, SECOND_BOUNCE, UNDECIDED, coarse_outcome, sample_pool, throw
 from ballmodel.state import BallState, ball_state
 
 pytestmark = pytest.mark.optimised
@@ -21,6 +21,7 @@ pytestmark = pytest.mark.optimised
 BOX = BallDistribution(
     (0.0, 1.2, 0.2), (0.3, 1.5, 0.5), (-0.8, -6.5, 0.0), (0.8, -4.0, 1.8), (-0.3, -1.2), (0.5, -0.4), "box"
 )
+SLOW = replace(BOX, velocity_min=(-0.8, -4.5, 0.4), velocity_max=(0.8, -2.8, 2.2), name="slow")
 
 
 # --- the paper's tables
@@ -69,7 +70,7 @@ def test_unknown_name_lists_the_valid_ones_and_the_nearest():
 
 def test_yaml_round_trip(tmp_path):
     path = tmp_path / "me.yaml"
-    distribution = replace(BOX, source="a test")
+    distribution = replace(BOX, source="a test", short_balls=True)
     save_distribution(path, distribution)
     assert load_distribution(path) == distribution == registry.resolve(path)
     assert [p.name for p in tmp_path.iterdir()] == ["me.yaml"]
@@ -88,6 +89,7 @@ def test_yaml_round_trip(tmp_path):
         ("z: [0.2, 0.5]", "z: [0.2, .nan]", "finite numbers"),
         ("z: [0.2, 0.5]", "q: [0.2, 0.5]", "unknown key 'q'"),
         ("velocity: {x: [-1, 1], y: [-6, -4], z: [0, 1]}", "", "missing key velocity"),
+        ("name: box", "name: box\nshort_balls: 1", "short_balls is 1; true or false is allowed"),
         ("name: box", "name: [box", "not valid YAML"),
     ],
 )
@@ -157,6 +159,9 @@ def brute_force(distribution, n, seed, dt=1 / 1500):
         alive &= ~((np.hypot(gap_y, gap_z) < 0.02) & (np.abs(x[0]) < 0.915))
         hit = (x[2] < 0.02) & (x[2] > -0.01) & (v[2] < 0) & (np.abs(x[0]) < 0.7625) & (np.abs(x[1]) < 1.37)
         in_box = np.all((x[:2].T >= distribution.landing_min) & (x[:2].T <= distribution.landing_max), axis=1)
+        again = alive & hit & bounced
+        if distribution.short_balls:
+            kept, arrival = kept | again, np.where(again, i * dt, arrival)
         alive &= ~(hit & (bounced | ~in_box))
         landing = np.where(hit & ~bounced, x[:2], landing)
         # Nakashima's bounce of a ball without spin: the contact point slips with the ball's own velocity.
@@ -173,9 +178,10 @@ def brute_force(distribution, n, seed, dt=1 / 1500):
     return proposal, kept, landing, arrival
 
 
-def test_pool_is_distributed_like_brute_force_rejection():
-    pool = sample_pool(jax.random.key(0), BOX, ball_params(), 3000)
-    proposal, kept, landing, arrival = brute_force(BOX, 8000, 1)
+@pytest.mark.parametrize("box", [BOX, replace(SLOW, short_balls=True)], ids=["once", "short"])
+def test_pool_is_distributed_like_brute_force_rejection(box):
+    pool = sample_pool(jax.random.key(0), box, ball_params(), 3000)
+    proposal, kept, landing, arrival = brute_force(box, 8000, 1)
     drawn = np.concatenate([pool.state.position, pool.state.velocity, pool.landing, pool.arrival[None]])
     reference = np.concatenate([proposal, landing, arrival[None]])[:, kept]
     assert kept.sum() > 500
@@ -186,6 +192,18 @@ def test_pool_is_distributed_like_brute_force_rejection():
         assert ks_2samp(drawn[1] + drawn[pair], reference[1] + reference[pair]).pvalue > 1e-3
     assert binomtest(int(kept.sum()), kept.size, float(pool.acceptance)).pvalue > 1e-3
     assert float(pool.rejected.sum()) == pytest.approx(1.0, abs=1e-5)
+
+
+def test_short_balls_are_drawn_where_the_distribution_says_so():
+    boxes = [replace(SLOW, short_balls=short) for short in (False, True)]
+    once, short = pools = [sample_pool(jax.random.key(0), box, ball_params(), 2000) for box in boxes]
+    landing = SLOW.landing_min, SLOW.landing_max
+    outcomes = [np.asarray(throw(ball_params(), pool.state, *landing).outcome) for pool in pools]
+    assert np.all(outcomes[0] == KEPT) and set(outcomes[1]) == {KEPT, SECOND_BOUNCE}
+    share = float(once.rejected[SECOND_BOUNCE] / (once.rejected[SECOND_BOUNCE] + once.acceptance))
+    assert 0.2 < share < 0.9
+    assert binomtest(int((outcomes[1] == SECOND_BOUNCE).sum()), 2000, share).pvalue > 1e-3
+    assert float(short.acceptance) == pytest.approx(float(once.rejected[SECOND_BOUNCE] + once.acceptance), abs=0.02)
 
 
 def test_both_simulations_decide_alike_ball_by_ball():

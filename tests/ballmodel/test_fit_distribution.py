@@ -60,6 +60,24 @@ def test_both_fits_find_the_same_sixteen_numbers():
     np.testing.assert_allclose(box, np.concatenate([starts.min(axis=1), starts.max(axis=1)]), atol=0.02)
 
 
+def test_a_persons_short_balls_are_drawn_if_asked_for_and_if_there_are_any():
+    """Which balls are short, by parabolas and Nakashima's bounce: drag takes little, and makes them shorter."""
+    rng, n, start, climb = np.random.default_rng(1), 60, 0.8, 2.0
+    position = np.stack([rng.uniform(-0.2, 0.2, n), np.full(n, start), rng.uniform(0.25, 0.3, n)])
+    fall = (climb + np.sqrt(climb**2 + 2 * 9.81 * 0.255)) / 9.81
+    down = 9.81 * fall - climb
+    for speed, short in ((2.3, True), (3.6, False)):
+        after = speed * (1.0 - min(0.25 * 1.93 * down / speed, 0.4))
+        second = start - speed * fall - after * 2.0 * 0.93 * down / 9.81  # [m] y of the second bounce
+        assert (-1.25 < second < 0.0) if short else second < -1.6
+        velocity = np.stack([rng.uniform(-0.1, 0.1, n), -speed + rng.uniform(-0.05, 0.05, n), np.full(n, climb)])
+        strokes = MeasuredStates(np.arange(n), BallState(position, velocity, np.zeros((3, n))), "strokes")
+        for asked in (False, True):
+            box, report = fit_human(strokes, ball_params(), eps=50.0, short_balls=asked)
+            assert box.short_balls == (asked and short)
+            assert (report.outcomes["bounce on the table a second time"] == n) == short
+
+
 @pytest.mark.skipif(not MEASURED.is_dir(), reason=f"no measured data in {MEASURED}")
 def test_both_fits_agree_on_a_ball_launcher():
     measured = read(MEASURED / "aimy_launcher" / "mn5008_topspin.hdf5")
