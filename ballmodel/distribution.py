@@ -87,12 +87,18 @@ def check_keys(data: Any, allowed: Iterable[str], where: str) -> None:
         raise ValueError(f"{where}: missing key {', '.join(missing)}; wanted: {', '.join(allowed)}")
 
 
-def parse_distribution(data: Any, where: str, name: str = "", source: str = "") -> BallDistribution:
-    """Builds a distribution from its YAML form; ``where`` (file and key) opens every message. Raises ValueError."""
-    check_keys(data, (*OPTIONAL, *AXES), where)
+def short_balls_of(data: dict, where: str) -> bool:
+    """Whether short balls are drawn. Raises ValueError for what is neither true nor false."""
     short = data.get(SHORT_BALLS, False)
     if not isinstance(short, bool):
         raise ValueError(f"{where}: {SHORT_BALLS} is {short!r}; true or false is allowed")
+    return short
+
+
+def parse_distribution(data: Any, where: str, name: str = "", source: str = "") -> BallDistribution:
+    """Builds a distribution from its YAML form; ``where`` (file and key) opens every message. Raises ValueError."""
+    check_keys(data, (*OPTIONAL, *AXES), where)
+    short = short_balls_of(data, where)
     ends = {}
     for part, axes in AXES.items():
         check_keys(data[part], axes, f"{where}: {part}")

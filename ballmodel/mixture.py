@@ -17,7 +17,7 @@ import yaml
 from jaxtyping import Float
 
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
-from ballmodel.distribution import NOTES, BallDistribution, check_keys
+from ballmodel.distribution import OPTIONAL, SHORT_BALLS, BallDistribution, check_keys, short_balls_of
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.yaml import read as read_yaml
 from ballmodel.state import BallState
@@ -45,6 +45,7 @@ class BallMixture:
     covariances: Float[np.ndarray, "k 9 9"]
     name: str = ""
     source: str = ""
+    short_balls: bool = False  # as of a BallDistribution
 
     def __post_init__(self) -> None:
         weights, means, covariances = (
@@ -84,7 +85,9 @@ class BallMixture:
         low, high = (ends.tolist() for ends in ((self.means - spread).min(axis=0), (self.means + spread).max(axis=0)))
         half_x, half_y = TABLE_WIDTH / 2, TABLE_LENGTH / 2
         landing = ((-half_x, -half_y), (half_x, 0.0))
-        return BallDistribution(low[:3], high[:3], low[3:6], high[3:6], *landing, self.name, self.source)
+        return BallDistribution(
+            low[:3], high[:3], low[3:6], high[3:6], *landing, self.name, self.source, self.short_balls
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The YAML form."""
@@ -92,12 +95,14 @@ class BallMixture:
             {"weight": float(w), "mean": m.tolist(), "covariance": c.tolist()}
             for w, m, c in zip(self.weights, self.means, self.covariances, strict=True)
         ]
-        return {"name": self.name, "source": self.source, "components": components}
+        short = {SHORT_BALLS: True} if self.short_balls else {}
+        return {"name": self.name, "source": self.source, **short, "components": components}
 
 
 def parse_mixture(data: Any, where: str, name: str = "", source: str = "") -> BallMixture:
     """Builds a mixture from its YAML form; ``where`` (file and key) opens every message. Raises ValueError."""
-    check_keys(data, (*NOTES, "components"), where)
+    check_keys(data, (*OPTIONAL, "components"), where)
+    short = short_balls_of(data, where)
     components = data["components"]
     if not isinstance(components, list) or not components:
         raise ValueError(f"{where}: components: a list, each with {', '.join(COMPONENT)}, is wanted")
@@ -106,7 +111,8 @@ def parse_mixture(data: Any, where: str, name: str = "", source: str = "") -> Ba
     try:
         arrays = ([np.array(c[part], np.float64) for c in components] for part in COMPONENT)
         weights, means, covariances = (np.stack(part) for part in arrays)
-        return BallMixture(weights, means, covariances, str(data.get("name", name)), str(data.get("source", source)))
+        name, source = str(data.get("name", name)), str(data.get("source", source))
+        return BallMixture(weights, means, covariances, name, source, short)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from None
 

@@ -278,7 +278,8 @@ def _sample_mixture(
     components = [jnp.asarray(a, jnp.float32) for a in (np.log(np.maximum(mixture.weights, 1e-30)), mixture.means.T)]
     factors = jnp.asarray(np.moveaxis(mixture.factors, 0, -1), jnp.float32)
     most = int(np.ceil((n + 10.0) / min_acceptance / CHUNK))
-    table, counts = _fill(key, params, *components, factors, jnp.float32(dt), jnp.int32(most), n=n)
+    short = mixture.short_balls
+    table, counts = _fill(key, params, *components, factors, jnp.float32(dt), jnp.int32(most), n=n, short=short)
     proposals = counts.sum()
     shares = counts / proposals
     if int(counts[KEPT]) < n:
@@ -287,7 +288,7 @@ def _sample_mixture(
     return BallPool(state, table[9], table[10:12], shares[KEPT], shares)
 
 
-@partial(jax.jit, static_argnames="n")
+@partial(jax.jit, static_argnames=("n", "short"))
 def _fill(
     key: Key[Array, ""],
     params: BallParams,
@@ -297,8 +298,12 @@ def _fill(
     dt: Float[Array, ""],
     most: Int[Array, ""],
     n: int,
+    short: bool,
 ) -> tuple[Float[Array, "12 n"], Float[Array, " outcomes"]]:
-    """State (9), arrival and landing (2) of the first n balls kept of at most ``most`` chunks, and the outcomes."""
+    """State (9), arrival and landing (2) of the first n balls kept of at most ``most`` chunks, and the outcomes.
+
+    short: balls that bounce twice are kept.
+    """
 
     def unfilled(carry: tuple[Array, Array, Array]) -> Array:
         calls, counts, _ = carry
@@ -311,10 +316,11 @@ def _fill(
         normal = jax.random.normal(key_normal, (9, CHUNK), jnp.float32)
         rows = means[:, component] + jnp.sum(factors[:, :, component] * normal[None], axis=1)
         thrown = throw(params, BallState(rows[:3], rows[3:6], rows[6:]), *ROBOT_SIDE, dt)
-        order = jnp.argsort(thrown.outcome != KEPT, stable=True)
+        outcome = jnp.where(short & (thrown.outcome == SECOND_BOUNCE), KEPT, thrown.outcome)
+        order = jnp.argsort(outcome != KEPT, stable=True)
         rows = jnp.concatenate([rows, thrown.arrival[None], thrown.landing])[:, order]
         table = jax.lax.dynamic_update_slice(table, rows, (0, counts[KEPT].astype(jnp.int32)))
-        found = jnp.sum(thrown.outcome[None] == jnp.arange(len(OUTCOMES))[:, None], axis=1)
+        found = jnp.sum(outcome[None] == jnp.arange(len(OUTCOMES))[:, None], axis=1)
         return calls + 1, counts + found, table
 
     zero = jnp.zeros((), jnp.int32)

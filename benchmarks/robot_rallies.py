@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.config.build import Experiment
-from experiments.deploy.rig import scene
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.finetuning import loop
 from experiments.runs import load_policy
@@ -28,6 +27,7 @@ from mjx_tt import platform
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
 from mjx_tt.rally.simulator import Box, RallySimulator
+from mjx_tt.robot.robot import paper
 from robot_io.control import rally
 from robot_io.control.config import RobotConfig
 from robot_io.control.interfaces import BridgeConfig
@@ -40,6 +40,7 @@ from robot_io.emulator.world import World
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.rally_ends import FILTERED, End
 
+SCENE = str(paper().scene())
 LONGEST_RALLY = 60.0  # [s] per rally on average before something is wrong
 
 
@@ -95,13 +96,13 @@ class Serial(VirtualPlayer):
 
 def compare(policy: Policy, player: str, tracker: TrackerParams, identity: str, box: Box, pairs: int) -> None:
     """The first rally of each of so many sessions with either tracker, all else alike, noise included while it can."""
-    world, person, config = World(scene(), RigParams().world), Serial(player), bridge_config(box)
+    world, person, config = World(SCENE, RigParams().world), Serial(player), bridge_config(box)
     found: list[list[RallySummary]] = []
     for person.session in range(pairs):
         pair = []
         for chosen in (tracker, replace(tracker, identity=identity)):
             params = RigParams(tracker=chosen, seed=person.session)
-            robot = LockStep(scene(), person, StreamingPolicy(policy), params, config, world=world)
+            robot = LockStep(SCENE, person, StreamingPolicy(policy), params, config, world=world)
             pair += first_rally(robot)
         if len(pair) == 2:
             found.append(pair)
@@ -133,7 +134,7 @@ def bridge_config(box: Box) -> BridgeConfig:
 
 def rig(policy: Policy, player: str, params: RigParams, box: Box, rallies: int, seed: int) -> None:
     """Rallies through the bridge in lock-step."""
-    robot = LockStep(scene(), VirtualPlayer(player, seed), StreamingPolicy(policy), params, bridge_config(box))
+    robot = LockStep(SCENE, VirtualPlayer(player, seed), StreamingPolicy(policy), params, bridge_config(box))
     robot.start()
     robot.throwing, began = True, time.monotonic()
     while len(robot.rallies) < rallies and robot.now < LONGEST_RALLY * rallies:

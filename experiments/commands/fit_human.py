@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -179,6 +180,7 @@ def _fit_mixture(report: HumanReport, box: BallDistribution, ball: BallParams, p
         fitted, choice = fit_mixture(report.landed, name, box.source)
     except ValueError as error:
         raise ConfigError(f"--mixture {path}: {error}") from None
+    fitted = replace(fitted, short_balls=box.short_balls)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_mixture(path, fitted)
     console.print(

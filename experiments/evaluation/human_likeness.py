@@ -7,7 +7,7 @@ Protocol: a random forest, cross-validated, on as many balls of the model as hel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -86,7 +86,7 @@ def compare(landed: BallState, box: BallDistribution, ball: BallParams, picture:
     count = min(HELD_OUT, len(rows) // 4)
     count = count if count >= FEWEST else 0
     held, known = rows[order[:count]], rows[order[count:]]
-    mixture, _ = fit_mixture(_state(known), seed=seed)
+    mixture = replace(fit_mixture(_state(known), seed=seed)[0], short_balls=box.short_balls)
     keys = jax.random.split(jax.random.key(seed))
     drawn = {
         name: start_states(sample_pool(key, balls, ball, max(count, DRAWN)).state)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from scipy.stats import ks_2samp
 from ballmodel import registry
 from ballmodel.flight import ball_params
 from ballmodel.mixture import BallMixture, fit_mixture, load_mixture, save_mixture, start_states
-from ballmodel.sampling import KEPT, ROBOT_SIDE, sample_pool, throw
+from ballmodel.sampling import KEPT, ROBOT_SIDE, SECOND_BOUNCE, sample_pool, throw
 from ballmodel.state import BallState
 
 
@@ -33,26 +35,28 @@ def test_a_mixture_has_the_moments_of_what_made_it_and_reads_back(tmp_path):
     mean = mixture.weights @ mixture.means
     np.testing.assert_allclose(mean, rows.mean(axis=0), atol=0.02 * rows.std(axis=0).max())
     assert np.all(mixture.covariances[:, 8, 8] == 0.0)  # a row that does not vary stays at its value
-    save_mixture(tmp_path / "me.yaml", mixture)
+    save_mixture(tmp_path / "me.yaml", replace(mixture, short_balls=True))
     again = registry.resolve(tmp_path / "me.yaml")
-    assert isinstance(again, BallMixture) and (again.name, again.source) == ("two", "a test")
+    assert isinstance(again, BallMixture) and (again.name, again.source, again.short_balls) == ("two", "a test", True)
     np.testing.assert_allclose(again.covariances, mixture.covariances, rtol=1e-12)
 
 
 @pytest.mark.slow
-def test_a_pool_holds_valid_balls_spin_as_the_mixture_has_it():
+@pytest.mark.parametrize("short", [False, True])
+def test_a_pool_holds_valid_balls_spin_as_the_mixture_has_it(short):
     """Against draws by NumPy, of which the full simulation keeps what it keeps."""
-    mixture, _ = fit_mixture(strokes(900))
+    mixture = replace(fit_mixture(strokes(900))[0], short_balls=short)
+    valid = (KEPT, SECOND_BOUNCE) if short else (KEPT,)
     pool = sample_pool(jax.random.key(1), mixture, ball_params(), 3000)
     again = throw(ball_params(), pool.state, *ROBOT_SIDE)
-    assert np.all(np.asarray(again.outcome) == KEPT)
+    assert set(np.asarray(again.outcome)) == set(valid)
     np.testing.assert_allclose(again.arrival, pool.arrival, atol=1e-5)
     rng = np.random.default_rng(2)
     component = rng.choice(mixture.weights.size, 6000, p=mixture.weights)
     normal = rng.standard_normal((6000, 9))
     rows = mixture.means[component] + np.einsum("nij,nj->ni", mixture.factors[component], normal)
     state = BallState(*(np.float32(rows[:, i : i + 3].T) for i in (0, 3, 6)))
-    kept = np.asarray(throw(ball_params(), state, *ROBOT_SIDE).outcome) == KEPT
+    kept = np.isin(np.asarray(throw(ball_params(), state, *ROBOT_SIDE).outcome), valid)
     assert abs(kept.mean() - float(pool.acceptance)) < 0.03
     for i, ours in enumerate(start_states(pool.state).T[:8]):
         assert ks_2samp(ours, rows[kept, i]).pvalue > 1e-3, i
