@@ -3,13 +3,15 @@
 STATES is DeepMind's rallies.json (D'Ambrosio et al. 2025, CC-BY-4.0), read where it lies. The first call fits a box and
 a mixture to all but 1,500 of the strokes and writes their YAMLs with the model whose lift the authors estimated the
 spins by; ``mjx-tt train`` takes them. A call with ``--policies RUN...`` throws the strokes that were held
-out, each once, with the spin it had, and ``--reachable N`` seeks motions for N of them ball by ball.
+out, each once, with the spin it had, those that bounce twice apart; ``--reachable N`` seeks motions for N of the others
+ball by ball.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -21,7 +23,7 @@ from ballmodel.fit_distribution import fit_human
 from ballmodel.io import read
 from ballmodel.io.deepmind import MeasuredStates
 from ballmodel.mixture import fit_mixture, save_mixture, start_states
-from ballmodel.sampling import KEPT, ROBOT_SIDE, BallPool, throw
+from ballmodel.sampling import KEPT, ROBOT_SIDE, SECOND_BOUNCE, BallPool, throw
 from ballmodel.state import BallState
 from experiments.evaluation.evaluate import return_rate
 from experiments.runs import load_policy
@@ -45,6 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of the fitted distributions")
     parser.add_argument("--policies", nargs="+", default=[], help="runs or artefacts")
     parser.add_argument("--reachable", type=int, default=0, metavar="N", help="seek motions for N of the strokes")
+    parser.add_argument("--short-balls", action="store_true", help="strokes that bounce twice are drawn as well")
     parser.add_argument("--seed", type=int, default=0, help="of the strokes that are held out")
     chosen = parser.parse_args(arguments)
     platform.configure()
@@ -57,35 +60,34 @@ def main(arguments: list[str] | None = None) -> int:
     order = np.random.default_rng(chosen.seed).permutation(len(rows))
     held, known = rows[order[:HELD_OUT]], rows[order[HELD_OUT:]]
     if not chosen.policies and not chosen.reachable:
-        fit(known, chosen.out, model)
+        fit(known, chosen.out, model, chosen.short_balls)
         return 0
     simulator = Simulator(TaskConfig(sim_rate=SIM_RATE), jax.local_device_count())
-    balls = pool(held, model)
-    count = balls.arrival.size
-    print(
-        f"{len(held):,} held-out strokes that land; {len(held) - count} of them would bounce twice and are not thrown"
-    )
     key = jax.random.key(chosen.seed)
-    policy = None
-    for path in chosen.policies:
-        policy = load_policy.load(path).policy
-        rate = return_rate(Evaluator(simulator, balls, model, ()).play(policy, key))
-        print(f"{path}: {rate.value:.1%} ({rate.low:.1%} to {rate.high:.1%}) of {count:,} strokes returned")
+    policies = {path: load_policy.load(path).policy for path in chosen.policies}
+    kinds = {"bounce once": pool(held, model, KEPT), "are short and bounce twice": pool(held, model, SECOND_BOUNCE)}
+    for kind, balls in kinds.items():
+        print(f"{balls.arrival.size:,} of {len(held):,} held-out strokes that land {kind}")
+        evaluator = Evaluator(simulator, balls, model, ())
+        for path, policy in policies.items():
+            rate = return_rate(evaluator.play(policy, key))
+            print(f"  {path}: {rate.value:.1%} ({rate.low:.1%} to {rate.high:.1%}) of them returned")
     if chosen.reachable:
-        found = reachability.reachable(simulator, balls, model, key, chosen.reachable, policy)
+        last = next(reversed(policies.values()), None)
+        found = reachability.reachable(simulator, kinds["bounce once"], model, key, chosen.reachable, last)
         low, high = wilson(found.returned, found.balls)
         print(f"in reach, at least: {found.rate:.1%} ({low:.1%} to {high:.1%}) of {found.balls}")
     return 0
 
 
-def fit(known: np.ndarray, out: Path, model: SimModel) -> None:
+def fit(known: np.ndarray, out: Path, model: SimModel, short_balls: bool) -> None:
     """Writes box.yaml and mixture.yaml of strokes (n, 9)."""
     state = BallState(known[:, :3].T, known[:, 3:6].T, known[:, 6:].T)
     strokes = MeasuredStates(np.arange(len(known)), state, f"{len(known):,} measured strokes")
-    box, _ = fit_human(strokes, model.ball, name="box")
+    box, _ = fit_human(strokes, model.ball, name="box", short_balls=short_balls)
     save_distribution(out / "box.yaml", box)
     mixture, choice = fit_mixture(state, "mixture", strokes.source)
-    save_mixture(out / "mixture.yaml", mixture)
+    save_mixture(out / "mixture.yaml", replace(mixture, short_balls=short_balls))
     print(f"{out}: lift.yaml, box.yaml and mixture.yaml ({choice.chosen} components) of {len(known):,} strokes")
 
 
@@ -94,11 +96,11 @@ def as_state(rows: np.ndarray) -> BallState:
     return BallState(*(jnp.asarray(rows[:, i : i + 3].T, jnp.float32) for i in (0, 3, 6)))
 
 
-def pool(rows: np.ndarray, model: SimModel) -> BallPool:
-    """Those of the strokes (n, 9) as balls to be thrown that bounce once before they pass the robot."""
+def pool(rows: np.ndarray, model: SimModel, outcome: int) -> BallPool:
+    """Those of the strokes (n, 9) with that outcome before they pass the robot as balls to be thrown."""
     state = as_state(rows)
     thrown = throw(model.ball, state, *ROBOT_SIDE)
-    kept = np.asarray(thrown.outcome) == KEPT
+    kept = np.asarray(thrown.outcome) == outcome
     state, thrown = jax.tree.map(lambda a: a[..., kept] if a.ndim else a, (state, thrown))
     return BallPool(state, thrown.arrival, thrown.landing, jnp.ones(()), jnp.ones(1))
 
