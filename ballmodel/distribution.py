@@ -88,7 +88,7 @@ def check_keys(data: Any, allowed: Iterable[str], where: str) -> None:
 
 
 def short_balls_of(data: dict, where: str) -> bool:
-    """Whether short balls are drawn. Raises ValueError for what is neither true nor false."""
+    """Choice of short balls, false by default. Raises ValueError for what is neither true nor false."""
     short = data.get(SHORT_BALLS, False)
     if not isinstance(short, bool):
         raise ValueError(f"{where}: {SHORT_BALLS} is {short!r}; true or false is allowed")
