@@ -50,7 +50,7 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m "slow and not realtime"
-	USERS_FUSION=1 $(PYTEST) $(PARALLEL) tests/experiments/study -m slow
+	USERS_FUSION=1 $(PYTEST) $(PARALLEL) tests/experiments/study -m "slow and not realtime"
 	$(PYTEST) $(REALTIME) -m "slow and realtime"
 
 test-all: test test-slow

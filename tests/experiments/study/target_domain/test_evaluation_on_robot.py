@@ -38,6 +38,7 @@ def late_until_a_session_has_ended(folder, said: io.StringIO, over: threading.Ev
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_rallies_that_faults_cut_short_go_on_in_another_session_and_all_count(tmp_path):
     """The real rig, its controller's process stopped until it is not brought back after a fault."""
     run, folder, said, over = tmp_path / "run", tmp_path / "rallies", io.StringIO(), threading.Event()
@@ -56,7 +57,7 @@ def test_rallies_that_faults_cut_short_go_on_in_another_session_and_all_count(tm
     reports = [json.loads(path.read_text()) for path in sorted(folder.glob("2*.json"))]
     played = [rally for report in reports for rally in report["rallies"]["list"]]
     lost = [sum(not rally["filtered"] for rally in report["rallies"]["list"]) for report in reports]
-    assert len(reports) == 2 and BEFORE <= lost[0] < RALLIES and sum(lost) == RALLIES, (lost, said.getvalue())
+    assert len(reports) >= 2 and BEFORE <= lost[0] < RALLIES and sum(lost) == RALLIES, (lost, said.getvalue())
     assert reports[0]["faults"] and f"{RALLIES - lost[0]} of {RALLIES} rallies are left" in said.getvalue()
     counted = scoring.read(step.outputs[0])
     np.testing.assert_array_equal(counted.length, [rally["length"] for rally in played])
