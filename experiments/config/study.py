@@ -138,8 +138,9 @@ class Study(Section):
     """In reality; the number of updates is the round's."""
     reality: Reality = Reality()
     """Effects of the virtual reality that training does not know."""
-    baselines: bool = True
-    """The paper's ten models; false: the variants alone, without what they are compared with."""
+    baselines: bool | Literal["is2r"] = True
+    """The paper's ten models; is2r: of these the loop's alone, to compare variants with it; false: the variants alone,
+    without what they are compared with."""
     fresh: bool = True
     """Also the variant whose weights are not carried back from reality to simulation."""
     identification: Identification | None = None
@@ -192,15 +193,19 @@ class Study(Section):
             )
         if self.identification is not None and self.identification.joints is not None and self.robot is None:
             raise ValueError("identification.joints: the virtual reality records its own; leave it null")
-        if not self.baselines:
+        if self.baselines is not True:
             for key, given in (
-                ("fresh", self.fresh),
+                ("fresh", self.fresh and not self.baselines),
                 ("ablation", self.ablation),
                 ("evaluation.cross", self.evaluation.cross),
                 ("evaluation.effects", self.evaluation.effects and self.robot is None),
             ):
                 if given:
-                    raise ValueError(f"{key}: compares the paper's models, and baselines is false; leave it out, too")
+                    chosen = self.baselines or "false"
+                    raise ValueError(
+                        f"{key}: compares the paper's models, and baselines is {chosen}; leave it out, too"
+                    )
+        if not self.baselines:
             if self.identification is None and not self.randomised and not self.bound:
                 raise ValueError("baselines: false leaves nothing to do without identification, randomised or bound")
         simulation = self.simulation

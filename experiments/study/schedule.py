@@ -76,6 +76,8 @@ LOOP: tuple[Item, ...] = (
     Human("M2", ("D0", "D1", "D2")),
     Simulated("is2r-sim3", "M2", "is2r-ft65", 2),
     Real("is2r-ft100", "is2r-sim3", 2),
+)
+COMPARED: tuple[Item, ...] = (
     Real("s2r-ft65", "is2r-ft35", 1),
     Real("s2r-ft100", "s2r-ft65", 2),
     Simulated("oracle-sim", "M2", None, None),
@@ -148,6 +150,7 @@ def items(study: Study, player: str) -> tuple[Item, ...]:
     """Items made for a player, in an order in which everything comes after what it needs."""
     chosen = (
         (LOOP if study.baselines else (M0,))
+        + (COMPARED if study.baselines is True else ())
         + (FRESH if study.fresh else ())
         + (IDENTIFIED if study.identification else ())
     )

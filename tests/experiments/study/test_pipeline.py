@@ -124,7 +124,9 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
         ({"robot": "lockstep", "identification": {}}, "logs no session; take robot: rig"),
         ({"evaluation": {"rallies": 40, "lanes": 8}}, "evaluation.rallies 40 is less than 50"),
         ({"identification": {"joints": "logs"}}, "identification.joints: the virtual reality records its own"),
-        ({"baselines": False, "identification": {}}, "evaluation.cross: compares the paper's models"),
+        ({"baselines": False, "identification": {}}, "evaluation.cross: .* and baselines is false; leave it out"),
+        ({"baselines": "is2r", "identification": {}}, "evaluation.cross: .* and baselines is is2r; leave it out"),
+        ({"baselines": "s2r"}, "baselines: got 's2r'; allowed: .*is2r"),
         (
             {"baselines": False, "evaluation": {"rallies": 50, "lanes": 5, "cross": False, "effects": False}},
             "leaves nothing to do without identification, randomised or bound",
@@ -222,13 +224,23 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
         assert {"world2", "id-ft100", "prior-ft100", "bound-ft100"} <= made
         assert set(schedule.MODELS) <= made
     # "fine-tuned for 70 updates per cycle for the last two cycles and 60 for the first": 200, oracle 35 %.
-    by_key = {item.key: item for item in schedule.LOOP if not isinstance(item, Human)}
+    by_key = {item.key: item for item in (*schedule.LOOP, *schedule.COMPARED) if not isinstance(item, Human)}
     spent = {}
     for key, item in by_key.items():
         before = spent.get(item.source, 0) if item.source else 0
         spent[key] = before + (schedule.updates(whole, item) if isinstance(item, Real) else 0)
     assert spent["is2r-ft100"] == spent["s2r-ft100"] == 200 and spent["oracle-ft"] == 0.35 * 200
     assert schedule.updates(whole, by_key["oracle-sim"]) == 40000
+
+
+def test_the_loop_alone_is_compared_with_its_variants():
+    changes = ("baselines=is2r", "identification={}", "ablation=null", "evaluation={cross: false, effects: false}")
+    found = schedule.pairings(study_config.load(study_config.shipped()["study_night"], changes))
+    of_one = {model for trainer, player, model in found if trainer == player == "player4"}
+    rounds = ("sim1", "ft35", "sim2", "ft65", "sim3", "ft100")
+    loops = {f"{loop}-{step}" for loop in ("is2r", "id") for step in rounds}
+    assert of_one == loops | {f"fresh-{step}" for step in ("sim2", "ft65", "sim3", "ft100")}
+    assert len(found) == 5 * len(of_one)
 
 
 def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
@@ -247,7 +259,7 @@ def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
 
 def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
     night = study_config.load(study_config.shipped()["study_night"])
-    by_key = {item.key: item for item in schedule.LOOP if isinstance(item, Simulated)}
+    by_key = {item.key: item for item in (*schedule.LOOP, *schedule.COMPARED) if isinstance(item, Simulated)}
     first = training.configuration(night, by_key["is2r-sim1"], "player3/M0", None, 5)
     later = training.configuration(night, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
     oracle = training.configuration(night, by_key["oracle-sim"], "player3/M2", None, 7)
