@@ -23,7 +23,7 @@ from robot_io.emulator.config import RigParams
 from tests.support.paths import ROOT
 
 POLICY = ROOT / "experiments/shipped/policies/quickstart"
-PLAYED, LATE = 60, 0.02  # balls of a session; [s] by which the second robot obeys later
+PLAYED, LATE = 40, 0.02  # balls of a session; [s] by which the second robot obeys later
 
 
 def world() -> on_robot.RobotWorld:
@@ -50,8 +50,8 @@ def test_a_fine_tuning_without_a_log_is_told_so(tmp_path):
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     path = tmp_path_factory.mktemp("served") / "D0.csv"
-    balls = served_balls.served("player3", 60, 3, "D0")
-    assert len(balls) == 60 and all(t.position[1, 0] > 0.5 and t.position[1].min() < 0.0 for t in balls)
+    balls = served_balls.served("player3", 40, 3, "D0")
+    assert len(balls) == 40 and all(t.position[1, 0] > 0.5 and t.position[1].min() < 0.0 for t in balls)
     measurements.write_csv(path, balls)
     return path
 
