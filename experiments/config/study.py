@@ -205,9 +205,8 @@ class Study(Section):
                     raise ValueError(
                         f"{key}: compares the paper's models, and baselines is {chosen}; leave it out, too"
                     )
-        if not self.baselines:
-            if self.identification is None and not self.randomised and not self.bound:
-                raise ValueError("baselines: false leaves nothing to do without identification, randomised or bound")
+        if not (self.baselines or self.identification or self.randomised or self.bound):
+            raise ValueError("baselines: false leaves nothing to do without identification, randomised or bound")
         simulation = self.simulation
         later = {f"simulation.rounds.{k}.later_rewards": r.later_rewards for k, r in enumerate(simulation.rounds)}
         experiment.refuse_rewards(simulation.optimiser, simulation.task, "simulation.", later)
