@@ -20,7 +20,8 @@ from experiments.study.target_domain.evaluation_on_robot import rally_step
 from tests.support.paths import ROOT
 
 POLICY = ROOT / "experiments/shipped/policies/quickstart"
-RALLIES, BEFORE = 5, 2  # that count; of these before the machine is late
+RALLIES = 5  # that count
+BEFORE = 2  # rallies before the machine is late, whether they count or not
 STOPPED, PERIOD = 0.15, 0.5  # [s] the arm's controller stands still; often enough that no recovery is left in peace
 
 
@@ -56,9 +57,10 @@ def test_rallies_that_faults_cut_short_go_on_in_another_session_and_all_count(tm
         disturbing.join()
     reports = [json.loads(path.read_text()) for path in sorted(folder.glob("2*.json"))]
     played = [rally for report in reports for rally in report["rallies"]["list"]]
-    lost = [sum(not rally["filtered"] for rally in report["rallies"]["list"]) for report in reports]
-    assert len(reports) >= 2 and BEFORE <= lost[0] < RALLIES and sum(lost) == RALLIES, (lost, said.getvalue())
-    assert reports[0]["faults"] and f"{RALLIES - lost[0]} of {RALLIES} rallies are left" in said.getvalue()
+    count = [sum(not rally["filtered"] for rally in report["rallies"]["list"]) for report in reports]
+    assert len(reports) >= 2 and len(reports[0]["rallies"]["list"]) >= BEFORE, said.getvalue()
+    assert count[0] < RALLIES and sum(count) == RALLIES, (count, said.getvalue())
+    assert reports[0]["faults"] and f"{RALLIES - count[0]} of {RALLIES} rallies are left" in said.getvalue()
     counted = scoring.read(step.outputs[0])
     np.testing.assert_array_equal(counted.length, [rally["length"] for rally in played])
     np.testing.assert_array_equal(counted.filtered, [rally["filtered"] for rally in played])
