@@ -36,7 +36,7 @@ A file name without a folder that is not in the current folder is looked up amon
 
 @app.default
 def compare(
-    comparison: Annotated[str, Parameter("YAML", help="docs/results/algorithms.md explains it")],
+    comparison: Annotated[str, Parameter("YAML", help="docs/how-to/compare-algorithms.md explains it")],
     /,
     *,
     out: Annotated[str, option("FOLDER", "where its folder goes (default: runs)")] = "runs",

@@ -41,7 +41,7 @@ report_app = command(
     "study-report",
     "the report of a study, whole or under way: one HTML page",
     """\
-  mjx-tt study-report runs/study-quick
+  mjx-tt study-report runs/study_quick
 
 Writes report/index.html with its pictures and tables: the paper's figures with ours beside them. What a study lacks is
 named.

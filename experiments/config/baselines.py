@@ -223,6 +223,12 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comp
         raise ConfigError(
             f"{path}: experiment: training.later_rewards: a comparison has one set of reward weights; null"
         )
+    for key in ("network", "initial_policy"):
+        if getattr(experiment, key) is not None:
+            raise ConfigError(
+                f"{path}: experiment: {key}: {getattr(experiment, key)}: every algorithm of a comparison starts from "
+                "random weights of its own network; null"
+            )
     return comparison, experiment
 
 

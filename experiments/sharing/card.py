@@ -13,6 +13,7 @@ from robot_io.policy.artefact import Artefact
 # Name -> value, lower and upper end of its 95 % interval, count and unit of what it was measured on.
 Rates = dict[str, tuple[float, float, float, int, str]]
 
+_METHODS = {"zeroth_order": "Blackbox Gradient Sensing", "first_order": "first-order gradients"}  # optimiser.gradient
 _TEMPLATES = Environment(
     loader=PackageLoader("experiments.sharing"),
     undefined=StrictUndefined,
@@ -32,6 +33,7 @@ def write(artefact: Artefact, config: dict[str, Any], evaluation: dict[str, Any]
             **manifest,
             config=config,
             balls=balls,
+            method=_METHODS[(config.get("optimiser") or {}).get("gradient", "zeroth_order")],
             evaluation=evaluation,
             rates=rates(evaluation),
             percent=_percent,

@@ -295,6 +295,7 @@ def test_a_comparison_on_another_robot_runs(tmp_path):
         ("budget={clock: cpu}", r"minutes, episodes or both"),
         ("seeds=[1, 1]", r"seeds.*different"),
         ("experiment.training.later_rewards={after: 0.5, rewards: real}", r"later_rewards"),
+        ("experiment.initial_policy=runs/quickstart", r"experiment: initial_policy: .*runs/quickstart.*random weights"),
         ("experiment.ball=narrow", r"experiment.*unknown key.*ball"),
     ],
 )

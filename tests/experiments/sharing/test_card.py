@@ -69,6 +69,13 @@ def test_without_a_bound_it_is_left_out_and_an_evaluation_of_another_kind_is_ref
         write(artefact, {"episodes": 3})
     with pytest.raises(RunError, match="lacks what a card says"):
         write(artefact, {key: value for key, value in evaluation.items() if key != "engine"})
-    assert "on the balls mine" in card.write(
+    assert "by Blackbox Gradient Sensing on the balls mine" in card.write(
         artefact, {"name": "a", "balls": {"name": "mine"}, "model": {}}, evaluation
     )
+
+
+def test_it_names_the_gradient_that_trained_the_policy(artefact):
+    config = artefact.manifest["provenance"]["config"]
+    first_order = config | {"optimiser": config["optimiser"] | {"gradient": "first_order"}}
+    text = card.write(artefact, first_order, artefact.manifest["provenance"]["evaluation"])
+    assert "by first-order gradients on" in text and "Blackbox" not in text

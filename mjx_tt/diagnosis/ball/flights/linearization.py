@@ -21,7 +21,7 @@ SPIN, KICK = slice(6, 9), slice(9, 12)
 MAGNUS = FLIGHT + "magnus_coefficient"
 START_STEPS = np.array([1e-6] * 3 + [1e-5] * 3 + [0.1] * 3 + [1e-5] * 3)  # [m], [m/s], [rad/s], [m/s]
 COARSE = 0.1  # of an effect's scale: a step over which few balls go from sliding to rolling at once
-REFERENCE_MAGNUS = 0.6  # k used where the nominal model has none: in flight only k omega shows (PHYSICS: 0.3 to 1.5)
+REFERENCE_MAGNUS = 0.6  # k used where the nominal model has none: in flight only k omega shows (published: 0.3 to 1.5)
 
 
 @dataclass(frozen=True)
