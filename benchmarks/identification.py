@@ -37,6 +37,7 @@ from experiments.study import identification
 from experiments.study.analysis.identified import LOGS, estimates, holds
 from experiments.study.target_domain import hidden_effects, hit_log, joint_log
 from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.study.target_domain.world import with_spin
 from experiments.training.loop import train
 from mjx_tt import platform
 from mjx_tt.env.policy import Policy
@@ -49,6 +50,7 @@ WORLDS = ("nominal", "prior", "identified", "hits", "truth")
 CLASSES = ((), ("lift",), (), ("bounce",), (), ("blade",), (), ("mount",), (), ("lift", "bounce", "blade", "mount"))
 BALLS, RALLIES, LANES = 4000, 80, 16  # balls of each evaluation; rallies of each policy, in lanes
 CAMERA_NOISE = 0.003  # [m]
+BELIEVED = SimModel().latency.ball_observation  # [s]
 SHARED = {"lift": ("flight",), "bounce": ("restitution",), "blade": ("paddle.restitution",), "mount": ()}
 
 
@@ -135,12 +137,13 @@ def of_reality(
         {"name": "x", "simulation": {"rounds": rounds}, "reality": {"outside": list(outside)}}, "study"
     )
     reality, folder = VirtualReality(study, seed), out / f"logs_{seed}"
-    person, keys = reality.player(player), jax.random.split(jax.random.key(seed), 6)
+    person, whole = reality.player(player), jax.random.key(seed)
+    keys = [*jax.random.split(whole, 6), jax.random.fold_in(whole, 6)]
     measurements.write_csv(_made(folder) / "D0.csv", reality.first_balls(person, logged[0], keys[0], "D0"))
     records = joint_log.record(reality.simulator.task, reality.known, keys[1], logged[1])
     identification.write_joints(folder / "joints", records)
     policy = load_policy.load(QUICKSTART).policy
-    log = hit_log.record(reality.simulator, reality.known, person, policy, keys[2], "hits", CAMERA_NOISE)
+    log = hit_log.record(reality.simulator, reality.known, person, policy, keys[2], "hits", CAMERA_NOISE, BELIEVED)
     identification.write_hits(folder / "hits", log.balls, log.joints)
     prior = identification.prior(studies.PRIOR, "prior")
     worlds = {"nominal": ModelFile(SimModel()), "prior": ModelFile(SimModel(), prior)}
@@ -153,7 +156,7 @@ def of_reality(
         seconds[name], worlds[name] = time.monotonic() - began, found.world
         counts[name] = found.hits
         found.world.save(folder / f"{name}.yaml")
-    worlds["truth"] = ModelFile(reality.model)
+    worlds["truth"] = ModelFile(with_spin(reality, player, keys[6]))
     base = {
         "seed": seed,
         "outside": list(outside),

@@ -20,6 +20,8 @@ from ballmodel.io import read
 from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Dataset, Trajectory
 from experiments import measurements
+from experiments.study import delays
+from experiments.study.analysis.identified import PRIOR_ALONE
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, joint_path
 from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
 from mjx_tt.diagnosis.logs import ROBOT_FILES, load_logs
@@ -31,11 +33,8 @@ from mjx_tt.sim.model import ModelFile, SimModel
 from mjx_tt.sim.randomisation import Randomised, Range, Samples
 
 BALLS, CLOCK = "balls.csv", 1e6  # [s] by which the clocks of several folders of hits are set apart
-BALL_DELAY = "latency.ball_observation"
 # The frame is the table's: bounces that lie too high are a camera that sees high, not a table that stands there.
 HEIGHT, SEEN_HIGH = "ball.table.height", "sensing.ball_offset_z"
-# Delays of which the joints' log shows sums: these are left as believed, the actions' take the change.
-GAUGE = ("latency.abb_observation", "latency.festo_observation")
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,8 @@ def identify(
     if len(balls) > most:
         balls = tuple(balls[i] for i in np.sort(np.random.default_rng(0).permutation(len(balls))[:most]))
     ranges = {one.path: (one.low, one.high) for one in before}
-    known = {path: (0.5 * (low + high), (high - low) / 12**0.5) for path, (low, high) in ranges.items()}
+    arm, axes = (models.paths(believed.model)[path] for path in (delays.ARM, delays.AXES))
+    known = delays.moments(ranges, arm)
     seen = {HEIGHT if path == SEEN_HIGH else path: normal for path, normal in known.items()}
     flown = of_balls.fit(balls, believed.model, seen, say)
     say("fitting the drives")
@@ -95,17 +95,22 @@ def identify(
     drawn = [] if driven is None else [driven.samples()]
     lift = np.random.default_rng(1).normal(0.0, of_balls.LIFT_ERROR, of_balls.DRAWS)
     if struck is not None:
-        shown, lift = struck.samples(ranges)
+        shown, lift = struck.samples(delays.against_the_arm(ranges, arm))
         drawn.append(shown)
-    samples = _joined([_in_the_tables_frame(flown.samples(lift)), *drawn])
-    settled = {*samples.paths, *(GAUGE if driven is not None else ())}
+    found = {path for one in drawn for path in one.paths}
+    # Against the arm, whose delay is as believed; which other ranges know nothing of.
+    open_ = [path for path in (delays.AXES, delays.BALL) if drawn and path in ranges and path not in found]
+    if open_:
+        drawn.append(delays.drawn(ranges, arm, open_, of_balls.DRAWS))
+    samples = delays.in_sum(_joined([_in_the_tables_frame(flown.samples(lift)), *drawn]), axes)
+    settled = {*samples.paths, *((delays.ARM,) if drawn else ())}
     others: list[Randomised] = [one for one in before if one.path not in settled]
     own = settled | {one.path for one in before}
     others += [one for one in believed.randomise if not set(one.paths) & own]
     centre = dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
     left = {} if driven is None else driven.left
     hit = 0 if struck is None else struck.hits
-    made_of = {"flights": flown.problem.grid.n, "hits": hit, "joints": left}
+    made_of = {"flights": flown.problem.grid.n, "hits": hit, "joints": left, PRIOR_ALONE: open_}
     world = ModelFile(models.with_values(flown.model(), centre), (samples, *others), {"identified": made_of})
     return Identified(world, flown.problem.grid.n, hit, left, flown.posterior.converged)
 
@@ -147,12 +152,6 @@ def _of_hits(
         tuple(map(np.concatenate, zip(*(getattr(path, name) for path in paths), strict=True)))
         for name in ("time", "position")
     )
-    known = dict(known)
-    if BALL_DELAY in known:
-        # The joints' delay shows in sums with their commands' alone, where it is taken as believed: by how much it is
-        # not, the ball's seems to differ.
-        mean, deviation = known[BALL_DELAY]
-        known[BALL_DELAY] = mean, 2**0.5 * deviation
     return of_hits.fit(flown, balls, JointPath(times, places), known)
 
 

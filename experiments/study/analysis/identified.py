@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from experiments.study import delays
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile
 from mjx_tt.sim.randomisation import Samples
 
 LOGS, PRIOR, BELIEVED = "logs", "prior", "as believed"
-BUSES = ("abb", "festo")
+PRIOR_ALONE = "from the prior alone"  # what made the world: those of its samples that no log decided
 SPIN = "ball_spin."  # of strokes: a person's own, so that a reality has no one number for it
 
 
@@ -18,38 +19,26 @@ def estimates(world: ModelFile, truth: Mapping[str, float] | None = None) -> lis
     """A row for each parameter that the world moved or draws: its value, 90 % of what is drawn, and the truth if known.
 
     decided by: the logs, the prior, or neither. truth: values that differ from the nominal model, by dotted path;
-    delays as ``in_sums`` has them.
+    delays as ``delays.in_sums`` has them.
     """
     nominal, values = models.paths(), models.paths(world.model)
-    drawn = {path: ends for one in world.randomise for path, ends in one.ends().items()}
-    logged = {path for one in world.randomise if isinstance(one, Samples) for path in one.paths}
-    known = None if truth is None else in_sums(nominal | dict(truth), values)
+    shown = [delays.as_shown(x, values[delays.AXES]) if isinstance(x, Samples) else x for x in world.randomise]
+    drawn = {path: ends for one in shown for path, ends in one.ends().items()}
+    alone = (world.provenance or {}).get("identified", {}).get(PRIOR_ALONE, ())
+    logged = {path for one in shown if isinstance(one, Samples) for path in one.paths} - set(alone)
+    known = None if truth is None else delays.in_sums(nominal | dict(truth), values)
     rows = []
     for path, value in values.items():
         low, high = drawn.get(path, (value, value))
         if low == high == nominal[path] and (truth is None or path not in truth):
             continue
         row: dict[str, Any] = {"parameter": path, "believed": nominal[path], "low": low, "high": high}
-        alone = path not in drawn and value != nominal[path]  # one value for all, such as the strokes' mean spin
-        row["decided by"] = LOGS if path in logged or alone else PRIOR if path in drawn else BELIEVED
+        one_value = path not in drawn and value != nominal[path]  # for all, such as the strokes' mean spin
+        row["decided by"] = LOGS if path in logged or one_value else PRIOR if path in drawn else BELIEVED
         if known is not None and not path.startswith(SPIN):
             row["truth"] = known[path]
         rows.append(row)
     return rows
-
-
-def in_sums(truth: Mapping[str, float], believed: Mapping[str, float]) -> dict[str, float]:
-    """The truth's values with delays as logs and play can show them.
-
-    Of a bus only the sum of the delays of command and measurement shows, of the ball its delay against the arm's
-    joints: the joints' are as believed, and the others have the difference.
-    """
-    found = dict(truth)
-    observed = {bus: f"latency.{bus}_observation" for bus in BUSES}
-    for bus, path in observed.items():
-        found[f"latency.{bus}_action"] += truth[path] - believed[path]
-    found["latency.ball_observation"] += believed[observed["abb"]] - truth[observed["abb"]]
-    return found | {path: believed[path] for path in observed.values()}
 
 
 def holds(row: Mapping[str, Any]) -> bool | None:

@@ -59,12 +59,14 @@ def record(
     key: PRNGKeyArray,
     session: str,
     noise: float,
+    believed: float,
     lanes: int = 12,
     turns: int = 10,
 ) -> HitLog:
     """``lanes`` x ``turns`` balls of rallies of a player with a policy, one after the other on the log's clock.
 
-    model: the reality, without what is nominal; noise: [m] of the camera.
+    model: the reality, without what is nominal; noise: [m] of the camera; believed: [s] by which the camera is late as
+    far as one knows, which its stamps are put right by.
     """
     start_key, play_key, camera_key = jax.random.split(key, 3)
     policy = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[..., None], lanes, axis=-1), policy)
@@ -80,8 +82,7 @@ def record(
         late_by = np.asarray(episodes.latency)
         for lane in range(lanes):
             begin = EVERY * (turn * lanes + lane)
-            # Less what the model believes: a log's stamps are put right by it when they are read.
-            late = float(late_by[0, lane]) - SimModel().latency.ball_observation
+            late = float(late_by[0, lane]) - believed
             count = in_sight(watched[0][..., lane])
             time = begin + late + np.arange(count) / CAMERA_RATE
             balls.append(Trajectory(session, str(len(balls)), np.asarray(time), seen[:, :count, lane]))

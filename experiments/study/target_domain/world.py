@@ -19,10 +19,12 @@ from experiments.config.study import Study
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import CONFIG, Run
+from experiments.study import delays
 from experiments.study.target_domain import hit_log, joint_log
 from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.hit_log import HitLog
 from mjx_tt.diagnosis.joint import JointRecord
+from mjx_tt.robot import robot as robots
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 
@@ -47,6 +49,17 @@ class World(Protocol):
         """Function that scores a policy with the player; None where scores are not needed."""
 
 
+def with_spin(reality: VirtualReality, player: str, key: PRNGKeyArray) -> SimModel:
+    """The reality's model with mean and spread of the spin of a player's strokes."""
+    state = reality.simulator.start(reality.player(player), reality.known, key, STROKES)
+    spin = np.asarray(state.ball.spin)
+    mean, std = (
+        {f"ball_spin.{kind}_{axis}": float(x) for axis, x in zip("xyz", values, strict=True)}
+        for kind, values in (("mean", spin.mean(axis=1)), ("std", spin.std(axis=1)))
+    )
+    return models.with_values(reality.model, mean | std)
+
+
 class VirtualWorld:
     """The virtual reality of a seed."""
 
@@ -63,14 +76,7 @@ class VirtualWorld:
 
     def with_spin(self, player: str, name: str) -> SimModel:
         """The reality as a training could have it at best: with mean and spread of the spin of the player's strokes."""
-        reality = self.reality
-        state = reality.simulator.start(reality.player(player), reality.known, self._key(name), STROKES)
-        spin = np.asarray(state.ball.spin)
-        mean, std = (
-            {f"ball_spin.{kind}_{axis}": float(x) for axis, x in zip("xyz", values, strict=True)}
-            for kind, values in (("mean", spin.mean(axis=1)), ("std", spin.std(axis=1)))
-        )
-        return models.with_values(reality.model, mean | std)
+        return with_spin(self.reality, player, self._key(name))
 
     def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
         """Commands and measured positions of all joints in so many seconds of motion without a ball."""
@@ -80,7 +86,10 @@ class VirtualWorld:
         """Balls of rallies with the policy of the run ``source``."""
         reality, policy = self.reality, load_policy.load(source).policy
         person, noise = reality.player(player), self._study.reality.camera_noise
-        return hit_log.record(reality.simulator, reality.known, person, policy, self._key(name), name, noise)
+        plain = build.with_prior(self._study.simulation.model, robots.paper(), "simulation")
+        late = models.paths(models.from_dict(plain, "simulation.model").model)[delays.BALL]
+        key = self._key(name)
+        return hit_log.record(reality.simulator, reality.known, person, policy, key, name, noise, late)
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         theta, statistics = load_policy.load_statistics(source)

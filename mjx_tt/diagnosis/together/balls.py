@@ -102,8 +102,10 @@ def fit(
     kept = [t for t in flown if clear_of_the_edge(t)]
     if len(kept) < len(flown):
         say(f"left out, for they bounced at the table's edge: {len(flown) - len(kept)}")
+    usual = models.paths()
+    # An effect's least change is one from the nominal model; here changes are from the middle of its prior.
     effects = tuple(
-        replace(e, scale=prior[e.path][1], express=None)
+        replace(e, scale=prior[e.path][1], express=None, low=e.low + usual[e.path] - prior[e.path][0])
         for e in EFFECTS
         if e.fit and not e.at_paddle and e.path in prior and not e.made_of
     )

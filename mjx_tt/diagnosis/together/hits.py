@@ -1,4 +1,4 @@
-"""Posterior of rubber, delay of the ball, encoders' zeros and the camera's sideways offset, from hits.
+"""Posterior of rubber, delays of ball and axes, encoders' zeros and the camera's sideways offset, from hits.
 
 None of these shows in a ball before its hit or in the joints alone, and none can be told apart in a single hit; they
 are ordinary sizes of what every installation has. So nothing is named here: each has a prior, and the maximum of the
@@ -23,12 +23,14 @@ from mjx_tt.diagnosis.hits.diagnose import FARTHEST, FEWEST_HITS, line_behind, s
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses
 from mjx_tt.diagnosis.together.balls import LIFT_ERROR, BallsTogether
 from mjx_tt.sim.randomisation import Samples
-from robot_io.contract import JOINT_NAMES
+from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
 
 PADDLE = ("ball.paddle.restitution", "ball.paddle.tangential_gain", "latency.ball_observation")
 CAMERA = ("sensing.ball_offset_x", "sensing.ball_offset_y")
+AXES = "latency.festo_observation"  # against the arm's, which is taken as believed: the clock's origin shows nowhere
+HEIGHT, SEEN_HIGH = "ball.table.height", "sensing.ball_offset_z"
 ZEROS = tuple(f"drives.{joint}.joint_offset" for joint in JOINT_NAMES)
-SHOWN = (*PADDLE, *CAMERA, *ZEROS)  # by hits, and by no other log
+SHOWN = (*PADDLE, *CAMERA, AXES, *ZEROS)  # by hits, and by no other log
 LIFT = "lift"  # error of its coefficient, along which the balls' parameters go
 STEP = 0.05  # of a prior's deviation, by which derivatives are taken
 ROUNDS = 4
@@ -63,8 +65,10 @@ def fit(
 ) -> HitsTogether | None:
     """The posterior after the hits among the trajectories; None where there are fewer than FEWEST_HITS of them.
 
-    balls: what flights before a hit say, which is taken as settled but for the lift. path: of the joints on the balls'
-    clock, with the zeros that were reported. prior: of those of ``SHOWN`` that are sought; the others stay as they are.
+    balls: what flights before a hit say, which is taken as settled but for the lift; a table that lies high in it is a
+    camera that sees high, since the robot stands in the table's frame. path: of the joints on the balls' clock, as late
+    as the model of ``balls`` has it, with the zeros that were reported. prior: of those of ``SHOWN`` that are sought;
+    the others stay as they are.
     """
     pairs = watched_hits(trajectories, path)
     if len(pairs) < FEWEST_HITS or path is None:
@@ -90,9 +94,17 @@ def fit(
         """Measured positions (3, T, n) that the model plays, and when each is hit (n,)."""
         at = dict(zip(names, values, strict=True))
         zeros = [at.get(name, 0.0) for name in ZEROS]
-        moved = JointPath(path.time, tuple(q - zero for q, zero in zip(path.position, zeros, strict=True)))
+        later = at.get(AXES, problem.nominal[AXES]) - problem.nominal[AXES]
+        moved = JointPath(
+            tuple(t - later if i in FESTO_JOINTS else t for i, t in enumerate(path.time)),
+            tuple(q - zero for q, zero in zip(path.position, zeros, strict=True)),
+        )
         changed = problem.values(balls.along_lift(float(at[LIFT]))[:, None, None])
         begin = started(float(at[LIFT])).copy()
+        if HEIGHT in changed:
+            high = changed[HEIGHT] - problem.nominal[HEIGHT]
+            changed |= {HEIGHT: changed[HEIGHT] - high, SEEN_HIGH: problem.nominal[SEEN_HIGH] + high}
+            begin[2] -= high[0, 0]
         for name in (*PADDLE, *CAMERA):
             if name in at:
                 changed[name] = np.full((1, 1), at[name])

@@ -46,6 +46,9 @@ def test_balls_that_spin_faster_than_anybody_hits_are_left_out(monkeypatch):
     """With a limit that some of these balls exceed: what is left is below it, and all else is as without the others."""
     balls, said = thrown(np.random.default_rng(1).normal(0.0, 8.0, 80)), []
     whole = of_balls.fit(balls, SimModel(), KNOWN)
+    # A spin that does not decay at all is as possible as one that decays by twice the prior's middle.
+    (decay,) = (effect for effect in whole.problem.effects if effect.name == "spin_decay")
+    assert decay.low == pytest.approx(-KNOWN[decay.path][0])
     fast = np.linalg.norm(whole.posterior.at.start[SPIN], axis=0)
     limit = float(np.sort(fast)[-4:-2].mean())  # two exceed it, if the others keep their spins
     monkeypatch.setattr(of_balls, "FASTEST", limit)

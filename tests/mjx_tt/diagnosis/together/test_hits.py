@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -46,6 +48,35 @@ def test_all_of_it_is_found_together_within_its_errors():
     drawn, lift = found.samples({name: (m - 9 * d, m + 9 * d) for name, (m, d) in PRIOR.items()})
     assert drawn.paths == tuple(WANTED) and lift.shape == (hits.DRAWS,)
     np.testing.assert_allclose(np.cov(drawn.values.T), found.covariance[:-1, :-1], rtol=0.6, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_axes_that_are_measured_later_than_the_arm_are_not_taken_for_zeros():
+    late, zeros = 0.015, {f"drives.gantry_{axis}.joint_offset": (0.0, 0.004) for axis in "xy"}
+    measured, records = play(Rubber(), 7)
+    path = joint_path(records, MODEL)
+    path = JointPath(tuple(t + late if i < 2 else t for i, t in enumerate(path.time)), path.position)
+    prior = {**PRIOR, **zeros, hits.AXES: (0.033, 0.014)}
+    found = hits.fit(balls.fit(measured, MODEL, FLIGHTS), measured, path, prior)
+    at, errors = dict(zip(found.paths, found.mean, strict=True)), np.sqrt(np.diagonal(found.covariance))
+    error = dict(zip(found.paths, errors, strict=True))
+    assert error[hits.AXES] < 0.006 and abs(at[hits.AXES] - 0.033 - late) < 2.5 * error[hits.AXES]
+    assert all(abs(at[name]) < 2.5 * error[name] for name in zeros)
+    assert abs(at["latency.ball_observation"] - 0.040) < 2.5 * error["latency.ball_observation"]
+
+
+@pytest.mark.slow
+def test_a_camera_that_sees_high_moves_the_ball_against_the_paddle():
+    """Bounces that lie 12 mm too high are the camera's: seen without it, the same hits show the same."""
+    measured, path = fitted(TRUTH, 7)
+    flights = balls.fit(measured, MODEL, {**FLIGHTS, hits.HEIGHT: (-3.0, 0.01)})
+    (height,) = (i for i, effect in enumerate(flights.problem.effects) if effect.path == hits.HEIGHT)
+    theta = flights.posterior.theta + 0.012 * np.eye(len(flights.problem.effects))[height]
+    above = replace(flights, posterior=replace(flights.posterior, theta=theta))
+    seen_high = [replace(t, position=t.position + np.array([[0.0], [0.0], [0.012]])) for t in measured]
+    plain, high = hits.fit(flights, measured, path, PRIOR), hits.fit(above, seen_high, path, PRIOR)
+    errors = np.sqrt(np.diagonal(plain.covariance))
+    assert np.all(np.abs(high.mean - plain.mean)[:-1] < 0.1 * errors[:-1]), (plain.mean, high.mean)
 
 
 def test_too_few_hits_leave_everything_open():
