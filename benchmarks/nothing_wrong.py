@@ -38,6 +38,7 @@ QUICKSTART = Path("experiments/shipped/policies/quickstart")
 PLAYERS = ("player1", "player2", "player3", "player4", "player5")
 BALLS, SECONDS = 200, 60.0  # of the kind balls; of its joints [s]
 NOISE = 0.003  # [m] of the camera
+LATE = SimModel().latency.ball_observation  # [s]
 EPOCH = 1_600_000_000_000_000_000  # [ns] since 1970 of the logs' begin
 _lobs = jax.jit(human_player.first_ball, static_argnums=3)
 
@@ -67,7 +68,7 @@ class Nominal:
         """Balls of rallies with the hits in them."""
         player = self.reality.player(PLAYERS[seed % len(PLAYERS)])
         key = jax.random.key(seed)
-        found = hit_log.record(self.reality.simulator, self.model, player, self.policy, key, "nominal", NOISE)
+        found = hit_log.record(self.reality.simulator, self.model, player, self.policy, key, "nominal", NOISE, LATE)
         return Logs(tuple(found.balls), found.joints, {})
 
 
