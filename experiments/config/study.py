@@ -92,8 +92,8 @@ class Evaluation(Section):
     """Rallies of every model with its own player and with others."""
 
     rallies: Annotated[int, Field(ge=FEWEST_ON_RIG)] = 80
-    """Played by each player with each model, 50 at least, on the rig 5; what is left after filtering is cut to the top
-    60, then to the top 50."""
+    """Played by each player with each model, 50 at least, on the rig 5; what is left after filtering is cut to the
+    first 60, then to the longest 50, or five sixths of fewer."""
     lanes: Count = 8
     """Sessions side by side into which these rallies are divided."""
     max_touches: Count = 400

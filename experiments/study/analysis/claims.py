@@ -134,7 +134,7 @@ class Measurements:
     @cached_property
     def raw(self) -> Bootstrap:
         """Rally lengths that the paper reports, own and cross-evaluations."""
-        return Bootstrap(self.study.pick(own=None), over_seeds=self.over_seeds)
+        return Bootstrap(self.study.pick(own=None, selected=False), over_seeds=self.over_seeds, longest=True)
 
     @cached_property
     def unselected(self) -> Bootstrap:
@@ -144,13 +144,13 @@ class Measurements:
     @cached_property
     def normalised(self) -> Bootstrap:
         """Own evaluations of the ten models, normalised by player."""
-        rallies = self.study.pick(TEN)
+        rallies = self.study.pick(TEN, selected=False)
         return _finite(rallies, normalised_by_player(rallies), self.over_seeds)
 
     @cached_property
     def cross_normalised(self) -> Bootstrap:
         """Own and cross-evaluations of the final models, normalised by the trainer's own evaluation of the model."""
-        rallies = self.study.pick(FINAL, own=None)
+        rallies = self.study.pick(FINAL, own=None, selected=False)
         return _finite(rallies, normalised_by_model(rallies), self.over_seeds)
 
     def ratio(
@@ -175,8 +175,9 @@ class Measurements:
 
     def short(self) -> Estimate | None:
         """Share of rallies below SHORT, S2R+FT minus i-S2R."""
-        rallies = self.study.pick(FINAL)
-        return self.minus(Bootstrap(rallies, rallies.length < SHORT, self.over_seeds), S2R, IS2R, "all")
+        rallies = self.study.pick(FINAL, selected=False)
+        boot = Bootstrap(rallies, rallies.length < SHORT, self.over_seeds, longest=True)
+        return self.minus(boot, S2R, IS2R, "all")
 
     def longer(self) -> Estimate | None:
         """Share of players whose rallies are longer under i-S2R than under S2R+FT."""
@@ -382,4 +383,4 @@ def _changes(models: dict[str, BallDistribution]) -> tuple[float, float]:
 
 def _finite(rallies: Rallies, values: np.ndarray, over_seeds: bool) -> Bootstrap:
     good = np.isfinite(values)
-    return Bootstrap(rallies.take(good), values[good], over_seeds)
+    return Bootstrap(rallies.take(good), values[good], over_seeds, longest=True)

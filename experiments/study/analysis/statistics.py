@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from experiments.stats import sign_flip, t_interval, welch_interval, welch_p
-from experiments.study.analysis.scoring import Rallies
+from experiments.study.analysis.scoring import Rallies, kept
 
 DRAWS = 2000
 FEWEST_SEEDS = 5  # drawn anew: 4 of 5 give 70 different means, 1 of 2 give two
@@ -70,6 +70,9 @@ class Estimate:
 class Bootstrap:
     """Means over cells (one seed's policy with one evaluator) whose rallies, and the seeds, are drawn anew.
 
+    ``longest``: means of the rallies that are reported. The pool of each evaluation is drawn anew, and of each draw the
+    longest are selected, since to draw from the selected ones alone takes the selection for granted.
+
     With S seeds, FEWEST_SEEDS at least, S - 1 of them are drawn with replacement: the spread of the draws is then an
     unbiased estimate of the spread of a mean over S seeds (Rao and Wu 1988), which drawing S makes too small by
     (S - 1) / S.
@@ -82,14 +85,21 @@ class Bootstrap:
         over_seeds: bool = True,
         draws: int = DRAWS,
         key: int = 0,
+        longest: bool = False,
     ) -> None:
-        """values: (n,) of each rally, its length by default."""
-        values = rallies.length if values is None else values
+        """rallies: that count; values: (n,) of each rally, its length by default."""
+        values = np.asarray(rallies.length if values is None else values, float)
         rng = np.random.default_rng(key)
-        self.cells = cells(rallies, np.asarray(values, float))
+        reported = rallies.selected if longest else np.ones(len(rallies), bool)
+        self.cells = cells(rallies.take(reported), values[reported])
         self.seeds = tuple(sorted({cell[0] for cell in self.cells}))
         self.point = {cell: float(v.mean()) for cell, v in self.cells.items()}
-        self._draws = {cell: v[rng.integers(0, v.size, (draws, v.size))].mean(axis=1) for cell, v in self.cells.items()}
+        pooled = rallies.pooled if longest else reported
+        order = np.flatnonzero(pooled)[np.argsort(-rallies.length[pooled], kind="stable")]  # the longest first
+        self._draws = {
+            cell: _means(v, kept(v.size) if longest else v.size, draws, rng)
+            for cell, v in cells(rallies.take(order), values[order]).items()
+        }
         # Which seeds each draw takes, by how many there are: the same for all means, so that their differences pair.
         self._chosen = {
             s: rng.integers(0, s, (s - 1, draws)) for s in range(FEWEST_SEEDS, len(self.seeds) + 1) if over_seeds
@@ -142,6 +152,14 @@ class Bootstrap:
         return Estimate(float(points.mean()), drawn, sum(self.cells[cell].size for cell in found))
 
 
+def _means(values: np.ndarray, first: int, draws: int, rng: np.random.Generator) -> np.ndarray:
+    """(draws,) means of the ``first`` of values drawn with replacement and put in the order that they had."""
+    drawn = rng.integers(0, values.size, (draws, values.size))
+    if first < values.size:
+        drawn = np.sort(drawn, axis=1)[:, :first]
+    return values[drawn].mean(axis=1)
+
+
 def cells(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
     """The values by seed, trainer, evaluator and model."""
     groups: dict[Cell, list[int]] = {}
@@ -152,7 +170,7 @@ def cells(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
 
 
 def normalised_by_player(rallies: Rallies) -> np.ndarray:
-    """(n,) (length - mean) / std, both over the own evaluations of the trainer in that seed (Normalization,
+    """(n,) (length - mean) / std, both over the reported own evaluations of the trainer in that seed (Normalization,
     Evaluations).
 
     ``rallies``: own evaluations of the ten models. NaN where all lengths of a player are equal.
@@ -161,8 +179,8 @@ def normalised_by_player(rallies: Rallies) -> np.ndarray:
 
 
 def normalised_by_model(rallies: Rallies) -> np.ndarray:
-    """(n,) (length - mean) / std, both over the trainer's own evaluation of that model (Normalization,
-    Cross-Evaluations).
+    """(n,) (length - mean) / std, both over what is reported of the trainer's own evaluation of that model
+    (Normalization, Cross-Evaluations).
 
     ``rallies``: own and cross-evaluations; NaN where the trainer did not evaluate the model.
     """
@@ -175,13 +193,13 @@ def _standardised(
     length = rallies.length.astype(float)
     columns = zip(*(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")), strict=True)
     names = [group(cell) for cell in columns]
-    out, own = np.full(length.size, np.nan), rallies.own
+    out, based = np.full(length.size, np.nan), rallies.selected & (rallies.own | (not own_only))
     index: dict[tuple[int | str, ...], list[int]] = {}
     for i, name in enumerate(names):
         index.setdefault(name, []).append(i)
     for numbers in index.values():
         members = np.array(numbers)
-        base = length[members[own[members]]] if own_only else length[members]
+        base = length[members[based[members]]]
         if base.size > 1 and base.std(ddof=1) > 0.0:
             out[members] = (length[members] - base.mean()) / base.std(ddof=1)
     return out

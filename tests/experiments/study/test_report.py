@@ -51,6 +51,35 @@ def test_bootstrap_of_one_policy_is_scipys():
     assert (interval.low, interval.high) == pytest.approx(theirs, abs=0.15)
 
 
+@pytest.mark.parametrize("count", [52, 60, 80])
+def test_bootstrap_of_the_longest_selects_in_every_draw(count):
+    """Against a bootstrap by a loop; the interval holds the mean of the longest five sixths as often as it says."""
+    rng, draws = np.random.default_rng(count), []
+    length = rng.geometric(0.05, count)
+    boot = Bootstrap(rallies({(0, "player1", "player1", "m"): length}), draws=8000, longest=True)
+    found, pool = boot.mean("m", ["player1"]), length[:60]
+    keep = round(pool.size * 5 / 6)
+    assert found.value == pytest.approx(np.sort(pool)[-keep:].mean())
+    for _ in range(8000):
+        draws.append(np.sort(rng.choice(pool, pool.size))[-keep:].mean())
+    assert np.percentile(found.draws, (2.5, 50, 97.5)) == pytest.approx(np.percentile(draws, (2.5, 50, 97.5)), rel=0.02)
+    truth, held = 1.18 * 20.0, 0
+    for k in range(200):
+        data = rallies({(0, "player1", "player1", "m"): rng.geometric(0.05, count)})
+        i = Bootstrap(data, draws=300, key=k, longest=True).mean("m", ["player1"]).interval
+        held += i.low <= truth <= i.high
+    assert 0.87 <= held / 200 <= 0.99
+
+
+def test_an_evaluation_with_fewer_than_sixty_that_count_is_named(tmp_path):
+    folder = made_up_study.make(tmp_path, names=("player5",), balls=6, rallies=58, cross=False)
+    study = study_data.load(folder)
+    r = study.rallies
+    count = int(np.sum(~r.filtered & (r.model == "is2r-ft100")))
+    line = f"is2r-ft100: {count} rallies that count of 60, the longest {round(count * 5 / 6)} are reported"
+    assert f"seed 0, player5 with player5, {line}" in study.missing
+
+
 @pytest.mark.parametrize("count", [5, 6, 9])
 def test_bootstrap_over_seeds_has_the_spread_of_a_mean_over_seeds(count):
     levels = np.random.default_rng(count).integers(2, 40, count)  # rallies of a seed do not differ: only seeds do
