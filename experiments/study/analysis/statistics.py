@@ -8,7 +8,7 @@ seeds it would draw a handful of points, which are no 95 %: there it is the boot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,12 +31,21 @@ def chance(seeds: int) -> str:
 
 @dataclass(frozen=True)
 class Interval:
-    """A number with its 95 % interval; ``n`` of what it is the mean of."""
+    """A number with its 95 % interval; ``n`` of what it is the mean of; over: what the interval takes as independent,
+    where that is not what the study's other intervals do."""
 
     value: float
     low: float
     high: float
     n: int = 0
+    over: str = ""
+
+
+def exponential(logs: Interval) -> Interval:
+    """A mean of logarithms as a geometric mean."""
+    with np.errstate(over="ignore"):
+        value, low, high = np.exp([logs.value, logs.low, logs.high]).tolist()
+    return Interval(value, low, high, logs.n, logs.over)
 
 
 @dataclass(frozen=True)
@@ -203,6 +212,40 @@ def _standardised(
         if base.size > 1 and base.std(ddof=1) > 0.0:
             out[members] = (length[members] - base.mean()) / base.std(ddof=1)
     return out
+
+
+def share_of(held: Iterable[tuple[int, bool]]) -> Interval:
+    """Share of what holds, (seed, true or false) each, with percentiles of a bootstrap over seeds.
+
+    What belongs to one seed shares its reality and its logs, so that seeds alone are drawn anew, S - 1 of S; without an
+    interval (NaN) where there are fewer than FEWEST_SEEDS.
+    """
+    table: dict[int, list[int]] = {}
+    for seed, true in held:
+        counts = table.setdefault(seed, [0, 0])
+        counts[0] += true
+        counts[1] += 1
+    count = np.array(list(table.values())).T  # (2, S) that hold, and all
+    value, seeds = float(count[0].sum() / count[1].sum()), count.shape[1]
+    if seeds < FEWEST_SEEDS:
+        return Interval(value, np.nan, np.nan, int(count[1].sum()))
+    drawn = count[:, np.random.default_rng(0).integers(0, seeds, (seeds - 1, DRAWS))].sum(axis=1)
+    low, high = np.percentile(drawn[0] / drawn[1], (2.5, 97.5))
+    return Interval(value, float(low), float(high), int(count[1].sum()))
+
+
+def t_over_seeds(values: Mapping[tuple[int, str], float]) -> Interval:
+    """Mean of values by seed and player: over the players of each seed, then over seeds, with Student's t over seeds.
+
+    The players of a seed share one hidden reality. Without an interval (NaN) where there is one seed only.
+    """
+    by_seed: dict[int, list[float]] = {}
+    for (seed, _), value in values.items():
+        by_seed.setdefault(seed, []).append(value)
+    means = [float(np.mean(found)) for found in by_seed.values()]
+    if len(means) < 2:
+        return Interval(means[0], np.nan, np.nan, len(means))
+    return Interval(*t_interval(means), len(means))
 
 
 def t_mean(values: ArrayLike) -> Interval:
