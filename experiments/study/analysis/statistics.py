@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -105,7 +106,7 @@ class Bootstrap:
         self.point = {cell: float(v.mean()) for cell, v in self.cells.items()}
         pooled = rallies.pooled if longest else reported
         order = np.flatnonzero(pooled)[np.argsort(-rallies.length[pooled], kind="stable")]  # the longest first
-        self._draws = {
+        self._draws: dict[Cell, Any] = {
             cell: _means(v, kept(v.size) if longest else v.size, draws, rng)
             for cell, v in cells(rallies.take(order), values[order]).items()
         }
