@@ -99,6 +99,7 @@ class Evidence:
     valid          it came down on the robot's half, from above and without a bounce before
     landing        (2, ...) [m] there
     hit, returned  by the robot: touched after the bounce, landed on the human's half
+    fault          the robot stopped itself
     idle           the robot did not react
     inside         the ball was one of the distribution that the policy was trained for
     grazed         the robot's return touched the net
@@ -112,6 +113,7 @@ class Evidence:
     landing: Any
     hit: Any
     returned: Any
+    fault: Any
     idle: Any
     inside: Any
     grazed: Any
@@ -125,10 +127,11 @@ class Evidence:
             c.TABLE_LENGTH / 2 - self.came_down[1] < CORNER
         )
         return (
+            (self.fault, End.ROBOT_MISSED),  # whatever became of the ball
             (returned & self.grazed, End.ROBOT_GRAZES_NET),
             (returned & corner, End.ROBOT_CORNER),
             (returned, End.HUMAN_BOUNCES),
-            (self.net & valid, End.HUMAN_GRAZES_NET),
+            (self.net & valid & ~self.hit, End.HUMAN_GRAZES_NET),
             (first & self.net & ~valid, End.FIRST_NET),
             (first & self.own_side, End.SERVICE),
             (first & ~valid, End.FIRST_OVER_TABLE),

@@ -92,8 +92,8 @@ class Evaluation(Section):
     """Rallies of every model with its own player and with others."""
 
     rallies: Annotated[int, Field(ge=FEWEST_ON_RIG)] = 80
-    """Played by each player with each model, 50 at least, on the rig 5; what is left after filtering is cut to the top
-    60, then to the top 50."""
+    """Played by each player with each model, 50 at least, on the rig 5; what is left after filtering is cut to the
+    first 60, then to the longest 50, or five sixths of fewer."""
     lanes: Count = 8
     """Sessions side by side into which these rallies are divided."""
     max_touches: Count = 400
@@ -135,7 +135,7 @@ class Study(Section):
     simulation: Simulation
     """Training in simulation."""
     fine_tuning: FineTuning = FineTuning()
-    """In reality; the number of updates is the round's."""
+    """In reality; the number of updates is the round's, the seed the step's, and evaluation_balls are a robot's."""
     reality: Reality = Reality()
     """Effects of the virtual reality that training does not know."""
     baselines: bool | Literal["is2r"] = True
@@ -207,6 +207,7 @@ class Study(Section):
                     )
         if not (self.baselines or self.identification or self.randomised or self.bound):
             raise ValueError("baselines: false leaves nothing to do without identification, randomised or bound")
+        self._no_fine_tuning_in_vain()
         simulation = self.simulation
         later = {f"simulation.rounds.{k}.later_rewards": r.later_rewards for k, r in enumerate(simulation.rounds)}
         experiment.refuse_rewards(simulation.optimiser, simulation.task, "simulation.", later)
@@ -220,6 +221,20 @@ class Study(Section):
                 f"recordings: {{{files}}}, files that `mjx-tt fit-human` reads"
             )
         return self
+
+    def _no_fine_tuning_in_vain(self) -> None:
+        """Raises ValueError for settings of fine-tuning that the study would not use."""
+        chosen, default = self.fine_tuning, FineTuning()
+        if chosen.seed != default.seed:
+            raise ValueError(
+                f"fine_tuning.seed {chosen.seed}: each step's chance follows from its name and the study's seeds; "
+                "leave it out"
+            )
+        if self.robot is None and chosen.evaluation_balls != default.evaluation_balls:
+            raise ValueError(
+                f"fine_tuning.evaluation_balls {chosen.evaluation_balls}: played on a robot alone, to compare before "
+                "and after; leave it out, evaluation.rallies compares all policies"
+            )
 
     def recording(self, player: str) -> str:
         """File of a player's first balls. Raises KeyError where there is none."""

@@ -239,7 +239,7 @@ class RallySimulator:
         goes_on = answered & (state.touches + 2 <= max_touches)
         idle = jnp.all(robot.sums.peak_velocity < IDLE * column(limits.policy_velocity), axis=0)
         inside = jnp.ones(lanes, bool) if box is None else box.holds(ball, jnp.where(sent.valid, sent.landing, 0.0))
-        end = ending(first, sent, outcome, answered, met, blind | idle, inside)
+        end = ending(first, sent, outcome, fault, answered, met, blind | idle, inside)
 
         learnt = jax.tree.map(partial(jnp.where, returned & met.reached), answer.state, state.player)
         rested = human_player.rested(player, learnt)

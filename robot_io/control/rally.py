@@ -122,8 +122,7 @@ class RallyCounter:
         if summary.outcome == RETURNED and summary.fault is None:
             rally.returned, rally.over_at = summary, summary.ended + ANSWER_TIME
         else:
-            fault = summary.fault is not None
-            self._close(summary.ended, End.ROBOT_MISSED if fault else self._evidence(summary, first).end())
+            self._close(summary.ended, self._evidence(summary, first).end())
         self._show()
 
     def not_played(self, now: float, aborted: bool = False) -> None:
@@ -168,6 +167,7 @@ class RallyCounter:
             landing=np.array(landing),
             hit=true(summary.outcome != MISSED),
             returned=true(summary.outcome == RETURNED),
+            fault=true(summary.fault is not None),
             idle=true(summary.idle),
             inside=true(inside),
             grazed=true(summary.grazed),

@@ -17,6 +17,7 @@ not comparable  the study lacks what the claim is about; or the paper makes no s
 "No difference" is a ratio of one, a difference of zero, and of a share, one half.
 
 Intervals are 95 % bootstrap intervals over seeds and rallies (``study_statistics``) unless a measure says otherwise.
+Those of the human models' changes are Student's t over seeds, or over the players of a single seed: the reason says so.
 """
 
 from __future__ import annotations
@@ -40,9 +41,11 @@ from experiments.study.analysis.statistics import (
     Interval,
     Models,
     difference,
+    exponential,
     normalised_by_model,
     normalised_by_player,
     t_mean,
+    t_over_seeds,
 )
 from experiments.study.analysis.study_folder import BallLog, Study, change, paper_models, widths
 from mjx_tt.rally.end_reasons import End
@@ -50,6 +53,7 @@ from mjx_tt.rally.end_reasons import End
 WIDEST = 4.0  # of an interval of a ratio that still tells "alike": from half to double
 PLAYS = 2.0  # touches; the shortest rally in the paper's table of player skill
 LARGEST = 1e4  # number that is printed as one
+ONE_SEED = "the players of one seed alone, who share its reality"
 SHORT = 5  # touches; the paper's "shorter" rallies
 AGREES, DIRECTION, DIFFERS, UNDECIDED, NOT_COMPARABLE = (
     "agrees",
@@ -134,7 +138,7 @@ class Measurements:
     @cached_property
     def raw(self) -> Bootstrap:
         """Rally lengths that the paper reports, own and cross-evaluations."""
-        return Bootstrap(self.study.pick(own=None), over_seeds=self.over_seeds)
+        return Bootstrap(self.study.pick(own=None, selected=False), over_seeds=self.over_seeds, longest=True)
 
     @cached_property
     def unselected(self) -> Bootstrap:
@@ -144,13 +148,13 @@ class Measurements:
     @cached_property
     def normalised(self) -> Bootstrap:
         """Own evaluations of the ten models, normalised by player."""
-        rallies = self.study.pick(TEN)
+        rallies = self.study.pick(TEN, selected=False)
         return _finite(rallies, normalised_by_player(rallies), self.over_seeds)
 
     @cached_property
     def cross_normalised(self) -> Bootstrap:
         """Own and cross-evaluations of the final models, normalised by the trainer's own evaluation of the model."""
-        rallies = self.study.pick(FINAL, own=None)
+        rallies = self.study.pick(FINAL, own=None, selected=False)
         return _finite(rallies, normalised_by_model(rallies), self.over_seeds)
 
     def ratio(
@@ -175,8 +179,9 @@ class Measurements:
 
     def short(self) -> Estimate | None:
         """Share of rallies below SHORT, S2R+FT minus i-S2R."""
-        rallies = self.study.pick(FINAL)
-        return self.minus(Bootstrap(rallies, rallies.length < SHORT, self.over_seeds), S2R, IS2R, "all")
+        rallies = self.study.pick(FINAL, selected=False)
+        boot = Bootstrap(rallies, rallies.length < SHORT, self.over_seeds, longest=True)
+        return self.minus(boot, S2R, IS2R, "all")
 
     def longer(self) -> Estimate | None:
         """Share of players whose rallies are longer under i-S2R than under S2R+FT."""
@@ -252,25 +257,31 @@ class Measurements:
         return out
 
     def model_change(self) -> Interval | None:
-        """Geometric mean over players and seeds of the second change over the first, with its t interval."""
-        ratios = [b / a for a, b in self.changes.values() if a > 0 and b > 0]
-        if len(ratios) < 2:
+        """Geometric mean over players and seeds of the second change over the first; t over seeds, else players."""
+        logs = {at: float(np.log(b / a)) for at, (a, b) in self.changes.items() if a > 0 and b > 0}
+        if len(logs) < 2:
             return None
-        t = t_mean(np.log(ratios))
-        value, low, high = np.exp([t.value, t.low, t.high]).tolist()
-        return Interval(value, low, high, t.n)
+        found = t_over_seeds(logs)
+        return exponential(found if found.n > 1 else replace(t_mean([*logs.values()]), over=ONE_SEED))
 
     def change_levels(self) -> Interval | None:
-        """Second change of beginners over that of intermediate players, geometric means with Welch's interval."""
-        logs = [
-            np.log([b for (_, p), (_, b) in self.changes.items() if p in of_level(level) and b > 0])
-            for level in ("beginner", "intermediate")
-        ]
-        if min(map(len, logs)) < 2:
+        """Second change of beginners over that of intermediate players, geometric means.
+
+        Student's t over seeds; of one seed Welch's interval over players.
+        """
+        found: dict[int, tuple[list[float], list[float]]] = {}
+        for (seed, player), (_, b) in self.changes.items():
+            for k, level in enumerate(("beginner", "intermediate")):
+                if player in of_level(level) and b > 0:
+                    found.setdefault(seed, ([], []))[k].append(float(np.log(b)))
+        both = {seed: logs for seed, logs in found.items() if all(logs)}
+        if len(both) > 1:
+            means = {(seed, ""): float(np.mean(low) - np.mean(high)) for seed, (low, high) in both.items()}
+            return exponential(t_over_seeds(means))
+        low, high = next(iter(both.values()), ([], []))
+        if min(len(low), len(high)) < 2:
             return None
-        with np.errstate(over="ignore"):
-            value, low, high = np.exp(welch_interval(logs[1], logs[0]))
-        return Interval(float(value), float(low), float(high), sum(map(len, logs)))
+        return exponential(Interval(*welch_interval(high, low), len(low) + len(high), ONE_SEED))
 
     def differences(self) -> list[tuple[str, str, str, str, Difference]]:
         """Every pair of final models in every group, raw and normalised: group, scale, a, b, difference."""
@@ -308,6 +319,7 @@ def findings(m: Measurements) -> list[Finding]:
             verdict, why = NOT_COMPARABLE, "the paper leaves it open; this is our answer"
         else:
             verdict, why = judge(kind, unit, interval, claim.value)
+            why += f"; it is over {interval.over}" if interval.over else ""
         out.append(Finding(claim, unit, interval, verdict, why, _paper(claim)))
     return out
 
@@ -382,4 +394,4 @@ def _changes(models: dict[str, BallDistribution]) -> tuple[float, float]:
 
 def _finite(rallies: Rallies, values: np.ndarray, over_seeds: bool) -> Bootstrap:
     good = np.isfinite(values)
-    return Bootstrap(rallies.take(good), values[good], over_seeds)
+    return Bootstrap(rallies.take(good), values[good], over_seeds, longest=True)

@@ -14,8 +14,7 @@ from pathlib import Path
 from ballmodel.io.atomic_files import replacing
 from experiments.config.study import EFFECTS
 from experiments.errors import ConfigError
-from experiments.stats import t_interval
-from experiments.study.analysis.statistics import Interval
+from experiments.study.analysis.statistics import Interval, exponential, t_over_seeds
 
 FILE = "effects.csv"
 MODELS = ("is2r-sim1", "is2r-sim3", "oracle-sim", "is2r-ft100", "s2r-ft100", "oracle-ft")
@@ -38,20 +37,18 @@ class Outcome:
 
 
 def gain(outcomes: list[Outcome], model: str, without: str) -> Interval | None:
-    """Rally length without an effect over that with all: geometric mean over players and seeds, Student's t on its log.
+    """Rally length without an effect over that with all: geometric mean over the players of each seed, then over seeds.
 
-    None where no player and seed have both; no interval (NaN) for a single one.
+    Student's t on the seeds' logarithms, since the players of a seed share one reality; no interval (NaN) for one seed,
+    None where no player and seed have both.
     """
     found = {(o.seed, o.player, o.without): o.length for o in outcomes if o.model == model and o.length > 0.0}
-    logs = [
-        math.log(length / found[seed, player, NOTHING])
+    logs = {
+        (seed, player): math.log(length / found[seed, player, NOTHING])
         for (seed, player, world), length in found.items()
         if world == without and (seed, player, NOTHING) in found
-    ]
-    if not logs:
-        return None
-    mean, low, high = t_interval(logs) if len(logs) > 1 else (logs[0], math.nan, math.nan)
-    return Interval(math.exp(mean), math.exp(low), math.exp(high), len(logs))
+    }
+    return exponential(t_over_seeds(logs)) if logs else None
 
 
 def write(path: Path, outcomes: list[Outcome]) -> None:

@@ -2,7 +2,8 @@
 
 Abeyruwan et al. 2022, Details on Rally Score Evaluations: rallies whose end the table marks "Filter" are removed; of
 the others the "top 60" are taken and sorted by length, and the 50 longest of these are reported. Both numbers matter
-only if the 60 are the first in the order of play, so that is how they are read here.
+only if the 60 are the first in the order of play, so that is how they are read here. Of fewer than 60 the same share is
+reported, five sixths: to take 50 of 52 and 50 of 60 would favour the policy that has more rallies to drop.
 """
 
 from __future__ import annotations
@@ -57,16 +58,25 @@ def end_of(text: str) -> End:
         raise ValueError(f"{text!r} is no end of a rally; 1 to {len(ROWS)} are allowed, or {names}") from None
 
 
-def select(length: ArrayLike, filtered: ArrayLike, pool: int = POOL, keep: int = KEEP) -> np.ndarray:
+def kept(pooled: int) -> int:
+    """Number of rallies that are reported of a pool of so many: five sixths, 50 of 60."""
+    return round(pooled * KEEP / POOL)
+
+
+def pool(filtered: ArrayLike) -> np.ndarray:
+    """(n,) bool, the rallies of one evaluation among which the longest are reported: the first 60 that count."""
+    counted = ~np.asarray(filtered, bool)
+    return counted & (np.cumsum(counted) <= POOL)
+
+
+def select(length: ArrayLike, filtered: ArrayLike) -> np.ndarray:
     """(n,) bool, the rallies that are reported, of one evaluation's in the order of play.
 
-    length: (n,) touches; filtered: (n,) bool. The first ``pool`` that are not filtered, and of these the ``keep``
-    longest; of equal lengths the earlier. With fewer, all that there are.
+    length: (n,) touches; filtered: (n,) bool. Of the ``pool`` the longest five sixths; of equal lengths the earlier.
     """
-    length, filtered = np.asarray(length), np.asarray(filtered, bool)
-    first = np.flatnonzero(~filtered)[:pool]
+    length, first = np.asarray(length), np.flatnonzero(pool(filtered))
     chosen = np.zeros(length.size, bool)
-    chosen[first[np.argsort(-length[first], kind="stable")[:keep]]] = True
+    chosen[first[np.argsort(-length[first], kind="stable")[: kept(first.size)]]] = True
     return chosen
 
 
@@ -74,7 +84,8 @@ def select(length: ArrayLike, filtered: ArrayLike, pool: int = POOL, keep: int =
 class Rallies:
     """Rallies of any number of evaluations, one element each, arrays of one length.
 
-    robot_ended is 1, 0 or UNKNOWN; length counts the paddle touches of human and robot.
+    robot_ended is 1, 0 or UNKNOWN; length counts the paddle touches of human and robot; pooled: among the first 60 of
+    an evaluation that count, of which the longest are ``selected``.
     """
 
     seed: np.ndarray
@@ -87,6 +98,7 @@ class Rallies:
     end: np.ndarray
     robot_ended: np.ndarray
     filtered: np.ndarray
+    pooled: np.ndarray
     selected: np.ndarray
 
     def __len__(self) -> int:
@@ -121,6 +133,7 @@ def scored(
         end=end,
         robot_ended=np.array([UNKNOWN if e is None else int(e) for e in ended], int),
         filtered=filtered,
+        pooled=pool(filtered),
         selected=select(length, filtered),
     )
 

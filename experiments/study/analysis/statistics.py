@@ -8,14 +8,15 @@ seeds it would draw a handful of points, which are no 95 %: there it is the boot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from experiments.stats import sign_flip, t_interval, welch_interval, welch_p
-from experiments.study.analysis.scoring import Rallies
+from experiments.study.analysis.scoring import Rallies, kept
 
 DRAWS = 2000
 FEWEST_SEEDS = 5  # drawn anew: 4 of 5 give 70 different means, 1 of 2 give two
@@ -31,12 +32,21 @@ def chance(seeds: int) -> str:
 
 @dataclass(frozen=True)
 class Interval:
-    """A number with its 95 % interval; ``n`` of what it is the mean of."""
+    """A number with its 95 % interval; ``n`` of what it is the mean of; over: what the interval takes as independent,
+    where that is not what the study's other intervals do."""
 
     value: float
     low: float
     high: float
     n: int = 0
+    over: str = ""
+
+
+def exponential(logs: Interval) -> Interval:
+    """A mean of logarithms as a geometric mean."""
+    with np.errstate(over="ignore"):
+        value, low, high = np.exp([logs.value, logs.low, logs.high]).tolist()
+    return Interval(value, low, high, logs.n, logs.over)
 
 
 @dataclass(frozen=True)
@@ -70,6 +80,9 @@ class Estimate:
 class Bootstrap:
     """Means over cells (one seed's policy with one evaluator) whose rallies, and the seeds, are drawn anew.
 
+    ``longest``: means of the rallies that are reported. The pool of each evaluation is drawn anew, and of each draw the
+    longest are selected, since to draw from the selected ones alone takes the selection for granted.
+
     With S seeds, FEWEST_SEEDS at least, S - 1 of them are drawn with replacement: the spread of the draws is then an
     unbiased estimate of the spread of a mean over S seeds (Rao and Wu 1988), which drawing S makes too small by
     (S - 1) / S.
@@ -82,14 +95,21 @@ class Bootstrap:
         over_seeds: bool = True,
         draws: int = DRAWS,
         key: int = 0,
+        longest: bool = False,
     ) -> None:
-        """values: (n,) of each rally, its length by default."""
-        values = rallies.length if values is None else values
+        """rallies: that count; values: (n,) of each rally, its length by default."""
+        values = np.asarray(rallies.length if values is None else values, float)
         rng = np.random.default_rng(key)
-        self.cells = cells(rallies, np.asarray(values, float))
+        reported = rallies.selected if longest else np.ones(len(rallies), bool)
+        self.cells = cells(rallies.take(reported), values[reported])
         self.seeds = tuple(sorted({cell[0] for cell in self.cells}))
         self.point = {cell: float(v.mean()) for cell, v in self.cells.items()}
-        self._draws = {cell: v[rng.integers(0, v.size, (draws, v.size))].mean(axis=1) for cell, v in self.cells.items()}
+        pooled = rallies.pooled if longest else reported
+        order = np.flatnonzero(pooled)[np.argsort(-rallies.length[pooled], kind="stable")]  # the longest first
+        self._draws: dict[Cell, Any] = {
+            cell: _means(v, kept(v.size) if longest else v.size, draws, rng)
+            for cell, v in cells(rallies.take(order), values[order]).items()
+        }
         # Which seeds each draw takes, by how many there are: the same for all means, so that their differences pair.
         self._chosen = {
             s: rng.integers(0, s, (s - 1, draws)) for s in range(FEWEST_SEEDS, len(self.seeds) + 1) if over_seeds
@@ -142,6 +162,14 @@ class Bootstrap:
         return Estimate(float(points.mean()), drawn, sum(self.cells[cell].size for cell in found))
 
 
+def _means(values: np.ndarray, first: int, draws: int, rng: np.random.Generator) -> np.ndarray:
+    """(draws,) means of the ``first`` of values drawn with replacement and put in the order that they had."""
+    drawn = rng.integers(0, values.size, (draws, values.size))
+    if first < values.size:
+        drawn = np.sort(drawn, axis=1)[:, :first]
+    return values[drawn].mean(axis=1)
+
+
 def cells(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
     """The values by seed, trainer, evaluator and model."""
     groups: dict[Cell, list[int]] = {}
@@ -152,7 +180,7 @@ def cells(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
 
 
 def normalised_by_player(rallies: Rallies) -> np.ndarray:
-    """(n,) (length - mean) / std, both over the own evaluations of the trainer in that seed (Normalization,
+    """(n,) (length - mean) / std, both over the reported own evaluations of the trainer in that seed (Normalization,
     Evaluations).
 
     ``rallies``: own evaluations of the ten models. NaN where all lengths of a player are equal.
@@ -161,8 +189,8 @@ def normalised_by_player(rallies: Rallies) -> np.ndarray:
 
 
 def normalised_by_model(rallies: Rallies) -> np.ndarray:
-    """(n,) (length - mean) / std, both over the trainer's own evaluation of that model (Normalization,
-    Cross-Evaluations).
+    """(n,) (length - mean) / std, both over what is reported of the trainer's own evaluation of that model
+    (Normalization, Cross-Evaluations).
 
     ``rallies``: own and cross-evaluations; NaN where the trainer did not evaluate the model.
     """
@@ -175,16 +203,50 @@ def _standardised(
     length = rallies.length.astype(float)
     columns = zip(*(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")), strict=True)
     names = [group(cell) for cell in columns]
-    out, own = np.full(length.size, np.nan), rallies.own
+    out, based = np.full(length.size, np.nan), rallies.selected & (rallies.own | (not own_only))
     index: dict[tuple[int | str, ...], list[int]] = {}
     for i, name in enumerate(names):
         index.setdefault(name, []).append(i)
     for numbers in index.values():
         members = np.array(numbers)
-        base = length[members[own[members]]] if own_only else length[members]
+        base = length[members[based[members]]]
         if base.size > 1 and base.std(ddof=1) > 0.0:
             out[members] = (length[members] - base.mean()) / base.std(ddof=1)
     return out
+
+
+def share_of(held: Iterable[tuple[int, bool]]) -> Interval:
+    """Share of what holds, (seed, true or false) each, with percentiles of a bootstrap over seeds.
+
+    What belongs to one seed shares its reality and its logs, so that seeds alone are drawn anew, S - 1 of S; without an
+    interval (NaN) where there are fewer than FEWEST_SEEDS.
+    """
+    table: dict[int, list[int]] = {}
+    for seed, true in held:
+        counts = table.setdefault(seed, [0, 0])
+        counts[0] += true
+        counts[1] += 1
+    count = np.array(list(table.values())).T  # (2, S) that hold, and all
+    value, seeds = float(count[0].sum() / count[1].sum()), count.shape[1]
+    if seeds < FEWEST_SEEDS:
+        return Interval(value, np.nan, np.nan, int(count[1].sum()))
+    drawn = count[:, np.random.default_rng(0).integers(0, seeds, (seeds - 1, DRAWS))].sum(axis=1)
+    low, high = np.percentile(drawn[0] / drawn[1], (2.5, 97.5))
+    return Interval(value, float(low), float(high), int(count[1].sum()))
+
+
+def t_over_seeds(values: Mapping[tuple[int, str], float]) -> Interval:
+    """Mean of values by seed and player: over the players of each seed, then over seeds, with Student's t over seeds.
+
+    The players of a seed share one hidden reality. Without an interval (NaN) where there is one seed only.
+    """
+    by_seed: dict[int, list[float]] = {}
+    for (seed, _), value in values.items():
+        by_seed.setdefault(seed, []).append(value)
+    means = [float(np.mean(found)) for found in by_seed.values()]
+    if len(means) < 2:
+        return Interval(means[0], np.nan, np.nan, len(means))
+    return Interval(*t_interval(means), len(means))
 
 
 def t_mean(values: ArrayLike) -> Interval:

@@ -104,7 +104,7 @@ class Study:
         own: bool | None = True,
         selected: bool = True,
     ) -> scoring.Rallies:
-        """Rallies that count. own: by the trainer (True), by others (False), both (None); selected: the top 50 only."""
+        """Rallies that count. own: by the trainer (True), by others (False), both (None); selected: reported ones."""
         r = self.rallies
         where = r.selected if selected else ~r.filtered
         for chosen, column in ((models, r.model), (trainers, r.trainer)):
@@ -250,9 +250,10 @@ def _missing(study: Study) -> list[str]:
             if len(fitted) < len(ROUNDS):
                 out.append(f"seed {seed}, {player}: human model {', '.join(m for m in ROUNDS if m not in fitted)}")
     short = [
-        f"seed {seed}, {trainer} with {evaluator}, {model}: {count} rallies that count"
+        f"seed {seed}, {trainer} with {evaluator}, {model}: {count} rallies that count of {scoring.POOL}, "
+        f"the longest {scoring.kept(count)} are reported"
         for (seed, trainer, evaluator, model), count in counted(r).items()
-        if count < scoring.KEEP
+        if count < scoring.POOL
     ]
     return out + short
 

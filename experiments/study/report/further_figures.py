@@ -290,7 +290,10 @@ def unselected(study: Study, m: Measurements) -> Figure | None:
     groups = ("all", *LEVELS, WITHOUT)
     rows, labels, colours = [], [], []
     for group in groups:
-        for boot, name, shade in ((m.raw, "50 of the first 60", COLOUR[IS2R]), (m.unselected, "every rally", FAINT)):
+        for boot, name, shade in (
+            (m.raw, "longest 5/6 of the first 60", COLOUR[IS2R]),
+            (m.unselected, "every rally", FAINT),
+        ):
             rows.append(interval_of(m.ratio("is2r-ft100", "s2r-ft100", group, boot=boot)))
             labels.append(f"{group + ' players' if group == 'all' else group}: {name}")
             colours.append(shade)

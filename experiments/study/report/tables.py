@@ -12,10 +12,10 @@ import numpy as np
 
 from ballmodel import registry
 from ballmodel.io.atomic_files import replacing
-from experiments.stats import holm, wilson
+from experiments.stats import holm
 from experiments.study.analysis import effect_costs
 from experiments.study.analysis.claims import Finding, Measurements, paper_changes, show, span
-from experiments.study.analysis.identified import estimates, holds
+from experiments.study.analysis.identified import PRIOR, estimates, holds
 from experiments.study.analysis.paper import (
     ABLATED,
     BY_KEY,
@@ -30,7 +30,7 @@ from experiments.study.analysis.paper import (
     level,
     of_level,
 )
-from experiments.study.analysis.statistics import FEWEST_SEEDS, chance, t_mean
+from experiments.study.analysis.statistics import FEWEST_SEEDS, Interval, chance, share_of, t_mean
 from experiments.study.analysis.study_folder import NUMBERS, ROUNDS, Study, numbers, paper_models, widths
 from mjx_tt.rally.end_reasons import ROWS, End
 from mjx_tt.sim.model import ModelFile
@@ -67,12 +67,18 @@ def claims(findings: Sequence[Finding]) -> Table:
 
 
 def effects_left_out(study: Study) -> Table:
-    """Rally length of each model in a reality without an effect over that with all, with 95 % intervals."""
+    """Rally length of each model in a reality without an effect over that with all, with 95 % intervals over seeds."""
+
+    def cell(gain: Interval | None) -> str:
+        if gain is None or np.isnan(gain.low):  # one seed has no interval
+            return "" if gain is None else f"{gain.value:.2f}"
+        return f"{gain.value:.2f} ({gain.low:.2f} to {gain.high:.2f})"
+
     rows = []
     for world in effect_costs.WORLDS[1:]:
         gains = [effect_costs.gain(study.effects, model, world) for model in effect_costs.MODELS]
         if any(gains):
-            rows.append((world, *("" if g is None else f"{g.value:.2f} ({g.low:.2f} to {g.high:.2f})" for g in gains)))
+            rows.append((world, *map(cell, gains)))
     head = ("left out", *(BY_KEY[model].label for model in effect_costs.MODELS))
     return Table(head, rows, tuple(range(1, len(head))))
 
@@ -259,17 +265,26 @@ def identified(study: Study) -> Table:
 
 
 def coverage(study: Study) -> Table:
-    """Share of the opened reality's values in the intervals of 90 %, by what decided them."""
-    found: dict[tuple[str, str], list[bool]] = {}
-    for _, _, name, row in _estimates(study):
+    """Share of the opened reality's values in the intervals of 90 %, by what decided them, over seeds.
+
+    Each interval once: all players of a seed have those of its one log of joints, and those of the prior.
+    """
+    found: dict[tuple[str, str], dict[tuple[int, str, float, float], bool]] = {}
+    for seed, _, name, row in _estimates(study):
         if (held := holds(row)) is not None:
-            found.setdefault((name, row["decided by"]), []).append(held)
+            different = found.setdefault((name, row["decided by"]), {})
+            different[seed, row["parameter"], row["low"], row["high"]] = held
     rows = []
     for (name, source), inside in sorted(found.items()):
-        low, high = wilson(sum(inside), len(inside))
-        share = f"{sum(inside) / len(inside):.0%} ({100 * low:.0f} to {100 * high:.0f})"
-        rows.append((name, source, f"{sum(inside)} of {len(inside)}", share))
-    return Table(("round", "decided by", "intervals of 90 % that hold the truth", "share"), rows, (2, 3))
+        share = share_of((seed, held) for (seed, *_), held in inside.items())
+        width = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
+        if source == PRIOR:
+            width = "none: given, not estimated"
+        elif np.isnan(share.low):
+            width = f"none: fewer than {FEWEST_SEEDS} seeds"
+        rows.append((name, source, f"{sum(inside.values())} of {len(inside)}", f"{share.value:.0%}", width))
+    head = ("round", "decided by", "different intervals of 90 % that hold the truth", "share", "95 % over seeds")
+    return Table(head, rows, (2, 3, 4))
 
 
 def _estimates(study: Study) -> Iterator[tuple[int, str, str, dict[str, Any]]]:

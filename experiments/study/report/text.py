@@ -75,7 +75,7 @@ def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:
     if unselected is not None:
         i = unselected.interval
         out.append(
-            "On every rally that counts, instead of the 50 longest of 60, i-S2R / S2R+FT is "
+            "On every rally that counts, instead of the longest five sixths, i-S2R / S2R+FT is "
             f"{i.value:.2f} ({i.low:.2f} to {i.high:.2f})."
         )
     counts = {v: [f for f in found.values() if f.verdict == v] for v in VERDICTS}

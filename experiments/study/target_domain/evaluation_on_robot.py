@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from experiments.deploy import session
 from experiments.deploy.rig import RIG
 from experiments.errors import ConfigError, RunError
 from experiments.finetuning import loop
-from experiments.runs import load_policy
+from experiments.runs import load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
 from experiments.study.analysis import scoring
@@ -22,8 +23,10 @@ from experiments.study.blind import protocol
 from experiments.study.workflow import Step, Waiting
 from experiments.training import finalize
 from mjx_tt.rally.end_reasons import End
+from robot_io.policy import artefact as artefacts
 
-SESSIONS = 3  # on the rig at most, until all rallies are played: a busy machine ends some by faults of its own
+SESSIONS = 3  # on the rig at most in one go, until all rallies are played: a busy machine ends some by its own faults
+PLAYED = "played.json"  # an evaluation's rallies so far, with the sessions that they are from
 
 
 def seed_of(name: str) -> int:
@@ -41,6 +44,58 @@ def exported(trained: TrainedPolicy, console: Console) -> Path:
     return folder
 
 
+@dataclass(frozen=True)
+class Evaluation:
+    """Rallies of one policy over all its sessions.
+
+    artefact  digest of the policy
+    begun     sessions, of which those with a report in ``reports`` are in ``rallies``
+    """
+
+    artefact: str
+    begun: int = 0
+    reports: tuple[str, ...] = ()
+    rallies: tuple[dict[str, Any], ...] = ()
+
+    @property
+    def counted(self) -> int:
+        return sum(not one["filtered"] for one in self.rallies)
+
+    def last(self, folder: Path) -> Path:
+        """The newest session's report; the folder where no session has one."""
+        return folder / self.reports[-1] if self.reports else folder
+
+    def save(self, folder: Path) -> None:
+        """Writes it, whole or not at all."""
+        folder.mkdir(parents=True, exist_ok=True)
+        run_dir.write_json(folder / PLAYED, asdict(self))
+
+
+def _played(folder: Path, artefact: str) -> Evaluation:
+    """The evaluation of a policy so far, with reports that are new in the folder, saved; an empty one at first.
+
+    Raises ConfigError for a file that cannot be read.
+    """
+    path, found = folder / PLAYED, Evaluation(artefact)
+    try:
+        if path.exists():
+            kept = json.loads(path.read_text(encoding="utf-8"))
+            if kept["artefact"] == artefact:  # else of the policy before it was trained anew
+                found = Evaluation(artefact, kept["begun"], tuple(kept["reports"]), tuple(kept["rallies"]))
+        for report in sorted(
+            p for p in folder.glob("[0-9]*.json") if "." not in p.stem and p.name not in found.reports
+        ):
+            path, told = report, json.loads(report.read_text(encoding="utf-8"))
+            if told["artefact_sha256"] == artefact:
+                more = (told.get("rallies") or {"list": []})["list"]
+                reports = (*found.reports, report.name)
+                found = Evaluation(artefact, max(found.begun, len(reports)), reports, (*found.rallies, *more))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {error!r}; restore the file") from None
+    found.save(folder)
+    return found
+
+
 def rally_step(
     folder: Path,
     who: tuple[int, str, str, str],
@@ -49,34 +104,45 @@ def rally_step(
     rallies: int,
     console: Console,
 ) -> Step:
-    """Rallies of a virtual player with a policy on the rig. who: seed, trainer, evaluator, model."""
+    """Rallies of a virtual player with a policy on the rig. who: seed, trainer, evaluator, model.
+
+    Rallies count however a session or the program ended, and the next run of the step goes on with them: to drop them
+    would choose among a policy's sessions.
+    """
     seed, trainer, evaluator, model = who
     name, counted = f"seed{seed}/rallies/{trainer}-{evaluator}-{model}", folder / protocol.EVALUATIONS
 
     def run() -> str:
         artefact = exported(load_policy.load(run_of()), console)
-        found: list[dict[str, Any]] = []
-        left = rallies
-        for attempt in range(SESSIONS):
-            chance = seed_of(name) + attempt
-            status = session.run(
-                artefact, RIG, None, None, "numpy", folder, None, chance, None, console, left, evaluator
-            )
+        digest = artefacts.load(artefact).digest
+        found = _played(folder, digest)
+        for _ in range(SESSIONS):
+            left = rallies - found.counted
+            if left <= 0:
+                break
+            chance = seed_of(name) + found.begun
+            found = replace(found, begun=found.begun + 1)
+            found.save(folder)
+            try:
+                status = session.run(
+                    artefact, RIG, None, None, "numpy", folder, None, chance, None, console, left, evaluator
+                )
+            finally:
+                found = _played(folder, digest)
             if status == session.INTERRUPTED:
                 raise KeyboardInterrupt(f"{name}: stopped")
-            report = max(folder.glob("*.json"))
-            # What was played counts, however the session ended: to drop it would choose among a policy's sessions.
-            found += (json.loads(report.read_text(encoding="utf-8")).get("rallies") or {"list": []})["list"]
-            left = rallies - sum(not one["filtered"] for one in found)
+            left = rallies - found.counted
             if left <= 0 or status == 0:  # all are played, or somebody ended it by a key
                 break
-            console.print(f"{report}: {left} of {rallies} rallies are left to play", highlight=False, soft_wrap=True)
-        if left > 0:
-            raise RunError(
-                f"{name}: {rallies} rallies that count are needed, {left} are missing; the last session is {report}. "
-                "Make the machine quiet; the same command starts this evaluation again"
+            console.print(
+                f"{found.last(folder)}: {left} of {rallies} rallies are left to play", highlight=False, soft_wrap=True
             )
-        played = [(one["length"], End[one["end"]]) for one in found]
+        if found.counted < rallies:
+            raise RunError(
+                f"{name}: {rallies} rallies that count are needed, {rallies - found.counted} are missing; the last "
+                f"session is {found.last(folder)}. Make the machine quiet; the same command goes on with these rallies"
+            )
+        played = [(one["length"], End[one["end"]]) for one in found.rallies]
         scored = scoring.scored(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
         scoring.write(counted, scored)
         return f"{len(played)} rallies, {scored.length[~scored.filtered].mean():.1f} touches on average"

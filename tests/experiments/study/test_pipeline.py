@@ -138,6 +138,9 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
         ),
         ({"identification": {"second": 5}}, "identification.second: unknown key; did you mean 'seconds'"),
         ({"fine_tuning": {"rewards": "sim"}}, "not measure"),
+        ({"fine_tuning": {"seed": 3}}, "test: fine_tuning.seed 3: each step's chance follows from its name"),
+        ({"robot": "rig", "fine_tuning": {"seed": 3}}, "test: fine_tuning.seed 3"),
+        ({"fine_tuning": {"evaluation_balls": 20}}, "test: fine_tuning.evaluation_balls 20: played on a robot alone"),
     ],
 )
 def test_mistakes_in_a_study_are_named(changes, message):

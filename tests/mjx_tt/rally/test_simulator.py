@@ -213,8 +213,7 @@ def test_a_robot_that_hits_itself_faults_and_gets_a_dummy_ball(simulator):
         and np.all(length[end == End.DUMMY_WITH_PADDLE] == 1)
     )
     assert not np.any(dummy[1:] & dummy[:-1])  # after a dummy ball the robot stands at its start again
-    before = end[:-1][dummy[1:]]
-    assert set(before) <= {End.ROBOT_MISSED, End.SERVICE, End.FIRST_NET, End.FIRST_OVER_TABLE, End.HUMAN_GRAZES_NET}
+    assert set(end[:-1][dummy[1:]]) == {End.ROBOT_MISSED}  # also where the ball was a service, or into the net
 
 
 @pytest.fixture(scope="module")
@@ -325,7 +324,7 @@ def test_corner_and_cord_of_the_robots_return():
     assert side < 0.25 and line < 0.25
     sent = Sent(*(jnp.array([flag] * 2) for flag in (False, False, True)), jnp.array([[0.3] * 2, [-0.9] * 2]))
     false = jnp.zeros(2, bool)
-    end = ending(false, sent, jnp.full(2, RETURNED), false, met, false, ~false)
+    end = ending(false, sent, jnp.full(2, RETURNED), false, false, met, false, ~false)
     assert [End(e) for e in np.asarray(end)] == [End.ROBOT_CORNER, End.ROBOT_GRAZES_NET]
 
 

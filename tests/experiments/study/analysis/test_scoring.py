@@ -41,15 +41,29 @@ def test_a_return_beside_the_table_is_the_robots():
     assert one.robot_ended.tolist() == [1] and not one.filtered[0] and one.selected[0]
 
 
-def test_selection_is_the_fifty_longest_of_the_first_sixty():
+def test_selection_is_the_longest_five_sixths_of_the_first_sixty():
     rng = np.random.default_rng(1)
     for count in (10, 55, 64, 90):
         length, filtered = rng.integers(1, 30, count), rng.random(count) < 0.15
         chosen = scoring.select(length, filtered)
         pool = [i for i in range(count) if not filtered[i]][:60]
-        while len(pool) > 50:  # take away the shortest, one by one; of equal ones the last played
+        wanted = {60: 50}.get(len(pool), round(len(pool) * 5 / 6))
+        while len(pool) > wanted:  # take away the shortest, one by one; of equal ones the last played
             pool.remove(min(pool, key=lambda i: (length[i], -i)))
         assert np.flatnonzero(chosen).tolist() == pool
+
+
+def test_fewer_rallies_that_count_do_not_shift_the_mean():
+    """The same lengths, of 60 rallies 8 filtered or none: the means agree, as 50 of 52 and 50 of 60 would not."""
+    rng, means = np.random.default_rng(4), []
+    for dropped in (8, 0):
+        end = np.where(np.arange(60) < dropped, End.SERVICE, End.ROBOT_MISSED)
+        drawn = (scoring.scored(0, "p", "p", "m", "A", rng.geometric(0.05, 60), end) for _ in range(2000))
+        means.append([one.length[one.selected].mean() for one in drawn])
+    few, many = np.mean(means, axis=1)
+    assert few == pytest.approx(many, rel=0.02)  # each is known to 0.4 %
+    assert many == pytest.approx(1.18 * 20.0, rel=0.02)
+    assert [scoring.kept(n) for n in (0, 1, 52, 60)] == [0, 1, 43, 50]
 
 
 def test_a_rally_after_the_sixtieth_is_not_reported_however_long():

@@ -10,13 +10,19 @@ import shutil
 import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from experiments.deploy import session
+from experiments.errors import RunError
 from experiments.study.analysis import scoring
-from experiments.study.target_domain.evaluation_on_robot import rally_step
+from experiments.study.target_domain import evaluation_on_robot
+from experiments.study.target_domain.evaluation_on_robot import PLAYED, rally_step, seed_of
+from robot_io.errors import RefusedError
+from robot_io.policy import artefact as artefacts
 from tests.support.paths import ROOT
 
 POLICY = ROOT / "experiments/shipped/policies/quickstart"
@@ -29,7 +35,7 @@ def late_until_a_session_has_ended(folder, said: io.StringIO, over: threading.Ev
     """Stop the process of the arm again and again after a few rallies, until the first session's report is there."""
     while said.getvalue().count("rally ") < BEFORE and not over.is_set():
         time.sleep(0.05)
-    while not list(folder.glob("*.json")) and not over.is_set():
+    while not list(folder.glob("2*.json")) and not over.is_set():
         for process in multiprocessing.active_children():
             if process.name == "rig-arm":
                 os.kill(process.pid, signal.SIGSTOP)
@@ -64,3 +70,96 @@ def test_rallies_that_faults_cut_short_go_on_in_another_session_and_all_count(tm
     counted = scoring.read(step.outputs[0])
     np.testing.assert_array_equal(counted.length, [rally["length"] for rally in played])
     np.testing.assert_array_equal(counted.filtered, [rally["filtered"] for rally in played])
+
+
+class Sessions:
+    """Stands in for the rig: plays rallies of growing length in sessions that end as they are told.
+
+    plan: of each session (rallies that count, its end): an exit status, an exception, or None, killed without a report
+    """
+
+    def __init__(self, plan) -> None:
+        self.plan, self.chances, self.asked, self.length = list(plan), [], [], 0
+
+    def run(
+        self, artefact, robot, balls, distribution, backend, folder, params, seed, seconds, console, rallies, player
+    ):
+        self.chances.append(seed)
+        self.asked.append(rallies)
+        count, end = self.plan.pop(0)
+        told = [self._rally("FIRST_NET", True)]  # each session has one that is filtered
+        told += [self._rally("ROBOT_MISSED", False) for _ in range(min(count, rallies))]
+        if end is not None:
+            report = {"artefact_sha256": artefacts.load(artefact).digest, "rallies": {"list": told}}
+            name = f"20260101-00000{len(self.chances)}"
+            (folder / f"{name}.json").write_text(json.dumps(report))
+            (folder / f"{name}.layout.json").write_text("{}")
+        if not isinstance(end, int):
+            raise end or RefusedError("killed")
+        return end
+
+    def _rally(self, end: str, filtered: bool) -> dict:
+        self.length += 1
+        return {"length": self.length, "end": end, "filtered": filtered}
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A policy that is exported already, and the folder of its evaluation."""
+    (tmp_path / "rallies").mkdir()
+    return Path(shutil.copytree(POLICY, tmp_path / "run"))
+
+
+def step_of(run, monkeypatch, plan, rallies=10):
+    """The step of a zero-shot policy, and the sessions that it will have."""
+    rig, folder = Sessions(plan), run.parent / "rallies"
+    monkeypatch.setattr(session, "run", rig.run)
+    monkeypatch.setattr(evaluation_on_robot, "exported", lambda trained, console: run)
+    who = (0, "player3", "player3", "zero_shot")
+    return rally_step(folder, who, lambda: run, (), rallies, Console(file=io.StringIO())), rig
+
+
+def test_a_failed_evaluation_goes_on_with_what_it_played(run, monkeypatch):
+    step, rig = step_of(run, monkeypatch, [(3, 1), (2, 1), (2, 1), (5, 0)])
+    with pytest.raises(RunError, match="3 are missing.*goes on with these rallies"):
+        step.run()
+    assert rig.asked == [10, 7, 5]
+    step.run()
+    assert rig.asked[3:] == [3] and not rig.plan
+    assert rig.chances == [seed_of(step.name) + k for k in range(4)]
+    counted = scoring.read(step.outputs[0])
+    np.testing.assert_array_equal(counted.length, np.arange(1, 15))  # every rally once, in the order of play
+    assert (~counted.filtered).sum() == 10
+
+
+@pytest.mark.parametrize("end", [session.INTERRUPTED, OSError("the pipe broke"), None])
+def test_a_session_that_is_stopped_or_raises_counts_if_it_has_a_report(run, monkeypatch, end):
+    step, rig = step_of(run, monkeypatch, [(4, end), (9, 0), (1, 0)])
+    with pytest.raises((KeyboardInterrupt, OSError, RefusedError)):
+        step.run()
+    if end is None:
+        rig.plan = [(10, 0)]
+    step.run()
+    assert rig.asked == [10, 10 if end is None else 6]
+    assert rig.chances == [seed_of(step.name), seed_of(step.name) + 1]
+    assert (~scoring.read(step.outputs[0]).filtered).sum() == 10
+
+
+def test_a_policy_that_was_trained_anew_is_evaluated_anew(run, monkeypatch):
+    step, rig = step_of(run, monkeypatch, [(4, 1), (0, 0), (10, 0)])
+    with pytest.raises(RunError):
+        step.run()
+    folder = run.parent / "rallies"
+    for path in [folder / PLAYED, *folder.glob("2*[0-9].json")]:
+        path.write_text(path.read_text().replace(artefacts.load(run).digest, "another"))
+    step.run()
+    assert rig.asked == [10, 6, 10]
+
+
+def test_an_evaluation_whose_table_is_gone_is_written_again_without_play(run, monkeypatch):
+    step, rig = step_of(run, monkeypatch, [(10, 0)])
+    step.run()
+    written = step.outputs[0].read_bytes()
+    step.outputs[0].unlink()
+    step.run()
+    assert step.outputs[0].read_bytes() == written and len(rig.asked) == 1
