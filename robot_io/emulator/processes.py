@@ -202,7 +202,8 @@ def _run(
     pipe: Connection,
     arguments: tuple,
 ) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):  # no terminal ends hardware; the owner's death does
+        signal.signal(number, signal.SIG_IGN)
     shared = Shared(name, contract.n_joints)
     # These stand for hardware, which nothing else on this machine can delay; below the bridge's priority.
     realtime.prepare(PRIORITY)
