@@ -110,6 +110,7 @@ class Rig:
         except (EOFError, DeviceError) as error:
             self.close()
             raise DeviceError(str(error) or "rig: a process ended at once") from None
+        self._shared.unlink()
 
     @property
     def robot(self) -> RobotConfig:

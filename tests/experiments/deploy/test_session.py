@@ -161,6 +161,7 @@ def states(session_log):
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT])
 def test_a_terminal_that_closes_ends_the_play_in_order(policy, tmp_path, number):
     """The owner dies at once; the control process is not of its group, brakes and ends its log."""
+    before = set(Path("/dev/shm").glob("psm_*"))
     with started(policy, tmp_path) as running:
         family = children(running.pid)
         apart = [child for child in family if os.getpgid(child) != os.getpgid(running.pid)]
@@ -173,6 +174,7 @@ def test_a_terminal_that_closes_ends_the_play_in_order(policy, tmp_path, number)
     while any(lives(child) for child in family):
         assert time.monotonic() < end, "processes are left behind"
         time.sleep(0.05)
+    assert set(Path("/dev/shm").glob("psm_*")) <= before, "shared memory is left behind"
     (path,) = tmp_path.glob("*.mcap")
     session_log = log.read(path)
     # The rig ends with its owner, so the loss of its devices may be noticed first: a fault, which brakes as well.
