@@ -17,3 +17,11 @@ class JogFirstError(RefusedError):
 
 class ContractError(ValueError):
     """Data that cannot be the contract of a robot."""
+
+
+def said(error: BaseException) -> str:
+    """An error's type and words; the type alone where its words cannot be had."""
+    try:
+        return f"{type(error).__name__}: {error}"
+    except Exception:  # __str__ is the error's own code: it must not raise where a robot is being braked
+        return type(error).__name__

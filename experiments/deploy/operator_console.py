@@ -99,6 +99,7 @@ class View:
         )
         lines = [head]
         lines += [Text(f"FAULT {f.cause}: {f.text}", "red") for f in s.faults]
+        lines += [Text(f"STOPPED: {s.stopped}", "yellow")] if s.stopped else []
         if not s.faults:
             lines += [Text(f"waiting: {text}", "yellow") for text in s.present.values()]
         outcomes = ", ".join(f"{n} {name}" for name, n in s.outcomes.items()) or "none yet"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import select
 import threading
 import time
 from collections import deque
@@ -31,6 +32,7 @@ from robot_io.emulator.processes import Rig
 from robot_io.errors import JogFirstError, RefusedError
 from robot_io.log import view as log_view
 from robot_io.policy import artefact as artefacts
+from robot_io.safety.owner_watch import BEAT_PERIOD
 
 READY_TIME = 60.0  # [s] for the control process to start
 PREPARE_TIME = 40.0  # [s] for the axes to home and the arm to report
@@ -59,6 +61,7 @@ class Session:
         self.status: Status | None = None
         self.timings: dict[str, Any] = {}
         self._episodes: deque[Played | RallyOver] = deque()  # that came while an answer was waited for
+        self._beaten = -math.inf
 
     def __enter__(self) -> Session:
         return self
@@ -73,8 +76,24 @@ class Session:
         except OSError:
             pass  # it has ended: the next message says so
 
+    def beat(self, absence: float = 0.0) -> None:
+        """Show that the operator's keys are read, or will be again in so many seconds.
+
+        Only from where they are read: a thread that beats by itself would go on beside a terminal that hangs.
+        """
+        self._beaten = time.monotonic()
+        try:
+            free = select.select([], [self.pipe], [], 0.0)[1]
+        except (OSError, ValueError):
+            return  # it has ended: the next message says so
+        if free:  # a control process that stands still must not keep the owner from its keys
+            self.send(messages.Beat(absence))
+
     def messages(self, seconds: float) -> Iterator[Message]:
-        """Messages that arrive within that time. Raises RefusedError when the control process has ended."""
+        """Messages that arrive within that time. Raises RefusedError when the control process has ended.
+
+        Whoever has armed the robot must call it again within ``robot_io.safety.owner_watch.LONGEST_SILENCE``.
+        """
         while self._episodes:
             yield self._episodes.popleft()
         yield from self._received(seconds)
@@ -89,7 +108,14 @@ class Session:
 
     def _received(self, seconds: float) -> Iterator[Message]:
         end = time.monotonic() + seconds
-        while self.pipe.poll(max(end - time.monotonic(), 0.0)):
+        while True:
+            now = time.monotonic()
+            if now >= self._beaten + BEAT_PERIOD:
+                self.beat()
+            if not self.pipe.poll(max(min(end - now, BEAT_PERIOD), 0.0)):
+                if time.monotonic() >= end:
+                    return
+                continue
             try:
                 message = self.pipe.recv()
             except (EOFError, OSError):
@@ -331,8 +357,8 @@ def _watch(
             view.say(KEYS[key].text)
         if rig is not None:
             rig.check()
-            if session.status and session.status.faults:
-                fault, in_a_row = session.status.faults[0], in_a_row + 1
+            if session.status and (fault := session.status.halt):
+                in_a_row += 1
                 text = f"{fault.cause}: {fault.text}"
                 if in_a_row > RECOVERIES:
                     return f"stopped by {in_a_row} faults in a row, the last: {text}"

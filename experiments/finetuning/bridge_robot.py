@@ -7,10 +7,12 @@ from typing import Any
 from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, Keyboard, View
 from experiments.deploy.session import RECOVERIES, Session
 from experiments.finetuning.robot import PlayedBall
-from robot_io.control.messages import Discard, Pause, Played, PolicySet, Refused, SetPolicy, Stop
+from robot_io.control.messages import Beat, Discard, Pause, Played, PolicySet, Refused, SetPolicy, Stop
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
 from robot_io.policy.policy import Policy
+
+COMPUTING = 30.0  # [s] for an update between two balls, the compilation of the first one included
 
 
 class BridgeRobot:
@@ -57,16 +59,17 @@ class BridgeRobot:
                     session.send(Pause(True))
                     if message.summary.fault and self._rig is not None:
                         session.recover(self._rig)
+                    session.send(Beat(COMPUTING))
                     return PlayedBall(message.summary, message.ball)
             if refused:
                 session.send(exchange)
             self._keys()
             if self._rig is not None:
                 self._rig.check()
-                if session.status and session.status.faults:
+                if session.status and (halt := session.status.halt):
                     failures += 1
                     if failures > RECOVERIES:
-                        raise RefusedError(f"the rig does not recover: {session.status.faults[0].text}")
+                        raise RefusedError(f"the rig does not recover: {halt.text}")
                     session.recover(self._rig)
                     session.send(exchange)
 

@@ -19,7 +19,7 @@ from experiments.deploy.rig import RIG, box_of, rig_for
 from experiments.deploy.session import Session
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.finetuning import loop
-from experiments.finetuning.bridge_robot import BridgeRobot
+from experiments.finetuning.bridge_robot import COMPUTING, BridgeRobot
 from experiments.finetuning.robot import LockStepRallies, Robot
 from experiments.runs import load_policy, run_dir
 from experiments.training import finalize
@@ -86,6 +86,7 @@ def finetune(
             session.prepare(rig)
             session.arm()
             rig.throw(True)
+            session.beat(COMPUTING)  # armed and paused, until the first population is drawn
         return loop.finetune(source, settings, run, bridge, console, bridge, experiment)
 
 

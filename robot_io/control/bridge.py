@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from time import perf_counter
 
@@ -36,22 +36,12 @@ from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.devices.egm.session import ArmFeedback, EgmSession
 from robot_io.devices.tracker import Tracker
-from robot_io.errors import RefusedError
+from robot_io.errors import RefusedError, said
 from robot_io.history import History
-from robot_io.log.messages import (
-    Action,
-    Ball,
-    Command,
-    Event,
-    Joints,
-    Level,
-    Observation,
-    Record,
-    Tick,
-    json_text,
-)
+from robot_io.log.messages import Action, Ball, Command, Event, Joints, Level, Observation, Record, Tick, json_text
 from robot_io.log.recorder import NullRecorder, SessionRecorder
 from robot_io.safety.clearance import RobotGeometry
+from robot_io.safety.coasting import Coasting
 from robot_io.safety.faults import Cause
 from robot_io.safety.gate import GateState, SafetyGate, Sent
 
@@ -95,8 +85,8 @@ class Bridge:
         self._state = BridgeState.DISARMED
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
-        self._axes_received = self._tick_time = self._last_tick = -math.inf
-        self._start = np.full(contract.n_joints, np.nan)  # reference at the start of the period
+        self._axes_received = self._last_tick = -math.inf
+        self._motion = Coasting(gate.period, np.array(contract.limits.acceleration))  # as the devices are told it
         self._zeros = np.zeros(contract.n_joints)
         self._policy_limit = np.array(contract.limits.policy_velocity)
         speed = (jog.SPEED if config.jog else config.home_speed) * self._policy_limit
@@ -107,7 +97,7 @@ class Bridge:
         self._reported_unlogged = 0
         self._log_failure = ""  # why the log's file cannot be written
         self._errors: set[str] = set()  # of the program, each logged once
-        self._stopping_since = -math.inf
+        self._stopping_since, self.stopped_because = -math.inf, ""  # the reason of a stop that no operator asked for
         self._been_home, self.paused = False, config.jog  # at the home pose since it was armed
         self.policy_seconds = 0.0  # of the last tick; 0 when the policy was not asked
 
@@ -130,9 +120,13 @@ class Bridge:
 
     def set_policy(self, policy: Policy, version: int = 0) -> None:
         """Exchange the policy; ``version`` is in its balls' summaries. Raises RefusedError while it is playing."""
+        self.check_exchange()
+        self._policy, self.policy_version = policy, version
+
+    def check_exchange(self) -> None:
+        """Raise RefusedError while the policy is playing."""
         if self.state is BridgeState.ACTIVE:
             raise RefusedError("the policy is playing: exchange it between balls")
-        self._policy, self.policy_version = policy, version
 
     def arm(self, now: float) -> None:
         """DISARMED to READY: the robot will move to its home pose. Raises RefusedError with the reason."""
@@ -149,7 +143,8 @@ class Bridge:
         self.gate.arm(measured, now, velocity)
         self._arm_session_id = self.arm_session.session_id
         self._arm_restarted = self._been_home = False
-        self._start = measured
+        self._motion.ticked(measured, self._zeros, now)
+        self.stopped_because = ""
         self._way_home.restart()
         self._home = measured if self.config.jog else self._home
         self._change(BridgeState.READY, now, "armed by the operator")
@@ -160,15 +155,16 @@ class Bridge:
             raise RefusedError(f"not jogged: the state is {self.state.value}; arm it first, in mjx-tt robot jog")
         self._home = self.gate.reference + jog.joints_of(step, self._geometry, self.gate.reference)
 
-    def stop(self, now: float) -> None:
-        """The operator's stop: slows down, holds, and ends DISARMED."""
+    def stop(self, now: float, because: str = "") -> None:
+        """The operator's stop, or one without the operator for a reason: slows down, holds, and ends DISARMED."""
         if self.state in (BridgeState.READY, BridgeState.ACTIVE):
             self.gate.brake(now)
-            self._stopping_since = now
-            self._change(BridgeState.STOPPING, now, "stopped by the operator")
+            self._stopping_since, self.stopped_because = now, because
+            self._change(BridgeState.STOPPING, now, because or "stopped by the operator")
             with self._guarded(now):
                 self.play.abort("stopped", now)
-        self.event(now, Level.INFO, "operator", "stop")
+        if not because:
+            self.event(now, Level.INFO, "operator", "stop")
 
     def reset(self, now: float) -> None:
         """FAULT to DISARMED. Raises RefusedError without a fault, while a cause is present or the robot still moves."""
@@ -194,11 +190,12 @@ class Bridge:
 
     def failed(self, error: BaseException, now: float) -> None:
         """Brake for an error of the program, wherever it was raised, and latch it as INTERNAL."""
-        sentence = f"{type(error).__name__}: {error}"
+        sentence = said(error)
         self.gate.fault(Cause.INTERNAL, sentence, now)
-        if sentence not in self._errors and len(self._errors) < 100:
-            self._errors.add(sentence)
-            self.event(now, Level.FATAL, "error", "".join(traceback.format_exception(error)))
+        with suppress(Exception):  # it brakes by now, and an error may not let itself be described
+            if sentence not in self._errors and len(self._errors) < 100:
+                self._errors.add(sentence)
+                self.event(now, Level.FATAL, "error", "".join(traceback.format_exception(error)))
 
     @contextmanager
     def _guarded(self, now: float) -> Iterator[None]:
@@ -230,13 +227,8 @@ class Bridge:
         # Where the old reference would lead a controller that was started anew, nobody has asked for.
         self._arm_restarted |= feedback.sequence < self._arm_sequence
         self._arm_sequence = feedback.sequence
-        if self.gate.state is GateState.DISARMED or self._arm_restarted or not np.isfinite(self._start).all():
-            return None
-        rows = self._arm_rows
-        velocity = self.gate.velocity[rows]
-        # A tick that is overdue must not let the reference run away.
-        since = min(max(now - self._tick_time, 0.0), 2.0 * self.gate.period)
-        return self._start[rows] + velocity * since, velocity
+        moved = None if self.gate.state is GateState.DISARMED or self._arm_restarted else self._motion.at(now)
+        return None if moved is None else (moved[0][self._arm_rows], moved[1][self._arm_rows])
 
     def tracker_received(self, datagram: bytes, source: str, now: float, port: int | None = None) -> None:
         """Take one datagram from an IP address and port; without a port none is checked."""
@@ -269,19 +261,25 @@ class Bridge:
             measured, measured_velocity = joints(self.feedback, self.config.contract)
             self.play.moved(measured_velocity)
             request = self._decide(now)
-        sent = self.gate.command(request, measured, measured_velocity, now)
-        self._start = self.gate.start if self.gate.engaged else measured
-        self._tick_time = now
+        sent: Sent | None = None
+        with self._guarded(now):
+            sent = self.gate.command(request, measured, measured_velocity, now)
+            self._motion.ticked(self.gate.start if self.gate.engaged else measured, sent.velocity, now)
+        if sent is None:  # arm and axes, which get no new command, slow down by themselves
+            with self._guarded(now):
+                self._after(now)
+            return self._zeros.copy()
+        start = self._motion.start
         with self._guarded(now):
             if self.gate.engaged:
-                self.axes.command(self._start[self._axes_rows], sent.velocity[self._axes_rows], now)
+                self.axes.command(start[self._axes_rows], sent.velocity[self._axes_rows], now)
         with self._guarded(now):
             self._follow_the_way(request, sent, now)
             self._after(now)
         with self._guarded(now):
             n, ages = self.counts.ticks, reversed(self._ages(now))
             timing = Tick(n, now, now - deadline, self.policy_seconds, *ages)
-            self._log(timing, Command(n, now, request, sent.velocity, self._start))
+            self._log(timing, Command(n, now, request, sent.velocity, start))
         if self.unlogged > self._reported_unlogged:
             self._reported_unlogged = self.unlogged
             self.event(now, Level.WARNING, "log_error", json_text({"unlogged": self.unlogged}))
@@ -347,7 +345,7 @@ class Bridge:
         try:
             action = action_of(policy, observation)
         except Exception as error:  # whatever a policy does, the robot is braked
-            self.gate.fault(Cause.MALFORMED_COMMAND, f"the policy failed: {type(error).__name__}: {error}", now)
+            self.gate.fault(Cause.MALFORMED_COMMAND, f"the policy failed: {said(error)}", now)
             return self._zeros.copy()
         self.policy_seconds = perf_counter() - began
         episode.steps += 1

@@ -1,4 +1,4 @@
-"""Parts that a bridge is made of, as it sees them, its settings and its states."""
+"""Parts that a bridge is made of, as it sees them, its settings and its states; options of a control process."""
 
 from __future__ import annotations
 
@@ -74,3 +74,24 @@ class BridgeConfig:
 
 
 STANDARD_PLAY = BridgeConfig()
+
+
+@dataclass(frozen=True)
+class ControlOptions:
+    """artefact: folder, None: a policy that stands still, on a robot with the joints of ``contract``.
+
+    backend: of ``robot_io.policy.backends``; log_folder and log_name of the MCAP, None: no log.
+    box: balls that the policy was trained for; None: nothing is out of distribution
+    dry: nothing is sent to arm and axes, which move in thought; jog: no balls are taken, the operator moves the robot
+    """
+
+    artefact: str | None
+    backend: str = "auto"
+    log_folder: str | None = None
+    log_name: str = "session"
+    box: Box | None = None
+    metadata: tuple[tuple[str, str], ...] = ()
+    attachments: tuple[tuple[str, str | bytes], ...] = ()
+    dry: bool = False
+    jog: bool = False
+    contract: Contract = PAPER

@@ -78,7 +78,18 @@ class Quit:
     """Stop the robot and end the process."""
 
 
-Request = Prepare | Arm | Stop | Reset | Discard | Pause | Jog | Mark | SetPolicy | Quit
+@dataclass(frozen=True)
+class Beat:
+    """Sign of life: the owner reads the operator's keys. Every other request is one as well.
+
+    absence  [s] until the next one, where the owner computes meanwhile; only while paused, and within
+             ``robot_io.safety.owner_watch.LONGEST_ABSENCE``
+    """
+
+    absence: float = 0.0
+
+
+Request = Prepare | Arm | Stop | Reset | Discard | Pause | Jog | Mark | SetPolicy | Quit | Beat
 
 
 @dataclass(frozen=True)
@@ -170,6 +181,7 @@ class Status:
     rallies         that count, with the mean_rally and longest_rally of them; last_rally: the last one in words
     egm             fields of ``EgmStatistics``
     tracker_counts  datagrams by fate
+    stopped         the reason of a stop that no operator asked for, until it is armed again; empty: none
     """
 
     time: float
@@ -199,6 +211,7 @@ class Status:
     axes_late: int = 0
     log_dropped: int = 0
     timings: dict[str, Any] = field(default_factory=dict)
+    stopped: str = ""
 
     @classmethod
     def of(
@@ -243,7 +256,13 @@ class Status:
             axes_late=axes.late,
             log_dropped=dropped,
             timings=timings.summary(),
+            stopped=bridge.stopped_because,
         )
+
+    @property
+    def halt(self) -> FaultReport | None:
+        """The reason why a robot that was armed is so no longer, though nobody asked for it; None: none."""
+        return self.faults[0] if self.faults else FaultReport("stopped", self.stopped) if self.stopped else None
 
     @property
     def missing(self) -> str:

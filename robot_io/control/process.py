@@ -12,7 +12,7 @@ import select
 import signal
 import time
 from collections import deque
-from dataclasses import dataclass
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from robot_io import log
-from robot_io.contract import PAPER, Contract, n_parameters
+from robot_io.contract import n_parameters
 from robot_io.control import messages, realtime
 from robot_io.control.bridge import Bridge, BridgeConfig
 from robot_io.control.bridge import Policy as StepPolicy
@@ -30,18 +30,20 @@ from robot_io.control.commissioning.homing import prepare
 from robot_io.control.commissioning.mark import Stay
 from robot_io.control.config import RobotConfig, linear_axes
 from robot_io.control.episode import EpisodeSummary
-from robot_io.control.rally import Box
+from robot_io.control.interfaces import BridgeState
+from robot_io.control.interfaces import ControlOptions as ControlOptions
 from robot_io.control.timings import Timings
 from robot_io.devices.egm.session import EgmConfig, EgmSession, EgmSocket
 from robot_io.devices.festo import AxesThread
 from robot_io.devices.fixed_base import FixedBase
 from robot_io.devices.tracker import Tracker, TrackerSocket
-from robot_io.errors import RefusedError
+from robot_io.errors import RefusedError, said
 from robot_io.policy import artefact as artefacts
 from robot_io.policy.backends import choose, make_policy
 from robot_io.policy.policy import Policy
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.gate import SafetyGate
+from robot_io.safety.owner_watch import OwnerWatch
 
 STATUS_PERIOD = 0.2  # [s]
 STOP_TIME = 2.0  # [s] for coming to rest before the process ends
@@ -56,27 +58,6 @@ class Closable(Protocol):
 Closing = TypeVar("Closing", bound=Closable)
 
 
-@dataclass(frozen=True)
-class ControlOptions:
-    """artefact: folder, None: a policy that stands still, on a robot with the joints of ``contract``.
-
-    backend: of ``robot_io.policy.backends``; log_folder and log_name of the MCAP, None: no log.
-    box: balls that the policy was trained for; None: nothing is out of distribution
-    dry: nothing is sent to arm and axes, which move in thought; jog: no balls are taken, the operator moves the robot
-    """
-
-    artefact: str | None
-    backend: str = "auto"
-    log_folder: str | None = None
-    log_name: str = "session"
-    box: Box | None = None
-    metadata: tuple[tuple[str, str], ...] = ()
-    attachments: tuple[tuple[str, str | bytes], ...] = ()
-    dry: bool = False
-    jog: bool = False
-    contract: Contract = PAPER
-
-
 def start(config: RobotConfig, options: ControlOptions) -> tuple[BaseProcess, Connection]:
     """Starts the process; the first message on the pipe is "ready" or "failed"."""
     context = multiprocessing.get_context("spawn")
@@ -88,13 +69,14 @@ def start(config: RobotConfig, options: ControlOptions) -> tuple[BaseProcess, Co
 
 
 def _main(config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the owner, who asks for an orderly stop
+    realtime.leave_terminal()  # Ctrl-C goes to the owner, who asks for an orderly stop
     try:
         control = Control(config, options, pipe)
     except Exception as error:
         pipe.send(messages.Failed(f"{error}" or type(error).__name__))
         return
-    signal.signal(signal.SIGTERM, lambda *_: control.quit())
+    for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, lambda *_: control.quit())
     with control:
         control.run()
 
@@ -168,7 +150,7 @@ class Control:
         except BaseException:
             self._close()
             raise
-        self._quit = False
+        self._quit, self._owner = False, OwnerWatch()
         self._status_at = 0.0
         self._period = 1.0 / config.rate
 
@@ -215,7 +197,7 @@ class Control:
             self._loop()
         except BaseException as error:  # nothing leaves the loop before the robot stands
             self._bring_to_rest(error)
-            self._send(messages.Failed(f"{type(error).__name__}: {error}"))
+            self._send(messages.Failed(said(error)))
             raise
         finally:
             self._send(messages.Ended(self.timings.summary()))
@@ -227,9 +209,15 @@ class Control:
         self._quit = True
 
     def _bring_to_rest(self, error: BaseException) -> None:
-        """Brake through the gate and answer the arm until the robot stands, with as little of the loop as possible."""
+        """Brake through the gate and answer the arm until the robot stands, with as little of the loop as possible.
+
+        Each step is by itself: whatever fails for ever, the others go on, and an arm without ticks is slowed down.
+        """
         now = time.monotonic()
-        self.bridge.failed(error, now)
+        with suppress(BaseException):
+            self.bridge.failed(error, now)
+        with suppress(BaseException):  # where even the fault cannot be latched
+            self.bridge.gate.brake(now)
         deadline, end = now, now + STOP_TIME
         while now < end:
             try:
@@ -237,14 +225,15 @@ class Control:
                     end = min(end, now + AFTER_REST)
                 if select.select([self._arm_socket.fileno()], [], [], max(deadline - now, 0.0))[0]:
                     self._answer_arm()
-                now = time.monotonic()
-                if now >= deadline:
-                    deadline = now + self._period
-                    self._take_axes()
-                    self.bridge.tick(now, now)
-            except BaseException:  # whatever fails again: the next reply and the next tick still count
+            except BaseException:
                 time.sleep(0.001)
-                now = time.monotonic()
+            now = time.monotonic()
+            if now >= deadline:
+                deadline = now + self._period
+                with suppress(BaseException):
+                    self._take_axes()
+                with suppress(BaseException):
+                    self.bridge.tick(now, now)
 
     def _loop(self) -> None:
         spin, bridge = self._config.realtime.spin, self.bridge
@@ -305,6 +294,9 @@ class Control:
             self.bridge.axes_received(state.position, state.received)
 
     def _tick(self, deadline: float, now: float) -> None:
+        silent = self._owner.ticked(now)
+        if silent and self.bridge.state in (BridgeState.READY, BridgeState.ACTIVE):
+            self.bridge.stop(now, silent)
         self._take_axes()
         self.bridge.tick(deadline, now)
         self.timings.lateness.add(now - deadline)
@@ -330,8 +322,11 @@ class Control:
 
     def _obey(self, request: messages.Request) -> None:
         now = time.monotonic()
+        self._owner.heard()
         try:
             match request:
+                case messages.Beat(absence):
+                    self._owner.heard(absence if self.bridge.paused and not self._options.jog else 0.0)
                 case messages.Arm():
                     self.bridge.arm(now)
                 case messages.Prepare():
@@ -350,6 +345,7 @@ class Control:
                 case messages.Pause(on):
                     self.bridge.paused = on or self._options.jog
                 case messages.SetPolicy(policy, version):
+                    self.bridge.check_exchange()  # before a policy is built, which takes its time
                     self.bridge.set_policy(make_policy(self._backend, policy, self._contract), version)
                     self._send(messages.PolicySet(version))
                 case messages.Quit():
@@ -359,8 +355,7 @@ class Control:
         except RefusedError as error:
             self._send(messages.Refused(request, error))
         except Exception as error:  # a request that cannot be carried out must not end the play
-            name = type(request).__name__
-            self._send(messages.Refused(request, RefusedError(f"{name}: {type(error).__name__}: {error}")))
+            self._send(messages.Refused(request, RefusedError(f"{type(request).__name__}: {said(error)}")))
 
     def _episode(self, summary: EpisodeSummary) -> None:
         self._send(messages.Played(summary, self.bridge.play.track(summary.number)))

@@ -1,10 +1,11 @@
-"""Means of an ordinary Linux process to be on time; every refusal is reported, none is an error."""
+"""Means of an ordinary Linux process to be on time, and undisturbed; every refusal is reported, none is an error."""
 
 from __future__ import annotations
 
 import ctypes
 import gc
 import os
+import signal
 import sys
 
 MCL_CURRENT, MCL_FUTURE = 1, 2
@@ -29,6 +30,17 @@ def prepare(priority: int | None = 50, lock_memory: bool = True) -> list[str]:
     gc.freeze()
     gc.disable()  # the loop makes no cycles; a collection would come at the worst moment
     return report
+
+
+def leave_terminal() -> None:
+    """To be called first by a process that a terminal must not end: neither its keys nor its closing reach it then.
+
+    Ctrl-Z would freeze it at the robot's last speed, Ctrl-\\ or a closed window end it there. Not for a process that
+    leads a group.
+    """
+    os.setsid()
+    for number in (signal.SIGINT, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _lock_memory() -> str:

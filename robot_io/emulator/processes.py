@@ -110,6 +110,7 @@ class Rig:
         except (EOFError, DeviceError) as error:
             self.close()
             raise DeviceError(str(error) or "rig: a process ended at once") from None
+        self._shared.unlink()
 
     @property
     def robot(self) -> RobotConfig:
@@ -202,7 +203,8 @@ def _run(
     pipe: Connection,
     arguments: tuple,
 ) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):  # no terminal ends hardware; the owner's death does
+        signal.signal(number, signal.SIG_IGN)
     shared = Shared(name, contract.n_joints)
     # These stand for hardware, which nothing else on this machine can delay; below the bridge's priority.
     realtime.prepare(PRIORITY)

@@ -112,7 +112,12 @@ class Shared:
         self.views.clear()
         del self._block
         self._memory.close()
+        self.unlink()
+
+    def unlink(self) -> None:
+        """Take away the name of a block that was made here: once all have attached, no death leaves it behind."""
         if self._owner:
+            self._owner = False
             self._memory.unlink()
 
 

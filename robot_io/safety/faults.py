@@ -11,7 +11,7 @@ from robot_io.errors import RefusedError
 class Cause(Enum):
     """Every reason for a fault; the value is its short name in logs."""
 
-    ESTOP = "estop"  # the emergency stop is pressed
+    ESTOP = "estop"  # the emergency stop is pressed, where something tells: the devices do not
     NON_FINITE_COMMAND = "non_finite_command"  # a requested velocity is NaN or infinite
     MALFORMED_COMMAND = "malformed_command"  # a request of another shape or type, or subnormal numbers
     NON_FINITE_FEEDBACK = "non_finite_feedback"  # measured positions or velocities are not eight finite numbers

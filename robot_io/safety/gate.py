@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robot_io.contract import CONTROL_RATE, LIMITS, JointLimits
-from robot_io.errors import JogFirstError, RefusedError
+from robot_io.errors import JogFirstError, RefusedError, said
 from robot_io.limits import limit_velocity
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.config import SLACK
@@ -307,7 +307,7 @@ class SafetyGate:
                 velocity, changed = self._allowed(wanted, braked)
                 broken = self._broken(velocity)
             except Exception as error:  # a mistake of ours must still brake the robot
-                broken = f"{type(error).__name__}: {error}"
+                broken = said(error)
             if broken:
                 self.fault(Cause.INTERNAL, broken, now)
                 velocity, changed = braked, (self.state.value,)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 from types import SimpleNamespace
 
-from robot_io.control import process, realtime
+from robot_io.control import messages, process, realtime
 from robot_io.control.config import RealTimeConfig, RobotConfig
 from robot_io.control.process import Control, ControlOptions
+from robot_io.safety.owner_watch import BEAT_PERIOD
 from tests.support.simulated_clock import CONTROLLER, Simulation
 
 
@@ -42,11 +44,14 @@ class FrameSocket(ArmSocket):
 
 
 class Simulated:
-    """A control process in this one; ``script``: what happens at moments [s] of its clock."""
+    """A control process in this one; ``script``: what happens at moments [s] of its clock.
+
+    beats  whether its owner shows signs of life, on that clock: one in real time cannot
+    """
 
     def __init__(self, artefact, monkeypatch, **options):
         self.simulation = Simulation()
-        self.script = []
+        self.script, self.beats, self._beaten = [], True, 0.0
         self.pipe, theirs = multiprocessing.Pipe()
         monkeypatch.setattr(process, "EgmSocket", lambda *_: ArmSocket(self.simulation))
         monkeypatch.setattr(process, "TrackerSocket", lambda *_: FrameSocket(self.simulation))
@@ -71,6 +76,10 @@ class Simulated:
         end = simulation.now + seconds + 1e-9  # not before a deadline by rounding
         while simulation.now < end and not simulation.packets:
             simulation.advance()
+            if self.beats and simulation.now >= self._beaten + BEAT_PERIOD:
+                self._beaten = simulation.now
+                with contextlib.suppress(OSError):  # the owner has closed its end
+                    self.pipe.send(messages.Beat())
             while self.script and self.script[0][0] <= simulation.now:
                 self.script.pop(0)[1]()
         ready = ["arm"] * bool(simulation.packets) + ["tracker"] * bool(simulation.frames)

@@ -40,6 +40,7 @@ def test_the_view_shows_state_faults_joints_and_counts():
         ball=(0.1, -0.2, 0.02),
         clock={"drift": -4e-5, "seconds": 60},
         dry=True,
+        stopped="not heard for 2 s",
         timings={"missed_ticks": 6, "tick": {"p50_ms": 1.0, "p99_ms": 2.0, "max_ms": 3.0}},
     )
     with view:
@@ -51,6 +52,7 @@ def test_the_view_shows_state_faults_joints_and_counts():
         "ball +0.100 -0.200 +0.020 m in the table frame; tracker's clock +40.0 ppm over 60 s",
         "in thought",
         "FAULT estop: the button is pressed",
+        "STOPPED: not heard for 2 s",
         "balls 3: 2 returned, 1 missed",
         "rally 1 touches; 4 rallies, 5.2 on average, longest 12; last: 2 touches: Human returning a ball over",
         "+0.100 m ",

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,6 +33,7 @@ from robot_io.emulator.processes import Rig, free_ports
 from robot_io.errors import DeviceError, JogFirstError, RefusedError
 from robot_io.policy import artefact, export
 from robot_io.policy.policy import Policy
+from robot_io.safety.owner_watch import LONGEST_SILENCE
 from tests.support.paths import ROOT
 from tests.support.simulated_control import Simulated
 
@@ -113,6 +115,87 @@ def test_ctrl_c_ends_with_the_summary(policy, tmp_path):
     (summary,) = (json.loads(path.read_text()) for path in tmp_path.glob("*.json"))
     assert summary["episodes"] >= 1 and summary["egm"]["replies"] > 100
     assert len(log.read(summary["log"]).episodes) >= 1
+
+
+def started(policy, folder, *more):
+    """``mjx-tt run`` on the rig as a group of its own, after its first ball."""
+    command = [
+        sys.executable,
+        "-m",
+        "experiments.cli",
+        "run",
+        str(policy),
+        "--robot",
+        "rig",
+        "--log",
+        str(folder),
+        *more,
+    ]
+    pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    running = subprocess.Popen(command, cwd=ROOT, start_new_session=True, **pipe)
+    for line in running.stdout:
+        if line.startswith("ball 1:"):
+            break
+    return running
+
+
+def children(pid):
+    """Processes of a parent, by number."""
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def lives(pid):
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def states(session_log):
+    """The bridge's states in a log, each with the reason why it was entered."""
+    texts = [json.loads(event.text) for event in session_log.events if event.name == "state"]
+    return [(text["to"], text["why"]) for text in texts]
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT])
+def test_a_terminal_that_closes_ends_the_play_in_order(policy, tmp_path, number):
+    """The owner dies at once; the control process is not of its group, brakes and ends its log."""
+    before = set(Path("/dev/shm").glob("psm_*"))
+    with started(policy, tmp_path) as running:
+        family = children(running.pid)
+        apart = [child for child in family if os.getpgid(child) != os.getpgid(running.pid)]
+        try:
+            assert len(apart) == 1 and os.getsid(apart[0]) == apart[0]
+        finally:
+            os.killpg(running.pid, number)
+    assert running.returncode == -number
+    end = time.monotonic() + 20.0
+    while any(lives(child) for child in family):
+        assert time.monotonic() < end, "processes are left behind"
+        time.sleep(0.05)
+    assert set(Path("/dev/shm").glob("psm_*")) <= before, "shared memory is left behind"
+    (path,) = tmp_path.glob("*.mcap")
+    session_log = log.read(path)
+    # The rig ends with its owner, so the loss of its devices may be noticed first: a fault, which brakes as well.
+    assert states(session_log)[-1][0] in ("stopping", "disarmed")
+    assert np.abs(session_log.commands.sent).max() > 0 and not session_log.commands.sent[:, -1].any()
+
+
+@pytest.mark.realtime
+def test_play_goes_on_after_an_owner_that_stood_still(policy, tmp_path):
+    """As Ctrl-Z, a stalled SSH or Ctrl-S do to it: the robot is stopped meanwhile, and on the rig armed again."""
+    with started(policy, tmp_path, "--balls", "3") as running:
+        os.kill(running.pid, signal.SIGSTOP)
+        time.sleep(LONGEST_SILENCE + 1.5)
+        os.kill(running.pid, signal.SIGCONT)
+        text = running.stdout.read()
+    assert running.returncode == 0, text
+    assert "stopped: the operator's program was not heard for 2 s" in " ".join(text.split())
+    (path,) = tmp_path.glob("*.mcap")
+    found = states(log.read(path))
+    silent = next(i for i, (_, why) in enumerate(found) if "was not heard" in why)
+    assert [state for state, _ in found[silent : silent + 3]] == ["stopping", "disarmed", "ready"], found
 
 
 def test_flipped_bit_is_refused(policy, tmp_path):
@@ -310,6 +393,38 @@ def test_killed_bridge_leaves_a_readable_log_and_the_arm_stops(playing):
 
 
 @pytest.mark.realtime
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+def test_signals_never_leave_the_robot_moving(playing, number):
+    """Those of a terminal's stop do nothing, the others end the process once the robot stands."""
+    _, session, folder = playing
+    for ignored in (signal.SIGINT, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU):
+        os.kill(session.process.pid, ignored)
+    before = session.status.time
+    until(session, lambda status: status.time > before + 0.5)
+    os.kill(session.process.pid, number)
+    session.process.join(10.0)
+    assert session.process.exitcode == 0
+    session_log = log.read(folder / "session.mcap")
+    assert states(session_log)[-1][0] in ("stopping", "disarmed") and not session_log.commands.sent[:, -1].any()
+
+
+@pytest.mark.realtime
+def test_a_session_that_nobody_listens_to_is_stopped(playing):
+    rig, session, _ = playing
+    end = time.monotonic() + LONGEST_SILENCE + 1.0
+    while time.monotonic() < end:
+        list(session.messages(0.3))
+    if session.status.faults:  # a busy machine, as above
+        session.recover(rig)
+    assert session.status.state in ("ready", "active") and not session.status.stopped
+    time.sleep(LONGEST_SILENCE + 1.0)
+    list(session.messages(0.5))
+    assert session.status.state in ("disarmed", "fault") and "was not heard" in session.status.stopped
+    session.recover(rig)
+    assert session.status.state in ("ready", "active") and not session.status.halt
+
+
+@pytest.mark.realtime
 def test_missed_ticks_are_in_the_log(playing):
     """The control process is held for 45 ms: late, but not yet a fault of timing."""
     _, session, folder = playing
@@ -317,7 +432,7 @@ def test_missed_ticks_are_in_the_log(playing):
         os.kill(session.process.pid, signal.SIGSTOP)
         time.sleep(0.045)
         os.kill(session.process.pid, signal.SIGCONT)
-        time.sleep(0.3)
+        list(session.messages(0.3))
     session.close()
     missed = session.timings["missed_ticks"]
     events = [event for event in log.read(folder / "session.mcap").events if event.name == "ticks_missed"]

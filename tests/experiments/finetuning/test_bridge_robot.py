@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from experiments.finetuning.bridge_robot import BridgeRobot
+from experiments.finetuning.bridge_robot import COMPUTING, BridgeRobot
 from robot_io.control import messages
 from robot_io.errors import RefusedError
 from robot_io.policy.policy import Policy
@@ -42,6 +42,9 @@ class Session:
 
     def send(self, request):
         self._requests.append((self.simulation.now + PIPE, request))
+
+    def last_requests(self):
+        return [request for _, request in list(self._requests)[-2:]]
 
     def messages(self, seconds):
         end = self.simulation.now + seconds
@@ -98,5 +101,7 @@ def test_a_ball_is_credited_to_the_policy_that_played_it(gap):
     finally:
         Constant.step = step
     assert len(credited) == 4
+    # Nobody reads the keys while the next policy is computed: it says so, once no balls are taken any more.
+    assert session.last_requests() == [messages.Pause(True), messages.Beat(COMPUTING)]
     for number, member in credited.items():
         assert played[number] == {member}, (credited, played)

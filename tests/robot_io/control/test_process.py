@@ -7,8 +7,12 @@ import pytest
 
 from robot_io import contract
 from robot_io.control import messages, process
+from robot_io.control.interfaces import BridgeState
 from robot_io.policy import export
 from robot_io.policy.policy import Policy
+from robot_io.safety.coasting import PATIENCE
+from robot_io.safety.owner_watch import LONGEST_SILENCE
+from tests.support.simulated_clock import DEAD_TIME
 from tests.support.simulated_control import Simulated
 
 
@@ -61,6 +65,152 @@ def test_an_exception_leaves_the_loop_after_the_robot_stands(simulated, part, er
     for _ in range(300):
         simulation.advance()
     np.testing.assert_allclose(simulation.arm, rest, rtol=0, atol=1e-3)
+
+
+class Wordless(Exception):
+    def __str__(self):
+        raise RuntimeError("no words either")
+
+
+def raising(error):
+    def escape(*_, **__):
+        raise error("made up")
+
+    return escape
+
+
+LASTING = ["bridge.gate.command", "_take_axes", "bridge.tick", "_tick", "bridge.play.settle"]
+
+
+@pytest.mark.parametrize("part", LASTING)
+@pytest.mark.parametrize("error", [Escaped, ValueError, Wordless])
+def test_an_exception_that_lasts_leaves_the_arm_at_rest_within_its_braking_distance(simulated, part, error):
+    """Raised from some moment on for ever, at more than 1 rad/s; the arm answers late, as it does at all times."""
+    control, simulation = simulated.control, simulated.simulation
+    *path, name = part.split(".")
+    owner, gate, seen = control, control.bridge.gate, []
+    for step in path:
+        owner = getattr(owner, step)
+
+    def move():
+        control.bridge._home = control.bridge._home + [0.3, 0.1, 0.8, 0, 0, 1.0, 0, 1.0]
+        simulated.pipe.send(messages.Arm())
+
+    def spoil():
+        setattr(owner, name, raising(error))
+        seen.append((simulation.arm.copy(), gate.velocity[2:]))
+
+    simulated.script = [(10.5, move), (10.8, spoil), (12.0, control.quit)]
+    try:
+        with control:
+            control.run()
+    except error:
+        pass
+    ((place, velocity),) = seen
+    assert np.abs(velocity).max() > 1.0
+    assert error.__name__ in [fault.sentence.partition(":")[0] for fault in gate.faults]
+    assert all(not speed.any() for now, _, speed in simulation.replies if now > 11.3)
+    for _ in range(300):
+        simulation.advance()
+    late = DEAD_TIME + (PATIENCE + 2) / 75
+    braking = np.abs(velocity) * late + velocity**2 / (2 * np.array(contract.LIMITS.acceleration[2:]))
+    assert (np.abs(simulation.arm - place) <= braking + 0.02).all()
+    rest = simulation.arm.copy()
+    for _ in range(300):
+        simulation.advance()
+    np.testing.assert_allclose(simulation.arm, rest, rtol=0, atol=1e-3)
+
+
+def test_an_exception_brakes_also_where_no_fault_can_be_latched(simulated):
+    control, simulation = simulated.control, simulated.simulation
+    gate = control.bridge.gate
+
+    def move():
+        control.bridge._home = control.bridge._home + [0, 0, 0.8, 0, 0, 1.0, 0, 1.0]
+        simulated.pipe.send(messages.Arm())
+
+    def spoil():
+        gate.fault = raising(ValueError)
+        control._obey = raising(ValueError)
+
+    simulated.script = [(10.5, move), (10.8, spoil)]
+    with pytest.raises(ValueError, match="made up"), control:
+        control.run()
+    assert gate.at_rest and not simulation.replies[-1][2].any()
+    assert isinstance(simulated.words()[-1], messages.Ended)
+
+
+@pytest.mark.parametrize("jog", [False, True])
+def test_a_silent_owner_is_a_stop_in_order_with_its_reason(tmp_path, monkeypatch, jog):
+    simulated = Simulated(None, monkeypatch, jog=jog)
+    bridge, simulation, seen = simulated.control.bridge, simulated.simulation, []
+
+    def move():
+        bridge._home = bridge._home + [0, 0, 0.8, 0, 0, 1.0, 0, 1.0]
+
+    def fall_silent():
+        seen.append(bridge.state)
+        simulated.beats = False
+
+    simulated.script = [
+        (10.5, lambda: simulated.pipe.send(messages.Arm())),
+        (15.0, fall_silent),
+        (15.0 + LONGEST_SILENCE - 0.3, lambda: seen.append(bridge.state)),
+        (15.0 + LONGEST_SILENCE - 0.2, move),
+        (15.0 + LONGEST_SILENCE + 0.05, lambda: seen.append(bridge.state)),
+        (15.0 + LONGEST_SILENCE + 1.0, lambda: seen.append(bridge.state)),
+        (15.0 + LONGEST_SILENCE + 1.0, lambda: simulated.pipe.send(messages.Arm())),
+        (15.0 + LONGEST_SILENCE + 1.3, lambda: seen.append((bridge.state, bridge.stopped_because))),
+        (15.0 + LONGEST_SILENCE + 1.4, simulated.control.quit),
+    ]
+    with simulated.control:
+        simulated.control.run()
+    ready = BridgeState.READY
+    assert seen == [ready, ready, BridgeState.STOPPING, BridgeState.DISARMED, (ready, "")]
+    stopped = [message for message in simulated.words() if isinstance(message, messages.Status) and message.stopped]
+    assert stopped and "was not heard for 2 s" in stopped[-1].stopped
+    at_rest = [speed for now, _, speed in simulation.replies if abs(now - 15.9 - LONGEST_SILENCE) < 0.1]
+    assert at_rest and not np.any(at_rest) and stopped[-1].halt.text == stopped[-1].stopped
+
+
+@pytest.mark.parametrize(("paused", "jog"), [(True, False), (False, False), (False, True)])
+def test_an_owner_may_announce_its_absence_only_while_no_balls_are_taken(tmp_path, monkeypatch, paused, jog):
+    simulated = Simulated(None, monkeypatch, jog=jog)
+    bridge, pipe, seen = simulated.control.bridge, simulated.pipe, []
+
+    def leave():
+        pipe.send(messages.Pause(paused))
+        pipe.send(messages.Beat(10.0))
+        simulated.beats = False
+
+    simulated.script = [
+        (10.5, lambda: pipe.send(messages.Arm())),
+        (11.0, leave),
+        (20.0, lambda: seen.append(bridge.state)),
+        (22.0, lambda: seen.append(bridge.state)),
+        (22.1, simulated.control.quit),
+    ]
+    with simulated.control:
+        simulated.control.run()
+    assert seen == [BridgeState.READY if paused else BridgeState.DISARMED, BridgeState.DISARMED]
+
+
+def test_a_policy_is_not_built_while_another_plays(simulated):
+    pipe, bridge, states = simulated.pipe, simulated.control.bridge, []
+    wrong = messages.SetPolicy(Policy(np.zeros(7), np.zeros(11), np.ones(11)), 1)
+
+    def exchange():
+        states.append(bridge.state)
+        pipe.send(wrong)
+
+    simulated.simulation.ball = lambda now: (
+        np.array([0.0, 1.5 - 4.2 * (now - 13.0), max(0.03, 0.35 - 0.5 * (now - 13.0))]) if 13.0 <= now < 13.72 else None
+    )
+    simulated.script = [(10.5, lambda: pipe.send(messages.Arm())), (13.3, exchange), (13.6, simulated.control.quit)]
+    with simulated.control:
+        simulated.control.run()
+    (refused,) = [message.sentence for message in simulated.words() if isinstance(message, messages.Refused)]
+    assert states == [BridgeState.ACTIVE] and refused == "the policy is playing: exchange it between balls"
 
 
 def test_what_fails_for_ever_does_not_keep_the_process(simulated):
