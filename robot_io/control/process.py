@@ -335,7 +335,7 @@ class Control:
                 case messages.Arm():
                     self.bridge.arm(now)
                 case messages.Prepare():
-                    prepare(self._axes, self.bridge.check_homing)
+                    prepare(self._axes, lambda: self.bridge.check_homing(now))
                 case messages.Stop():
                     self.bridge.stop(now)
                 case messages.Reset():
