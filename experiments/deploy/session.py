@@ -111,7 +111,10 @@ class Session:
                     yield message
 
     def prepare(self, rig: Rig | None) -> None:
-        """Switch the axes on and home them, on the rig the arm too, until nothing is missing. Raises RefusedError."""
+        """Switch the axes on and home them, on the rig the arm too, until nothing is missing. Raises RefusedError.
+
+        In a fault they are not homed: nothing else is missing then.
+        """
         if rig is not None:
             rig.switch_on()
         end, again = time.monotonic() + PREPARE_TIME, True
@@ -121,8 +124,12 @@ class Session:
                 self.send(messages.Prepare())
             again = False
             for message in self._answers(0.3):
-                if isinstance(message, Status) and not message.missing:
-                    return
+                if isinstance(message, Status):
+                    unhomed = (
+                        message.state == "fault" and message.preparable and not message.arm and not message.tracker
+                    )
+                    if unhomed or not message.missing:
+                        return
                 if isinstance(message, Refused):  # until the arm has sent its position, or an axis has answered
                     refusal, again = message.error, True
         missing = "no status" if self.status is None else self.status.missing
@@ -160,6 +167,7 @@ class Session:
             try:
                 self.prepare(rig)
                 self.reset()
+                self.prepare(rig)  # what lost its reference is homed without a fault only
                 self.arm()
                 return
             except RefusedError as error:  # a busy machine may be late again: a new fault, or what is over by now
@@ -320,7 +328,7 @@ def _watch(
                     console.print(f"rally {rally.number}: {touches}: {rally.text}", highlight=False)
         key = keyboard.pressed()
         if key is not None:  # whatever it is, the operator wants something else
-            recovery = Recovery(time.monotonic()) if key == RECOVER else None
+            recovery = Recovery(time.monotonic(), session.status, rig is not None) if key == RECOVER else None
         if key == QUIT:
             break
         if key == PAUSE:
@@ -356,4 +364,6 @@ def _continued(session: Session, recovery: Recovery, status: Status, view: View)
         return None
     if request is not None:
         session.send(request)
+    if recovery.word:
+        view.say(recovery.word)
     return None if recovery.done else recovery
