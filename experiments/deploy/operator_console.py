@@ -40,7 +40,7 @@ KEYS = {
     "a": Key("arm: the robot goes to its home pose", messages.Arm()),
     STOP: Key("stop", messages.Stop()),
     "r": Key("reset a fault", messages.Reset()),
-    RECOVER: Key("continue after a fault: switch on, reset, home and arm; where somebody must mend something, reset"),
+    RECOVER: Key("continue after a fault: switch on, reset, home and arm"),
     "d": Key("discard this ball", messages.Discard()),
     PAUSE: Key("pause: take no new balls, or resume"),
     QUIT: Key("stop and end"),

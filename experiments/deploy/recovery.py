@@ -43,16 +43,18 @@ class Recovery:
             reasons = "; ".join(filter(None, [self._refusal, reasons]))
             raise TimeoutError(f"not recovered within {LONGEST:g} s: {reasons or status.state}")
         if status.state in ("ready", "active"):  # a fault that comes later is not the one that the key was for
-            return self._ended("nothing to recover: the robot is armed")
+            self._end_with("nothing to recover: the robot is armed")
+            return None
         if not self._prepared:
             self._prepared = True
             if status.state != "fault" and not self._by_itself:
-                self._ended(f"not armed: {reasons}")
+                self._end_with(f"not armed: {reasons}")
             return Prepare()
         if status.state == "fault":
             return self._out_of_the_fault(status)
         if not self._by_itself:
-            return self._ended(f"reset, not armed: {reasons}" if reasons else "all is well: press a to arm")
+            self._end_with(f"reset, not armed: {reasons}" if reasons else "all is well: press a to arm")
+            return None
         if self._again and status.axes:
             self._again = False
             return Prepare()
@@ -70,7 +72,7 @@ class Recovery:
             return Prepare()
         return None
 
-    def _ended(self, word: str) -> None:
+    def _end_with(self, word: str) -> None:
         self.done, self.word = True, word
 
 

@@ -217,9 +217,11 @@ def run(
         if robot == RIG:
             console.print("starting the rig ...", highlight=False)
             rig = stack.enter_context(rig_for(loaded, distribution, rig_params, seed, player))
-            config, text = rig.robot, robots.to_yaml(rig.robot)
+            contract, config, text = loaded.contract, rig.robot, robots.to_yaml(rig.robot)
         else:
-            config = robots.load_robot(robot, contract=loaded.contract)
+            contract = robots.standing(robot)
+            artefacts.check_robot(artefact, loaded.contract, contract)
+            config = robots.load_robot(robot, contract=contract)
             contradictions.check(config, robot, log_folder)
             text = Path(robot).read_text(encoding="utf-8")
         name = time.strftime("%Y%m%d-%H%M%S")
@@ -236,6 +238,7 @@ def run(
                 ("calibration.yaml", robots.to_yaml(config.calibration)),
                 *robot_attachment.of_policy(loaded, console),
             ),
+            contract=contract,
         )
         log_folder.mkdir(parents=True, exist_ok=True)
         session = stack.enter_context(Session(config, options, console))

@@ -58,7 +58,7 @@ Closing = TypeVar("Closing", bound=Closable)
 
 @dataclass(frozen=True)
 class ControlOptions:
-    """artefact: folder, None: a policy that stands still, on a robot with the joints of ``contract``.
+    """artefact: folder, None: a policy that stands still. contract: of the robot; an artefact's must be the same.
 
     backend: of ``robot_io.policy.backends``; log_folder and log_name of the MCAP, None: no log.
     box: balls that the policy was trained for; None: nothing is out of distribution
@@ -105,8 +105,8 @@ class Control:
     def __init__(self, config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
         self._config, self._options, self._pipe = config, options, pipe
         arm, found = config.arm, config.calibration.robot
-        loaded = None if options.artefact is None else artefacts.load(options.artefact)
-        self._contract = contract = options.contract if loaded is None else loaded.contract
+        self._contract = contract = options.contract  # not the policy's: it must not bring the limits that guard it
+        loaded = None if options.artefact is None else artefacts.load(options.artefact, contract)
         config.check_joints(contract)
         if loaded is None:
             seen = contract.n_observation
