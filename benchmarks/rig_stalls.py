@@ -127,7 +127,7 @@ def pull(rig: Rig, kind: str, connected: bool) -> None:
 def recovered(rig: Rig, session: Session) -> str:
     """The operator's one key, once the arm's controller is on again; why it failed, empty: it did not."""
     rig.switch_on()
-    recovery = Recovery(time.monotonic())
+    recovery = Recovery(time.monotonic(), session.status, emulated=True)
     while not recovery.done:
         for message in session.messages(0.3):
             if isinstance(message, Refused) and recovery.refused(message):

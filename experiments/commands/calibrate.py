@@ -67,6 +67,7 @@ def calibrate(
     if part == "tracker":
         found = _tracker(path, today, screen)
     elif part == "robot":
+        own = own or (robots.named(robot) if robot else None)
         contract, end = (PAPER, None) if own is None else _standing(own)
         config = robots.load_robot(robot, False, contract) if robot else RobotConfig.of(contract)
         found = _robot(path, tuple(axis.zero for axis in config.axes), today, screen, contract, end)

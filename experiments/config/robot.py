@@ -46,15 +46,45 @@ RANGES = {RobotConfig: robot_config.RANGES, RigParams: rig_config.RANGES, Calibr
 Config = TypeVar("Config", RobotConfig, RigParams, Calibration)
 
 
-def load_robot(path: str | Path, calibrated: bool = True, contract: Contract = PAPER) -> RobotConfig:
+def named(path: str | Path) -> str | None:
+    """Name or folder of the robot that a robot.yaml has as ``robot``, a folder seen from the file's own; None: none.
+
+    Raises ConfigError.
+    """
+    given = _mapping(path).get("robot")
+    if given is None:
+        return None
+    if not isinstance(given, str):
+        raise ConfigError(f"{path}: robot: got {_shown(given)}; allowed: a robot's name or folder")
+    from mjx_tt.robot import robot as simulated
+
+    return given if given in simulated.names() else str(Path(path).parent / given)
+
+
+def standing(path: str | Path) -> Contract:
+    """Contract of the robot that a robot.yaml names, the paper's where it names none. Raises ConfigError."""
+    robot = named(path)
+    if robot is None:
+        return PAPER
+    from mjx_tt.robot import robot as simulated
+
+    return checked(f"{path}: robot", simulated.load, robot).contract
+
+
+def load_robot(path: str | Path, calibrated: bool = True, contract: Contract | None = None) -> RobotConfig:
     """A robot.yaml, its calibration in it or in a file that it names. Raises ConfigError.
 
     Without ``safety.speed_scale`` the robot is slow: COMMISSIONING.
 
     calibrated  False: its calibration is not looked at
-    contract    whose joints it has
+    contract    of the robot that stands there, which must be the one that the file names, if any; None: that one
     """
     data = _mapping(path)
+    if contract is None or data.get("robot") is not None:
+        there = standing(path)
+        if contract is not None and contract != there:
+            raise ConfigError(f"{path}: robot: names {there.robot}, asked for is {contract.robot} as it is now")
+        contract = there
     if not calibrated:
         data.pop("calibration", None)
     if isinstance(named := data.get("calibration"), str):  # relative to robot.yaml

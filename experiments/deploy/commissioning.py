@@ -44,7 +44,8 @@ def check(
 ) -> int:
     """Compute and log everything, send nothing: tracker and arm are heard, arm and axes move in thought.
 
-    robot  a robot.yaml; own: name or folder of the robot that stands there, None: the policy's, else the paper's
+    robot  a robot.yaml; own: name or folder of the robot that stands there, None: the one that robot.yaml names, the
+           policy's, or the paper's
     """
     return _operate(robot, artefact, log_folder, noted, seconds, console, True, own)
 
@@ -174,7 +175,7 @@ def _operate(
     dry: bool,
     own: str | None,
 ) -> int:
-    contract, kept = _robot_of(artefact, own, console)
+    contract, kept = _robot_of(artefact, own or robots.named(robot), console)
     config, name = robots.load_robot(robot, contract=contract), time.strftime("%Y%m%d-%H%M%S")
     attachments: tuple[tuple[str, str | bytes], ...] = (
         ("robot.yaml", robot.read_text(encoding="utf-8")),

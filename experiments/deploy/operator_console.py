@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import sys
 import termios
+import time
 import tty
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +21,10 @@ from robot_io.control import messages
 
 COLOURS = {"disarmed": "white", "ready": "green", "active": "bold green", "stopping": "yellow", "fault": "bold red"}
 QUIT, PAUSE, RECOVER = "q", "h", "c"
+STOP = " "
+MOVING = "parc+-"  # keys after which something moves, or may
+ESCAPE = "\x1b"
+LONGEST_READ = 4096  # bytes; a terminal keeps no more
 
 
 @dataclass(frozen=True)
@@ -32,20 +38,61 @@ class Key:
 KEYS = {
     "p": Key("switch on and home the linear axes", messages.Prepare()),
     "a": Key("arm: the robot goes to its home pose", messages.Arm()),
-    " ": Key("stop", messages.Stop()),
+    STOP: Key("stop", messages.Stop()),
     "r": Key("reset a fault", messages.Reset()),
-    RECOVER: Key("continue after a fault: switch on, home what lost its reference, reset and arm"),
+    RECOVER: Key("continue after a fault: switch on, reset, home and arm"),
     "d": Key("discard this ball", messages.Discard()),
     PAUSE: Key("pause: take no new balls, or resume"),
     QUIT: Key("stop and end"),
 }
 
 
+class EscapeFilter:
+    """Takes escape sequences out of what a terminal sends: arrow keys, function keys, Alt with a key, reports.
+
+    A sequence goes on in the next piece when a read ends inside it, unless ``BROKEN_OFF`` seconds lie between them:
+    then what began it was the Esc key itself, which must not swallow the keys that follow.
+    """
+
+    BROKEN_OFF = 0.5  # [s]; a terminal sends a sequence at once
+
+    def __init__(self) -> None:
+        self._inside = ""  # what has come of a sequence that has not ended
+        self._last = -math.inf
+
+    def keys(self, text: str, now: float) -> str:
+        """The characters of a piece, read at ``now`` [s], that belong to no sequence."""
+        if now - self._last > self.BROKEN_OFF:
+            self._inside = ""
+        self._last = now
+        found = []
+        for character in text:
+            if self._inside or character == ESCAPE:
+                self._inside += character
+                if _ended(self._inside):
+                    self._inside = ""
+            else:
+                found.append(character)
+        return "".join(found)
+
+
+def _ended(sequence: str) -> bool:
+    """True when an escape sequence is complete (ECMA-48; and a Linux console's function keys, two brackets and one)."""
+    if len(sequence) < 2:
+        return False
+    kind, last = sequence[1], sequence[-1]
+    if kind in "[O":
+        return len(sequence) > 2 and "@" <= last <= "~" and sequence != "\x1b[["
+    if kind in "]PX^_":  # strings
+        return last == "\a" or sequence.endswith("\x1b\\")
+    return kind != ESCAPE
+
+
 class Keyboard:
     """Single keys without Enter; nothing where the input is no terminal. Use as a context manager."""
 
     def __enter__(self) -> Keyboard:
-        self._terminal = sys.stdin.isatty()
+        self._terminal, self._filter = sys.stdin.isatty(), EscapeFilter()
         if self._terminal:
             self._before = termios.tcgetattr(sys.stdin)
             tty.setcbreak(sys.stdin)
@@ -56,10 +103,22 @@ class Keyboard:
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
 
     def pressed(self) -> str | None:
-        """The next key that waits."""
+        """The key that counts of all that wait, so that none queues behind the repetitions of another.
+
+        The stop key goes before everything, even inside an escape sequence, then the one that ends. Of others the last
+        counts; where they are different ones at once, as in a paste, only of those after which nothing moves.
+        """
         if not self._terminal or not select.select([sys.stdin], [], [], 0.0)[0]:
             return None
-        return os.read(sys.stdin.fileno(), 1).decode(errors="ignore")
+        text = os.read(sys.stdin.fileno(), LONGEST_READ).decode(errors="ignore")
+        keys = self._filter.keys(text, time.monotonic())
+        if STOP in text:
+            return STOP
+        if QUIT in keys:
+            return QUIT
+        if len(set(keys)) > 1:
+            keys = "".join(key for key in keys if key not in MOVING)
+        return keys[-1:] or None
 
 
 class View:

@@ -1,8 +1,9 @@
-"""The operator's one key after a fault: axes on, reset, arm, each once nothing stands against it."""
+"""The operator's one key after a fault: axes on, reset, home, arm, each once nothing stands against it."""
 
 from __future__ import annotations
 
 from robot_io.control.messages import Arm, Prepare, Refused, Request, Reset, Status
+from robot_io.safety.faults import Cause
 
 LONGEST = 20.0  # [s] from the key until the robot is armed
 
@@ -10,36 +11,72 @@ LONGEST = 20.0  # [s] from the key until the robot is armed
 class Recovery:
     """Steps from a fault to an armed robot, one per status of the control process.
 
-    It waits for what is missing or present, and sends each request once; the first again while it is refused, since
-    axes whose cable was out answer later.
+    What somebody else has to mend (a cable, the emergency stop, the arm's controller) is mended by a hand near the
+    robot. So it moves by itself, homing or armed, only if from the key on nothing was missing but what Prepare does:
+    power and references of the axes. Otherwise it ends after the reset, and ``word`` asks for the operator's next key.
+
+    status    the newest at the key, None: none has come
+    emulated  nothing real moves: it waits for whatever is missing, and goes on by itself
+    word      what the operator is to be told at the end; empty: nothing
     """
 
-    def __init__(self, now: float) -> None:
-        self._steps: list[Request] = [Prepare(), Reset(), Arm()]
+    def __init__(self, now: float, status: Status | None, emulated: bool = False) -> None:
+        self.done, self.word = False, ""
+        self._emulated = emulated
+        self._by_itself = emulated or (status is not None and only_unprepared(status))
         self._end, self._refusal = now + LONGEST, ""
-
-    @property
-    def done(self) -> bool:
-        return not self._steps
+        self._prepared = self._reset = False  # asked for once
+        self._again = False  # Prepare, which was refused or could not home before the reset
 
     def refused(self, message: Refused) -> bool:
         """Take a refusal; True when it ends the recovery."""
         if not isinstance(message.request, Prepare):
             return True
-        self._steps, self._refusal = [Prepare(), Reset(), Arm()], message.sentence
+        self._again, self._refusal = True, message.sentence
         return False
 
     def step(self, status: Status, now: float) -> Request | None:
         """Request that is due in this state; None: wait. Raises TimeoutError with what is missing."""
+        self._by_itself = self._emulated or (self._by_itself and only_unprepared(status))
+        reasons = "; ".join(filter(None, [status.missing, *status.present.values()]))
         if now > self._end:
-            reasons = "; ".join(filter(None, [self._refusal, status.missing, *status.present.values()]))
+            reasons = "; ".join(filter(None, [self._refusal, reasons]))
             raise TimeoutError(f"not recovered within {LONGEST:g} s: {reasons or status.state}")
-        request = self._steps[0]
-        if not isinstance(request, Prepare) and (status.missing or status.present):
+        if status.state in ("ready", "active"):  # a fault that comes later is not the one that the key was for
+            self._end_with("nothing to recover: the robot is armed")
             return None
-        if isinstance(request, Reset) and not status.faults:
-            self._steps.pop(0)
-            return self.step(status, now)
-        if isinstance(request, Arm) and status.state != "disarmed":
+        if not self._prepared:
+            self._prepared = True
+            if status.state != "fault" and not self._by_itself:
+                self._end_with(f"not armed: {reasons}")
+            return Prepare()
+        if status.state == "fault":
+            return self._out_of_the_fault(status)
+        if not self._by_itself:
+            self._end_with(f"reset, not armed: {reasons}" if reasons else "all is well: press a to arm")
             return None
-        return self._steps.pop(0)
+        if self._again and status.axes:
+            self._again = False
+            return Prepare()
+        if reasons or status.state != "disarmed":
+            return None
+        self.done = True
+        return Arm()
+
+    def _out_of_the_fault(self, status: Status) -> Request | None:
+        if not status.present and not self._reset:
+            self._reset = self._again = True
+            return Reset()
+        if status.present and self._again and not self._reset:  # axes whose cable was out answer later
+            self._again = False
+            return Prepare()
+        return None
+
+    def _end_with(self, word: str) -> None:
+        self.done, self.word = True, word
+
+
+def only_unprepared(status: Status) -> bool:
+    """Nothing is missing or present but axes without power or reference, which Prepare gives them."""
+    others = set(status.present) - {Cause.AXIS_LOST.value}
+    return not (status.arm or status.tracker or others) and (not status.axes or status.preparable)

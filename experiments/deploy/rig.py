@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,7 @@ def rig(
         del keys[key]
     params = robots.load_rig(rig_params, standing)
     with Rig(str(standing.scene()), throws, params, chosen, standing.contract) as running, Keyboard() as keyboard:
-        out.write_text(robots.to_yaml(running.robot), encoding="utf-8")
+        out.write_text(robots.to_yaml(replace(running.robot, robot=_named(robot))), encoding="utf-8")
         console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}", highlight=False)
         console.print("   ".join(f"\\[{k}] {text}" for k, (_, text) in keys.items()), highlight=False)
         throwing, connected = False, True
@@ -151,3 +152,8 @@ def rig(
             if request:
                 qpos, _ = running.state()
                 console.print(f"{request}; {running.thrown} balls thrown; joints {np.round(qpos, 3)}", highlight=False)
+
+
+def _named(robot: str | None) -> str | None:
+    """The key ``robot`` of a robot.yaml, wherever that is, from what the command line says."""
+    return robot if robot is None or robot in simulated.names() else str(Path(robot).resolve())

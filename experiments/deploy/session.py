@@ -137,7 +137,10 @@ class Session:
                     yield message
 
     def prepare(self, rig: Rig | None) -> None:
-        """Switch the axes on and home them, on the rig the arm too, until nothing is missing. Raises RefusedError."""
+        """Switch the axes on and home them, on the rig the arm too, until nothing is missing. Raises RefusedError.
+
+        In a fault they are not homed: nothing else is missing then.
+        """
         if rig is not None:
             rig.switch_on()
         end, again = time.monotonic() + PREPARE_TIME, True
@@ -147,8 +150,12 @@ class Session:
                 self.send(messages.Prepare())
             again = False
             for message in self._answers(0.3):
-                if isinstance(message, Status) and not message.missing:
-                    return
+                if isinstance(message, Status):
+                    unhomed = (
+                        message.state == "fault" and message.preparable and not message.arm and not message.tracker
+                    )
+                    if unhomed or not message.missing:
+                        return
                 if isinstance(message, Refused):  # until the arm has sent its position, or an axis has answered
                     refusal, again = message.error, True
         missing = "no status" if self.status is None else self.status.missing
@@ -186,6 +193,7 @@ class Session:
             try:
                 self.prepare(rig)
                 self.reset()
+                self.prepare(rig)  # what lost its reference is homed without a fault only
                 self.arm()
                 return
             except RefusedError as error:  # a busy machine may be late again: a new fault, or what is over by now
@@ -235,9 +243,11 @@ def run(
         if robot == RIG:
             console.print("starting the rig ...", highlight=False)
             rig = stack.enter_context(rig_for(loaded, distribution, rig_params, seed, player))
-            config, text = rig.robot, robots.to_yaml(rig.robot)
+            contract, config, text = loaded.contract, rig.robot, robots.to_yaml(rig.robot)
         else:
-            config = robots.load_robot(robot, contract=loaded.contract)
+            contract = robots.standing(robot)
+            artefacts.check_robot(artefact, loaded.contract, contract)
+            config = robots.load_robot(robot, contract=contract)
             contradictions.check(config, robot, log_folder)
             text = Path(robot).read_text(encoding="utf-8")
         name = time.strftime("%Y%m%d-%H%M%S")
@@ -254,6 +264,7 @@ def run(
                 ("calibration.yaml", robots.to_yaml(config.calibration)),
                 *robot_attachment.of_policy(loaded, console),
             ),
+            contract=contract,
         )
         log_folder.mkdir(parents=True, exist_ok=True)
         session = stack.enter_context(Session(config, options, console))
@@ -346,7 +357,7 @@ def _watch(
                     console.print(f"rally {rally.number}: {touches}: {rally.text}", highlight=False)
         key = keyboard.pressed()
         if key is not None:  # whatever it is, the operator wants something else
-            recovery = Recovery(time.monotonic()) if key == RECOVER else None
+            recovery = Recovery(time.monotonic(), session.status, rig is not None) if key == RECOVER else None
         if key == QUIT:
             break
         if key == PAUSE:
@@ -382,4 +393,6 @@ def _continued(session: Session, recovery: Recovery, status: Status, view: View)
         return None
     if request is not None:
         session.send(request)
+    if recovery.word:
+        view.say(recovery.word)
     return None if recovery.done else recovery

@@ -47,8 +47,9 @@ def finetune(
     """
     experiment = loop.experiment_of(source, distribution)
     moved = experiment.task.robot
-    installed = None if robot in (LOCK_STEP, RIG) else robots.load_robot(robot, contract=moved.contract)
+    installed = None if robot in (LOCK_STEP, RIG) else robots.load_robot(robot)
     if installed is not None:
+        artefacts.check_robot(source, moved.contract, robots.standing(robot))
         contradictions.check(installed, robot)
     if robot == LOCK_STEP:
         params = robots.load_rig(rig_params, moved)
@@ -64,7 +65,7 @@ def finetune(
         rig = None
         if robot == RIG:
             rig = stack.enter_context(rig_for(artefacts.load(artefact), distribution, rig_params, seed, player))
-        config = rig.robot if rig else installed or robots.load_robot(robot, contract=moved.contract)
+        config = rig.robot if rig else installed or robots.load_robot(robot)
         options = process.ControlOptions(
             str(artefact),
             backend,
@@ -77,6 +78,7 @@ def finetune(
                 ("calibration.yaml", robots.to_yaml(config.calibration)),
                 *robot_attachment.of_policy(artefacts.load(artefact), console),
             ),
+            contract=moved.contract,
         )
         session = stack.enter_context(Session(config, options, console))
         keyboard = stack.enter_context(Keyboard())

@@ -23,7 +23,7 @@ from time import perf_counter
 import numpy as np
 
 from robot_io.control.commissioning import jog
-from robot_io.control.commissioning.homing import check_homing
+from robot_io.control.commissioning.homing import HomingGuard
 from robot_io.control.commissioning.way_home import WayHome
 from robot_io.control.episode import Episode, EpisodeSummary
 from robot_io.control.interfaces import STANDARD_PLAY, Axes, action_of
@@ -82,6 +82,7 @@ class Bridge:
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
         self.feedback = Feedback(ball=self.play.strokes.track, axes=History(256), arm=ArmHistory(256))  # a second
         self._blade = partial(blade, self.feedback, self._geometry)
+        self._homing = HomingGuard(arm, axes, self.feedback, self._geometry, contract, gate.config.still)
         self._state = BridgeState.DISARMED
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
@@ -156,13 +157,15 @@ class Bridge:
         self._home = self.gate.reference + jog.joints_of(step, self._geometry, self.gate.reference)
 
     def stop(self, now: float, because: str = "") -> None:
-        """The operator's stop, or one without the operator for a reason: slows down, holds, and ends DISARMED."""
+        """The operator's stop, or one for a reason: slows down, holds, ends DISARMED. Axes that are being homed stop."""
         if self.state in (BridgeState.READY, BridgeState.ACTIVE):
             self.gate.brake(now)
             self._stopping_since, self.stopped_because = now, because
             self._change(BridgeState.STOPPING, now, because or "stopped by the operator")
             with self._guarded(now):
                 self.play.abort("stopped", now)
+        elif self.gate.at_rest:  # otherwise the gate brakes them
+            self.axes.stop()
         if not because:
             self.event(now, Level.INFO, "operator", "stop")
 
@@ -174,14 +177,9 @@ class Bridge:
         self._logged_faults = 0
         self._change(BridgeState.DISARMED, now, "fault reset by the operator")
 
-    def check_homing(self) -> None:
-        """Raise RefusedError unless the linear axes may search their references; where they are is unknown until then.
-
-        The robot must be disarmed, and the arm, where it is measured to be, clear of everything wherever the axes go.
-        """
-        if self.state not in (BridgeState.DISARMED, BridgeState.FAULT) or not self.gate.at_rest:
-            raise RefusedError(f"axes not homed: the state is {self.state.value}; stop the robot first")
-        check_homing(self._geometry, self.measured, self.config.contract)
+    def check_homing(self, now: float) -> None:
+        """Raise RefusedError unless the linear axes may search their references, as of ``HomingGuard.check``."""
+        self._homing.check(self.state, now)
 
     def discard(self, now: float) -> None:
         """Marks the ball in play, or the one before, as not to be used."""
@@ -318,7 +316,11 @@ class Bridge:
         self.gate.check(now, *self._ages(now), playing, since_tick)
         arm, axes = self.arm_session.problem(now), self.axes.problem(now)
         self.gate.condition(Cause.ARM_NOT_READY, arm is not None, arm or "", now)
-        self.gate.condition(Cause.AXIS_LOST, axes is not None, axes or "", now)
+        # Axes are homed only without a fault: that they must be does not keep one from being reset.
+        after_reset = self.state is BridgeState.FAULT and self.gate.at_rest and self.axes.preparable(now)
+        self.gate.condition(Cause.AXIS_LOST, axes is not None and not after_reset, axes or "", now)
+        if stopped := self._homing.watch(now):
+            self.event(now, Level.WARNING, "homing", f"stopped: {stopped}")
         clock = self.tracker.clock.problem
         self.gate.condition(Cause.CLOCK, clock is not None, clock or "", now)
         armed = self._state in (BridgeState.READY, BridgeState.ACTIVE)

@@ -117,10 +117,12 @@ class RealTimeConfig:
 class RobotConfig:
     """An installed robot. Limits of arm and axes are the contract's; ``safety`` can only narrow what moves.
 
-    Which joints it has is in the policy's contract: ``check_joints``.
+    robot  the robot that stands there: a name that comes with the program or a folder, seen from robot.yaml; None: the
+           paper's. Its contract is what the gate guards by, whatever a policy says; ``check_joints`` compares
     """
 
     name: str = "robot"
+    robot: str | None = None
     rate: float = CONTROL_RATE
     arm: ArmConfig = ArmConfig()
     axis_profile: str = "cmmt"

@@ -44,7 +44,12 @@ class Axes(Protocol):
 
     def command(self, position: np.ndarray, velocity: np.ndarray, now: float) -> None: ...
 
+    @property
+    def homing(self) -> bool: ...
+
     def stop(self) -> None: ...
+
+    def preparable(self, now: float) -> bool: ...
 
     def problem(self, now: float) -> str | None: ...
 
@@ -78,7 +83,7 @@ STANDARD_PLAY = BridgeConfig()
 
 @dataclass(frozen=True)
 class ControlOptions:
-    """artefact: folder, None: a policy that stands still, on a robot with the joints of ``contract``.
+    """artefact: folder, None: a policy that stands still. contract: of the robot; an artefact's must be the same.
 
     backend: of ``robot_io.policy.backends``; log_folder and log_name of the MCAP, None: no log.
     box: balls that the policy was trained for; None: nothing is out of distribution

@@ -172,6 +172,7 @@ class Status:
     state           value of the ``BridgeState``
     present         sentences of conditions that keep the robot from being armed, by cause
     arm, axes, tracker  the reason why each cannot be used, or None
+    preparable      the axes' reason is none that Prepare does not mend: they are switched off or not homed
     joints          name, unit, measured position, commanded velocity of each joint
     ball            (3) [m] where the tracker's newest frame shows it, in the table frame; None: nowhere
     clock           ``Clock.report`` of the tracker's
@@ -205,6 +206,7 @@ class Status:
     mean_rally: float = 0.0
     longest_rally: int = 0
     last_rally: str = ""
+    preparable: bool = False
     egm: dict[str, Any] = field(default_factory=dict)
     tracker_counts: dict[str, int] = field(default_factory=dict)
     axes_cycles: int = 0
@@ -250,6 +252,7 @@ class Status:
             mean_rally=counts.rallies.touched / max(counts.rallies.rallies, 1),
             longest_rally=counts.rallies.longest,
             last_rally=counts.rallies.last,
+            preparable=axes.preparable(now),
             egm=asdict(session.statistics),
             tracker_counts=dict(tracker.counts),
             axes_cycles=axes.cycles,

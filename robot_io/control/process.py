@@ -87,8 +87,8 @@ class Control:
     def __init__(self, config: RobotConfig, options: ControlOptions, pipe: Connection) -> None:
         self._config, self._options, self._pipe = config, options, pipe
         arm, found = config.arm, config.calibration.robot
-        loaded = None if options.artefact is None else artefacts.load(options.artefact)
-        self._contract = contract = options.contract if loaded is None else loaded.contract
+        self._contract = contract = options.contract  # not the policy's: it must not bring the limits that guard it
+        loaded = None if options.artefact is None else artefacts.load(options.artefact, contract)
         config.check_joints(contract)
         if loaded is None:
             seen = contract.n_observation
@@ -330,7 +330,7 @@ class Control:
                 case messages.Arm():
                     self.bridge.arm(now)
                 case messages.Prepare():
-                    prepare(self._axes, self.bridge.check_homing)
+                    prepare(self._axes, lambda: self.bridge.check_homing(now))
                 case messages.Stop():
                     self.bridge.stop(now)
                 case messages.Reset():

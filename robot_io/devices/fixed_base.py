@@ -18,6 +18,7 @@ class FixedBase:
     homed: bool = True
     enabled: bool = True
     answering: bool = True
+    homing: bool = False
     cycles: int = 0  # none: there is nobody to exchange with
     late: int = 0
 
@@ -40,6 +41,9 @@ class FixedBase:
     def enable(self) -> None: ...
 
     home = acknowledge = stop = disable = start = close = enable
+
+    def preparable(self, now: float) -> bool:
+        return True
 
     def problem(self, now: float) -> str | None:
         return None

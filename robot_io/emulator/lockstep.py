@@ -213,12 +213,13 @@ class LockStep:
             self.run(0.3)
         self.axes.enable()
         self.run(0.3)
+        self.run(3.0, lambda: not self.bridge.gate.present)
+        if self.bridge.state is BridgeState.FAULT:
+            self.bridge.reset(self.now)
         if not self.axes.homed:
             self.axes.home()
         self.run(3.0, lambda: self.axes.problem(self.now) is None)
         self.run(0.1)
-        if self.bridge.state is BridgeState.FAULT:
-            self.bridge.reset(self.now)
         try:
             self.bridge.arm(self.now)
         except JogFirstError:

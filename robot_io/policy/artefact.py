@@ -95,8 +95,10 @@ class Artefact:
         return ExportedPolicy(self.policy)
 
 
-def load(folder: str | Path) -> Artefact:
+def load(folder: str | Path, standing: contract.Contract | None = None) -> Artefact:
     """Reads and verifies an artefact: files, every hash, schema, contract, finite numbers, golden outputs.
+
+    standing  of the robot that it shall move; None: whatever the artefact says
 
     Raises ArtefactError naming the file, what was found, what was expected and what to do.
     """
@@ -110,6 +112,7 @@ def load(folder: str | Path) -> Artefact:
         if found != expected:
             raise ArtefactError(f"{folder / name}: SHA-256 is {found}, the manifest says {expected}; {_RECOPY}")
     robot = contract.from_description(manifest["contract"])
+    check_robot(folder, robot, standing or robot)
     if NETWORK in contents:
         return _own(folder, contents, manifest, robot)
     parameters = _parameters(folder, contents, contract.parameter_shapes(robot.n_joints))
@@ -205,6 +208,17 @@ def architecture(robot: Contract = contract.PAPER) -> dict[str, Any]:
         "kernel_axes": "(tap, input, output), tap 0 is the older observation",
         "n_parameters": contract.n_parameters(robot.n_joints),
     }
+
+
+def check_robot(source: str | Path, robot: contract.Contract, standing: contract.Contract) -> None:
+    """Raise ArtefactError naming every field in which a policy's robot is not the one that stands there."""
+    found, expected = (json.loads(json.dumps(contract.describe(one))) for one in (robot, standing))
+    lines = [line if len(line) <= 200 else f"{line[:200]} ..." for line in differences(found, expected, "contract")]
+    if lines:
+        raise ArtefactError(
+            f"{source}: a policy for {robot.robot}, and robot.yaml is of {standing.robot}: {'; '.join(lines)}; name "
+            "the policy's robot there (key robot), if that is what stands there, or export a policy for this one"
+        )
 
 
 def differences(found: Any, expected: Any, path: str) -> list[str]:

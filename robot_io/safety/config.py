@@ -34,7 +34,7 @@ class SafetyConfig:
                      more than the limiter's margin
     escape_speed     share of the velocity limits while a gap is smaller than its margin
     still            measured speed (8,) above which the robot counts as moving and is not armed
-    overspeed        measured speed over its limit that is a fault
+    overspeed        measured speed over its limit that is a fault; ``monitor.UNSCALED`` is added to a scaled limit
     following_error  distance (8,) of a measured position from where the reference was between ``delay`` before
     delay            shortest and longest time from a command to the measurement of its effect
     following_ticks  commands in a row after which a following error is a fault

@@ -15,15 +15,23 @@ from robot_io.safety.faults import Cause
 EXACT = 0.002  # [m], [rad] by which a robot may go beside its reference unnoticed
 FORGOTTEN = 1.0  # [s] in which a controller takes a deviation away: EGM's position correction with gain 1
 WORSE = 1.5  # times the deviations seen: the next one may be larger than all of them
+# [m/s], [rad/s] that a measured speed may exceed its scaled limit by, however low that is: noise, and the position
+# corrections of axes and arm, which no scale lowers.
+UNSCALED = {"m": 0.3, "rad": 0.5}
 EARLY = 0.1  # [s] by which a measurement may be looked at before the end of the newest period
 
 
 class FeedbackMonitor:
-    """Compares measurements with limits, geometry and the references that were sent."""
+    """Compares measurements with limits, geometry and the references that were sent.
+
+    limits  unscaled: those of the speed are scaled here, as the commands are
+    """
 
     def __init__(self, limits: JointLimits, geometry: RobotGeometry, config: SafetyConfig) -> None:
         self._lower, self._upper = np.array(limits.lower), np.array(limits.upper)
-        self._fastest = config.overspeed * np.array(limits.velocity)
+        fastest = config.overspeed * np.array(limits.velocity)
+        floor = np.array([UNSCALED[unit] for unit in geometry.units])
+        self._fastest = np.minimum(fastest, config.speed_scale * fastest + floor)
         self._geometry, self._config = geometry, config
         self._joints, self._units = geometry.joints, geometry.units
         self._tolerance = np.array(config.following_error)

@@ -22,7 +22,7 @@ class FollowingAxes:
     """Linear axes that are where they were commanded to be at once; also stands for the thread around them."""
 
     cycles = late = 0
-    fault, homed, answering = None, True, True
+    fault, homed, answering, homing = None, True, True, False
 
     def __init__(self, position: np.ndarray) -> None:
         self.position, self.stops, self.closed = np.array(position), 0, False
@@ -51,6 +51,9 @@ class FollowingAxes:
 
     def close(self):
         self.closed = True
+
+    def preparable(self, now):
+        return True
 
     def problem(self, now):
         return None

@@ -60,6 +60,7 @@ class DryAxes:
     fault: None = None
     homed: bool = True
     answering: bool = True
+    homing: bool = False
 
     @property
     def state(self) -> DryAxes:
@@ -79,6 +80,9 @@ class DryAxes:
     def start(self) -> None: ...
 
     enable = home = acknowledge = stop = disable = close = start
+
+    def preparable(self, now: float) -> bool:
+        return True
 
     def problem(self, now: float) -> str | None:
         return None

@@ -8,6 +8,9 @@ import numpy as np
 
 from robot_io.contract import PAPER, Contract
 from robot_io.control.commissioning.dry import DryAxes
+from robot_io.control.interfaces import Axes, BridgeState
+from robot_io.control.observation import Feedback, joints
+from robot_io.devices.egm.session import EgmSession
 from robot_io.devices.festo import AxesThread
 from robot_io.devices.fixed_base import FixedBase
 from robot_io.errors import JogFirstError, RefusedError
@@ -15,6 +18,7 @@ from robot_io.safety.clearance import RobotGeometry
 
 HOMING_GAP = 0.03  # [m] of everything to everything while the linear axes search their references
 HOMING_PLACES = 21  # along each axis at which that is looked at
+SLIP = 0.01  # [rad] by which a joint of the arm may leave its place meanwhile: 2 cm of the gap for a stretched arm
 
 
 def check_homing(geometry: RobotGeometry, measured: np.ndarray, contract: Contract = PAPER) -> None:
@@ -36,8 +40,78 @@ def check_homing(geometry: RobotGeometry, measured: np.ndarray, contract: Contra
         )
 
 
+class HomingGuard:
+    """Watches the arm before and while the linear axes search their references, past the gate.
+
+    still  speed (n,) above which a joint counts as moving
+    """
+
+    def __init__(
+        self,
+        arm: EgmSession,
+        axes: Axes,
+        feedback: Feedback,
+        geometry: RobotGeometry,
+        contract: Contract,
+        still: tuple[float, ...],
+    ) -> None:
+        self._arm, self._axes, self._feedback = arm, axes, feedback
+        self._geometry, self._contract = geometry, contract
+        self._rows = list(contract.arm)
+        self._still = np.array(still)[self._rows]
+        self._place: np.ndarray | None = None  # of the arm when the search began
+
+    def check(self, state: BridgeState, now: float) -> None:
+        """Raise RefusedError unless the axes may begin.
+
+        The robot must be disarmed, and the arm, heard of just now and at rest, clear of everything wherever they go.
+        """
+        if state is BridgeState.FAULT:
+            raise RefusedError("axes not homed: the state is fault; reset it first, then home them")
+        if state is not BridgeState.DISARMED:
+            raise RefusedError(f"axes not homed: the state is {state.value}; stop the robot first")
+        measured, velocity = joints(self._feedback, self._contract)
+        if not np.isfinite(measured[self._rows]).all():
+            raise RefusedError("axes not homed: the arm's position is not known; start its EGM session first")
+        trouble = self._trouble(velocity[self._rows], now)
+        if trouble:
+            raise RefusedError(f"axes not homed: {trouble}")
+        check_homing(self._geometry, measured, self._contract)
+
+    def watch(self, now: float) -> str:
+        """Stop axes that are being homed when the arm cannot be trusted to stay; the reason, empty: nothing is wrong.
+
+        Called at every control tick.
+        """
+        if not self._axes.homing:
+            self._place = None
+            return ""
+        measured, velocity = joints(self._feedback, self._contract)
+        place = measured[self._rows]
+        if self._place is None:
+            self._place = place
+        trouble = self._trouble(velocity[self._rows], now)
+        if not trouble and not (np.abs(place - self._place) <= SLIP).all():
+            trouble = f"the arm has left its place by {np.abs(place - self._place).max():.3f} rad"
+        if trouble:
+            self._axes.stop()
+        return trouble
+
+    def _trouble(self, velocity: np.ndarray, now: float) -> str:
+        """Why it is not sure where the arm is or that it stays there, by its speed (6,) too; empty: nothing."""
+        problem = self._arm.problem(now)
+        if problem:
+            return f"where the arm is must be sure: {problem}"
+        if (np.abs(velocity) > self._still).any():
+            return f"the arm moves at {np.abs(velocity).max():.2f} rad/s"
+        return ""
+
+
 def prepare(axes: AxesThread | DryAxes | FixedBase, check: Callable[[], None]) -> None:
-    """Acknowledge faults, switch on, home what is not homed; ``check`` raises RefusedError where that is not safe."""
+    """Acknowledge faults, switch on, home what is not homed; ``check`` raises RefusedError where that is not safe.
+
+    Until it is, nothing is homed: what is asked for here passes the gate by.
+    """
     if axes.axes.fault:
         axes.acknowledge()
     axes.enable()

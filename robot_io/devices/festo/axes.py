@@ -125,10 +125,10 @@ class FestoAxes:
         self._supervise(now)
         self._moving = self._may_move(now)
         commands = self._commands(now)
-        healthy = self.fault is None
+        healthy, busy = self.fault is None, self._moving or self.homing
         for i, channel in enumerate(self._channels):
             self._exchange(channel, commands[i], now)
-            if healthy and self.fault is not None and self._moving:
+            if healthy and self.fault is not None and busy:
                 # The other axes must not wait for the next cycle to stop.
                 healthy, self._moving, self._sequence = False, False, self._sequence + 1
                 commands = self._commands(now)
@@ -140,8 +140,30 @@ class FestoAxes:
         """Nothing moves, as far as is known."""
         return all(c.status is None or not c.status.enabled or abs(c.status.velocity) < 0.005 for c in self._channels)
 
+    @property
+    def homing(self) -> bool:
+        """One of them is to search its reference, or does."""
+        return any(channel.homing for channel in self._channels)
+
+    def preparable(self, now: float) -> bool:
+        """Nothing is wrong but, perhaps, that they are switched off or not homed."""
+        return self._unfit(now) is None
+
     def problem(self, now: float) -> str | None:
         """Reason why the axes cannot follow commands, as a sentence that says what to do; None when they can."""
+        state, unfit = self._state, self._unfit(now)
+        if unfit is not None or state is None:
+            return unfit
+        if self.homing:
+            return "The linear axes are being homed: wait."
+        if not state.enabled:
+            return f"{self._names(lambda s: not s.enabled)} switched off: enable the axes."
+        if not state.homed:
+            return f"{self._names(lambda s: not s.homed)} not homed: home the axes."
+        return None
+
+    def _unfit(self, now: float) -> str | None:
+        """The problem that neither switching on nor homing mends; None without one."""
         fault, state = self.fault, self._state
         if fault is not None:
             return fault.sentence
@@ -151,12 +173,6 @@ class FestoAxes:
         if age > self.config.state_timeout:
             limit = self.config.state_timeout
             return f"The linear axes' state is {age:.3f} s old, allowed are {limit:.3f} s: is the exchange running?"
-        if any(channel.homing for channel in self._channels):
-            return "The linear axes are being homed: wait."
-        if not state.enabled:
-            return f"{self._names(lambda s: not s.enabled)} switched off: enable the axes."
-        if not state.homed:
-            return f"{self._names(lambda s: not s.homed)} not homed: home the axes."
         return None
 
     def switch_off(self) -> None:
@@ -252,13 +268,15 @@ class FestoAxes:
         self.commanded = np.array([m.velocity for m in moves])
         commands = []
         for channel, wanted in zip(self._channels, moves, strict=True):
-            status, axis = channel.status, channel.axis
+            status, axis, healthy = channel.status, channel.axis, self.fault is None
+            # Only what would stop by itself when the computer dies gets power, and none while a fault is latched.
+            may_be_on = channel.on and channel.configured and status and not status.fault
             commands.append(
                 AxisCommand(
-                    enable=bool(channel.on and status and not status.fault and (status.enabled or status.ready)),
+                    enable=bool(may_be_on and status and (status.enabled or (status.ready and healthy))),
                     # Pulsed: a drive that is still braking takes no notice of the edge.
                     acknowledge=bool(self._acknowledging and status and status.fault and self._sequence // 8 % 2),
-                    home=bool(channel.homing and status and status.enabled),
+                    home=bool(channel.homing and may_be_on and status and status.enabled and healthy),
                     move=self._moving,
                     position=(wanted.position - axis.zero) * axis.direction,
                     speed=wanted.speed,
@@ -335,7 +353,9 @@ class FestoAxes:
         channel.configured = True
 
     def _latch(self, cause: str, sentence: str) -> None:
-        """The first fault counts: the others mostly follow from it."""
+        """The first fault counts: the others mostly follow from it. No axis goes on searching its reference."""
+        for channel in self._channels:
+            channel.homing = False
         if self.fault is None:
             self.fault = AxesFault(cause, sentence)
 

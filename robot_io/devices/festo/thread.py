@@ -76,6 +76,14 @@ class AxesThread:
     def state(self) -> AxesState | None:
         return self.axes.state
 
+    @property
+    def homing(self) -> bool:
+        return self.axes.homing
+
+    def preparable(self, now: float) -> bool:
+        """As ``FestoAxes.preparable``, while the thread runs."""
+        return self._failure is None and self._thread.is_alive() and self.axes.preparable(now)
+
     def problem(self, now: float) -> str | None:
         """As ``FestoAxes.problem``; also that the thread has ended, which lasts."""
         if self._failure is not None:

@@ -142,6 +142,7 @@ def test_every_number_of_a_robot_has_a_ceiling():
     sections |= {"calibration", *(f"calibration.{part}" for part in ("tracker", "robot", "clock"))}
     words = {
         "name",
+        "robot",
         "axis_profile",
         "realtime.lock_memory",
         *(f"calibration.{part}.date" for part in ("tracker", "robot", "clock")),

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import sys
 from io import StringIO
 
+import pytest
 from rich.console import Console
 
-from experiments.deploy.operator_console import KEYS, View
+from experiments.deploy.operator_console import KEYS, EscapeFilter, Keyboard, View
 from robot_io.control import messages
 from robot_io.errors import RefusedError
 
@@ -63,3 +67,60 @@ def test_the_view_shows_state_faults_joints_and_counts():
         *(key.text for key in KEYS.values()),
     ):
         assert shown in text, shown
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """A keyboard on a terminal of its own, and the end that types."""
+    hand, end = pty.openpty()
+    with os.fdopen(end) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        with Keyboard() as keyboard:
+            yield keyboard, lambda typed: os.write(hand, typed)
+    os.close(hand)
+
+
+@pytest.mark.parametrize(
+    ("typed", "key"),
+    [
+        (b"+" * 90 + b" ", " "),  # held for three seconds while the program was busy
+        (b" " + b"+" * 90, " "),
+        (b"a q+", " "),
+        (b"++q+++", "q"),
+        (b"+++++", "+"),
+        (b"a", "a"),
+        (b"++++1", "1"),
+        (b"1+", "1"),  # of a joint that was chosen at that moment no step is taken
+        (b"13", "3"),
+        (b"pa", None),
+        (b"a pasted line", " "),
+        (b"a-pasted-line", "e"),
+        (b"\x1b[a", None),
+        (b"\x1b[A\x1b[1;5C\x1bOa\x1b[[a\x1b[3~", None),
+        (b"\x1ba", None),  # Alt
+        (b"\x1b\x1b[a", None),
+        (b"\x1b]0;a\x07\x1bPa\x1b\\", None),
+        (b"\x1b[ap", "p"),
+        (b"\x1b ", " "),  # nothing hides the stop
+    ],
+)
+def test_one_key_counts_of_all_that_wait_and_a_stop_before_all(terminal, typed, key):
+    keyboard, press = terminal
+    press(typed)
+    assert keyboard.pressed() == key
+    assert keyboard.pressed() is None  # nothing is left over
+
+
+def test_a_sequence_that_a_read_ends_in_is_dropped_wholly(terminal):
+    keyboard, press = terminal
+    for typed in (b"\x1b", b"[", b"1;", b"5", b"a"):
+        press(typed)
+        assert keyboard.pressed() is None
+    press(b"a")
+    assert keyboard.pressed() == "a"
+
+
+def test_the_escape_key_itself_swallows_nothing_that_follows():
+    keys = EscapeFilter()
+    assert keys.keys("\x1b", 10.0) == ""
+    assert keys.keys("q", 11.0) == "q"

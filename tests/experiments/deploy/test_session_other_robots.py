@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.resources
 import json
+import os
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -202,9 +204,61 @@ def test_an_arm_that_egm_does_not_carry_is_refused():
 
 def test_the_control_process_says_which_robot_it_was_given(tmp_path):
     policy = exported(tmp_path / "artefact", UR10E)
-    options = play.process.ControlOptions(str(policy))
+    options = play.process.ControlOptions(str(policy), contract=simulated.load_shipped(UR10E).contract)
     with pytest.raises(RefusedError, match="axes: got 2 entries; allowed: 1 for ur10e_rail, rail"):
         play.Session(RobotConfig(), options, Console())
+    with pytest.raises(RefusedError, match="a policy for ur10e_rail, and robot.yaml is of irb120_gantry: contract"):
+        play.Session(RobotConfig(), play.process.ControlOptions(str(policy)), Console())
+
+
+def loosened(folder):
+    """A policy of the paper's robot whose manifest calls it another one, five times as fast and with a low table."""
+    geometry = json.loads((importlib.resources.files("robot_io.safety") / "robot_geometry.json").read_text())
+    geometry["table"]["centre"][2] = -30.0
+    limits = {name: tuple(5.0 * v for v in getattr(PAPER.limits, name)) for name in ("velocity", "policy_velocity")}
+    other = replace(PAPER, robot="mine", limits=replace(PAPER.limits, **limits), geometry=json.dumps(geometry))
+    zero = Policy(np.zeros(n_parameters()), np.zeros(PAPER.n_observation), np.ones(PAPER.n_observation))
+    export.write(folder, zero, {"config": {"balls": "narrow"}}, robot=other)
+    return folder
+
+
+@pytest.mark.parametrize("how", ["run", "control process"])
+def test_a_policy_does_not_bring_the_limits_that_guard_against_it(tmp_path, how):
+    """Its robot must be the one that robot.yaml names: each field that differs is named, and nothing is opened."""
+    policy, path = loosened(tmp_path / "artefact"), tmp_path / "robot.yaml"
+    path.write_text("name: lab\n")
+    console = Console(record=True, width=200)
+    with pytest.raises((artefacts.ArtefactError, ConfigError, RefusedError)) as error:
+        if how == "run":
+            play.run(policy, str(path), 1, None, "numpy", tmp_path / "log", None, 0, None, console)
+        else:
+            play.Session(robots.load_robot(path), play.process.ControlOptions(str(policy)), console)
+    said = str(error.value)
+    assert "contract.limits.velocity[2]: found 21.8" in said and "contract.robot: found 'mine', not expected" in said
+    assert "contract.geometry" in said and not (tmp_path / "log").exists()
+
+
+def test_robot_yaml_names_the_robot_that_stands_there(tmp_path):
+    ur10e, path = simulated.load_shipped(UR10E), tmp_path / "lab" / "robot.yaml"
+    path.parent.mkdir()
+    path.write_text(yaml.safe_dump({"robot": UR10E, "axes": [{}]}))
+    assert robots.standing(path) == ur10e.contract and robots.load_robot(path).robot == UR10E
+    artefacts.load(exported(tmp_path / "artefact", UR10E), robots.standing(path))
+    with pytest.raises(artefacts.ArtefactError, match="a policy for fr3_pedestal, and robot.yaml is of ur10e_rail"):
+        artefacts.load(exported(tmp_path / "fr3", FR3), robots.standing(path))
+    with pytest.raises(ConfigError, match="robot: names ur10e_rail, asked for is fr3_pedestal"):
+        robots.load_robot(path, contract=simulated.load_shipped(FR3).contract)
+    folder = simulated.yaml_path(FR3).parent
+    path.write_text(yaml.safe_dump({"robot": os.path.relpath(folder, path.parent), "axes": []}))
+    assert robots.standing(path) == simulated.load_shipped(FR3).contract
+    path.write_text("robot: nowhere\n")
+    with pytest.raises(ConfigError, match="robot.yaml: robot: .*nowhere"):
+        robots.standing(path)
+    path.write_text("robot: 7\n")
+    with pytest.raises(ConfigError, match="robot: got 7; allowed: a robot's name or folder"):
+        robots.standing(path)
+    path.write_text("name: lab\n")
+    assert robots.standing(path) == PAPER
 
 
 def test_a_rig_reacts_as_late_as_the_robots_yaml_says_unless_rig_yaml_does(tmp_path):

@@ -326,21 +326,23 @@ def test_the_axes_are_homed_only_with_the_arm_out_of_the_way():
     """Over the table their search would end in it, wherever they start."""
     rig = lockstep()
     with pytest.raises(RefusedError, match="the arm's position is not known"):
-        rig.bridge.check_homing()
+        rig.bridge.check_homing(rig.now)
     power_on(rig, axes=False)
-    rig.bridge.check_homing()
+    rig.bridge.check_homing(rig.now)
     home = rig.bridge.arm_session.feedback.position
     for joint, value in ((1, 1.4), (2, 0.9), (4, -1.5)):
         stretched = home.copy()
         stretched[joint] = value
-        rig.bridge.feedback.arm.add(rig.now + 1e-3, stretched)
+        rig.bridge.feedback.arm.clear()
+        for age in (2e-3, 1e-3, 0.0):  # it has been there for a while
+            rig.bridge.feedback.arm.add(rig.now - age, stretched)
         if rig.bridge._geometry.gaps(np.array([[0.0, 0.5, *stretched]]).T).min() < 0.0:
             with pytest.raises(RefusedError, match="axes not homed: .* jog the arm to its home pose"):
-                rig.bridge.check_homing()
+                rig.bridge.check_homing(rig.now)
             break
     else:
         raise AssertionError("none of these poses meets the table")
     rig = lockstep()
     rig.start()
     with pytest.raises(RefusedError, match="the state is ready; stop the robot first"):
-        rig.bridge.check_homing()
+        rig.bridge.check_homing(rig.now)

@@ -488,16 +488,108 @@ def test_problems_before_the_first_motion():
 
 
 def test_a_drive_that_does_not_take_the_node_guard():
-    class Deaf(DirectLink):
-        def exchange(self, write_address, values, read_address, count):
-            if write_address == 400:
-                return [1000, 0]
-            return super().exchange(write_address, values, read_address, count)
-
-    rig = LockStep(wrap=Deaf)
+    rig = LockStep(wrap=NoGuard)
     rig.run(0.05)
     assert rig.axes.fault.cause == "node_guard" and "[1000, 0]" in rig.axes.problem(rig.now)
     assert LockStep(node_guard=5.0).start().emulators[0].node_guard == 0.1  # one that does
+
+
+class NoGuard(DirectLink):
+    """A drive that does not take the node guard."""
+
+    def exchange(self, write_address, values, read_address, count):
+        if write_address == 400:
+            return [1000, 0]
+        return super().exchange(write_address, values, read_address, count)
+
+
+def test_a_drive_that_would_not_stop_by_itself_gets_no_power():
+    """The operator's whole request at once: acknowledge, enable, home."""
+    rig = LockStep(wrap=NoGuard)
+    rig.run(0.05)
+    for _ in range(3):
+        for request in (rig.axes.acknowledge, rig.axes.enable, rig.axes.home):
+            request()
+        rig.run(0.5)
+        assert rig.axes.fault.cause == "node_guard"
+        for emulator in rig.emulators:
+            assert not emulator.outputs[0] & 0x0801  # ON, START_HOMING
+            assert not emulator.drive.operating and not emulator.drive.homing and not emulator.drive.homed
+
+
+def homing(profile="cmmt"):
+    """Both axes in their search, which takes a second."""
+    rig = LockStep(profile)
+    rig.run(0.05)
+    rig.axes.enable()
+    rig.run(0.3)
+    rig.axes.home()
+    rig.run(0.2)
+    assert rig.axes.homing and all(emulator.drive.homing for emulator in rig.emulators)
+    return rig
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("gone", [0, 1])
+@pytest.mark.parametrize("how", ["lost", "fault"])
+def test_an_axis_that_is_gone_ends_the_other_ones_homing(profile, gone, how):
+    """In the same cycle, and for good: acknowledging the fault does not go on with it."""
+    rig = homing(profile)
+    other = rig.emulators[1 - gone]
+    if how == "lost":
+        rig.emulators[gone].disconnect()
+    else:
+        rig.emulators[gone].inject_fault(51)
+    before = other.images
+    rig.axes.cycle(rig.now)
+    assert other.images > before and not rig.axes.homing
+    assert not other.outputs[0] & (0x0800 if profile == "cmmt" else 0x0004)  # START_HOMING, HOM
+    rig.run(0.1)
+    assert not other.drive.homing and other.drive.operating  # it holds
+    rig.emulators[gone].reconnect()
+    rig.run(1.5)
+    rig.axes.acknowledge()
+    rig.run(0.5)
+    assert rig.axes.fault is None and not rig.axes.homing and not other.drive.homed
+    rig.axes.enable()
+    rig.axes.home()
+    rig.run(2.0)
+    assert rig.axes.problem(rig.now) is None
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_stop_ends_homing(profile):
+    rig = homing(profile)
+    rig.axes.stop()
+    rig.run(0.1)
+    assert not rig.axes.homing and not any(emulator.drive.homing for emulator in rig.emulators)
+    rig.run(1.5)
+    assert "not homed" in rig.axes.problem(rig.now) and rig.axes.preparable(rig.now)
+
+
+def test_a_drive_gets_no_power_while_a_fault_is_latched():
+    """A fault of its own that goes away later, by itself or by somebody's hand, does not switch it on."""
+    rig = LockStep()
+    rig.run(0.05)
+    rig.axes.enable()
+    rig.emulators[0].disconnect()
+    rig.run(0.1)
+    assert rig.axes.fault.cause == "axis_lost" and not rig.emulators[1].drive.operating
+    rig.emulators[0].reconnect()
+    rig.run(0.5)
+    assert not any(emulator.drive.operating for emulator in rig.emulators)
+
+
+def test_what_switching_on_and_homing_mend_is_told_apart():
+    rig = LockStep()
+    assert not rig.axes.preparable(rig.now)  # they have not answered
+    rig.run(0.1)
+    assert "switched off" in rig.axes.problem(rig.now) and rig.axes.preparable(rig.now)
+    rig.start()
+    assert rig.axes.preparable(rig.now)
+    rig.emulators[0].inject_fault(51)
+    rig.run(0.1)
+    assert not rig.axes.preparable(rig.now)
 
 
 def test_commands_are_checked():
