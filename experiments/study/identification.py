@@ -20,7 +20,7 @@ from ballmodel.io import read
 from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Dataset, Trajectory
 from experiments import measurements
-from experiments.study import delays
+from experiments.study.analysis import delays
 from experiments.study.analysis.identified import PRIOR_ALONE
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, joint_path
 from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv

@@ -157,7 +157,7 @@ class Bridge:
         self._home = self.gate.reference + jog.joints_of(step, self._geometry, self.gate.reference)
 
     def stop(self, now: float, because: str = "") -> None:
-        """The operator's stop, or one for a reason: slows down, holds, ends DISARMED. Axes that are being homed stop."""
+        """The operator's stop, or one for a reason: slows down, holds, ends DISARMED. Axes that search a zero stop."""
         if self.state in (BridgeState.READY, BridgeState.ACTIVE):
             self.gate.brake(now)
             self._stopping_since, self.stopped_because = now, because

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from experiments.study import delays
+from experiments.study.analysis import delays
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile
 from mjx_tt.sim.randomisation import Samples

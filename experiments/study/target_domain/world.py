@@ -19,7 +19,7 @@ from experiments.config.study import Study
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import CONFIG, Run
-from experiments.study import delays
+from experiments.study.analysis import delays
 from experiments.study.target_domain import hit_log, joint_log
 from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.hit_log import HitLog

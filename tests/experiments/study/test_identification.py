@@ -14,7 +14,8 @@ from experiments import measurements
 from experiments.config import study as study_config
 from experiments.config.study import PRIOR
 from experiments.runs import load_policy
-from experiments.study import delays, identification
+from experiments.study import identification
+from experiments.study.analysis import delays
 from experiments.study.analysis.identified import BELIEVED, LOGS, estimates, holds
 from experiments.study.analysis.identified import PRIOR as DRAWN
 from experiments.study.target_domain import hit_log, joint_log

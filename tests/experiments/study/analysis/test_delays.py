@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.study import delays
+from experiments.study.analysis import delays
 from experiments.study.analysis.identified import LOGS, PRIOR_ALONE, estimates, holds
 from experiments.study.analysis.identified import PRIOR as DRAWN
 from mjx_tt.sim import model as models
