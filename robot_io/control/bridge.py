@@ -82,7 +82,9 @@ class Bridge:
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
         self.feedback = Feedback(ball=self.play.strokes.track, axes=History(256), arm=ArmHistory(256))  # a second
         self._blade = partial(blade, self.feedback, self._geometry)
-        self._homing = HomingGuard(arm, axes, self.feedback, self._geometry, contract, gate.config.still)
+        self._homing = HomingGuard(
+            arm, axes, lambda: joints(self.feedback, contract), self._geometry, contract, gate.config.still
+        )
         self._state = BridgeState.DISARMED
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
@@ -178,8 +180,11 @@ class Bridge:
         self._change(BridgeState.DISARMED, now, "fault reset by the operator")
 
     def check_homing(self, now: float) -> None:
-        """Raise RefusedError unless the linear axes may search their references, as of ``HomingGuard.check``."""
-        self._homing.check(self.state, now)
+        """Raise RefusedError unless the robot is disarmed and ``HomingGuard.check`` lets the linear axes be homed."""
+        if self.state is not BridgeState.DISARMED:
+            first = "reset it first, then home them" if self.state is BridgeState.FAULT else "stop the robot first"
+            raise RefusedError(f"axes not homed: the state is {self.state.value}; {first}")
+        self._homing.check(now)
 
     def discard(self, now: float) -> None:
         """Marks the ball in play, or the one before, as not to be used."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
 from robot_io.contract import PAPER, Contract
 from robot_io.control.commissioning.dry import DryAxes
-from robot_io.control.interfaces import Axes, BridgeState
-from robot_io.control.observation import Feedback, joints
 from robot_io.devices.egm.session import EgmSession
 from robot_io.devices.festo import AxesThread
 from robot_io.devices.fixed_base import FixedBase
@@ -40,37 +39,43 @@ def check_homing(geometry: RobotGeometry, measured: np.ndarray, contract: Contra
         )
 
 
+class HomedAxes(Protocol):
+    """Linear axes as far as it matters here."""
+
+    @property
+    def homing(self) -> bool: ...
+
+    def stop(self) -> None: ...
+
+
 class HomingGuard:
     """Watches the arm before and while the linear axes search their references, past the gate.
 
-    still  speed (n,) above which a joint counts as moving
+    joints  gives the newest positions and velocities of the joints, both (n,)
+    still   speed (n,) above which a joint counts as moving
     """
 
     def __init__(
         self,
         arm: EgmSession,
-        axes: Axes,
-        feedback: Feedback,
+        axes: HomedAxes,
+        joints: Callable[[], tuple[np.ndarray, np.ndarray]],
         geometry: RobotGeometry,
         contract: Contract,
         still: tuple[float, ...],
     ) -> None:
-        self._arm, self._axes, self._feedback = arm, axes, feedback
+        self._arm, self._axes, self._joints = arm, axes, joints
         self._geometry, self._contract = geometry, contract
         self._rows = list(contract.arm)
         self._still = np.array(still)[self._rows]
         self._place: np.ndarray | None = None  # of the arm when the search began
 
-    def check(self, state: BridgeState, now: float) -> None:
-        """Raise RefusedError unless the axes may begin.
+    def check(self, now: float) -> None:
+        """Raise RefusedError unless the axes of a disarmed robot may begin.
 
-        The robot must be disarmed, and the arm, heard of just now and at rest, clear of everything wherever they go.
+        The arm, heard of just now, ready and at rest, must be clear of everything wherever they go.
         """
-        if state is BridgeState.FAULT:
-            raise RefusedError("axes not homed: the state is fault; reset it first, then home them")
-        if state is not BridgeState.DISARMED:
-            raise RefusedError(f"axes not homed: the state is {state.value}; stop the robot first")
-        measured, velocity = joints(self._feedback, self._contract)
+        measured, velocity = self._joints()
         if not np.isfinite(measured[self._rows]).all():
             raise RefusedError("axes not homed: the arm's position is not known; start its EGM session first")
         trouble = self._trouble(velocity[self._rows], now)
@@ -86,7 +91,7 @@ class HomingGuard:
         if not self._axes.homing:
             self._place = None
             return ""
-        measured, velocity = joints(self._feedback, self._contract)
+        measured, velocity = self._joints()
         place = measured[self._rows]
         if self._place is None:
             self._place = place
@@ -98,7 +103,7 @@ class HomingGuard:
         return trouble
 
     def _trouble(self, velocity: np.ndarray, now: float) -> str:
-        """Why it is not sure where the arm is or that it stays there, by its speed (6,) too; empty: nothing."""
+        """Reason to doubt where the arm is or that it stays there, by its speed (6,) too; empty: none."""
         problem = self._arm.problem(now)
         if problem:
             return f"where the arm is must be sure: {problem}"

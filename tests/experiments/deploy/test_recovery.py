@@ -20,7 +20,7 @@ def status(state="fault", faults=None, present=None, arm=None, axes=None, prepar
 
 
 def steps(recovery, *statuses):
-    """What is sent for each status; ``done`` ends it."""
+    """Requests for each status; ``done`` ends it."""
     return [None if recovery.done else recovery.step(seen, 1.0) for seen in statuses]
 
 
