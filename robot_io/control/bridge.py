@@ -82,9 +82,8 @@ class Bridge:
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
         self.feedback = Feedback(ball=self.play.strokes.track, axes=History(256), arm=ArmHistory(256))  # a second
         self._blade = partial(blade, self.feedback, self._geometry)
-        self._homing = HomingGuard(
-            arm, axes, lambda: joints(self.feedback, contract), self._geometry, contract, gate.config.still
-        )
+        seen = partial(joints, self.feedback, contract)
+        self._homing = HomingGuard(arm, axes, seen, self._geometry, contract, gate.config.still)
         self._state = BridgeState.DISARMED
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
@@ -180,11 +179,8 @@ class Bridge:
         self._change(BridgeState.DISARMED, now, "fault reset by the operator")
 
     def check_homing(self, now: float) -> None:
-        """Raise RefusedError unless the robot is disarmed and ``HomingGuard.check`` lets the linear axes be homed."""
-        if self.state is not BridgeState.DISARMED:
-            first = "reset it first, then home them" if self.state is BridgeState.FAULT else "stop the robot first"
-            raise RefusedError(f"axes not homed: the state is {self.state.value}; {first}")
-        self._homing.check(now)
+        """Raise RefusedError unless the linear axes may search their references, as of ``HomingGuard.check``."""
+        self._homing.check(self.state.value, now)
 
     def discard(self, now: float) -> None:
         """Marks the ball in play, or the one before, as not to be used."""
@@ -259,12 +255,11 @@ class Bridge:
     def tick(self, deadline: float, now: float) -> np.ndarray:
         """One control period: observe, decide, pass the gate, hand over to the devices; the sent velocity (8,)."""
         self.counts.ticks, self.policy_seconds, request = self.counts.ticks + 1, 0.0, self._zeros
-        measured, measured_velocity = np.full_like(self._zeros, np.nan), self._zeros
+        measured, measured_velocity, sent = np.full_like(self._zeros, np.nan), self._zeros, None
         with self._guarded(now):
             measured, measured_velocity = joints(self.feedback, self.config.contract)
             self.play.moved(measured_velocity)
             request = self._decide(now)
-        sent: Sent | None = None
         with self._guarded(now):
             sent = self.gate.command(request, measured, measured_velocity, now)
             self._motion.ticked(self.gate.start if self.gate.engaged else measured, sent.velocity, now)
@@ -280,8 +275,8 @@ class Bridge:
             self._follow_the_way(request, sent, now)
             self._after(now)
         with self._guarded(now):
-            n, ages = self.counts.ticks, reversed(self._ages(now))
-            timing = Tick(n, now, now - deadline, self.policy_seconds, *ages)
+            n = self.counts.ticks
+            timing = Tick(n, now, now - deadline, self.policy_seconds, *reversed(self._ages(now)))
             self._log(timing, Command(n, now, request, sent.velocity, start))
         if self.unlogged > self._reported_unlogged:
             self._reported_unlogged = self.unlogged

@@ -70,11 +70,14 @@ class HomingGuard:
         self._still = np.array(still)[self._rows]
         self._place: np.ndarray | None = None  # of the arm when the search began
 
-    def check(self, now: float) -> None:
-        """Raise RefusedError unless the axes of a disarmed robot may begin.
+    def check(self, state: str, now: float) -> None:
+        """Raise RefusedError unless the axes may begin, in the bridge's ``state``.
 
-        The arm, heard of just now, ready and at rest, must be clear of everything wherever they go.
+        The robot must be disarmed, the arm, heard of just now, ready and at rest, clear of everything wherever they go.
         """
+        if state != "disarmed":
+            first = "reset it first, then home them" if state == "fault" else "stop the robot first"
+            raise RefusedError(f"axes not homed: the state is {state}; {first}")
         measured, velocity = self._joints()
         if not np.isfinite(measured[self._rows]).all():
             raise RefusedError("axes not homed: the arm's position is not known; start its EGM session first")
