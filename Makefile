@@ -49,11 +49,12 @@ test: $(READY)
 	$(PYTEST) $(REALTIME) -m "not slow and realtime"
 
 test-slow: $(READY)
-	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m "slow and not realtime"
+	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m "slow and not realtime and not exhaustive"
 	USERS_FUSION=1 $(PYTEST) $(PARALLEL) tests/experiments/study -m "slow and not realtime"
 	$(PYTEST) $(REALTIME) -m "slow and realtime"
 
 test-all: test test-slow
+	$(PYTEST) $(PARALLEL) tests -m exhaustive
 
 check: $(READY)
 	$(BIN)/ruff check .

@@ -502,14 +502,15 @@ def test_bounces_far_off_stay_in_their_ranges():
 
 
 SLOW = pytest.mark.slow
+MORE = (SLOW, pytest.mark.exhaustive)  # others of their kind stay in continuous integration
 PEOPLE = pytest.mark.skipif(
     not human_strokes.DATA.exists(), reason=f"measured strokes are absent: {human_strokes.DATA}"
 )
 FIXED = [
     pytest.param(Case("none", (), 0.0, "ar1", 11, count=200), ("right",), marks=SLOW),
-    pytest.param(Case("single", ("wind_x",), 20.0, "range", 13, count=200), ("right",), marks=SLOW),
+    pytest.param(Case("single", ("wind_x",), 20.0, "range", 13, count=200), ("right",), marks=MORE),
     pytest.param(Case("single", ("drag_coefficient",), 20.0, "ar1", 14, count=200), ("right",), marks=SLOW),
-    pytest.param(Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",), marks=SLOW),
+    pytest.param(Case("single", ("table_friction",), 20.0, "causal", 15, count=200), ("right",), marks=MORE),
     pytest.param(Case("invented", ("air_jet",), 20.0, "iid", 17, count=200), ("flagged",), marks=SLOW),
     pytest.param(
         Case("deleted", ("table_friction",), 20.0, "iid", 18, without=("table_friction",), count=100),
@@ -523,8 +524,10 @@ FIXED = [
         marks=SLOW,
     ),
     pytest.param(Case("human_none", (), 0.0, "ar1", 31, count=200), ("right",), marks=[SLOW, PEOPLE]),
-    pytest.param(Case("human_single", ("table_height",), 10.0, "iid", 32, count=100), ("right",), marks=[SLOW, PEOPLE]),
-    pytest.param(Case("human_single", ("wind_z",), 20.0, "range", 33, count=200), ("right",), marks=[SLOW, PEOPLE]),
+    pytest.param(
+        Case("human_single", ("table_height",), 10.0, "iid", 32, count=100), ("right",), marks=[*MORE, PEOPLE]
+    ),
+    pytest.param(Case("human_single", ("wind_z",), 20.0, "range", 33, count=200), ("right",), marks=[*MORE, PEOPLE]),
     pytest.param(
         Case("human_pair", ("drag_coefficient", "table_tilt_x"), 20.0, "ar1", 34, count=200),
         ("right",),
@@ -532,12 +535,12 @@ FIXED = [
     ),
     # It changes drag and lift alike: one cause, not two.
     pytest.param(Case("human_single", ("ball_mass",), 20.0, "iid", 35, count=200), ("right",), marks=[SLOW, PEOPLE]),
-    pytest.param(Case("kalman", (), 0.0, "iid", 41, count=200), ("right",), marks=SLOW),
+    pytest.param(Case("kalman", (), 0.0, "iid", 41, count=200), ("right",), marks=MORE),
     # What its filter leaves along a flight is no finding; a wind beside it still is.
-    pytest.param(Case("kalman", (), 0.0, "iid", 1792730053), ("right",), marks=SLOW),
+    pytest.param(Case("kalman", (), 0.0, "iid", 1792730053), ("right",), marks=MORE),
     pytest.param(Case("kalman", ("wind_x",), 10.0, "ar1", 9001), ("right",), marks=SLOW),
     # Balls that spin fast would explain more of what it did behind the bounce than a filter of the catalogue.
-    pytest.param(Case("kalman", (), 0.0, "causal", 1212613227), ("right",), marks=SLOW),
+    pytest.param(Case("kalman", (), 0.0, "causal", 1212613227), ("right",), marks=MORE),
     # Three causes that undo each other were named for a filter, each larger than the error on unseen balls.
     pytest.param(Case("kalman", (), 0.0, "causal", 424983216), ("right", "flagged"), marks=SLOW),
     # A filter blurs a bounce as balls would that spin a little, by a lift that no ball has.

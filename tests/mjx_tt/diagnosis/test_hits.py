@@ -24,6 +24,7 @@ pytestmark = pytest.mark.optimised
 MODEL = with_values(SimModel(), {"ball.table.height": -3.0})
 HITS, RATE, RADIUS, THICKNESS = 48, 125.0, 0.020, 0.012
 BEFORE, AFTER = 0.45, 0.3  # [s] of each ball
+MORE = (pytest.mark.slow, pytest.mark.exhaustive)
 
 
 @dataclass(frozen=True)
@@ -121,9 +122,9 @@ def judged(rubber: Rubber, seed: int):
     "name, rubber, change",
     [
         ("paddle_restitution", Rubber(restitution=0.837), -0.08),
-        pytest.param("paddle_friction", Rubber(gain=0.48), -0.20, marks=pytest.mark.slow),
+        pytest.param("paddle_friction", Rubber(gain=0.48), -0.20, marks=MORE),
         pytest.param("paddle_tilt", Rubber(tilt=0.04), 0.04, marks=pytest.mark.slow),
-        pytest.param("paddle_offset", Rubber(offset=0.012), 0.012, marks=pytest.mark.slow),
+        pytest.param("paddle_offset", Rubber(offset=0.012), 0.012, marks=MORE),
         pytest.param("ball_latency", Rubber(late=0.02), 0.02, marks=pytest.mark.slow),
     ],
 )
