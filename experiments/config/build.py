@@ -101,6 +101,12 @@ def with_prior(data: dict[str, Any], robot: Robot, where: str) -> dict[str, Any]
     return data | {"randomise": dict(prior.PRIOR)}
 
 
+def believed(model: dict[str, Any]) -> ModelFile:
+    """The model of the paper's robot that a study's plain data ``simulation.model`` say. Raises ConfigError."""
+    plain = with_prior(model, robots.paper(), "simulation")
+    return models.from_dict(plain, "simulation.model")
+
+
 def robot_of(config: Config, where: str) -> tuple[Robot, str | dict[str, Any] | None]:
     """The experiment's robot, and its content in place of the folder; a name of the program's own robots stays.
 

@@ -11,8 +11,9 @@ from robot_io.control.messages import Beat, Discard, Pause, Played, PolicySet, R
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
 from robot_io.policy.policy import Policy
+from robot_io.safety.owner_watch import LONGEST_ABSENCE
 
-COMPUTING = 30.0  # [s] for an update between two balls, the compilation of the first one included
+COMPUTING = LONGEST_ABSENCE  # for an update between two balls, the compilation of the first one included
 
 
 class BridgeRobot:

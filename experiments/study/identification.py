@@ -28,13 +28,12 @@ from mjx_tt.diagnosis.logs import ROBOT_FILES, load_logs
 from mjx_tt.diagnosis.together import balls as of_balls
 from mjx_tt.diagnosis.together import hits as of_hits
 from mjx_tt.diagnosis.together import joints as of_joints
+from mjx_tt.diagnosis.together.hits import HEIGHT, SEEN_HIGH
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
 from mjx_tt.sim.randomisation import Randomised, Range, Samples
 
 BALLS, CLOCK = "balls.csv", 1e6  # [s] by which the clocks of several folders of hits are set apart
-# The frame is the table's: bounces that lie too high are a camera that sees high, not a table that stands there.
-HEIGHT, SEEN_HIGH = "ball.table.height", "sensing.ball_offset_z"
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,6 @@ from experiments.study.training import POLICY
 from experiments.study.workflow import Step
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.env.policy import Policy
-from mjx_tt.robot import robot as robots
-from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile
 
 CONVERGENCE = "convergence.json"
@@ -226,8 +224,7 @@ class Loop(Places):
         moved = () if joints is None else tuple(joints / file for file in ROBOT_FILES)
 
         def run() -> str:
-            plain = build.with_prior(self.study.simulation.model, robots.paper(), "simulation")
-            believed = models.from_dict(plain, "simulation.model")
+            believed = build.believed(self.study.simulation.model)
             before = identification.prior(settings.prior, "identification.prior")
             found = checked(
                 name, identification.identify, [*data, *moved], settings.balls, believed, before, hits, settings.seconds

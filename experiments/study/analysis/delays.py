@@ -17,7 +17,7 @@ from mjx_tt.sim.randomisation import Samples
 
 ARM, AXES, BALL = (f"latency.{name}_observation" for name in ("abb", "festo", "ball"))
 TOLD = "latency.festo_action"  # the axes' command
-SEED = 2
+SEED = 2  # of the draws; those of balls, joints and hits have others
 
 Ends = Mapping[str, tuple[float, float]]  # low and high end by dotted path
 

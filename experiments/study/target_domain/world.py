@@ -24,7 +24,6 @@ from experiments.study.target_domain import hit_log, joint_log
 from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.hit_log import HitLog
 from mjx_tt.diagnosis.joint import JointRecord
-from mjx_tt.robot import robot as robots
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 
@@ -86,10 +85,8 @@ class VirtualWorld:
         """Balls of rallies with the policy of the run ``source``."""
         reality, policy = self.reality, load_policy.load(source).policy
         person, noise = reality.player(player), self._study.reality.camera_noise
-        plain = build.with_prior(self._study.simulation.model, robots.paper(), "simulation")
-        late = models.paths(models.from_dict(plain, "simulation.model").model)[delays.BALL]
-        key = self._key(name)
-        return hit_log.record(reality.simulator, reality.known, person, policy, key, name, noise, late)
+        late = models.paths(build.believed(self._study.simulation.model).model)[delays.BALL]
+        return hit_log.record(reality.simulator, reality.known, person, policy, self._key(name), name, noise, late)
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         theta, statistics = load_policy.load_statistics(source)

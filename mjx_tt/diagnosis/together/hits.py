@@ -28,6 +28,7 @@ from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
 PADDLE = ("ball.paddle.restitution", "ball.paddle.tangential_gain", "latency.ball_observation")
 CAMERA = ("sensing.ball_offset_x", "sensing.ball_offset_y")
 AXES = "latency.festo_observation"  # against the arm's, which is taken as believed: the clock's origin shows nowhere
+# The frame is the table's: bounces that lie too high are a camera that sees high, not a table that stands there.
 HEIGHT, SEEN_HIGH = "ball.table.height", "sensing.ball_offset_z"
 ZEROS = tuple(f"drives.{joint}.joint_offset" for joint in JOINT_NAMES)
 SHOWN = (*PADDLE, *CAMERA, AXES, *ZEROS)  # by hits, and by no other log

@@ -21,6 +21,7 @@ from experiments.study.analysis.identified import PRIOR as DRAWN
 from experiments.study.target_domain import hit_log, joint_log
 from experiments.study.target_domain.finetuning import VirtualReality
 from mjx_tt import diagnosis
+from mjx_tt.diagnosis.together.hits import SEEN_HIGH
 from mjx_tt.env.task import Task, TaskConfig
 from mjx_tt.robot import model as robot
 from mjx_tt.sim import model as models
@@ -77,7 +78,7 @@ def identified(task, tmp_path_factory):
     measurements.write_csv(folder / "D0.csv", balls(World(friction=0.19, height=0.006)))
     logs, before = [folder / "D0.csv", folder / "joints"], identification.prior(PRIOR, "prior")
     found = identification.identify(logs, 100, ModelFile(SimModel()), before)
-    truth = {**slow, "ball.table.friction": 0.19, identification.SEEN_HIGH: 0.006}
+    truth = {**slow, "ball.table.friction": 0.19, SEEN_HIGH: 0.006}
     return folder, found, truth
 
 
