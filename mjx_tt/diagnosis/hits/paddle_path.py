@@ -36,9 +36,10 @@ class JointPath:
         """True if every joint was measured over this time."""
         return all(t[0] <= start and t[-1] >= end for t in self.time)
 
-    def at(self, time: Float[np.ndarray, ...]) -> Float[np.ndarray, "8 ..."]:
-        """Positions of all joints."""
-        return np.stack([np.interp(time, t, q) for t, q in zip(self.time, self.position, strict=True)])
+    def at(self, time: Float[np.ndarray, "#8 ..."]) -> Float[np.ndarray, "8 ..."]:
+        """Positions of all joints, each at times of its own, (8, ...), or all at the same, (1, ...)."""
+        each = np.broadcast_to(time, (len(self.time), *time.shape[1:]))
+        return np.stack([np.interp(now, t, q) for now, t, q in zip(each, self.time, self.position, strict=True)])
 
 
 def joint_path(records: Sequence[JointRecord], model: SimModel) -> JointPath | None:
@@ -60,19 +61,24 @@ def watched(trajectory: Trajectory, path: JointPath | None) -> bool:
 
 
 def poses(
-    trajectories: Sequence[Trajectory], steps: Float[np.ndarray, "L n"], path: JointPath | None
+    trajectories: Sequence[Trajectory],
+    steps: Float[np.ndarray, "L n"],
+    path: JointPath | None,
+    late: Float[np.ndarray, "8 n"] | None = None,
 ) -> PaddlePose | None:
     """The blade at the ends of all steps, each quantity (3, L + 1, n); None where no ball's joints were watched.
 
-    steps: [s] of measured time from each trajectory's first sample on.
+    steps: [s] of measured time from each trajectory's first sample on. late: [s] by which a ball is stamped late
+    against each joint: it was where it is measured when the joint was where it had been so much before.
     """
     seen = np.array([watched(t, path) for t in trajectories])
     if path is None or not seen.any():
         return None
     begin = np.array([t.time[0] for t in trajectories])
-    time = begin + np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
-    q = path.at(time)
-    qd = (path.at(time + HALF_WINDOW) - path.at(time - HALF_WINDOW)) / (2.0 * HALF_WINDOW)
+    time = (begin + np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)]))[None]
+    before = 0.0 if late is None else late[:, None]
+    q = path.at(time - before)
+    qd = (path.at(time - before + HALF_WINDOW) - path.at(time - before - HALF_WINDOW)) / (2.0 * HALF_WINDOW)
     with jax.enable_x64(True):
         pose = jax.tree.map(np.asarray, _pose(q, qd))
     return PaddlePose(pose.position + np.where(seen, 0.0, FAR), pose.normal, pose.velocity, pose.angular_velocity)

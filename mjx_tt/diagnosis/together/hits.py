@@ -2,8 +2,8 @@
 
 None of these shows in a ball before its hit or in the joints alone, and none can be told apart in a single hit; they
 are ordinary sizes of what every installation has. So nothing is named here: each has a prior, and the maximum of the
-posterior is sought by Gauss-Newton on the returns' place and velocity behind the paddle. The spread from hit to hit is
-the noise, as in ``diagnose``.
+posterior is sought by Gauss-Newton on the returns' place and velocity behind the paddle. Every hit has delays of its
+own besides (``hit_scatter``), at which it is linearised; what else it scatters by is the noise, as in ``diagnose``.
 """
 
 from __future__ import annotations
@@ -19,22 +19,24 @@ from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading
 from mjx_tt.diagnosis.ball.flights.forward_model import grid, predict
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem
-from mjx_tt.diagnosis.hits.diagnose import FARTHEST, FEWEST_HITS, line_behind, spread, watched_hits
+from mjx_tt.diagnosis.hits.diagnose import FARTHEST, FEWEST_HITS, line_behind, watched_hits
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses
 from mjx_tt.diagnosis.together.balls import LIFT_ERROR, BallsTogether
+from mjx_tt.diagnosis.together.hit_scatter import believed_delays, scatter
 from mjx_tt.sim.randomisation import Samples
 from robot_io.contract import FESTO_JOINTS, JOINT_NAMES
 
-PADDLE = ("ball.paddle.restitution", "ball.paddle.tangential_gain", "latency.ball_observation")
+RUBBER = ("ball.paddle.restitution", "ball.paddle.tangential_gain")
 CAMERA = ("sensing.ball_offset_x", "sensing.ball_offset_y")
-AXES = "latency.festo_observation"  # against the arm's, which is taken as believed: the clock's origin shows nowhere
+# Against the arm's delay, which is taken as believed: the clock's origin shows nowhere.
+DELAYS = BALL, AXES = ("latency.ball_observation", "latency.festo_observation")
 # The frame is the table's: bounces that lie too high are a camera that sees high, not a table that stands there.
 HEIGHT, SEEN_HIGH = "ball.table.height", "sensing.ball_offset_z"
 ZEROS = tuple(f"drives.{joint}.joint_offset" for joint in JOINT_NAMES)
-SHOWN = (*PADDLE, *CAMERA, AXES, *ZEROS)  # by hits, and by no other log
+SHOWN = (*RUBBER, *DELAYS, *CAMERA, *ZEROS)  # by hits, and by no other log
 LIFT = "lift"  # error of its coefficient, along which the balls' parameters go
 STEP = 0.05  # of a prior's deviation, by which derivatives are taken
-ROUNDS = 4
+ROUNDS, INNER = 6, 3
 # Times the noise that hits scatter by. What all hits share is wrong as well: spins that a flight hardly shows, a
 # camera's yaw, the balls' own parameters. Over eleven realities errors were one to four times what the scatter gives.
 WIDER = 2.0
@@ -91,53 +93,60 @@ def fit(
     def started(lift: float) -> np.ndarray:
         return fit_starts(problem, balls.along_lift(lift), first, before_hit, None, spins)
 
-    def seen(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Measured positions (3, T, n) that the model plays, and when each is hit (n,)."""
+    def seen(values: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Measured positions (3, T, n) that the model plays with each hit's own delays, and when each is hit (n,)."""
         at = dict(zip(names, values, strict=True))
         zeros = [at.get(name, 0.0) for name in ZEROS]
-        later = at.get(AXES, problem.nominal[AXES]) - problem.nominal[AXES]
-        moved = JointPath(
-            tuple(t - later if i in FESTO_JOINTS else t for i, t in enumerate(path.time)),
-            tuple(q - zero for q, zero in zip(path.position, zeros, strict=True)),
+        moved = replace(path, position=tuple(q - zero for q, zero in zip(path.position, zeros, strict=True)))
+        ball, axes_ = (
+            at.get(name, problem.nominal[name]) - problem.nominal[name] + mine
+            for name, mine in zip(DELAYS, own, strict=True)
         )
+        late = np.stack([ball - axes_ if i in FESTO_JOINTS else ball for i in range(len(JOINT_NAMES))])
         changed = problem.values(balls.along_lift(float(at[LIFT]))[:, None, None])
         begin = started(float(at[LIFT])).copy()
         if HEIGHT in changed:
             high = changed[HEIGHT] - problem.nominal[HEIGHT]
             changed |= {HEIGHT: changed[HEIGHT] - high, SEEN_HIGH: problem.nominal[SEEN_HIGH] + high}
             begin[2] -= high[0, 0]
-        for name in (*PADDLE, *CAMERA):
+        for name in (*RUBBER, *CAMERA):
             if name in at:
                 changed[name] = np.full((1, 1), at[name])
         for i, name in enumerate(CAMERA):  # the ball is where the camera's offset puts it
             begin[i] -= at.get(name, problem.nominal[name]) - problem.nominal[name]
-        flown = predict(problem.model, changed, begin[:, None], replace(g, paddle=poses(whole, g.steps, moved)), axes)
+        paddle = poses(whole, g.steps, moved, late)
+        flown = predict(problem.model, changed, begin[:, None], replace(g, paddle=paddle), problem.axes)
         return flown.measured[:, :, 0], flown.hit_time[0]
 
-    axes = problem.axes
     mean, deviation = np.array([prior[name] for name in names]).T
-    values, precision = mean.copy(), np.diag(deviation**-2.0)
+    values, precision, own = mean.copy(), np.diag(deviation**-2.0), np.zeros((2, g.n))
+    jitter = believed_delays(problem.model.latency)
     for _ in range(ROUNDS):
-        base, hit = seen(values)
+        base, hit = seen(values, own)
         behind = line_behind(g, out, hit)
         y = behind(np.where(out, g.measured - base, 0.0))
         usable = np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)
-        columns = []
-        for i, size in enumerate(STEP * deviation):
-            other, met = seen(values + size * np.eye(len(values))[i])
+
+        sizes = np.concatenate([STEP * deviation, STEP * np.sqrt(np.diagonal(jitter)) + 1e-6])
+        columns = []  # by the values and by the delays of each hit's own, which all hits are moved by at once
+        for step, size in zip(np.diag(sizes), sizes, strict=True):
+            other, met = seen(values + step[:-2], own + step[-2:, None])
             columns.append(behind(np.where(out, other - base, 0.0)) / size)
             usable &= np.isfinite(met)
         if usable.sum() < FEWEST_HITS:
             return None
-        jacobian, y = np.array(columns)[:, :, usable], y[:, usable]
+        jacobian, slopes = np.split(np.array(columns)[:, :, usable], [len(values)])
+        y = y[:, usable] + np.einsum("kcn,kn->cn", slopes, own[:, usable])  # of hits without delays of their own
         change = np.zeros(len(values))
-        for _ in range(ROUNDS):  # the noise is what the change leaves over
-            root, weight = spread(y - np.einsum("kcn,k->cn", jacobian, change))
-            j = np.einsum("cd,kdn->kcn", root, jacobian) * np.sqrt(weight) / WIDER
-            covariance = np.linalg.inv(np.einsum("kcn,lcn->kl", j, j) + precision)
-            right = np.einsum("kcn,cn->k", j, root @ y * np.sqrt(weight)) / WIDER
+        for _ in range(INNER):  # the scatter is what the change leaves over
+            left = y - np.einsum("kcn,k->cn", jacobian, change)
+            noise = scatter(left, slopes, jitter)
+            inverse = np.linalg.inv(noise.covariance(slopes)) * noise.weight[:, None, None] / WIDER**2
+            covariance = np.linalg.inv(np.einsum("kcn,ncd,ldn->kl", jacobian, inverse, jacobian) + precision)
+            right = np.einsum("kcn,ncd,dn->k", jacobian, inverse, y)
             change = covariance @ (right + precision @ (mean - values))
         values = values + change
+        own[:, usable] = noise.own(y - np.einsum("kcn,k->cn", jacobian, change), slopes)
         if np.max(np.abs(change) / np.sqrt(np.diagonal(covariance))) < SETTLED:
             break
     return HitsTogether(names, values, covariance, int(usable.sum()))

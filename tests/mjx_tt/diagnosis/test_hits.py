@@ -23,6 +23,7 @@ pytestmark = pytest.mark.optimised
 # These balls meet nothing but the paddle: the table is out of their way.
 MODEL = with_values(SimModel(), {"ball.table.height": -3.0})
 HITS, RATE, RADIUS, THICKNESS = 48, 125.0, 0.020, 0.012
+EVERY = 1.5  # [s] from ball to ball
 BEFORE, AFTER = 0.45, 0.3  # [s] of each ball
 MORE = (pytest.mark.slow, pytest.mark.exhaustive)
 
@@ -37,6 +38,7 @@ class Rubber:
     tilt: float = 0.0
     offset: float = 0.0
     late: float = 0.0
+    jitter: float = 0.0  # [s] deviation of the delays of ball, arm and axes from hit to hit
 
 
 def drag(_, state):
@@ -47,15 +49,17 @@ def drag(_, state):
 
 
 class Swing:
-    """A robot that swings about its home pose."""
+    """A robot that swings about its home pose; one that plays makes the same stroke at every ball."""
 
-    def __init__(self, rng) -> None:
+    def __init__(self, rng, plays: bool = False) -> None:
         self.model = model.load_model()
         self.data = mujoco.MjData(self.model)
         self.home = model.home_qpos(self.model)
         self.site = self.model.site("paddle").id
         self.size, self.rate = rng.uniform(0.06, 0.2, 8), rng.uniform(2.0, 6.0, 8)
         self.phase = rng.uniform(0, 2 * np.pi, 8)
+        if plays:
+            self.rate = 2 * np.pi / EVERY * np.random.default_rng(8).integers(2, 5, 8)  # up to 3 rad/s, 50 rad/s^2
 
     def joints(self, t):
         return self.home[:, None] + self.size[:, None] * np.sin(self.rate[:, None] * t + self.phase[:, None])
@@ -76,12 +80,16 @@ class Swing:
 
 
 def play(rubber: Rubber, seed: int, noise: float = 0.002):
-    """Balls and joint records of HITS returns, one ball every 1.5 s, on one clock."""
+    """Balls and joint records of HITS returns, one ball every 1.5 s, on one clock.
+
+    Where delays differ from hit to hit the robot plays: it strokes as late as it sees the ball.
+    """
     rng = np.random.default_rng(seed)
-    swing = Swing(rng)
+    swing = Swing(rng, rubber.jitter > 0.0)
+    own = rubber.jitter * np.random.default_rng(seed + 1).normal(size=(3, HITS))  # of ball, arm, axes
     balls, grid = [], np.arange(int((BEFORE + AFTER) * RATE)) / RATE
     for i in range(HITS):
-        hit = 1.5 * (i + 1)
+        hit = EVERY * (i + 1) - own[0, i]
         centre, normal, velocity, spin = swing.blade(hit)
         if rubber.tilt:
             axis = np.cross([0.0, 0.0, 1.0], normal)
@@ -103,12 +111,19 @@ def play(rubber: Rubber, seed: int, noise: float = 0.002):
         later = solve_ivp(drag, (hit, hit + AFTER + 0.02), [*place, *outgoing], dense_output=True, rtol=1e-9, atol=1e-9)
         time = hit - BEFORE + rng.uniform(0, 1 / RATE) + grid
         path = np.where(time < hit, past.sol(np.minimum(time, hit))[:3], later.sol(np.maximum(time, hit))[:3])
-        balls.append(Trajectory("day", str(i), time + rubber.late, path + rng.normal(0.0, noise, path.shape)))
-    clock = np.arange(0.0, 1.5 * (HITS + 2), 0.004)
+        seen = path + rng.normal(0.0, noise, path.shape)
+        balls.append(Trajectory("day", str(i), time + rubber.late + own[0, i], seen))
+    clock = np.arange(0.0, EVERY * (HITS + 2), 0.004)
     q = swing.joints(clock) + rng.normal(0.0, 2e-5, (8, clock.size))
     # A joint's position is reported later than it was: 33 ms on the linear axes, 29 ms on the arm (the paper's table).
     age = [0.033, 0.033, *[0.029] * 6]
-    records = [JointRecord(name, clock, 0.0 * clock, clock + age[j], q[j]) for j, name in enumerate(JOINT_NAMES)]
+    # From hit to hit a joint's own delay changes while nothing is hit.
+    between = EVERY * (np.repeat(np.arange(HITS) + 1, 2) + np.tile([-0.4, 0.4], HITS))
+    arm, axes = (np.interp(clock, between, np.repeat(one, 2)) for one in own[1:])
+    records = [
+        JointRecord(name, clock, 0.0 * clock, clock + age[j] + (axes if j < 2 else arm), q[j])
+        for j, name in enumerate(JOINT_NAMES)
+    ]
     return balls, records
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, joint_path
 from mjx_tt.diagnosis.together import balls, hits
-from tests.mjx_tt.diagnosis.test_hits import MODEL, Rubber, play
+from tests.mjx_tt.diagnosis.test_hits import HITS, MODEL, Rubber, play
 
 pytestmark = pytest.mark.optimised
 
@@ -48,6 +48,23 @@ def test_all_of_it_is_found_together_within_its_errors():
     drawn, lift = found.samples({name: (m - 9 * d, m + 9 * d) for name, (m, d) in PRIOR.items()})
     assert drawn.paths == tuple(WANTED) and lift.shape == (hits.DRAWS,)
     np.testing.assert_allclose(np.cov(drawn.values.T), found.covariance[:-1, :-1], rtol=0.6, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("jitter", [0.009, 0.015])
+def test_delays_that_differ_from_hit_to_hit_lead_nothing_astray(jitter):
+    """A robot that plays strokes as late as it sees the ball: how late and how fast go together."""
+    measured, path = fitted(replace(TRUTH, jitter=jitter), 11)
+    axes = {hits.AXES: (0.033, 0.014)}
+    found = hits.fit(balls.fit(measured, MODEL, FLIGHTS), measured, path, {**PRIOR, **axes})
+    error = dict(zip(found.paths, np.sqrt(np.diagonal(found.covariance)), strict=True))
+    for name, value in {**WANTED, hits.AXES: 0.033}.items():
+        at = found.mean[found.paths.index(name)]
+        assert abs(at - value) < 2.5 * error[name], (name, at, error[name])
+    # Two delays differ; HITS of them tell their mean by so much, which is stated WIDER.
+    mean_of_hits = jitter * (2.0 / HITS) ** 0.5
+    assert error["ball.paddle.restitution"] < 0.01
+    assert all(error[name] < 1.2 * hits.WIDER * mean_of_hits for name in hits.DELAYS)
 
 
 @pytest.mark.slow
