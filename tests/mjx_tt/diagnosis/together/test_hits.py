@@ -96,6 +96,15 @@ def test_a_camera_that_sees_high_moves_the_ball_against_the_paddle():
     assert np.all(np.abs(high.mean - plain.mean)[:-1] < 0.1 * errors[:-1]), (plain.mean, high.mean)
 
 
+def test_a_hit_that_is_met_or_missed_within_a_difference_decides_nothing():
+    columns = np.random.default_rng(0).normal(size=(3, 6, 40))
+    columns[1, 4, 17] = 60.0
+    columns[2, :3, 5] = 60.0  # place alone: a return through a point near by
+    assert np.flatnonzero(~hits.smooth(columns)).tolist() == [17]
+    columns[2] = 0.0  # shows nowhere
+    assert np.flatnonzero(~hits.smooth(columns)).tolist() == [17]
+
+
 def test_too_few_hits_leave_everything_open():
     measured, path = fitted(TRUTH, 7)
     found = balls.fit(measured, MODEL, FLIGHTS)
