@@ -13,9 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from mjx_tt.diagnosis.together import hits
 from mjx_tt.sim.randomisation import Samples
 
-ARM, AXES, BALL = (f"latency.{name}_observation" for name in ("abb", "festo", "ball"))
+ARM, AXES, BALL = "latency.abb_observation", hits.AXES, hits.BALL
 TOLD = "latency.festo_action"  # the axes' command
 SEED = 2  # of the draws; those of balls, joints and hits have others
 

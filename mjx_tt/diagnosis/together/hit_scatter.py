@@ -34,10 +34,13 @@ class HitScatter:
         """Of a hit's six numbers, delays and all. slopes: [m/s], [m/s^2] of the six numbers by the two delays."""
         return self.left + np.einsum("kcn,kl,ldn->ncd", slopes, self.delays, slopes)
 
+    def gain(self, slopes: Float[np.ndarray, "2 6 n"]) -> Float[np.ndarray, "n 2 6"]:
+        """Delays of a hit per unit of each of its six numbers, as Kalman's gain has it."""
+        return np.einsum("kl,lcn->nkc", self.delays, slopes) @ np.linalg.inv(self.covariance(slopes))
+
     def own(self, y: Float[np.ndarray, "6 n"], slopes: Float[np.ndarray, "2 6 n"]) -> Float[np.ndarray, "2 n"]:
         """Each hit's delays [s], as far as they show: the mean of their posterior."""
-        solved = np.linalg.solve(self.covariance(slopes), y.T[..., None])[..., 0]
-        return np.einsum("kl,lcn,nc->kn", self.delays, slopes, solved)
+        return np.einsum("nkc,cn->kn", self.gain(slopes), y)
 
 
 def believed_delays(latency: LatencyParams) -> Float[np.ndarray, "2 2"]:
@@ -62,12 +65,10 @@ def scatter(
     inverse = np.linalg.inv(believed + 1e-12 * np.eye(2))
     for _ in range(ROUNDS):
         now = HitScatter(left, size * believed, weight)
-        whole = now.covariance(slopes)
-        gain = np.einsum("kl,lcn->nkc", now.delays, slopes) @ np.linalg.inv(whole)
-        own = np.einsum("nkc,cn->kn", gain, y)
-        open_ = now.delays - np.einsum("nkc,lcn,lm->nkm", gain, slopes, now.delays)  # (n, 2, 2)
+        own = now.own(y, slopes)
+        open_ = now.delays - np.einsum("nkc,lcn,lm->nkm", now.gain(slopes), slopes, now.delays)  # (n, 2, 2)
         rest = y - np.einsum("kn,kcn->cn", own, slopes)
-        distance = np.sqrt(np.einsum("cn,ncd,dn->n", y, np.linalg.inv(whole), y))
+        distance = np.sqrt(np.einsum("cn,ncd,dn->n", y, np.linalg.inv(now.covariance(slopes)), y))
         weight = huber_weights(distance, HUBER)
         bounded = weight**2  # so that a hit beside all others adds at most HUBER^2 (Maronna's M-estimate)
         left = (rest * bounded) @ rest.T + np.einsum("kcn,nkl,ldn,n->cd", slopes, open_, slopes, bounded)

@@ -100,11 +100,11 @@ def fit(
         at = dict(zip(names, values, strict=True))
         zeros = [at.get(name, 0.0) for name in ZEROS]
         moved = replace(path, position=tuple(q - zero for q, zero in zip(path.position, zeros, strict=True)))
-        ball, axes_ = (
+        ball, axes = (
             at.get(name, problem.nominal[name]) - problem.nominal[name] + mine
             for name, mine in zip(DELAYS, own, strict=True)
         )
-        late = np.stack([ball - axes_ if i in FESTO_JOINTS else ball for i in range(len(JOINT_NAMES))])
+        late = np.stack([ball - axes if i in FESTO_JOINTS else ball for i in range(len(JOINT_NAMES))])
         changed = problem.values(balls.along_lift(float(at[LIFT]))[:, None, None])
         begin = started(float(at[LIFT])).copy()
         if HEIGHT in changed:
@@ -128,7 +128,6 @@ def fit(
         behind = line_behind(g, out, hit)
         y = behind(np.where(out, g.measured - base, 0.0))
         usable = np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)
-
         sizes = np.concatenate([STEP * deviation, STEP * np.sqrt(np.diagonal(jitter)) + 1e-6])
         columns = []  # by the values and by the delays of each hit's own, which all hits are moved by at once
         for step, size in zip(np.diag(sizes), sizes, strict=True):

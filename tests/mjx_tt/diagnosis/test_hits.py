@@ -80,7 +80,7 @@ class Swing:
 
 
 def play(rubber: Rubber, seed: int, noise: float = 0.002):
-    """Balls and joint records of HITS returns, one ball every 1.5 s, on one clock.
+    """Balls and joint records of HITS returns, one ball EVERY so often, on one clock.
 
     Where delays differ from hit to hit the robot plays: it strokes as late as it sees the ball.
     """
