@@ -26,12 +26,15 @@ def test_delays_against_the_arm_share_the_arms():
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 1.5])
 def test_finds_how_large_delays_and_the_rest_are(times):
-    y, slopes = drawn(400, times)
-    y[:, :8] += 40.0 * np.sqrt(np.diagonal(LEFT))[:, None]  # hits that met something else
+    y, slopes = drawn(4000, times)
+    clean = scatter(y, slopes, BELIEVED)
+    np.testing.assert_allclose(clean.delays, times**2 * BELIEVED, rtol=0.1)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(clean.left)), np.sqrt(np.diagonal(LEFT)), rtol=0.1)
+    y[:, :80] += 40.0 * np.sqrt(np.diagonal(LEFT))[:, None]  # two in a hundred met something else
     found = scatter(y, slopes, BELIEVED)
-    np.testing.assert_allclose(found.delays, times**2 * BELIEVED, rtol=0.2)
-    np.testing.assert_allclose(np.sqrt(np.diagonal(found.left)), np.sqrt(np.diagonal(LEFT)), rtol=0.3)
-    assert found.weight[:8].max() < 0.6 < np.median(found.weight[8:])
+    np.testing.assert_allclose(found.delays, clean.delays, rtol=0.1)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found.left)), np.sqrt(np.diagonal(clean.left)), rtol=0.1)
+    assert found.weight[:80].max() < 0.6 < np.median(found.weight[80:])
 
 
 def test_delays_are_bounded_where_something_else_looks_like_them():
