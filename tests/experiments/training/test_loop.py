@@ -15,7 +15,7 @@ from experiments.runs import checkpoint
 from experiments.runs.metrics import read
 from tests.support.paths import ROOT
 
-UPDATES = 300
+UPDATES = 600
 EXPERIMENT = """
 name: tiny
 balls: player5/M0
@@ -57,10 +57,16 @@ def finish(process: subprocess.Popen) -> str:
     return output
 
 
-def wait_for_checkpoint(process: subprocess.Popen, folder: Path) -> None:
-    while not list(folder.glob("checkpoints/[0-9]*.npz")):
+def updates_measured(folder: Path) -> int:
+    metrics = folder / "metrics.jsonl"
+    return metrics.read_bytes().count(b"\n") if metrics.exists() else 0
+
+
+def wait_for_checkpoint(process: subprocess.Popen, folder: Path, updates: int = 0) -> None:
+    """Wait for the first checkpoint, and until so many updates are measured."""
+    while not list(folder.glob("checkpoints/[0-9]*.npz")) or updates_measured(folder) < updates:
         if process.poll() is not None:
-            pytest.fail(f"ended before its first checkpoint: {finish(process)}")
+            pytest.fail(f"ended before its first checkpoint and update {updates}: {finish(process)}")
         time.sleep(0.01)
 
 
@@ -97,13 +103,14 @@ def assert_same_run(folder: Path, reference: Path) -> None:
 
 @pytest.mark.slow
 def test_killed_at_random_and_resumed_equals_uninterrupted(yaml, uninterrupted, tmp_path):
-    delay = random.uniform(0.0, 1.0)
+    # Where it is killed is counted in updates, since computers differ in how many they make in a second.
+    update, moment = random.randint(1, UPDATES // 2), random.uniform(0.0, 0.02)
     killed = start(yaml, tmp_path / "run")
-    wait_for_checkpoint(killed, tmp_path / "run")
-    time.sleep(delay)
+    wait_for_checkpoint(killed, tmp_path / "run", update)
+    time.sleep(moment)
     killed.send_signal(signal.SIGKILL)
     finish(killed)
-    assert killed.returncode == -signal.SIGKILL, f"ended before it was killed, {delay} s after its first checkpoint"
+    assert killed.returncode == -signal.SIGKILL, f"ended before it was killed, {moment} s after update {update}"
     resumed = start(yaml, tmp_path / "run")
     output = finish(resumed)
     assert resumed.returncode == 0, output
