@@ -34,6 +34,7 @@ import jax  # noqa: E402 - reads the environment
 from jaxtyping import install_import_hook  # noqa: E402
 
 import tests.support.type_checker  # noqa: E402, F401 - found by its name
+from tests.support.machine_watch import pytest_collection_modifyitems, watched_machine  # noqa: E402, F401 - for pytest
 
 # STRICT_ARRAYS=1: annotations of functions are checked, arrays by type and shape, in every call (of compiled functions:
 # when they are traced); numbers change their type and arrays their rank only where the code says so.
