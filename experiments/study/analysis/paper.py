@@ -75,7 +75,16 @@ BY_KEY = {model.key: model for model in (*MODELS, *VARIANT, *OTHER_WORLDS, *ABLA
 TEN = tuple(model.key for model in MODELS)
 FINAL = ("is2r-ft100", "s2r-ft100", "oracle-ft")
 """The methods' final policies, in the order of the paper's figures; these are cross-evaluated."""
-SHORT = {"is2r-ft100": "i-S2R", "s2r-ft100": "S2R+FT", "oracle-ft": "S2R-Oracle+FT"}
+LAST = (*FINAL, *(rounds[-1].key for rounds in LEARNED.values()))
+"""These and the final policies of the variants that train in other worlds."""
+SHORT = {
+    "is2r-ft100": "i-S2R",
+    "s2r-ft100": "S2R+FT",
+    "oracle-ft": "S2R-Oracle+FT",
+    "prior-ft100": "in the prior",
+    "id-ft100": "identified",
+    "bound-ft100": "in reality",
+}
 
 CROSS = {
     "player1": ("player4", "player5"),

@@ -20,7 +20,7 @@ from ballmodel.io.yaml import read as read_yaml
 from experiments.errors import ConfigError
 from experiments.runs.run_dir import CONFIG
 from experiments.study.analysis import effect_costs, scoring
-from experiments.study.analysis.paper import BY_KEY, BY_SKILL, CROSS, FINAL, TEN
+from experiments.study.analysis.paper import BY_KEY, BY_SKILL, CROSS, FINAL, IS2R, LEARNED, MODELS, TEN
 from experiments.study.analysis.statistics import Models
 from mjx_tt.rally.human_player import FOLDER as VIRTUAL_PLAYERS
 
@@ -76,7 +76,8 @@ class BallLog:
 class Study:
     """Content of a study's folder.
 
-    missing: what a whole study would have besides, in words
+    missing: what the study that its settings ask for would have besides, in words
+    left_out: what its settings leave out of a whole study, in words
     """
 
     folder: Path
@@ -84,6 +85,7 @@ class Study:
     info: dict[str, Any]
     rallies: scoring.Rallies
     missing: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
 
     @cached_property
     def seeds(self) -> tuple[int, ...]:
@@ -217,7 +219,8 @@ def load(folder: Path) -> Study:
         if strange:
             raise ConfigError(f"{evaluated}: the figures have no place for any of its rallies: {'; '.join(strange)}")
         raise ConfigError(f"{folder}: nothing to report on yet: there is no player's folder and no rally")
-    study.missing.extend([*(f"a place for rallies with {which}" for which in strange), *_missing(study)])
+    models, cross, study.left_out = _asked_for(settings)
+    study.missing.extend([*(f"a place for rallies with {which}" for which in strange), *_missing(study, models, cross)])
     return study
 
 
@@ -229,8 +232,24 @@ def _instead(folder: Path) -> str:
     return f"; it holds ordinary training, on which `mjx-tt evaluate {runs[0]}` reports"
 
 
-def _missing(study: Study) -> list[str]:
-    """Parts of a whole study that this one lacks, in words."""
+def _asked_for(settings: dict[str, Any]) -> tuple[tuple[str, ...], bool, list[str]]:
+    """Models of the paper and of the identification that a study makes, whether others play them, what it leaves out.
+
+    Without settings, those of the paper.
+    """
+    baselines = settings.get("baselines", True)
+    models = {True: TEN, False: ()}.get(baselines, tuple(m.key for m in MODELS if m.method == IS2R))
+    left_out = list(dict.fromkeys(BY_KEY[key].method for key in TEN if key not in models))
+    cross = (settings.get("evaluation") or {}).get("cross", True)
+    if not cross:
+        left_out.append("rallies with players who did not train the policy")
+    if settings.get("identification") is not None:
+        models += tuple(model.key for model in LEARNED["id"])
+    return models, cross, left_out
+
+
+def _missing(study: Study, models: tuple[str, ...], cross: bool) -> list[str]:
+    """Parts that a study lacks of those models and cross-evaluations, in words."""
     out = []
     absent = [p for p in BY_SKILL if p not in study.players]
     if absent:
@@ -239,15 +258,16 @@ def _missing(study: Study) -> list[str]:
     there = set(zip(r.seed.tolist(), r.trainer.tolist(), r.evaluator.tolist(), r.model.tolist(), strict=True))
     for seed in study.seeds:
         for player in study.players:
-            lacking = [m for m in TEN if (seed, player, player, m) not in there]
+            lacking = [m for m in models if (seed, player, player, m) not in there]
             if lacking:
-                what = "all ten models" if len(lacking) == len(TEN) else ", ".join(lacking)
+                count = "ten" if models == TEN else str(len(models))
+                what = f"all {count} models" if len(lacking) == len(models) else ", ".join(lacking)
                 out.append(f"seed {seed}, {player}: evaluation of {what}")
             others = [e for e in CROSS[player] if any((seed, player, e, m) not in there for m in FINAL)]
-            if others:
+            if others and cross:
                 out.append(f"seed {seed}, {player}: cross-evaluation by {', '.join(others)}")
             fitted = study.models_of(seed, player)
-            if len(fitted) < len(ROUNDS):
+            if len(fitted) < len(ROUNDS) and "is2r-sim1" in models:
                 out.append(f"seed {seed}, {player}: human model {', '.join(m for m in ROUNDS if m not in fitted)}")
     short = [
         f"seed {seed}, {trainer} with {evaluator}, {model}: {count} rallies that count of {scoring.POOL}, "

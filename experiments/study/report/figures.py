@@ -22,8 +22,10 @@ from experiments.study.analysis.paper import (
     FRESH,
     IDENTIFIED,
     IS2R,
+    LAST,
     LEVELS,
     ORACLE,
+    OTHER_WORLDS,
     RANDOMISED,
     S2R,
     SHORT,
@@ -47,6 +49,7 @@ from experiments.study.report.style import (
     note_empty,
     of_player,
     patches,
+    played,
     player_label,
     styled,
 )
@@ -79,13 +82,14 @@ def _prefix(method: str) -> str:
 @styled
 def aggregated(study: Study, m: Measurements) -> Figure | None:
     """Boxes of the rally lengths, raw and normalised, and their histogram (all_player_results)."""
-    if not has(m.raw, FINAL):
+    if not has(m.raw, LAST):
         return None
     figure = Figure(figsize=(11, 3.9))
     left, centre, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.25))
-    boxes(left, [lengths(m.raw, key, "all") for key in FINAL], FINAL, "rally length", log=True)
+    keys, normalised = played(m.raw, LAST), played(m.normalised, LAST)
+    boxes(left, [lengths(m.raw, key, "all") for key in keys], keys, "rally length", log=True)
     left.set_title("Rally length, all players")
-    boxes(centre, [lengths(m.normalised, key, "all") for key in FINAL], FINAL, "normalised rally length")
+    boxes(centre, [lengths(m.normalised, key, "all") for key in normalised], normalised, "normalised rally length")
     centre.set_title("Normalised by player")
     _histogram(right, m)
     if right.has_data():
@@ -95,12 +99,13 @@ def aggregated(study: Study, m: Measurements) -> Figure | None:
 
 def _histogram(axes: Axes, m: Measurements) -> None:
     edges = np.array([2, *range(5, LONGEST + 1, 5), LONGEST + 1])
-    shown = ("is2r-ft100", "s2r-ft100")
-    for key, offset in zip(shown, (-0.21, 0.21), strict=True):
+    shown = played(m.raw, ("is2r-ft100", "s2r-ft100", "id-ft100"))
+    width = 0.84 / max(len(shown), 1)
+    for k, key in enumerate(shown):
         values = lengths(m.raw, key, "all")
-        if values.size:
-            share = np.histogram(np.clip(values, edges[0], LONGEST), edges)[0] / values.size
-            axes.bar(np.arange(share.size) + offset, 100 * share, 0.4, color=colour(key), label=SHORT[key])
+        share = np.histogram(np.clip(values, edges[0], LONGEST), edges)[0] / values.size
+        place = np.arange(share.size) + (k - 0.5 * (len(shown) - 1)) * width
+        axes.bar(place, 100 * share, 0.95 * width, color=colour(key), label=SHORT[key])
     names = [f"{a}-{b - 1}" for a, b in pairwise(edges[:-1])] + [f"{LONGEST}+"]
     axes.set_xticks(range(len(names)), names, rotation=60, fontsize=8)
     axes.set_xlabel("rally length")
@@ -111,15 +116,16 @@ def _histogram(axes: Axes, m: Measurements) -> None:
 @styled
 def means(study: Study, m: Measurements, group: str = "all") -> Figure | None:
     """Mean normalised length, its boxes, mean length (app_summary; without the advanced player: its outlier figure)."""
-    if not has(m.raw, FINAL):
+    if not has(m.raw, LAST):
         return None
     figure = Figure(figsize=(11, 3.7))
     left, centre, right = figure.subplots(1, 3)
-    bars(left, [mean_of(m.normalised, key, group) for key in FINAL], FINAL, "normalised rally length")
+    keys, normalised = played(m.raw, LAST), played(m.normalised, LAST)
+    bars(left, [mean_of(m.normalised, key, group) for key in normalised], normalised, "normalised rally length")
     left.set_title("Mean normalised rally length")
-    boxes(centre, [lengths(m.normalised, key, group) for key in FINAL], FINAL, "normalised rally length")
+    boxes(centre, [lengths(m.normalised, key, group) for key in normalised], normalised, "normalised rally length")
     centre.set_title("Normalised rally length")
-    bars(right, [mean_of(m.raw, key, group) for key in FINAL], FINAL, "rally length")
+    bars(right, [mean_of(m.raw, key, group) for key in keys], keys, "rally length")
     right.set_title("Mean rally length")
     return figure
 
@@ -127,13 +133,14 @@ def means(study: Study, m: Measurements, group: str = "all") -> Figure | None:
 @styled
 def by_skill(study: Study, m: Measurements) -> Figure | None:
     """Boxes above, means below, by skill level (main_summary_by_skill_level, app_summary_by_skill_level_means)."""
-    if not has(m.raw, FINAL):
+    if not has(m.raw, LAST):
         return None
     figure = Figure(figsize=(11, 6.8))
     for column, (upper, lower) in zip(LEVELS, figure.subplots(2, 3).T, strict=True):
-        boxes(upper, [lengths(m.raw, key, column) for key in FINAL], FINAL, "rally length", log=True)
+        keys = played(m.raw, LAST)
+        boxes(upper, [lengths(m.raw, key, column) for key in keys], keys, "rally length", log=True)
         upper.set_title(level_label(column))
-        bars(lower, [mean_of(m.raw, key, column) for key in FINAL], FINAL, "mean rally length, 95 %")
+        bars(lower, [mean_of(m.raw, key, column) for key in keys], keys, "mean rally length, 95 %")
     return figure
 
 
@@ -190,7 +197,7 @@ def checkpoints(study: Study, m: Measurements, normalise: bool = False) -> Figur
 @styled
 def cross(study: Study, m: Measurements) -> Figure | None:
     """Own and cross-evaluations: mean length, mean normalised length, share that is kept (main_cross_eval_summary)."""
-    if not has(m.raw, FINAL):
+    if not any(cell[1] != cell[2] for cell in m.raw.cells):
         return None
     figure = Figure(figsize=(11, 3.9))
     left, centre, right = figure.subplots(1, 3)
@@ -234,7 +241,7 @@ def cross(study: Study, m: Measurements) -> Figure | None:
 @styled
 def cross_by_player(study: Study, m: Measurements) -> Figure | None:
     """Mean and normalised length of each trainer's policies with each evaluator (app:cross_eval_details)."""
-    if not has(m.raw, FINAL):
+    if not any(cell[1] != cell[2] for cell in m.raw.cells):
         return None
     trainers = study.players
     figure = Figure(figsize=(10, 2.2 * len(trainers)))
@@ -259,15 +266,16 @@ def cross_by_player(study: Study, m: Measurements) -> Figure | None:
 
 @styled
 def by_player(study: Study, m: Measurements) -> Figure | None:
-    """Mean and distribution of the rally length of the ten models, player by player (app:trainer_details)."""
-    if not has(m.raw, TEN):
+    """Mean and distribution of the rally length of each model, player by player (app:trainer_details)."""
+    keys = played(m.raw, (*TEN, *(model.key for model in OTHER_WORLDS)))
+    if not keys:
         return None
     figure = Figure(figsize=(11, 2.35 * len(study.players)))
     grid = figure.subplots(len(study.players), 2, squeeze=False)
     for row, ((left, right), player) in enumerate(zip(grid, study.players, strict=True)):
         last = row == len(study.players) - 1
-        bars(left, [evaluated(m.raw, player, player, key) for key in TEN], TEN, "mean, 95 %", last)
-        boxes(right, [of_player(m.raw, player, key) for key in TEN], TEN, "rally length", log=True, labelled=last)
+        bars(left, [evaluated(m.raw, player, player, key) for key in keys], keys, "mean, 95 %", last)
+        boxes(right, [of_player(m.raw, player, key) for key in keys], keys, "rally length", log=True, labelled=last)
         left.set_title(f"{player_label(player).capitalize()}")
         left.axhline(registry.skill(player).mean, color=INK, linestyle="--", linewidth=1.0)
     line = Line2D([], [], color=INK, linestyle="--", linewidth=1.0, label="paper: mean over the ten models")

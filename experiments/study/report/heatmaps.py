@@ -28,7 +28,7 @@ from experiments.study.report.style import colour, player_label, styled
 from mjx_tt.viz.html import FAINT, INK
 
 CELLS = 3
-METHODS = ("is2r-ft100", "s2r-ft100")
+METHODS = ("is2r-ft100", "s2r-ft100", "id-ft100")  # the first two that a study has
 GAP = 0.35  # between the large cells, in squares
 Grids = tuple[np.ndarray, np.ndarray]  # counts and returned counts, both (3, 3, 3, 3)
 
@@ -65,13 +65,14 @@ def outgoing(logs: list[BallLog]) -> Grids:
 
 @styled
 def heatmaps(study: Study, which: Callable[[list[BallLog]], Grids]) -> Figure | None:
-    """One row per player, i-S2R left and S2R+FT right. which: ``incoming`` or ``outgoing``."""
-    rows = [p for p in study.players if any(study.logs(p, key) for key in METHODS)]
+    """One row per player, one column per method. which: ``incoming`` or ``outgoing``."""
+    methods = [key for key in METHODS if any(study.logs(p, key) for p in study.players)][:2]
+    rows = [p for p in study.players if any(study.logs(p, key) for key in methods)]
     if not rows:
         return None
-    figure = Figure(figsize=(9.2, 4.75 * len(rows) + 0.6))
-    for axes_row, player in zip(figure.subplots(len(rows), 2, squeeze=False), rows, strict=True):
-        for axes, key in zip(axes_row, METHODS, strict=True):
+    figure = Figure(figsize=(4.6 * len(methods), 4.75 * len(rows) + 0.6))
+    for axes_row, player in zip(figure.subplots(len(rows), len(methods), squeeze=False), rows, strict=True):
+        for axes, key in zip(axes_row, methods, strict=True):
             logs = study.logs(player, key)
             axes.set_axis_off()
             if not logs:

@@ -227,7 +227,12 @@ def evaluated(boot: Bootstrap, trainer: str, evaluator: str, key: str) -> Interv
 
 def has(boot: Bootstrap, keys: Sequence[str]) -> bool:
     """True for a bootstrap that holds any of the models."""
-    return any(cell[3] in keys for cell in boot.cells)
+    return bool(played(boot, keys))
+
+
+def played(boot: Bootstrap, keys: Sequence[str], trainer: str | None = None) -> list[str]:
+    """Those of the models that a bootstrap holds, of one trainer or of any."""
+    return [key for key in keys if any(c[3] == key and trainer in (None, c[1]) for c in boot.cells)]
 
 
 def interval_of(estimate: Estimate | None) -> Interval | None:

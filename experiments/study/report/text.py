@@ -14,20 +14,20 @@ from experiments.study.analysis.claims import (
     Finding,
     Measurements,
 )
-from experiments.study.analysis.paper import LEVELS, SHORT, of_level
+from experiments.study.analysis.paper import FINAL, LEVELS, SHORT, of_level
 from experiments.study.analysis.statistics import Interval
 
 
 def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:
     """The findings in plain words, only of what was measured."""
-    out = []
+    out = _loop(m)
     intervals = {key: f.interval for key, f in found.items() if f.interval is not None}
 
     def measured(*keys: str) -> list[str]:
         return [key for key in keys if key in intervals]
 
     if measured("all-ratio"):
-        means = ((name, m.raw.mean(key, of_level("all"))) for key, name in SHORT.items())
+        means = ((SHORT[key], m.raw.mean(key, of_level("all"))) for key in FINAL)
         text = ", ".join(f"{name} {mean.value:.1f}" for name, mean in means if mean is not None)
         out.append(f"Mean rally length in hits: {text}.")
         out.append(
@@ -80,13 +80,40 @@ def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:
         )
     counts = {v: [f for f in found.values() if f.verdict == v] for v in VERDICTS}
     out.append(
-        f"Of {len(found)} claims of the paper, {len(counts[AGREES])} agree, {len(counts[DIRECTION])} agree in "
-        "direction, "
-        f"{len(counts[DIFFERS])} differ, {len(counts[UNDECIDED])} are undecided and {len(counts[NOT_COMPARABLE])} "
-        "not comparable."
+        f"Of {len(found)} claims of the paper {len(counts[AGREES])} agree, {len(counts[DIRECTION])} in direction only, "
+        f"{len(counts[DIFFERS])} differ, {len(counts[UNDECIDED])} cannot be decided and {len(counts[NOT_COMPARABLE])} "
+        "not be compared."
     )
     differ = " ".join(f.claim.text for f in counts[DIFFERS])
     return [*out, f"What differs: {differ}"] if differ else out
+
+
+def _loop(m: Measurements) -> list[str]:
+    """Sentences on what the human model brings, and what identification does."""
+    out = []
+
+    def ratio(a: str, b: str) -> str | None:
+        """How many times as long, with the interval."""
+        estimate = m.ratio(a, b, "all")
+        if estimate is None:
+            return None
+        i = estimate.interval
+        return f"{i.value:.2f} times ({i.low:.2f} to {i.high:.2f})"
+
+    if rounds := ratio("is2r-sim3", "is2r-sim1"):
+        out.append(
+            "Before they are fine-tuned, policies of the third simulation, which knows the person's balls, play "
+            f"rallies that are {rounds} as long as those of the first."
+        )
+    if known := ratio("id-sim3", "is2r-sim3"):
+        first = ratio("id-sim3", "is2r-sim1")
+        out.append(
+            f"Where the simulation is identified besides, they are {known} as long as where it is not, and {first} as "
+            "long as those of the first simulation, which knows neither."
+        )
+    if tuned := ratio("id-ft100", "is2r-ft100"):
+        out.append(f"After the last fine-tuning they are {tuned} as long as without identification.")
+    return out
 
 
 def compared(ratio: Interval) -> str:

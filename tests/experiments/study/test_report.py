@@ -26,7 +26,7 @@ from experiments.study.analysis import paper as study_paper
 from experiments.study.analysis import study_folder as study_data
 from experiments.study.analysis.claims import DIFFERENCE, HITS, RATIO, SHARE, judge
 from experiments.study.analysis.statistics import Bootstrap, Interval
-from experiments.study.report import heatmaps, tsne
+from experiments.study.report import figures, heatmaps, page, text, tsne
 from mjx_tt.rally.end_reasons import End
 from tests.support import made_up_study
 
@@ -379,6 +379,37 @@ def test_a_study_that_has_just_begun_has_a_report(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match="is no study"):
         study_data.load(tmp_path / "empty")
+
+
+def test_a_study_of_chosen_methods_is_whole_and_says_first_what_identification_brings(tmp_path):
+    """Rallies of one length per policy, so that every ratio is known; the other methods are left out on purpose."""
+    touches = {"sim1": (5, 6), "ft35": (6, 7), "sim2": (8, 20), "ft65": (9, 30), "sim3": (10, 45), "ft100": (20, 50)}
+    lengths = {
+        (seed, player, player, f"{method}-{stage}"): np.full(60, touches[stage][i])
+        for seed in range(5)
+        for player in study_paper.BY_SKILL
+        for i, method in enumerate(("is2r", "id"))
+        for stage in touches
+    }
+    scoring.write(tmp_path / "evaluations.csv", rallies(lengths))
+    settings = "name: chosen\nbaselines: is2r\nidentification: {}\nevaluation: {cross: false}\n"
+    (tmp_path / "study.yaml").write_text(settings)
+    study = study_data.load(tmp_path)
+    assert study.left_out == ["S2R", "S2R-Oracle", "rallies with players who did not train the policy"]
+    assert [line for line in study.missing if "human model" not in line] == []
+    report = page.Report(study)
+    said = text.sentences(report.measured, report.findings)
+    assert "2.00 times (2.00 to 2.00) as long as those of the first." in said[0]
+    assert "4.50 times (4.50 to 4.50) as long as where it is not, and 9.00 times" in said[1]
+    assert "2.50 times" in said[2] and "fine-tuning" in said[2]
+    assert figures.cross(study, report.measured) is None  # not bars of the own players alone
+    for axes in figures.by_skill(study, report.measured).axes:  # no empty place for a method that was left out
+        assert [label.get_text() for label in axes.get_xticklabels()] == ["i-S2R", "identified"]
+
+    (tmp_path / "study.yaml").write_text("name: whole\n")  # where all was asked for, it is missing
+    study = study_data.load(tmp_path)
+    assert study.left_out == [] and "seed 4, player1: cross-evaluation by player4, player5" in study.missing
+    assert "seed 0, player3: evaluation of s2r-ft65, s2r-ft100, oracle-sim, oracle-ft" in study.missing
 
 
 def test_a_folder_of_ordinary_trainings_is_no_study(tmp_path, capsys):
