@@ -85,7 +85,7 @@ def sentences(m: Measurements, found: dict[str, Finding]) -> list[str]:
         "not be compared."
     )
     differ = " ".join(f.claim.text for f in counts[DIFFERS])
-    return [*out, f"What differs: {differ}"] if differ else out
+    return [*out, f"The paper's claims that differ: {differ}"] if differ else out
 
 
 def _loop(m: Measurements) -> list[str]:
