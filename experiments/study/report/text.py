@@ -93,7 +93,7 @@ def _loop(m: Measurements) -> list[str]:
     out = []
 
     def ratio(a: str, b: str) -> str | None:
-        """How many times as long, with the interval."""
+        """Ratio of mean rally lengths in words, with its interval."""
         estimate = m.ratio(a, b, "all")
         if estimate is None:
             return None
