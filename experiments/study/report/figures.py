@@ -133,11 +133,11 @@ def means(study: Study, m: Measurements, group: str = "all") -> Figure | None:
 @styled
 def by_skill(study: Study, m: Measurements) -> Figure | None:
     """Boxes above, means below, by skill level (main_summary_by_skill_level, app_summary_by_skill_level_means)."""
-    if not has(m.raw, LAST):
+    keys = played(m.raw, LAST)
+    if not keys:
         return None
     figure = Figure(figsize=(11, 6.8))
     for column, (upper, lower) in zip(LEVELS, figure.subplots(2, 3).T, strict=True):
-        keys = played(m.raw, LAST)
         boxes(upper, [lengths(m.raw, key, column) for key in keys], keys, "rally length", log=True)
         upper.set_title(level_label(column))
         bars(lower, [mean_of(m.raw, key, column) for key in keys], keys, "mean rally length, 95 %")

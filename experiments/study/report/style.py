@@ -230,9 +230,9 @@ def has(boot: Bootstrap, keys: Sequence[str]) -> bool:
     return bool(played(boot, keys))
 
 
-def played(boot: Bootstrap, keys: Sequence[str], trainer: str | None = None) -> list[str]:
-    """Those of the models that a bootstrap holds, of one trainer or of any."""
-    return [key for key in keys if any(c[3] == key and trainer in (None, c[1]) for c in boot.cells)]
+def played(boot: Bootstrap, keys: Sequence[str]) -> list[str]:
+    """Those of the models that a bootstrap holds."""
+    return [key for key in keys if any(cell[3] == key for cell in boot.cells)]
 
 
 def interval_of(estimate: Estimate | None) -> Interval | None:
