@@ -216,10 +216,8 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
 
 def jax_export(policy: Policy) -> bytes:
     """The policy with its numbers inside, serialised by ``jax.export`` for the CPU, any batch size."""
-    function = jax.jit(partial(_forward, policy))
     shape = jax.export.symbolic_shape(f"{contract.HISTORY}, {policy.n_observation}, batch")
-    exported = jax.export.export(function, platforms=["cpu"])(jax.ShapeDtypeStruct(shape, jnp.float32))
-    return bytes(exported.serialize())
+    return jax_network.serialised(partial(_forward, policy), jax.ShapeDtypeStruct(shape, jnp.float32))
 
 
 def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: contract.Contract) -> dict[str, bytes]:

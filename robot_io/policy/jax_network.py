@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -13,6 +14,8 @@ import numpy as np
 from robot_io import contract
 from robot_io.policy.own_network import ExportedNetwork
 from robot_io.policy.policy import Policy
+
+_FRAMES = "jax_traceback_in_locations_limit"
 
 
 class ExportedPolicy:
@@ -80,8 +83,25 @@ def exported(network: Any, n_observation: int = contract.N_OBSERVATION) -> Expor
             return jnp.clip(jnp.asarray(action), -1.0, 1.0), tuple(map(jnp.asarray, jax.tree.leaves(after)))
 
     arguments = [number(network.size), x, x, jax.ShapeDtypeStruct((), bool), tuple(jax.tree.leaves(state)), x]
-    content = jax.export.export(jax.jit(step), platforms=["cpu"])(*arguments)
-    return ExportedNetwork(network.name, tuple(network.shapes.items()), bytes(content.serialize()), network.source)
+    content = serialised(step, *arguments)
+    return ExportedNetwork(network.name, tuple(network.shapes.items()), content, network.source)
+
+
+def serialised(function: Callable[..., Any], *shapes: Any) -> bytes:
+    """A function as ``jax.export`` writes it for the CPU, without the places in source files that it was traced from.
+
+    A policy is passed on; the folders of the machine that exported it are nobody's business. shapes: of its arguments.
+    """
+
+    def anew(*arguments: Any) -> Any:  # of a function that was compiled before, JAX keeps the places
+        return function(*arguments)
+
+    frames = getattr(jax.config, _FRAMES)
+    jax.config.update(_FRAMES, 0)
+    try:
+        return bytes(jax.export.export(jax.jit(anew), platforms=["cpu"])(*shapes).serialize())
+    finally:
+        jax.config.update(_FRAMES, frames)
 
 
 def reference(network: Any, policy: Policy, observations: np.ndarray) -> np.ndarray:

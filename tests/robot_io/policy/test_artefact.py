@@ -189,6 +189,14 @@ def test_stored_forms_load_without_this_package_and_agree(exported, batch):
     np.testing.assert_allclose(jax_action, expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("made", ["here", "shipped"])
+def test_no_file_names_a_place_on_the_machine_that_wrote_it(exported, made):
+    folder = exported[0] if made == "here" else ROOT / "experiments/shipped/policies/quickstart"
+    for file in folder.iterdir():
+        content = file.read_bytes()
+        assert str(ROOT).encode() not in content and b".py" not in content, file.name
+
+
 def test_constant_component_of_the_normaliser_has_no_effect(tmp_path):
     policy = _policy()
     policy.inv_std[4] = 0.0
