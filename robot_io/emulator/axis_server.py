@@ -96,17 +96,18 @@ class AxisServer:
         server = _SingleConnectionServer(
             device,
             (self._host, self.port),
-            ModbusDeviceIdentification(info_name=IDENTITY),
             self._check,
+            lambda: self._bank.disconnected,
         )
         await server.serve_forever(background=True)
         # What pymodbus declares as a transport is the server of asyncio while it listens.
         self.port = cast(asyncio.Server, server.transport).sockets[0].getsockname()[1]
         self._started.set()
         try:
+            silent = False
             while not self._finish.is_set():
-                server.closed = self._bank.disconnected
-                if self._bank.disconnected or self._bank.guard_tripped:
+                plugged, silent = silent and not self._bank.disconnected, self._bank.disconnected
+                if plugged or self._bank.guard_tripped:
                     self._bank.guard_tripped = False
                     server.drop()
                 self.refused = server.refused
@@ -152,26 +153,37 @@ class AxisServer:
 
 
 class _SingleConnectionServer(ModbusTcpServer):
+    """disconnected: tells whether the cable is out. Then nothing is answered, and what arrives does nothing."""
+
     def __init__(
         self,
         device: SimDevice,
         address: tuple[str, int],
-        identity: ModbusDeviceIdentification,
         trace_pdu: Callable[[bool, ModbusPDU], ModbusPDU],
+        disconnected: Callable[[], bool],
     ) -> None:
-        super().__init__(device, address=address, identity=identity, trace_pdu=trace_pdu)
-        self.closed = False
+        def wire(sending: bool, data: bytes) -> bytes:
+            return b"" if sending and disconnected() else data
+
+        identity = ModbusDeviceIdentification(info_name=IDENTITY)
+        super().__init__(device, address=address, identity=identity, trace_packet=wire, trace_pdu=trace_pdu)
+        self._disconnected, self._unanswered = disconnected, set[_Unanswered]()
         self.refused = 0
 
     def handle_new_connection(self) -> ModbusProtocol:
-        if self.closed or self.active_connections:
+        """asyncio, the caller, needs no more than a protocol."""
+        if self._disconnected():  # the kernel has accepted it, which no cable does; it hears nothing of that
+            return cast(ModbusProtocol, _Unanswered(self._unanswered))
+        if self.active_connections:
             self.refused += 1
-            return cast(ModbusProtocol, _Refusal())  # asyncio, the caller, needs no more than a protocol
+            return cast(ModbusProtocol, _Refusal())
         return super().handle_new_connection()
 
     def drop(self) -> None:
         for connection in list(self.active_connections.values()):
             connection.close()
+        for unanswered in list(self._unanswered):
+            unanswered.close()
 
 
 class _Refusal(asyncio.Protocol):
@@ -179,6 +191,23 @@ class _Refusal(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         cast(asyncio.Transport, transport).abort()
+
+
+class _Unanswered(asyncio.Protocol):
+    """A connection to a drive whose cable is out; one of ``all_of_them`` until it ends."""
+
+    def __init__(self, all_of_them: set[_Unanswered]) -> None:
+        self._all = all_of_them
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        self._all.add(self)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._all.discard(self)
+
+    def close(self) -> None:
+        self._transport.abort()
 
 
 async def _wait(event: asyncio.Event, seconds: float) -> None:

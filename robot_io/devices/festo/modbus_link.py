@@ -7,6 +7,7 @@ import time
 from typing import Protocol
 
 from pymodbus.client import ModbusTcpClient
+from pymodbus.exceptions import ModbusIOException
 from pymodbus.pdu import ExceptionResponse
 
 DEFAULT_PORT = 502
@@ -78,7 +79,7 @@ class ModbusLink:
         self._where = f"axis at {address} port {port}, device id {device_id}"
         logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)  # AxisLost tells the same, once
         self._client = ModbusTcpClient(address, port=port, timeout=timeout, retries=0)
-        self._device_id = device_id
+        self._device_id, self._timeout = device_id, timeout
         self._combined = combined
         self._next_attempt = 0.0
 
@@ -98,6 +99,9 @@ class ModbusLink:
                 answer = self._client.write_registers(write_address, values, device_id=self._device_id)
                 if not answer.isError():
                     answer = self._client.read_holding_registers(read_address, count=count, device_id=self._device_id)
+        except ModbusIOException as error:
+            reason = f"no sound answer within {self._timeout:g} s: is it powered, is the cable in?"
+            raise self._lost(reason) from error
         except (
             Exception
         ) as error:  # whatever a damaged answer or a dying socket raises inside pymodbus: the axis is lost

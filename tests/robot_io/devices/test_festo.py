@@ -158,6 +158,12 @@ def test_modbus_link_says_what_is_wrong():
         bad_address = ModbusLink("127.0.0.1", server.port, timeout=1.0)
         with pytest.raises(AxisLost, match="registers 0 and 300: illegal data address"):
             bad_address.exchange(0, image, 300, 2)
+        time.sleep(0.05)
+        good = ModbusLink("127.0.0.1", server.port, timeout=0.2)
+        good.exchange(0, image, 100, 28)
+        emulator.disconnect()
+        with pytest.raises(AxisLost, match="no sound answer within 0.2 s: .* is the cable in?"):
+            good.exchange(0, image, 100, 28)
     with pytest.raises(AxisLost, match="not connected"):  # and does not try again at once
         bad_address.exchange(0, image, 100, 28)
     with pytest.raises(AxisLost, match="no connection"):

@@ -372,13 +372,30 @@ def test_a_second_client_is_refused(served):
     assert ask(server, frame(0x03, struct.pack(">HH", 100, 1)))[7:9] == b"\x03\x02"  # free again
 
 
-def test_a_pulled_cable_closes_the_connection(served):
+def test_a_pulled_cable_is_silence(served):
+    """No answer, no end of the connection, nothing done: until it is plugged in, when old connections are gone."""
     emulator, server = served
+    request = frame(0x17, read_write())
     with socket.create_connection(("127.0.0.1", server.port), timeout=2.0) as connection:
-        connection.sendall(frame(0x03, struct.pack(">HH", 100, 1)))
-        assert connection.recv(100)
+        connection.sendall(request)
+        assert connection.recv(100) and emulator.images == 1
         emulator.disconnect()
-        assert connection.recv(100) == b""
+        connection.settimeout(0.3)
+        connection.sendall(request)
+        with pytest.raises(TimeoutError):
+            connection.recv(100)
+        with socket.create_connection(("127.0.0.1", server.port), timeout=0.3) as another:
+            another.sendall(request)
+            with pytest.raises(TimeoutError):
+                another.recv(100)
+            assert emulator.images == 1
+            emulator.reconnect()
+            for old in (connection, another):
+                try:
+                    assert old.recv(100) == b""
+                except ConnectionResetError:
+                    pass
+    assert ask(server, request)[7] == 0x17 and emulator.images == 2
 
 
 def test_a_port_in_use(served):
