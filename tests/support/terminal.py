@@ -62,7 +62,7 @@ class Terminal:
         return ESCAPES.sub("", self._text)
 
     def wait(self, pattern: str, seconds: float = 20.0) -> str:
-        """What was shown since the last key, once ``pattern`` is in it."""
+        """Text shown since the last key, once ``pattern`` is in it."""
         end = time.monotonic() + seconds
         while not re.search(pattern, text := self.read(0.1)):
             assert time.monotonic() < end, f"{pattern!r} was not shown within {seconds:g} s, but:\n{text[-4000:]}"
