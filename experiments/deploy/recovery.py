@@ -5,7 +5,7 @@ from __future__ import annotations
 from robot_io.control.messages import Arm, Prepare, Refused, Request, Reset, Status
 from robot_io.safety.faults import Cause
 
-LONGEST = 20.0  # [s] from the key until the robot is armed
+LONGEST = 20.0  # [s] from the key, or from the end of the axes' search, until the robot is armed
 
 
 class Recovery:
@@ -39,6 +39,8 @@ class Recovery:
         """Request that is due in this state; None: wait. Raises TimeoutError with what is missing."""
         self._by_itself = self._emulated or (self._by_itself and only_unprepared(status))
         reasons = "; ".join(filter(None, [status.missing, *status.present.values()]))
+        if status.homing:  # which has a time limit of its own
+            self._end = now + LONGEST
         if now > self._end:
             reasons = "; ".join(filter(None, [self._refusal, reasons]))
             raise TimeoutError(f"not recovered within {LONGEST:g} s: {reasons or status.state}")

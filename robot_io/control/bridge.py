@@ -83,7 +83,7 @@ class Bridge:
         self.feedback = Feedback(ball=self.play.strokes.track, axes=History(256), arm=ArmHistory(256))  # a second
         self._blade = partial(blade, self.feedback, self._geometry)
         seen = partial(joints, self.feedback, contract)
-        self._homing = HomingGuard(arm, axes, seen, self._geometry, contract, gate.config.still)
+        self._homing = HomingGuard(arm, axes, seen, self._geometry, contract, gate.config.still, config.overtravel)
         self._state = BridgeState.DISARMED
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
@@ -95,8 +95,7 @@ class Bridge:
         braking = config.home_braking * np.array(contract.limits.acceleration)
         self._way_home = WayHome(gate, contract.limits, speed, braking)
         self._logged_faults = self._clock_windows = 0
-        self.unlogged = 0  # records that could not be logged
-        self._reported_unlogged = 0
+        self.unlogged = self._reported_unlogged = 0  # records that could not be logged
         self._log_failure = ""  # why the log's file cannot be written
         self._errors: set[str] = set()  # of the program, each logged once
         self._stopping_since, self.stopped_because = -math.inf, ""  # the reason of a stop that no operator asked for
@@ -159,16 +158,17 @@ class Bridge:
 
     def stop(self, now: float, because: str = "") -> None:
         """The operator's stop, or one for a reason: slows down, holds, ends DISARMED. Axes that search a zero stop."""
+        self.stopped_because = because or self.stopped_because
         if self.state in (BridgeState.READY, BridgeState.ACTIVE):
             self.gate.brake(now)
-            self._stopping_since, self.stopped_because = now, because
+            self._stopping_since = now
             self._change(BridgeState.STOPPING, now, because or "stopped by the operator")
             with self._guarded(now):
                 self.play.abort("stopped", now)
         elif self.gate.at_rest:  # otherwise the gate brakes them
             self.axes.stop()
-        if not because:
-            self.event(now, Level.INFO, "operator", "stop")
+        if not because or self._state is BridgeState.DISARMED:
+            self.event(now, Level.INFO, "operator", because or "stop")
 
     def reset(self, now: float) -> None:
         """FAULT to DISARMED. Raises RefusedError without a fault, while a cause is present or the robot still moves."""
@@ -312,8 +312,8 @@ class Bridge:
         """Tells the gate what is wrong with the devices."""
         since_tick = 0.0 if self._last_tick == -math.inf else now - self._last_tick
         self._last_tick = now
-        playing = self.state is BridgeState.ACTIVE
-        self.gate.check(now, *self._ages(now), playing, since_tick)
+        self.gate.check(now, *self._ages(now), self.state is BridgeState.ACTIVE, since_tick)
+        self.gate.unreferenced = not self.axes.homed
         arm, axes = self.arm_session.problem(now), self.axes.problem(now)
         self.gate.condition(Cause.ARM_NOT_READY, arm is not None, arm or "", now)
         # Axes are homed only without a fault: that they must be does not keep one from being reset.

@@ -45,6 +45,7 @@ RANGES = {
     "axes_motion.acknowledge_timeout": (0.1, 10.0),
     "axes_motion.enable_timeout": (0.1, 30.0),
     "axes_motion.homing_timeout": (0.1, 120.0),
+    "axes_motion.overtravel": (0.0, 0.5),
     "tracker.port": PORT,
     "tracker.source_port": PORT,
     "tracker.oldest": (0.01, 0.2),

@@ -45,6 +45,9 @@ class Axes(Protocol):
     def command(self, position: np.ndarray, velocity: np.ndarray, now: float) -> None: ...
 
     @property
+    def homed(self) -> bool: ...
+
+    @property
     def homing(self) -> bool: ...
 
     def stop(self) -> None: ...
@@ -65,6 +68,7 @@ class BridgeConfig:
     box              what the policy was trained for; None: no ball is out of distribution
     base             where the robot stands, from where the model has it
     jog              once armed it stays where it is, takes no balls and moves as ``jog`` asks
+    overtravel       [m] beyond their range that the linear axes may go while they search their references
     contract         of the robot
     """
 
@@ -75,6 +79,7 @@ class BridgeConfig:
     box: Box | None = None
     base: Frame = HERE
     jog: bool = False
+    overtravel: float = 0.0
     contract: Contract = PAPER
 
 

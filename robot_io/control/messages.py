@@ -172,6 +172,7 @@ class Status:
     state           value of the ``BridgeState``
     present         sentences of conditions that keep the robot from being armed, by cause
     arm, axes, tracker  the reason why each cannot be used, or None
+    homing          the axes search their references
     preparable      the axes' reason is none that Prepare does not mend: they are switched off or not homed
     joints          name, unit, measured position, commanded velocity of each joint
     ball            (3) [m] where the tracker's newest frame shows it, in the table frame; None: nowhere
@@ -207,6 +208,7 @@ class Status:
     longest_rally: int = 0
     last_rally: str = ""
     preparable: bool = False
+    homing: bool = False
     egm: dict[str, Any] = field(default_factory=dict)
     tracker_counts: dict[str, int] = field(default_factory=dict)
     axes_cycles: int = 0
@@ -253,6 +255,7 @@ class Status:
             longest_rally=counts.rallies.longest,
             last_rally=counts.rallies.last,
             preparable=axes.preparable(now),
+            homing=axes.homing,
             egm=asdict(session.statistics),
             tracker_counts=dict(tracker.counts),
             axes_cycles=axes.cycles,

@@ -135,13 +135,17 @@ class Control:
             )
             self._axes = self._open(axes or AxesThread(linear_axes(config, contract)))
             self._tracker = Tracker(config.tracker, config.calibration)
+            beyond = config.axes_motion.overtravel
+            play = BridgeConfig(
+                config.delays, box=options.box, base=found.base, jog=options.jog, overtravel=beyond, contract=contract
+            )
             self.bridge = Bridge(
                 self._session,
                 self._axes,
                 self._tracker,
                 gate,
                 policy,
-                BridgeConfig(config.delays, box=options.box, base=found.base, jog=options.jog, contract=contract),
+                play,
                 recorder,
                 self._episode,
                 lambda summary: self._send(messages.RallyOver(summary)),
@@ -295,7 +299,7 @@ class Control:
 
     def _tick(self, deadline: float, now: float) -> None:
         silent = self._owner.ticked(now)
-        if silent and self.bridge.state in (BridgeState.READY, BridgeState.ACTIVE):
+        if silent and (self.bridge.state in (BridgeState.READY, BridgeState.ACTIVE) or self._axes.homing):
             self.bridge.stop(now, silent)
         self._take_axes()
         self.bridge.tick(deadline, now)

@@ -142,6 +142,11 @@ class AxisEmulator:
         with self._lock:
             self.drive.fault(code)
 
+    def power_cycle(self, reading: float) -> None:
+        """The drive's supply is switched off and on: it has no reference, and reads ``reading`` [m] where it stands."""
+        with self._lock:
+            self.drive.restart(reading)
+
     def disconnect(self) -> None:
         """The cable is pulled: nothing gets through until ``reconnect``."""
         self.disconnected = True

@@ -153,6 +153,12 @@ class Drive:
         self._area += 0.5 * (before + self.x) * dt
         self._past.add(now, self.x, self._area)
 
+    def restart(self, reading: float) -> None:
+        """Its supply was gone for a moment: no power, no reference, and ``reading`` [m] where it stands."""
+        self.power, self.fault_code = Power.INHIBITED, 0
+        self.homed = self.homing = self.task = self.paused = False
+        self.x, self.v, self.origin = self._position, 0.0, self._position - reading
+
     def set_point(self) -> float:
         """Velocity [m/s] for the plant: the smoothed generated one and the position controller's."""
         window, x, v = self.params.smoothing, self.x, self.v

@@ -22,6 +22,7 @@ from robot_io.contract import CONTROL_RATE, LIMITS, JointLimits
 from robot_io.errors import JogFirstError, RefusedError, said
 from robot_io.limits import limit_velocity
 from robot_io.safety.clearance import RobotGeometry
+from robot_io.safety.coasting import PATIENCE, Coasting
 from robot_io.safety.config import SLACK
 from robot_io.safety.config import SafetyConfig as SafetyConfig
 from robot_io.safety.faults import Cause, Fault, FaultLatch
@@ -125,8 +126,13 @@ class SafetyGate:
         self._offset = np.zeros(n)  # the same, remembered while the reference moves
         self._measured_velocity: np.ndarray | None = None
         self._last: float | None = None  # time of the command before
+        self._gap = 0.0  # [s] from it to the newest
+        self._coasting = Coasting(period, self._a)  # as the devices are told it
         self._lead = 0.0  # [s] that commands are ahead of the clock
         self._armed_at = 0.0
+        # The linear axes do not know where they are. Set by whoever sees them; while nothing moves, what they say then
+        # is no limit or contact that keeps a fault from being reset: axes are homed only without one.
+        self.unreferenced = False
 
     @property
     def state(self) -> GateState:
@@ -203,7 +209,9 @@ class SafetyGate:
             i = int(outside.argmax())
             allowed = f"[{self._low[i]:.4f}, {self._high[i]:.4f}] {self.geometry.units[i]}"
             found = f"{self.geometry.joints[i]} is at {position[i]:.4f}"
-            raise JogFirstError(f"not armed: {found}, allowed is {allowed}; jog it back")
+            by_hand = "move it by its drive's own program, or by hand without power"
+            how = by_hand if self.geometry.units[i] == "m" else "jog it back"
+            raise JogFirstError(f"not armed: {found}, allowed is {allowed}; {how}")
         touching = self._monitor.contact(position)
         if touching:
             raise JogFirstError(f"not armed: {touching}; jog it away")
@@ -292,6 +300,7 @@ class SafetyGate:
         """
         now = self._timing(now)
         self._watch(measured, measured_velocity, now)
+        self._coast(now)
         wanted = self._request(request, now)
         if not self._engaged:
             self._start = self._reference
@@ -315,8 +324,24 @@ class SafetyGate:
         self._velocity = velocity
         self._start = self._reference
         self._reference = self._reference + velocity * self.period
+        self._coasting.ticked(self._start, velocity, now)
         self._monitor.sent(self._reference, now + self.period)
         return Sent(velocity.copy(), self._reference.copy(), changed, self.state)
+
+    def _coast(self, now: float) -> None:
+        """Takes over the motion that the devices were told while ticks were missing: it has slowed down by itself, and
+        whoever brakes on from the last tick's velocity would make them faster again."""
+        if not self._engaged or self._gap <= PATIENCE * self.period:
+            return
+        moved = self._coasting.at(now)
+        if moved is not None:
+            self._reference, self._velocity = moved
+        else:  # they hold the measured place by now
+            self._velocity = np.zeros_like(self._velocity)
+            if self._measured is not None:
+                self._reference = self._measured[0]
+        self._start = self._reference - self._velocity * self.period
+        self._monitor.sent(self._reference, now)
 
     def _follow_the_arm(self, now: float) -> None:
         """While stopping: a reference that the measured arm explains. Without a credible measurement it stays."""
@@ -449,14 +474,14 @@ class SafetyGate:
 
     def _timing(self, now: float) -> float:
         """Watches the rhythm of the commands; returns the time to go on with."""
-        last, self._last = self._last, now
+        last, self._last, self._gap = self._last, now, 0.0
         if not math.isfinite(now):
             self._last = last
             self.fault(Cause.TIMING, f"the time is {now}", last or 0.0)
             return last or 0.0
         if last is None or not self._engaged:
             return now
-        gap = now - last
+        gap = self._gap = now - last
         self._lead = max(0.0, self._lead + self.period - gap)
         if gap < 0.0:
             self.fault(Cause.TIMING, f"time went back by {-gap:.4f} s", now)
@@ -496,8 +521,9 @@ class SafetyGate:
             self._measured = (position, velocity)
         if not self._engaged:
             self._reference = position
+        unknown = self.unreferenced and self._mode is not GateState.ARMED and self.at_rest
         for cause, sentence in self._monitor.conditions(position, velocity).items():
-            self.condition(cause, bool(sentence), sentence, now)
+            self.condition(cause, bool(sentence) and not unknown, sentence, now)
         if not self._engaged:
             return
         self._unexplained = self._monitor.unexplained(position, now)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Protocol
 
@@ -16,18 +17,26 @@ from robot_io.errors import JogFirstError, RefusedError
 from robot_io.safety.clearance import RobotGeometry
 
 HOMING_GAP = 0.03  # [m] of everything to everything while the linear axes search their references
-HOMING_PLACES = 21  # along each axis at which that is looked at
+HOMING_PLACES = 21  # along each axis at which that is looked at, at least
+HOMING_STEP = 0.1  # [m] between them, at most
 SLIP = 0.01  # [rad] by which a joint of the arm may leave its place meanwhile: 2 cm of the gap for a stretched arm
 
 
-def check_homing(geometry: RobotGeometry, measured: np.ndarray, contract: Contract = PAPER) -> None:
-    """Raise RefusedError unless the arm, measured (n,), is clear of everything wherever the linear axes may go."""
+def check_homing(
+    geometry: RobotGeometry, measured: np.ndarray, contract: Contract = PAPER, overtravel: float = 0.0
+) -> None:
+    """Raise RefusedError unless the arm, measured (n,), is clear of everything wherever the linear axes may go.
+
+    overtravel [m]: beyond their range at both ends, where switches and stops are that a search may run into.
+    """
     if not np.isfinite(measured[list(contract.arm)]).all():
         raise RefusedError("axes not homed: the arm's position is not known; start its EGM session first")
     if not contract.carrying:
         return
     limits = contract.limits
-    places = np.meshgrid(*(np.linspace(limits.lower[i], limits.upper[i], HOMING_PLACES) for i in contract.carrying))
+    places = np.meshgrid(
+        *(_search(limits.lower[i] - overtravel, limits.upper[i] + overtravel) for i in contract.carrying)
+    )
     q = np.repeat(measured[:, None], places[0].size, axis=1)
     q[list(contract.carrying)] = [axis.ravel() for axis in places]
     gaps = geometry.gaps(q)
@@ -37,6 +46,11 @@ def check_homing(geometry: RobotGeometry, measured: np.ndarray, contract: Contra
             f"axes not homed: somewhere on their way {row} comes as near as {gaps.min():.3f} m, allowed is "
             f"{HOMING_GAP} m; jog the arm to its home pose first"
         )
+
+
+def _search(lower: float, upper: float) -> np.ndarray:
+    """Places [m] of an axis, at most ``HOMING_STEP`` apart."""
+    return np.linspace(lower, upper, max(HOMING_PLACES, math.ceil((upper - lower) / HOMING_STEP) + 1))
 
 
 class HomedAxes(Protocol):
@@ -53,6 +67,7 @@ class HomingGuard:
 
     joints  gives the newest positions and velocities of the joints, both (n,)
     still   speed (n,) above which a joint counts as moving
+    overtravel  as of ``check_homing``
     """
 
     def __init__(
@@ -63,9 +78,10 @@ class HomingGuard:
         geometry: RobotGeometry,
         contract: Contract,
         still: tuple[float, ...],
+        overtravel: float = 0.0,
     ) -> None:
         self._arm, self._axes, self._joints = arm, axes, joints
-        self._geometry, self._contract = geometry, contract
+        self._geometry, self._contract, self._overtravel = geometry, contract, overtravel
         self._rows = list(contract.arm)
         self._still = np.array(still)[self._rows]
         self._place: np.ndarray | None = None  # of the arm when the search began
@@ -84,7 +100,7 @@ class HomingGuard:
         trouble = self._trouble(velocity[self._rows], now)
         if trouble:
             raise RefusedError(f"axes not homed: {trouble}")
-        check_homing(self._geometry, measured, self._contract)
+        check_homing(self._geometry, measured, self._contract, self._overtravel)
 
     def watch(self, now: float) -> str:
         """Stop axes that are being homed when the arm cannot be trusted to stay; the reason, empty: nothing is wrong.

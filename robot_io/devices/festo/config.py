@@ -49,6 +49,8 @@ class AxesConfig:
     command_timeout      age of a command at which the axes stop and hold [s]
     state_timeout        age of the state at which it counts as unknown [s]
     acknowledge_timeout, enable_timeout, homing_timeout [s]
+    overtravel           how far beyond either end of the range a search for the reference may take an axis [m]: to
+                         switches and stops, as measured on the robot
     """
 
     speed: float = 2.0
@@ -65,10 +67,11 @@ class AxesConfig:
     acknowledge_timeout: float = 1.0
     enable_timeout: float = 5.0
     homing_timeout: float = 30.0
+    overtravel: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
+            if not (math.isfinite(value) and (value > 0 or (value == 0 and name == "overtravel"))):
                 raise ValueError(f"AxesConfig.{name} is {value}, it must be positive and finite")
         if self.gain * self.latency > 1 / math.e:
             raise ValueError(

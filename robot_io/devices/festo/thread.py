@@ -77,6 +77,10 @@ class AxesThread:
         return self.axes.state
 
     @property
+    def homed(self) -> bool:
+        return self.axes.homed
+
+    @property
     def homing(self) -> bool:
         return self.axes.homing
 

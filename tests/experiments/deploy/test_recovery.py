@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from experiments.deploy.recovery import LONGEST, Recovery
@@ -101,6 +103,15 @@ def test_a_second_fault_is_not_reset():
     assert steps(recovery, status(), status(), status(), status()) == [Prepare(), Reset(), None, None]
     with pytest.raises(TimeoutError):
         recovery.step(status(), LONGEST + 0.1)
+
+
+def test_a_search_may_take_its_time_and_twenty_seconds_begin_after_it():
+    recovery, searching = Recovery(0.0, status(**UNHOMED)), replace(status("disarmed", **UNHOMED), homing=True)
+    assert recovery.step(status(**UNHOMED), 1.0) == Prepare() and recovery.step(status(**UNHOMED), 2.0) == Reset()
+    recovery.step(status("disarmed", **UNHOMED), 2.1)
+    for now in range(3, 61):
+        assert recovery.step(searching, float(now)) is None
+    assert recovery.step(status("disarmed"), 60.0 + LONGEST - 0.1) == Arm()
 
 
 def test_axes_that_do_not_answer_yet_are_prepared_again():

@@ -173,6 +173,31 @@ def test_a_silent_owner_is_a_stop_in_order_with_its_reason(tmp_path, monkeypatch
     assert at_rest and not np.any(at_rest) and stopped[-1].halt.text == stopped[-1].stopped
 
 
+def test_a_silent_owner_ends_the_search_of_the_axes(tmp_path, monkeypatch):
+    """Disarmed, but something moves, past the gate; and the stop key is what is not heard either."""
+    simulated = Simulated(None, monkeypatch)
+    axes, seen = simulated.simulation.axes, []
+
+    def search():
+        axes.homed, axes.homing = False, True
+        simulated.beats = False
+
+    def stopped():
+        seen.append((axes.stops, simulated.control.bridge.stopped_because))
+        axes.homing = False
+
+    simulated.script = [
+        (11.0, search),
+        (11.0 + LONGEST_SILENCE - 0.3, lambda: seen.append(axes.stops)),
+        (11.0 + LONGEST_SILENCE + 0.05, stopped),
+        (11.0 + LONGEST_SILENCE + 0.5, simulated.control.quit),
+    ]
+    with simulated.control:
+        simulated.control.run()
+    before, (after, because) = seen
+    assert before == 0 and after >= 1 and "was not heard for 2 s" in because
+
+
 @pytest.mark.parametrize(("paused", "jog"), [(True, False), (False, False), (False, True)])
 def test_an_owner_may_announce_its_absence_only_while_no_balls_are_taken(tmp_path, monkeypatch, paused, jog):
     simulated = Simulated(None, monkeypatch, jog=jog)

@@ -14,6 +14,8 @@ import pytest
 
 from robot_io.contract import JOINT_UNITS, LIMITS
 from robot_io.control.bridge import BridgeState
+from robot_io.emulator.arm import ArmParams
+from robot_io.emulator.config import RigParams
 from robot_io.errors import RefusedError
 from robot_io.safety.clearance import BLADE
 from robot_io.safety.config import SafetyConfig
@@ -135,6 +137,31 @@ def test_random_stalls_stop_the_robot_where_it_is_and_recovery_works():
     assert found["recovered"] == found["faults"], found
     assert worst["outside"] <= 0.0
     assert worst["speed"] < SafetyConfig().blade_speed
+
+
+@pytest.mark.parametrize("seconds", [0.045, 0.07, 0.095, 0.3])
+@pytest.mark.parametrize("streams", [True, False])
+def test_a_bridge_that_stood_still_makes_nothing_faster_again(seconds, streams, monkeypatch):
+    """With the shipped RAPID's time-out EGM survives 0.1 s: what is sent then reaches an arm that moves."""
+    rig = playing(Swing(0.5), params=RigParams(pause=0.05, arm=ArmParams(comm_timeout=0.1, stream_always=streams)))
+    bridge, told, reply = rig.bridge, [], rig.bridge.arm_session.reply
+
+    def noted(position, velocity, now):
+        told.append(np.concatenate([bridge.gate.velocity[:2], velocity]))
+        return reply(position, velocity, now)
+
+    monkeypatch.setattr(bridge.arm_session, "reply", noted)
+    assert rig.run(3.0, lambda: bool(told) and np.abs(told[-1][2:]).max() > 1.0)
+    rig.bridge_alive = False
+    rig.run(seconds)
+    told.clear()
+    rig.bridge_alive = True
+    rig.run(1.0)
+    speeds = np.abs(told)
+    assert bridge.state is BridgeState.FAULT and (np.diff(speeds, axis=0) <= 1e-9).all()
+    assert bridge.gate.at_rest and not rig.world.collisions
+    rig.recover()
+    assert bridge.state is BridgeState.READY
 
 
 def test_a_pulled_cable_of_the_arm_is_a_fault_and_mended():

@@ -293,6 +293,11 @@ def changed_home(joint, value):
     ("position", "velocity", "message"),
     [
         (changed_home(3, UPPER[3]), ZERO, r"joint_2 is at 1.9199, allowed is \[.*, 1.90\d+\] rad; jog it back"),
+        (
+            changed_home(0, -1.0),
+            ZERO,
+            r"gantry_x is at -1.0000, allowed is \[-0.99\d+, .* m; move it by its drive's own",
+        ),
         (changed_home(0, -2.0), ZERO, "gantry_x is at -2.0000, allowed is"),
         (changed_home(7, np.nan), ZERO, "measured position: joint_6 is nan"),
         (changed_home(7, np.inf), ZERO, "measured position: joint_6 is inf"),

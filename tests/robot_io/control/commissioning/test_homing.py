@@ -7,6 +7,7 @@ import pytest
 
 from robot_io.control.bridge import BridgeState
 from robot_io.control.commissioning.homing import SLIP, prepare
+from robot_io.control.interfaces import BridgeConfig
 from robot_io.devices.egm.messages import encode_robot
 from robot_io.devices.festo import AxesThread
 from robot_io.emulator.axes import DriveParams
@@ -16,9 +17,9 @@ from robot_io.safety.faults import Cause
 from tests.support.lockstep_play import lockstep
 
 
-def standing():
+def standing(**options):
     """A robot whose arm is on and whose axes are switched on and not homed."""
-    rig = lockstep(params=RigParams(drive=DriveParams(homing_time=1.0)))
+    rig = lockstep(params=RigParams(drive=DriveParams(homing_time=1.0)), **options)
     rig.arm.motors_on()
     rig.arm.start_rapid()
     rig.arm.start_egm()
@@ -156,6 +157,52 @@ def test_a_reference_that_a_drive_lost_is_found_again(axis):
     np.testing.assert_allclose(rig.world.qpos[2:], place[2:], rtol=0, atol=0.02)
     bridge.arm(rig.now)
     assert rig.run(5.0, lambda: bridge.at_home)
+
+
+@pytest.mark.parametrize("reading", [-3.0, 0.0, 7.0])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_drive_that_restarts_with_a_coordinate_of_no_meaning_is_brought_back(axis, reading):
+    """Far outside of the range it is no limit that keeps the fault, without which nothing is homed."""
+    rig = lockstep()
+    rig.start()
+    rig.emulators[axis].power_cycle(reading)
+    rig.run(0.5)
+    assert rig.bridge.state is BridgeState.FAULT
+    with pytest.raises(RefusedError, match="reset it first"):
+        prepared(rig)
+    rig.run(0.5)
+    place = rig.world.qpos
+    rig.bridge.reset(rig.now)
+    rig.run(0.1)
+    with pytest.raises(RefusedError, match="not armed: axes: .* not homed"):
+        rig.bridge.arm(rig.now)
+    prepared(rig)
+    assert rig.run(2.0, lambda: rig.axes.problem(rig.now) is None)
+    rig.run(0.1)
+    np.testing.assert_allclose(rig.world.qpos, place, rtol=0, atol=0.02)
+    assert not rig.bridge.gate.present
+    rig.bridge.arm(rig.now)
+    assert rig.run(5.0, lambda: rig.bridge.at_home)
+
+
+def test_limits_count_again_once_the_axes_know_where_they_are():
+    rig = lockstep()
+    rig.start()
+    rig.bridge.stop(rig.now)
+    rig.run(0.5)
+    rig.world.data.qpos[rig.world._q[0]] = 1.1  # pushed by hand
+    rig.run(0.2)
+    assert rig.axes.homed and Cause.LIMIT in rig.bridge.gate.present
+
+
+def test_the_search_is_clear_beyond_the_range_as_far_as_switches_and_stops_are():
+    """At the home pose an upper arm 5.5 cm beyond the end at the table stands in it."""
+    rig = standing(config=BridgeConfig(overtravel=0.0))
+    rig.bridge.check_homing(rig.now)
+    geometry, pose = rig.bridge.gate.geometry, np.array(rig.bridge.gate.geometry.home, float)
+    pose[1] = 0.555
+    assert geometry.gaps(pose[:, None]).min() < 0.0
+    refused(standing(config=BridgeConfig(overtravel=0.055)), "jog the arm")
 
 
 def test_the_rig_finds_a_lost_reference_by_itself():
