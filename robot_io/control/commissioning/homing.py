@@ -44,7 +44,7 @@ def check_homing(
         row = geometry.rows[int(gaps.min(axis=1).argmin())]
         raise JogFirstError(
             f"axes not homed: somewhere on their way {row} comes as near as {gaps.min():.3f} m, allowed is "
-            f"{HOMING_GAP} m; jog the arm to its home pose first"
+            f"{HOMING_GAP} m; jog the arm to its home pose first, or away from there"
         )
 
 
