@@ -188,8 +188,8 @@ class EgmSession:
         if self._is_stale(now):
             return (
                 f"No EGM packet from the arm's controller for {now - feedback.received:.3f} s (limit "
-                f"{self.config.timeout:.3f} s): check the cable and whether the EGM session has ended there"
-                f"{self._refusals()}."
+                f"{self.config.timeout:.3f} s): check its emergency stop, the cable, and whether the EGM session has "
+                f"ended there{self._refusals()}."
             )
         if self._rival is not None and now - self._rival[1] < RECENT:
             return (
