@@ -318,7 +318,11 @@ class SafetyGate:
             except Exception as error:  # a mistake of ours must still brake the robot
                 broken = said(error)
             if broken:
-                self.fault(Cause.INTERNAL, broken, now)
+                if self._gap > PATIENCE * self.period:  # farther than the tick before was proven for
+                    late = f"{self._gap:.3f} s between two commands, after which it cannot keep its limits"
+                    self.fault(Cause.TIMING, f"{late}: {broken}", now)
+                else:
+                    self.fault(Cause.INTERNAL, broken, now)
                 velocity, changed = braked, (self.state.value,)
         self._acceleration = (velocity - self._velocity) / self.period
         self._velocity = velocity

@@ -285,6 +285,27 @@ def test_nothing_moves_before_arming():
     assert not sent.velocity.any() and not ideal.gate.faults and Cause.NON_FINITE_FEEDBACK in ideal.gate.present
 
 
+@pytest.mark.parametrize("late", [0.03, 0.04, 0.049])
+def test_a_late_tick_before_the_end_of_a_range_is_no_mistake_of_ours(late):
+    """At any moment: the robot has gone on for two periods and braked, farther than one tick was proven for."""
+    request, causes = np.where(np.arange(8) == 7, 20.0, 0.0), set()
+    for ticks in range(2, 60):
+        ideal = Ideal()
+        for _ in range(ticks):
+            ideal.tick(request)
+        v, start = ideal.velocity.copy(), ideal.position - ideal.velocity * T
+        left = np.maximum(np.abs(v) - A_MAX * (late - 2 * T), 0.0)
+        ideal.position = start + np.sign(v) * (np.abs(v) * 2 * T + (v**2 - left**2) / (2 * A_MAX))
+        ideal.velocity = np.sign(v) * left
+        farthest = max(ideal.position[7] + left[7] * T + left[7] ** 2 / (2 * A_MAX[7]), UPPER[7])
+        ideal.now += late - T
+        for _ in range(30):
+            ideal.tick(request)
+            assert ideal.position[7] <= farthest
+        causes |= {fault.cause for fault in ideal.gate.faults}
+    assert Cause.TIMING in causes and causes <= {Cause.TIMING, Cause.LIMIT}
+
+
 def changed_home(joint, value):
     return np.where(np.arange(8) == joint, value, HOME)
 
