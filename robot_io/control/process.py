@@ -330,7 +330,8 @@ class Control:
         try:
             match request:
                 case messages.Beat(absence):
-                    self._owner.heard(absence if self.bridge.paused and not self._options.jog else 0.0)
+                    may = self.bridge.paused and not self._options.jog and not self._axes.homing
+                    self._owner.heard(absence if may else 0.0)
                 case messages.Arm():
                     self.bridge.arm(now)
                 case messages.Prepare():

@@ -107,12 +107,13 @@ class AxisServer:
             silent = False
             while not self._finish.is_set():
                 plugged, silent = silent and not self._bank.disconnected, self._bank.disconnected
-                if plugged or self._bank.guard_tripped:
+                if plugged or (self._bank.guard_tripped and not silent):
                     self._bank.guard_tripped = False
                     server.drop()
                 self.refused = server.refused
                 await _wait(self._finish, WATCH)
         finally:
+            server.drop()
             await server.shutdown()
             await asyncio.sleep(0)
 

@@ -19,19 +19,19 @@ class Coasting:
 
     def __init__(self, period: float, acceleration: np.ndarray) -> None:
         self._period, self._a = period, acceleration
-        self._time = -math.inf
+        self.time = -math.inf  # of the tick
         self.start = np.full_like(acceleration, np.nan)  # reference (n,) at the tick
         self._velocity = np.zeros_like(acceleration)
 
     def ticked(self, start: np.ndarray, velocity: np.ndarray, now: float) -> None:
         """The motion from ``now`` on: from ``start`` (n,) at ``velocity`` (n,)."""
-        self.start, self._velocity, self._time = start, velocity, now
+        self.start, self._velocity, self.time = start, velocity, now
 
     def at(self, now: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Reference (n,) and velocity (n,); None: hold the measured place."""
         if not np.isfinite(self.start).all():
             return None
-        since, on_time = max(now - self._time, 0.0), PATIENCE * self._period
+        since, on_time = max(now - self.time, 0.0), PATIENCE * self._period
         if since <= on_time:
             return self.start + self._velocity * since, self._velocity
         speed = np.abs(self._velocity)

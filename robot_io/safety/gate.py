@@ -126,7 +126,6 @@ class SafetyGate:
         self._offset = np.zeros(n)  # the same, remembered while the reference moves
         self._measured_velocity: np.ndarray | None = None
         self._last: float | None = None  # time of the command before
-        self._gap = 0.0  # [s] from it to the newest
         self._coasting = Coasting(period, self._a)  # as the devices are told it
         self._lead = 0.0  # [s] that commands are ahead of the clock
         self._armed_at = 0.0
@@ -231,6 +230,7 @@ class SafetyGate:
         self._deviation, self._offset = np.zeros_like(self._velocity), np.zeros_like(self._velocity)
         self._lead, self._last = 0.0, None
         self._monitor.restart(position, now)
+        self._coasting.ticked(position, self._velocity, now)
 
     def brake(self, now: float) -> None:
         """Slows down to rest from the next command on and holds; no fault. Armed again by ``arm``."""
@@ -299,8 +299,12 @@ class SafetyGate:
         Never raises: whatever is wrong with the inputs is a fault, and what comes back then is the braked motion.
         """
         now = self._timing(now)
+        missed = now - self._coasting.time if self._missed(now) else 0.0
+        held = self._coast(now)
         self._watch(measured, measured_velocity, now)
-        self._coast(now)
+        if held and self._measured is not None:
+            self._reference = self._start = self._measured[0]
+            self._monitor.sent(self._reference, now)
         wanted = self._request(request, now)
         if not self._engaged:
             self._start = self._reference
@@ -318,8 +322,8 @@ class SafetyGate:
             except Exception as error:  # a mistake of ours must still brake the robot
                 broken = said(error)
             if broken:
-                if self._gap > PATIENCE * self.period:  # farther than the tick before was proven for
-                    late = f"{self._gap:.3f} s between two commands, after which it cannot keep its limits"
+                if missed:  # farther than the tick before was proven for
+                    late = f"{missed:.3f} s between two commands, after which it cannot keep its limits"
                     self.fault(Cause.TIMING, f"{late}: {broken}", now)
                 else:
                     self.fault(Cause.INTERNAL, broken, now)
@@ -332,20 +336,24 @@ class SafetyGate:
         self._monitor.sent(self._reference, now + self.period)
         return Sent(velocity.copy(), self._reference.copy(), changed, self.state)
 
-    def _coast(self, now: float) -> None:
+    def _coast(self, now: float) -> bool:
         """Takes over the motion that the devices were told while ticks were missing: it has slowed down by itself, and
-        whoever brakes on from the last tick's velocity would make them faster again."""
-        if not self._engaged or self._gap <= PATIENCE * self.period:
-            return
+        whoever brakes on from the last tick's velocity would make them faster again. True: they hold the measured place
+        by now, wherever that is."""
+        if not self._engaged or not self._missed(now):
+            return False
         moved = self._coasting.at(now)
-        if moved is not None:
-            self._reference, self._velocity = moved
-        else:  # they hold the measured place by now
+        if moved is None:
             self._velocity = np.zeros_like(self._velocity)
-            if self._measured is not None:
-                self._reference = self._measured[0]
+            return True
+        self._reference, self._velocity = moved
         self._start = self._reference - self._velocity * self.period
         self._monitor.sent(self._reference, now)
+        return False
+
+    def _missed(self, now: float) -> bool:
+        """The last command that was worked out is so old that the devices have begun to slow down."""
+        return now - self._coasting.time > PATIENCE * self.period
 
     def _follow_the_arm(self, now: float) -> None:
         """While stopping: a reference that the measured arm explains. Without a credible measurement it stays."""
@@ -478,14 +486,14 @@ class SafetyGate:
 
     def _timing(self, now: float) -> float:
         """Watches the rhythm of the commands; returns the time to go on with."""
-        last, self._last, self._gap = self._last, now, 0.0
+        last, self._last = self._last, now
         if not math.isfinite(now):
             self._last = last
             self.fault(Cause.TIMING, f"the time is {now}", last or 0.0)
             return last or 0.0
         if last is None or not self._engaged:
             return now
-        gap = self._gap = now - last
+        gap = now - last
         self._lead = max(0.0, self._lead + self.period - gap)
         if gap < 0.0:
             self.fault(Cause.TIMING, f"time went back by {-gap:.4f} s", now)

@@ -157,11 +157,36 @@ def test_a_bridge_that_stood_still_makes_nothing_faster_again(seconds, streams, 
     told.clear()
     rig.bridge_alive = True
     rig.run(1.0)
+    assert len(told) > 50 or not streams  # without a stream EGM, which ended after 0.1 s, is silent
+    assert len(told) > 10 or seconds > 0.1
     speeds = np.abs(told)
     assert bridge.state is BridgeState.FAULT and (np.diff(speeds, axis=0) <= 1e-9).all()
     assert bridge.gate.at_rest and not rig.world.collisions
     rig.recover()
     assert bridge.state is BridgeState.READY
+
+
+def test_an_error_that_lasted_for_some_ticks_makes_nothing_faster_again(monkeypatch):
+    rig = playing(Swing(0.5))
+    bridge, told, reply, watch = rig.bridge, [], rig.bridge.arm_session.reply, rig.bridge.gate._watch
+
+    def noted(position, velocity, now):
+        told.append(np.concatenate([bridge.gate.velocity[:2], velocity]))
+        return reply(position, velocity, now)
+
+    def broken(*arguments):
+        raise ZeroDivisionError("a mistake of ours")
+
+    monkeypatch.setattr(bridge.arm_session, "reply", noted)
+    assert rig.run(3.0, lambda: bool(told) and np.abs(told[-1][2:]).max() > 1.0)
+    told.clear()
+    monkeypatch.setattr(bridge.gate, "_watch", broken)
+    rig.run(10 * T)
+    monkeypatch.setattr(bridge.gate, "_watch", watch)
+    rig.run(1.0)
+    arm = np.abs(told)[:, 2:]
+    assert len(told) > 200 and (np.diff(arm, axis=0) <= 1e-9).all() and not arm[-1].any()
+    assert bridge.gate.faults[0].cause is Cause.INTERNAL and bridge.gate.at_rest
 
 
 def test_a_pulled_cable_of_the_arm_is_a_fault_and_mended():

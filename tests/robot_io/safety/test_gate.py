@@ -306,6 +306,22 @@ def test_a_late_tick_before_the_end_of_a_range_is_no_mistake_of_ours(late):
     assert Cause.TIMING in causes and causes <= {Cause.TIMING, Cause.LIMIT}
 
 
+@pytest.mark.parametrize("unreferenced", [False, True])
+def test_axes_without_a_reference_hide_no_limit_while_the_robot_is_armed_or_moves(unreferenced):
+    ideal, beyond = Ideal(), np.where(np.arange(8) == 0, -3.0, HOME)
+    ideal.gate.unreferenced = unreferenced
+    for _ in range(20):
+        ideal.tick(0.5 * V_MAX)
+    ideal.tick(measured=beyond)
+    assert Cause.LIMIT in ideal.gate.present and ideal.gate.state is GateState.FAULT
+    while not ideal.gate.at_rest:
+        assert Cause.LIMIT in ideal.gate.present
+        ideal.tick(measured=beyond)
+    for _ in range(3):
+        ideal.tick(measured=beyond)
+    assert (Cause.LIMIT in ideal.gate.present) != unreferenced
+
+
 def changed_home(joint, value):
     return np.where(np.arange(8) == joint, value, HOME)
 
