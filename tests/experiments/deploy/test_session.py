@@ -117,6 +117,12 @@ def test_ctrl_c_ends_with_the_summary(policy, tmp_path):
     assert len(log.read(summary["log"]).episodes) >= 1
 
 
+def as_in_a_terminal():
+    """Signals end a program there; these tests may run under nohup, or behind an &, which pass on that they are ignored."""
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def started(policy, folder, *more):
     """``mjx-tt run`` on the rig as a group of its own, after its first ball."""
     command = [
@@ -132,7 +138,7 @@ def started(policy, folder, *more):
         *more,
     ]
     pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    running = subprocess.Popen(command, cwd=ROOT, start_new_session=True, **pipe)
+    running = subprocess.Popen(command, cwd=ROOT, start_new_session=True, preexec_fn=as_in_a_terminal, **pipe)
     for line in running.stdout:
         if line.startswith("ball 1:"):
             break
