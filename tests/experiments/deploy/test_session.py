@@ -118,7 +118,7 @@ def test_ctrl_c_ends_with_the_summary(policy, tmp_path):
 
 
 def as_in_a_terminal():
-    """Signals end a program there; these tests may run under nohup, or behind an &, which pass on that they are ignored."""
+    """Signals end a program there; nohup, or an &, under which tests may run, passes on that they are ignored."""
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
         signal.signal(number, signal.SIG_DFL)
 
