@@ -61,14 +61,14 @@ class Terminal:
                 break
         return ESCAPES.sub("", self._text)
 
-    def wait(self, pattern: str, seconds: float = 20.0) -> str:
+    def wait(self, pattern: str, seconds: float = 60.0) -> str:
         """Text shown since the last key, once ``pattern`` is in it."""
         end = time.monotonic() + seconds
         while not re.search(pattern, text := self.read(0.1)):
             assert time.monotonic() < end, f"{pattern!r} was not shown within {seconds:g} s, but:\n{text[-4000:]}"
         return text
 
-    def ended(self, seconds: float = 20.0) -> int:
+    def ended(self, seconds: float = 60.0) -> int:
         """Exit status, once the command has ended."""
         end = time.monotonic() + seconds
         while self.process.poll() is None:
