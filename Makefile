@@ -5,7 +5,9 @@
 # make study-quick  the whole study in small: five virtual players, all methods, a report (16 to 30 minutes on two
 #             cores; resumable)
 # make test   set up and run the tests but for the slow ones (docs/how-to/run-the-tests.md)
-# make test-all  the slow ones as well
+# make test-changed  those that a change since the last commit (BASE=...) can affect
+# make test-slow  a quarter of the slow tests, another one at each commit
+# make test-all  all tests
 # make check  set up and check style, types and imports
 # make exam   hide causes in logs and let the diagnosis find them: the large examination (hours; resumable)
 # make docs   set up and build the documentation into docs/_build/html; a dead link or an unknown name is an error
@@ -16,7 +18,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: view demo rig-demo study-quick test test-slow test-all check exam docs bench setup clean
+.PHONY: view demo rig-demo study-quick test test-changed test-slow test-all check exam docs bench setup clean
 
 view: $(READY)
 	$(BIN)/mjx-tt view
@@ -36,6 +38,7 @@ study-quick: $(READY)
 WORKERS  ?= 2
 PYTEST   := $(BIN)/python -m pytest
 PARALLEL := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+FAST     := -m "not slow and not realtime"
 
 # Where arrays are computed: every annotation is checked, types and ranks of arrays change only where the code says so.
 # The longest come first, so that neither process waits for the other at the end.
@@ -44,23 +47,33 @@ ALL_ELSE := tests/robot_io/safety tests $(addprefix --ignore=,$(STRICT))
 REALTIME  = $(shell grep -rl --include="test_*.py" "mark.realtime" tests)
 
 test: $(READY)
-	STRICT_ARRAYS=1 $(PYTEST) $(PARALLEL) $(STRICT) -m "not slow and not realtime"
-	$(PYTEST) $(PARALLEL) $(ALL_ELSE) -m "not slow and not realtime"
+	STRICT_ARRAYS=1 $(PYTEST) $(PARALLEL) $(STRICT) $(FAST)
+	$(PYTEST) $(PARALLEL) $(ALL_ELSE) $(FAST)
 	$(PYTEST) $(REALTIME) -m "not slow and realtime"
 
-test-slow: $(READY)
-	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m "slow and not realtime and not exhaustive"
-	USERS_FUSION=1 $(PYTEST) $(PARALLEL) tests/experiments/study -m "slow and not realtime"
-	$(PYTEST) $(REALTIME) -m "slow and realtime"
+# What differs from the commit BASE, and all that imports it.
+BASE     ?= HEAD
+test-changed: $(READY)
+	$(BIN)/python -m tests.support.changed $(BASE) | xargs -r $(PYTEST) $(PARALLEL) $(FAST)
 
-test-all: test test-slow
-	$(PYTEST) $(PARALLEL) tests -m exhaustive
+# The slow tests in SHARDS parts of equal time, by the times in tests/durations.json; each commit's turn is another
+# part, so that they all run within as many landings. SHARDS=1 runs all.
+SHARDS   ?= 4
+TURN     ?= $(shell git rev-list --count HEAD 2>/dev/null || echo 0)
+PART      = --splits $(SHARDS) --group $(shell echo $$(($(TURN) % $(SHARDS) + 1))) --durations-path tests/durations.json
+test-slow: $(READY)
+	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m "slow and not realtime" $(PART)
+	USERS_FUSION=1 $(PYTEST) $(PARALLEL) tests/experiments/study -m "slow and not realtime" $(PART)
+	$(PYTEST) $(REALTIME) -m "slow and realtime" $(PART)
+
+test-all: test
+	$(MAKE) test-slow SHARDS=1
 
 check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(PYTEST) tests/test_imports.py
+	$(BIN)/lint-imports --no-logo
 
 exam: $(READY)
 	$(BIN)/python -m tests.exam
