@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,18 +78,7 @@ class Dataset:
 
     trajectories: tuple[Trajectory, ...]
     source: str
-
-    @classmethod
-    def from_samples(cls, samples: Mapping[tuple[str, str], Sequence[Sequence[float]]], source: str) -> Dataset:
-        """Trajectories from rows (t, x, y, z) by session and name. Raises ValueError naming source and trajectory."""
-        trajectories = []
-        for (session, name), rows in samples.items():
-            table = np.array(rows)
-            try:
-                trajectories.append(Trajectory(session, name, table[:, 0], table[:, 1:].T))
-            except ValueError as error:
-                raise ValueError(f"{source}: {error}") from None
-        return cls(tuple(trajectories), source)
+    notes: tuple[str, ...] = ()  # what was done to the file's samples
 
     def __len__(self) -> int:
         return len(self.trajectories)

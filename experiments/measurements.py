@@ -9,7 +9,7 @@ import numpy as np
 
 from ballmodel.io import MeasuredStates, read
 from ballmodel.io.atomic_files import replacing
-from ballmodel.io.csv import COLUMNS
+from ballmodel.io.tables import COLUMNS
 from ballmodel.trajectory import Dataset
 from experiments.errors import ConfigError, checked
 from mjx_tt.diagnosis.tracks import clean

@@ -1,12 +1,12 @@
 from .aimy import read_aimy as read_aimy
-from .csv import read_csv as read_csv
 from .deepmind import MeasuredStates as MeasuredStates
 from .deepmind import read_deepmind as read_deepmind
 from .events import Events as Events
 from .events import read_events as read_events
 from .formats import FORMATS as FORMATS
+from .formats import TRACKS as TRACKS
 from .formats import read as read
-from .mcap import read_mcap as read_mcap
-from .mcap import write_mcap as write_mcap
+from .messages import write_mcap as write_mcap
+from .samples import TrackOptions as TrackOptions
 from .spindoe import SpinDataset as SpinDataset
 from .spindoe import read_spindoe as read_spindoe

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ballmodel.io.atomic_files import replacing
-from ballmodel.io.csv import COLUMNS
+from ballmodel.io.tables import COLUMNS
 from experiments.evaluation.figures import HIT_COLOUR, INK, MISSED_COLOUR, RETURNED_COLOUR, STYLE
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry
 from experiments.stats import t_interval, welch_interval, wilson

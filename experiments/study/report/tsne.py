@@ -71,7 +71,7 @@ def trained(study: Study, seed: int, player: str, name: str) -> np.ndarray | Non
     """
     from ballmodel.fit_distribution import fit_human
     from ballmodel.flight import ball_params
-    from ballmodel.io.csv import read_csv
+    from ballmodel.io.tables import read_csv
 
     path = study.trajectories(seed, player, name)
     if path is None:

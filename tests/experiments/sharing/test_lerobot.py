@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from ballmodel.io.csv import COLUMNS
+from ballmodel.io.tables import COLUMNS
 from experiments import cli
 from experiments.errors import ConfigError
 from experiments.sharing import lerobot, recordings

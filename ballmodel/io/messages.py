@@ -1,0 +1,208 @@
+"""Tracks in message logs: MCAP (JSON, Protobuf and ROS messages) and ROS 1 and 2 bags.
+
+A message holds a ball when it has a point: Foxglove's PointInFrame, ROS's PointStamped and PoseStamped, or the same as
+JSON. Its own stamp counts, the log's time where it has none. Names of session and trajectory may be added:
+    {"timestamp": {"sec", "nsec"}, "frame_id", "point": {"x", "y", "z"}, "session", "trajectory"}
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.exceptions import McapError
+from mcap.records import Channel, Footer, Message, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+from zstandard import ZstdError
+
+from ballmodel.io.atomic_files import replacing
+from ballmodel.io.samples import Samples, TrackOptions
+from ballmodel.trajectory import Dataset
+
+TOPIC = "/ball"
+FRAME = "table"
+NANO = 1_000_000_000
+Decoder = Callable[[bytes], Any]
+
+_NUMBER, _TEXT, _COUNT = {"type": "number"}, {"type": "string"}, {"type": "integer", "minimum": 0}
+SCHEMA = {
+    "title": "BallSample",
+    "type": "object",
+    "properties": {
+        "timestamp": {"type": "object", "title": "time", "properties": {"sec": _COUNT, "nsec": _COUNT}},
+        "frame_id": _TEXT,
+        "point": {"type": "object", "properties": {"x": _NUMBER, "y": _NUMBER, "z": _NUMBER}},
+        "session": _TEXT,
+        "trajectory": _TEXT,
+    },
+    "required": ["timestamp", "frame_id", "point", "trajectory"],
+}
+
+
+def write_mcap(path: str | os.PathLike, dataset: Dataset) -> None:
+    """Writes all samples, trajectory after trajectory; times are rounded to nanoseconds.
+
+    The file appears only when it is complete. Raises ValueError for times before zero, which MCAP cannot hold.
+    """
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        writer = Writer(stream, chunk_size=256 * 1024, compression=CompressionType.ZSTD)
+        writer.start(profile="", library="ballmodel")
+        schema = writer.register_schema("BallSample", "jsonschema", json.dumps(SCHEMA).encode())
+        channel = writer.register_channel(TOPIC, "json", schema)
+        for trajectory in dataset:
+            if trajectory.time[0] < 0.0:
+                raise ValueError(
+                    f"{trajectory.label}: starts at t={trajectory.time[0]}; MCAP holds no time before zero"
+                )
+            for i, (t, (x, y, z)) in enumerate(zip(trajectory.time, trajectory.position.T, strict=True)):
+                stamp = round(float(t) * NANO)
+                message = {
+                    "timestamp": {"sec": stamp // NANO, "nsec": stamp % NANO},
+                    "frame_id": FRAME,
+                    "point": {"x": x, "y": y, "z": z},
+                    "session": trajectory.session,
+                    "trajectory": trajectory.name,
+                }
+                writer.add_message(channel, stamp, json.dumps(message).encode(), publish_time=stamp, sequence=i)
+        writer.finish()
+
+
+def read_mcap(path: str | os.PathLike, options: TrackOptions) -> Samples:
+    """The balls of an MCAP file; of one that was cut short those of its complete chunks.
+
+    Raises:
+        ValueError: no topic holds points, several do, or a message is damaged; the message says what to give.
+    """
+    notes: list[str] = []
+    return _collect(path, _read_mcap(Path(path), options, notes), options, notes)
+
+
+def _read_mcap(path: Path, options: TrackOptions, notes: list[str]) -> Iterator[tuple[str, float, Any]]:
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, tuple[str, Decoder | None]] = {}
+    complete, cause, decoded = False, "it ends without a footer", 0
+    with open(path, "rb") as stream:
+        records = iter(StreamReader(stream, validate_crcs=True).records)
+        while True:
+            try:
+                record = next(records, None)
+            except (McapError, ZstdError, ValueError, OSError) as error:
+                cause = f"{type(error).__name__}: {error}"
+                break
+            if record is None:
+                break
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record.topic, _choose_decoder(record, schemas.get(record.schema_id))
+            elif isinstance(record, Footer):
+                complete = True
+            elif isinstance(record, Message):
+                topic, decode = channels[record.channel_id]
+                if decode is None or options.topic not in (None, topic):
+                    continue
+                try:
+                    message = decode(record.data)
+                except Exception as error:  # of whatever library decodes it
+                    raise ValueError(f"{path}: message {decoded} on {topic}: {error}") from None
+                decoded += 1
+                yield topic, record.log_time / NANO, message
+    if not complete:
+        notes.append(f"the file is damaged or cut short ({cause}); its complete chunks were read")
+
+
+def _choose_decoder(channel: Channel, schema: Schema | None) -> Decoder | None:
+    if channel.message_encoding == "json":
+        return json.loads
+    if channel.message_encoding == "protobuf" and schema is not None:
+        files = descriptor_pb2.FileDescriptorSet.FromString(schema.data)
+        pool = descriptor_pool.DescriptorPool()
+        for file in files.file:
+            pool.Add(file)
+        return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name)).FromString
+    if channel.message_encoding in ("cdr", "ros1") and schema is not None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        ros1 = channel.message_encoding == "ros1"
+        types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+        name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/")
+        if name not in types.fielddefs:
+            types.register(get_types_from_msg(schema.data.decode(), name))
+        return lambda data: (types.deserialize_ros1 if ros1 else types.deserialize_cdr)(data, name)
+    return None
+
+
+def read_bag(path: str | os.PathLike, options: TrackOptions) -> Samples:
+    """The balls of a ROS 1 bag (a file) or ROS 2 bag (a folder). Raises ValueError as ``read_mcap`` does."""
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.typesys import Stores, get_typestore
+
+    def messages() -> Iterator[tuple[str, float, Any]]:
+        try:
+            with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+                wanted = [c for c in reader.connections if options.topic in (None, c.topic)]
+                for connection, stamp, data in reader.messages(connections=wanted):
+                    yield connection.topic, stamp / NANO, reader.deserialize(data, connection.msgtype)
+        except AnyReaderError as error:
+            raise ValueError(f"{path}: not readable as a ROS bag: {error}") from None
+
+    return _collect(path, messages(), options, [])
+
+
+def _get(message: Any, name: str) -> Any:
+    return message.get(name) if isinstance(message, dict) else getattr(message, name, None)
+
+
+def _find_point(message: Any) -> Any:
+    """The part of a message that has x, y and z."""
+    for way in (("point",), ("pose", "position"), ("pose", "pose", "position"), ("position",), ()):
+        part = message
+        for name in way:
+            part = _get(part, name)
+        if all(_get(part, axis) is not None for axis in "xyz"):
+            return part
+    return None
+
+
+def _find_time(message: Any) -> float | None:
+    """The message's own stamp [s]."""
+    for stamp in (_get(message, "timestamp"), _get(_get(message, "header"), "stamp"), _get(message, "stamp")):
+        seconds = [v for name in ("sec", "secs", "seconds") if (v := _get(stamp, name)) is not None]
+        parts = [v for name in ("nsec", "nanosec", "nsecs", "nanos") if (v := _get(stamp, name)) is not None]
+        if seconds and parts:
+            return float(seconds[0]) + float(parts[0]) / NANO
+    return None
+
+
+def _collect(
+    path: str | os.PathLike, messages: Iterator[tuple[str, float, Any]], options: TrackOptions, notes: list[str]
+) -> Samples:
+    balls: dict[str, list[tuple[float, float, float, float, str, str]]] = {}
+    topics: dict[str, int] = {}
+    for topic, logged, message in messages:
+        topics[topic] = topics.get(topic, 0) + 1
+        point, stamp = _find_point(message), _find_time(message)
+        if point is None:
+            if topic == (options.topic or TOPIC):
+                raise ValueError(f"{path}: message {topics[topic] - 1} on {topic}: expected a point with x, y and z")
+            continue
+        try:
+            place = [float(_get(point, axis)) for axis in "xyz"]
+        except (TypeError, ValueError):
+            raise ValueError(f"{path}: message {topics[topic] - 1} on {topic}: x, y, z are no numbers") from None
+        labels = [str(_get(message, name) or "") for name in ("session", "trajectory")]
+        balls.setdefault(topic, []).append((logged if stamp is None else stamp, *place, labels[0], labels[1]))
+    chosen = options.topic or (TOPIC if TOPIC in balls else next(iter(balls), None))
+    if chosen not in balls:
+        listed = ", ".join(topics) or "none"
+        raise ValueError(f"{path}: no point on the topic {chosen or TOPIC}; topics that can be read: {listed}")
+    if options.topic is None and chosen != TOPIC and len(balls) > 1:
+        raise ValueError(f"{path}: points are on {', '.join(balls)}; name the ball's: --topic {chosen}")
+    time, *position, session, track = map(list, zip(*balls[chosen], strict=True))
+    return Samples(np.array(time), np.array(position), session, track, tuple(notes))
