@@ -1,9 +1,12 @@
-"""Initial state of a ball from its free flight: the paper's Nelder-Mead, and Levenberg-Marquardt for thousands at once.
+"""Initial state of a ball from its free flight: the paper's Nelder-Mead, and Gauss-Newton for thousands at once.
 
 Both minimise the same thing: the Euclidean distance between the measured positions and a simulated flight, over the
 position and velocity at the first sample (Abeyruwan et al. 2022, "Modeling Human Ball Distributions"). The simulated
 flight takes the steps of ``ballmodel.flight``: the interval between two samples is cut into the fewest equal steps that
 are no longer than DT, so the flight meets every measured time exactly. All in float64.
+
+No force depends on where the ball is, so the flight's shape depends on the velocity alone and the derivative by the
+initial position is the identity: only three directions need differentiating.
 """
 
 from __future__ import annotations
@@ -14,9 +17,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import lineax
 import numpy as np
-import optimistix
 from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
@@ -32,8 +33,8 @@ DT = 1.0 / 300.0  # [s] longest step of the simulated flight
 MIN_SAMPLES = 4  # 12 numbers for 6 unknowns
 PAD = 32  # numbers of samples and of trajectories are rounded up to it, so that similar batches share one compiled fit
 MANY, PAD_MANY = 256, 512  # and more than MANY trajectories to this
-SOLVER = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9, linear_solver=lineax.Normal(lineax.Cholesky()))
 MAX_ITERATIONS = 50
+STEP_TOLERANCE = 1e-9  # [m], [m/s] change below which a fit has converged
 
 
 @dataclass(frozen=True)
@@ -49,12 +50,12 @@ class FitResult:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class _Measured:
-    """Flights of n balls, padded to T samples and to S steps between two of them; of one ball inside ``vmap``."""
+    """Flights of n balls, padded to T samples and to S steps between two of them."""
 
-    spin: Float[Array, "3 *n"]  # [rad/s] at the first sample
-    steps: Float[Array, "gaps S *n"]  # [s] lengths of the T - 1 gaps' steps; zero where there are fewer
-    position: Float[Array, "3 T *n"]  # [m]
-    mask: Float[Array, "T *n"]  # 1 for a sample, 0 for padding
+    spin: Float[Array, "3 n"]  # [rad/s] at the first sample
+    steps: Float[Array, "gaps S n"]  # [s] lengths of the T - 1 gaps' steps; zero where there are fewer
+    position: Float[Array, "3 T n"]  # [m]
+    mask: Float[Array, "T n"]  # 1 for a sample, 0 for padding
 
 
 def _check(trajectories: Sequence[Trajectory]) -> None:
@@ -70,7 +71,7 @@ def _check(trajectories: Sequence[Trajectory]) -> None:
 
 def _pad(
     trajectories: Sequence[Trajectory], spin: Float[np.ndarray, "3 n"]
-) -> tuple[_Measured, Float[np.ndarray, "6 n"]]:
+) -> tuple[_Measured, Float[np.ndarray, "3 n"], Float[np.ndarray, "3 n"]]:
     """The padded flights, and position and velocity at the first sample of a parabola through each one's samples."""
     n = len(trajectories)
     length = -(-max(map(len, trajectories)) // PAD) * PAD
@@ -90,56 +91,119 @@ def _pad(
     sums = np.einsum("itn,atn->nia", powers, np.moveaxis(position, 0, -1))
     coefficients = np.linalg.solve(moments, sums)
     measured = _Measured(*map(jnp.asarray, (spin, steps, np.moveaxis(position, 0, -1), mask.T)))
-    return measured, np.concatenate([coefficients[:, 0].T, coefficients[:, 1].T])
+    return measured, coefficients[:, 0].T, coefficients[:, 1].T
 
 
-def _residual(unknowns: Float[Array, "6"], flight: FlightParams, measured: _Measured) -> Float[Array, "3 T"]:
-    """Measured minus simulated positions [m] of one ball that starts with position and velocity ``unknowns``."""
+def _shape(flight: FlightParams, velocity: Float[Array, "3 n"], measured: _Measured) -> Float[Array, "3 T n"]:
+    """Positions (3, T, n) of a flight that starts at the origin."""
 
     def advance(state: BallState, dts: Array) -> tuple[BallState, Array]:
         state, _ = jax.lax.scan(lambda s, dt: (free_step(flight, s, dt), None), state, dts)
         return state, jnp.asarray(state.position)
 
-    start = BallState(unknowns[:3], unknowns[3:], measured.spin)
+    start = BallState(jnp.zeros_like(velocity), velocity, measured.spin)
     _, positions = jax.lax.scan(advance, start, measured.steps)
-    flown = jnp.concatenate([unknowns[None, :3], positions]).T
-    return measured.mask[None] * (measured.position - flown)
+    return jnp.moveaxis(jnp.concatenate([start.position[None], positions]), 0, 1)
 
 
-def _soften(residual: Float[Array, "3 T"], huber: float | None) -> Float[Array, "3 T"]:
-    """Residuals whose square is Huber's loss of the distance."""
-    if huber is None:
-        return residual
-    square = jnp.maximum(jnp.sum(residual * residual, axis=0), 1e-24)
-    distance = jnp.sqrt(square)
-    loss = jnp.where(distance <= huber, square, 2.0 * huber * distance - huber * huber)
-    return residual * jnp.sqrt(loss / square)[None]
+def _weights(distance: Array, mask: Array, huber: float | None) -> Array:
+    return mask if huber is None else mask * jnp.minimum(1.0, huber / jnp.maximum(distance, 1e-12))
+
+
+def _cost(distance: Array, mask: Array, huber: float | None) -> Array:
+    square = distance * distance
+    if huber is not None:
+        square = jnp.where(distance <= huber, square, 2.0 * huber * distance - huber * huber)
+    return jnp.sum(mask * square, axis=0)
+
+
+def _linearise(
+    flight: FlightParams,
+    x0: Float[Array, "3 n"],
+    v0: Float[Array, "3 n"],
+    measured: _Measured,
+    huber: float | None,
+) -> tuple[Float[Array, " n"], Float[Array, "n 6 6"], Float[Array, "n 6"]]:
+    """Cost (n,), normal matrix (n, 6, 6) and right-hand side (n, 6) of the weighted least squares at a state."""
+
+    def shape(velocity: Array) -> Array:
+        return _shape(flight, velocity, measured)
+
+    directions = jnp.broadcast_to(jnp.eye(3)[:, :, None], (3, *v0.shape))
+    relative, slopes = jax.vmap(lambda e: jax.jvp(shape, (v0,), (e,)), out_axes=(None, 0))(directions)
+    residual, mask = measured.position - relative - x0[:, None], measured.mask
+    distance = jnp.sqrt(jnp.sum(residual * residual, axis=0))
+    weight = _weights(distance, mask, huber)
+    total = jnp.sum(weight, axis=0)
+    zero = jnp.zeros_like(total)
+    position_velocity = [[jnp.sum(weight * slopes[k, i], axis=0) for k in range(3)] for i in range(3)]
+    velocity_velocity = [
+        [jnp.sum(weight[None] * slopes[k] * slopes[m], axis=(0, 1)) for m in range(3)] for k in range(3)
+    ]
+    rows = [[total if i == j else zero for j in range(3)] + position_velocity[i] for i in range(3)]
+    rows += [[position_velocity[i][k] for i in range(3)] + velocity_velocity[k] for k in range(3)]
+    normal = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    right = [jnp.sum(weight * residual[i], axis=0) for i in range(3)]
+    right += [jnp.sum(weight[None] * slopes[k] * residual, axis=(0, 1)) for k in range(3)]
+    return _cost(distance, mask, huber), normal, jnp.stack(right, axis=-1)
 
 
 @partial(jax.jit, static_argnames="huber")
-@partial(jax.vmap, in_axes=(None, -1, -1, None), out_axes=-1)
-def _fit(
-    flight: FlightParams, guess: Float[Array, "6"], measured: _Measured, huber: float | None
-) -> tuple[Float[Array, "6"], Float[Array, ""], Float[Array, "6 6"], Bool[Array, ""]]:
-    """Unknowns, rms distance [m], covariance and whether the fit converged."""
-    found = optimistix.least_squares(
-        lambda unknowns, _: _soften(_residual(unknowns, flight, measured), huber),
-        SOLVER,
-        guess,
-        options={"jac": "fwd"},
-        max_steps=MAX_ITERATIONS,
-        throw=False,
-    )
-    residual = _residual(found.value, flight, measured)
-    slopes = jax.jacfwd(_residual)(found.value, flight, measured).reshape(-1, 6)
-    square, samples = jnp.sum(residual * residual, axis=0), jnp.sum(measured.mask)
-    weight = measured.mask  # of Huber's loss, as iteratively reweighted least squares has it
-    if huber is not None:
-        weight = weight * jnp.minimum(1.0, huber / jnp.maximum(jnp.sqrt(square), 1e-12))
-    normal = slopes.T @ (jnp.tile(weight, 3)[:, None] * slopes)
-    spread = jnp.sum(weight * square) / (3.0 * samples - 6.0)
-    converged = found.result == optimistix.RESULTS.successful
-    return found.value, jnp.sqrt(jnp.sum(square) / samples), jnp.linalg.inv(normal) * spread, converged
+def _levenberg_marquardt(
+    flight: FlightParams,
+    x0: Float[Array, "3 n"],
+    v0: Float[Array, "3 n"],
+    measured: _Measured,
+    huber: float | None,
+) -> tuple[Array, Array, Array, Array, Array]:
+    linearise = partial(_linearise, flight, measured=measured, huber=huber)
+
+    def unfinished(carry: dict[str, Array]) -> Array:
+        return (carry["iteration"] < MAX_ITERATIONS) & ~jnp.all(carry["converged"])
+
+    def iterate(carry: dict[str, Array]) -> dict[str, Array]:
+        diagonal = jnp.diagonal(carry["normal"], axis1=1, axis2=2)
+        damped = carry["normal"] + carry["damping"][:, None, None] * diagonal[:, :, None] * jnp.eye(6)[None]
+        change = jnp.linalg.solve(damped, carry["right"][..., None])[..., 0]
+        x_new, v_new = carry["x0"] + change[:, :3].T, carry["v0"] + change[:, 3:].T
+        cost, normal, right = linearise(x_new, v_new)
+        better = (cost <= carry["cost"]) & ~carry["converged"]
+        small = jnp.max(jnp.abs(change), axis=1) < STEP_TOLERANCE
+
+        def pick(new: Array, old: Array) -> Array:
+            return jnp.where(better.reshape((-1,) + (1,) * (new.ndim - 1)), new, old)
+
+        return {
+            "x0": jnp.where(better, x_new, carry["x0"]),
+            "v0": jnp.where(better, v_new, carry["v0"]),
+            "cost": pick(cost, carry["cost"]),
+            "normal": pick(normal, carry["normal"]),
+            "right": pick(right, carry["right"]),
+            "damping": jnp.where(better, carry["damping"] * 0.1, carry["damping"] * 10.0),
+            "converged": carry["converged"] | small,
+            "iteration": carry["iteration"] + 1,
+        }
+
+    cost, normal, right = linearise(x0, v0)
+    carry = {
+        "x0": x0,
+        "v0": v0,
+        "cost": cost,
+        "normal": normal,
+        "right": right,
+        "damping": jnp.full_like(cost, 1e-6),
+        "converged": cost < 0.0,
+        "iteration": jnp.zeros((), jnp.int32),
+    }
+    carry = jax.lax.while_loop(unfinished, iterate, carry)
+    x0, v0 = carry["x0"], carry["v0"]
+    residual, mask = measured.position - _shape(flight, v0, measured) - x0[:, None], measured.mask
+    square = jnp.sum(residual * residual, axis=0)
+    samples = jnp.sum(mask, axis=0)
+    rms = jnp.sqrt(jnp.sum(mask * square, axis=0) / samples)
+    spread = jnp.sum(_weights(jnp.sqrt(square), mask, huber) * square, axis=0) / (3.0 * samples - 6.0)
+    covariance = jnp.moveaxis(jnp.linalg.inv(carry["normal"]), 0, -1) * spread[None, None]
+    return x0, v0, rms, covariance, carry["converged"]
 
 
 def fit_gauss_newton(
@@ -150,16 +214,11 @@ def fit_gauss_newton(
 ) -> FitResult:
     """Fits all free flights at once by damped Gauss-Newton (Levenberg-Marquardt).
 
+    trajectories: free flights (see ``trajectory.free_flight``) of any lengths, each with at least MIN_SAMPLES samples.
+    spin: known spins (3, n) [rad/s] at the first sample; without it the balls do not rotate.
+    huber: distance [m] beyond which a sample counts linearly instead of by its square; None for plain least squares.
     Compiles once for each padded number of trajectories and samples and each number of steps between samples.
-
-    Args:
-        trajectories: free flights (see ``trajectory.free_flight``) of any lengths, each with MIN_SAMPLES samples.
-        flight: what moves the balls.
-        spin: known spins (3, n) [rad/s] at the first sample; without it the balls do not rotate.
-        huber: distance [m] beyond which a sample counts linearly instead of by its square; None for least squares.
-
-    Raises:
-        ValueError: there are too few samples, or the spin has the wrong shape.
+    Raises ValueError for too few samples or a spin of the wrong shape.
     """
     _check(trajectories)
     n = len(trajectories)
@@ -169,16 +228,17 @@ def fit_gauss_newton(
         raise ValueError(f"spin has shape {spin.shape}, (3, {n}) is wanted: one spin for each trajectory")
     spins = np.pad(spin, ((0, 0), (0, extra)), mode="edge")
     with jax.enable_x64(True):
-        measured, guess = _pad([*trajectories, *[trajectories[-1]] * extra], spins)
-        result = _fit(without_nominal(flight), guess, measured, huber)
-        unknowns, rms, covariance, converged = (np.asarray(a)[..., :n] for a in result)
-    return FitResult(BallState(unknowns[:3], unknowns[3:], spin), rms, covariance, converged)
+        measured, x0, v0 = _pad([*trajectories, *[trajectories[-1]] * extra], spins)
+        result = _levenberg_marquardt(without_nominal(flight), x0, v0, measured, huber)
+        x0, v0, rms, covariance, converged = (np.asarray(a)[..., :n] for a in result)
+    return FitResult(BallState(x0, v0, spin), rms, covariance, converged)
 
 
 @jax.jit
 def _rms_distance(unknowns: Float[Array, "6"], flight: FlightParams, measured: _Measured) -> Float[Array, ""]:
-    residual = _residual(unknowns, flight, measured)
-    return jnp.sqrt(jnp.sum(residual * residual) / jnp.sum(measured.mask))
+    flown = unknowns[:3, None, None] + _shape(flight, unknowns[3:, None], measured)
+    square = jnp.sum((measured.position - flown) ** 2, axis=0)
+    return jnp.sqrt(jnp.sum(measured.mask * square) / jnp.sum(measured.mask))
 
 
 def fit_nelder_mead(
@@ -191,8 +251,8 @@ def fit_nelder_mead(
     _check([trajectory])
     spin = np.zeros(3) if spin is None else np.asarray(spin, np.float64)
     with jax.enable_x64(True):
-        padded, guess = _pad([trajectory], spin[:, None])
-        measured, start = jax.tree.map(lambda x: x[..., 0], (padded, guess))
+        measured, *guess = _pad([trajectory], spin[:, None])
+    start = np.concatenate(guess)[:, 0]
     # The simplex spans the guess's likely error: a centimetre, a tenth of a metre per second.
     simplex = start + np.vstack([np.zeros(6), np.diag([0.01] * 3 + [0.1] * 3)])
     nominal = without_nominal(flight)

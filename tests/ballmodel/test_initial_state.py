@@ -134,8 +134,8 @@ def test_same_shapes_compile_once():
         trajectories, _ = balls(7, 20, 0.001, seed=seed)
         fit_gauss_newton(trajectories, FlightParams(drag_coefficient=0.4 + 0.1 * seed))
         if seed == 0:
-            compiled = initial_state._fit._cache_size()
-    assert initial_state._fit._cache_size() == compiled
+            compiled = initial_state._levenberg_marquardt._cache_size()
+    assert initial_state._levenberg_marquardt._cache_size() == compiled
     assert not jax.config.jax_enable_x64
 
 
