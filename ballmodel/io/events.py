@@ -1,7 +1,8 @@
 """Shots and bounces in the form of Sony's Ace (SonyResearch/ace_public): one CSV of events, measured with spin.
 
-Columns player_id, rally_id, type (shot or bounce), timestamp, ball_pos, ball_vel_out, ball_spin_out, the last three
-bracketed triples in metres, m/s and rad/s. Their x points towards the human and z up; the table frame has y there.
+Columns player_id, rally_id, type (shot, bounce or net, of which shot_p1 is one player's), timestamp, ball_pos,
+ball_vel_out, ball_spin_out, the last three bracketed triples in metres, m/s and rad/s. Their x points towards the human
+and z up; the table frame has y there.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from ballmodel.state import BallState
 
+KINDS = ("shot", "bounce", "net")
 COLUMNS = ("rally_id", "type", "timestamp", "ball_pos", "ball_vel_out", "ball_spin_out")
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|nan", re.IGNORECASE)
 
@@ -48,17 +50,20 @@ def read_events(path: str | os.PathLike) -> Events:
     missing = [name for name in COLUMNS if not rows or name not in rows[0]]
     if missing:
         raise ValueError(f"{path}: column {', '.join(missing)} is missing; wanted: {', '.join(COLUMNS)}")
+    unique = len({row["rally_id"] for row in rows}) == len(rows)  # match/rally/event
     rally, shot, numbers = [], [], []
     for number, row in enumerate(rows, start=2):
-        kind = row["type"].strip().lower()
-        if kind not in ("shot", "bounce"):
-            raise ValueError(f"{path}: row {number}, column 'type': {row['type']!r}; allowed: shot, bounce")
+        kind = row["type"].strip().lower().partition("_")[0]  # shot_p1: the first player's
+        if kind not in KINDS:
+            raise ValueError(f"{path}: row {number}, column 'type': {row['type']!r}; allowed: {', '.join(KINDS)}")
+        if kind == "net":
+            continue
         vectors = [[float(v) for v in NUMBER.findall(row[name])] for name in COLUMNS[3:]]
         if any(len(v) not in (0, 3) for v in vectors):
             raise ValueError(f"{path}: row {number}: three numbers in brackets are wanted as {', '.join(COLUMNS[3:])}")
         values = [float(row["timestamp"]), *(x for v in vectors for x in v or [np.nan] * 3)]
         if np.all(np.isfinite(values)):
-            rally.append(row["rally_id"])
+            rally.append(row["rally_id"].rpartition("/")[0] if unique else row["rally_id"])
             shot.append(kind == "shot")
             numbers.append(values)
     if not numbers:

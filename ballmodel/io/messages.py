@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -74,10 +75,10 @@ def write_mcap(path: str | os.PathLike, dataset: Dataset) -> None:
 
 
 def read_mcap(path: str | os.PathLike, options: TrackOptions) -> Samples:
-    """The balls of an MCAP file; of one that was cut short those of its complete chunks.
+    """The balls of an MCAP file.
 
     Raises:
-        ValueError: no topic holds points, several do, or a message is damaged; the message says what to give.
+        ValueError: the file is damaged, no topic holds points, or several do; the message says what to give.
     """
     notes: list[str] = []
     return _collect(path, _read_mcap(Path(path), options, notes), options, notes)
@@ -92,7 +93,7 @@ def _read_mcap(path: Path, options: TrackOptions, notes: list[str]) -> Iterator[
         while True:
             try:
                 record = next(records, None)
-            except (McapError, ZstdError, ValueError, OSError) as error:
+            except (McapError, ZstdError, ValueError, OSError, struct.error) as error:
                 cause = f"{type(error).__name__}: {error}"
                 break
             if record is None:
@@ -113,6 +114,11 @@ def _read_mcap(path: Path, options: TrackOptions, notes: list[str]) -> Iterator[
                     raise ValueError(f"{path}: message {decoded} on {topic}: {error}") from None
                 decoded += 1
                 yield topic, record.log_time / NANO, message
+    if not complete and not options.salvage:
+        raise ValueError(
+            f"{path}: damaged or cut short ({cause}); its complete chunks hold {decoded} messages, "
+            "read them with --salvage"
+        )
     if not complete:
         notes.append(f"the file is damaged or cut short ({cause}); its complete chunks were read")
 

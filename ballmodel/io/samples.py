@@ -36,6 +36,7 @@ class TrackOptions:
         time: unit of the times, one of TIMES, or FRAMES.
         rate: frames a second, where times are numbers of frames.
         topic: of the messages that hold the ball.
+        salvage: whether a log that is damaged or cut short is read up to there.
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
@@ -43,6 +44,7 @@ class TrackOptions:
     time: str | None = None
     rate: float | None = None
     topic: str | None = None
+    salvage: bool = False
 
     def __post_init__(self) -> None:
         for name, value, allowed in (("length", self.length, LENGTHS), ("time", self.time, (*TIMES, FRAMES))):
@@ -74,8 +76,13 @@ def make_dataset(samples: Samples, source: str, options: TrackOptions) -> Datase
     notes = list(samples.notes)
     time, position = np.asarray(samples.time, float), np.asarray(samples.position, float)
     known = np.isfinite(time) & np.isfinite(position).all(axis=0)
-    same = known & (position[0] == position[1]) & (position[1] == position[2])  # no ball is there: 0, 0, 0 or -1, -1, -1
-    for lost, words in ((~known, "without all their numbers"), (same, "with three equal coordinates, which mark no ball")):
+    same = (
+        known & (position[0] == position[1]) & (position[1] == position[2])
+    )  # no ball is there: 0, 0, 0 or -1, -1, -1
+    for lost, words in (
+        (~known, "without all their numbers"),
+        (same, "with three equal coordinates, which mark no ball"),
+    ):
         if lost.any():
             notes.append(f"{int(lost.sum())} of {lost.size} rows {words} were left out")
     kept = np.flatnonzero(known & ~same)
@@ -121,7 +128,9 @@ def _find_length(position: Float[np.ndarray, "3 n"], told: str | None, notes: li
         size = float(np.median(np.abs(position).max(axis=0)))
         told = "m" if size < 20.0 else "cm" if size < 400.0 else "mm"
         if told != "m":
-            notes.append(f"positions were taken for {told}: half of the samples are {size:.0f} and more from the origin")
+            notes.append(
+                f"positions were taken for {told}: half of the samples are {size:.0f} and more from the origin"
+            )
     return LENGTHS[told]
 
 

@@ -1,32 +1,34 @@
 """Flights with measured spin in the form of SpinDOE (cogsys-tuebingen/spindoe): a folder, one file per flight.
 
 ``index.csv`` names the files (traj_file) and their spins (x_spin, y_spin, z_spin [rad/s]); a flight's file holds
-``t;x;y;z`` in seconds and metres, semicolons between, with or without a header. Balls fly towards -y; the table lies
-20 mm below the ball's centre at the bounce. Samples whose time does not increase are left out.
+``t;x;y;z`` in seconds and metres, with or without a header. An index may say 0 where the file is 000.csv, in its own
+folder or in one below it. Balls fly towards -y; the table lies 20 mm below the ball's centre at the bounce.
 """
 
 from __future__ import annotations
 
 import csv
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from ballmodel.io.samples import TrackOptions, make_dataset
+from ballmodel.io.tables import read_table
 from ballmodel.trajectory import Dataset, Trajectory
 
 INDEX = "index.csv"
 SPINS = ("x_spin", "y_spin", "z_spin")
+UNITS = TrackOptions(length="m", time="s")
 
 
 @dataclass(frozen=True)
 class SpinDataset(Dataset):
     """Trajectories whose spins were measured."""
 
-    spin: Float[np.ndarray, "3 n"]  # [rad/s]
-    repeated: int  # samples left out, whose time did not increase
+    spin: Float[np.ndarray, "3 n"] = field(default_factory=lambda: np.zeros((3, 0)))  # [rad/s]
 
 
 def read_spindoe(path: str | os.PathLike) -> SpinDataset:
@@ -40,7 +42,8 @@ def read_spindoe(path: str | os.PathLike) -> SpinDataset:
     missing = [name for name in ("traj_file", *SPINS) if not rows or name not in rows[0]]
     if missing:
         raise ValueError(f"{index}: column {', '.join(missing)} is missing; wanted: traj_file, {', '.join(SPINS)}")
-    trajectories, spins, repeated = [], [], 0
+    trajectories: list[Trajectory] = []
+    spins, notes = [], {}
     for number, row in enumerate(rows, start=2):
         try:
             spins.append([float(row[name]) for name in SPINS])
@@ -48,32 +51,23 @@ def read_spindoe(path: str | os.PathLike) -> SpinDataset:
             raise ValueError(
                 f"{index}: row {number}: three numbers of rad/s are wanted as {', '.join(SPINS)}"
             ) from None
-        file_path = index.parent / row["traj_file"].strip()
-        table = _table(file_path)
-        later = np.concatenate([[True], np.diff(np.maximum.accumulate(table[:, 0])) > 0.0])
-        repeated += int((~later).sum())
-        try:
-            trajectories.append(Trajectory(index.parent.name, file_path.stem, table[later, 0], table[later, 1:].T))
-        except ValueError as error:
-            raise ValueError(f"{file_path}: {error}") from None
-    return SpinDataset(tuple(trajectories), str(index.parent), np.array(spins).T, repeated)
+        file = _find_file(index.parent, row["traj_file"].strip())
+        flight = make_dataset(read_table(file, UNITS), str(file), UNITS)
+        longest = max(flight, key=len)
+        trajectories.append(Trajectory(index.parent.name, file.stem, longest.time, longest.position))
+        notes |= {f"{file.name}: {note}": None for note in flight.notes}
+    return SpinDataset(tuple(trajectories), str(index.parent), tuple(notes), np.array(spins).T)
 
 
-def _table(path: Path) -> Float[np.ndarray, "n 4"]:
-    """Rows t, x, y, z of a flight's file."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file, though the index names it")
-    rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
-        fields = [field.strip() for field in line.replace(",", ";").split(";") if field.strip()]
-        try:
-            rows.append([float(field) for field in fields[:4]])
-        except ValueError:
-            if number > 1:
-                raise ValueError(f"{path}: row {number}: numbers t;x;y;z are wanted, got {line!r}") from None
-            continue
-        if len(fields) < 4:
-            raise ValueError(f"{path}: row {number}: four numbers t;x;y;z are wanted, got {line!r}")
-    if not rows:
-        raise ValueError(f"{path}: no sample")
-    return np.array(rows)
+def _find_file(folder: Path, name: str) -> Path:
+    """A flight's file as the index names it: by its whole name, or by its number."""
+    if (folder / name).is_file():
+        return folder / name
+    found = [
+        p
+        for p in sorted(folder.rglob("*.csv"))
+        if p.name == name or (p.stem.isdigit() and p.stem.lstrip("0") == name.lstrip("0"))
+    ]
+    if len(found) != 1:
+        raise FileNotFoundError(f"{folder / name}: no such file, though the index names it")
+    return found[0]

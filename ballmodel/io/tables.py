@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +21,26 @@ NUMBERS = ("t", "x", "y", "z")
 # Names in small letters without units, blanks and underscores; earlier ones are preferred.
 ALIASES = {
     "session": ("session", "match", "recording", "game"),
-    "trajectory": ("trajectory", "trajectoryid", "traj", "track", "trackid", "ball", "ballid", "flight", "stroke", "id"),
+    "trajectory": (
+        "trajectory",
+        "trajectoryid",
+        "traj",
+        "track",
+        "trackid",
+        "ball",
+        "ballid",
+        "flight",
+        "stroke",
+        "id",
+    ),
     "t": ("t", "time", "timestamp", "stamp", "seconds", "frame", "frameid", "framenumber", "frameno", "frameidx"),
     **{
-        axis: (axis, *(f"{word}{axis}" for word in ("pos", "position", "ball", "point", "p")), f"{axis}pos", f"{axis}3d")
+        axis: (
+            axis,
+            *(f"{word}{axis}" for word in ("pos", "position", "ball", "point", "p")),
+            f"{axis}pos",
+            f"{axis}3d",
+        )
         for axis in "xyz"
     },
 }
@@ -157,7 +172,11 @@ def _plain(name: str) -> tuple[str, str]:
 def find_columns(names: tuple[str, ...] | list[str]) -> dict[str, str]:
     """Which of a table's columns is which of COLUMNS."""
     plain = {_plain(name)[0]: name for name in reversed(names)}
-    return {role: next(plain[a] for a in aliases if a in plain) for role, aliases in ALIASES.items() if {*aliases} & {*plain}}
+    return {
+        role: next(plain[a] for a in aliases if a in plain)
+        for role, aliases in ALIASES.items()
+        if {*aliases} & {*plain}
+    }
 
 
 def _pick(path: Path, table: pd.DataFrame, first: int, options: TrackOptions) -> Samples:
@@ -173,8 +192,8 @@ def _pick(path: Path, table: pd.DataFrame, first: int, options: TrackOptions) ->
     missing = [role for role in NUMBERS if role not in found]
     if missing:
         raise ValueError(
-            f"{path}: row {max(first - 1, 1)}: no column is known as {', '.join(missing)}; there are {', '.join(names)}. "
-            f"Name them: --columns {','.join(f'{role}=NAME' for role in missing)}"
+            f"{path}: row {max(first - 1, 1)}: no column is known as {', '.join(missing)}; there are "
+            f"{', '.join(names)}. Name them: --columns {','.join(f'{role}=NAME' for role in missing)}"
         )
     numbers = {role: _convert(path, table[found[role]], found[role], first) for role in NUMBERS}
     notes = []
@@ -218,5 +237,3 @@ def _convert(path: Path, column: pd.Series, name: str, first: int) -> np.ndarray
         i = int(wrong[0])
         raise ValueError(f"{path}: row {first + i}, column {name!r}: {column.iloc[i]!r} is not a number")
     return values.to_numpy(float)
-
-

@@ -9,17 +9,20 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from ballmodel.io.formats import read
+from ballmodel.io.formats import SUFFIXES, read
+from ballmodel.io.samples import TrackOptions
+from ballmodel.io.spindoe import INDEX
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
-from mjx_tt.diagnosis.tracks.frame import check
+from mjx_tt.diagnosis.tracks.frame import align
 from mjx_tt.robot.robot import Robot
 
+GUESS = TrackOptions()
 TURN = 0.15  # [m] that a ball comes back before it counts as hit
 ROBOT_FILES = ("command.csv", "state.csv")
 
@@ -43,40 +46,63 @@ def hashes(paths: Sequence[str | os.PathLike]) -> dict[Path, str]:
     found: dict[Path, str] = {}
     seen: dict[str, Path] = {}
     for file in (file for path in map(Path, paths) for file in _expand(path)):
-        digest = hashlib.sha256(file.read_bytes()).hexdigest()
+        parts = sorted(file.iterdir()) if file.is_dir() else [file]
+        digest = hashlib.sha256(b"".join(part.read_bytes() for part in parts)).hexdigest()
         if digest in seen and file.name != ROBOT_FILES[0]:  # the same commands may be given twice
             raise ValueError(f"{file}: is the same log as {seen[digest]}, which would count twice")
         found[file], seen[digest] = digest, file
     return found
 
 
-def load_logs(paths: Sequence[str | os.PathLike], robot: Robot | None = None) -> Logs:
-    """Reads logs: ball trajectories (CSV, MCAP, AIMY) and pairs command.csv, state.csv (or a folder that holds them).
+def load_logs(
+    paths: Sequence[str | os.PathLike],
+    robot: Robot | None = None,
+    options: TrackOptions = GUESS,
+    frame: str | None = None,
+) -> Logs:
+    """Reads logs: tracks of balls and pairs command.csv, state.csv (or a folder that holds them).
 
-    Of several pairs the longest is used. robot: whose joints they are; None: the paper's. Raises ValueError naming the
-    file and what is wrong with it, FileNotFoundError when there is none.
+    Of several pairs the longest is used. Files of one folder share a frame.
+
+    Args:
+        paths: files and folders.
+        robot: whose joints they are; None: the paper's.
+        options: what is known of the tracks' columns, units and topic.
+        frame: of the tracks (see ``tracks.frame.align``); None: found out.
+
+    Raises:
+        ValueError: names the file and what is wrong with it.
+        FileNotFoundError: there is no such file.
     """
     files = hashes(paths)
     if not files:
         raise ValueError("no log was given")
     balls: list[Trajectory] = []
     joints, notes = longest([(str(folder), read_robot_csv(*pair, robot)) for folder, pair in _pairs(files).items()])
+    tracks: dict[Path, list[Trajectory]] = {}
     for file in (f for f in files if f.name not in ROBOT_FILES):
         try:
-            data = read(file)
+            data = read(file, options=options)
         except ValueError as error:
             if file.suffix.lower() != ".mcap":
                 raise
             raise ValueError(
-                f"{error} (a log of balls holds messages on /ball; a session of `mjx-tt run` is read by "
+                f"{error} (a session of `mjx-tt run` is read by "
                 "`mjx-tt diagnose`, or by experiments.commands.diagnose.read_logs)"
             ) from None
         if not hasattr(data, "trajectories"):
             raise ValueError(
                 f"{file}: holds single ball states, no trajectories: a diagnosis needs positions over time"
             )
-        check(data.trajectories, str(file))
-        balls += data.trajectories
+        notes += tuple(f"{file.name}: {note}" for note in data.notes)
+        single = len(data) == 1 and not data.trajectories[0].name
+        tracks.setdefault(file.parent, []).extend(
+            replace(t, name=file.stem) if single else t for t in data.trajectories
+        )
+    for folder, found in tracks.items():
+        names = [file.name for file in files if file.parent == folder and file.name not in ROBOT_FILES]
+        aligned, done = align(found, str(folder / names[0]) if len(names) == 1 else str(folder), frame)
+        balls, notes = balls + list(aligned), notes + done
     return Logs(tuple(balls), joints, {str(file): digest for file, digest in files.items()}, notes)
 
 
@@ -109,13 +135,15 @@ def _pairs(files: Iterable[Path]) -> dict[Path, tuple[Path, Path]]:
 
 
 def _expand(path: Path) -> list[Path]:
-    if not path.is_dir():
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file or folder")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if path.is_file() or (path / "metadata.yaml").is_file():  # a file, or a ROS 2 bag
         return [path]
-    found = [p for p in sorted(path.iterdir()) if p.suffix.lower() in (".csv", ".mcap", ".hdf5", ".h5")]
+    if (path / INDEX).is_file():
+        return [path / INDEX]
+    found = [p for p in sorted(path.iterdir()) if p.suffix.lower() in SUFFIXES]
     if not found:
-        raise ValueError(f"{path}: holds no .csv, .mcap or .hdf5")
+        raise ValueError(f"{path}: holds no log; expected files of {', '.join(SUFFIXES)}")
     return found
 
 

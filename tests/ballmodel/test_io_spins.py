@@ -13,7 +13,9 @@ def test_spindoe(tmp_path):
     (tmp_path / "001.csv").write_text("0.00;0.1;1.2;0.3\n0.01;0.1;1.1;0.31\n0.01;0.1;1.1;0.31\n0.02;0.1;1.0;0.31\n")
     (tmp_path / "002.csv").write_text("t;x;y;z\n0.5;0;1;0.2\n0.6;0;0.5;0.2\n")
     found = read_spindoe(tmp_path)
-    assert [t.name for t in found] == ["001", "002"] and found.repeated == 1
+    assert [t.name for t in found] == ["001", "002"] and found.notes == (
+        "001.csv: 1 samples that repeat a time were left out",
+    )
     np.testing.assert_array_equal(found.spin, [[10, 0], [-2, 0], [3.5, 100]])
     np.testing.assert_array_equal(found.trajectories[0].time, [0.0, 0.01, 0.02])
     (tmp_path / "002.csv").unlink()
@@ -30,6 +32,16 @@ def test_spindoe(tmp_path):
 HEAD = "player_id,rally_id,type,timestamp,ball_pos,ball_vel_out,ball_spin_out\n"
 
 
+def found_of_players(path):
+    """Rows as published ones are: a player in the type, a rally id of each row's own, nets."""
+    path.write_text(
+        HEAD + 'p1,m1/r0/event0,shot_p1,0.5,"[1.4, 0.2, 0.3]","[-6.0, 0.1, 1.0]","[0, 0, 0]"\n'
+        'p1,m1/r0/event1,bounce_p2,0.9,"[-0.7, 0.3, 0.02]","[-5, 0, 2]","[0, 1, 2]"\n'
+        'p2,m1/r0/event2,net,1.2,"[0, 0, 0.1]","[0, -0.5, -1]","[0, 0, 0]"\n'
+    )
+    return read_events(path)
+
+
 def test_events(tmp_path):
     path = tmp_path / "ace.csv"
     path.write_text(
@@ -44,6 +56,10 @@ def test_events(tmp_path):
     np.testing.assert_allclose(found.state.velocity[:, 0], [-0.1, -6.0, 1.0])
     np.testing.assert_allclose(found.state.spin[:, 0], [120.0, 0.0, 5.0])
     assert [list(i) for i in found.landings] == [[0], [1]]
+    players = found_of_players(path)
+    assert (
+        len(players) == 2 and players.rally == ("m1/r0", "m1/r0") and [list(i) for i in players.landings] == [[0], [1]]
+    )
     path.write_text(HEAD + 'a,1,serve,0.5,"[1,2,3]","[1,2,3]","[1,2,3]"\n')
-    with pytest.raises(ValueError, match="row 2, column 'type': 'serve'; allowed: shot, bounce"):
+    with pytest.raises(ValueError, match="row 2, column 'type': 'serve'; allowed: shot, bounce, net"):
         read_events(path)

@@ -6,8 +6,9 @@ off before a fall is judged: from 8.5 m/s on it exceeds gravity.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +18,6 @@ from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.tracks.chains import Track, take_apart
 
 GRAVITY_RANGE = (5.0, 15.0)  # [m/s^2] that a fall in metres and seconds may show
-BOUNCE_RANGE = (-0.05, 0.12)  # [m] height of the ball's centre at a bounce in the table frame
 FEWEST = 8  # samples of a trajectory that tells anything
 SPAN = 0.06  # [s] between the three samples that give an acceleration
 DRAG = 0.12  # [1/m] of a ball, low rather than high
@@ -25,94 +25,167 @@ MARGIN = 0.08  # [m] beside the table within which a bounce is one on it
 LEVEL = 0.10  # [m] of height within which a bounce is at the table's, or the floor's
 LOW = NET_HEIGHT - 0.03  # [m] below which no ball passes the net's place
 WRONG = 0.25  # share of bounces and passages over the net that do not fit, from which the frame is another
-EXPLAINED = 0.4  # of that share, left by a named offset that explains it
+FITS = 0.15  # share up to which another frame explains a log
 MOST = 200  # trajectories looked at, spread over the log
 
 
 @dataclass(frozen=True)
 class _Signs:
-    """Bounces and paths of a log in its own frame."""
+    """Bounces and paths of a log in some frame."""
 
     bounces: Float[np.ndarray, "3 b"]  # [m]
     paths: tuple[Float[np.ndarray, "3 k"], ...]  # [m] of the arcs
 
-    def misfit(self, shift: Sequence[float]) -> tuple[int, int, int]:
-        """Bounces, and passages over the net's place, that cannot be after a shift [m]; and how many there are."""
-        by = np.asarray(shift)[:, None]
-        x, y, z = self.bounces + by
+    def moved(self, frame: Frame) -> _Signs:
+        return _Signs(frame.to_table(self.bounces), tuple(map(frame.to_table, self.paths)))
+
+    def misfit(self) -> tuple[int, int]:
+        """Bounces that lie neither on the table nor on the floor, and balls that pass below the net's edge."""
+        x, y, z = self.bounces
         over_table = (np.abs(x) < TABLE_WIDTH / 2 + MARGIN) & (np.abs(y) < TABLE_LENGTH / 2 + MARGIN)
         inside = (np.abs(x) < TABLE_WIDTH / 2 - MARGIN) & (np.abs(y) < TABLE_LENGTH / 2 - MARGIN)
         on_table = over_table & (np.abs(z - BALL_RADIUS) < LEVEL)
         played = on_table.sum() >= 0.3 * x.size  # without bounces on the table there is no floor beside it
         on_floor = played & ~inside & (np.abs(z - BALL_RADIUS + TABLE_HEIGHT) < LEVEL)
-        low = count = 0
-        for path in self.paths:
-            p = path + by
+        return int(np.sum(~(on_table | on_floor))), sum(int(np.sum(np.maximum(*h) < LOW)) for h in self._heights())
+
+    def share(self) -> float:
+        """``misfit`` as a share of all bounces and passages."""
+        return sum(self.misfit()) / max(self.bounces.shape[1] + sum(h[0].size for h in self._heights()), 1)
+
+    def _heights(self) -> Iterator[tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]]:
+        """Heights before and after each path's passages of the net's place."""
+        for p in self.paths:
             k = np.flatnonzero(p[1, :-1] * p[1, 1:] < 0.0)
             here = k[np.abs(p[0, k]) < TABLE_WIDTH / 2]
-            count += here.size
-            low += int(np.sum(np.maximum(p[2, here], p[2, here + 1]) < LOW))
-        return int(np.sum(~(on_table | on_floor))), low, count + x.size
+            yield p[2, here], p[2, here + 1]
+
+    def oddness(self) -> tuple[float, float]:
+        """Distance [m] of the middle of play from the net, in halves, and share of balls that do not fly towards -y."""
+        if not self.paths:
+            return 0.0, 0.0
+        middle = np.median(np.concatenate(self.paths, axis=1)[:2], axis=1)
+        return round(float(np.hypot(*middle)) / 0.5) * 0.5, float(np.mean([p[1, -1] >= p[1, 0] for p in self.paths]))
 
 
-def _offsets() -> dict[str, tuple[float, float, float]]:
-    """Likely origins, and what has to be added to coordinates that count from them."""
-    half_x, half_y = TABLE_WIDTH / 2, TABLE_LENGTH / 2
-    corner = "the corner of the table at"
-    places = {
-        "the table's centre": (0.0, 0.0),
-        f"{corner} the least x and y": (-half_x, -half_y),
-        f"{corner} the largest x and y": (half_x, half_y),
-        f"{corner} the largest x and the least y": (half_x, -half_y),
-        f"{corner} the least x and the largest y": (-half_x, half_y),
-    }
-    places |= {"the middle of an end line": (0.0, -half_y), "the middle of the other end line": (0.0, half_y)}
-    places |= {"the middle of a side line": (-half_x, 0.0), "the middle of the other side line": (half_x, 0.0)}
-    out = {}
-    for name, (x, y) in places.items():
-        out[name] = (x, y, 0.0)
-        out[f"{name}, and z from the floor"] = (x, y, -TABLE_HEIGHT)
-    return out
+@dataclass(frozen=True)
+class Frame:
+    """A frame that trackers use: the table's own, turned about z by quarters, from another origin."""
+
+    words: tuple[str, ...]  # that name it, of FRAMES
+    quarters: int
+    shift: tuple[float, float, float]  # [m] added to turned coordinates
+
+    def to_table(self, position: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+        x, y, z = position
+        for _ in range(self.quarters):
+            x, y = -y, x
+        return np.stack([x, y, z]) + np.array(self.shift)[:, None]
+
+    def __str__(self) -> str:
+        turned = f"turned by {90 * self.quarters} degrees about z, " if self.quarters else ""
+        return f"{', '.join(self.words) or 'table'} ({turned}{', '.join(f'{s:+.4g}' for s in self.shift)} m added)"
 
 
-def check(trajectories: Sequence[Trajectory], source: str) -> None:
-    """Refuses balls that cannot be metres and seconds in the table frame.
+FRAMES = {
+    "corner": "the origin is a corner of the table",
+    "end": "the origin is the middle of an end line",
+    "side": "the origin is the middle of a side line",
+    "floor": "z is measured from the floor",
+    "x-along": "x runs along the table",
+}
 
-    Raises ValueError that describes what they look like, with the offset that would mend it where one is likely.
+
+def _frames() -> Iterator[Frame]:
+    half = TABLE_WIDTH / 2, TABLE_LENGTH / 2
+    for quarters in (0, 2, 1, 3):  # the fewest changes first
+        for above in (0.0, -TABLE_HEIGHT):
+            for a, b in product((0, -1, 1), repeat=2):
+                place = () if not (a or b) else ("corner",) if a and b else ("side",) if a else ("end",)
+                words = (*place, *(("floor",) if above else ()), *(("x-along",) if quarters % 2 else ()))
+                yield Frame(words, quarters, (a * half[0], b * half[1], above))
+
+
+def align(
+    trajectories: Sequence[Trajectory], source: str, frame: str | None = None
+) -> tuple[tuple[Trajectory, ...], tuple[str, ...]]:
+    """Trajectories in the table frame, and what was done to bring them there.
+
+    The frame is told by how balls fall, where they bounce and where they pass the net. Coordinates that fit the table
+    frame stay as they are. A frame that is turned by 180 degrees looks the same; balls then fly towards -y mostly.
+
+    Args:
+        trajectories: in metres and seconds.
+        source: for messages.
+        frame: words of FRAMES joined by "+", or "table", where it is known.
+
+    Raises:
+        ValueError: the balls do not fall along -z, or no frame explains where they bounce.
     """
     if not trajectories:
         raise ValueError(f"{source}: holds no trajectory")
+    words = None if frame is None else set(frame.split("+")) - {"table"}
+    if words is not None and not words <= FRAMES.keys():
+        raise ValueError(f"frame: expected table, or words of {', '.join(FRAMES)} joined by +, got {frame!r}")
     long = [t for t in trajectories if len(t) >= FEWEST]
     if not long:
         raise ValueError(f"{source}: no trajectory has {FEWEST} samples, the longest has {max(map(len, trajectories))}")
     long = long[:: -(-len(long) // MOST)]
     bend, fall = (np.median(a, axis=0) for a in zip(*map(_acceleration, long), strict=True))
-    largest = float(np.abs(bend).max())
-    if largest > 100.0 * GRAVITY_RANGE[1]:
-        raise ValueError(
-            f"{source}: balls fall at {largest:.0f} per s^2, metres and seconds are wanted (are these millimetres?)"
-        )
     signs = _signs([take_apart(t) for t in long])
-    wrong, low, count = signs.misfit((0.0, 0.0, 0.0))
     bounces = signs.bounces.shape[1]
     many = bounces >= max(3, 0.2 * len(long))
-    proven = many and wrong < 0.1 * bounces
-    if not proven:
+    if not (many and signs.misfit()[0] < 0.1 * bounces):
         _check_fall(bend, fall, source)
     travel = np.median([np.ptp(np.percentile(t.position, [5, 95], axis=1), axis=0) for t in long], axis=0)
-    if travel[0] > 2.0 * travel[1]:
-        raise ValueError(
-            f"{source}: balls travel {travel[0]:.2f} m along x and {travel[1]:.2f} m along y; y is the table's length "
-            "(swapped axes?)"
-        )
-    if many:
-        _check_origin(signs, wrong, low, count, source)
-    middle = np.median(np.concatenate([t.position for t in long], axis=1), axis=1)
+    across = bool(travel[0] > 2.0 * travel[1])
+    chosen = _choose(signs, across, words) if many or words is not None else Frame((), 0, (0.0, 0.0, 0.0))
+    if chosen is None or (chosen.quarters == 0 and across):
+        raise ValueError(_describe(signs, travel, source))
+    middle = np.median(np.concatenate([chosen.to_table(t.position) for t in long], axis=1), axis=1)
     if abs(middle[0]) > 1.5 or abs(middle[1]) > 2.5:
         raise ValueError(
             f"{source}: the balls' middle is x = {middle[0]:.2f}, y = {middle[1]:.2f} m, far from the table's centre "
             "(another frame?)"
         )
+    if not chosen.quarters and not any(chosen.shift):
+        return tuple(trajectories), ()
+    note = f"{source}: coordinates were brought into the table frame from the frame {chosen}"
+    return tuple(replace(t, position=chosen.to_table(t.position)) for t in trajectories), (note,)
+
+
+def _choose(signs: _Signs, across: bool, words: set[str] | None) -> Frame | None:
+    """The frame in which bounces and passages over the net are where table and net are."""
+    found = []
+    for frame in _frames():
+        if (words is not None and set(frame.words) != words) or (words is None and across == (frame.quarters % 2 == 0)):
+            continue
+        moved = signs.moved(frame)
+        bounces = max(signs.bounces.shape[1], 1)
+        wrong, share = moved.misfit()[0] / bounces, moved.share()
+        x, y, _ = moved.bounces
+        quarter = not frame.words and np.mean((x > -MARGIN) & (y > -MARGIN)) > 0.95 and share > WRONG
+        if not frame.quarters and not frame.words and wrong < WRONG and not quarter:
+            return frame
+        found.append((share, moved.oddness(), len(found), frame))
+    if not found:
+        return None
+    best = min(share for share, *_ in found)
+    if words is None and best > FITS:
+        return None
+    return min((entry for entry in found if entry[0] < best + 0.02), key=lambda entry: entry[1:3])[3]
+
+
+def _describe(signs: _Signs, travel: Float[np.ndarray, "3"], source: str) -> str:
+    """What is wrong with a log's frame."""
+    wrong, low = signs.misfit()
+    x, y, z = np.median(signs.bounces, axis=1) if signs.bounces.size else np.full(3, np.nan)
+    return (
+        f"{source}: {wrong} of {signs.bounces.shape[1]} bounces lie beside the table, {low} balls pass below the net; "
+        f"the median bounce is at x = {x:.2f}, y = {y:.2f}, z = {z:.3f} m, and balls travel {travel[0]:.2f} m along x "
+        f"and {travel[1]:.2f} m along y. Expected the table frame: its origin at the table's centre, y along the "
+        f"table, bounces at z = {BALL_RADIUS} m. Convert the coordinates, or name the frame: --frame {'+'.join(FRAMES)}"
+    )
 
 
 def _check_fall(bend: Float[np.ndarray, "3"], fall: Float[np.ndarray, "3"], source: str) -> None:
@@ -127,38 +200,6 @@ def _check_fall(bend: Float[np.ndarray, "3"], fall: Float[np.ndarray, "3"], sour
         raise ValueError(f"{source}: balls fall along {'xyz'[down]}, z must point up (swapped axes?)")
     if fall[2] > 0.0:
         raise ValueError(f"{source}: balls fall towards +z, z must point up")
-
-
-def _check_origin(signs: _Signs, wrong: int, low: int, count: int, source: str) -> None:
-    """Raises ValueError where bounces and passages over the net are not where table and net are."""
-    bounces = signs.bounces.shape[1]
-    median = np.median(signs.bounces, axis=1)
-    misfit = (wrong + low) / count
-    x, y, z = signs.bounces
-    quarter = np.mean((x > -MARGIN) & (y > -MARGIN)) > 0.95
-    if wrong < WRONG * bounces and not (quarter and misfit > WRONG):
-        return
-    found = {name: signs.misfit(shift) for name, shift in _offsets().items()}
-    name = min(found, key=lambda n: (found[n][0] + found[n][1]) / max(found[n][2], 1))
-    left = (found[name][0] + found[name][1]) / max(found[name][2], 1)
-    hint = "another frame: is z measured from the floor, or from the camera?"
-    if left < EXPLAINED * misfit:
-        shift = _offsets()[name]
-        hint = f"is the origin {name}? Then add ({', '.join(f'{s:+.4g}' for s in shift)}) m to x, y, z"
-        if name.startswith("the table's centre, "):
-            hint = f"another frame: is z measured from the floor? Then add {shift[2]:+.4g} m to z"
-    elif BOUNCE_RANGE[0] < median[2] < BOUNCE_RANGE[1] and wrong < 2 * WRONG * bounces:
-        return
-    if not BOUNCE_RANGE[0] < median[2] < BOUNCE_RANGE[1]:
-        raise ValueError(
-            f"{source}: balls bounce at z = {median[2]:.3f} m; in the table frame the ball's centre bounces at "
-            f"z = {BALL_RADIUS} m ({hint})"
-        )
-    raise ValueError(
-        f"{source}: {wrong} of {bounces} bounces lie beside the table, {low} balls pass below the net; the median "
-        f"bounce is at x = {median[0]:.2f}, y = {median[1]:.2f} m, the table reaches to {TABLE_WIDTH / 2:.2f} and "
-        f"{TABLE_LENGTH / 2:.2f} m from its centre ({hint})"
-    )
 
 
 def _acceleration(t: Trajectory) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

@@ -11,7 +11,7 @@ import pytest
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.report.cleaning import taken_out
 from mjx_tt.diagnosis.tracks import clean
-from mjx_tt.diagnosis.tracks.frame import check
+from mjx_tt.diagnosis.tracks.frame import align
 from tests.exam.generator.sessions import draw_balls, measure
 from tests.exam.generator.world import World, fly
 
@@ -328,27 +328,43 @@ def test_fast_balls_are_no_swapped_axes():
             a = -0.141 * np.linalg.norm(v) * v - [0, 0, 9.81]
             p, v = p + v / 180 + a / 2 / 180**2, v + a / 180
         out.append(Trajectory("fast", f"{i}", time, np.array(path).T))
-    check(out, "log.csv")
+    aligned, notes = align(out, "log.csv")
+    assert aligned == tuple(out) and not notes
 
 
 @pytest.mark.parametrize(
-    "shift, hint",
+    "shift, turn, words",
     [
-        ((0.7625, 1.37, 0.0), r"least x and y\? Then add \(-0.7625, -1.37, \+0\) m"),
-        ((0.7625, 1.37, 0.76), r"and z from the floor\? Then add \(-0.7625, -1.37, -0.76\) m"),
-        ((0.0, 1.37, 0.0), "middle of an end line"),
-        ((0.0, 0.0, 0.76), r"z measured from the floor\? Then add -0.76 m"),
+        ((0.7625, 1.37, 0.0), 0, "corner"),
+        ((0.7625, 1.37, 0.76), 0, "corner+floor"),
+        ((0.0, 1.37, 0.0), 0, "end"),
+        ((0.0, 0.0, 0.76), 0, "floor"),
+        ((0.0, 0.0, 0.0), 3, "x-along"),
+        ((0.7625, -1.37, 0.0), 1, "corner+x-along"),
     ],
 )
-def test_another_origin_is_named_with_its_offset(shift, hint):
-    moved = [_with(t, t.position + np.array(shift)[:, None]) for t in flights()]
-    with pytest.raises(ValueError, match=hint):
-        check(moved, "log.csv")
+def test_another_frame_is_found_and_said(shift, turn, words):
+    quarter = np.linalg.matrix_power(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), turn)
+    balls = flights()
+    moved = [_with(t, quarter @ (t.position + np.array(shift)[:, None])) for t in balls]
+    for told in (None, words):
+        aligned, notes = align(moved, "log.csv", told)
+        assert len(notes) == 1 and words.replace("+", ", ") in notes[0]
+        for found, ball in zip(aligned, balls, strict=True):
+            np.testing.assert_allclose(found.position, ball.position, atol=1e-12)
+
+
+def test_a_frame_that_nothing_explains_is_refused():
+    moved = [_with(t, t.position + np.array([2.0, 0.4, 0.35])[:, None]) for t in flights()]
+    with pytest.raises(ValueError, match="bounces lie beside the table.*Convert the coordinates, or name the frame"):
+        align(moved, "log.csv")
+    with pytest.raises(ValueError, match=r"expected table, or words of corner, .* got 'moon'"):
+        align(moved, "log.csv", "moon")
 
 
 @pytest.mark.parametrize("dirt", KINDS, ids=lambda d: d.__name__)
 def test_dirt_is_no_other_frame(dirt):
-    check(dirt(np.random.default_rng(1)).tracks, "log.csv")
+    assert not align(dirt(np.random.default_rng(1)).tracks, "log.csv")[1]
 
 
 def test_the_picture_shows_every_kind_that_lost_samples():
