@@ -173,7 +173,7 @@ def _choose(signs: _Signs, across: bool, words: set[str] | None) -> Frame | None
     best = min(share for share, *_ in found)
     if words is None and best > FITS:
         return None
-    return min((entry for entry in found if entry[0] < best + 0.02), key=lambda entry: entry[1:3])[3]
+    return min((entry for entry in found if entry[0] <= max(best, FITS)), key=lambda entry: entry[1:3])[3]
 
 
 def _describe(signs: _Signs, travel: Float[np.ndarray, "3"], source: str) -> str:
