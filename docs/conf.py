@@ -20,9 +20,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
-    "docstrings",
     "generated_pages",
-    "mentioned_files",
 ]
 exclude_patterns = ["_build", "_ext"]
 nitpicky = True
