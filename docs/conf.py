@@ -33,6 +33,7 @@ smartquotes_action = "qe"  # two hyphens begin an option
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
 
+napoleon_use_ivar = True
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True

@@ -36,8 +36,8 @@ COMMAND = re.compile(r"^mjx-tt (.+?)(?: >.*| &)?$", re.MULTILINE)
 KEY = re.compile(r"(?:^|[{,]) *-? *([a-z]\w+): ", re.MULTILINE)
 # Words of other programs and standards, and names that a reader fills in.
 FOREIGN = set(
-    "EGMStreamStart EGM_STOP_RAMP_DOWN JobSet RESULTS SEED_TRAINER_EVALUATOR_MODEL SESSION TRobEGM T_ROB1 a0 ars_algorithm "
-    "human_M0 icp_map launch_param profidrive security sha256sum ssh telegram111 ulimit".split()
+    "EGMStreamStart EGM_STOP_RAMP_DOWN JobSet RESULTS SEED_TRAINER_EVALUATOR_MODEL SESSION TRobEGM T_ROB1 a0 "
+    "ars_algorithm human_M0 icp_map launch_param profidrive security sha256sum ssh telegram111 ulimit".split()
 )
 
 
@@ -50,7 +50,9 @@ def vocabulary() -> frozenset[str]:
         ignored = {id(constant) for constant, _ in docstrings(tree)}
         for node in ast.walk(tree):
             if id(node) not in ignored:
-                values = (v for _, value in ast.iter_fields(node) for v in (value if isinstance(value, list) else [value]))
+                values = (
+                    v for _, value in ast.iter_fields(node) for v in (value if isinstance(value, list) else [value])
+                )
                 words.update(word for v in values if isinstance(v, str) for word in WORD.findall(v))
     for path in DATA:
         words.update(WORD.findall(path.read_text("utf-8")))
@@ -85,7 +87,9 @@ def in_module(parts: list[str]) -> bool:
         path = ROOT.joinpath(*parts[:n])
         sources = [*path.glob("__init__.py*"), *path.parent.glob(f"{path.name}.py")]
         if path.is_dir() or sources:
-            return n == len(parts) or any(re.search(rf"\b{parts[n]}\b", source.read_text("utf-8")) for source in sources)
+            return n == len(parts) or any(
+                re.search(rf"\b{parts[n]}\b", source.read_text("utf-8")) for source in sources
+            )
     return False
 
 
