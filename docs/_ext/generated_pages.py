@@ -45,7 +45,8 @@ def _complete(app: Sphinx, what: str, name: str, value: Any, options: Any, lines
         told = {name for parameter in parse_google("\n".join(lines)).params for name in parameter.arg_name.split(", ")}
         notes = {field: note for field, note in field_notes(value)[1].items() if field not in told}
         if notes:
-            lines += ["", "Attributes:", *(f"    {field}: {note}" for field, note in notes.items()), ""]
+            escaped = {field: re.sub(r"([*|])", r"\\\1", note) for field, note in notes.items()}
+            lines += ["", "Attributes:", *(f"    {field}: {note}" for field, note in escaped.items()), ""]
 
 
 def google(docstring: str) -> str:
@@ -332,7 +333,7 @@ def api_page(package: str, described: dict[int, str]) -> str:
         for name, value in public.items()
         if not isinstance(value, types.ModuleType) and name != "annotations"
     }
-    rest = [package, "=" * len(package), "", f".. automodule:: {package}", "   :no-index:", ""]
+    rest = [package, "=" * len(package), "", *(inspect.getdoc(module) or "").splitlines(), ""]
     objects = [name for name in sorted(public) if callable(public[name])]
     own = [name for name in objects if id(public[name]) not in described]
     if own:
