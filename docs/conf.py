@@ -34,6 +34,7 @@ myst_heading_anchors = 4
 myst_links_external_new_tab = False
 
 napoleon_use_ivar = True
+napoleon_attr_annotations = False  # Sphinx cannot read jaxtyping's shapes
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
