@@ -10,7 +10,7 @@
 # make test-all  all tests
 # make check  set up and check style, types and imports
 # make exam   hide causes in logs and let the diagnosis find them: the large examination (hours; resumable)
-# make docs   set up and build the documentation into docs/_build/html; a dead link or an unknown name is an error
+# make docs   set up and build the documentation into docs/_build/html; a dead link is an error
 # make bench  set up and measure speed against MJX, MuJoCo C and PyBullet
 PYTHON ?= python3
 VENV   := .venv

@@ -1,1 +1,1 @@
-"""Speed of training on this machine, beside other engines: ``mjx-tt bench`` or ``python -m benchmarks.bench``."""
+"""Speed of training on this machine, beside other engines: ``make bench`` or ``python -m benchmarks.bench``."""

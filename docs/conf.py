@@ -20,9 +20,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
-    "docstrings",
     "generated_pages",
-    "mentioned_files",
 ]
 exclude_patterns = ["_build", "_ext"]
 nitpicky = True
@@ -35,6 +33,8 @@ smartquotes_action = "qe"  # two hyphens begin an option
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
 
+napoleon_use_ivar = True
+napoleon_attr_annotations = False  # Sphinx cannot read jaxtyping's shapes
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True

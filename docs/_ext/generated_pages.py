@@ -9,20 +9,21 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import fnmatch
 import importlib
 import inspect
 import io
 import json
+import re
 import textwrap
 import types
 import typing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from docstrings import as_rest, field_notes
+from docstring_parser.google import parse as parse_google
 
 if TYPE_CHECKING:
-    from cyclopts import App
     from sphinx.application import Sphinx
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
@@ -33,7 +34,49 @@ PACKAGES = ("robot_io", "ballmodel", "bgs", "mjx_tt")  # a name that several sho
 def setup(app: Sphinx) -> dict[str, Any]:
     """Entry point of the extension."""
     app.connect("builder-inited", lambda app: write_all())
+    app.connect("autodoc-process-docstring", _complete, priority=400)  # before Napoleon
     return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+def _complete(app: Sphinx, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
+    """Adds the notes beside a dataclass's fields to its docstring."""
+    lines[:] = google("\n".join(lines)).splitlines()
+    if what == "class" and dataclasses.is_dataclass(value):
+        told = {name for parameter in parse_google("\n".join(lines)).params for name in parameter.arg_name.split(", ")}
+        notes = {field: note for field, note in field_notes(value)[1].items() if field not in told}
+        if notes:
+            escaped = {field: re.sub(r"([*|])", r"\\\1", note) for field, note in notes.items()}
+            lines += ["", "Attributes:", *(f"    {field}: {note}" for field, note in escaped.items()), ""]
+
+
+def google(docstring: str) -> str:
+    """Docstring with rows "name   meaning" in columns as a Google section; any other text stays as it is."""
+    blocks = docstring.split("\n\n")
+    for i, block in enumerate(blocks):
+        rows = textwrap.dedent(block).splitlines()
+        columns = [re.match(r"([a-z][\w.*]*(?:, [a-z][\w.*]*)*) {2,}(\S.*)$", row) for row in rows]
+        if (
+            rows
+            and columns[0]
+            and all(column or row.startswith("  ") for column, row in zip(columns, rows, strict=True))
+        ):
+            text = [
+                f"    {c[1]}: {c[2]}" if c else f"        {row.strip()}" for c, row in zip(columns, rows, strict=True)
+            ]
+            blocks[i] = "\n".join(["Attributes:", *text])
+    return "\n\n".join(blocks)
+
+
+def field_notes(kind: type) -> tuple[str, dict[str, str]]:
+    """Summary of a dataclass, and what its docstring and the comments beside its fields say of each field."""
+    docstring, source = google(inspect.getdoc(kind) or ""), inspect.getsource(kind)
+    notes = {name: text for text, name in re.findall(r"^    # (.+)\n    (\w+): ", source, re.MULTILINE)}
+    notes |= dict(re.findall(r"^    (\w+): .*?  # (.+)$", source, re.MULTILINE))
+    for parameter in parse_google(docstring).params:
+        for field in dataclasses.fields(kind):
+            if any(fnmatch.fnmatch(field.name, name) for name in parameter.arg_name.split(", ")):
+                notes[field.name] = parameter.description or ""
+    return docstring.split("\n\n")[0], notes
 
 
 def write_all() -> None:
@@ -267,39 +310,16 @@ def _cell(text: str) -> str:
 
 
 def command_line_page() -> str:
-    """Every command with its arguments and examples, from the definitions that the command line itself uses."""
+    """Every command with its arguments and examples."""
     from experiments import cli
 
+    overview, *sections = re.split(r"^(?=## mjx-tt )", cli.app.generate_docs(), flags=re.MULTILINE)
+    examples = {f"## mjx-tt {command.name[0]}": command.help_epilogue.strip() for command in cli.COMMANDS}
     lines = ["# Command line", "", "`mjx-tt COMMAND --help` shows the same in a terminal.", ""]
-    lines += ["| command | |", "|---|---|"]
-    lines += [f"| [`{c.name[0]}`](#mjx-tt-{c.name[0]}) | {_cell(c.help)} |" for c in cli.COMMANDS]
-    for command in cli.COMMANDS:
-        name = command.name[0]
-        lines += ["", f"(mjx-tt-{name})=", f"## mjx-tt {name}", "", _sentence(command.help), ""]
-        examples, remarks = _examples(command.help_epilogue)
-        lines += ["```text", *examples, "```", "", *remarks, ""]
-        lines += _arguments(command)
-    return "\n".join(lines) + "\n"
-
-
-def _sentence(text: str) -> str:
-    return text[0].upper() + text[1:].rstrip(".") + "."
-
-
-def _examples(epilogue: str) -> tuple[list[str], list[str]]:
-    """Indented rows of a help text without their indentation, and its other rows."""
-    rows = epilogue.removeprefix("examples:\n").splitlines()
-    return [row[2:] for row in rows if row.startswith("  ")], [row for row in rows if not row.startswith("  ")]
-
-
-def _arguments(command: App) -> list[str]:
-    rows = []
-    for argument in command.assemble_argument_collection():
-        name, parameter = argument.names[0], argument.parameter
-        value = parameter.metavar or (" or ".join(typing.get_args(argument.hint)) if name.startswith("--") else "")
-        note = _cell(parameter.help or "") + (" (required)" if argument.required and name.startswith("--") else "")
-        rows.append(f"| `{f'{name} {value}'.strip()}` | {note} |")
-    return ["| argument | meaning |", "|---|---|", *rows] if rows else []
+    lines.append(overview[overview.index("**Commands**") :])
+    for section in sections:
+        lines += [section, "```text", examples[section.splitlines()[0]], "```", ""]
+    return "\n".join(lines)
 
 
 def api_page(package: str, described: dict[int, str]) -> str:
@@ -313,8 +333,7 @@ def api_page(package: str, described: dict[int, str]) -> str:
         for name, value in public.items()
         if not isinstance(value, types.ModuleType) and name != "annotations"
     }
-    summary = (inspect.getdoc(module) or "").strip()
-    rest = [package, "=" * len(package), "", *as_rest(summary.splitlines()), ""]
+    rest = [package, "=" * len(package), "", *(inspect.getdoc(module) or "").splitlines(), ""]
     objects = [name for name in sorted(public) if callable(public[name])]
     own = [name for name in objects if id(public[name]) not in described]
     if own:

@@ -61,7 +61,7 @@ Context = Mapping[str, object] | None
 
 
 def write_report(folder: str | os.PathLike, diagnosis: Diagnosis, title: str, play: Play | None = None) -> list[Path]:
-    """Writes report.html and plots/*.png into a folder and returns their paths, the page first.
+    """Writes `report.html` and `plots/*.png` into a folder and returns their paths, the page first.
 
     play: what the defect costs. Raises OSError when the folder cannot be written; files that were there stay whole.
     """
