@@ -16,9 +16,8 @@ from mcap.records import Attachment, Metadata
 
 from robot_io.contract import Contract
 from robot_io.log.messages import Action, Ball, Command, Event, Joints, Level, LogError, Observation, Tick
-from robot_io.log.scan import Fault, Messages, Scan
-from robot_io.log.topics import EVENT, NANO, NumbersTopic, Topic, topics
-from robot_io.log.wire import Wire, WireError
+from robot_io.log.scan import Fault, Scan
+from robot_io.log.topics import EVENT, NANO, Messages, NumbersTopic, Topic, topics
 from robot_io.log.writer import FORMAT, FORMAT_VERSION, robot_of
 
 PIECE = 2_000_000  # messages of one piece of ``stream``: some forty minutes
@@ -177,20 +176,13 @@ class _Columns:
                 if topic is EVENT:
                     self._events += [self._event(batch, i) for i in mine]
                 elif isinstance(topic, NumbersTopic):
-                    numbers = topic.decode(Wire(batch.data, batch.start[mine], batch.end[mine]))
+                    numbers = topic.decode(batch, mine)
                     heads = (batch.log_time[mine], batch.publish_time[mine], batch.sequence[mine].astype(np.int64))
                     self._columns[topic.name].append((*heads, numbers))
             except (DecodeError, ValueError) as error:
-                at = (
-                    self._scan.messages
-                    - len(batch)
-                    + 1
-                    + (int(mine[error.index]) if isinstance(error, WireError) else 0)
-                )
-                what = (
-                    f"no {topic.message.DESCRIPTOR.full_name} of this robot" if isinstance(error, WireError) else error
-                )
-                raise LogError(f"{self._scan.path}: message {at} of the file, on {topic.name}: {what}") from None
+                last = self._scan.messages
+                where = f"messages {last - len(batch) + 1} to {last} of the file"
+                raise LogError(f"{self._scan.path}: {where}, on {topic.name}: {error}") from None
 
     def take(self, metadata: dict[str, dict[str, str]], attachments: dict[str, bytes]) -> SessionLog:
         """What came so far, and forgets it."""

@@ -29,8 +29,7 @@ from zstandard import ZstdError, frame_content_size
 
 from ballmodel.io.atomic_files import replacing
 from robot_io.log.messages import LogError
-from robot_io.log.topics import NANO
-from robot_io.log.wire import MARGIN
+from robot_io.log.topics import MARGIN, NANO, Messages
 from robot_io.log.writer import CHUNK_SIZE, SUFFIX, UNFINISHED, checksum
 
 LARGEST_CHUNK = 1 << 28  # bytes, unpacked
@@ -97,30 +96,6 @@ class Overview:
         if self.complete:
             return "damaged" if self.faults else "sound"
         return "damaged" if len(self.faults) > 1 else "interrupted"
-
-
-@dataclass(frozen=True)
-class Messages:
-    """n messages in the order of the file.
-
-    data          bytes in which they stand, with ``MARGIN`` more
-    start, end    (n,) of each message's content in ``data``
-    channel, sequence, log_time, publish_time  (n,); times in ns
-    """
-
-    data: np.ndarray
-    start: np.ndarray
-    end: np.ndarray
-    channel: np.ndarray
-    sequence: np.ndarray
-    log_time: np.ndarray
-    publish_time: np.ndarray
-
-    def __len__(self) -> int:
-        return self.start.size
-
-    def content(self, i: int) -> bytes:
-        return self.data[self.start[i] : self.end[i]].tobytes()
 
 
 class Scan:
@@ -246,8 +221,8 @@ class Scan:
     def _batch(self) -> Iterator[Messages]:
         """The messages that were kept, and forgets them."""
         if self._starts:
-            data = np.frombuffer(b"".join([*self._contents, bytes(MARGIN)]), np.uint8)
-            start, end = np.array(self._starts, np.int64), np.array(self._ends, np.int64)
+            data = np.frombuffer(b"".join([bytes(MARGIN), *self._contents]), np.uint8)
+            start, end = (np.array(places, np.int64) + MARGIN for places in (self._starts, self._ends))
             heads = np.lib.stride_tricks.sliding_window_view(data, _MESSAGE.itemsize)[start].view(_MESSAGE)[:, 0]
             self.messages += start.size
             fields = (np.ascontiguousarray(heads[name]) for name in _MESSAGE.names or ())

@@ -6,24 +6,27 @@ vectors and the ticks have two small schemas of their own.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from foxglove_schemas_protobuf.JointState_pb2 import JointState
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.Point3InFrame_pb2 import Point3InFrame
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from numpy.lib.stride_tricks import sliding_window_view
 
 from robot_io.contract import PAPER, Contract
 from robot_io.log.messages import Action, Ball, Command, Event, Joints, LogError, Numbers, Observation, Record, Tick
-from robot_io.log.wire import Wire
 
 NANO = 1_000_000_000
 FRAME = "table"
 SEQUENCE = 1 << 32
+MARGIN = 1 << 13  # bytes, more than a message of numbers has
 TIMINGS = ("lateness", "policy_seconds", "ball_age", "gantry_age", "arm_age")
 
 
@@ -82,20 +85,47 @@ class Topic:
         return files.SerializeToString(deterministic=True)
 
 
+@dataclass(frozen=True)
+class Messages:
+    """n messages in the order of the file.
+
+    data          bytes in which they stand, after ``MARGIN`` others
+    start, end    (n,) of each message's content in ``data``
+    channel, sequence, log_time, publish_time  (n,); times in ns
+    """
+
+    data: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+    channel: np.ndarray
+    sequence: np.ndarray
+    log_time: np.ndarray
+    publish_time: np.ndarray
+
+    def __len__(self) -> int:
+        return self.start.size
+
+    def content(self, i: int) -> bytes:
+        return self.data[self.start[i] : self.end[i]].tobytes()
+
+
 @dataclass(frozen=True, kw_only=True)
 class NumbersTopic(Topic):
     """A topic with numbers of one kind of record.
 
-    record    its class
-    fields    what the message holds of it, in the order of the message's numbers
-    width     numbers of a field that is an array, 1 for scalars
-    stamp     field that is the publish time; the log time is ``record.LOGGED``
-    sequence  field that is the sequence number, "" for none
+    record        its class
+    fields        what the message holds of it
+    width         numbers of a field that is an array, 1 for scalars
+    write, read   the message, without timestamp and tick, of the fields' numbers, and back
+    stamp         field that is the publish time; the log time is ``record.LOGGED``
+    sequence      field that is the sequence number, "" for none
     """
 
     record: type[Numbers]
     fields: tuple[str, ...]
     width: int
+    write: Callable[[list[Any]], Any]
+    read: Callable[[Any], list[float]]
     stamp: str = "time"
     sequence: str = "tick"
 
@@ -108,80 +138,67 @@ class NumbersTopic(Topic):
                     kind = type(record).__name__
                     raise LogError(f"{kind}.{name} has {len(part)} numbers, expected {self.width} for this robot")
             parts = [part.tolist() for part in parts]
-        return self._encode(record, parts)
-
-    def decode(self, wire: Wire) -> np.ndarray:
-        """Numbers (fields * width, n) of n messages. Raises WireError for one that is another robot's or damaged."""
-        wire.skip_block(_number(self.message, "timestamp"))  # it is the publish time
-        numbers = self._decode(wire)
-        wire.finish()
-        return numbers
-
-    def _encode(self, record: Any, parts: list[Any]) -> Any:
-        raise NotImplementedError
-
-    def _decode(self, wire: Wire) -> np.ndarray:
-        raise NotImplementedError
-
-
-class PointTopic(NumbersTopic):
-    """A field of three numbers as a point in the table's frame."""
-
-    def _encode(self, record: Any, parts: list[Any]) -> Any:
-        return Point3InFrame(frame_id=FRAME, point=Point3(**dict(zip("xyz", parts[0], strict=True))))
-
-    def _decode(self, wire: Wire) -> np.ndarray:
-        wire.expect_text(_number(Point3InFrame, "frame_id"), FRAME)
-        wire.enter(_number(Point3InFrame, "point"))
-        return np.stack([wire.double(_number(Point3, axis)) for axis in "xyz"])
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointsTopic(NumbersTopic):
-    """Fields with a number for each joint. ``keys``: their names in JointState."""
-
-    joints: tuple[str, ...]
-    keys: tuple[str, ...]
-
-    def _encode(self, record: Any, parts: list[Any]) -> Any:
-        message = JointStates()
-        for name, *numbers in zip(self.joints, *parts, strict=True):
-            message.joints.add(name=name, **dict(zip(self.keys, numbers, strict=True)))
+        message = self.write(parts)
+        if self._has_tick:
+            message.tick = record.tick
         return message
 
-    def _decode(self, wire: Wire) -> np.ndarray:
-        joints = []
-        for name in self.joints:
-            wire.enter(_number(JointStates, "joints"))
-            wire.expect_text(_number(JointState, "name"), name)
-            joints.append([wire.double(_number(JointState, key)) for key in self.keys])
-        return np.stack([columns[k] for k in range(len(self.keys)) for columns in joints])
+    def decode(self, batch: Messages, mine: np.ndarray) -> np.ndarray:
+        """Numbers (fields * width, n) of the messages with indices ``mine`` (n,). Raises ValueError for others.
+
+        Most messages end in the same bytes but for their numbers, and are read together. One in which a zero was left
+        out, as proto3 does, or that somebody else wrote, is read by the protobuf library.
+        """
+        template, places = self._template
+        start, end, data = batch.start[mine], batch.end[mine], batch.data
+        rows = sliding_window_view(data, template.size)[end - template.size]
+        size = 2 + data[start + 1].astype(np.int64) + template.size  # a timestamp stands before
+        if self._has_tick:
+            tick = batch.sequence[mine].astype(np.int64)
+            size += np.where(tick > 0, 2, 0) + sum((tick >= 1 << bits).astype(int) for bits in range(7, 32, 7))
+        constant = np.setdiff1d(np.arange(template.size), places)
+        alike = (end - start == size) & (rows[:, constant] == template[constant]).all(axis=1)
+        numbers = np.ascontiguousarray(rows[:, places.ravel()]).view("<f8")
+        for i in np.flatnonzero(~alike):
+            numbers[i] = self.read(self.message.FromString(batch.content(mine[i])))
+        return np.ascontiguousarray(numbers.T)
+
+    @cached_property
+    def _has_tick(self) -> bool:
+        return "tick" in self.message.DESCRIPTOR.fields_by_name
+
+    @cached_property
+    def _template(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bytes at the end of every message, and where among them its numbers stand (numbers, 8)."""
+        numbers = np.arange(len(self.fields) * self.width) + math.pi
+        parts = numbers.reshape(len(self.fields), -1).tolist()
+        content = self.write(parts if self.width > 1 else [part[0] for part in parts]).SerializeToString()
+        starts = np.array([content.index(number.tobytes()) for number in numbers])
+        return np.frombuffer(content, np.uint8), starts[:, None] + np.arange(8)
 
 
-class ValuesTopic(NumbersTopic):
-    """A tick's vector."""
-
-    def _encode(self, record: Any, parts: list[Any]) -> Any:
-        return Values(tick=record.tick, values=parts[0])
-
-    def _decode(self, wire: Wire) -> np.ndarray:
-        wire.skip_varint(_number(Values, "tick"))
-        return wire.doubles(_number(Values, "values"), self.width)
+def _write_point(parts: list[Any]) -> Any:
+    return Point3InFrame(frame_id=FRAME, point=Point3(**dict(zip("xyz", parts[0], strict=True))))
 
 
-class TickTopic(NumbersTopic):
-    """A tick's timings."""
-
-    def _encode(self, record: Any, parts: list[Any]) -> Any:
-        return TickMessage(tick=record.tick, **dict(zip(self.fields, parts, strict=True)))
-
-    def _decode(self, wire: Wire) -> np.ndarray:
-        wire.skip_varint(_number(TickMessage, "tick"))
-        return np.stack([wire.double(_number(TickMessage, name)) for name in self.fields])
+def _write_joints(joints: tuple[str, ...], keys: tuple[str, ...], parts: list[Any]) -> Any:
+    message = JointStates()
+    for name, *numbers in zip(joints, *parts, strict=True):
+        message.joints.add(name=name, **dict(zip(keys, numbers, strict=True)))
+    return message
 
 
-def _number(message: Any, name: str) -> int:
-    return message.DESCRIPTOR.fields_by_name[name].number
+def _read_joints(joints: tuple[str, ...], keys: tuple[str, ...], message: Any) -> list[float]:
+    found = tuple(joint.name for joint in message.joints)
+    if found != joints:
+        raise ValueError(f"joints are {found}, expected {joints}")
+    return [getattr(joint, key) for key in keys for joint in message.joints]
+
+
+def _read_values(count: int, message: Any) -> list[float]:
+    if len(message.values) != count:
+        raise ValueError(f"{len(message.values)} values, expected {count}")
+    return list(message.values)
 
 
 EVENT = Topic("/event", Log)
@@ -194,40 +211,45 @@ def topics(robot: Contract = PAPER) -> dict[str, Topic]:
     observed = {"names": " ".join(robot.observation_names), "units": " ".join(robot.observation_units)}
     acted = {"names": " ".join(joints), "units": "1"}
 
-    def by_joint(name: str, record: type[Numbers], sequence: str = "tick", **keys: str) -> JointsTopic:
-        fields = tuple(keys.values())
-        return JointsTopic(
-            name,
-            JointStates,
-            moved,
-            record=record,
-            fields=fields,
-            width=n,
-            sequence=sequence,
-            joints=joints,
-            keys=tuple(keys),
+    def of_joints(name: str, record: type[Numbers], sequence: str = "tick", **fields: str) -> Topic:
+        keys, known = tuple(fields), {"record": record, "fields": tuple(fields.values()), "sequence": sequence}
+        write, read = partial(_write_joints, joints, keys), partial(_read_joints, joints, keys)
+        return NumbersTopic(name, JointStates, moved, width=n, write=write, read=read, **known)
+
+    def of_values(name: str, record: type[Numbers], width: int, metadata: dict[str, str]) -> Topic:
+        write, read = lambda parts: Values(values=parts[0]), partial(_read_values, width)
+        return NumbersTopic(
+            name, Values, metadata, record=record, fields=("values",), width=width, write=write, read=read
         )
 
-    def vector(name: str, record: type[Numbers], width: int, metadata: dict[str, str]) -> ValuesTopic:
-        return ValuesTopic(name, Values, metadata, record=record, fields=("values",), width=width)
-
     found = (
-        PointTopic(
+        NumbersTopic(
             "/ball",
             Point3InFrame,
             {"frame": FRAME, "unit": "m"},
             record=Ball,
             fields=("position",),
             width=3,
+            write=_write_point,
+            read=lambda message: [message.point.x, message.point.y, message.point.z],
             stamp="capture_time",
             sequence="id",
         ),
-        by_joint("/joint_states", Joints, "", position="position", velocity="velocity"),
-        by_joint("/commands/requested", Command, velocity="requested"),
-        by_joint("/commands/sent", Command, position="reference", velocity="sent"),
-        vector("/observation", Observation, robot.n_observation, observed),
-        vector("/action", Action, n, acted),
-        TickTopic("/tick", TickMessage, {"unit": "s"}, record=Tick, fields=TIMINGS, width=1),
+        of_joints("/joint_states", Joints, "", position="position", velocity="velocity"),
+        of_joints("/commands/requested", Command, velocity="requested"),
+        of_joints("/commands/sent", Command, position="reference", velocity="sent"),
+        of_values("/observation", Observation, robot.n_observation, observed),
+        of_values("/action", Action, n, acted),
+        NumbersTopic(
+            "/tick",
+            TickMessage,
+            {"unit": "s"},
+            record=Tick,
+            fields=TIMINGS,
+            width=1,
+            write=lambda parts: TickMessage(**dict(zip(TIMINGS, parts, strict=True))),
+            read=lambda message: [getattr(message, name) for name in TIMINGS],
+        ),
         EVENT,
     )
     return {topic.name: topic for topic in found}
