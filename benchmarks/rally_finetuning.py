@@ -46,9 +46,9 @@ class Memory(NullRecorder):
             if isinstance(record, Event) and record.name == "episode_start":
                 self._number = json.loads(record.text)["episode"]
             elif isinstance(record, Observation):
-                self.observations.setdefault(self._number, []).append(record.observation)
+                self.observations.setdefault(self._number, []).append(record.values)
             elif isinstance(record, Action):
-                self.actions.setdefault(self._number, []).append(record.action)
+                self.actions.setdefault(self._number, []).append(record.values)
 
 
 class Watched(LockStepRallies):

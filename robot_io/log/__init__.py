@@ -15,12 +15,13 @@ from robot_io.log.messages import episode_start as episode_start
 from robot_io.log.reader import Episode as Episode
 from robot_io.log.reader import SessionLog as SessionLog
 from robot_io.log.reader import read as read
+from robot_io.log.reader import stream as stream
 from robot_io.log.recorder import FileRecorder as FileRecorder
 from robot_io.log.recorder import NullRecorder as NullRecorder
 from robot_io.log.recorder import Recorder as Recorder
 from robot_io.log.recorder import SessionRecorder as SessionRecorder
-from robot_io.log.repair import salvage as salvage
 from robot_io.log.scan import Overview as Overview
 from robot_io.log.scan import check as check
+from robot_io.log.scan import salvage as salvage
 from robot_io.log.tables import export as export
 from robot_io.log.tables import trajectories as trajectories

@@ -1,11 +1,15 @@
 """Records of a session's log, and the form in which they travel from the control thread to the recorder process.
 
-All times are seconds of the control process's monotonic clock. A record's ``log_time`` says when the control process
-had it: measurements also carry the time at which they were true, and the two are never mixed.
+All times are seconds of the control process's monotonic clock. Measurements carry two: the time at which they were true
+and the time at which the control process had them; the two are never mixed.
 
-Packed, a record is one kind byte and its fields, little endian without padding; arrays are float64. ``unpack`` is the
-inverse; its length says how many joints there are. A packed record has at most LARGEST bytes, so that a pipe takes a
-frame whole or not at all.
+A class here is the whole description of a record: packing, the log's topics (``robot_io.log.topics``) and the arrays
+that a log is read back into follow from its fields. Read back, a record holds all moments at once: every field has one
+more axis, the last.
+
+Packed, a record is one kind byte, its scalars in their order, and its arrays, little endian without padding. The
+length says how many joints there are. A packed record has at most LARGEST bytes, so that a pipe takes a frame whole or
+not at all.
 """
 
 from __future__ import annotations
@@ -14,15 +18,25 @@ import enum
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from functools import cache
+from operator import attrgetter
+from typing import Annotated, Any, ClassVar, Self, get_type_hints
 
 import numpy as np
 
 LARGEST = 4094  # bytes: PIPE_BUF of Linux, less the two of a frame's length
 _CUT = " [cut]"
 _LONGEST_TEXT = 3900  # bytes of UTF-8 of an event's text
+_ALIKE = 0  # length of an array with one number for each of the robot's joints, or of its observation's components
+
+# Types of fields: ``struct`` formats of scalars, lengths of arrays.
+Float = Annotated[Any, "d"]
+Count = Annotated[Any, "Q"]
+Number = Annotated[Any, "I"]
+Point = Annotated[Any, 3]
+Vector = Annotated[Any, _ALIKE]
 
 
 class LogError(ValueError):
@@ -39,8 +53,67 @@ class Level(enum.IntEnum):
     FATAL = 5
 
 
+class Numbers:
+    """A record whose fields are all numbers.
+
+    LOGGED  the field that says when the control process had the record
+    """
+
+    __slots__ = ()
+    KIND: ClassVar[int]
+    LOGGED: ClassVar[str] = "time"
+
+    @property
+    def log_time(self) -> float | None:
+        return getattr(self, self.LOGGED)
+
+    def pack(self) -> bytes:
+        """Raises LogError for arrays of other shapes than the fields have."""
+        layout = _layout(type(self))
+        packed, alike = layout.head.pack(self.KIND, *layout.scalars(self)), None
+        for name, length in layout.arrays:
+            values = np.asarray(getattr(self, name), "<f8")
+            alike = alike or values.shape
+            if len(alike) != 1 or values.shape != ((length,) if length else alike):
+                wanted = f"({length},)" if length else alike if len(alike) == 1 else "one number for each joint"
+                raise LogError(f"{type(self).__name__}.{name} has shape {values.shape}, expected {wanted}")
+            packed += values.tobytes()
+        return packed
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Self:
+        layout = _layout(cls)
+        _, *scalars = layout.head.unpack_from(data)
+        fields: dict[str, Any] = dict(zip(layout.names, scalars, strict=True))
+        size, parts = len(data) - layout.head.size, len(layout.arrays)
+        length = (layout.arrays[0][1] or size // (8 * parts)) if parts else 0
+        if size != 8 * parts * length:
+            raise ValueError(f"expected {layout.head.size + 8 * parts * max(length, 1)} bytes")
+        numbers = np.frombuffer(data, "<f8", offset=layout.head.size) if parts else np.empty(0)
+        for i, (name, _) in enumerate(layout.arrays):
+            fields[name] = numbers[i * length : (i + 1) * length]
+        return cls(**fields)
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    head: struct.Struct
+    names: tuple[str, ...]
+    scalars: Callable[[Any], tuple]
+    arrays: tuple[tuple[str, int], ...]
+
+
+@cache
+def _layout(cls: type[Numbers]) -> _Layout:
+    hints = get_type_hints(cls, include_extras=True)
+    fields = {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
+    names = tuple(name for name, form in fields.items() if isinstance(form, str))
+    arrays = tuple((name, form) for name, form in fields.items() if not isinstance(form, str))
+    return _Layout(struct.Struct("<B" + "".join(fields[name] for name in names)), names, attrgetter(*names), arrays)
+
+
 @dataclass(frozen=True, eq=False, slots=True)
-class Ball:
+class Ball(Numbers):
     """One sample of the ball's position.
 
     capture_time  [s] when the camera saw it
@@ -50,26 +123,15 @@ class Ball:
     """
 
     KIND: ClassVar[int] = 1
-    capture_time: float
-    received: float
-    position: np.ndarray
-    id: int = 0
-
-    @property
-    def log_time(self) -> float:
-        return self.received
-
-    def pack(self) -> bytes:
-        return _BALL.pack(self.KIND, self.capture_time, self.received, self.id) + _array(self, "position", 3)
-
-    @classmethod
-    def unpack(cls, data: bytes) -> Ball:
-        _, capture_time, received, id = _BALL.unpack_from(data)
-        return cls(capture_time, received, _arrays(data, _BALL.size, 3)[0], id)
+    LOGGED: ClassVar[str] = "received"
+    capture_time: Float
+    received: Float
+    position: Point
+    id: Number = 0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Joints:
+class Joints(Numbers):
     """Measured joint state in the order of the robot's contract.
 
     time      [s] when it was true
@@ -79,28 +141,19 @@ class Joints:
     """
 
     KIND: ClassVar[int] = 2
-    time: float
-    position: np.ndarray
-    velocity: np.ndarray
-    received: float | None = None
+    LOGGED: ClassVar[str] = "received"
+    time: Float
+    position: Vector
+    velocity: Vector
+    received: Float = None
 
-    @property
-    def log_time(self) -> float:
-        return self.time if self.received is None else self.received
-
-    def pack(self) -> bytes:
-        head = _TWO_TIMES.pack(self.KIND, self.time, self.log_time)
-        return head + _alike(self, "position", "velocity")
-
-    @classmethod
-    def unpack(cls, data: bytes) -> Joints:
-        _, time, received = _TWO_TIMES.unpack_from(data)
-        position, velocity = _parts(data, _TWO_TIMES.size, 2)
-        return cls(time, position, velocity, received)
+    def __post_init__(self) -> None:
+        if self.received is None:
+            object.__setattr__(self, "received", self.time)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Command:
+class Command(Numbers):
     """Velocity that the policy asked for and that which went to the robot in one control tick.
 
     requested  (n,) joint velocity asked for [m/s], [rad/s]
@@ -109,71 +162,35 @@ class Command:
     """
 
     KIND: ClassVar[int] = 3
-    tick: int
-    time: float
-    requested: np.ndarray
-    sent: np.ndarray
-    reference: np.ndarray
-
-    @property
-    def log_time(self) -> float:
-        return self.time
-
-    def pack(self) -> bytes:
-        return _TICKED.pack(self.KIND, self.tick, self.time) + _alike(self, "requested", "sent", "reference")
-
-    @classmethod
-    def unpack(cls, data: bytes) -> Command:
-        _, tick, time = _TICKED.unpack_from(data)
-        return cls(tick, time, *_parts(data, _TICKED.size, 3))
+    tick: Count
+    time: Float
+    requested: Vector
+    sent: Vector
+    reference: Vector
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Observation:
-    """The newest observation (3 + n,) that the policy was given in one control tick, SI units, not normalised."""
+class Observation(Numbers):
+    """The newest observation, ``values`` (3 + n,), that the policy was given in a control tick; SI, not normalised."""
 
     KIND: ClassVar[int] = 4
-    tick: int
-    time: float
-    observation: np.ndarray
-
-    @property
-    def log_time(self) -> float:
-        return self.time
-
-    def pack(self) -> bytes:
-        return _TICKED.pack(self.KIND, self.tick, self.time) + _alike(self, "observation")
-
-    @classmethod
-    def unpack(cls, data: bytes) -> Observation:
-        _, tick, time = _TICKED.unpack_from(data)
-        return cls(tick, time, *_parts(data, _TICKED.size, 1))
+    tick: Count
+    time: Float
+    values: Vector
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Action:
-    """The policy's answer (n,) in one control tick, in [-1, 1]."""
+class Action(Numbers):
+    """The policy's answer, ``values`` (n,), in one control tick, in [-1, 1]."""
 
     KIND: ClassVar[int] = 5
-    tick: int
-    time: float
-    action: np.ndarray
-
-    @property
-    def log_time(self) -> float:
-        return self.time
-
-    def pack(self) -> bytes:
-        return _TICKED.pack(self.KIND, self.tick, self.time) + _alike(self, "action")
-
-    @classmethod
-    def unpack(cls, data: bytes) -> Action:
-        _, tick, time = _TICKED.unpack_from(data)
-        return cls(tick, time, *_parts(data, _TICKED.size, 1))
+    tick: Count
+    time: Float
+    values: Vector
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Tick:
+class Tick(Numbers):
     """Timing of one control tick; all in seconds, an age is infinite while nothing has come.
 
     time            when the tick began
@@ -185,33 +202,26 @@ class Tick:
     """
 
     KIND: ClassVar[int] = 6
-    tick: int
-    time: float
-    lateness: float
-    policy_seconds: float
-    ball_age: float = float("inf")
-    gantry_age: float = float("inf")
-    arm_age: float = float("inf")
+    tick: Count
+    time: Float
+    lateness: Float
+    policy_seconds: Float
+    ball_age: Float = math.inf
+    gantry_age: Float = math.inf
+    arm_age: Float = math.inf
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class End(Numbers):
+    """The last record of a session that was closed properly: how many records were lost on the way, and why."""
+
+    KIND: ClassVar[int] = 9
+    dropped: Count
+    malformed: Count
 
     @property
-    def log_time(self) -> float:
-        return self.time
-
-    def pack(self) -> bytes:
-        return _TICK.pack(
-            self.KIND,
-            self.tick,
-            self.time,
-            self.lateness,
-            self.policy_seconds,
-            self.ball_age,
-            self.gantry_age,
-            self.arm_age,
-        )
-
-    @classmethod
-    def unpack(cls, data: bytes) -> Tick:
-        return cls(*_TICK.unpack(data)[1:])
+    def log_time(self) -> None:
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +245,7 @@ class Event:
     def pack(self) -> bytes:
         name, text = self.name.encode(), self.text.encode()
         if not 0 < len(name) <= 100:
-            raise LogError(f"event name {self.name!r}: 1 to 100 bytes are needed, put details into the text")
+            raise LogError(f"event name {self.name!r}: expected 1 to 100 bytes; put details into the text")
         if len(text) > _LONGEST_TEXT:
             text = text[:_LONGEST_TEXT].decode(errors="ignore").encode() + _CUT.encode()
         return _EVENT.pack(self.KIND, self.time, Level(self.level), len(name)) + name + text
@@ -270,34 +280,9 @@ class Metadata:
         return cls(*json.loads(data[1:]))
 
 
-@dataclass(frozen=True, slots=True)
-class End:
-    """The last record of a session that was closed properly: how many records were lost on the way, and why."""
-
-    KIND: ClassVar[int] = 9
-    dropped: int
-    malformed: int
-
-    @property
-    def log_time(self) -> None:
-        return None
-
-    def pack(self) -> bytes:
-        return _END.pack(self.KIND, self.dropped, self.malformed)
-
-    @classmethod
-    def unpack(cls, data: bytes) -> End:
-        return cls(*_END.unpack(data)[1:])
-
-
 Record = Ball | Joints | Command | Observation | Action | Tick | Event | Metadata | End
 
-_BALL = struct.Struct("<BddI")
-_TWO_TIMES = struct.Struct("<Bdd")
-_TICKED = struct.Struct("<BQd")
-_TICK = struct.Struct("<BQd5d")
 _EVENT = struct.Struct("<BdBB")
-_END = struct.Struct("<BQQ")
 _KINDS = {kind.KIND: kind for kind in (Ball, Joints, Command, Observation, Action, Tick, Event, Metadata, End)}
 
 
@@ -352,31 +337,3 @@ def _finite(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_finite(v) for v in value]
     return value
-
-
-def _array(record: Record, name: str, length: int) -> bytes:
-    values = np.asarray(getattr(record, name), "<f8")
-    if values.shape != (length,):
-        raise LogError(f"{type(record).__name__}.{name} has shape {values.shape}, expected ({length},)")
-    return values.tobytes()
-
-
-def _alike(record: Record, first: str, *others: str) -> bytes:
-    """Arrays as long as the first one, which is as long as the robot has joints."""
-    shape = np.shape(getattr(record, first))
-    if len(shape) != 1:
-        raise LogError(f"{type(record).__name__}.{first} has shape {shape}, expected one number for each joint")
-    return b"".join(_array(record, name, shape[0]) for name in (first, *others))
-
-
-def _parts(data: bytes, offset: int, count: int) -> list[np.ndarray]:
-    """Arrays of one length, ``count`` of them, that ``_alike`` packed."""
-    length = (len(data) - offset) // (8 * count)
-    return _arrays(data, offset, *[length] * count)
-
-
-def _arrays(data: bytes, offset: int, *lengths: int) -> list[np.ndarray]:
-    if len(data) != offset + 8 * sum(lengths):
-        raise ValueError(f"{offset + 8 * sum(lengths)} bytes are needed")
-    ends = np.cumsum(lengths)[:-1]
-    return np.split(np.frombuffer(data, "<f8", offset=offset), ends)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,67 +12,15 @@ from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.records import Attachment, Metadata
 
 from robot_io.contract import Contract
-from robot_io.log import schema
-from robot_io.log.messages import Event, Level, LogError
+from robot_io.log.messages import Action, Ball, Command, Event, Joints, Level, LogError, Observation, Tick
 from robot_io.log.scan import Fault, Scan
-from robot_io.log.schema import NANO, Topic
+from robot_io.log.topics import EVENT, NANO, Messages, NumbersTopic, Topic, topics
 from robot_io.log.writer import FORMAT, FORMAT_VERSION, robot_of
 
-
-@dataclass(frozen=True)
-class BallSeries:
-    """capture_time, received (n,) [s]; position (3, n) [m] in the table frame; id (n,) number of the ball in play."""
-
-    capture_time: np.ndarray
-    received: np.ndarray
-    position: np.ndarray
-    id: np.ndarray
-
-
-@dataclass(frozen=True)
-class JointSeries:
-    """time, received (n,) [s]; position (joints, n) [m], [rad]; velocity (joints, n)."""
-
-    time: np.ndarray
-    received: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-
-
-@dataclass(frozen=True)
-class CommandSeries:
-    """tick (n,); time (n,) [s]; requested, sent (joints, n) velocities; reference (joints, n) commanded position."""
-
-    tick: np.ndarray
-    time: np.ndarray
-    requested: np.ndarray
-    sent: np.ndarray
-    reference: np.ndarray
-
-
-@dataclass(frozen=True)
-class PolicySeries:
-    """tick (n,); time (n,) [s]; values (3 + joints, n) observations or (joints, n) actions."""
-
-    tick: np.ndarray
-    time: np.ndarray
-    values: np.ndarray
-
-
-@dataclass(frozen=True)
-class TickSeries:
-    """tick (n,); time, lateness, policy_seconds and the devices' ages, each (n,) [s]."""
-
-    tick: np.ndarray
-    time: np.ndarray
-    lateness: np.ndarray
-    policy_seconds: np.ndarray
-    ball_age: np.ndarray
-    gantry_age: np.ndarray
-    arm_age: np.ndarray
+PIECE = 2_000_000  # messages of one piece of ``stream``: some forty minutes
 
 
 @dataclass(frozen=True)
@@ -97,6 +45,8 @@ class SessionLog:
     robot        its contract
     metadata     MCAP metadata records by name; "session" is always there, "end" if the recorder finished the file
     attachments  files kept with the session
+    ball, joints, commands, observations, actions, ticks
+                 every field of the records as an array, whose last axis is the record: times (n,), vectors (joints, n)
     faults       what is wrong with the file; always empty unless it was read with ``salvage``
     """
 
@@ -104,12 +54,12 @@ class SessionLog:
     robot: Contract
     metadata: dict[str, dict[str, str]]
     attachments: dict[str, bytes]
-    ball: BallSeries
-    joints: JointSeries
-    commands: CommandSeries
-    observations: PolicySeries
-    actions: PolicySeries
-    ticks: TickSeries
+    ball: Ball
+    joints: Joints
+    commands: Command
+    observations: Observation
+    actions: Action
+    ticks: Tick
     events: tuple[Event, ...]
     faults: tuple[Fault, ...]
 
@@ -151,29 +101,6 @@ class SessionLog:
         return tuple(found.values())
 
 
-class _Column:
-    """Numbers of one topic as they come, compactly."""
-
-    def __init__(self, topic: Topic) -> None:
-        self._topic = topic
-        self._logged, self._published, self._sequence = array("q"), array("q"), array("q")
-        self._numbers = array("d")
-
-    def add(self, record: Message, message: Any) -> None:
-        self._numbers.extend(self._topic.numbers(message))
-        self._logged.append(record.log_time)
-        self._published.append(record.publish_time)
-        self._sequence.append(record.sequence)
-
-    def arrays(self, clock_offset_ns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Published and logged times (n,) [s], sequence numbers (n,), numbers (width, n)."""
-        logged, published = (
-            (np.array(times, np.int64) - clock_offset_ns) / NANO for times in (self._logged, self._published)
-        )
-        numbers = np.array(self._numbers, np.float64).reshape(-1, self._topic.width)
-        return published, logged, np.array(self._sequence, np.int64), np.ascontiguousarray(numbers.T)
-
-
 def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
     """Reads a whole log; every checksum is checked.
 
@@ -183,118 +110,161 @@ def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
     Raises LogError for such files, files that are no session log, and messages that break the format
     (docs/reference/log-format.md); OSError when the file cannot be read.
     """
+    (session,) = _pieces(path, salvage, None)
+    return session
+
+
+def stream(path: str | os.PathLike, salvage: bool = False, most: int = PIECE) -> Iterator[SessionLog]:
+    """Reads a log piece by piece, for sessions that do not fit into memory: each has about ``most`` messages.
+
+    Pieces follow each other without gaps or overlap, and there is at least one. An episode may begin in one piece and
+    end in another. The last piece has all metadata, attachments and faults. Raises as ``read``: damage is found where
+    it is, after the pieces before it, or, where only the whole file's checksum shows it, before the last piece.
+    """
+    return _pieces(path, salvage, most)
+
+
+def _pieces(path: str | os.PathLike, salvage: bool, most: int | None) -> Iterator[SessionLog]:
     scan = Scan(path)
-    topics: dict[str, Topic] = {}  # of the robot that the metadata of the session names, which stand before messages
-    columns: dict[str, _Column] = {}
-    events: list[tuple[int, Event]] = []
     metadata: dict[str, dict[str, str]] = {}
     attachments: dict[str, bytes] = {}
-    schemas: dict[int, str] = {}
-    declared: dict[int, Channel] = {}
-    channels: dict[int, Topic | None] = {}
-    count, last = 0, 0
-    for record in scan:
-        if isinstance(record, Message):
-            count, last = count + 1, max(last, record.log_time)
-            if not topics:
-                topics = schema.topics(robot_of(metadata.get("session", {}), str(path)))
-                columns = {name: _Column(topic) for name, topic in topics.items() if topic.width}
-            if record.channel_id not in channels and record.channel_id in declared:
-                channels[record.channel_id] = _topic(path, declared[record.channel_id], schemas, topics)
-            topic = channels.get(record.channel_id)
-            if topic is None:  # a topic of a later version, or its declaration was lost
-                continue
-            try:
-                message = topic.message.FromString(record.data)
-                if topic is schema.EVENT:
-                    events.append((record.publish_time, _event(message)))
-                else:
-                    columns[topic.name].add(record, message)
-            except (DecodeError, ValueError) as error:
-                raise LogError(f"{path}: message {count} of the file, on {topic.name}: {error}") from None
-        elif isinstance(record, Schema):
-            schemas[record.id] = record.name
-        elif isinstance(record, Channel):
-            declared[record.id] = record
-        elif isinstance(record, Metadata):
-            metadata[record.name] = record.metadata
-        elif isinstance(record, Attachment):
-            attachments[record.name] = record.data
+    columns: _Columns | None = None
+    last = count = 0
+    for part in scan:
+        if isinstance(part, Metadata):
+            metadata[part.name] = part.metadata
+        elif isinstance(part, Attachment):
+            attachments[part.name] = part.data
+        else:
+            last = max(last, int(part.log_time.max()))
+            columns = columns or _Columns(scan, metadata.get("session", {}))
+            columns.add(part)
+            if scan.faults and not salvage and most is not None:
+                break
+            if most is not None and scan.messages - count >= most:
+                _check_format(path, metadata)
+                count = scan.messages
+                yield columns.take(metadata, attachments)
     session = metadata.get("session", {})
     if scan.faults and not salvage:
-        raise LogError(_explain(scan, count, last, session))
+        raise LogError(_explain(scan, last, session))
+    _check_format(path, metadata)
+    yield (columns or _Columns(scan, session)).take(metadata, attachments)
+
+
+class _Columns:
+    """Messages of a log as they come, as arrays by topic."""
+
+    def __init__(self, scan: Scan, session: dict[str, str]) -> None:
+        self._scan = scan
+        self._robot = robot_of(session, str(scan.path))
+        self._offset = int(session.get("clock_offset_ns", 0))
+        self._topics = topics(self._robot)
+        self._channels: dict[int, Topic | None] = {}
+        self._events: list[Event] = []
+        # By topic: log times, publish times, sequence numbers, numbers (width, n).
+        self._columns: dict[str, list[tuple[np.ndarray, ...]]] = {name: [] for name in self._topics}
+
+    def add(self, batch: Messages) -> None:
+        """Raises LogError for a message that is not as its topic's are."""
+        for channel in np.unique(batch.channel).tolist():
+            topic = self._topic(channel)
+            if topic is None:  # a topic of a later version, or its declaration was lost
+                continue
+            mine = np.flatnonzero(batch.channel == channel)
+            try:
+                if topic is EVENT:
+                    self._events += [self._event(batch, i) for i in mine]
+                elif isinstance(topic, NumbersTopic):
+                    numbers = topic.decode(batch, mine)
+                    heads = (batch.log_time[mine], batch.publish_time[mine], batch.sequence[mine].astype(np.int64))
+                    self._columns[topic.name].append((*heads, numbers))
+            except (DecodeError, ValueError) as error:
+                last = self._scan.messages
+                where = f"messages {last - len(batch) + 1} to {last} of the file"
+                raise LogError(f"{self._scan.path}: {where}, on {topic.name}: {error}") from None
+
+    def take(self, metadata: dict[str, dict[str, str]], attachments: dict[str, bytes]) -> SessionLog:
+        """What came so far, and forgets it."""
+        events, self._events = tuple(self._events), []
+        return SessionLog(
+            self._scan.path,
+            self._robot,
+            dict(metadata),
+            dict(attachments),
+            *map(self._series, (Ball, Joints, Command, Observation, Action, Tick)),
+            events,
+            tuple(self._scan.faults),
+        )
+
+    def _series(self, record: Any) -> Any:
+        """Every field of a kind of record."""
+        mine = [t for t in self._topics.values() if isinstance(t, NumbersTopic) and t.record is record]
+        parts = [self._arrays(topic) for topic in mine]
+        if len(parts) > 1:
+            # A record's two messages: one of them may be lost with a damaged chunk, or be still to come.
+            _, *shared = np.intersect1d(parts[0][2], parts[1][2], return_indices=True)
+            for topic, part, kept in zip(mine, parts, shared, strict=True):
+                left = slice(kept.max(initial=-1) + 1, None)
+                self._columns[topic.name] = [tuple(column[..., left] for column in part)]
+            parts = [tuple(column[..., kept] for column in part) for part, kept in zip(parts, shared, strict=True)]
+        values: dict[str, np.ndarray] = {}
+        for topic, (logged, published, sequence, numbers) in zip(mine, parts, strict=True):
+            for i, name in enumerate(topic.fields):
+                values[name] = numbers[i * topic.width : (i + 1) * topic.width]
+                if topic.width == 1:
+                    values[name] = values[name][0]
+            values |= {record.LOGGED: self._seconds(logged), topic.stamp: self._seconds(published)}
+            if topic.sequence:
+                values[topic.sequence] = sequence
+        return record(**values)
+
+    def _arrays(self, topic: NumbersTopic) -> tuple[np.ndarray, ...]:
+        columns, self._columns[topic.name] = self._columns[topic.name], []
+        if not columns:
+            nothing = np.empty(0, np.int64)
+            return nothing, nothing, nothing, np.empty((len(topic.fields) * topic.width, 0))
+        return tuple(np.concatenate(parts, axis=-1) for parts in zip(*columns, strict=True))
+
+    def _seconds(self, times: np.ndarray) -> np.ndarray:
+        return (times - self._offset) / NANO
+
+    def _event(self, batch: Messages, i: int) -> Event:
+        message = EVENT.message.FromString(batch.content(i))
+        time = (int(batch.publish_time[i]) - self._offset) / NANO
+        return Event(time, Level(message.level), message.name, message.message)
+
+    def _topic(self, channel: int) -> Topic | None:
+        if channel not in self._channels and channel in self._scan.channels:
+            declared = self._scan.channels[channel]
+            topic = self._channels[channel] = self._topics.get(declared.topic)
+            schema = self._scan.schemas.get(declared.schema_id)
+            found = schema.name if schema else None
+            if topic is not None and (declared.message_encoding, found) != (
+                "protobuf",
+                topic.message.DESCRIPTOR.full_name,
+            ):
+                raise LogError(
+                    f"{self._scan.path}: {topic.name} holds {found!r} in {declared.message_encoding!r}, expected "
+                    f"{topic.message.DESCRIPTOR.full_name!r} in 'protobuf'; see docs/reference/log-format.md"
+                )
+        return self._channels.get(channel)
+
+
+def _check_format(path: str | os.PathLike, metadata: dict[str, dict[str, str]]) -> None:
+    session = metadata.get("session", {})
     if session.get("format") != FORMAT or session.get("format_version") != str(FORMAT_VERSION):
         found = f"{session.get('format')!r} version {session.get('format_version')!r}"
         raise LogError(f"{path}: format is {found}, expected {FORMAT!r} version '{FORMAT_VERSION}'")
-    robot = robot_of(session, str(path))
-    columns = columns or {name: _Column(topic) for name, topic in schema.topics(robot).items() if topic.width}
-    return _assemble(scan, robot, metadata, attachments, columns, events)
 
 
-def _assemble(
-    scan: Scan,
-    robot: Contract,
-    metadata: dict[str, dict[str, str]],
-    attachments: dict[str, bytes],
-    columns: dict[str, _Column],
-    events: list[tuple[int, Event]],
-) -> SessionLog:
-    offset, n = int(metadata["session"]["clock_offset_ns"]), robot.n_joints
-    arrays = {name: column.arrays(offset) for name, column in columns.items()}
-    captured, received, ids, positions = arrays[schema.BALL.name]
-    time, joints_received, _, joints = arrays[schema.JOINT_STATES]
-    _, _, requested_ticks, requested = arrays[schema.REQUESTED]
-    sent_time, _, sent_ticks, sent = arrays[schema.SENT]
-    # One of the two messages may be lost with a damaged chunk.
-    ticks, i, j = np.intersect1d(requested_ticks, sent_ticks, return_indices=True)
-    tick_time, _, tick, tick_numbers = arrays[schema.TICK.name]
-    return SessionLog(
-        path=scan.path,
-        robot=robot,
-        metadata=metadata,
-        attachments=attachments,
-        ball=BallSeries(captured, received, positions, ids),
-        joints=JointSeries(time, joints_received, joints[:n], joints[n:]),
-        commands=CommandSeries(ticks, sent_time[j], requested[:, i], sent[n:, j], sent[:n, j]),
-        observations=_policy(arrays[schema.OBSERVATION]),
-        actions=_policy(arrays[schema.ACTION]),
-        ticks=TickSeries(tick, tick_time, *tick_numbers),
-        events=tuple(Event((stamp - offset) / NANO, event.level, event.name, event.text) for stamp, event in events),
-        faults=tuple(scan.faults),
-    )
-
-
-def _policy(arrays: tuple[np.ndarray, ...]) -> PolicySeries:
-    time, _, tick, values = arrays
-    return PolicySeries(tick, time, values)
-
-
-def _event(message: Any) -> Event:
-    return Event(0.0, Level(message.level), message.name, message.message)
-
-
-def _topic(
-    path: str | os.PathLike, channel: Channel, schemas: dict[int, str], topics: dict[str, Topic]
-) -> Topic | None:
-    topic = topics.get(channel.topic)
-    if topic is not None:
-        expected = topic.message.DESCRIPTOR.full_name
-        found = schemas.get(channel.schema_id)
-        if channel.message_encoding != "protobuf" or found != expected:
-            raise LogError(
-                f"{path}: {channel.topic} holds {found!r} in {channel.message_encoding!r}, expected {expected!r} in "
-                "'protobuf'; see docs/reference/log-format.md"
-            )
-    return topic
-
-
-def _explain(scan: Scan, count: int, last: int, session: dict[str, str]) -> str:
+def _explain(scan: Scan, last: int, session: dict[str, str]) -> str:
     places = "; ".join(map(str, scan.faults[:3])) + ("; ..." if len(scan.faults) > 3 else "")
     state = "damaged" if scan.complete else "not finished"
-    if not count or "clock_offset_ns" not in session:
-        return f"{scan.path}: {state} ({places}); {count} messages of it are sound"
+    if not scan.messages or "clock_offset_ns" not in session:
+        return f"{scan.path}: {state} ({places}); {scan.messages} messages of it are sound"
     span = (last - int(session["clock_offset_ns"])) / NANO - float(session["start_time"])
     return (
-        f"{scan.path}: {state} ({places}); {count} messages of the first {span:.2f} s can be had: "
+        f"{scan.path}: {state} ({places}); {scan.messages} messages of the first {span:.2f} s can be had: "
         f"mjx-tt log salvage {scan.path}"
     )

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ballmodel.io.atomic_files import replacing
-from robot_io.log.reader import BallSeries, SessionLog
+from robot_io.log.messages import Ball
+from robot_io.log.reader import SessionLog
 
 GAP = 0.25  # [s] without a sample, after which a ball of the same number is another trajectory
 SHORTEST = 2  # samples of a trajectory that is worth a row
@@ -55,7 +56,7 @@ def export(log: SessionLog, folder: str | Path) -> list[Path]:
     return paths
 
 
-def trajectories(ball: BallSeries) -> list[tuple[str, np.ndarray]]:
+def trajectories(ball: Ball) -> list[tuple[str, np.ndarray]]:
     """Name and sample indices (n,), in the order of capture, of every ball in play.
 
     A ball's number tells one from the next. A number that comes again after GAP seconds without it, such as after a

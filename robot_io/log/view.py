@@ -33,7 +33,7 @@ from ballmodel.constants import (
 from robot_io.calibrated import Frame
 from robot_io.contract import PAPER, Contract
 from robot_io.log.messages import Ball, Event, Joints, Record
-from robot_io.log.schema import FRAME, Encoded, Topic
+from robot_io.log.topics import FRAME, Encoded, Topic
 from robot_io.safety.clearance import FIXED, SHIPPED
 
 HERE = Frame()

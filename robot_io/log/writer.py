@@ -22,8 +22,9 @@ from robot_io import contract
 from robot_io.calibrated import Frame
 from robot_io.contract import PAPER, Contract
 from robot_io.errors import ContractError
-from robot_io.log import schema, view
+from robot_io.log import view
 from robot_io.log.messages import End, LogError, Metadata, as_strings, unpack
+from robot_io.log.topics import NANO, SEQUENCE, Encoded, encode, stamps, topics
 
 FORMAT = "mjx-tt session log"
 FORMAT_VERSION = 1
@@ -102,7 +103,7 @@ def session(
     if robot != PAPER:
         own[CONTRACT] = contract.describe(robot)
     if host:
-        started = datetime.fromtimestamp(start_time + clock_offset_ns / schema.NANO, UTC)
+        started = datetime.fromtimestamp(start_time + clock_offset_ns / NANO, UTC)
         own |= {
             "started_utc": started.isoformat(timespec="milliseconds"),
             "host": platform.node(),
@@ -167,15 +168,15 @@ class SessionWriter:
         )
         self._writer.start(profile="", library=f"robot_io.log {FORMAT_VERSION}")
         self._add_metadata("session", session.metadata)
-        start = round(float(session.metadata["start_time"]) * schema.NANO) + session.clock_offset_ns
+        start = round(float(session.metadata["start_time"]) * NANO) + session.clock_offset_ns
         for name, content in session.attachments.items():
             media_type = "application/octet-stream" if b"\0" in content else "text/plain"
             self._writer.add_attachment(start, start, name, media_type, content)
         schemas: dict[str, int] = {}
         self._channels = {}
         robot = robot_of(session.metadata, session.name)
-        self._encoder = schema.Encoder(robot)
-        for topic in (*self._encoder.topics.values(), *view.TOPICS.values()):
+        self._topics = topics(robot)
+        for topic in (*self._topics.values(), *view.TOPICS.values()):
             schema_name = topic.message.DESCRIPTOR.full_name
             if schema_name not in schemas:
                 schemas[schema_name] = self._writer.register_schema(schema_name, "protobuf", topic.schema())
@@ -194,12 +195,15 @@ class SessionWriter:
         elif isinstance(record, End):
             self._end = record
         else:
-            for encoded in (*self._encoder.encode(record), *self._view.encode(record)):
+            for encoded in (*encode(record, self._topics), *self._view.encode(record)):
                 self._add_message(encoded)
         self._unflushed = True
 
     def flush(self) -> None:
-        """Ends the chunk and brings everything so far to the disk."""
+        """Ends the chunk and brings everything so far to the disk. Raises OSError, also for a file that is gone."""
+        path = self._session.unfinished
+        if not path.exists() or not os.path.samestat(path.stat(), os.fstat(self._file.fileno())):
+            raise FileNotFoundError(f"{path}: removed or moved while it was written")
         if self._unflushed:
             self._writer.flush()
             os.fdatasync(self._file.fileno())
@@ -230,16 +234,16 @@ class SessionWriter:
         sync_folder(path.parent)
         return path
 
-    def _add_message(self, encoded: schema.Encoded) -> None:
+    def _add_message(self, encoded: Encoded) -> None:
         published, logged = self._nanoseconds(encoded.publish_time), self._nanoseconds(encoded.log_time)
-        for stamp in schema.stamps(encoded.message):
-            stamp.seconds, stamp.nanos = divmod(published, schema.NANO)
+        for stamp in stamps(encoded.message):
+            stamp.seconds, stamp.nanos = divmod(published, NANO)
         self._writer.add_message(
             self._channels[encoded.topic.name],
             log_time=logged,
             data=encoded.message.SerializeToString(),
             publish_time=published,
-            sequence=encoded.sequence % schema.SEQUENCE,
+            sequence=encoded.sequence % SEQUENCE,
         )
         self.messages += 1
 
@@ -249,7 +253,7 @@ class SessionWriter:
     def _nanoseconds(self, seconds: float) -> int:
         if not math.isfinite(seconds):
             raise LogError(f"time {seconds}: a finite number of seconds is needed")
-        nanoseconds = round(seconds * schema.NANO) + self._session.clock_offset_ns
+        nanoseconds = round(seconds * NANO) + self._session.clock_offset_ns
         if not 0 <= nanoseconds < 1 << 63:
             raise LogError(f"time {seconds}: is {nanoseconds} ns since 1970, MCAP holds no time before that")
         return nanoseconds

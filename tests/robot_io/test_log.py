@@ -483,11 +483,11 @@ def test_trajectories_follow_the_ball_not_the_order_of_arrival():
     ids = np.array([4, 4, 4, 4, 5, 4, 4, 9, 5])
     position = np.ones((3, 9))
     position[0, 6] = 7.0
-    found = log.trajectories(log.reader.BallSeries(times, times, position, ids))
+    found = log.trajectories(log.Ball(times, times, position, ids))
     assert [(name, list(indices)) for name, indices in found] == [("4", [0, 2, 1]), ("5", [4, 8]), ("4.2", [5, 6])]
     position[2, 2] = np.nan
-    assert list(log.trajectories(log.reader.BallSeries(times, times, position, ids))[0][1]) == [0, 1]
-    nothing = log.reader.BallSeries(np.zeros(0), np.zeros(0), np.zeros((3, 0)), np.zeros(0, int))
+    assert list(log.trajectories(log.Ball(times, times, position, ids))[0][1]) == [0, 1]
+    nothing = log.Ball(np.zeros(0), np.zeros(0), np.zeros((3, 0)), np.zeros(0, int))
     assert log.trajectories(nothing) == []
 
 

@@ -152,7 +152,7 @@ def test_a_log_keeps_the_whole_contract_and_refuses_another_number_of_joints(tmp
     found = log.read(made_up(tmp_path, robot))
     assert found.robot == robot.contract and found.robot.geometry == robot.contract.geometry
     with log.FileRecorder.start(tmp_path, "wrong", {}, robot=robot.contract) as recorder:
-        with pytest.raises(log.LogError, match="a record of 8 numbers, the robot's have 7"):
+        with pytest.raises(log.LogError, match="has 8 numbers, expected 7"):
             recorder.put(log.Action(1, 0.1, np.zeros(8)))
     with pytest.raises(log.LogError, match="metadata contract: written by the log itself"):
         log.FileRecorder.start(tmp_path, "hidden", {"contract": "{}"})
