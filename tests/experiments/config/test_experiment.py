@@ -13,7 +13,7 @@ import yaml
 from ballmodel import registry
 from bgs import directions, shaping
 from bgs.strategy import BGSConfig
-from experiments.config import build
+from experiments.config import build, files
 from experiments.config import experiment as config
 from experiments.config.baselines import Comparison
 from experiments.config.finetuning import FineTuning
@@ -45,7 +45,7 @@ def complaint(data: dict) -> str:
 
 @pytest.mark.parametrize("path", config.shipped().values(), ids=config.shipped().keys())
 def test_shipped_experiments_load_and_fit_the_schema(path):
-    jsonschema.validate(config.read_yaml(path.read_text(), str(path)), config.json_schema())
+    jsonschema.validate(files.read_yaml(path.read_text(), str(path)), config.json_schema())
     loaded = config.load(path)
     assert loaded.name == path.stem
     build.experiment(loaded, str(path))

@@ -1,0 +1,89 @@
+"""Allowed ranges of the numbers in files, as annotations of their fields: ``Annotated[float, Within(0.0, 1.0, "s")]``.
+
+Pydantic reads such a field as a finite number (``ballmodel.io.validation``), and ``check_ranges`` looks at what a
+program has built, without pydantic, which the robot's side does not load.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+from numbers import Real
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
+
+if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+    from pydantic.json_schema import JsonSchemaValue
+    from pydantic_core import CoreSchema
+
+
+@dataclass(frozen=True)
+class Within:
+    """A finite number from ``low`` to ``high``, in SI units; the ends are allowed.
+
+    Files hold one number, also where a program may put an array of a batch. A whole number stays one.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        from pydantic_core import core_schema
+
+        low = None if self.low == -math.inf else self.low
+        high = None if self.high == math.inf else self.high
+        if source is int:
+            return core_schema.int_schema(
+                ge=None if low is None else math.ceil(low), le=None if high is None else math.floor(high)
+            )
+        return core_schema.float_schema(ge=low, le=high, allow_inf_nan=False)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return handler(schema) | ({"unit": self.unit} if self.unit else {})
+
+    def __str__(self) -> str:
+        return f"{self.low:g} to {self.high:g}{self.unit and ' '}{self.unit}"
+
+
+FINITE = Within()
+
+
+def within(hint: Any) -> Within | None:
+    """The range in a type hint; None where there is none."""
+    if get_origin(hint) is Annotated:
+        return next((note for note in get_args(hint)[1:] if isinstance(note, Within)), None)
+    return next((found for found in map(within, get_args(hint)) if found), None)
+
+
+@cache
+def type_hints(kind: type) -> dict[str, Any]:
+    """Type hints of a dataclass with their annotations."""
+    return get_type_hints(kind, include_extras=True)
+
+
+def check_ranges(config: Any) -> None:
+    """Checks all annotated numbers of a dataclass and of the dataclasses in it; None is allowed.
+
+    Raises ValueError naming the first field outside its range, the range and the value.
+    """
+    for path, value, allowed in _numbers(config, ""):
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        if not (number and math.isfinite(value) and allowed.low <= value <= allowed.high):
+            raise ValueError(f"{path}: expected {allowed}, got {value!r}")
+
+
+def _numbers(config: Any, prefix: str) -> Iterator[tuple[str, Any, Within]]:
+    """Path, value and range of every number."""
+    for field in fields(config):
+        allowed, waiting = within(type_hints(type(config))[field.name]), [(prefix + field.name, getattr(config, field.name))]
+        while waiting:
+            path, value = waiting.pop(0)
+            if isinstance(value, tuple):
+                waiting += [(f"{path}[{i}]", entry) for i, entry in enumerate(value)]
+            elif is_dataclass(value):
+                yield from _numbers(value, f"{path}.")
+            elif allowed is not None and value is not None:
+                yield path, value, allowed
