@@ -1,6 +1,6 @@
 """Allowed ranges of the numbers in files, as annotations of their fields: ``Annotated[float, Within(0.0, 1.0, "s")]``.
 
-Pydantic reads such a field as a finite number (``ballmodel.io.validation``), and ``check_ranges`` looks at what a
+Pydantic reads such a field as a finite number (``ballmodel.io.validation``), and ``check_fields`` looks at what a
 program has built, without pydantic, which the robot's side does not load.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from numbers import Real
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
@@ -45,17 +45,11 @@ class Within:
         return handler(schema) | ({"unit": self.unit} if self.unit else {})
 
     def __str__(self) -> str:
-        return f"{self.low:g} to {self.high:g}{self.unit and ' '}{self.unit}"
+        ends = f"{self.low:g} to {self.high:g}" if self.low < self.high else f"{self.low:g}"
+        return f"{ends}{self.unit and ' '}{self.unit}"
 
 
 FINITE = Within()
-
-
-def within(hint: Any) -> Within | None:
-    """The range in a type hint; None where there is none."""
-    if get_origin(hint) is Annotated:
-        return next((note for note in get_args(hint)[1:] if isinstance(note, Within)), None)
-    return next((found for found in map(within, get_args(hint)) if found), None)
 
 
 @cache
@@ -64,26 +58,40 @@ def type_hints(kind: type) -> dict[str, Any]:
     return get_type_hints(kind, include_extras=True)
 
 
-def check_ranges(config: Any) -> None:
-    """Checks all annotated numbers of a dataclass and of the dataclasses in it; None is allowed.
+def find_note(hint: Any) -> Any:
+    """The ``Within`` or ``Literal`` in a type hint that says which values are allowed; None where there is none."""
+    if get_origin(hint) is Literal:
+        return hint
+    if get_origin(hint) is Annotated:
+        return next((note for note in get_args(hint)[1:] if isinstance(note, Within)), None)
+    return next((found for found in map(find_note, get_args(hint)) if found), None)
 
-    Raises ValueError naming the first field outside its range, the range and the value.
+
+def check_fields(config: Any) -> None:
+    """Checks annotated numbers and choices of a dataclass and of the dataclasses in it; None is allowed.
+
+    Raises ValueError naming the first field at fault, what is allowed and the value.
     """
-    for path, value, allowed in _numbers(config, ""):
-        number = isinstance(value, Real) and not isinstance(value, bool)
-        if not (number and math.isfinite(value) and allowed.low <= value <= allowed.high):
-            raise ValueError(f"{path}: expected {allowed}, got {value!r}")
+    for path, value, allowed in _fields(config, ""):
+        if isinstance(allowed, Within):
+            number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+            right, words = number and allowed.low <= value <= allowed.high, str(allowed)
+        else:
+            right, words = value in get_args(allowed), " or ".join(map(repr, get_args(allowed)))
+        if not right:
+            raise ValueError(f"{path}: expected {words}, got {value!r}")
 
 
-def _numbers(config: Any, prefix: str) -> Iterator[tuple[str, Any, Within]]:
-    """Path, value and range of every number."""
+def _fields(config: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
+    """Path, value and what is allowed of every annotated field, and of every entry of a tuple."""
     for field in fields(config):
-        allowed, waiting = within(type_hints(type(config))[field.name]), [(prefix + field.name, getattr(config, field.name))]
+        allowed = find_note(type_hints(type(config))[field.name])
+        waiting = [(prefix + field.name, getattr(config, field.name))]
         while waiting:
             path, value = waiting.pop(0)
             if isinstance(value, tuple):
                 waiting += [(f"{path}[{i}]", entry) for i, entry in enumerate(value)]
             elif is_dataclass(value):
-                yield from _numbers(value, f"{path}.")
+                yield from _fields(value, f"{path}.")
             elif allowed is not None and value is not None:
                 yield path, value, allowed

@@ -22,6 +22,7 @@ T = TypeVar("T")
 Node = dict[str, Any]  # of a JSON schema
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+ENDS = {"exclusiveMinimum": "more than", "minimum": "at least", "exclusiveMaximum": "less than", "maximum": "at most"}
 LONGEST = 120  # characters of what was given that are shown
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -185,8 +186,10 @@ class _Place:
         if kind in ("number", "integer"):
             return _number(node, "a number" if kind == "number" else "a whole number")
         if kind == "array":
-            each = [a for item in (node.get("prefixItems") or [node.get("items", {})]) for a in self._alternatives(item)]
-            entries = _either(dict.fromkeys(map(self._describe, each)))
+            items = node.get("prefixItems") or [node.get("items", {})]
+            entries = _either(
+                dict.fromkeys(self._describe(each) for item in items for each in self._alternatives(item))
+            )
             least, most = node.get("minItems", 0), node.get("maxItems")
             count = f" of {least}" if least == most else f" of at least {least}" if least else ""
             return f"a list{count}, each {entries}"
@@ -217,11 +220,12 @@ def _choices(node: Node) -> list[Any]:
 
 
 def _number(node: Node, noun: str) -> str:
-    words = {"exclusiveMinimum": "more than", "minimum": "at least", "exclusiveMaximum": "less than", "maximum": "at most"}
     unit = f" {node['unit']}" if "unit" in node else ""
+    if "minimum" in node and node.get("minimum") == node.get("maximum"):
+        return f"{node['minimum']:g}{unit}"
     if "minimum" in node and "maximum" in node:
         return f"{noun} from {node['minimum']:g} to {node['maximum']:g}{unit}"
-    ends = " and ".join(f"{word} {node[key]:g}" for key, word in words.items() if key in node)
+    ends = " and ".join(f"{word} {node[key]:g}" for key, word in ENDS.items() if key in node)
     return f"{noun} of {ends}{unit}" if ends else noun.replace("a number", "a finite number") + unit
 
 
