@@ -187,12 +187,10 @@ class _Place:
             return _number(node, "a number" if kind == "number" else "a whole number")
         if kind == "array":
             items = node.get("prefixItems") or [node.get("items", {})]
-            entries = _either(
-                dict.fromkeys(self._describe(each) for item in items for each in self._alternatives(item))
-            )
+            each = (self._describe(node) for item in items for node in self._alternatives(item))
             least, most = node.get("minItems", 0), node.get("maxItems")
             count = f" of {least}" if least == most else f" of at least {least}" if least else ""
-            return f"a list{count}, each {entries}"
+            return f"a list{count}, each {_either(dict.fromkeys(each))}"
         if kind == "object":
             names = ", ".join(node.get("properties", {}))
             return f"a mapping{names and f' with the keys {names}'}"

@@ -10,6 +10,7 @@ import jax
 
 from ballmodel import registry
 from ballmodel.io import yaml
+from ballmodel.io.validation import Section
 from ballmodel.registry import Balls
 from ballmodel.sampling import BallPool, sample_pool
 from bgs import optimizers
@@ -17,7 +18,6 @@ from bgs.strategy import BGSConfig
 from experiments.config import prior
 from experiments.config.experiment import Config, Rewards, Task, Training
 from experiments.config.optimiser import Optimiser
-from experiments.config.section import Section
 from experiments.errors import ConfigError, checked
 from mjx_tt.env import own as user_file
 from mjx_tt.env import rewards

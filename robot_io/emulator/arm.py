@@ -78,9 +78,7 @@ class ArmParams:
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
         if min(self.stop_deceleration) <= 0 or min(self.max_speed) <= 0 or not self.overspeed >= 1:
-            raise ValueError(
-                "stop_deceleration, max_speed, overspeed: expected positive numbers, of overspeed at least 1"
-            )
+            raise ValueError("stop_deceleration, max_speed: expected positive numbers; overspeed: expected at least 1")
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError(f"lower: expected less than upper, {self.upper}, in each joint, got {self.lower}")
 

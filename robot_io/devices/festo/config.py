@@ -77,8 +77,8 @@ class AxesConfig:
                 raise ValueError(f"{name}: expected a positive, finite number, got {value}")
         if self.gain * self.latency > 1 / math.e:
             raise ValueError(
-                f"gain: expected at most {1 / math.e / self.latency:.2f} / s with a latency of {self.latency} s, beyond "
-                f"which it overshoots, got {self.gain}"
+                f"gain: expected at most {1 / math.e / self.latency:.2f} / s with a latency of {self.latency} s, got "
+                f"{self.gain}; more overshoots"
             )
 
 

@@ -142,13 +142,11 @@ def test_points_calibrations_and_parts_of_another_robot_are_refused(tmp_path, mo
     path.write_text(
         f"axes: []\ncalibration: {{robot: {{joint_zeros: {[0.01] * 6}, axes_zero: [], date: '2026-11-22'}}}}"
     )
-    with pytest.raises(
-        ConfigError, match="calibration.robot.joint_zeros: expected 7 entries for fr3_pedestal, .* got 6"
-    ):
+    with pytest.raises(ConfigError, match="robot.joint_zeros: expected 7 entries for fr3_pedestal, .* got 6"):
         robots.load_robot(path, contract=fr3)
     path.write_text(f"axes: [{{}}]\ncalibration: {{robot: {{joint_zeros: {[0.01] * 6}, date: '2026-11-22'}}}}")
     with pytest.raises(
-        ConfigError, match="calibration.robot.axes_zero: expected 1 entries for ur10e_rail, one for each of rail, got 2"
+        ConfigError, match="calibration.robot.axes_zero: expected 1 entries for ur10e_rail, .*rail, got 2"
     ):
         robots.load_robot(path, contract=ur10e)
     path.write_text(f"calibration: {{robot: {{joint_zeros: {[0.01] * 7}, date: '2026-11-22'}}}}")

@@ -205,7 +205,7 @@ def test_an_arm_that_egm_does_not_carry_is_refused():
 def test_the_control_process_says_which_robot_it_was_given(tmp_path):
     policy = exported(tmp_path / "artefact", UR10E)
     options = play.process.ControlOptions(str(policy), contract=simulated.load_shipped(UR10E).contract)
-    with pytest.raises(RefusedError, match="axes: expected 1 entries for ur10e_rail, one for each of rail, got 2"):
+    with pytest.raises(RefusedError, match="axes: expected 1 entries for ur10e_rail, .*rail, got 2"):
         play.Session(RobotConfig(), options, Console())
     with pytest.raises(RefusedError, match="a policy for ur10e_rail, and robot.yaml is of irb120_gantry: contract"):
         play.Session(RobotConfig(), play.process.ControlOptions(str(policy)), Console())
@@ -277,9 +277,7 @@ def test_a_rig_reacts_as_late_as_the_robots_yaml_says_unless_rig_yaml_does(tmp_p
     assert robots.load_rig(path).hidden.joint_zeros[0] == 0.01
     path.write_text("hidden: {joint_zeros: [0.01, 0, 0, 0, 0, 0, 0]}\n")
     assert robots.load_rig(path, robot).hidden.joint_zeros == (0.01, *(0.0,) * 6)
-    with pytest.raises(
-        ConfigError, match="hidden.joint_zeros: expected 6 entries for irb120_gantry, .* joint_1.* got 7"
-    ):
+    with pytest.raises(ConfigError, match="joint_zeros: expected 6 entries for irb120_gantry, .* joint_1.* got 7"):
         robots.load_rig(path)
     params = replace(RigParams().arm, max_speed=(1.0,) * 6)
     with pytest.raises(ValueError, match="arm.max_speed is .* those of fr3_pedestal are its YAML's"):
