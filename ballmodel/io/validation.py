@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from typing import Annotated, Any, TypeVar
 
@@ -23,6 +23,7 @@ Node = dict[str, Any]  # of a JSON schema
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 ENDS = {"exclusiveMinimum": "more than", "minimum": "at least", "exclusiveMaximum": "less than", "maximum": "at most"}
+MOST_NAMES = 24  # of keys that a message lists
 LONGEST = 120  # characters of what was given that are shown
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -65,7 +66,7 @@ def validate(kind: type[T], data: Any, where: str) -> T:
         return _file(kind).model_validate_json(content).content  # type: ignore[attr-defined]
     except ValidationError as error:
         lines = dict.fromkeys(format_errors(error, kind, from_json(content)["content"]))
-        raise ValueError("\n".join(f"{where}: {line}" for line in lines)) from None
+        raise ValueError("\n".join(f"{where}: {line}" for text in lines for line in text.splitlines())) from None
 
 
 def read(kind: type[T], path: str | os.PathLike) -> T:
@@ -81,6 +82,15 @@ def json_schema(kind: Any) -> dict[str, Any]:
         root = schema["$defs"].pop(root["$ref"].removeprefix("#/$defs/"))
     rest = {"$defs": schema["$defs"]} if schema.get("$defs") else {}
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | root | rest
+
+
+def find(table: Mapping[str, T], name: str, what: str) -> T:
+    """The entry of a name. Raises ValueError with the valid names; ``what`` says what they are names of."""
+    if name in table:
+        return table[name]
+    close = difflib.get_close_matches(str(name).lower(), table, 1, cutoff=0.0)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    raise ValueError(f"expected a {what}, {', '.join(table)}, got {name!r}{hint}")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -156,7 +166,7 @@ class _Place:
             names = list(dict.fromkeys(key for node in self.owners for key in node.get("properties", {})))
             new = next((node["renamed"][name] for node in self.owners if name in node.get("renamed", {})), None)
             hint = f"it is now called {new}" if new else nearest(name, names)
-            return path, _formula(f"one of the keys {', '.join(names)}", f"the unknown key {name!r}", hint)
+            return path, _formula(f"one of the keys {_list(names)}", f"the unknown key {name!r}", hint)
         if kind.startswith("union_tag"):
             tags = [str(node["properties"]["kind"]["const"]) for node in self.nodes if "kind" in node["properties"]]
             tag, expected = given.get("kind") if isinstance(given, dict) else None, _either(map(repr, tags))
@@ -192,7 +202,7 @@ class _Place:
             count = f" of {least}" if least == most else f" of at least {least}" if least else ""
             return f"a list{count}, each {_either(dict.fromkeys(each))}"
         if kind == "object":
-            names = ", ".join(node.get("properties", {}))
+            names = _list(list(node.get("properties", {})))
             return f"a mapping{names and f' with the keys {names}'}"
         if kind == "string":
             return f"text that matches {node['pattern']}" if "pattern" in node else "text"
@@ -201,6 +211,11 @@ class _Place:
 
 def _formula(expected: str, got: str, remedy: str = "") -> str:
     return f": expected {expected}, got {got}{remedy and '; '}{remedy}"
+
+
+def _list(names: list[str]) -> str:
+    more = len(names) - MOST_NAMES
+    return ", ".join(names) if more <= 0 else f"{', '.join(names[:MOST_NAMES])} and {more} more"
 
 
 def _entry(node: Node, index: int) -> Any:
