@@ -42,11 +42,12 @@ def explained(error: Exception) -> bool:
 
 @contextmanager
 def error_context(where: str = "") -> Iterator[None]:
-    """Turns a complaint about a request into a ConfigError that begins with ``where``, its file or key."""
+    """Turns a complaint about a request into a ConfigError whose lines begin with ``where``, its file or key."""
     try:
         yield
     except (ValueError, OSError, RuntimeError) as error:
-        raise ConfigError(f"{where}: {error}" if where else str(error)) from None
+        lines = str(error).splitlines() or [""]
+        raise ConfigError("\n".join(f"{where}: {line}" for line in lines) if where else str(error)) from None
 
 
 def checked(where: str, function: Callable[..., T], *arguments: Any) -> T:
