@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from typing import Annotated, Any, TypeVar
@@ -77,10 +78,10 @@ def read(kind: type[T], path: str | os.PathLike) -> T:
 def json_schema(kind: Any) -> dict[str, Any]:
     """JSON schema of a type's files, for editors that complete and check while one types."""
     schema = _schema(kind)
-    root = schema["properties"]["content"]
+    root, definitions = schema["properties"]["content"], dict(schema.get("$defs", {}))
     if "$ref" in root:
-        root = schema["$defs"].pop(root["$ref"].removeprefix("#/$defs/"))
-    rest = {"$defs": schema["$defs"]} if schema.get("$defs") else {}
+        root = definitions.pop(root["$ref"].removeprefix("#/$defs/"))
+    rest = {"$defs": definitions} if definitions else {}
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | root | rest
 
 
@@ -134,7 +135,7 @@ class _Place:
             properties = [node.get("properties", {}) for node in self.nodes]
             if isinstance(part, int) and isinstance(data, list):
                 self.path += f"[{part}]"
-                below = [_entry(node, part) for node in self.nodes]
+                below = [_entry(node, part) for node in self.nodes if node.get("type") == "array"]
                 data = data[part] if part < len(data) else None
             elif isinstance(data, dict) and (part in data or any(part in keys for keys in properties)):
                 self.path += f".{part}"
@@ -179,8 +180,8 @@ class _Place:
             return path, _formula(message, _shown(given))
         if kind == "value_error":  # about several keys, which it names with what was given
             message = message.removeprefix(f"{self.nodes[0].get('title', '')}.")
-            first = message.split(" ")[0].split(":")[0].split(".")[0].split("[")[0]
-            within = path and first in self.nodes[0].get("properties", {})
+            key = re.match(r"(\w+)[.:[]", message)
+            within = path and key and key[1] in self.nodes[0].get("properties", {})
             return path, f"{'.' if within else path and ': '}{message}"
         choices = [str(value) for node in self.nodes for value in _choices(node)]
         return path, _formula(self.expected(), _shown(given), nearest(given, choices) if isinstance(given, str) else "")

@@ -178,7 +178,7 @@ def test_a_mistake_is_refused_with_file_element_and_remedy(folder, what):
 def test_all_mistakes_of_a_file_are_named_at_once(folder):
     file = folder / YAML
     text = file.read_text(encoding="utf-8")
-    for before, after in (("velocity: 2, acc", "velocity: -2, acc"), ("home: 0.1}", "home: 9}"), ("[0.05,", "[50,")):
+    for before, after in (("velocity: 2, acc", "velocity: -2, acc"), ("home: 1.701}", "home: 9}"), ("[0.05,", "[50,")):
         assert before in text
         text = text.replace(before, after, 1)
     file.write_text(text, encoding="utf-8")

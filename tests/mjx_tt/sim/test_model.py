@@ -16,7 +16,7 @@ from mjx_tt.sim.model import LATENCIES, BallSpinParams, LatencyParams, ModelFile
 def test_yaml_keeps_every_parameter(tmp_path):
     """Every leaf gets its own value, so none can be lost or swapped."""
     values = {}
-    for i, path in enumerate(model.paths()):
+    for i, path in enumerate(path for path in model.paths() if path != "ball.flight.integrator"):
         low, high = np.clip(model.bounds(path), -200.0, 200.0)
         values[path] = float(low + (0.2 + 0.00307 * i) * (high - low))
     values["ball.flight.integrator"] = "midpoint"
