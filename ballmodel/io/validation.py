@@ -140,7 +140,7 @@ class _Place:
             elif isinstance(data, dict) and (part in data or any(part in keys for keys in properties)):
                 self.path += f".{part}"
                 below = [keys[part] for keys in properties if part in keys]
-                below = below or [n["additionalProperties"] for n in self.nodes if n.get("additionalProperties")]
+                below = below or [value for node in self.nodes for value in _values(node)]
                 data = data.get(part)
             else:  # pydantic's name of a member of a union, which the writer of the file has never seen
                 self.nodes = [node for node in self.nodes if part in _tags(node)] or self.nodes
@@ -169,7 +169,9 @@ class _Place:
             hint = f"it is now called {new}" if new else nearest(name, names)
             return path, _formula(f"one of the keys {_list(names)}", f"the unknown key {name!r}", hint)
         if kind.startswith("union_tag"):
-            tags = [str(node["properties"]["kind"]["const"]) for node in self.nodes if "kind" in node["properties"]]
+            tags = [
+                str(node["properties"]["kind"]["const"]) for node in self.nodes if "kind" in node.get("properties", {})
+            ]
             tag, expected = given.get("kind") if isinstance(given, dict) else None, _either(map(repr, tags))
             hint = nearest(tag, tags) if tag else "it says which kind of mapping this is"
             return f"{path}.kind".removeprefix("."), _formula(expected, repr(tag) if tag else "nothing", hint)
@@ -179,9 +181,8 @@ class _Place:
         if kind == "value_error" and not isinstance(given, dict):
             return path, _formula(message, _shown(given))
         if kind == "value_error":  # about several keys, which it names with what was given
-            message = message.removeprefix(f"{self.nodes[0].get('title', '')}.")
             key = re.match(r"(\w+)[.:[]", message)
-            within = path and key and key[1] in self.nodes[0].get("properties", {})
+            within = path and key and any(key[1] in node.get("properties", {}) for node in self.nodes)
             return path, f"{'.' if within else path and ': '}{message}"
         choices = [str(value) for node in self.nodes for value in _choices(node)]
         return path, _formula(self.expected(), _shown(given), nearest(given, choices) if isinstance(given, str) else "")
@@ -222,6 +223,11 @@ def _list(names: list[str]) -> str:
 def _entry(node: Node, index: int) -> Any:
     fixed = node.get("prefixItems", ())
     return fixed[index] if index < len(fixed) else node.get("items", {})
+
+
+def _values(node: Node) -> list[Any]:
+    """Schemas of a mapping's values, whatever their keys."""
+    return [value for value in (node.get("additionalProperties"), *node.get("patternProperties", {}).values()) if value]
 
 
 def _tags(node: Node) -> tuple[Any, ...]:

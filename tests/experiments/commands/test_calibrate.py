@@ -92,7 +92,7 @@ def test_a_calibration_that_run_would_refuse_is_named_and_not_written(measured, 
     (measured / "calibration.yaml").write_text(before)
     assert cli.main(["calibrate", "robot", "far.csv"]) == 1
     told = capsys.readouterr().err
-    assert "calibration.yaml: robot.joint_zeros" in told and "allowed: -0.05 to 0.05" in told
+    assert "calibration.yaml: robot.joint_zeros" in told and "from -0.05 to 0.05 rad" in told
     assert (measured / "calibration.yaml").read_text() == before
 
 
