@@ -45,7 +45,10 @@ class Within:
         return handler(schema) | ({"unit": self.unit} if self.unit else {})
 
     def __str__(self) -> str:
-        ends = f"{self.low:g} to {self.high:g}" if self.low < self.high else f"{self.low:g}"
+        if math.isinf(self.high):
+            ends = "a finite number" if math.isinf(self.low) else f"at least {self.low:g}"
+        else:
+            ends = f"{self.low:g} to {self.high:g}" if self.low < self.high else f"{self.low:g}"
         return f"{ends}{self.unit and ' '}{self.unit}"
 
 

@@ -169,9 +169,8 @@ class _Place:
             hint = f"it is now called {new}" if new else nearest(name, names)
             return path, _formula(f"one of the keys {_list(names)}", f"the unknown key {name!r}", hint)
         if kind.startswith("union_tag"):
-            tags = [
-                str(node["properties"]["kind"]["const"]) for node in self.nodes if "kind" in node.get("properties", {})
-            ]
+            kinds = [node["properties"]["kind"] for node in self.nodes if "kind" in node.get("properties", {})]
+            tags = [str(choice) for node in kinds for choice in _choices(node)]
             tag, expected = given.get("kind") if isinstance(given, dict) else None, _either(map(repr, tags))
             hint = nearest(tag, tags) if tag else "it says which kind of mapping this is"
             return f"{path}.kind".removeprefix("."), _formula(expected, repr(tag) if tag else "nothing", hint)

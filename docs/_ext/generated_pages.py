@@ -178,6 +178,7 @@ def dataclass_schema(kind: type) -> dict[str, Any]:
 
 def model_page() -> str:
     """Every parameter of the simulation's model, its nominal value and its comment."""
+    from ballmodel.io.ranges import Within, find_note, type_hints
     from mjx_tt.sim import model
     from mjx_tt.sim.actuators import DriveParams
 
@@ -213,8 +214,12 @@ def model_page() -> str:
             owner = next(h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h))
         summary, notes = field_notes(owner)
         title = "drives.JOINT" if section in joints else section
-        lines += ["", f"## {title}", "", _cell(summary), "", "| key | nominal | meaning |", "|---|---|---|"]
-        lines += [f"| `{key}` | {_nominal(value)} | {_cell(notes.get(key, ''))} |" for key, value in values.items()]
+        lines += ["", f"## {title}", "", _cell(summary), ""]
+        lines += ["| key | nominal | allowed | meaning |", "|---|---|---|---|"]
+        for key, value in values.items():
+            allowed = find_note(type_hints(owner)[key])
+            words = str(allowed) if isinstance(allowed, Within) else " or ".join(typing.get_args(allowed))
+            lines.append(f"| `{key}` | {_nominal(value)} | {words} | {_cell(notes.get(key, ''))} |")
     return "\n".join(lines) + "\n"
 
 

@@ -45,6 +45,14 @@ def test_numbers_are_read_as_in_every_other_yaml(tmp_path):
         ModelFile.load(tmp_path / "b.yaml")
 
 
+def test_what_is_drawn_keeps_the_order_of_the_file(tmp_path):
+    """Each entry has a key of its own by its place: another order draws other worlds from the same seed."""
+    paths = ["latency.abb_action", "ball.table.restitution", "ball.flight.mass"]
+    lines = "".join(f"  {path}: {list(model.bounds(path))}\n" for path in paths)
+    (tmp_path / "a.yaml").write_text(f"randomise:\n{lines}")
+    assert [one.path for one in ModelFile.load(tmp_path / "a.yaml").randomise] == paths
+
+
 def test_what_is_left_out_is_nominal(tmp_path):
     (tmp_path / "a.yaml").write_text("ball: {table: {restitution: 0.9}}\nsensing:\n  ball_offset_x: 0.01\n")
     read = ModelFile.load(tmp_path / "a.yaml")
