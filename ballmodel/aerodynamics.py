@@ -14,13 +14,17 @@ has only the inertia-box fluid model and drops lift silently.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated, Literal, TypeAlias, get_args
 
 import jax
-from jaxtyping import Float
 
 from ballmodel import constants as c
+from ballmodel.io.ranges import Within
 from ballmodel.partial_params import optional
 from ballmodel.vec import Scalars, Vec, Vector, cross, norm
+
+Integrator: TypeAlias = Literal["paper", "midpoint"]  # acceleration at a step's start (the paper's), or at its middle
+INTEGRATORS = get_args(Integrator)
 
 
 @jax.tree_util.register_dataclass
@@ -28,29 +32,28 @@ from ballmodel.vec import Scalars, Vec, Vector, cross, norm
 class FlightParams:
     """Parameters of free flight; every field is a scalar or has the batch shape of the balls."""
 
-    drag_coefficient: Float[jax.Array, "*#batch"] | float = c.DRAG_COEFFICIENT  # C_d
-    magnus_coefficient: Float[jax.Array, "*#batch"] | float = 0.0  # k in C_L = k r |omega| / |u|
-    lift_saturation: Float[jax.Array, "*#batch"] | float | None = optional(0.0)  # c in C_L = k S / (1 + c S)
-    spin_decay: Float[jax.Array, "*#batch"] | float = 0.0  # [1/s]
-    air_density: Float[jax.Array, "*#batch"] | float = c.AIR_DENSITY  # [kg/m^3]
-    mass: Float[jax.Array, "*#batch"] | float = c.BALL_MASS  # [kg]
-    radius: Float[jax.Array, "*#batch"] | float = c.BALL_RADIUS  # [m]
-    area: Float[jax.Array, "*#batch"] | float = c.BALL_AREA  # [m^2] cross-section
-    buoyancy: Float[jax.Array, "*#batch"] | float = (
+    drag_coefficient: Annotated[Scalars, Within(0.0, 5.0)] = c.DRAG_COEFFICIENT  # C_d
+    magnus_coefficient: Annotated[Scalars, Within(-10.0, 10.0)] = 0.0  # k in C_L = k r |omega| / |u|
+    lift_saturation: Annotated[Scalars, Within(0.0, 100.0)] | None = optional(0.0)  # c in C_L = k S / (1 + c S)
+    spin_decay: Annotated[Scalars, Within(-10.0, 100.0, "1/s")] = 0.0  # [1/s]
+    air_density: Annotated[Scalars, Within(0.0, 10.0, "kg/m^3")] = c.AIR_DENSITY  # [kg/m^3]
+    mass: Annotated[Scalars, Within(0.0001, 0.1, "kg")] = c.BALL_MASS  # [kg]
+    radius: Annotated[Scalars, Within(0.001, 0.1, "m")] = c.BALL_RADIUS  # [m]
+    area: Annotated[Scalars, Within(1e-06, 0.1, "m^2")] = c.BALL_AREA  # [m^2] cross-section
+    buoyancy: Annotated[Scalars, Within(-10.0, 10.0)] = (
         0.0  # fraction of gravity taken away; 0.0149 for a ball in air at 20 degC
     )
-    gravity_x: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s^2]
-    gravity_y: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s^2]
-    gravity_z: Float[jax.Array, "*#batch"] | float = -c.GRAVITY  # [m/s^2]
-    wind_x: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s]
-    wind_y: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s]
-    wind_z: Float[jax.Array, "*#batch"] | float = 0.0  # [m/s]
-    integrator: str = field(default="paper", metadata={"static": True})  # one of INTEGRATORS
+    gravity_x: Annotated[Scalars, Within(-100.0, 100.0, "m/s^2")] = 0.0  # [m/s^2]
+    gravity_y: Annotated[Scalars, Within(-100.0, 100.0, "m/s^2")] = 0.0  # [m/s^2]
+    gravity_z: Annotated[Scalars, Within(-100.0, 100.0, "m/s^2")] = -c.GRAVITY  # [m/s^2]
+    wind_x: Annotated[Scalars, Within(-50.0, 50.0, "m/s")] = 0.0  # [m/s]
+    wind_y: Annotated[Scalars, Within(-50.0, 50.0, "m/s")] = 0.0  # [m/s]
+    wind_z: Annotated[Scalars, Within(-50.0, 50.0, "m/s")] = 0.0  # [m/s]
+    integrator: Integrator = field(default="paper", metadata={"static": True})
 
 
 # C_L = S / (0.55 + 3.55 S), with C_d = 0.33: landing errors of 68 mm in the median where the best constant k has 104.
 SATURATING_LIFT = {"magnus_coefficient": 1 / 0.55, "lift_saturation": 3.55 / 0.55, "drag_coefficient": 0.33}
-INTEGRATORS = ("paper", "midpoint")  # acceleration of a step taken at its start (the paper's), or at its middle
 
 
 def drag_factor(params: FlightParams) -> Scalars:

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
 
 from ballmodel import constants as c
+from ballmodel.io.ranges import Within
 from ballmodel.partial_params import optional, value_or
 from ballmodel.vec import TINY, Scalars, Vec, Vector, components, cross, dot, norm
 
@@ -33,15 +33,15 @@ STICKING = 2.0 / 5.0  # alpha that brings the contact point of a thin shell to r
 class SurfaceParams:
     """Impact on table or net; scalars or of the balls' batch shape."""
 
-    restitution: Float[jax.Array, "*#batch"] | float  # e at zero speed
-    restitution_slope: Float[jax.Array, "*#batch"] | float  # [s/m], loss of e per normal speed
-    friction: Float[jax.Array, "*#batch"] | float  # mu
-    height: Float[jax.Array, "*#batch"] | float  # [m], shift of the surface along z from its nominal place
+    restitution: Annotated[Scalars, Within(0.0, 1.5)]  # e at zero speed
+    restitution_slope: Annotated[Scalars, Within(-1.0, 1.0, "s/m")]  # [s/m], loss of e per normal speed
+    friction: Annotated[Scalars, Within(0.0, 5.0)]  # mu
+    height: Annotated[Scalars, Within(-0.5, 0.5, "m")]  # [m], shift of the surface along z from its nominal place
     # slope dz/dx of the surface, about the table's centre
-    tilt_x: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
-    tilt_y: Float[jax.Array, "*#batch"] | float | None = optional(0.0)  # slope dz/dy
+    tilt_x: Annotated[Scalars, Within(-1.0, 1.0)] | None = optional(0.0)
+    tilt_y: Annotated[Scalars, Within(-1.0, 1.0)] | None = optional(0.0)  # slope dz/dy
     # e_t, slip that a gripped contact point springs back with over the slip that it came with
-    tangential_restitution: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
+    tangential_restitution: Annotated[Scalars, Within(-1.0, 1.0)] | None = optional(0.0)
 
 
 @jax.tree_util.register_dataclass
@@ -49,17 +49,17 @@ class SurfaceParams:
 class PaddleParams:
     """Impact on the paddle's rubber and the blade's size; scalars or of the balls' batch shape."""
 
-    restitution: Float[jax.Array, "*#batch"] | float = c.RUBBER_RESTITUTION  # a in e = a - b |v_n|
-    restitution_slope: Float[jax.Array, "*#batch"] | float = c.RUBBER_RESTITUTION_SLOPE  # b [s/m]
-    tangential_gain: Float[jax.Array, "*#batch"] | float = c.RUBBER_TANGENTIAL_GAIN  # k_v
-    radius: Float[jax.Array, "*#batch"] | float = c.PADDLE_RADIUS  # [m]
-    thickness: Float[jax.Array, "*#batch"] | float = c.PADDLE_THICKNESS  # [m]
+    restitution: Annotated[Scalars, Within(0.0, 1.5)] = c.RUBBER_RESTITUTION  # a in e = a - b |v_n|
+    restitution_slope: Annotated[Scalars, Within(-1.0, 1.0, "s/m")] = c.RUBBER_RESTITUTION_SLOPE  # b [s/m]
+    tangential_gain: Annotated[Scalars, Within(-2.0, 2.0)] = c.RUBBER_TANGENTIAL_GAIN  # k_v
+    radius: Annotated[Scalars, Within(0.01, 0.5, "m")] = c.PADDLE_RADIUS  # [m]
+    thickness: Annotated[Scalars, Within(0.0, 0.1, "m")] = c.PADDLE_THICKNESS  # [m]
     # [rad], turns the blade's normal about the blade's horizontal in-plane axis; positive turns it downwards (closes)
-    tilt: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
+    tilt: Annotated[Scalars, Within(-1.0, 1.0, "rad")] | None = optional(0.0)
     # [m], shift of the blade along its (turned) normal
-    offset: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
+    offset: Annotated[Scalars, Within(-0.5, 0.5, "m")] | None = optional(0.0)
     # share of the restitution that is lost at the blade's rim; it grows with the square of the distance from its centre
-    rim_loss: Float[jax.Array, "*#batch"] | float | None = optional(0.0)
+    rim_loss: Annotated[Scalars, Within(0.0, 1.0)] | None = optional(0.0)
 
 
 def table_params() -> SurfaceParams:

@@ -7,25 +7,22 @@ and in the table frame, so a ball towards the robot has vy < 0.
 
 from __future__ import annotations
 
-import difflib
 import os
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
 from jaxtyping import Bool, Float
+from pydantic import BeforeValidator
 
 from ballmodel.io.atomic_files import replacing
+from ballmodel.io.validation import Finite, Increasing, Section, validate
 from ballmodel.io.yaml import read as read_yaml
 from ballmodel.state import BallState
 
 AXES = {"position": ("x", "y", "z"), "velocity": ("x", "y", "z"), "landing": ("x", "y")}
-SHORT_BALLS = "short_balls"
-NOTES = ("name", "source", "paper")
-OPTIONAL = (*NOTES, SHORT_BALLS)
 EPS_FACTOR = 2.0
 
 
@@ -50,12 +47,10 @@ class BallDistribution:
         for part, axes in AXES.items():
             low, high = (tuple(float(v) for v in getattr(self, f"{part}_{end}")) for end in ("min", "max"))
             if not len(low) == len(high) == len(axes):
-                raise ValueError(f"{self.name}: {part} needs {len(axes)} numbers at each end, got {low} and {high}")
+                raise ValueError(f"{self.name}: {part}: expected {len(axes)} numbers at each end, got {low}, {high}")
             for axis, a, b in zip(axes, low, high, strict=True):
                 if not (np.isfinite(a) and np.isfinite(b) and a <= b):
-                    raise ValueError(
-                        f"{self.name}: {part}.{axis} is [{a}, {b}]; finite numbers with min <= max are allowed"
-                    )
+                    raise ValueError(f"{self.name}: {part}.{axis}: expected finite numbers min <= max, got [{a}, {b}]")
             object.__setattr__(self, f"{part}_min", low)
             object.__setattr__(self, f"{part}_max", high)
 
@@ -70,50 +65,78 @@ class BallDistribution:
             }
             for part, axes in AXES.items()
         }
-        short = {SHORT_BALLS: True} if self.short_balls else {}
+        short = {"short_balls": True} if self.short_balls else {}
         return {"name": self.name, "source": self.source, **intervals, **short}
 
 
-def check_keys(data: Any, allowed: Iterable[str], where: str) -> None:
-    """Raises ValueError where ``data`` is no mapping of exactly the keys ``allowed``; optional ones may be absent."""
-    if not isinstance(data, dict):
-        raise ValueError(f"{where}: a mapping with the keys {', '.join(allowed)} is wanted, got {data!r}")
-    for key in data:
-        if key not in allowed:
-            near = difflib.get_close_matches(str(key), allowed, n=1, cutoff=0.0)
-            raise ValueError(f"{where}: unknown key {key!r}; did you mean {near[0]!r}? Allowed: {', '.join(allowed)}")
-    missing = [key for key in allowed if key not in data and key not in OPTIONAL]
-    if missing:
-        raise ValueError(f"{where}: missing key {', '.join(missing)}; wanted: {', '.join(allowed)}")
+Interval = Annotated[tuple[Finite, Finite], Increasing]
+Text = Annotated[str, BeforeValidator(str)]
 
 
-def short_balls_of(data: dict, where: str) -> bool:
-    """Choice of short balls, false by default. Raises ValueError for what is neither true nor false."""
-    short = data.get(SHORT_BALLS, False)
-    if not isinstance(short, bool):
-        raise ValueError(f"{where}: {SHORT_BALLS} is {short!r}; true or false is allowed")
-    return short
+class Space(Section):
+    """Ends of a quantity in space."""
+
+    x: Interval
+    """[min, max]."""
+    y: Interval
+    """[min, max]."""
+    z: Interval
+    """[min, max]."""
+
+
+class Plane(Section):
+    """Ends of a place on the table."""
+
+    x: Interval
+    """[min, max] in m."""
+    y: Interval
+    """[min, max] in m."""
+
+
+class BallFile(Section):
+    """Keys that the YAMLs of boxes and mixtures share."""
+
+    name: Text | None = None
+    """Name of the balls; null: the file's."""
+    source: Text | None = None
+    """Where they come from."""
+    paper: Any = None
+    """Notes on a published table."""
+    short_balls: bool = False
+    """Also balls that would bounce a second time before the robot's end line."""
+
+    def labels(self, name: str, source: str) -> dict[str, Any]:
+        """Fields that distributions and mixtures share; ``name`` and ``source`` stand in for missing ones."""
+        return {
+            "name": name if self.name is None else self.name,
+            "source": source if self.source is None else self.source,
+            "short_balls": self.short_balls,
+        }
+
+
+class BoxFile(BallFile):
+    """The YAML of a box."""
+
+    position: Space
+    """[m] of the start."""
+    velocity: Space
+    """[m/s] at the start."""
+    landing: Plane
+    """Where the ball first bounces."""
+
+    def box(self, name: str, source: str) -> BallDistribution:
+        """The box; ``name`` and ``source`` stand in for missing ones."""
+        ends = {
+            f"{part}_{end}": tuple(getattr(getattr(self, part), axis)[i] for axis in axes)
+            for part, axes in AXES.items()
+            for i, end in enumerate(("min", "max"))
+        }
+        return BallDistribution(**ends, **self.labels(name, source))
 
 
 def parse_distribution(data: Any, where: str, name: str = "", source: str = "") -> BallDistribution:
     """Builds a distribution from its YAML form; ``where`` (file and key) opens every message. Raises ValueError."""
-    check_keys(data, (*OPTIONAL, *AXES), where)
-    short = short_balls_of(data, where)
-    ends = {}
-    for part, axes in AXES.items():
-        check_keys(data[part], axes, f"{where}: {part}")
-        for axis in axes:
-            interval = data[part][axis]
-            numbers = isinstance(interval, list) and all(type(v) in (int, float) for v in interval)
-            if not numbers or len(interval) != 2:
-                raise ValueError(f"{where}: {part}.{axis} is {interval!r}; two numbers [min, max] are allowed")
-        ends[f"{part}_min"] = tuple(data[part][axis][0] for axis in axes)
-        ends[f"{part}_max"] = tuple(data[part][axis][1] for axis in axes)
-    try:
-        name, source = str(data.get("name", name)), str(data.get("source", source))
-        return BallDistribution(**ends, name=name, source=source, short_balls=short)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+    return validate(BoxFile, data, where).box(name, source)
 
 
 def load_distribution(path: str | os.PathLike) -> BallDistribution:

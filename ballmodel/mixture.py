@@ -10,20 +10,22 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
 from jaxtyping import Float
+from pydantic import Field
 
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
-from ballmodel.distribution import OPTIONAL, SHORT_BALLS, BallDistribution, check_keys, short_balls_of
+from ballmodel.distribution import BallDistribution, BallFile
 from ballmodel.io.atomic_files import replacing
+from ballmodel.io.ranges import Within
+from ballmodel.io.validation import Finite, Section, validate
 from ballmodel.io.yaml import read as read_yaml
 from ballmodel.state import BallState
 
 ROWS = tuple(f"{part}.{axis}" for part in ("position", "velocity", "spin") for axis in "xyz")
-COMPONENT = ("weight", "mean", "covariance")
 NUMBERS_OF_COMPONENTS = (1, 2, 3, 5, 8, 12, 16, 24)
 FOLDS = 3
 MOST_BALLS = 4000  # that choose the number of components
@@ -54,20 +56,19 @@ class BallMixture:
         k, rows = weights.size, len(ROWS)
         if weights.shape != (k,) or not k or means.shape != (k, rows) or covariances.shape != (k, rows, rows):
             raise ValueError(
-                f"{self.name}: weights (k,), means (k, {rows}) and covariances (k, {rows}, {rows}) are wanted, got "
+                f"{self.name}: expected weights (k,), means (k, {rows}) and covariances (k, {rows}, {rows}), got "
                 f"{weights.shape}, {means.shape}, {covariances.shape}"
             )
         if not all(np.all(np.isfinite(part)) for part in (weights, means, covariances)):
-            raise ValueError(f"{self.name}: numbers of a mixture must be finite")
+            raise ValueError(f"{self.name}: expected finite numbers")
         if np.any(weights < 0.0) or abs(weights.sum() - 1.0) > 1e-3:
-            raise ValueError(f"{self.name}: weights {weights.tolist()}: shares that sum to 1 are allowed")
+            raise ValueError(f"{self.name}: weights: expected shares that sum to 1, got {weights.tolist()}")
         for i, covariance in enumerate(covariances):
             size = np.abs(covariance).max()
             symmetric = np.allclose(covariance, covariance.T, atol=1e-6 * size)
             if not symmetric or np.linalg.eigvalsh(covariance)[0] < -1e-5 * size:
                 raise ValueError(
-                    f"{self.name}: covariance of component {i}: a symmetric matrix without negative eigenvalues is "
-                    "allowed"
+                    f"{self.name}: covariance of component {i}: expected symmetry and no negative eigenvalues"
                 )
         for part, value in (("weights", weights / weights.sum()), ("means", means), ("covariances", covariances)):
             object.__setattr__(self, part, value)
@@ -95,26 +96,39 @@ class BallMixture:
             {"weight": float(w), "mean": m.tolist(), "covariance": c.tolist()}
             for w, m, c in zip(self.weights, self.means, self.covariances, strict=True)
         ]
-        short = {SHORT_BALLS: True} if self.short_balls else {}
+        short = {"short_balls": True} if self.short_balls else {}
         return {"name": self.name, "source": self.source, **short, "components": components}
+
+
+class Component(Section):
+    """A Gaussian over start states: position [m], velocity [m/s], spin [rad/s]."""
+
+    weight: Annotated[float, Within(0.0)]
+    """Share of the balls."""
+    mean: list[Finite]
+    """Nine numbers."""
+    covariance: list[list[Finite]]
+    """Nine times nine."""
+
+
+class MixtureFile(BallFile):
+    """The YAML of a mixture."""
+
+    components: Annotated[list[Component], Field(min_length=1)]
+    """The Gaussians."""
 
 
 def parse_mixture(data: Any, where: str, name: str = "", source: str = "") -> BallMixture:
     """Builds a mixture from its YAML form; ``where`` (file and key) opens every message. Raises ValueError."""
-    check_keys(data, (*OPTIONAL, "components"), where)
-    short = short_balls_of(data, where)
-    components = data["components"]
-    if not isinstance(components, list) or not components:
-        raise ValueError(f"{where}: components: a list, each with {', '.join(COMPONENT)}, is wanted")
-    for i, component in enumerate(components):
-        check_keys(component, COMPONENT, f"{where}: components[{i}]")
+    file = validate(MixtureFile, data, where)
     try:
-        arrays = ([np.array(c[part], np.float64) for c in components] for part in COMPONENT)
-        weights, means, covariances = (np.stack(part) for part in arrays)
-        name, source = str(data.get("name", name)), str(data.get("source", source))
-        return BallMixture(weights, means, covariances, name, source, short)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {error}") from None
+        weights, means, covariances = (
+            np.array([getattr(component, part) for component in file.components], np.float64)
+            for part in ("weight", "mean", "covariance")
+        )
+        return BallMixture(weights, means, covariances, **file.labels(name, source))
+    except ValueError as error:
+        raise ValueError(f"{where}: components: {error}") from None
 
 
 def load_mixture(path: str | os.PathLike) -> BallMixture:

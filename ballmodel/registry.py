@@ -5,19 +5,18 @@ Balls are a box of 16 numbers or a mixture of start states; a YAML with the key 
 
 from __future__ import annotations
 
-import difflib
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
-from ballmodel.distribution import NOTES, BallDistribution, check_keys, load_distribution, parse_distribution
+from ballmodel.distribution import BallDistribution, BoxFile, load_distribution, parse_distribution
+from ballmodel.io.validation import Section, find, validate
 from ballmodel.io.yaml import read as read_yaml
 from ballmodel.mixture import BallMixture, parse_mixture
 
 Balls: TypeAlias = BallDistribution | BallMixture
-T = TypeVar("T")
 
 FOLDER = Path(__file__).parent / "data"
 
@@ -27,12 +26,27 @@ class Skill:
     """A player's level and rally lengths (number of hits) over all evaluations, paper's table player_skill."""
 
     level: str  # beginner, intermediate or advanced
-    min: float
+    min: int
     p25: float
     mean: float
     std: float
     p75: float
-    max: float
+    max: int
+
+
+class PlayerFile(Section):
+    """The YAML of one of the paper's players: a box for each round, and the player's skill."""
+
+    name: str
+    """Name of the player."""
+    source: str
+    """Where the numbers come from."""
+    paper: Any = None
+    """Notes on the published table."""
+    skill: Skill
+    """Level and rally lengths."""
+    models: dict[str, BoxFile]
+    """By the name of the round."""
 
 
 @cache
@@ -44,21 +58,12 @@ def _catalogue() -> tuple[dict[str, BallDistribution], dict[str, Skill]]:
             distribution = load_distribution(path)
             distributions[distribution.name] = distribution
             continue
-        check_keys(data, (*NOTES, "skill", "models"), str(path))
-        check_keys(data["skill"], tuple(f.name for f in fields(Skill)), f"{path}: skill")
-        player = data["name"]
-        skills[player] = Skill(**data["skill"])
-        for model, intervals in data["models"].items():
-            name = f"{player}/{model}"
-            distributions[name] = parse_distribution(intervals, f"{path}: models.{model}", name, data["source"])
+        player = validate(PlayerFile, data, str(path))
+        skills[player.name] = player.skill
+        for model, box in player.models.items():
+            name = f"{player.name}/{model}"
+            distributions[name] = box.box(name, player.source)
     return distributions, skills
-
-
-def _find(table: dict[str, T], name: str, what: str) -> T:
-    if name in table:
-        return table[name]
-    near = difflib.get_close_matches(name.lower(), table, n=1, cutoff=0.0)
-    raise ValueError(f"no {what} is called {name!r}; did you mean {near[0]!r}? There are: {', '.join(table)}")
 
 
 def names() -> tuple[str, ...]:
@@ -68,12 +73,12 @@ def names() -> tuple[str, ...]:
 
 def load(name: str) -> BallDistribution:
     """The distribution of that name, such as "player3/M1" or "narrow". Raises ValueError listing the valid names."""
-    return _find(_catalogue()[0], name, "distribution")
+    return find(_catalogue()[0], name, "distribution")
 
 
 def skill(player: str) -> Skill:
     """The skill of "player1" to "player5". Raises ValueError listing the valid names."""
-    return _find(_catalogue()[1], player, "player")
+    return find(_catalogue()[1], player, "player")
 
 
 def parse_balls(data: Any, where: str, name: str = "", source: str = "") -> Balls:
@@ -96,5 +101,5 @@ def resolve(name_or_path: str | os.PathLike) -> Balls:
     if path.suffix not in (".yaml", ".yml"):
         return load(str(name_or_path))
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; a path to a distribution's YAML or one of {', '.join(names())}")
+        raise FileNotFoundError(f"{path}: no such file; expected a distribution's YAML or one of {', '.join(names())}")
     return parse_balls(read_yaml(path), str(path), path.stem)

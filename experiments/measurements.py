@@ -11,7 +11,7 @@ from ballmodel.io import MeasuredStates, read
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.tables import COLUMNS
 from ballmodel.trajectory import Dataset
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.prediction import SpinPrior, fit_states
 from mjx_tt.prediction.state_fit import lift_known
@@ -22,7 +22,8 @@ LEAST_SAMPLES = 8  # of a stroke whose start and spin are fitted
 
 def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
     """The balls of several files together. Raises ConfigError for files that hold different kinds of measurements."""
-    parts = [checked("", read, path, format) for path in paths]
+    with error_context():
+        parts = [read(path, format) for path in paths]
     source = ", ".join(part.source for part in parts)
     datasets = [part for part in parts if isinstance(part, Dataset)]
     if len(datasets) == len(parts):

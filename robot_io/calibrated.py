@@ -9,13 +9,21 @@ import math
 from dataclasses import dataclass
 from datetime import date
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 
-from robot_io.ranges import check_ranges
+from ballmodel.io.ranges import Within, check_fields
 
 Triple = tuple[float, float, float]
 ZERO: Triple = (0.0, 0.0, 0.0)
+# [m] root mean square; a larger residual says that the points contradict each other.
+LARGEST_TRACKER_RESIDUAL, LARGEST_ROBOT_RESIDUAL = 0.005, 0.004
+TrackerPosition = Annotated[float, Within(-20.0, 20.0, "m")]
+Angle = Annotated[float, Within(-3.1416, 3.1416, "rad")]
+BaseShift = Annotated[float, Within(-0.03, 0.03, "m")]
+BaseTurn = Annotated[float, Within(-0.03, 0.03, "rad")]
+TipShift = Annotated[float, Within(-0.01, 0.01, "m")]
 
 
 @dataclass(frozen=True)
@@ -59,8 +67,10 @@ class TrackerCalibration(Frame):
     date                YYYY-MM-DD, empty: never
     """
 
-    residual: float = 0.0
-    points: int = 0
+    position: tuple[TrackerPosition, TrackerPosition, TrackerPosition] = ZERO
+    rotation: tuple[Angle, Angle, Angle] = ZERO
+    residual: Annotated[float, Within(0.0, LARGEST_TRACKER_RESIDUAL, "m")] = 0.0
+    points: Annotated[int, Within(0, 1000000)] = 0
     date: str = ""
 
 
@@ -77,13 +87,13 @@ class RobotCalibration:
     residual, points, date  as of the tracker
     """
 
-    base_position: Triple = ZERO
-    base_rotation: Triple = ZERO
-    joint_zeros: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    tip: Triple = ZERO
-    axes_zero: tuple[float, ...] = (0.0, 0.0)
-    residual: float = 0.0
-    points: int = 0
+    base_position: tuple[BaseShift, BaseShift, BaseShift] = ZERO
+    base_rotation: tuple[BaseTurn, BaseTurn, BaseTurn] = ZERO
+    joint_zeros: tuple[Annotated[float, Within(-0.05, 0.05, "rad")], ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    tip: tuple[TipShift, TipShift, TipShift] = ZERO
+    axes_zero: tuple[Annotated[float, Within(-5.0, 5.0, "m")], ...] = (0.0, 0.0)
+    residual: Annotated[float, Within(0.0, LARGEST_ROBOT_RESIDUAL, "m")] = 0.0
+    points: Annotated[int, Within(0, 1000000)] = 0
     date: str = ""
 
     @property
@@ -105,29 +115,10 @@ class ClockCalibration:
     date      as of the tracker
     """
 
-    drift: float = 0.0
-    lag: float | None = None
-    residual: float = 0.0
+    drift: Annotated[float, Within(-5e-4, 5e-4)] = 0.0
+    lag: Annotated[float, Within(-0.1, 0.2, "s")] | None = None
+    residual: Annotated[float, Within(0.0, 0.002, "s")] = 0.0
     date: str = ""
-
-
-# Allowed in a calibration; a residual beyond its range says that the points contradict each other.
-RANGES = {
-    "tracker.position": (-20.0, 20.0),
-    "tracker.rotation": (-3.1416, 3.1416),
-    "tracker.residual": (0.0, 0.005),
-    "tracker.points": (0, 1_000_000),
-    "robot.base_position": (-0.03, 0.03),
-    "robot.base_rotation": (-0.03, 0.03),
-    "robot.joint_zeros": (-0.05, 0.05),
-    "robot.tip": (-0.01, 0.01),
-    "robot.axes_zero": (-5.0, 5.0),
-    "robot.residual": (0.0, 0.004),
-    "robot.points": (0, 1_000_000),
-    "clock.drift": (-5e-4, 5e-4),
-    "clock.lag": (-0.1, 0.2),
-    "clock.residual": (0.0, 0.002),
-}
 
 
 @dataclass(frozen=True)
@@ -145,10 +136,10 @@ class Calibration:
                 if when and date.fromisoformat(when).isoformat() != when:
                     raise ValueError
             except ValueError:
-                raise ValueError(f"{name}.date is {when!r}, allowed is YYYY-MM-DD or nothing") from None
+                raise ValueError(f"{name}.date: expected YYYY-MM-DD or nothing, got {when!r}") from None
             if not when and getattr(self, name) != type(getattr(self, name))():
-                raise ValueError(f"{name}.date is empty, but {name} was changed; allowed is the day of its measurement")
-        check_ranges(self, RANGES)
+                raise ValueError(f"{name}.date: expected the day of the measurement, got nothing; {name} was changed")
+        check_fields(self)
 
 
 UNCALIBRATED = Calibration()

@@ -19,7 +19,7 @@ class ContractError(ValueError):
     """Data that cannot be the contract of a robot."""
 
 
-def said(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """An error's type and words; the type alone where its words cannot be had."""
     try:
         return f"{type(error).__name__}: {error}"

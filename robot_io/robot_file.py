@@ -15,32 +15,25 @@
       blade: [col_blade]
       pairs: [[col_base, col_blade]]
 
-NumPy and the standard library only, so that the robot's side may read it; ``mjx_tt.robot.robot`` adds the MJCF.
+``mjx_tt.robot.robot`` adds the MJCF; the control process knows a robot by its contract and does not read this file.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any
 
+from pydantic import Field, model_validator
+
+from ballmodel.io.ranges import Within
+from ballmodel.io.validation import Finite, Positive, Section, validate
 from robot_io.contract import Contract, JointLimits
 
-KEYS = {
-    "name": "letters, digits, _ and -",
-    "mjcf": "the MJCF's file, beside the YAML",
-    "paddle": "name of the site at the blade's centre",
-    "carrying": "names of the linear axes that carry the arm, or []",
-    "joints": "a mapping of every joint, from the base to the paddle",
-    "mount": "{position: [x, y, z], yaw: angle}",
-    "latencies": "a mapping of [mean, deviation] in seconds",
-    "drives": "a mapping of joints to their drives",
-    "clearance": "{table: [...], blade: [...], pairs: [[a, b], ...]}",
-}
-OPTIONAL = ("mount", "latencies", "drives")
-JOINT_KEYS = ("range", "velocity", "acceleration", "margin", "policy_velocity", "home")
+Text = Annotated[str, Field(pattern=r"\S")]
+Seconds = Annotated[float, Within(0.0, 1.0, "s")]
+Latency = tuple[Seconds, Seconds]  # mean and deviation
 LATENCIES = {  # key of the YAML: that of a model YAML
     "ball_observation": "ball_observation",
     "arm_observation": "abb_observation",
@@ -48,7 +41,133 @@ LATENCIES = {  # key of the YAML: that of a model YAML
     "arm_action": "abb_action",
     "carrying_action": "festo_action",
 }
-LONGEST_LATENCY = 1.0  # [s]
+MOST_TURNS = 4.0  # of a hinge to either side: a larger range is in degrees
+
+
+class Joint(Section):
+    """A joint, in m if it is listed under carrying, else in rad."""
+
+    range: tuple[Finite, Finite]
+    """Lower and upper end."""
+    velocity: Positive
+    """Highest speed [1/s]."""
+    acceleration: Positive
+    """Highest commanded acceleration [1/s^2]."""
+    margin: Annotated[float, Within(0.0)]
+    """Distance that is kept from both ends."""
+    policy_velocity: Positive
+    """Velocity that an action of 1 asks for."""
+    home: Finite
+    """Position at which episodes begin."""
+
+    @model_validator(mode="after")
+    def _check_range(self) -> Joint:
+        (lower, upper), margin = self.range, self.margin
+        if not lower < upper:
+            raise ValueError(f"range: expected a lower end below the upper, got {[lower, upper]}")
+        low, high = lower + margin, upper - margin
+        if low < high and not low < self.home < high:
+            raise ValueError(
+                f"home: expected a position inside the range less its margin, {low:g} to {high:g}, got {self.home}"
+            )
+        return self
+
+
+class Mount(Section):
+    """Where the MJCF's origin stands in the table's frame."""
+
+    position: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """[m]."""
+    yaw: Finite = 0.0
+    """[rad]."""
+
+
+class Latencies(Section):
+    """Mean and deviation of each latency [s]; null: the paper's."""
+
+    ball_observation: Latency | None = None
+    """From the ball's capture to the policy."""
+    arm_observation: Latency | None = None
+    """From the arm's position to the policy."""
+    carrying_observation: Latency | None = None
+    """From the position of the carrying axes to the policy."""
+    arm_action: Latency | None = None
+    """From a command to its effect on the arm."""
+    carrying_action: Latency | None = None
+    """From a command to its effect on the carrying axes."""
+
+
+class Clearance(Section):
+    """Capsules, geoms of the MJCF, and what they must not touch."""
+
+    table: list[str]
+    """Capsules that are kept from the table and the floor."""
+    blade: Annotated[list[str], Field(min_length=1)]
+    """Those of them that are the blade."""
+    pairs: list[tuple[str, str]]
+    """Pairs that are kept from each other."""
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Clearance:
+        for key, names in (("table", self.table), ("blade", self.blade), *(("pairs", pair) for pair in self.pairs)):
+            if len(set(names)) < len(names):
+                raise ValueError(f"{key}: expected different capsules, got {list(names)}")
+        for name in self.blade:
+            if name not in self.table:
+                raise ValueError(f"blade: expected capsules of table, {', '.join(self.table)}, got {name!r}")
+        return self
+
+
+class Description(Section):
+    """The YAML of a robot."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
+    """Name of the robot: letters, digits, _ and -."""
+    mjcf: Text
+    """File of the MJCF, beside the YAML, or the MJCF itself."""
+    paddle: Text
+    """Site at the blade's centre: x along the handle, z out of the striking face."""
+    carrying: list[str]
+    """Linear axes that carry the arm; [] for a fixed base."""
+    joints: Annotated[dict[str, Joint], Field(min_length=1)]
+    """Every joint, from the base to the paddle."""
+    mount: Mount = Mount()
+    """Where the MJCF's origin stands."""
+    latencies: Latencies = Latencies()
+    """Latencies of the robot and its tracker."""
+    drives: dict[str, dict[str, Finite]] = {}
+    """By joint, what its drive does, as in a model YAML."""
+    clearance: Clearance
+    """What the robot must not touch."""
+
+    @model_validator(mode="after")
+    def _check_joints(self) -> Description:
+        if mistakes := list(self._mistakes()):
+            raise ValueError("\n".join(mistakes))
+        return self
+
+    def _mistakes(self) -> Iterator[str]:
+        for key, names in (("carrying", self.carrying), ("drives", self.drives)):
+            for name in names:
+                if name not in self.joints:
+                    yield f"{key}: expected joints, {', '.join(self.joints)}, got {name!r}"
+        if len(set(self.carrying)) < len(self.carrying):
+            yield f"carrying: expected different joints, got {self.carrying}"
+        for name, joint in self.joints.items():
+            if name not in self.carrying and max(map(abs, joint.range)) > 2.0 * math.pi * MOST_TURNS:
+                yield (
+                    f"joints.{name}.range: expected radians, not degrees, at most {MOST_TURNS:g} turns, "
+                    f"got {list(joint.range)}"
+                )
+
+    def model_values(self, latencies: Iterable[str]) -> Iterator[tuple[str, float]]:
+        """What the simulation's model gets: dotted path of a model YAML and value; ``latencies`` in their order."""
+        for key in latencies:
+            if (latency := getattr(self.latencies, key)) is not None:
+                yield f"latency.{LATENCIES[key]}", latency[0]
+                yield f"latency.{LATENCIES[key]}_std", latency[1]
+        for joint, drive in self.drives.items():
+            yield from ((f"drives.{joint}.{effect}", value) for effect, value in drive.items())
 
 
 @dataclass(frozen=True)
@@ -77,195 +196,31 @@ class RobotFile:
     pairs: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass
-class _Reader:
-    """Collects mistakes, so that a file is mended in one go."""
-
-    where: str
-    mistakes: list[str] = field(default_factory=list)
-
-    def wrong(self, key: str, given: Any, allowed: str) -> None:
-        self.mistakes.append(f"{self.where}: {key}: got {given!r}; allowed: {allowed}")
-
-    def mapping(self, key: str, given: Any, known: Iterable[str] | None, allowed: str) -> dict[str, Any]:
-        """The mapping, without keys that are not known; {} for anything else."""
-        if not isinstance(given, dict) or not all(isinstance(name, str) for name in given):
-            self.wrong(key, given, allowed)
-            return {}
-        names = list(given if known is None else known)
-        for name in given:
-            if name not in names:
-                close = difflib.get_close_matches(name, names, 1)
-                hint = f"did you mean {close[0]!r}? " if close else ""
-                path = f"{key}.{name}" if key else name
-                self.mistakes.append(f"{self.where}: {path}: unknown key; {hint}allowed: {', '.join(names)}")
-        return {name: value for name, value in given.items() if name in names}
-
-    def number(self, key: str, given: Any, allowed: str, right: Callable[[float], bool] = lambda _: True) -> float:
-        """A finite number for which ``right`` holds; NaN for anything else."""
-        fits = isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given)
-        if not fits or not right(given):
-            self.wrong(key, given, allowed)
-            return math.nan
-        return float(given)
-
-    def numbers(self, key: str, given: Any, count: int, allowed: str) -> tuple[float, ...]:
-        """``count`` finite numbers; () for anything else."""
-        if not isinstance(given, list) or len(given) != count:
-            self.wrong(key, given, allowed)
-            return ()
-        values = tuple(self.number(f"{key}[{i}]", value, "a finite number") for i, value in enumerate(given))
-        return () if any(math.isnan(value) for value in values) else values
-
-    def names(self, key: str, given: Any, allowed: str, known: Iterable[str] | None = None) -> tuple[str, ...]:
-        """Different names, of those known where they are given."""
-        if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
-            self.wrong(key, given, allowed)
-            return ()
-        choice = None if known is None else list(known)
-        for name in given:
-            if choice is not None and name not in choice:
-                self.wrong(key, name, ", ".join(choice))
-            elif given.count(name) > 1:
-                self.wrong(key, name, "every name once")
-        return tuple(dict.fromkeys(given))
-
-
 def parse(data: Any, where: str) -> RobotFile:
-    """The content of parsed YAML. Raises ValueError with a line for every mistake: file, key, given and allowed."""
-    reader = _Reader(where)
-    keys = reader.mapping("", data, KEYS, f"a mapping with the keys {', '.join(KEYS)}")
-    for key, allowed in KEYS.items():
-        if isinstance(data, dict) and key not in keys and key not in OPTIONAL:
-            reader.mistakes.append(f"{where}: {key}: missing; allowed: {allowed}")
-    for key in ("name", "mjcf", "paddle"):
-        if key in keys and not (isinstance(keys[key], str) and keys[key].strip()):
-            reader.wrong(key, keys[key], KEYS[key])
-    name = str(keys.get("name", ""))
-    if "name" in keys and not (name.replace("_", "").replace("-", "").isalnum() and name.isascii()):
-        reader.wrong("name", keys["name"], KEYS["name"])
-    joints = reader.mapping("joints", keys.get("joints", {}), None, KEYS["joints"])
-    if "joints" in keys and isinstance(keys["joints"], dict) and not joints:
-        reader.wrong("joints", keys["joints"], KEYS["joints"])
-    carrying = reader.names("carrying", keys.get("carrying", []), KEYS["carrying"], joints)
-    columns, home = _joints(reader, joints, carrying)
-    position, yaw = _mount(reader, keys.get("mount", {}))
-    model = (
-        *_latencies(reader, keys.get("latencies", {})),
-        *_drives(reader, keys.get("drives", {}), joints),
-    )
-    clearance = reader.mapping("clearance", keys.get("clearance", {}), ("table", "blade", "pairs"), KEYS["clearance"])
-    if "clearance" in keys:
-        for key in ("table", "blade", "pairs"):
-            if key not in clearance:
-                reader.mistakes.append(f"{where}: clearance.{key}: missing; allowed: {KEYS['clearance']}")
-    table = reader.names("clearance.table", clearance.get("table", []), "names of capsules")
-    blade = reader.names("clearance.blade", clearance.get("blade", []), "names of capsules of clearance.table", table)
-    if "blade" in clearance and not blade:
-        reader.wrong("clearance.blade", clearance["blade"], "at least one capsule of the blade")
-    pairs = _pairs(reader, clearance.get("pairs", []))
-    if reader.mistakes:
-        raise ValueError("\n".join(reader.mistakes))
-    try:
-        limits = JointLimits(**columns, joints=tuple(joints))
-    except ValueError as error:
-        joint, _, rest = str(error).partition(": ")
-        raise ValueError(f"{where}: joints.{joint}: {rest}") from None
-    units = tuple("m" if joint in carrying else "rad" for joint in joints)
-    contract = Contract(name, units, tuple(i for i, joint in enumerate(joints) if joint in carrying), limits)
-    return RobotFile(
-        name, str(keys["mjcf"]), str(keys["paddle"]), contract, home, position, yaw, model, table, blade, pairs
-    )
-
-
-def _joints(
-    reader: _Reader, joints: dict[str, Any], carrying: tuple[str, ...]
-) -> tuple[dict[str, tuple[float, ...]], tuple[float, ...]]:
-    """Limits by name and the home pose."""
-    columns: dict[str, list[float]] = {
-        name: [] for name in ("lower", "upper", "velocity", "acceleration", "margin", "policy_velocity")
+    """The content of parsed YAML. Raises ValueError with a line for every mistake: file, key, expected and given."""
+    file = validate(Description, data, where)
+    joints = file.joints
+    columns = {
+        key: tuple(getattr(joint, key) for joint in joints.values())
+        for key in ("velocity", "acceleration", "margin", "policy_velocity")
     }
-    home = []
-    for joint, given in joints.items():
-        path, unit = f"joints.{joint}", "m" if joint in carrying else "rad"
-        values = reader.mapping(path, given, JOINT_KEYS, f"a mapping of {', '.join(JOINT_KEYS)}")
-        for key in JOINT_KEYS:
-            if key not in values and isinstance(given, dict):
-                reader.mistakes.append(f"{reader.where}: {path}.{key}: missing; it has no default")
-        if "range" in values:
-            pair = reader.numbers(f"{path}.range", values["range"], 2, f"[lower, upper] in {unit}")
-            if pair and not pair[0] < pair[1]:
-                reader.wrong(f"{path}.range", values["range"], "lower below upper")
-            if pair and unit == "rad" and max(map(abs, pair)) > 8.0 * math.pi:
-                reader.wrong(f"{path}.range", values["range"], "radians, not degrees: at most four turns")
-            columns["lower"].append(pair[0] if pair else math.nan)
-            columns["upper"].append(pair[1] if pair else math.nan)
-        for key in ("velocity", "acceleration", "policy_velocity"):
-            if key in values:
-                per = "s^2" if key == "acceleration" else "s"
-                allowed = f"a positive number of {unit}/{per}"
-                columns[key].append(reader.number(f"{path}.{key}", values[key], allowed, lambda v: v > 0))
-        if "margin" in values:
-            allowed = f"a number of {unit}, 0 or positive"
-            columns["margin"].append(reader.number(f"{path}.margin", values["margin"], allowed, lambda v: v >= 0))
-        if "home" in values:
-            home.append(_home(reader, path, values, unit))
-    return {name: tuple(values) for name, values in columns.items()}, tuple(home)
-
-
-def _home(reader: _Reader, path: str, values: dict[str, Any], unit: str) -> float:
-    """The home position, inside the range less its margin."""
-    home = reader.number(f"{path}.home", values["home"], f"a position in {unit}")
-    ends, margin = values.get("range"), values.get("margin")
-    numbers = [*ends, margin] if isinstance(ends, list) and len(ends) == 2 else []
-    if numbers and all(isinstance(n, int | float) and not isinstance(n, bool) for n in numbers):
-        low, high = numbers[0] + numbers[2], numbers[1] - numbers[2]
-        if low < high and not (math.isnan(home) or low < home < high):
-            allowed = f"inside the range less its margin, {low:g} to {high:g} {unit}"
-            reader.wrong(f"{path}.home", values["home"], allowed)
-    return home
-
-
-def _mount(reader: _Reader, given: Any) -> tuple[tuple[float, float, float], float]:
-    mount = reader.mapping("mount", given, ("position", "yaw"), KEYS["mount"])
-    place = mount.get("position", [0.0, 0.0, 0.0])
-    position = reader.numbers("mount.position", place, 3, "[x, y, z] in m") or (0.0,) * 3
-    yaw = reader.number("mount.yaw", mount.get("yaw", 0.0), "an angle in rad")
-    return (position[0], position[1], position[2]), yaw
-
-
-def _latencies(reader: _Reader, given: Any) -> list[tuple[str, float]]:
-    found = []
-    for key, pair in reader.mapping("latencies", given, LATENCIES, KEYS["latencies"]).items():
-        allowed = f"[mean, deviation] in s, each from 0 to {LONGEST_LATENCY:g}"
-        values = reader.numbers(f"latencies.{key}", pair, 2, allowed)
-        if values and not all(0.0 <= value <= LONGEST_LATENCY for value in values):
-            reader.wrong(f"latencies.{key}", pair, allowed)
-        if values:
-            path = f"latency.{LATENCIES[key]}"
-            found += [(path, values[0]), (f"{path}_std", values[1])]
-    return found
-
-
-def _drives(reader: _Reader, given: Any, joints: dict[str, Any]) -> list[tuple[str, float]]:
-    """Numbers by path; which effects there are the simulation's model knows."""
-    found = []
-    for joint, drive in reader.mapping("drives", given, joints, KEYS["drives"]).items():
-        path = f"drives.{joint}"
-        for effect, value in reader.mapping(path, drive, None, "a mapping of effects such as {lag: 0.01}").items():
-            found.append((f"{path}.{effect}", reader.number(f"{path}.{effect}", value, "a finite number")))
-    return found
-
-
-def _pairs(reader: _Reader, given: Any) -> tuple[tuple[str, str], ...]:
-    if not isinstance(given, list):
-        reader.wrong("clearance.pairs", given, "a list of pairs of capsules, [[a, b], ...]")
-        return ()
-    pairs = []
-    for i, pair in enumerate(given):
-        names = reader.names(f"clearance.pairs[{i}]", pair, "two capsules, [a, b]")
-        if len(names) == 2:
-            pairs.append((names[0], names[1]))
-        elif names:
-            reader.wrong(f"clearance.pairs[{i}]", pair, "two different capsules")
-    return tuple(pairs)
+    lower, upper = zip(*(joint.range for joint in joints.values()), strict=True)
+    try:
+        limits = JointLimits(lower=lower, upper=upper, joints=tuple(joints), **columns)
+    except ValueError as error:  # begins with the joint
+        raise ValueError(f"{where}: joints.{error}") from None
+    units = tuple("m" if joint in file.carrying else "rad" for joint in joints)
+    carrying = tuple(i for i, joint in enumerate(joints) if joint in file.carrying)
+    return RobotFile(
+        name=file.name,
+        mjcf=file.mjcf,
+        paddle=file.paddle,
+        contract=Contract(file.name, units, carrying, limits),
+        home=tuple(joint.home for joint in joints.values()),
+        position=file.mount.position,
+        yaw=file.mount.yaw,
+        model=tuple(file.model_values(data.get("latencies", ()))),
+        table=tuple(file.clearance.table),
+        blade=tuple(file.clearance.blade),
+        pairs=tuple(file.clearance.pairs),
+    )

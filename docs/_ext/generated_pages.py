@@ -83,7 +83,7 @@ def write_all() -> None:
     """Write every generated page."""
     from experiments.config import baselines, experiment, site, study
     from experiments.config.finetuning import FineTuning
-    from experiments.config.robot import COMMISSIONING, RANGES
+    from experiments.config.robot import COMMISSIONING
     from robot_io.control.config import RobotConfig
     from robot_io.emulator.config import RigParams
 
@@ -98,8 +98,9 @@ def write_all() -> None:
     _write("verdict", schema_page("Verdict", "", verdict, {}))
     _write("model", model_page())
     slow = f"Without `safety.speed_scale` a robot moves at {COMMISSIONING:.0%} of its speed."
-    _write("robot", dataclass_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", RobotConfig, RANGES, slow))
-    _write("rig", dataclass_page("rig.yaml", "mjx-tt run --robot rig --rig", RigParams, RANGES))
+    robot = dataclass_schema(RobotConfig)
+    _write("robot", schema_page("robot.yaml", "mjx-tt run` and `mjx-tt finetune", robot, {}, slow))
+    _write("rig", schema_page("rig.yaml", "mjx-tt run --robot rig --rig", dataclass_schema(RigParams), {}))
     _write("command-line", command_line_page())
     described: dict[int, str] = {}
     for package in PACKAGES:
@@ -113,9 +114,9 @@ class Section(NamedTuple):
     definition: dict[str, Any]
 
 
-def schema_page(title: str, command: str, schema: dict[str, Any], known: dict[str, Section]) -> str:
+def schema_page(title: str, command: str, schema: dict[str, Any], known: dict[str, Section], remark: str = "") -> str:
     """Page with one table per section of a JSON schema, except those that ``known`` holds; they are added to it."""
-    page = title.lower()
+    page = title.lower().removesuffix(".yaml")
     definitions = schema.get("$defs", {})
     own = [name for name in _in_order(schema, definitions) if definitions[name].get("properties")]
     own = [name for name in own if name not in known or known[name].definition != definitions[name]]
@@ -123,7 +124,7 @@ def schema_page(title: str, command: str, schema: dict[str, Any], known: dict[st
     anchors = {name: section.anchor for name, section in known.items()}
     lines = [f"({page}-yaml)=", f"# {title}", ""]
     if command:
-        lines += [f"The YAML of `{command}`. Keys without a default are required.", ""]
+        lines += [f"The YAML of `{command}`. Keys without a default are required. {remark}".rstrip(), ""]
     else:
         lines += [schema.get("description", ""), ""]
     lines += _table(schema, definitions, anchors)
@@ -186,7 +187,9 @@ def _type(key: dict[str, Any], definitions: dict[str, Any], anchors: dict[str, s
     if isinstance(kind, list):
         return " or ".join(_type(key | {"type": each}, definitions, anchors) for each in kind)
     if kind == "array":
-        return "list of: " + _type(key["items"], definitions, anchors)
+        entries = key.get("prefixItems") or [key["items"]]
+        count = f"{len(entries)} of: " if "prefixItems" in key else "list of: "
+        return count + " or ".join(dict.fromkeys(_type(each, definitions, anchors) for each in entries))
     if kind == "object":
         values = key.get("additionalProperties")
         return (
@@ -195,44 +198,30 @@ def _type(key: dict[str, Any], definitions: dict[str, Any], anchors: dict[str, s
     if kind in ("number", "integer"):
         signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
         bounds = [f"{sign}\u00a0{key[bound]:,}" for bound, sign in signs.items() if bound in key]
-        return "\u00a0".join(["whole number" if kind == "integer" else "number", ", ".join(bounds)]).rstrip("\u00a0")
+        words = ["whole number" if kind == "integer" else "number", ", ".join(bounds), key.get("unit", "")]
+        return "\u00a0".join(word for word in words if word)
     return {"string": "text", "boolean": "true, false", "null": "`null`"}.get(kind, kind)
 
 
-def dataclass_page(
-    title: str, command: str, kind: type, ranges: dict[type, dict[str, tuple[float, float]]], remark: str = ""
-) -> str:
-    """Page with one table per dataclass that a YAML fills, with the ranges outside which a number is refused."""
-    allowed = ranges[kind]
-    lines = [f"# {title}", "", f"The YAML of `{command}`. Every key has a default. {remark}"]
-    waiting, done = [("", kind)], []
+def dataclass_schema(kind: type) -> dict[str, Any]:
+    """JSON schema of a YAML that dataclasses describe, with the notes of their docstrings and comments."""
+    from ballmodel.io import validation
+
+    schema = validation.json_schema(kind)
+    waiting, parts = [kind], {kind.__name__: schema} | schema.get("$defs", {})
     while waiting:
-        path, kind = waiting.pop(0)
-        if kind in done:
-            continue
-        done.append(kind)
-        hints = typing.get_type_hints(kind)
-        summary, meanings = field_notes(kind)
-        lines += ["", f"## {path}" if path else "", "", _cell(summary), ""]
-        told = bool(meanings) or any(map(dataclasses.is_dataclass, hints.values()))
-        lines += ["| key | type | default | allowed |" + " meaning |" * told, "|---|---|---|---|" + "---|" * told]
-        for field in dataclasses.fields(kind):
-            hint = hints[field.name]
-            inner = next((h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h)), None)
-            below = f"{path}.{field.name}".lstrip(".")
-            if inner is not None:
-                waiting.append((below, inner))
-                lines.append(f"| `{field.name}` | mapping | section `{below}` | | {_cell(field_notes(inner)[0])} |")
-            else:
-                text = hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
-                meaning = f" {_cell(meanings.get(field.name, ''))} |" * told
-                bounds = "{:g} to {:g}".format(*allowed[below]) if below in allowed else ""
-                lines.append(f"| `{field.name}` | {_cell(text)} | `{_plain(field)}` | {bounds} |{meaning}")
-    return "\n".join(lines) + "\n"
+        owner = waiting.pop()
+        part, (summary, notes) = parts[owner.__name__], field_notes(owner)
+        part["description"] = summary
+        for name, hint in typing.get_type_hints(owner).items():
+            part["properties"][name].setdefault("description", notes.get(name, ""))
+            waiting += [h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h)]
+    return schema
 
 
 def model_page() -> str:
     """Every parameter of the simulation's model, its nominal value and its comment."""
+    from ballmodel.io.ranges import Within, find_note, type_hints
     from mjx_tt.sim import model
     from mjx_tt.sim.actuators import DriveParams
 
@@ -268,21 +257,17 @@ def model_page() -> str:
             owner = next(h for h in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(h))
         summary, notes = field_notes(owner)
         title = "drives.JOINT" if section in joints else section
-        lines += ["", f"## {title}", "", _cell(summary), "", "| key | nominal | meaning |", "|---|---|---|"]
-        lines += [f"| `{key}` | {_nominal(value)} | {_cell(notes.get(key, ''))} |" for key, value in values.items()]
+        lines += ["", f"## {title}", "", _cell(summary), ""]
+        lines += ["| key | nominal | allowed | meaning |", "|---|---|---|---|"]
+        for key, value in values.items():
+            allowed = find_note(type_hints(owner)[key])
+            words = str(allowed) if isinstance(allowed, Within) else " or ".join(typing.get_args(allowed))
+            lines.append(f"| `{key}` | {_nominal(value)} | {words} | {_cell(notes.get(key, ''))} |")
     return "\n".join(lines) + "\n"
 
 
 def _nominal(value: float | str) -> str:
     return "none" if isinstance(value, float) and value > 100.0 else f"`{value}`"
-
-
-def _plain(field: dataclasses.Field) -> str:
-    if field.default is not dataclasses.MISSING:
-        return repr(field.default)
-    if field.default_factory is not dataclasses.MISSING:
-        return repr(field.default_factory())
-    return "required"
 
 
 def _default(key: dict[str, Any], definitions: dict[str, Any]) -> str:

@@ -133,7 +133,7 @@ def _robot(
 
 def _clock(path: Path, known: Calibration, today: str, screen: Console) -> ClockCalibration:
     from experiments.config import robot as robots
-    from experiments.config.experiment import read_yaml
+    from experiments.config.files import read_yaml
     from robot_io import log
     from robot_io.calibrated import Calibration
     from robot_io.calibration import clock

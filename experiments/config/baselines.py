@@ -11,11 +11,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from ballmodel.io.validation import Count, Name, Positive, Section, Seed
 from experiments.config import experiment as config
-from experiments.config import validation
+from experiments.config import files
 from experiments.config.experiment import Config
 from experiments.config.optimiser import Optimiser
-from experiments.config.section import Count, Name, Positive, Section, Seed
 from experiments.errors import ConfigError
 
 Layers = Annotated[list[Count], Field(min_length=1)]
@@ -213,9 +213,7 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> tuple[Comp
     Relative paths in the file are relative to its folder, those of overrides to the current one; an experiment that is
     not there is looked up among the shipped ones. Raises ConfigError.
     """
-    path = Path(path)
-    data = config.read_mapping(path, overrides, "a comparison", Comparison, shipped(), _absolute)
-    comparison = validation.validated(Comparison, data, str(path))
+    comparison = files.load(Comparison, "a comparison", path, overrides, _absolute)
     experiment = _experiment(comparison.experiment, str(path))
     if comparison.robot is not None:
         experiment = experiment.model_copy(update={"robot": comparison.robot})
@@ -246,7 +244,7 @@ def _absolute(data: dict[str, Any], folder: Path) -> None:
 
 def shipped() -> dict[str, Path]:
     """The comparisons that come with the program, by name."""
-    return config.shipped("compare")
+    return files.shipped("compare")
 
 
 def _experiment(given: str | dict[str, Any], where: str) -> Config:

@@ -10,6 +10,7 @@ import jax
 
 from ballmodel import registry
 from ballmodel.io import yaml
+from ballmodel.io.validation import Section
 from ballmodel.registry import Balls
 from ballmodel.sampling import BallPool, sample_pool
 from bgs import optimizers
@@ -17,8 +18,7 @@ from bgs.strategy import BGSConfig
 from experiments.config import prior
 from experiments.config.experiment import Config, Rewards, Task, Training
 from experiments.config.optimiser import Optimiser
-from experiments.config.section import Section
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 from mjx_tt.env import own as user_file
 from mjx_tt.env import rewards
 from mjx_tt.env.own import Definitions, Network
@@ -57,15 +57,15 @@ def experiment(config: Config, where: str) -> Experiment:
     """Looks up what a configuration names; ``where`` is its origin in errors. Raises ConfigError."""
     balls = distribution(config.balls, f"{where}: balls")
     robot, robot_data = robot_of(config, where)
-    nominal = checked(f"{where}: robot", nominal_model, robot)
+    with error_context(f"{where}: robot"):
+        nominal = nominal_model(robot)
     model_data = with_prior(_mapping(config.model, f"{where}: model"), robot, where)
-    if isinstance(config.model, str):
-        model = checked(f"{where}: model", models.from_dict, model_data, config.model, nominal)
-    else:
-        model = checked(where, models.from_dict, model_data, "model", nominal)
+    with error_context():
+        origin = f"{where}: model" + (f": {config.model}" if isinstance(config.model, str) else "")
+        model = models.from_dict(model_data, origin, nominal)
     if config.initial_policy is not None and not Path(config.initial_policy).is_dir():
         raise ConfigError(
-            f"{where}: initial_policy: {config.initial_policy} is no folder; allowed: a run or an artefact"
+            f"{where}: initial_policy: expected the folder of a run or an artefact, got {config.initial_policy}"
         )
     named = isinstance(config.balls, str) and config.balls in registry.names()
     own, text = definitions(config, where)
@@ -78,15 +78,13 @@ def experiment(config: Config, where: str) -> Experiment:
         }
     )
     if config.training.later_rewards is not None:
-        checked(f"{where}: training.later_rewards", reward_weights, config.training.later_rewards.rewards, own)
-    return Experiment(
-        config=alone,
-        distribution=balls,
-        model=model,
-        task=checked(f"{where}: task", task_config, config.task, own, robot),
-        bgs=checked(f"{where}: optimiser", bgs_config, config.optimiser, config.training.updates),
-        network=network(config, where),
-    )
+        with error_context(f"{where}: training.later_rewards"):
+            reward_weights(config.training.later_rewards.rewards, own)
+    with error_context(f"{where}: task"):
+        task = task_config(config.task, own, robot)
+    with error_context(f"{where}: optimiser"):
+        bgs = bgs_config(config.optimiser, config.training.updates)
+    return Experiment(alone, balls, model, task, bgs, network(config, where))
 
 
 def with_prior(data: dict[str, Any], robot: Robot, where: str) -> dict[str, Any]:
@@ -95,8 +93,8 @@ def with_prior(data: dict[str, Any], robot: Robot, where: str) -> dict[str, Any]
         return data
     if robot.contract.joints != JOINT_NAMES:
         raise ConfigError(
-            f"{where}: model.randomise: {prior.NAME} has ranges of the paper's robot alone; allowed: a range for each "
-            "parameter, as in model.randomise: {ball.paddle.restitution: [0.83, 1.0]}"
+            f"{where}: model.randomise: expected a range for each parameter, as in {{ball.paddle.restitution: "
+            f"[0.83, 1.0]}}, got {prior.NAME}, whose ranges are of the paper's robot alone"
         )
     return data | {"randomise": dict(prior.PRIOR)}
 
@@ -116,14 +114,14 @@ def robot_of(config: Config, where: str) -> tuple[Robot, str | dict[str, Any] | 
     if given is None or given == robots.DEFAULT:
         return robots.paper(), given
     if isinstance(given, dict):
-        return checked("", robots.from_content, given, f"{where}: robot"), given
+        with error_context():
+            return robots.from_content(given, f"{where}: robot"), given
     if given in robots.names():
         return robots.load_shipped(given), given
-    data = checked(f"{where}: robot", robots.content, given)
-    try:
+    with error_context(f"{where}: robot"):
+        data = robots.content(given)
+    with error_context():  # the lines name their origin
         return robots.load(given), data
-    except ValueError as error:  # whose lines name their origin
-        raise ConfigError(str(error)) from None
 
 
 def unknown_worlds(experiment: Experiment) -> Experiment | None:
@@ -145,15 +143,13 @@ def definitions(config: Config, where: str) -> tuple[Definitions, str | None]:
     if given is None:
         return Definitions(), None
     contract = robot_of(config, where)[0].contract
-    if "\n" in given:
-        return checked(f"{where}: definitions", user_file.load, given, f"definitions of {config.name}", contract), given
-    if not given.endswith(".py"):
-        raise ConfigError(f"{where}: definitions: {given}: a Python file is wanted, such as my_task.py")
-    try:
+    with error_context(f"{where}: definitions"):
+        if "\n" in given:
+            return user_file.load(given, f"definitions of {config.name}", contract), given
+        if not given.endswith(".py"):
+            raise ValueError(f"expected a Python file, such as my_task.py, got {given}")
         text = Path(given).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{where}: definitions: {given}: cannot be read: {error}") from None
-    return checked(f"{where}: definitions", user_file.load, text, given, contract), text
+        return user_file.load(text, given, contract), text
 
 
 def network(config: Config, where: str) -> Network | None:
@@ -162,16 +158,18 @@ def network(config: Config, where: str) -> Network | None:
         return None
     known = definitions(config, where)[0].networks
     if config.network not in known:
-        allowed = ", ".join(known) or "none is defined; name a file of yours under the key definitions"
-        raise ConfigError(f"{where}: network: {config.network} is not defined; allowed: {allowed}")
+        allowed = f"one of {', '.join(known)}" if known else "a file that defines it under the key definitions"
+        raise ConfigError(f"{where}: network: expected {allowed}, got {config.network}")
     return known[config.network]
 
 
 def distribution(balls: str | dict[str, Any], where: str) -> Balls:
     """The box or mixture of that name, in the YAML at that path, or with that content. Raises ConfigError."""
     if isinstance(balls, dict):
-        return checked(where, registry.parse_balls, balls, "content")
-    return checked(where, registry.resolve, balls)
+        with error_context():
+            return registry.parse_balls(balls, where)
+    with error_context(where):
+        return registry.resolve(balls)
 
 
 def task_config(
@@ -255,7 +253,8 @@ def key(seed: int, purpose: int) -> jax.Array:
 
 def pool(experiment: Experiment, key: jax.Array, n: int) -> BallPool:
     """``n`` balls of the experiment's distribution under its nominal ball model. Raises ConfigError."""
-    return checked("balls", sample_pool, key, experiment.distribution, experiment.model.model.ball, n)
+    with error_context("balls"):
+        return sample_pool(key, experiment.distribution, experiment.model.model.ball, n)
 
 
 def _shared(section: Section, settings: type) -> dict[str, Any]:
@@ -265,7 +264,7 @@ def _shared(section: Section, settings: type) -> dict[str, Any]:
 
 def _mapping(model: str | dict[str, Any], where: str) -> dict[str, Any]:
     """The content of a model YAML, plain data as it stands there."""
-    if isinstance(model, dict):
-        return checked(where, randomisation.with_content, model, "")
-    data = checked(where, randomisation.with_content, checked(where, yaml.read, model), Path(model).parent)
-    return {} if data is None else data
+    with error_context(where):
+        if isinstance(model, dict):
+            return randomisation.with_content(model, "")
+        return randomisation.with_content(yaml.read(model), Path(model).parent) or {}

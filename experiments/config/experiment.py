@@ -6,21 +6,16 @@ refers to are looked up by ``experiments.config.build``.
 
 from __future__ import annotations
 
-import difflib
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from ballmodel.io import yaml
-from experiments.config import validation
+from ballmodel.io import validation
+from ballmodel.io.validation import Count, Finite, Fraction, Name, Positive, Section, Seed
+from experiments.config import files
 from experiments.config.optimiser import Optimiser
-from experiments.config.section import Count, Finite, Name, Positive, Section, Seed
-from experiments.errors import ConfigError
-
-SHIPPED = Path(__file__).parents[1] / "shipped"  # train/, study/, compare/: YAMLs that come with the program
 
 
 class Rewards(Section):
@@ -74,7 +69,7 @@ class Task(Section):
 class LaterRewards(Section):
     """Other reward weights for the rest of a training."""
 
-    after: Annotated[float, Field(ge=0, le=1)]
+    after: Fraction
     """Share of the updates that are trained with the weights of the task."""
     rewards: Literal["sim", "real"] | Rewards
     """The weights from then on, as those of the task."""
@@ -175,115 +170,38 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Config:
 
     Relative paths in the file are relative to its folder, those of overrides to the current one. Raises ConfigError.
     """
-    path = Path(path)
-    return parse(read_mapping(path, overrides, "an experiment", Config, shipped(), absolute_paths), str(path))
+    return files.load(Config, "an experiment", path, overrides, absolute_paths)
 
 
 def absolute_paths(data: dict[str, Any], folder: Path) -> None:
     """Makes paths in an experiment's plain data absolute that are relative to ``folder``."""
-    for key in ("balls", "model", "robot", "initial_policy", "definitions"):
-        value = data.get(key)
-        if key == "robot" and not (folder / str(value)).exists():  # the name of one that comes with the program
-            continue
-        if key == "definitions" and "\n" in str(value):  # the file's content
-            continue
-        if isinstance(value, str) and (key != "balls" or Path(value).suffix in (".yaml", ".yml")):
-            data[key] = str((folder / value).resolve())
+    robot, balls = (str(data.get(key)) for key in ("robot", "balls"))
+    named = {
+        "robot": not (folder / robot).exists(),  # one that comes with the program
+        "balls": Path(balls).suffix not in (".yaml", ".yml"),
+        "definitions": "\n" in str(data.get("definitions")),  # the file's content
+    }
+    keys = ("balls", "model", "robot", "initial_policy", "definitions")
+    files.make_absolute(data, tuple(key for key in keys if not named.get(key)), folder)
     absolute_samples(data.get("model"), folder)
 
 
 def absolute_samples(model: Any, folder: Path) -> None:
     """Makes the path of the samples in a model's plain data absolute."""
-    drawn = model.get("randomise") if isinstance(model, dict) else None
-    if isinstance(drawn, dict) and isinstance(drawn.get("samples"), str):
-        drawn["samples"] = str((folder / drawn["samples"]).resolve())
+    if isinstance(model, dict):
+        files.make_absolute(model.get("randomise"), ("samples",), folder)
 
 
 def parse(data: dict[str, Any], where: str) -> Config:
     """A Config from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
-    return validation.validated(Config, data, where)
-
-
-def shipped(folder: str = "train") -> dict[str, Path]:
-    """The experiments that come with the program, by name, or the YAMLs of another folder of SHIPPED."""
-    return {path.stem: path for path in sorted((SHIPPED / folder).glob("*.yaml"))}
+    return files.validate(Config, data, where)
 
 
 def json_schema() -> dict[str, Any]:
     """JSON schema of an experiment YAML, for editors that complete and check while one types."""
-    return Config.model_json_schema() | {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    return validation.json_schema(Config)
 
 
-def read_yaml(text: str, where: str) -> Any:
-    """Parsed YAML. Raises ConfigError naming ``where`` and the line."""
-    try:
-        return yaml.parse(text, where)
-    except ValueError as error:
-        raise ConfigError(str(error)) from None
-
-
-def apply_override(data: dict[str, Any], override: str) -> None:
-    """Sets one value of parsed YAML, given as "dotted.path=value" with a YAML value. Raises ConfigError."""
-    path, sign, value = override.partition("=")
-    if not sign or not all(path.split(".")):
-        raise ConfigError(f"--set {override}: needs the form dotted.path=value, such as training.updates=500")
-    *parents, leaf = path.split(".")
-    for parent in parents:
-        data = data.setdefault(parent, {})
-        if not isinstance(data, dict):
-            raise ConfigError(f"--set {override}: {parent} is {data!r}, not a mapping")
-    data[leaf] = read_yaml(value, f"--set {override}")
-
-
-def read_mapping(
-    path: Path,
-    overrides: tuple[str, ...],
-    what: str,
-    section: type[Section],
-    shipped: dict[str, Path],
-    absolute: Callable[[dict[str, Any], Path], None],
-) -> dict[str, Any]:
-    """Keys of ``section`` from the file and the overrides "dotted.path=value", not checked. Raises ConfigError.
-
-    what, shipped: "an experiment" or the like, and those that come with the program, for messages
-    absolute: makes relative paths in the data absolute, given the folder to which they are relative
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}; {_hint(path, what, shipped)}") from None
-    data = read_yaml(text, str(path))
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: {what} is a mapping with the keys {', '.join(section.model_fields)}")
-    absolute(data, path.parent)
-    for override in overrides:
-        apply_override(data, override)
-    absolute(data, Path.cwd())
-    other = None if _KINDS[what][1] in data else _kind(data)
-    if other is not None:
-        command, key = _KINDS[other]
-        raise ConfigError(f"{path}: is {other}, it has the key {key}: `mjx-tt {command} {path}`; {what} is wanted here")
-    return data
-
-
-_KINDS = {  # of YAML: the command that takes it, the key by which it is known
-    "an experiment": ("train", "balls"),
-    "a study": ("is2r", "simulation"),
-    "a comparison": ("compare", "algorithms"),
-}
-
-
-def _kind(data: dict[str, Any]) -> str | None:
-    """Kind of YAML that its keys point to; None where they do not tell."""
-    return next((kind for kind, (_, key) in _KINDS.items() if key in data), None)
-
-
-def _hint(path: Path, what: str, shipped: dict[str, Path]) -> str:
-    """Guess at the file meant by one that is not there: one of another command, one nearly of that name."""
-    twin = next(SHIPPED.glob(f"*/{path.stem}.yaml"), None)
-    if path.stem not in shipped and twin:
-        other = _kind(read_yaml(twin.read_text(encoding="utf-8"), str(twin)))
-        if other not in (None, what):
-            return f"the shipped {twin.name} is {other}: `mjx-tt {_KINDS[other][0]} {twin.name}`; {what} is wanted here"
-    near = difflib.get_close_matches(path.stem, shipped, 1)
-    return f"did you mean {near[0]}.yaml?" if near else f"shipped are {', '.join(shipped)}"
+def shipped() -> dict[str, Path]:
+    """The experiments that come with the program, by name."""
+    return files.shipped("train")

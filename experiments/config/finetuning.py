@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from experiments.config import validation
-from experiments.config.experiment import Config, Rewards, apply_override, read_yaml
+from ballmodel.io.validation import Count, Seed
+from experiments.config import files
+from experiments.config.experiment import Config, Rewards
 from experiments.config.optimiser import Constant, EliteFraction, EmaDecay, NumDirections, Optimiser, Shaping, Step
-from experiments.config.section import Count, Seed
 from experiments.errors import ConfigError
 
 # Policies by first-order gradients return a third of their balls where the paper's sigma moves them, and learn from
@@ -60,23 +60,17 @@ def load(path: str | Path | None = None, overrides: tuple[str, ...] = (), traine
     """
     data, where = FineTuning().model_dump(mode="json"), "--set"
     for key, value in NEAR.items() if near(trained) else ():
-        apply_override(data, f"{key}={value}")
+        files.apply_override(data, f"{key}={value}")
     if path is not None:
-        try:
-            given = read_yaml(Path(path).read_text(encoding="utf-8"), str(path))
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: cannot be read: {error}") from None
-        if not isinstance(given, dict):
-            raise ConfigError(f"{path}: fine-tuning is a mapping with the keys {', '.join(FineTuning.model_fields)}")
-        data, where = data | given, str(path)
+        data, where = data | files.read_mapping(path), str(path)
     for override in overrides:
-        apply_override(data, override)
+        files.apply_override(data, override)
     return parse(data, where)
 
 
 def parse(data: dict[str, Any], where: str) -> FineTuning:
     """FineTuning from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
-    settings = validation.validated(FineTuning, data, where)
+    settings = files.validate(FineTuning, data, where)
     if settings.rewards == "sim" or not isinstance(settings.rewards, str):
         _check_rewards(settings.rewards, where)
     return settings
@@ -85,12 +79,10 @@ def parse(data: dict[str, Any], where: str) -> FineTuning:
 def _check_rewards(rewards: str | Rewards, where: str) -> None:
     if isinstance(rewards, str) or rewards.base == "sim":
         raise ConfigError(
-            f"{where}: rewards: the weights for simulation ask for terms that a robot does not measure; "
-            f"base them on real and weigh only {', '.join(MEASURED)}"
+            f"{where}: rewards: expected weights based on real, got sim; a robot measures only {', '.join(MEASURED)}"
         )
     for name, weight in rewards.model_dump(exclude={"base"}, exclude_none=True).items():
         if weight and name not in MEASURED:
             raise ConfigError(
-                f"{where}: rewards.{name} = {weight}: not measured on a robot, must be 0; "
-                f"terms with a weight: {', '.join(MEASURED)}"
+                f"{where}: rewards.{name}: expected 0, got {weight}; a robot measures only {', '.join(MEASURED)}"
             )

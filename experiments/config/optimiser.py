@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from experiments.config.section import Count, Decay, Positive, Section
+from ballmodel.io.validation import Count, Decay, Positive, Section
 
 # Keys of the optimiser, which training and fine-tuning share but for their defaults; see also ``Shaping``.
 NumDirections = Annotated[Count, Field(description="Antithetic pairs of perturbations per update.")]
@@ -89,6 +89,12 @@ class SigmaFall(Section):
 
 class Shaping(Section):
     """Keys of Blackbox Gradient Sensing that training and fine-tuning share with their defaults."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "renamed": {"pairs": "num_directions", "keep": "elite_fraction", "average": "ema_decay"},
+        }
+    )
 
     sigma: Positive = 0.025
     """Scale of the perturbations."""

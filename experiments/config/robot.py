@@ -5,26 +5,21 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import yaml
-from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from experiments.config.experiment import read_yaml
-from experiments.config.validation import LONGEST, nearest
-from experiments.errors import ConfigError, checked
-from robot_io.calibrated import RANGES as CALIBRATION_RANGES
+from experiments.config import files
+from experiments.config.files import read_mapping
+from experiments.errors import ConfigError, error_context
 from robot_io.calibrated import Calibration
 from robot_io.contract import PAPER, Contract
-from robot_io.control import config as robot_config
 from robot_io.control.config import RobotConfig
 from robot_io.emulator import config as rig_config
 from robot_io.emulator.config import RigParams, for_robot
 from robot_io.emulator.opponent import Throws
-from robot_io.ranges import is_number, outside
 
 if TYPE_CHECKING:  # a robot.yaml is read without JAX
     from ballmodel.registry import Balls
@@ -32,17 +27,6 @@ if TYPE_CHECKING:  # a robot.yaml is read without JAX
     from mjx_tt.sim.model import SimModel
 
 COMMISSIONING = 0.1  # speed_scale of a robot.yaml that sets none: full speed is asked for, not forgotten
-STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-WORDS = {
-    "int_type": "int",
-    "int_from_float": "int",
-    "float_type": "float",
-    "bool_type": "bool",
-    "string_type": "str",
-    "tuple_type": "a list",
-    "finite_number": "a finite number",
-}
-RANGES = {RobotConfig: robot_config.RANGES, RigParams: rig_config.RANGES, Calibration: CALIBRATION_RANGES}
 Config = TypeVar("Config", RobotConfig, RigParams, Calibration)
 
 
@@ -51,14 +35,14 @@ def named(path: str | Path) -> str | None:
 
     Raises ConfigError.
     """
-    given = _mapping(path).get("robot")
+    given = read_mapping(path).get("robot")
     if given is None:
         return None
     if not isinstance(given, str):
-        raise ConfigError(f"{path}: robot: got {_shown(given)}; allowed: a robot's name or folder")
-    from mjx_tt.robot import robot as simulated
+        raise ConfigError(f"{path}: robot: expected a robot's name or folder, got {given!r}")
+    from mjx_tt.robot import robot as robots
 
-    return given if given in simulated.names() else str(Path(path).parent / given)
+    return given if given in robots.names() else str(Path(path).parent / given)
 
 
 def standing(path: str | Path) -> Contract:
@@ -66,9 +50,10 @@ def standing(path: str | Path) -> Contract:
     robot = named(path)
     if robot is None:
         return PAPER
-    from mjx_tt.robot import robot as simulated
+    from mjx_tt.robot import robot as robots
 
-    return checked(f"{path}: robot", simulated.load, robot).contract
+    with error_context(f"{path}: robot"):
+        return robots.load(robot).contract
 
 
 def load_robot(path: str | Path, calibrated: bool = True, contract: Contract | None = None) -> RobotConfig:
@@ -79,11 +64,11 @@ def load_robot(path: str | Path, calibrated: bool = True, contract: Contract | N
     calibrated  False: its calibration is not looked at
     contract    of the robot that stands there, which must be the one that the file names, if any; None: that one
     """
-    data = _mapping(path)
+    data = read_mapping(path)
     if contract is None or data.get("robot") is not None:
         there = standing(path)
         if contract is not None and contract != there:
-            raise ConfigError(f"{path}: robot: names {there.robot}, asked for is {contract.robot} as it is now")
+            raise ConfigError(f"{path}: robot: expected {contract.robot} as it is now, got {there.robot}")
         contract = there
     if not calibrated:
         data.pop("calibration", None)
@@ -97,7 +82,7 @@ def load_robot(path: str | Path, calibrated: bool = True, contract: Contract | N
 
 def load_calibration(path: str | Path) -> Calibration:
     """A calibration of its own. Raises ConfigError."""
-    return fill(Calibration, _mapping(path), str(path))
+    return fill(Calibration, read_mapping(path), str(path))
 
 
 def load_rig(path: str | Path | None, robot: Robot | None = None) -> RigParams:
@@ -118,9 +103,10 @@ def load_rig(path: str | Path | None, robot: Robot | None = None) -> RigParams:
         )
         dead = standard.axis_dead_time if moved is None else max(moved - rig_config.AXIS_RESPONSE, 0.0)
         standard = replace(standard, arm=arm, axis_dead_time=dead)
-        checked("", RobotConfig.of(robot.contract).check_joints, robot.contract)
+        with error_context():
+            RobotConfig.of(robot.contract).check_joints(robot.contract)
     contract = PAPER if robot is None else robot.contract
-    params = standard if path is None else fill(RigParams, _mapping(path), str(path), standard, contract)
+    params = standard if path is None else fill(RigParams, read_mapping(path), str(path), standard, contract)
     return for_robot(params, contract)
 
 
@@ -134,13 +120,6 @@ def plain(config: RobotConfig | RigParams | Calibration) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config)))
 
 
-def _completed(given: Any, defaults: Any) -> Any:
-    """Content with the keys that its mappings omit, as the whole has them, which need not be their class's defaults."""
-    if not (isinstance(given, dict) and isinstance(defaults, dict)):
-        return given
-    return defaults | {key: _completed(value, defaults.get(key)) for key, value in given.items()}
-
-
 def fill(
     kind: type[Config], data: dict[str, Any], where: str, defaults: Config | None = None, contract: Contract = PAPER
 ) -> Config:
@@ -148,99 +127,20 @@ def fill(
 
     contract  whose joints a RobotConfig and RigParams have
     """
-    found = {path: (value, words) for path, value, words in outside(data, RANGES[kind]) if is_number(value)}
-    lines = [f"{path}: got {_shown(value)}; allowed: {words}" for path, (value, words) in found.items()]
-    try:
-        # By JSON, whose lists are tuples: nothing else is converted.
-        content = _completed(data, _defaults()[kind] if defaults is None else plain(defaults))
-        config = _adapters()[kind].validate_json(json.dumps({"file": content}, default=str)).file
-    except ValidationError as error:
-        for mistake in error.errors(include_url=False):
-            # A number outside its range is told above, and what a dataclass says of its section then as well.
-            if not found or (mistake["type"] != "value_error" and _path(mistake) not in found):
-                lines.append(_line(mistake, kind))
-    if not lines:
+    config = files.validate(kind, _complete(data, plain(kind() if defaults is None else defaults)), where)
+    with error_context(where):
         if isinstance(config, RobotConfig):
-            checked(where, config.check_joints, contract)
+            config.check_joints(contract)
         if isinstance(config, RigParams):
-            checked(where, for_robot, config, contract)
-        return config
-    raise ConfigError("\n".join(f"{where}: {line}" for line in dict.fromkeys(lines)))
+            for_robot(config, contract)
+    return config
 
 
-@cache
-def _defaults() -> dict[type, dict[str, Any]]:
-    """Content of a file that omits nothing and changes nothing, by its dataclass."""
-    return {kind: plain(kind()) for kind in RANGES}
-
-
-@cache
-def _adapters() -> dict[type, TypeAdapter]:
-    """Readers of files {"file": content}, by the dataclass of their content."""
-    found: dict[type, TypeAdapter] = {}
-    for kind in (RobotConfig, RigParams, Calibration):
-
-        class Content:  # pydantic takes the strictness of this class into the dataclasses inside
-            __pydantic_config__ = STRICT
-            file: Any
-
-        Content.__annotations__["file"] = kind
-        found[kind] = TypeAdapter(dataclasses.dataclass(Content))
-    return found
-
-
-def _line(mistake: Any, kind: type) -> str:
-    """One mistake: dotted path, what was given, what is allowed."""
-    *parents, last = mistake["loc"][1:] or ("",)
-    owner: Any = kind
-    for part in parents:
-        owner = _member(owner, part)
-    path = _path(mistake)
-    given, reason = mistake["input"], mistake["type"]
-    shown = _shown(given)
-    if reason == "unexpected_keyword_argument":
-        names = [f.name for f in dataclasses.fields(owner)]
-        return f"{path}: unknown key; {nearest(str(last), names)}allowed: {', '.join(names)}"
-    if reason == "value_error":
-        kind_of_section = getattr(_member(owner, last), "__name__", "")
-        return f"{path and path + '.'}{str(mistake['ctx']['error']).removeprefix(kind_of_section + '.')}"
-    if reason in ("too_long", "missing"):
-        tuple_of = owner if reason == "missing" else _member(owner, last)
-        at = path.rpartition("[")[0] if reason == "missing" else path
-        return f"{at}: got {len(given)} entries; allowed: {len(get_args(tuple_of))}"
-    allowed = WORDS.get(reason, mistake["msg"].removeprefix("Input should be "))
-    if reason in ("dataclass_type", "dataclass_exact_type"):
-        allowed = f"a mapping of {', '.join(f.name for f in dataclasses.fields(_member(owner, last)))}"
-    return f"{path}: got {shown}; allowed: {allowed}"
-
-
-def _path(mistake: Any) -> str:
-    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in mistake["loc"][1:])[1:]
-
-
-def _shown(given: Any) -> str:
-    return repr(given) if len(repr(given)) <= LONGEST else f"{repr(given)[:LONGEST]} ..."
-
-
-def _member(owner: Any, part: str | int) -> Any:
-    """Type of a field, or of an entry of a tuple; the first of a union."""
-    if isinstance(part, int):
-        return get_args(owner)[0]
-    if not part:
-        return owner
-    hint = get_type_hints(owner)[part]
-    return hint if get_origin(hint) is tuple else next(iter(get_args(hint)), hint)
-
-
-def _mapping(path: str | Path) -> dict[str, Any]:
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from None
-    data = read_yaml(text, str(path)) or {}
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: a mapping is needed, got {type(data).__name__}")
-    return data
+def _complete(given: Any, defaults: Any) -> Any:
+    """Content with the keys that its mappings omit, as the whole has them, which need not be their class's defaults."""
+    if not (isinstance(given, dict) and isinstance(defaults, dict)):
+        return given
+    return defaults | {key: _complete(value, defaults.get(key)) for key, value in given.items()}
 
 
 def throws_of(balls: Balls, model: SimModel, count: int, seed: int) -> Throws:
@@ -249,7 +149,8 @@ def throws_of(balls: Balls, model: SimModel, count: int, seed: int) -> Throws:
 
     from ballmodel.sampling import sample_pool
 
-    pool = checked(balls.name, sample_pool, jax.random.key(seed), balls, model.ball, count)
+    with error_context(balls.name):
+        pool = sample_pool(jax.random.key(seed), balls, model.ball, count)
     order = np.random.default_rng(seed).permutation(count)  # a pool need not be in random order
     return Throws(
         *(np.asarray(x, np.float64)[:, order] for x in (pool.state.position, pool.state.velocity, pool.state.spin))

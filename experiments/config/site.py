@@ -14,9 +14,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from experiments.config import validation
-from experiments.config.experiment import read_yaml
-from experiments.config.section import Count, Positive, Section
+from ballmodel.io.validation import Count, Positive, Section
+from experiments.config import files
 from experiments.errors import ConfigError
 
 
@@ -179,10 +178,10 @@ def load(path: str | os.PathLike) -> Site:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ConfigError(f"--site {path}: cannot be read: {reason}; allowed: {OWN}, or a site's YAML") from None
-    data = read_yaml(text, str(path))
+    data = files.read_yaml(text, str(path))
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: a site is a mapping with the keys {', '.join(Site.model_fields)}")
-    site = validation.validated(Site, data, str(path))
+    site = files.validate(Site, data, str(path))
     needed = {"parsl": "cluster"} | ({"kubernetes": "kubernetes"} if isinstance(site.provider, Kubernetes) else {})
     for package, extra in needed.items():
         if importlib.util.find_spec(package) is None:

@@ -12,13 +12,13 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from experiments.config import experiment, validation
-from experiments.config.experiment import LaterRewards, Task, read_mapping
+from ballmodel.io.validation import Count, Name, Positive, Section, Seed
+from experiments.config import experiment, files
+from experiments.config.experiment import LaterRewards, Task
 from experiments.config.finetuning import FineTuning
 from experiments.config.finetuning import parse as parse_fine_tuning
 from experiments.config.optimiser import Optimiser, Step
 from experiments.config.prior import PRIOR
-from experiments.config.section import Count, Name, Positive, Section, Seed
 
 Player = Literal["player1", "player2", "player3", "player4", "player5"]
 PLAYERS: tuple[Player, ...] = get_args(Player)
@@ -246,28 +246,28 @@ def load(path: str | os.PathLike, overrides: tuple[str, ...] = ()) -> Study:
 
     Relative paths in the file are relative to its folder, those of overrides to the current one. Raises ConfigError.
     """
-    path = Path(path)
-    return parse(read_mapping(path, overrides, "a study", Study, shipped(), _absolute), str(path))
+    return _check_fine_tuning(files.load(Study, "a study", path, overrides, _absolute), str(path))
 
 
 def _absolute(data: dict[str, Any], folder: Path) -> None:
-    if isinstance(data.get("robot"), str) and data["robot"] not in (RIG, LOCK_STEP):
-        data["robot"] = str((folder / data["robot"]).resolve())
-    if isinstance(data.get("recordings"), dict):
-        data["recordings"] = {k: str((folder / str(v)).resolve()) for k, v in data["recordings"].items()}
-    if isinstance(data.get("identification"), dict) and isinstance(data["identification"].get("joints"), str):
-        data["identification"]["joints"] = str((folder / data["identification"]["joints"]).resolve())
+    if data.get("robot") not in (RIG, LOCK_STEP):
+        files.make_absolute(data, ("robot",), folder)
+    files.make_absolute(data.get("recordings"), PLAYERS, folder)
+    files.make_absolute(data.get("identification"), ("joints",), folder)
     if isinstance(data.get("simulation"), dict):
         experiment.absolute_samples(data["simulation"].get("model"), folder)
 
 
 def parse(data: dict[str, Any], where: str) -> Study:
     """A Study from parsed YAML; ``where`` names its origin. Raises ConfigError with one line per mistake."""
-    study = validation.validated(Study, data, where)
+    return _check_fine_tuning(files.validate(Study, data, where), where)
+
+
+def _check_fine_tuning(study: Study, where: str) -> Study:
     parse_fine_tuning(study.fine_tuning.model_dump(mode="json"), f"{where}: fine_tuning")
     return study
 
 
 def shipped() -> dict[str, Path]:
     """The studies that come with the program, by name."""
-    return experiment.shipped("study")
+    return files.shipped("study")

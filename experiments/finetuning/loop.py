@@ -23,7 +23,7 @@ from ballmodel.io.atomic_files import replacing
 from bgs import normalizer, strategy
 from experiments.config import build
 from experiments.config.build import Experiment
-from experiments.config.experiment import read_yaml
+from experiments.config.files import read_yaml
 from experiments.config.finetuning import FineTuning
 from experiments.errors import RunError
 from experiments.finetuning import report

@@ -121,15 +121,16 @@ def place(
         suffix(out, ".yaml")
     start_jax(None)
     from experiments.config import build
-    from experiments.errors import checked
+    from experiments.errors import error_context
     from experiments.robots import placement
     from mjx_tt.robot import robot as robots
 
     screen = console()
-    path = checked("", robots.yaml_path, robot)
+    with error_context():
+        path = robots.yaml_path(robot)
+        before = robots.load(path)
     if out is None and path.is_relative_to(robots.SHIPPED):
         raise ConfigError(f"{robot}: comes with the program and is not changed; name another file with --out")
-    before = checked("", robots.load, path)
     distribution = build.distribution(balls, "--balls")
     found = placement.search(before, distribution, samples, seed)
     if found.score <= found.before:

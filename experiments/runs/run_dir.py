@@ -17,7 +17,8 @@ from typing import Any
 import yaml
 
 from ballmodel.io.atomic_files import replacing
-from experiments.config.experiment import Config, parse, read_yaml
+from experiments.config.experiment import Config, parse
+from experiments.config.files import read_yaml
 from experiments.errors import LockedError, RunError
 
 CONFIG, SESSIONS, LOCK = "config.yaml", "run.json", ".lock"

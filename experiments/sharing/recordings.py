@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.deploy.session_logs import LONGEST_GAP, is_session
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 from mjx_tt import diagnosis
 from robot_io import log
 from robot_io.contract import CONTROL_RATE, PAPER, Contract
@@ -107,7 +107,8 @@ def sessions(paths: Sequence[Path]) -> Recording:
     left, steps, latest = Counter[str](), [np.empty(0)], 0.0
     emulated = set()
     for path in paths:
-        session = checked("", log.read, path)
+        with error_context():
+            session = log.read(path)
         robot = robot or session.robot
         if session.robot != robot:
             raise ConfigError(
@@ -163,7 +164,8 @@ def sessions(paths: Sequence[Path]) -> Recording:
 
 def balls(paths: Sequence[str]) -> Recording:
     """Flights of measured balls, each between two gaps, interpolated linearly at the control rate."""
-    flights = checked("", diagnosis.load_logs, paths).balls
+    with error_context():
+        flights = diagnosis.load_logs(paths).balls
     episodes, short = [], 0
     for ball in flights:
         cuts = np.flatnonzero(np.diff(ball.time) > LONGEST_GAP) + 1

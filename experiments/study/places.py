@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.config.experiment import read_yaml
+from experiments.config.files import read_yaml
 from experiments.runs.locate import SELECTION
 from experiments.study.schedule import PRIOR
 

@@ -28,7 +28,7 @@ import numpy as np
 import yaml
 from matplotlib.lines import Line2D
 
-from ballmodel import registry as paper
+from ballmodel import registry
 from ballmodel.distribution import BallDistribution
 from ballmodel.fit_distribution import fit_human
 from ballmodel.io import yaml as yaml_file
@@ -178,7 +178,7 @@ class Calibration:
         rows = []
         for name, person in reached.items():
             for model, numbers in person.numbers.items():
-                wanted = sixteen(paper.load(f"{name}/{model}"))
+                wanted = sixteen(registry.load(f"{name}/{model}"))
                 for i, number in enumerate(NUMBERS):
                     span = wanted[i | 1] - wanted[i & ~1]
                     rows.append(
@@ -198,7 +198,7 @@ class Calibration:
         """A row for every player: rally lengths, the paper's and reached."""
         rows = []
         for name, person in reached.items():
-            skill, lengths = paper.skill(name), np.sort(person.lengths)
+            skill, lengths = registry.skill(name), np.sort(person.lengths)
             best = lengths[len(lengths) // 6 :]  # as "the top 50 of 60" does
             for label, wanted, found in (
                 ("min", skill.min, best.min()),

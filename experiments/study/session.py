@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from experiments.config import build
-from experiments.config.experiment import read_yaml
+from experiments.config.files import read_yaml
 from experiments.config.study import Study, parse
 from experiments.errors import RunError, checked
 from experiments.jobs.site import ALONE, Workers

@@ -10,7 +10,8 @@ from rich.console import Console
 
 from ballmodel.distribution import load_distribution
 from experiments.config import build
-from experiments.config.experiment import Config, Evaluation, Training, read_yaml
+from experiments.config.experiment import Config, Evaluation, Training
+from experiments.config.files import read_yaml
 from experiments.config.study import Study
 from experiments.runs import load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy

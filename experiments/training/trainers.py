@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from experiments.config import build
 from experiments.config.build import Experiment
-from experiments.errors import checked
+from experiments.errors import error_context
 from experiments.training.first_order import FirstOrderTrainer
 from experiments.training.update import Trainer
 from mjx_tt.env.rollout import Simulator
@@ -15,7 +15,8 @@ KINDS: dict[str, type[Trainer]] = {"zeroth_order": Trainer, "first_order": First
 def trainer(experiment: Experiment) -> Trainer:
     """The trainer with its pool of balls drawn. Raises ConfigError."""
     config = experiment.config
-    simulator = checked("training.devices", Simulator, experiment.task, build.device_count(config))
+    with error_context("training.devices"):
+        simulator = Simulator(experiment.task, build.device_count(config))
     return KINDS[config.optimiser.gradient](
         simulator,
         experiment.bgs,

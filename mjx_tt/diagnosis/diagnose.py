@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ballmodel.io.validation import find
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import causes, cross_validation
 from mjx_tt.diagnosis.ball import effects as ball_effects
@@ -120,7 +121,7 @@ def _check(logs: Logs, spin: str, without: Sequence[str]) -> None:
     for name in without:
         if name not in ball_effects.DESCRIPTIONS and name.split(".")[-1] not in joint_effects.NAMES:
             known = {*ball_effects.DESCRIPTIONS, *joint_effects.NAMES}
-            raise ValueError(f"no effect {name!r} to leave out{models.nearest(name, known)}")
+            find(dict.fromkeys(known), name, "effect")
     if not logs.balls and not logs.joints:
         raise ValueError("the logs hold neither balls nor joints")
 

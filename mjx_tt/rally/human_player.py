@@ -14,29 +14,29 @@ Component axis first, batch axes last; a player's leaves are scalars or of the b
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import math
 import os
-import types
-import typing
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
+from pydantic import GetCoreSchemaHandler
+from pydantic_core import core_schema
 
 from ballmodel import constants as c
 from ballmodel.aerodynamics import FlightParams
 from ballmodel.io import yaml
+from ballmodel.io.ranges import FINITE
+from ballmodel.io.validation import Finite, Increasing, find, validate
 from ballmodel.state import BallState
 from ballmodel.vec import Scalars, row
 from mjx_tt.rally.shots import aimed, erring, fall_seconds, stroke_seconds
 
-T = TypeVar("T")
+Number: TypeAlias = Annotated[jax.Array | float, FINITE]  # a file has one number
 
 FOLDER = Path(__file__).parents[1] / "assets" / "virtual_players"
 NOTES = ("name", "level", "source")
@@ -60,6 +60,12 @@ class Spread:
     low: jax.Array | float
     usual: jax.Array | float
     high: jax.Array | float
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        """In a file: [low, usual, high]."""
+        ends = handler(Annotated[tuple[Finite, Finite, Finite], Increasing])
+        return core_schema.no_info_after_validator_function(lambda values: cls(*values), ends)
 
     def draw(
         self, key: PRNGKeyArray, shape: tuple[int, ...], steadiness: Scalars, cut: float
@@ -88,8 +94,8 @@ class FirstBalls:
     climb: Spread  # [m/s] its ends bound the vertical velocity
     landing: Spread  # [m] y that is aimed at on the robot's side
     side: Spread  # [m] its ends bound the x that is aimed at there
-    service: jax.Array | float  # share of balls that bounce on the player's own side first
-    mishit: jax.Array | float  # share of balls with four times the errors
+    service: Number  # share of balls that bounce on the player's own side first
+    mishit: Number  # share of balls with four times the errors
 
 
 @jax.tree_util.register_dataclass
@@ -103,10 +109,10 @@ class Strokes:
     aim_y: Spread
     speed: Spread  # [m/s] horizontal; its ends are bounds
     clearance: Spread  # [m] of the ball over the net
-    steadiness: jax.Array | float  # of all these spreads
-    climb: jax.Array | float  # [m/s] highest vertical velocity
-    counter: jax.Array | float  # share of the incoming speed beyond 3.5 m/s that is added to the answer's
-    attack: jax.Array | float  # [1/s] speed added per height of the contact over COMFORTABLE_HEIGHT
+    steadiness: Number  # of all these spreads
+    climb: Number  # [m/s] highest vertical velocity
+    counter: Number  # share of the incoming speed beyond 3.5 m/s that is added to the answer's
+    attack: Number  # [1/s] speed added per height of the contact over COMFORTABLE_HEIGHT
 
 
 @jax.tree_util.register_dataclass
@@ -114,17 +120,17 @@ class Strokes:
 class Ability:
     """Ability of a player. Errors are those of an easy ball, as standard deviations."""
 
-    direction: jax.Array | float  # [rad] error of the stroke's direction, to the side
-    elevation: jax.Array | float  # [rad] and upwards
-    pace: jax.Array | float  # error of the speed, as a share
-    growth: jax.Array | float  # errors grow by this share per unit of difficulty
-    miss: jax.Array | float  # probability of missing an easy ball altogether
-    limit: jax.Array | float  # difficulty at which every second ball is missed
-    stand: jax.Array | float  # [m] x where the player waits
-    reach: jax.Array | float  # [m] to each side without a step
-    feet: jax.Array | float  # [m/s] speed to the side
-    easy_speed: jax.Array | float  # [m/s] of a return; each further metre per second is half a unit of difficulty
-    misread: jax.Array | float  # [rad] error upwards per SPIN_UNIT of incoming topspin that the player is not used to
+    direction: Number  # [rad] error of the stroke's direction, to the side
+    elevation: Number  # [rad] and upwards
+    pace: Number  # error of the speed, as a share
+    growth: Number  # errors grow by this share per unit of difficulty
+    miss: Number  # probability of missing an easy ball altogether
+    limit: Number  # difficulty at which every second ball is missed
+    stand: Number  # [m] x where the player waits
+    reach: Number  # [m] to each side without a step
+    feet: Number  # [m/s] speed to the side
+    easy_speed: Number  # [m/s] of a return; each further metre per second is half a unit of difficulty
+    misread: Number  # [rad] error upwards per SPIN_UNIT of incoming topspin that the player is not used to
 
 
 @jax.tree_util.register_dataclass
@@ -132,9 +138,9 @@ class Ability:
 class Spin:
     """Spin that a player's strokes give [rad/s]."""
 
-    top: jax.Array | float  # mean topspin; backspin is negative
-    top_spread: jax.Array | float  # standard deviations from stroke to stroke
-    side_spread: jax.Array | float
+    top: Number  # mean topspin; backspin is negative
+    top_spread: Number  # standard deviations from stroke to stroke
+    side_spread: Number
 
 
 @jax.tree_util.register_dataclass
@@ -142,11 +148,11 @@ class Spin:
 class Person:
     """Changes of a player in the course of a session."""
 
-    tiring: jax.Array | float  # share of the strength that is left lost per stroke
-    rest: jax.Array | float  # share of the tiredness that a pause between rallies takes away
-    weariness: jax.Array | float  # errors of a wholly tired player grow by this share
-    adapting: jax.Array | float  # share of what is new about the robot's returns that each of them teaches
-    strangeness: jax.Array | float  # difficulty per unit of surprise by a return
+    tiring: Number  # share of the strength that is left lost per stroke
+    rest: Number  # share of the tiredness that a pause between rallies takes away
+    weariness: Number  # errors of a wholly tired player grow by this share
+    adapting: Number  # share of what is new about the robot's returns that each of them teaches
+    strangeness: Number  # difficulty per unit of surprise by a return
 
 
 @jax.tree_util.register_dataclass
@@ -343,21 +349,18 @@ def names() -> tuple[str, ...]:
 
 def load(name: str) -> Player:
     """The virtual player of that name. Raises ValueError listing the valid names."""
-    if name not in names():
-        near = difflib.get_close_matches(str(name), names(), n=1, cutoff=0.0)
-        raise ValueError(
-            f"no virtual player is called {name!r}; did you mean {near[0]!r}? There are: {', '.join(names())}"
-        )
-    return read(FOLDER / f"{name}.yaml")
+    return read(find({known: FOLDER / f"{known}.yaml" for known in names()}, name, "virtual player"))
 
 
 def read(path: str | os.PathLike) -> Player:
-    """A player from a YAML file: the tree of field names, a spread as [low, usual, high]. Raises ValueError naming
-    file and key."""
+    """A player from a YAML file: the tree of field names, a spread as [low, usual, high].
+
+    Raises ValueError naming file and key.
+    """
     data = yaml.read(path)
-    if not isinstance(data, dict):
-        raise ValueError(f"{path}: a mapping of {', '.join(f.name for f in dataclasses.fields(Player))} is wanted")
-    return _parse(Player, {k: v for k, v in data.items() if k not in NOTES}, str(path), "")
+    if isinstance(data, dict):
+        data = {key: value for key, value in data.items() if key not in NOTES}
+    return validate(Player, data, str(path))
 
 
 def to_dict(player: Player) -> dict[str, Any]:
@@ -376,36 +379,3 @@ def _plain(player: Any) -> dict[str, Any] | list[float] | float:
 def stack(players: list[Player]) -> Player:
     """One Player whose leaves are (n,), one lane for each given."""
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf, jnp.float32) for leaf in leaves]), *players)
-
-
-def _parse(kind: type[T], data: Any, where: str, prefix: str) -> T:
-    hints = typing.get_type_hints(kind)
-    if not isinstance(data, dict):
-        raise ValueError(f"{where}: {prefix.rstrip('.')} = {data!r}, a mapping of {', '.join(hints)} is wanted")
-    for key in data:
-        if key not in hints:
-            near = difflib.get_close_matches(str(key), hints, n=1, cutoff=0.0)
-            raise ValueError(f"{where}: unknown key {prefix}{key}; did you mean {prefix}{near[0]}?")
-    values: dict[str, Any] = {}
-    for name, hint in hints.items():
-        path = f"{prefix}{name}"
-        if name not in data:
-            raise ValueError(f"{where}: missing key {path}")
-        value = data[name]
-        if hint is Spread:
-            if not (
-                isinstance(value, list) and len(value) == 3 and all(map(_is_number, value)) and value == sorted(value)
-            ):
-                raise ValueError(f"{where}: {path} = {value!r}, three numbers low <= usual <= high are allowed")
-            values[name] = Spread(*map(float, value))
-        elif isinstance(hint, types.UnionType):
-            if not _is_number(value):
-                raise ValueError(f"{where}: {path} = {value!r}, a finite number is wanted")
-            values[name] = float(value)
-        else:
-            values[name] = _parse(hint, value, where, f"{path}.")
-    return kind(**values)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -24,7 +24,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,9 @@ from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float
 
+from ballmodel.io.ranges import Within
 from ballmodel.partial_params import optional, value_or
+from ballmodel.vec import Scalars
 from robot_io.contract import JOINT_NAMES, LIMITS
 
 # "No limit" as numbers that no drive reaches: ten times the fastest joint's speed, and up to it within 10 microseconds.
@@ -51,19 +53,19 @@ class JointDrive:
     """
 
     # [s] more than latency.abb_action or festo_action draws
-    action_delay: Float[Array, "*#batch"] | float | None = optional(0.0)
+    action_delay: Annotated[Scalars, Within(0.0, 1.0, "s")] | None = optional(0.0)
     # [s] more than latency.*_observation draws
-    observation_delay: Float[Array, "*#batch"] | float | None = optional(0.0)
-    lag: Float[Array, "*#batch"] | float | None = optional(0.0)  # [s]
+    observation_delay: Annotated[Scalars, Within(0.0, 1.0, "s")] | None = optional(0.0)
+    lag: Annotated[Scalars, Within(0.0, 1.0, "s")] | None = optional(0.0)  # [s]
     # reached over commanded, beside actuation.velocity_gain
-    velocity_gain: Float[Array, "*#batch"] | float | None = optional(1.0)
-    joint_offset: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m], [rad] measured less true position
-    velocity_limit: Float[Array, "*#batch"] | float | None = optional(NO_VELOCITY_LIMIT)  # [m/s], [rad/s]
-    acceleration_limit: Float[Array, "*#batch"] | float | None = optional(NO_ACCELERATION_LIMIT)  # [m/s^2], [rad/s^2]
-    backlash: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m], [rad] width of the play
-    coulomb_friction: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m/s], [rad/s] that friction costs
-    deadband: Float[Array, "*#batch"] | float | None = optional(0.0)  # [m/s], [rad/s]
-    resonance: Float[Array, "*#batch"] | float | None = optional(0.0)  # [Hz] of a flexible mount; 0: it is rigid
+    velocity_gain: Annotated[Scalars, Within(-3.0, 3.0)] | None = optional(1.0)
+    joint_offset: Annotated[Scalars, Within(-3.2, 3.2)] | None = optional(0.0)  # [m], [rad] measured less true position
+    velocity_limit: Annotated[Scalars, Within(0.0)] | None = optional(NO_VELOCITY_LIMIT)  # [m/s], [rad/s]
+    acceleration_limit: Annotated[Scalars, Within(0.0)] | None = optional(NO_ACCELERATION_LIMIT)  # [m/s^2], [rad/s^2]
+    backlash: Annotated[Scalars, Within(0.0)] | None = optional(0.0)  # [m], [rad] width of the play
+    coulomb_friction: Annotated[Scalars, Within(0.0)] | None = optional(0.0)  # [m/s], [rad/s] that friction costs
+    deadband: Annotated[Scalars, Within(0.0)] | None = optional(0.0)  # [m/s], [rad/s]
+    resonance: Annotated[Scalars, Within(0.0)] | None = optional(0.0)  # [Hz] of a flexible mount; 0: it is rigid
 
 
 EFFECTS = tuple(f.name for f in dataclasses.fields(JointDrive))

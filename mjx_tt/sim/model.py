@@ -12,26 +12,28 @@ YAML: the tree of field names, all of them optional, plus
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import math
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import yaml
 from jax import Array
 from jaxtyping import Float, Key
+from typing_extensions import TypedDict
 
-from ballmodel.aerodynamics import INTEGRATORS
 from ballmodel.flight import BallParams, ball_params
 from ballmodel.io import yaml as yaml_file
 from ballmodel.io.atomic_files import replacing
-from mjx_tt.sim import bounds, randomisation
-from mjx_tt.sim.actuators import drive_params
+from ballmodel.io.ranges import Within, find_note, type_hints
+from ballmodel.io.validation import nearest, validate
+from ballmodel.vec import Scalars
+from mjx_tt.sim import randomisation
+from mjx_tt.sim.actuators import JointDrive, drive_params
 from mjx_tt.sim.randomisation import Drawing, Randomised
 from mjx_tt.sim.randomisation import Range as Range
 from mjx_tt.sim.randomisation import Samples as Samples
@@ -48,16 +50,16 @@ class LatencyParams:
     meant: a variance would have unit ms^2.
     """
 
-    ball_observation: Float[Array, "*#batch"] | float = 0.040
-    ball_observation_std: Float[Array, "*#batch"] | float = 0.0082
-    abb_observation: Float[Array, "*#batch"] | float = 0.029
-    abb_observation_std: Float[Array, "*#batch"] | float = 0.0082
-    festo_observation: Float[Array, "*#batch"] | float = 0.033
-    festo_observation_std: Float[Array, "*#batch"] | float = 0.009
-    abb_action: Float[Array, "*#batch"] | float = 0.071
-    abb_action_std: Float[Array, "*#batch"] | float = 0.0057
-    festo_action: Float[Array, "*#batch"] | float = 0.0645
-    festo_action_std: Float[Array, "*#batch"] | float = 0.0115
+    ball_observation: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.040
+    ball_observation_std: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.0082
+    abb_observation: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.029
+    abb_observation_std: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.0082
+    festo_observation: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.033
+    festo_observation_std: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.009
+    abb_action: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.071
+    abb_action_std: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.0057
+    festo_action: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.0645
+    festo_action_std: Annotated[Scalars, Within(0.0, 1.0, "s")] = 0.0115
 
 
 LATENCIES = ("ball_observation", "abb_observation", "festo_observation", "abb_action", "festo_action")
@@ -68,7 +70,7 @@ LATENCIES = ("ball_observation", "abb_observation", "festo_observation", "abb_ac
 class ActuationParams:
     """All drives alike: gain of the velocity command before the servo of the MJCF follows it."""
 
-    velocity_gain: Float[Array, "*#batch"] | float = 1.0  # reached over commanded velocity
+    velocity_gain: Annotated[Scalars, Within(-3.0, 3.0)] = 1.0  # reached over commanded velocity
 
 
 @jax.tree_util.register_dataclass
@@ -79,12 +81,12 @@ class BallSpinParams:
     The pool of balls is chosen without spin: those that spin much need not land where their distribution says.
     """
 
-    mean_x: Float[Array, "*#batch"] | float = 0.0
-    mean_y: Float[Array, "*#batch"] | float = 0.0
-    mean_z: Float[Array, "*#batch"] | float = 0.0
-    std_x: Float[Array, "*#batch"] | float = 0.0
-    std_y: Float[Array, "*#batch"] | float = 0.0
-    std_z: Float[Array, "*#batch"] | float = 0.0
+    mean_x: Annotated[Scalars, Within(-2000.0, 2000.0, "rad/s")] = 0.0
+    mean_y: Annotated[Scalars, Within(-2000.0, 2000.0, "rad/s")] = 0.0
+    mean_z: Annotated[Scalars, Within(-2000.0, 2000.0, "rad/s")] = 0.0
+    std_x: Annotated[Scalars, Within(0.0, 2000.0, "rad/s")] = 0.0
+    std_y: Annotated[Scalars, Within(0.0, 2000.0, "rad/s")] = 0.0
+    std_z: Annotated[Scalars, Within(0.0, 2000.0, "rad/s")] = 0.0
 
 
 def _ball() -> BallParams:
@@ -152,19 +154,21 @@ class ModelFile:
             temporary.write_text(yaml.dump(tree, Dumper=_Dumper, sort_keys=False, width=120), encoding="utf-8")
 
 
-def paths(node: Any = None, prefix: str = "") -> dict[str, Any]:
+def paths(node: SimModel | None = None) -> dict[str, Any]:
     """Every leaf of a SimModel by its dotted path; of the nominal model by default. Absent drives are nominal ones."""
-    node = SimModel() if node is None else node
+    return {path: value for path, value, _ in _leaves(SimModel() if node is None else node)}
+
+
+def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Dotted path, value and annotation of every leaf."""
     if isinstance(node, SimModel) and node.drives is None:
         node = dataclasses.replace(node, drives=drive_params(node.joints)())
-    leaves: dict[str, Any] = {}
     for f in _parameters(node):
         value = getattr(node, f.name)
         if dataclasses.is_dataclass(value):
-            leaves |= paths(value, f"{prefix}{f.name}.")
+            yield from _leaves(value, f"{prefix}{f.name}.")
         else:
-            leaves[prefix + f.name] = value
-    return leaves
+            yield prefix + f.name, value, find_note(type_hints(type(node))[f.name])
 
 
 def with_values(model: SimModel, values: Mapping[str, Any]) -> SimModel:
@@ -175,7 +179,7 @@ def with_values(model: SimModel, values: Mapping[str, Any]) -> SimModel:
     known = paths(SimModel(joints=model.joints))
     for path in values:
         if path not in known:
-            raise ValueError(f"unknown parameter {path!r}{nearest(path, known)}")
+            raise ValueError(f"expected a parameter of the model, got {path!r}; {nearest(path, known)}")
     if model.drives is None and any(path.startswith("drives.") for path in values):
         model = dataclasses.replace(model, drives=drive_params(model.joints)())
     return _with_values(model, values)
@@ -222,63 +226,61 @@ def draw_spin(key: Key[Array, ""], spin: BallSpinParams, shape: tuple[int, ...])
     return mean + std * jax.random.normal(key, mean.shape)
 
 
-def nearest(name: str, known: Collection[str]) -> str:
-    """', did you mean ...?' or the list of valid names."""
-    close = difflib.get_close_matches(name, list(known), 1)
-    return f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(sorted(known))}"
+def bounds(path: str) -> tuple[float, float]:
+    """Smallest and largest value of a number, by its dotted path: wide enough for everything measured, too narrow for
+    another unit or a typing slip. Programs may set what they like."""
+    _, _, name = path.rpartition(".")
+    note = find_note(type_hints(JointDrive)[name]) if path.startswith("drives.") else _notes(JOINT_NAMES)[path]
+    return note.low, note.high
 
 
 def from_dict(data: Any, where: str, nominal: SimModel | None = None) -> ModelFile:
     """A ModelFile from parsed YAML; ``where`` names its origin in errors, ``nominal`` has what the YAML leaves out."""
     nominal = SimModel() if nominal is None else nominal
-    if not isinstance(data, dict):
-        raise ValueError(f"{where}: a model is a mapping of parameter groups, got {type(data).__name__}")
-    data = dict(data)
-    ranges, provenance = (_mapping(data.pop(key, None), f"{where}: {key}") for key in ("randomise", "provenance"))
-    known = paths(nominal)
-    values = {}
-    for path, value in _flatten(data, where, known):
-        if isinstance(known[path], str):
-            if value not in INTEGRATORS:
-                raise ValueError(f"{where}: {path} = {value!r}, allowed are {INTEGRATORS}")
-        else:
-            value = _number(value, f"{where}: {path}", path)
-        values[path] = value
-
-    def parameter(path: Any, where: str) -> str:
-        if path not in known or isinstance(known[path], str):
-            raise ValueError(f"{where}: unknown parameter{nearest(str(path), known)}")
-        return str(path)
-
-    parsed = randomisation.parse(ranges, f"{where}: randomise", parameter, _number)
-    return ModelFile(with_values(nominal, values), parsed, provenance)
+    # In the order of the file: what is drawn depends on it.
+    content = _reorder(validate(file_type(nominal.joints), data, where), data)
+    ranges = content.pop("randomise", None) or {}
+    content.pop("provenance", None)
+    provenance = data.get("provenance") or {}  # as it stands there
+    return ModelFile(with_values(nominal, dict(_flatten(content))), randomisation.parse(ranges), provenance)
 
 
-def _flatten(data: dict, where: str, known: Collection[str], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in data.items():
-        path = f"{prefix}{key}"
+@cache
+def file_type(joints: tuple[str, ...] = JOINT_NAMES) -> Any:
+    """Type of a model YAML for a robot with these joints: the tree of parameters, none of which is required."""
+    tree: dict[str, Any] = {}
+    for path, note in _notes(joints).items():
+        *groups, leaf = path.split(".")
+        node = tree
+        for group in groups:
+            node = node.setdefault(group, {})
+        node[leaf] = Annotated[float, note] if isinstance(note, Within) else note
+    numbers = {path: note for path, note in _notes(joints).items() if isinstance(note, Within)}
+    extra = {"randomise": randomisation.file_type(numbers) | None, "provenance": dict[str, Any] | None}
+    return _mapping_type("Model", tree | extra)
+
+
+def _mapping_type(name: str, tree: dict[str, Any]) -> Any:
+    keys = {key: _mapping_type(key, below) if isinstance(below, dict) else below for key, below in tree.items()}
+    return TypedDict(name, keys, total=False)  # type: ignore[misc, operator]
+
+
+@cache
+def _notes(joints: tuple[str, ...]) -> dict[str, Any]:
+    """Annotations that say what is allowed, by dotted path."""
+    return {path: note for path, _, note in _leaves(SimModel(joints=joints))}
+
+
+def _reorder(content: Any, given: Any) -> Any:
+    """Valid content with the keys of its mappings in the order in which they were given."""
+    if not isinstance(content, dict):
+        return content
+    return {str(key): _reorder(content[str(key)], value) for key, value in given.items()}
+
+
+def _flatten(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
         if isinstance(value, dict):
-            yield from _flatten(value, where, known, f"{path}.")
-        elif path in known:
-            yield path, value
-        elif any(name.startswith(f"{path}.") for name in known):
-            raise ValueError(f"{where}: {path} = {value!r}, a mapping of its parameters is needed")
+            yield from _flatten(value, f"{prefix}{key}.")
         else:
-            beside = {name for name in known if name.startswith(prefix)} if prefix else {n.split(".")[0] for n in known}
-            hint = nearest(path, known) if difflib.get_close_matches(path, list(known), 1) else nearest(path, beside)
-            raise ValueError(f"{where}: unknown parameter {path!r}{hint}")
-
-
-def _mapping(value: Any, where: str) -> dict:
-    if value is not None and not isinstance(value, dict):
-        raise ValueError(f"{where} = {value!r}, a mapping is needed")
-    return value or {}
-
-
-def _number(value: Any, where: str, path: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ValueError(f"{where} = {value!r}, a finite number is needed")
-    low, high = bounds.of(path)
-    if not low <= value <= high:
-        raise ValueError(f"{where} = {value!r}, allowed is {low:g} to {high:g} in SI units")
-    return float(value)
+            yield f"{prefix}{key}", value

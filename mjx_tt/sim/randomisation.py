@@ -14,20 +14,24 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float, Key
+from pydantic import AfterValidator
+from typing_extensions import TypedDict
+
+from ballmodel.io.ranges import Within
+from ballmodel.io.validation import Increasing
 
 SAMPLES, WEIGHT = "samples", "weight"
-Number: TypeAlias = Callable[[Any, str, str], float]  # (value, where, dotted path) -> the number, or ValueError
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=[], meta_fields=["path", "low", "high"])
@@ -123,8 +127,8 @@ def drawn(key: Key[Array, ""], randomise: Sequence[Randomised | Drawing], shape:
     """Values by dotted path for a batch of ``shape`` episodes."""
     keys = jax.random.split(key, max(len(randomise), 1))  # one is left over where nothing is randomised
     values: dict[str, Array] = {}
-    for one, own in zip(randomise, keys, strict=False):
-        values |= one.drawn(own, shape)
+    for one, its_key in zip(randomise, keys, strict=False):
+        values |= one.drawn(its_key, shape)
     return values
 
 
@@ -141,56 +145,46 @@ def to_dict(randomise: Sequence[Randomised]) -> dict[str, Any]:
     return out
 
 
-def parse(data: Mapping[Any, Any], where: str, parameter: Callable[[Any, str], str], number: Number) -> tuple:
-    """Ranges and samples of a mapping ``randomise``. Raises ValueError naming ``where`` and the key.
-
-    parameter: (path, where) -> the dotted path of a number of the model, or ValueError. Samples stand as content.
-    """
+def parse(content: Mapping[str, Any]) -> tuple[Randomised, ...]:
+    """Ranges and samples of a mapping ``randomise``, valid by ``file_type``."""
     parsed: list[Randomised] = []
-    for path, given in data.items():
+    for path, given in content.items():
         if path == SAMPLES:
-            parsed.append(_samples(given, f"{where}.{SAMPLES}", parameter, number))
-            continue
-        parameter(path, f"{where}.{path}")
-        if not isinstance(given, list | tuple) or len(given) != 2:
-            raise ValueError(f"{where}.{path} = {given!r}, a range is [low, high]")
-        low, high = (number(end, f"{where}.{path}", path) for end in given)
-        if low > high:
-            raise ValueError(f"{where}.{path} = {given!r}, low must not exceed high")
-        parsed.append(Range(path, low, high))
-    paths = [path for one in parsed for path in one.paths]
-    twice = {path for path in paths if paths.count(path) > 1}
-    if twice:
-        raise ValueError(f"{where}: {', '.join(sorted(twice))} is drawn twice, by its range and by the samples")
+            columns = {name: column for name, column in given.items() if name != WEIGHT}
+            values = np.array(list(columns.values()), float).T
+            parsed.append(Samples(tuple(columns), values, np.array(given.get(WEIGHT, np.ones(len(values))), float)))
+        else:
+            parsed.append(Range(path, *given))
     return tuple(parsed)
 
 
-def _samples(given: Any, where: str, parameter: Callable[[Any, str], str], number: Number) -> Samples:
-    if not isinstance(given, dict) or not all(isinstance(column, list) for column in given.values()):
-        raise ValueError(f"{where} = {str(given)[:80]!r}, the name of a CSV or a list for each parameter is needed")
-    columns = dict(given)
-    weight = columns.pop(WEIGHT, None)
-    if not columns:
-        raise ValueError(f"{where}: no parameter is in it")
-    rows = {len(column) for column in (*columns.values(), *([] if weight is None else [weight]))}
-    if len(rows) > 1 or rows == {0}:
-        raise ValueError(f"{where}: the lists have {sorted(rows)} numbers, all must have as many, and one at least")
-    values = []
-    for path, column in columns.items():
-        parameter(path, f"{where}.{path}")
-        values.append([number(value, f"{where}.{path}[{i}]", path) for i, value in enumerate(column)])
-    count = rows.pop()
-    weights = np.ones(count) if weight is None else _weights(weight, f"{where}.{WEIGHT}")
-    return Samples(tuple(columns), np.array(values, float).T, weights)
+def file_type(numbers: Mapping[str, Within]) -> Any:
+    """Type of ``randomise`` in a YAML, by what is allowed for each number of the model; samples stand as content."""
+    ends = {path: Annotated[float, note] for path, note in numbers.items()}
+    columns = {path: list[end] for path, end in ends.items()} | {WEIGHT: list[Annotated[float, Within(0.0)]]}  # type: ignore[valid-type]
+    samples = TypedDict("samples", columns, total=False)  # type: ignore[misc, operator]
+    ranges = {path: Annotated[tuple[end, end], Increasing] for path, end in ends.items()}  # type: ignore[valid-type]
+    keys = ranges | {SAMPLES: Annotated[samples, AfterValidator(_check_samples)]}
+    return Annotated[TypedDict("randomise", keys, total=False), AfterValidator(_check_once)]  # type: ignore[misc, operator]
 
 
-def _weights(given: list, where: str) -> Float[np.ndarray, " S"]:
-    for i, value in enumerate(given):
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < float("inf"):
-            raise ValueError(f"{where}[{i}] = {value!r}, a number of at least 0 is needed")
-    if not sum(given) > 0.0:
-        raise ValueError(f"{where}: all weights are 0")
-    return np.array(given, float)
+def _check_samples(columns: dict[str, list[float]]) -> dict[str, list[float]]:
+    """Raises ValueError for lists that are no table of samples."""
+    if not set(columns) - {WEIGHT}:
+        raise ValueError("expected a list for a parameter at least, got none")
+    counts = sorted({len(column) for column in columns.values()})
+    if len(counts) > 1 or counts == [0]:
+        raise ValueError(f"expected lists of one length and not empty, got {counts} numbers")
+    if WEIGHT in columns and not sum(columns[WEIGHT]) > 0.0:
+        raise ValueError(f"{WEIGHT}: expected a weight above 0, got none")
+    return columns
+
+
+def _check_once(content: dict[str, Any]) -> dict[str, Any]:
+    """Raises ValueError for a parameter that has a range and samples."""
+    if twice := sorted(set(content.get(SAMPLES, ())) & set(content)):
+        raise ValueError(f"{', '.join(twice)}: expected a range or samples, got both")
+    return content
 
 
 def with_content(data: Any, folder: str | os.PathLike) -> Any:

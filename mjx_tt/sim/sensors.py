@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from ballmodel import constants as c
+from ballmodel.io.ranges import Within
 from ballmodel.partial_params import optional, value_or
 from ballmodel.state import BallState
 from ballmodel.vec import Scalars, dot, row
@@ -38,23 +40,23 @@ class SensingParams:
     """
 
     # Half width of the uniform noise on each coordinate, per control step [m]: "2 x the diameter" is its whole width.
-    ball_noise: Float[Array, "*#batch"] | float = c.BALL_DIAMETER
-    ball_offset_x: Float[Array, "*#batch"] | float = 0.0  # [m], calibration bias
-    ball_offset_y: Float[Array, "*#batch"] | float = 0.0
-    ball_offset_z: Float[Array, "*#batch"] | float = 0.0
-    camera_scale: Float[Array, "*#batch"] | float | None = optional(1.0)
-    camera_rotation_x: Float[Array, "*#batch"] | float | None = optional(0.0)  # [rad] about the table frame's axes
-    camera_rotation_y: Float[Array, "*#batch"] | float | None = optional(0.0)
-    camera_rotation_z: Float[Array, "*#batch"] | float | None = optional(0.0)
-    camera_distortion: Float[Array, "*#batch"] | float | None = optional(0.0)  # [1/m^2]
+    ball_noise: Annotated[Scalars, Within(0.0, 0.5, "m")] = c.BALL_DIAMETER
+    ball_offset_x: Annotated[Scalars, Within(-0.5, 0.5, "m")] = 0.0  # [m], calibration bias
+    ball_offset_y: Annotated[Scalars, Within(-0.5, 0.5, "m")] = 0.0
+    ball_offset_z: Annotated[Scalars, Within(-0.5, 0.5, "m")] = 0.0
+    camera_scale: Annotated[Scalars, Within(0.5, 2.0)] | None = optional(1.0)
+    camera_rotation_x: Annotated[Scalars, Within(-1.0, 1.0, "rad")] | None = optional(0.0)  # about the table's axes
+    camera_rotation_y: Annotated[Scalars, Within(-1.0, 1.0, "rad")] | None = optional(0.0)
+    camera_rotation_z: Annotated[Scalars, Within(-1.0, 1.0, "rad")] | None = optional(0.0)
+    camera_distortion: Annotated[Scalars, Within(-1.0, 1.0, "1/m^2")] | None = optional(0.0)  # [1/m^2]
     # Measured over true time. A policy reads no clock: all that this can do to it is to stretch the tracker's latency.
-    clock_rate: Float[Array, "*#batch"] | float | None = optional(1.0)
-    smoothing: Float[Array, "*#batch"] | float | None = optional(0.0)  # [s] time constant of the tracker's filter
-    filter_time: Float[Array, "*#batch"] | float | None = optional(0.0)  # [s] memory of a filter that predicts
+    clock_rate: Annotated[Scalars, Within(0.5, 2.0)] | None = optional(1.0)
+    smoothing: Annotated[Scalars, Within(0.0, 1.0, "s")] | None = optional(0.0)  # time constant of a filter
+    filter_time: Annotated[Scalars, Within(0.0, 1.0, "s")] | None = optional(0.0)  # memory of a filter that predicts
     # [m] surprise that makes it start afresh
-    filter_gate: Float[Array, "*#batch"] | float | None = optional(FILTER_GATE)
+    filter_gate: Annotated[Scalars, Within(0.0001, 10.0, "m")] | None = optional(FILTER_GATE)
     # [s] deviation of the moment of each measurement, Gaussian
-    jitter: Float[Array, "*#batch"] | float | None = optional(0.0)
+    jitter: Annotated[Scalars, Within(0.0, 0.1, "s")] | None = optional(0.0)
 
 
 @jax.tree_util.register_dataclass

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from robot_io.calibrated import RANGES, Frame, RobotCalibration
+from robot_io.calibrated import LARGEST_ROBOT_RESIDUAL, Frame, RobotCalibration
 from robot_io.contract import PAPER, Contract
 from robot_io.safety.clearance import RobotGeometry
 
@@ -94,7 +94,7 @@ def fit(
             raise ValueError(f"only {used.sum()} of {n} touches agree with each other; measure them again")
         solved = least_squares(cost, solved.x, args=(np.flatnonzero(used),))
     residuals = np.linalg.norm(misses(solved.x, every), axis=1)
-    if np.median(residuals) > RANGES["robot.residual"][1]:
+    if np.median(residuals) > LARGEST_ROBOT_RESIDUAL:
         raise ValueError(f"no calibration fits: half of the touches are {np.median(residuals):.3f} m off or more")
     x = np.round(solved.x * prior, 7).tolist()
     found = RobotCalibration(

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robot_io.calibrated import RANGES, TrackerCalibration
+from robot_io.calibrated import LARGEST_TRACKER_RESIDUAL, TrackerCalibration
 
 FEWEST = 5
 MOST_TRIPLES = 2000
@@ -53,7 +53,7 @@ def fit(table: np.ndarray, seen: np.ndarray, date: str) -> TrackerFit:
     if len(triples) > MOST_TRIPLES:
         triples = triples[np.random.default_rng(0).choice(len(triples), MOST_TRIPLES, replace=False)]
     best = _of_triples(table, seen, triples)
-    if np.median(best) > RANGES["tracker.residual"][1]:
+    if np.median(best) > LARGEST_TRACKER_RESIDUAL:
         raise ValueError(f"no rigid motion fits: half of the points are {np.median(best):.3f} m off or more")
     used = best <= OUTLIER * max(1.4826 * float(np.median(best)), FINEST)
     for _ in range(5):

@@ -36,7 +36,7 @@ from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.devices.egm.session import ArmFeedback, EgmSession
 from robot_io.devices.tracker import Tracker
-from robot_io.errors import RefusedError, said
+from robot_io.errors import RefusedError, format_error
 from robot_io.history import History
 from robot_io.log.messages import Action, Ball, Command, Event, Joints, Level, Observation, Record, Tick, json_text
 from robot_io.log.recorder import NullRecorder, SessionRecorder
@@ -189,7 +189,7 @@ class Bridge:
 
     def failed(self, error: BaseException, now: float) -> None:
         """Brake for an error of the program, wherever it was raised, and latch it as INTERNAL."""
-        sentence = said(error)
+        sentence = format_error(error)
         self.gate.fault(Cause.INTERNAL, sentence, now)
         with suppress(Exception):  # it brakes by now, and an error may not let itself be described
             if sentence not in self._errors and len(self._errors) < 100:
@@ -347,7 +347,7 @@ class Bridge:
         try:
             action = action_of(policy, observation)
         except Exception as error:  # whatever a policy does, the robot is braked
-            self.gate.fault(Cause.MALFORMED_COMMAND, f"the policy failed: {said(error)}", now)
+            self.gate.fault(Cause.MALFORMED_COMMAND, f"the policy failed: {format_error(error)}", now)
             return self._zeros.copy()
         self.policy_seconds = perf_counter() - began
         episode.steps += 1

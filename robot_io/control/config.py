@@ -4,80 +4,22 @@ from __future__ import annotations
 
 import ipaddress
 from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
-from robot_io.calibrated import RANGES as CALIBRATION_RANGES
+from ballmodel.io.ranges import Within, check_fields
 from robot_io.calibrated import Calibration
 from robot_io.contract import CONTROL_RATE, LIMITS, PAPER, Contract, JointLimits
-from robot_io.control.observation import LONGEST_DELAY, ObservationDelays
+from robot_io.control.observation import ObservationDelays
 from robot_io.devices.egm.messages import N_ARM_JOINTS
 from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
-from robot_io.ranges import check_ranges
 from robot_io.safety.config import SafetyConfig
 
 PROFILES = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
 ANSWER_TIME = 0.035  # [s] for an axis to answer: less than the age at which its state counts as stale
 SAME_ZERO = 1e-4  # [m] by which the zeros of a linear axis may differ from those of the robot's calibration
 
-PORT = (1, 65535)
-# Allowed in a robot.yaml: watchdogs, margins and time-outs end where they would no longer protect
-# (docs/concepts/safety.md).
-RANGES = {
-    "rate": (CONTROL_RATE, CONTROL_RATE),
-    "arm.port": PORT,
-    "arm.timeout": (0.01, 0.1),
-    "arm.controller_port": PORT,
-    "axes.port": PORT,
-    "axes.device_id": (0, 255),
-    "axes.zero": (-5.0, 5.0),
-    "axes.direction": (-1, 1),
-    "axes_motion.speed": (0.01, 2.0),
-    "axes_motion.acceleration": (0.1, 15.0),
-    "axes_motion.latency": (0.001, 0.3),
-    "axes_motion.gain": (0.001, 20.0),
-    "axes_motion.max_correction": (0.001, 0.5),
-    "axes_motion.lead": (0.001, 0.1),
-    "axes_motion.hold_speed": (0.001, 0.5),
-    "axes_motion.max_error": (0.005, 0.15),
-    "axes_motion.node_guard": (0.02, 0.2),
-    "axes_motion.command_timeout": (0.02, 0.1),
-    "axes_motion.state_timeout": (0.02, 0.1),
-    "axes_motion.acknowledge_timeout": (0.1, 10.0),
-    "axes_motion.enable_timeout": (0.1, 30.0),
-    "axes_motion.homing_timeout": (0.1, 120.0),
-    "axes_motion.overtravel": (0.0, 0.5),
-    "tracker.port": PORT,
-    "tracker.source_port": PORT,
-    "tracker.oldest": (0.01, 0.2),
-    "tracker.ahead": (0.0, 0.02),
-    "tracker.clock_offset": (-1e10, 1e10),
-    "tracker.clock_bound": (0.001, 0.02),
-    "tracker.latency": (0.0, 0.1),
-    "delays.ball": (0.0, LONGEST_DELAY),
-    "delays.arm": (0.0, LONGEST_DELAY),
-    "delays.axes": (0.0, LONGEST_DELAY),
-    "safety.speed_scale": (0.001, 1.0),
-    "safety.table_margin": (0.01, 0.5),
-    "safety.self_margin": (0.01, 0.5),
-    "safety.floor_margin": (0.15, 0.7),
-    "safety.blade_speed": (0.05, 10.0),
-    "safety.blade_acceleration": (1.0, 180.0),
-    "safety.overshoot": (0.005, 0.2),
-    "safety.escape_speed": (0.001, 0.1),
-    "safety.still": (0.001, 0.1),
-    "safety.overspeed": (1.05, 2.0),
-    "safety.following_error": (0.005, 0.4),
-    "safety.delay": (0.0, 0.3),
-    "safety.following_ticks": (1, 6),
-    "safety.late": (0.02, 0.1),
-    "safety.stale_arm": (0.01, 0.1),
-    "safety.stale_axes": (0.01, 0.1),
-    "safety.stale_tracker": (0.01, 0.05),
-    "safety.stale_policy": (0.02, 0.1),
-    "realtime.priority": (1, 99),
-    "realtime.spin": (0.0, 0.005),
-    **{f"calibration.{key}": allowed for key, allowed in CALIBRATION_RANGES.items()},
-}
+Port = Annotated[int, Within(1, 65535)]
 
 
 @dataclass(frozen=True)
@@ -88,10 +30,10 @@ class ArmConfig:
     """
 
     host: str = "127.0.0.1"
-    port: int = 6510
+    port: Port = 6510
     controller: str = "127.0.0.1"
-    timeout: float = 0.05
-    controller_port: int | None = None
+    timeout: Annotated[float, Within(0.01, 0.1, "s")] = 0.05
+    controller_port: Port | None = None
 
 
 @dataclass(frozen=True)
@@ -99,19 +41,19 @@ class AxisConfig:
     """One linear axis. zero [m]: robot's coordinate where the drive reads 0; direction 1 or -1."""
 
     host: str = "127.0.0.1"
-    port: int = 502
-    device_id: int = 1
-    zero: float = 0.0
-    direction: int = 1
+    port: Port = 502
+    device_id: Annotated[int, Within(0, 255)] = 1
+    zero: Annotated[float, Within(-5.0, 5.0, "m")] = 0.0
+    direction: Literal[-1, 1] = 1
 
 
 @dataclass(frozen=True)
 class RealTimeConfig:
     """priority of SCHED_FIFO or None; spin [s] of busy waiting before each tick."""
 
-    priority: int | None = 50
+    priority: Annotated[int, Within(1, 99)] | None = 50
     lock_memory: bool = True
-    spin: float = 0.0003
+    spin: Annotated[float, Within(0.0, 0.005, "s")] = 0.0003
 
 
 @dataclass(frozen=True)
@@ -124,9 +66,9 @@ class RobotConfig:
 
     name: str = "robot"
     robot: str | None = None
-    rate: float = CONTROL_RATE
+    rate: Annotated[float, Within(CONTROL_RATE, CONTROL_RATE, "Hz")] = CONTROL_RATE
     arm: ArmConfig = ArmConfig()
-    axis_profile: str = "cmmt"
+    axis_profile: Literal["cmmt", "fhpp"] = "cmmt"
     axes: tuple[AxisConfig, ...] = (AxisConfig(), AxisConfig())
     axes_motion: AxesConfig = field(default_factory=AxesConfig)
     tracker: TrackerConfig = TrackerConfig()
@@ -136,18 +78,12 @@ class RobotConfig:
     calibration: Calibration = Calibration()
 
     def __post_init__(self) -> None:
-        if self.axis_profile not in PROFILES:
-            raise ValueError(f"axis_profile is {self.axis_profile!r}, allowed: {', '.join(PROFILES)}")
-        check_ranges(self, RANGES)
-        for i, axis in enumerate(self.axes):
-            if axis.direction not in (-1, 1):
-                raise ValueError(f"axes[{i}].direction is {axis.direction}, allowed are 1 and -1")
+        check_fields(self)
         measured, zeros = self.calibration.robot, tuple(axis.zero for axis in self.axes)
         if measured.date and any(abs(a - b) > SAME_ZERO for a, b in zip(measured.axes_zero, zeros, strict=False)):
             raise ValueError(
-                f"calibration.robot.axes_zero is {measured.axes_zero}, the zeros of axes are {zeros}: the "
-                "robot was calibrated with other zeros; take calibration out of robot.yaml, note points and "
-                "calibrate it again (mjx-tt calibrate robot)"
+                f"calibration.robot.axes_zero: expected the zeros of axes, {zeros}, got {measured.axes_zero}; take "
+                "calibration out of robot.yaml, note points and calibrate the robot again (mjx-tt calibrate robot)"
             )
         for path in ("arm.host", "arm.controller", "tracker.host", "tracker.source"):
             device, name = path.split(".")
@@ -155,7 +91,7 @@ class RobotConfig:
             try:
                 ipaddress.IPv4Address(value)
             except ValueError:
-                raise ValueError(f"{path} is {value!r}, allowed is an IPv4 address such as 192.168.125.1") from None
+                raise ValueError(f"{path}: expected an IPv4 address such as 192.168.125.1, got {value!r}") from None
 
     @classmethod
     def of(cls, contract: Contract) -> RobotConfig:
@@ -166,41 +102,31 @@ class RobotConfig:
 
     def check_joints(self, contract: Contract = PAPER) -> None:
         """Raise ValueError naming the key where this is no installation of the contract's robot."""
-        names = [contract.joints[i] for i in contract.carrying]
-        if not N_ARM_JOINTS <= len(contract.arm) <= 2 * N_ARM_JOINTS:
+        arm, axes = ([contract.joints[i] for i in part] for part in (contract.arm, contract.carrying))
+        measured = self.calibration.robot
+        calibrated = {"joint_zeros": arm, "axes_zero": axes} if measured.date else {}
+        if not N_ARM_JOINTS <= len(arm) <= 2 * N_ARM_JOINTS:
             raise ValueError(
-                f"{contract.robot}: its arm has {len(contract.arm)} joints; allowed are {N_ARM_JOINTS} to "
-                f"{2 * N_ARM_JOINTS}, which EGM carries"
+                f"{contract.robot}: expected an arm of {N_ARM_JOINTS} to {2 * N_ARM_JOINTS} joints, which EGM carries, "
+                f"got {len(arm)}"
             )
-        if len(self.axes) != len(names):
-            raise ValueError(
-                f"axes: got {len(self.axes)} entries; allowed: {len(names)} for {contract.robot}, "
-                f"{', '.join(names) or 'which has no linear axes'}"
-            )
-        if len(self.safety.still) != contract.n_joints:
-            raise ValueError(
-                f"safety.still has {len(self.safety.still)} numbers, allowed for {contract.robot} are "
-                f"{contract.n_joints}"
-            )
+        for key, values, joints in (
+            ("axes", self.axes, axes),
+            ("safety.still", self.safety.still, contract.joints),
+            *((f"calibration.robot.{key}", getattr(measured, key), joints) for key, joints in calibrated.items()),
+        ):
+            if len(values) != len(joints):
+                of = f", one for each of {', '.join(joints)}" if joints else ""
+                raise ValueError(f"{key}: expected {len(joints)} entries for {contract.robot}{of}, got {len(values)}")
         for i in contract.carrying:
             speed, most = self.axes_motion.speed, contract.limits.velocity[i]
             if contract != PAPER and most > speed:
                 raise ValueError(
-                    f"axes_motion.speed is {speed} m/s, {contract.joints[i]} of {contract.robot} may be asked for "
-                    f"{most} m/s: allowed is at least that, up to {RANGES['axes_motion.speed'][1]} m/s"
+                    f"axes_motion.speed: expected at least {most} m/s, which {contract.joints[i]} of {contract.robot} "
+                    f"may be asked for, got {speed} m/s"
                 )
-            if self.safety.following_error[i] > 0.1:
-                raise ValueError(
-                    f"safety.following_error[{i}] is {self.safety.following_error[i]} m, allowed is 0.005 to 0.1"
-                )
-        measured = self.calibration.robot
-        for key, wanted in (("joint_zeros", [contract.joints[i] for i in contract.arm]), ("axes_zero", names)):
-            given = getattr(measured, key)
-            if measured.date and len(given) != len(wanted):
-                raise ValueError(
-                    f"calibration.robot.{key}: got {len(given)} entries; allowed: {len(wanted)} for {contract.robot}, "
-                    f"{', '.join(wanted) or 'which has no linear axes'}"
-                )
+            if (error := self.safety.following_error[i]) > 0.1:
+                raise ValueError(f"safety.following_error[{i}]: expected 0.005 to 0.1 m, got {error}")
 
 
 def axis_range(i: int, safety: SafetyConfig, limits: JointLimits = LIMITS) -> tuple[float, float]:

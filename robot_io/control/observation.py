@@ -8,9 +8,11 @@ to add is what is missing to the one in training.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from ballmodel.io.ranges import Within, check_fields
 from robot_io.calibrated import Frame
 from robot_io.contract import PAPER, Contract
 from robot_io.devices.egm.arm_history import ArmHistory
@@ -27,14 +29,12 @@ SPEED_SAMPLES = 3  # newest ones that count after a gap, however long it was: no
 class ObservationDelays:
     """Age [s] of what the policy sees: of the ball's capture, and of joint feedback since it was received."""
 
-    ball: float = 0.040
-    arm: float = 0.0
-    axes: float = 0.0
+    ball: Annotated[float, Within(0.0, LONGEST_DELAY, "s")] = 0.040
+    arm: Annotated[float, Within(0.0, LONGEST_DELAY, "s")] = 0.0
+    axes: Annotated[float, Within(0.0, LONGEST_DELAY, "s")] = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("ball", "arm", "axes"):
-            if not 0 <= getattr(self, name) <= LONGEST_DELAY:
-                raise ValueError(f"{name} is {getattr(self, name)} s, allowed is 0 to {LONGEST_DELAY}")
+        check_fields(self)
 
 
 @dataclass(frozen=True)

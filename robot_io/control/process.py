@@ -37,7 +37,7 @@ from robot_io.devices.egm.session import EgmConfig, EgmSession, EgmSocket
 from robot_io.devices.festo import AxesThread
 from robot_io.devices.fixed_base import FixedBase
 from robot_io.devices.tracker import Tracker, TrackerSocket
-from robot_io.errors import RefusedError, said
+from robot_io.errors import RefusedError, format_error
 from robot_io.policy import artefact as artefacts
 from robot_io.policy.backends import choose, make_policy
 from robot_io.policy.policy import Policy
@@ -201,7 +201,7 @@ class Control:
             self._loop()
         except BaseException as error:  # nothing leaves the loop before the robot stands
             self._bring_to_rest(error)
-            self._send(messages.Failed(said(error)))
+            self._send(messages.Failed(format_error(error)))
             raise
         finally:
             self._send(messages.Ended(self.timings.summary()))
@@ -360,7 +360,7 @@ class Control:
         except RefusedError as error:
             self._send(messages.Refused(request, error))
         except Exception as error:  # a request that cannot be carried out must not end the play
-            self._send(messages.Refused(request, RefusedError(f"{type(request).__name__}: {said(error)}")))
+            self._send(messages.Refused(request, RefusedError(f"{type(request).__name__}: {format_error(error)}")))
 
     def _episode(self, summary: EpisodeSummary) -> None:
         self._send(messages.Played(summary, self.bridge.play.track(summary.number)))

@@ -20,9 +20,11 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from ballmodel.io.ranges import Within
 from robot_io.calibrated import UNCALIBRATED, Calibration
 from robot_io.devices.clock import Clock
 from robot_io.errors import DeviceError
@@ -103,14 +105,14 @@ class TrackerConfig:
     """
 
     host: str = "127.0.0.1"
-    port: int = 6520
+    port: Annotated[int, Within(1, 65535)] = 6520
     source: str = "127.0.0.1"
-    oldest: float = 0.15
-    ahead: float = 0.005
-    clock_offset: float | None = 0.0
-    clock_bound: float = 0.01
-    latency: float = 0.015
-    source_port: int | None = None
+    oldest: Annotated[float, Within(0.01, 0.2, "s")] = 0.15
+    ahead: Annotated[float, Within(0.0, 0.02, "s")] = 0.005
+    clock_offset: Annotated[float, Within(-1e10, 1e10, "s")] | None = 0.0
+    clock_bound: Annotated[float, Within(0.001, 0.02, "s")] = 0.01
+    latency: Annotated[float, Within(0.0, 0.1, "s")] = 0.015
+    source_port: Annotated[int, Within(1, 65535)] | None = None
 
 
 class Tracker:

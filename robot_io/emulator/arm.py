@@ -13,9 +13,11 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
+from ballmodel.io.ranges import Within
 from robot_io.contract import ABB_JOINTS, LIMITS, PAPER, Contract
 from robot_io.devices.egm.messages import N_ARM_JOINTS, EgmError, decode_sensor, encode_robot
 
@@ -24,6 +26,9 @@ EVENTS_KEPT = 1000
 
 def _arm(values: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(values[i] for i in ABB_JOINTS)
+
+
+Deceleration = Annotated[float, Within(0.1, 1000.0, "rad/s^2")]
 
 
 @dataclass(frozen=True)
@@ -44,19 +49,19 @@ class ArmParams:
     stream_always      feedback also while EGM is not running (RAPID's EGMStreamStart)
     """
 
-    cycle: float = 0.004
-    feedback_delay: float = 0.029
-    dead_time: float = 0.055
-    low_pass: float = 20.0
-    pos_corr_gain: float = 1.0
-    comm_timeout: float = 1.0
-    stop_deceleration: tuple[float, ...] = (60.0, 60.0, 60.0, 100.0, 120.0, 120.0)
-    lower: tuple[float, ...] = _arm(LIMITS.lower)
-    upper: tuple[float, ...] = _arm(LIMITS.upper)
-    max_speed: tuple[float, ...] = _arm(LIMITS.velocity)
-    position_tolerance: float = math.radians(0.5)
-    overspeed: float = 1.1
-    queue_length: int = 64
+    cycle: Annotated[float, Within(0.001, 0.02, "s")] = 0.004
+    feedback_delay: Annotated[float, Within(0.0, 1.0, "s")] = 0.029
+    dead_time: Annotated[float, Within(0.0, 1.0, "s")] = 0.055
+    low_pass: Annotated[float, Within(0.1, 1000.0, "Hz")] = 20.0
+    pos_corr_gain: Annotated[float, Within(0.0, 100.0, "1/s")] = 1.0
+    comm_timeout: Annotated[float, Within(0.004, 10.0, "s")] = 1.0
+    stop_deceleration: tuple[Deceleration, ...] = (60.0, 60.0, 60.0, 100.0, 120.0, 120.0)
+    lower: tuple[Annotated[float, Within(-10.0, 10.0, "rad")], ...] = _arm(LIMITS.lower)
+    upper: tuple[Annotated[float, Within(-10.0, 10.0, "rad")], ...] = _arm(LIMITS.upper)
+    max_speed: tuple[Annotated[float, Within(0.01, 100.0, "rad/s")], ...] = _arm(LIMITS.velocity)
+    position_tolerance: Annotated[float, Within(0.0, 1.0, "rad")] = math.radians(0.5)
+    overspeed: Annotated[float, Within(1.0, 10.0)] = 1.1
+    queue_length: Annotated[int, Within(1, 10000)] = 64
     stream_always: bool = True
 
     def __post_init__(self) -> None:
@@ -65,19 +70,17 @@ class ArmParams:
         count = N_ARM_JOINTS if N_ARM_JOINTS in lengths else min(lengths)
         for name, values in each.items():
             if len(values) != count or not np.isfinite(values).all():
-                raise ValueError(f"ArmParams.{name} is {values}, allowed are {count} finite numbers")
+                raise ValueError(f"{name}: expected {count} finite numbers, got {values}")
         for name in ("cycle", "low_pass", "comm_timeout", "queue_length"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"ArmParams.{name} {getattr(self, name)} must be positive")
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("feedback_delay", "dead_time", "pos_corr_gain", "position_tolerance"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"ArmParams.{name} {getattr(self, name)} must be 0 or positive, and finite")
+                raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
         if min(self.stop_deceleration) <= 0 or min(self.max_speed) <= 0 or not self.overspeed >= 1:
-            raise ValueError("ArmParams: stop_deceleration and max_speed must be positive, overspeed at least 1")
+            raise ValueError("stop_deceleration, max_speed: expected positive numbers; overspeed: expected at least 1")
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
-            raise ValueError(
-                f"ArmParams.lower is {self.lower}, allowed is less than upper, {self.upper}, in each joint"
-            )
+            raise ValueError(f"lower: expected less than upper, {self.upper}, in each joint, got {self.lower}")
 
 
 def for_robot(params: ArmParams, contract: Contract) -> ArmParams:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Annotated
 
+from ballmodel.io.ranges import Within
 from robot_io.emulator.axis_motion import Past, advance, brake
 
 FOLLOWING_ERROR = 126  # CMMT's number
@@ -30,13 +32,13 @@ class DriveParams:
     homing_time           [s]; the search itself is not modelled, the axis stands
     """
 
-    speed: float = 2.0
-    acceleration: float = 15.0
-    smoothing: float = 0.008
-    position_gain: float = 20.0
-    following_error: float = 0.1
-    switch_on_time: float = 0.05
-    homing_time: float = 1.0
+    speed: Annotated[float, Within(0.01, 10.0, "m/s")] = 2.0
+    acceleration: Annotated[float, Within(0.1, 100.0, "m/s^2")] = 15.0
+    smoothing: Annotated[float, Within(0.0, 1.0, "s")] = 0.008
+    position_gain: Annotated[float, Within(0.1, 1000.0, "1/s")] = 20.0
+    following_error: Annotated[float, Within(0.001, 10.0, "m")] = 0.1
+    switch_on_time: Annotated[float, Within(0.0, 60.0, "s")] = 0.05
+    homing_time: Annotated[float, Within(0.0, 60.0, "s")] = 1.0
 
 
 class Drive:

@@ -4,31 +4,27 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from robot_io.ranges import check_ranges
-
-FAULT_RANGES = {
-    **{name: (0.0, 1.0) for name in ("loss", "duplication", "bit_flip", "reordering")},
-    **{name: (0.0, 10.0) for name in ("hold", "delay", "jitter")},
-}
+from ballmodel.io.ranges import Within, check_fields
 
 
 @dataclass(frozen=True)
 class NetworkFaults:
     """Probabilities per datagram, times in seconds. Raises ValueError for what is no probability or time."""
 
-    loss: float = 0.0
-    duplication: float = 0.0
-    bit_flip: float = 0.0
-    reordering: float = 0.0  # probability of being held back by ``hold``
-    hold: float = 0.006
-    delay: float = 0.0
-    jitter: float = 0.0  # standard deviation of an additional half-normal delay
+    loss: Annotated[float, Within(0.0, 1.0)] = 0.0
+    duplication: Annotated[float, Within(0.0, 1.0)] = 0.0
+    bit_flip: Annotated[float, Within(0.0, 1.0)] = 0.0
+    reordering: Annotated[float, Within(0.0, 1.0)] = 0.0  # probability of being held back by ``hold``
+    hold: Annotated[float, Within(0.0, 10.0, "s")] = 0.006
+    delay: Annotated[float, Within(0.0, 10.0, "s")] = 0.0
+    jitter: Annotated[float, Within(0.0, 10.0, "s")] = 0.0  # standard deviation of an additional half-normal delay
 
     def __post_init__(self) -> None:
-        check_ranges(self, FAULT_RANGES)
+        check_fields(self)
 
 
 class Network:

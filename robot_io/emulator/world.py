@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import mujoco
 import numpy as np
@@ -27,6 +28,7 @@ from ballmodel.constants import (
     TABLE_FRICTION,
     TABLE_RESTITUTION,
 )
+from ballmodel.io.ranges import Within
 from robot_io.contract import PAPER, Contract
 
 SHELL_INERTIA = SHELL_INERTIA_FACTOR * BALL_MASS * BALL_RADIUS**2
@@ -59,13 +61,13 @@ class WorldParams:
     rubber_gain           tangential impulse of the rubber over slip and mass
     """
 
-    timestep: float = 0.001
-    drag: float = 0.141
-    magnus: float = 0.0
-    table_restitution: float = TABLE_RESTITUTION
-    table_friction: float = TABLE_FRICTION
-    paddle_restitution: float = 0.81
-    rubber_gain: float = RUBBER_TANGENTIAL_GAIN
+    timestep: Annotated[float, Within(1e-4, 0.002, "s")] = 0.001
+    drag: Annotated[float, Within(0.0, 10.0, "1/m")] = 0.141
+    magnus: Annotated[float, Within(-1.0, 1.0)] = 0.0
+    table_restitution: Annotated[float, Within(0.01, 1.0)] = TABLE_RESTITUTION
+    table_friction: Annotated[float, Within(0.0, 10.0)] = TABLE_FRICTION
+    paddle_restitution: Annotated[float, Within(0.01, 1.0)] = 0.81
+    rubber_gain: Annotated[float, Within(0.0, 2.0)] = RUBBER_TANGENTIAL_GAIN
 
 
 class World:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
+from ballmodel.io.ranges import Within
 from robot_io.contract import JOINT_UNITS, N_JOINTS, Contract
 
 SLACK = 5e-4  # [m] by which margins may be missed between two ticks
@@ -43,24 +45,24 @@ class SafetyConfig:
                      four frames: more would leave no time to stop within 0.15 s behind the arm's dead time
     """
 
-    speed_scale: float = 1.0
-    table_margin: float = 0.02
-    self_margin: float = 0.02
-    floor_margin: float = 0.17
-    blade_speed: float = 8.0
-    blade_acceleration: float = 150.0
-    overshoot: tuple[float, ...] = _each(*_OVERSHOOT)
-    escape_speed: float = 0.05
-    still: tuple[float, ...] = _each(*_STILL)
-    overspeed: float = 1.5
-    following_error: tuple[float, ...] = _each(*_FOLLOWING_ERROR)
-    delay: tuple[float, float] = (0.0, 0.2)
-    following_ticks: int = 3
-    late: float = 0.05
-    stale_arm: float = 0.05
-    stale_axes: float = 0.05
-    stale_tracker: float = 0.035
-    stale_policy: float = 0.05
+    speed_scale: Annotated[float, Within(0.001, 1.0)] = 1.0
+    table_margin: Annotated[float, Within(0.01, 0.5, "m")] = 0.02
+    self_margin: Annotated[float, Within(0.01, 0.5, "m")] = 0.02
+    floor_margin: Annotated[float, Within(0.15, 0.7, "m")] = 0.17
+    blade_speed: Annotated[float, Within(0.05, 10.0, "m/s")] = 8.0
+    blade_acceleration: Annotated[float, Within(1.0, 180.0, "m/s^2")] = 150.0
+    overshoot: tuple[Annotated[float, Within(0.005, 0.2)], ...] = _each(*_OVERSHOOT)
+    escape_speed: Annotated[float, Within(0.001, 0.1)] = 0.05
+    still: tuple[Annotated[float, Within(0.001, 0.1)], ...] = _each(*_STILL)
+    overspeed: Annotated[float, Within(1.05, 2.0)] = 1.5
+    following_error: tuple[Annotated[float, Within(0.005, 0.4)], ...] = _each(*_FOLLOWING_ERROR)
+    delay: tuple[Annotated[float, Within(0.0, 0.3, "s")], Annotated[float, Within(0.0, 0.3, "s")]] = (0.0, 0.2)
+    following_ticks: Annotated[int, Within(1, 6)] = 3
+    late: Annotated[float, Within(0.02, 0.1, "s")] = 0.05
+    stale_arm: Annotated[float, Within(0.01, 0.1, "s")] = 0.05
+    stale_axes: Annotated[float, Within(0.01, 0.1, "s")] = 0.05
+    stale_tracker: Annotated[float, Within(0.01, 0.05, "s")] = 0.035
+    stale_policy: Annotated[float, Within(0.02, 0.1, "s")] = 0.05
 
     @classmethod
     def of(cls, contract: Contract) -> SafetyConfig:
@@ -71,19 +73,19 @@ class SafetyConfig:
     def __post_init__(self) -> None:
         for name in ("speed_scale", "escape_speed"):
             if not 0.0 < getattr(self, name) <= 1.0:
-                raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)}, allowed is more than 0 and at most 1")
+                raise ValueError(f"{name}: expected more than 0 and at most 1, got {getattr(self, name)}")
         for name in ("table_margin", "self_margin", "floor_margin"):
             if not SLACK < getattr(self, name) < 1.0:
-                raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)} m, allowed is {SLACK} m to 1 m")
+                raise ValueError(f"{name}: expected {SLACK} to 1 m, got {getattr(self, name)}")
         ages = ("stale_arm", "stale_axes", "stale_tracker", "stale_policy")
         for name in ("blade_speed", "blade_acceleration", "overspeed", "late", "following_ticks", *ages):
             if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"SafetyConfig.{name} is {getattr(self, name)}, it must be positive and finite")
+                raise ValueError(f"{name}: expected a positive, finite number, got {getattr(self, name)}")
         each = {name: getattr(self, name) for name in ("still", "overshoot", "following_error")}
         lengths = {len(values) for values in each.values()}
         count = N_JOINTS if N_JOINTS in lengths else min(lengths)
         for name, values in each.items():
             if len(values) != count or not all(0.0 < v < math.inf for v in values):
-                raise ValueError(f"SafetyConfig.{name} is {values}, allowed are {count} positive numbers")
+                raise ValueError(f"{name}: expected {count} positive numbers, got {values}")
         if not 0.0 <= self.delay[0] < self.delay[1] < math.inf:
-            raise ValueError(f"SafetyConfig.delay is {self.delay}, allowed are a shortest and a longer time in s")
+            raise ValueError(f"delay: expected a shortest and a longer time [s], got {self.delay}")

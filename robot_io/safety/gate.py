@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from robot_io.contract import CONTROL_RATE, LIMITS, JointLimits
-from robot_io.errors import JogFirstError, RefusedError, said
+from robot_io.errors import JogFirstError, RefusedError, format_error
 from robot_io.limits import limit_velocity
 from robot_io.safety.clearance import RobotGeometry
 from robot_io.safety.coasting import PATIENCE, Coasting
@@ -320,7 +320,7 @@ class SafetyGate:
                 velocity, changed = self._allowed(wanted, braked)
                 broken = self._broken(velocity)
             except Exception as error:  # a mistake of ours must still brake the robot
-                broken = said(error)
+                broken = format_error(error)
             if broken:
                 if missed:  # farther than the tick before was proven for
                     late = f"{missed:.3f} s between two commands, after which it cannot keep its limits"

@@ -59,7 +59,7 @@ def test_skill_of_a_player():
 
 
 def test_unknown_name_lists_the_valid_ones_and_the_nearest():
-    with pytest.raises(ValueError, match="did you mean 'player3/M1'.*narrow"):
+    with pytest.raises(ValueError, match="narrow.*did you mean 'player3/M1'"):
         registry.load("player3/m1")
     with pytest.raises(ValueError, match="player1, player2"):
         registry.skill("player9")
@@ -82,14 +82,14 @@ def test_yaml_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("position:", "positoin:", "unknown key 'positoin'; did you mean 'position'"),
-        ("landing:", "landing: 3 #", "landing: a mapping with the keys x, y is wanted, got 3"),
-        ("z: [0.2, 0.5]", "z: [0.2, high]", r"position.z is \[0.2, 'high'\]; two numbers"),
-        ("z: [0.2, 0.5]", "z: [0.5, 0.2]", r"position.z is \[0.5, 0.2\]; finite numbers with min <= max"),
-        ("z: [0.2, 0.5]", "z: [0.2, .nan]", "finite numbers"),
-        ("z: [0.2, 0.5]", "q: [0.2, 0.5]", "unknown key 'q'"),
-        ("velocity: {x: [-1, 1], y: [-6, -4], z: [0, 1]}", "", "missing key velocity"),
-        ("name: box", "name: box\nshort_balls: 1", "short_balls is 1; true or false is allowed"),
+        ("position:", "positoin:", r"positoin: expected .* unknown key 'positoin'; did you mean 'position'\?"),
+        ("landing:", "landing: 3 #", "landing: expected a mapping with the keys x, y, got 3"),
+        ("z: [0.2, 0.5]", "z: [0.2, high]", r"position.z\[1\]: expected a finite number, got 'high'"),
+        ("z: [0.2, 0.5]", "z: [0.5, 0.2]", r"position.z: expected numbers in ascending order, got \[0.5, 0.2\]"),
+        ("z: [0.2, 0.5]", "z: [0.2, .nan]", r"position.z\[1\]: expected a finite number, got nan"),
+        ("z: [0.2, 0.5]", "q: [0.2, 0.5]", "position.q: expected one of the keys x, y, z"),
+        ("velocity: {x: [-1, 1], y: [-6, -4], z: [0, 1]}", "", "velocity: expected a mapping .*, got nothing"),
+        ("name: box", "name: box\nshort_balls: 1", "short_balls: expected true or false, got 1"),
         ("name: box", "name: [box", "not valid YAML"),
     ],
 )

@@ -140,7 +140,7 @@ def test_train_skips_what_is_done_and_one_failing_job_does_not_stop_the_others(t
     (tmp_path / "broken.yaml").write_text("name: broken\nballs: player9/M0\n")
     again = mjx_tt("train", tmp_path / "broken.yaml", yaml, "--out", runs)
     assert again.returncode == 1
-    assert "no distribution is called 'player9/M0'" in again.stdout
+    assert "got 'player9/M0'; did you mean" in again.stdout
     assert "done before, skipped" in again.stdout
     assert (runs / "tiny" / "evaluation.json").stat().st_mtime_ns == before
     summary = again.stdout[again.stdout.index("Summary") :]
@@ -169,8 +169,9 @@ def test_mistake_in_a_yaml_ends_with_one_line(tmp_path):
     refused = process("train", tmp_path / "a.yaml")
     assert refused.returncode == 1
     assert refused.stderr.startswith(
-        f"mjx-tt: error: {tmp_path / 'a.yaml'}: trainin: unknown key; did you mean 'training'?"
+        f"mjx-tt: error: {tmp_path / 'a.yaml'}: trainin: expected one of the keys name, balls, "
     )
+    assert refused.stderr.endswith("got the unknown key 'trainin'; did you mean 'training'?\n")
     assert len(refused.stderr.splitlines()) == 1
 
 
@@ -330,10 +331,10 @@ def test_a_key_without_a_name_is_refused(tmp_path, capsys):
     path.write_text("name: ok\nballs: narrow\n")
     for override in (".=3", "training.=3", "=3"):
         assert cli.main(["train", str(path), "--set", override]) == 1
-        assert f"--set {override}: needs the form dotted.path=value" in capsys.readouterr().err
+        assert f"--set {override}: expected dotted.path=value" in capsys.readouterr().err
     path.write_text('name: ok\nballs: narrow\n"": 3\n')
     assert cli.main(["train", str(path)]) == 1
-    assert f"{path}: unknown key ''; allowed: name, balls" in capsys.readouterr().err
+    assert f"{path}: expected one of the keys name, balls, " in capsys.readouterr().err
 
 
 def test_a_long_value_is_cut(tmp_path, capsys):
@@ -341,7 +342,7 @@ def test_a_long_value_is_cut(tmp_path, capsys):
     path.write_text(f"name: ok\nballs: narrow\ntraining: {{updates: {list(range(500))}}}\n")
     assert cli.main(["train", str(path)]) == 1
     said = capsys.readouterr().err
-    assert "training.updates: got [0, 1, 2" in said and " ...; allowed: a valid integer" in said and len(said) < 400
+    assert "training.updates: expected a whole number of at least 1, got [0, 1, 2" in said and len(said) < 400
 
 
 def test_a_run_stands_for_its_artefact_and_an_artefact_for_its_run(tmp_path):

@@ -18,7 +18,7 @@ from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, REFERENCE_MAGNUS
 from mjx_tt.diagnosis.ball.leading import Leading
 from mjx_tt.diagnosis.ball.model_averaging import Averaged, averaged
 from mjx_tt.diagnosis.verdict import Cause, Estimate, Expressed, HeldOut, Part, Together, Unexplained
-from mjx_tt.sim import bounds
+from mjx_tt.sim import model as models
 from mjx_tt.sim.randomisation import Samples
 
 BOOTSTRAP = 100
@@ -196,7 +196,7 @@ def _samples(found: BallFindings, sets: Averaged, seed: int) -> tuple[Samples, .
     changes = np.maximum(changes, [e.low for e in effects])
     if found.choice.magnus is not None and found.problem.coefficient is not None:
         changes[:, found.problem.coefficient] = found.situation.theta[found.problem.coefficient]
-    values = {path: np.clip(v, *bounds.of(path)) for path, v in found.problem.values(changes.T).items()}
+    values = {path: np.clip(v, *models.bounds(path)) for path, v in found.problem.values(changes.T).items()}
     open_ = {path: v for path, v in values.items() if np.ptp(v) > 0.0 or v[0] != nominal[path]}
     if not open_:
         return ()

@@ -19,7 +19,6 @@ from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem, Situa
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
 from mjx_tt.diagnosis.ball.posterior import Posterior
 from mjx_tt.diagnosis.tracks import clean
-from mjx_tt.sim import bounds
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Samples
@@ -86,7 +85,8 @@ class BallsTogether:
         changes[free] += rng.multivariate_normal(np.zeros(len(free)), covariance, len(lift), method="eigh").T
         values = self.problem.values(changes)
         paths = tuple(effect.path for effect in self.problem.effects)
-        return Samples(paths, np.stack([np.clip(values[p], *bounds.of(p)) for p in paths], axis=1), np.ones(len(lift)))
+        columns = [np.clip(values[path], *models.bounds(path)) for path in paths]
+        return Samples(paths, np.stack(columns, axis=1), np.ones(len(lift)))
 
 
 def fit(

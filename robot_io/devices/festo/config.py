@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from ballmodel.io.ranges import Within
 from robot_io.devices.festo.modbus_link import RegisterLink
 from robot_io.devices.festo.profile import AxisProfile
 
@@ -53,30 +55,30 @@ class AxesConfig:
                          switches and stops, as measured on the robot
     """
 
-    speed: float = 2.0
-    acceleration: float = 15.0
-    latency: float = 0.0645 + 0.033
-    gain: float = 3.0
-    max_correction: float = 0.3
-    lead: float = 0.05
-    hold_speed: float = 0.1
-    max_error: float = 0.1
-    node_guard: float = 0.1
-    command_timeout: float = 0.05
-    state_timeout: float = 0.05
-    acknowledge_timeout: float = 1.0
-    enable_timeout: float = 5.0
-    homing_timeout: float = 30.0
-    overtravel: float = 0.0
+    speed: Annotated[float, Within(0.01, 2.0, "m/s")] = 2.0
+    acceleration: Annotated[float, Within(0.1, 15.0, "m/s^2")] = 15.0
+    latency: Annotated[float, Within(0.001, 0.3, "s")] = 0.0645 + 0.033
+    gain: Annotated[float, Within(0.001, 20.0, "1/s")] = 3.0
+    max_correction: Annotated[float, Within(0.001, 0.5, "m/s")] = 0.3
+    lead: Annotated[float, Within(0.001, 0.1, "s")] = 0.05
+    hold_speed: Annotated[float, Within(0.001, 0.5, "m/s")] = 0.1
+    max_error: Annotated[float, Within(0.005, 0.15, "m")] = 0.1
+    node_guard: Annotated[float, Within(0.02, 0.2, "s")] = 0.1
+    command_timeout: Annotated[float, Within(0.02, 0.1, "s")] = 0.05
+    state_timeout: Annotated[float, Within(0.02, 0.1, "s")] = 0.05
+    acknowledge_timeout: Annotated[float, Within(0.1, 10.0, "s")] = 1.0
+    enable_timeout: Annotated[float, Within(0.1, 30.0, "s")] = 5.0
+    homing_timeout: Annotated[float, Within(0.1, 120.0, "s")] = 30.0
+    overtravel: Annotated[float, Within(0.0, 0.5, "m")] = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (math.isfinite(value) and (value > 0 or (value == 0 and name == "overtravel"))):
-                raise ValueError(f"AxesConfig.{name} is {value}, it must be positive and finite")
+                raise ValueError(f"{name}: expected a positive, finite number, got {value}")
         if self.gain * self.latency > 1 / math.e:
             raise ValueError(
-                f"gain is {self.gain} / s, allowed with a latency of {self.latency} s is up to "
-                f"{1 / math.e / self.latency:.2f}: more overshoots"
+                f"gain: expected at most {1 / math.e / self.latency:.2f} / s with a latency of {self.latency} s, got "
+                f"{self.gain}; more overshoots"
             )
 
 

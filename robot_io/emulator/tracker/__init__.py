@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 
+from ballmodel.io.ranges import Within, check_fields
 from robot_io.devices.tracker import BallSample, encode
 from robot_io.emulator.tracker.cameras import CameraPair, CameraParams
 from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
@@ -15,7 +16,7 @@ from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
 if TYPE_CHECKING:
     from robot_io.emulator.world import World
 
-IDENTITIES = ("ball", "stroke", "lost")
+Offset = Annotated[float, Within(-1.0, 1.0, "m")]
 
 
 @dataclass(frozen=True)
@@ -32,16 +33,15 @@ class TrackerParams:
     cameras  two that triangulate the ball, lose it and mistake it for another
     """
 
-    rate: float = 125.0
-    latency: float = 0.015
-    noise: float = 0.003
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    identity: str = "ball"
+    rate: Annotated[float, Within(10.0, 1000.0, "Hz")] = 125.0
+    latency: Annotated[float, Within(0.0, 1.0, "s")] = 0.015
+    noise: Annotated[float, Within(0.0, 1.0, "m")] = 0.003
+    offset: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
+    identity: Literal["ball", "stroke", "lost"] = "ball"
     cameras: CameraParams = CameraParams()
 
     def __post_init__(self) -> None:
-        if self.identity not in IDENTITIES:
-            raise ValueError(f"identity is {self.identity!r}, allowed: {', '.join(IDENTITIES)}")
+        check_fields(self)
 
     def sees(self, world: World) -> tuple[int, bool]:
         """Number of the ball, and True when it is seen."""

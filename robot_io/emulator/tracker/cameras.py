@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-Place = tuple[float, float, float]
+from ballmodel.io.ranges import Within
+
+Coordinate = Annotated[float, Within(-10.0, 10.0, "m")]
+Place = tuple[Coordinate, Coordinate, Coordinate]
 BESIDE = 0.1  # [m]
 
 
@@ -31,40 +35,28 @@ class CameraParams:
     triangulated: bool = False
     first: Place = (-2.6, -1.6, 2.2)
     second: Place = (2.6, -1.6, 2.2)
-    focal: float = 1000.0
-    half_width: float = 720.0
-    half_height: float = 540.0
-    pixel_noise: float = 0.7
-    drop_out: float = 0.0
-    lost_for: float = 0.05
-    false_sight: float = 0.0
-    switch: float = 0.0
+    focal: Annotated[float, Within(100.0, 10000.0, "px")] = 1000.0
+    half_width: Annotated[float, Within(10.0, 10000.0, "px")] = 720.0
+    half_height: Annotated[float, Within(10.0, 10000.0, "px")] = 540.0
+    pixel_noise: Annotated[float, Within(0.0, 100.0, "px")] = 0.7
+    drop_out: Annotated[float, Within(0.0, 1.0)] = 0.0
+    lost_for: Annotated[float, Within(0.001, 10.0, "s")] = 0.05
+    false_sight: Annotated[float, Within(0.0, 1.0)] = 0.0
+    switch: Annotated[float, Within(0.0, 1.0)] = 0.0
 
     def __post_init__(self) -> None:
         for name in ("first", "second"):
             place = getattr(self, name)
             if math.hypot(*place[:2]) < BESIDE:
                 raise ValueError(
-                    f"{name} is {place}, allowed is a place at least {BESIDE} m beside the table's centre: a camera "
+                    f"{name}: expected a place at least {BESIDE} m beside the table's centre, got {place}; a camera "
                     "that looks straight down has no upper edge"
                 )
         if math.dist(self.first, self.second) < BESIDE:
-            raise ValueError(f"second is {self.second}, allowed is a place at least {BESIDE} m away from first")
+            raise ValueError(f"second: expected a place at least {BESIDE} m away from first, got {self.second}")
 
 
 FORGOTTEN = 0.1  # [s] out of sight after which the ball gets another number
-RANGES = {
-    "tracker.cameras.first": (-10.0, 10.0),
-    "tracker.cameras.second": (-10.0, 10.0),
-    "tracker.cameras.focal": (100.0, 10_000.0),
-    "tracker.cameras.half_width": (10.0, 10_000.0),
-    "tracker.cameras.half_height": (10.0, 10_000.0),
-    "tracker.cameras.pixel_noise": (0.0, 100.0),
-    "tracker.cameras.drop_out": (0.0, 1.0),
-    "tracker.cameras.lost_for": (0.001, 10.0),
-    "tracker.cameras.false_sight": (0.0, 1.0),
-    "tracker.cameras.switch": (0.0, 1.0),
-}
 
 
 class CameraPair:

@@ -6,8 +6,14 @@ Written without ``robot_io.calibrated`` on purpose: angles about fixed axes here
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+
+from ballmodel.io.ranges import Within
+
+Metres = Annotated[float, Within(-5.0, 5.0, "m")]
+Radians = Annotated[float, Within(-1.5, 1.5, "rad")]
 
 
 @dataclass(frozen=True)
@@ -21,11 +27,11 @@ class HiddenErrors:
     clock_drift      seconds per second that the tracker's clock gains
     """
 
-    camera_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    camera_angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    joint_zeros: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    clock_offset: float = 0.0
-    clock_drift: float = 0.0
+    camera_position: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    camera_angles: tuple[Radians, Radians, Radians] = (0.0, 0.0, 0.0)
+    joint_zeros: tuple[Annotated[float, Within(-0.05, 0.05, "rad")], ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    clock_offset: Annotated[float, Within(-1e6, 1e6, "s")] = 0.0
+    clock_drift: Annotated[float, Within(-1e-3, 1e-3)] = 0.0
 
     def seen(self, point: np.ndarray) -> np.ndarray:
         """Coordinates (3,) that the tracker gives to a point (3,) of the table frame [m]."""

@@ -289,14 +289,14 @@ def test_a_comparison_on_another_robot_runs(tmp_path):
         ("algorithms.X={kind: qt_opt, elites: 40}", r"algorithms\.X: .*elites 40 .*32"),
         (
             "algorithms.X={kind: ppo, minibatch: 7}",
-            r"algorithms\.X\.minibatch: unknown key; did you mean 'minibatches'",
+            r"algorithms\.X\.minibatch: expected .*; did you mean 'minibatches'",
         ),
         ("algorithms.a/b={kind: ppo}", r"algorithms\.a/b"),
         ("budget={clock: cpu}", r"minutes, episodes or both"),
         ("seeds=[1, 1]", r"seeds.*different"),
         ("experiment.training.later_rewards={after: 0.5, rewards: real}", r"later_rewards"),
         ("experiment.initial_policy=runs/quickstart", r"experiment: initial_policy: .*runs/quickstart.*random weights"),
-        ("experiment.ball=narrow", r"experiment.*unknown key.*ball"),
+        ("experiment.ball=narrow", r"experiment.*unknown key 'ball'"),
     ],
 )
 def test_a_mistake_in_the_yaml_is_named(tmp_path, override, message):

@@ -92,7 +92,7 @@ def test_a_calibration_that_run_would_refuse_is_named_and_not_written(measured, 
     (measured / "calibration.yaml").write_text(before)
     assert cli.main(["calibrate", "robot", "far.csv"]) == 1
     told = capsys.readouterr().err
-    assert "calibration.yaml: robot.joint_zeros" in told and "allowed: -0.05 to 0.05" in told
+    assert "calibration.yaml: robot.joint_zeros" in told and "from -0.05 to 0.05 rad" in told
     assert (measured / "calibration.yaml").read_text() == before
 
 
@@ -122,7 +122,7 @@ def test_calibrations_that_contradict_are_refused_by_file_and_key(tmp_path):
         robots.load_robot(path)
     assert robots.load_robot(path, calibrated=False).axes[1].zero == -0.5  # for another calibration
     calibration.write_text("tracker: {residual: 0.012, date: '2026-11-22'}")
-    with pytest.raises(ConfigError, match=r"found.yaml: tracker.residual: got 0.012; allowed: 0 to 0.005"):
+    with pytest.raises(ConfigError, match=r"found.yaml: tracker.residual: expected .* from 0 to 0.005 m, got 0.012"):
         robots.load_robot(path)
     calibration.write_text("clock: {drift: 4.0e-5}")
     with pytest.raises(ConfigError, match=r"found.yaml: clock.date is empty, but clock was changed"):

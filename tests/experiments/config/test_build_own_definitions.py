@@ -180,9 +180,9 @@ def test_code_is_not_packed(trained, capsys):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"network": "cnn"}, "network: cnn is not defined; allowed: gru"),
-        ({"definitions": "other.py"}, "definitions: .*other.py: cannot be read"),
-        ({"definitions": "my_task.txt"}, "a Python file is wanted"),
+        ({"network": "cnn"}, "network: expected one of gru, got cnn"),
+        ({"definitions": "other.py"}, "definitions: .*No such file .*other.py"),
+        ({"definitions": "my_task.txt"}, "definitions: expected a Python file"),
         ({"task.rewards": "{own: {calm: 1}}"}, "task: rewards.own: calm is not defined; allowed: calm_wrist, deep"),
         ({"training.later_rewards.rewards": "{own: {x: 1}}"}, "later_rewards: rewards.own: x is not defined"),
         ({"definitions": "null"}, "rewards.own: deep is not defined; allowed: none is defined; name a file"),

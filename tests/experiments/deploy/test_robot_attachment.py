@@ -119,7 +119,7 @@ def zipped(**files):
         (zipped(other="1"), "no robot in it: .*robot.json"),
         (zipped(**{"robot.json": "{}", "../outside": "1"}), "'../outside' is no name of a file in it"),
         (zipped(**{"robot.json": "{}", "a.stl": "1"}), "no robot in it: 'mjcf'"),
-        (zipped(**{"robot.json": '{"name": "a"}'}), "a.mcap: robot.zip: mjcf: missing; allowed: the MJCF's file"),
+        (zipped(**{"robot.json": '{"name": "a"}'}), "a.mcap: robot.zip: mjcf: expected text .*, got nothing"),
         (zipped(**{"robot.json": " " * 5000}), "no robot in it: more than"),
     ],
 )

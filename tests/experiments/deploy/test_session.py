@@ -238,13 +238,13 @@ def test_another_interface_is_refused(policy, tmp_path, change, named):
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        ("rate: 60", "rate: got 60; allowed: 75"),
+        ("rate: 60", "rate: expected 75 Hz, got 60"),
         ("arm: {hots: 10.0.0.1}", "did you mean 'host'"),
-        ("axis_profile: cmtm", "cmmt, fhpp"),
-        ("safety: {speed_scale: 2.0}", "speed_scale: got 2.0; allowed: 0.001 to 1"),
-        ("axes: [{port: 502}]", "allowed: 2"),
-        ("tracker: {port: '6520'}", "allowed: int"),
-        ("delays: {ball: 40}", "delays.ball: got 40; allowed: 0 to 0.1"),
+        ("axis_profile: cmtm", "expected 'cmmt' or 'fhpp', got 'cmtm'"),
+        ("safety: {speed_scale: 2.0}", "speed_scale: expected a number from 0.001 to 1, got 2.0"),
+        ("axes: [{port: 502}]", "axes: expected 2 entries"),
+        ("tracker: {port: '6520'}", "tracker.port: expected a whole number from 1 to 65535, got '6520'"),
+        ("delays: {ball: 40}", "delays.ball: expected a number from 0 to 0.1 s, got 40"),
     ],
 )
 def test_mistakes_in_robot_yaml_are_named(tmp_path, content, named):

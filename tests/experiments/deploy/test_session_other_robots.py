@@ -181,16 +181,16 @@ def test_a_robot_yaml_for_other_joints_is_refused_by_key(tmp_path):
     path.write_text(yaml.safe_dump({"axes": [{"host": "127.0.0.1"}]}))
     found = robots.load_robot(path, contract=ur10e)
     assert found.axes == (AxisConfig(),) and len(found.safety.still) == 7
-    with pytest.raises(ConfigError, match="axes: got 1 entries; allowed: 2 for irb120_gantry, gantry_x, gantry_y"):
+    with pytest.raises(ConfigError, match="axes: expected 2 entries for irb120_gantry, .* gantry_x, gantry_y, got 1"):
         robots.load_robot(path)
     fr3 = simulated.load_shipped(FR3).contract
-    with pytest.raises(ConfigError, match="axes: got 1 entries; allowed: 0 for fr3_pedestal, which has no linear axes"):
+    with pytest.raises(ConfigError, match="axes: expected 0 entries for fr3_pedestal, got 1"):
         robots.load_robot(path, contract=fr3)
     path.write_text(yaml.safe_dump({"axes": [{}], "axes_motion": {"speed": 1.0}}))
     with pytest.raises(ConfigError, match=r"axes_motion.speed is 1.0 m/s, rail of ur10e_rail may be asked for 2.0"):
         robots.load_robot(path, contract=ur10e)
     path.write_text(yaml.safe_dump({"axes": [{}], "safety": {"still": [0.05] * 8, "overshoot": [0.05] * 8}}))
-    with pytest.raises(ConfigError, match="SafetyConfig.following_error|safety.*8 positive numbers"):
+    with pytest.raises(ConfigError, match="safety.*8 positive numbers"):
         robots.load_robot(path, contract=ur10e)
     with pytest.raises(ValueError, match="axes: got 2 entries"):
         RobotConfig().check_joints(ur10e)
@@ -198,14 +198,14 @@ def test_a_robot_yaml_for_other_joints_is_refused_by_key(tmp_path):
 
 def test_an_arm_that_egm_does_not_carry_is_refused():
     short = replace(simulated.load_shipped(UR10E).contract, robot="short", carrying=(0, 1))
-    with pytest.raises(ValueError, match="short: its arm has 5 joints; allowed are 6 to 12, which EGM carries"):
+    with pytest.raises(ValueError, match="short: expected an arm of 6 to 12 joints, which EGM carries, got 5"):
         RobotConfig.of(short).check_joints(short)
 
 
 def test_the_control_process_says_which_robot_it_was_given(tmp_path):
     policy = exported(tmp_path / "artefact", UR10E)
     options = play.process.ControlOptions(str(policy), contract=simulated.load_shipped(UR10E).contract)
-    with pytest.raises(RefusedError, match="axes: got 2 entries; allowed: 1 for ur10e_rail, rail"):
+    with pytest.raises(RefusedError, match="axes: expected 1 entries for ur10e_rail, .*rail, got 2"):
         play.Session(RobotConfig(), options, Console())
     with pytest.raises(RefusedError, match="a policy for ur10e_rail, and robot.yaml is of irb120_gantry: contract"):
         play.Session(RobotConfig(), play.process.ControlOptions(str(policy)), Console())
@@ -255,7 +255,7 @@ def test_robot_yaml_names_the_robot_that_stands_there(tmp_path):
     with pytest.raises(ConfigError, match="robot.yaml: robot: .*nowhere"):
         robots.standing(path)
     path.write_text("robot: 7\n")
-    with pytest.raises(ConfigError, match="robot: got 7; allowed: a robot's name or folder"):
+    with pytest.raises(ConfigError, match="robot: expected a robot's name or folder, got 7"):
         robots.standing(path)
     path.write_text("name: lab\n")
     assert robots.standing(path) == PAPER
@@ -271,13 +271,13 @@ def test_a_rig_reacts_as_late_as_the_robots_yaml_says_unless_rig_yaml_does(tmp_p
     assert robots.load_rig(path, robot).arm.dead_time == 0.03
     path.write_text("hidden: {joint_zeros: [0.01, 0, 0, 0, 0, 0]}\n")
     with pytest.raises(
-        ConfigError, match="rig.yaml: hidden.joint_zeros: got 6 entries; allowed: 7 for fr3_pedestal, joi"
+        ConfigError, match="rig.yaml: hidden.joint_zeros: expected 7 entries for fr3_pedestal, .* got 6"
     ):
         robots.load_rig(path, robot)
     assert robots.load_rig(path).hidden.joint_zeros[0] == 0.01
     path.write_text("hidden: {joint_zeros: [0.01, 0, 0, 0, 0, 0, 0]}\n")
     assert robots.load_rig(path, robot).hidden.joint_zeros == (0.01, *(0.0,) * 6)
-    with pytest.raises(ConfigError, match="hidden.joint_zeros: got 7 entries; allowed: 6 for irb120_gantry, joint_1"):
+    with pytest.raises(ConfigError, match="joint_zeros: expected 6 entries for irb120_gantry, .* joint_1.* got 7"):
         robots.load_rig(path)
     params = replace(RigParams().arm, max_speed=(1.0,) * 6)
     with pytest.raises(ValueError, match="arm.max_speed is .* those of fr3_pedestal are its YAML's"):

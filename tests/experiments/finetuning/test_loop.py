@@ -150,7 +150,7 @@ def test_settings_come_from_file_then_command_line(tmp_path):
     "data, named",
     [
         ({"repeat": 5}, "repeats"),
-        ({"pairs": 5}, "pairs: now called num_directions"),
+        ({"pairs": 5}, "pairs: expected .*; it is now called num_directions"),
         ({"elite_fraction": 0.0}, "elite_fraction"),
         ({"rewards": "sim"}, "real"),
         ({"rewards": {"base": "real", "jerk": 0.3}}, "jerk"),

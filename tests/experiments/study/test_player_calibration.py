@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from ballmodel import registry as paper
+from ballmodel import registry
 from experiments.study import player_calibration
 from mjx_tt.rally import human_player
 
@@ -21,7 +21,7 @@ def reached(shift=0.0):
     for name in human_player.names():
         numbers = {}
         for model in ("M0", "M1", "M2"):
-            numbers[model] = player_calibration.sixteen(paper.load(f"{name}/{model}"))
+            numbers[model] = player_calibration.sixteen(registry.load(f"{name}/{model}"))
             numbers[model][1::2] -= shift
         found[name] = player_calibration.Reached(numbers, np.arange(2, 62), {m: 10 for m in numbers})
     return found
@@ -34,7 +34,7 @@ def bare():
 
 
 def test_the_numbers_are_named_in_their_order():
-    d = paper.load("player3/M1")
+    d = registry.load("player3/M1")
     numbers = dict(zip(player_calibration.NUMBERS, player_calibration.sixteen(d), strict=True))
     assert (
         numbers["position.z min"] == -0.15 and numbers["velocity.y max"] == -2.19 and numbers["landing.x max"] == 0.76

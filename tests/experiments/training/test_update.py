@@ -14,7 +14,7 @@ from ballmodel import registry
 from ballmodel.sampling import sample_pool
 from bgs import normalizer, optimizers, strategy
 from bgs.strategy import BGSConfig
-from experiments.config import build, experiment
+from experiments.config import build, experiment, files
 from experiments.training import loop
 from experiments.training.trainers import trainer as trainer_of
 from experiments.training.update import Trainer
@@ -204,7 +204,7 @@ def test_the_same_yaml_trains_under_both_engines():
     ball, latencies and noise, so without a difference in their parameters there is none in their returns."""
     returns = {}
     for engine in ("fused", "mjx"):
-        settings = experiment.parse(experiment.read_yaml(TINY.format(engine=engine), "tiny.yaml"), "tiny.yaml")
+        settings = experiment.parse(files.read_yaml(TINY.format(engine=engine), "tiny.yaml"), "tiny.yaml")
         trainer = trainer_of(build.experiment(settings, "tiny.yaml"))
         state, metrics = trainer.update(trainer.init(build.key(0, build.INITIAL_STATE)))
         assert trainer.simulator.task.engine.name == engine

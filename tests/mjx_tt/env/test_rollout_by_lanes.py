@@ -16,7 +16,6 @@ from mjx_tt.env import own, rewards
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import RolloutResult, Simulator
 from mjx_tt.env.task import TaskConfig
-from mjx_tt.sim import bounds
 from mjx_tt.sim import model as models
 from mjx_tt.sim.actuators import DriveParams
 from mjx_tt.sim.model import Range, SimModel
@@ -43,7 +42,7 @@ def everything() -> tuple[SimModel, tuple[Range, ...]]:
     model, ranges = SimModel(drives=DriveParams()), []
     for path, value in models.paths(model).items():
         if isinstance(value, int | float) and math.isfinite(value):
-            low, high = bounds.of(path)
+            low, high = models.bounds(path)
             if path.endswith(".resonance"):  # [Hz], of which 0 stands for a rigid mount
                 value = 8.0
             near = value + max(0.02 * abs(value), 1e-3)

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ballmodel import flight
-from ballmodel import registry as paper
+from ballmodel import flight, registry
 from ballmodel.flight import ball_params
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import sample_pool
@@ -120,7 +119,7 @@ def test_the_table_of_ends_has_the_papers_fifteen_rows_in_order():
 
 def test_a_turn_of_the_robot_is_the_rollouts_episode(simulator):
     world = with_values(WALL, {"ball.paddle.radius": 0.4})  # some balls pass the blade
-    pool = sample_pool(jax.random.key(0), paper.load("player3/M0"), world.ball, LANES)
+    pool = sample_pool(jax.random.key(0), registry.load("player3/M0"), world.ball, LANES)
     theta = np.stack([initial_theta(jax.random.key(i), 0.3) for i in range(LANES)], axis=1)
     state, result = shots(
         simulator, [(pool.state.position[:, i], pool.state.velocity[:, i]) for i in range(LANES)], 1, theta, world
@@ -184,7 +183,7 @@ def test_every_ball_gets_its_row(simulator):
 
 
 def test_balls_out_of_distribution(simulator):
-    narrow = Box.of(replace(paper.load("narrow"), landing_max=(0.2, -1.2), landing_min=(0.1, -1.3)))
+    narrow = Box.of(replace(registry.load("narrow"), landing_max=(0.2, -1.2), landing_min=(0.1, -1.3)))
     box = Box(narrow.low, narrow.high)
     _, later = shots(simulator, [LOB], 3, box=box)
     assert set(later.end) == {End.OUT_OF_DISTRIBUTION}

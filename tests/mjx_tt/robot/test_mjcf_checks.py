@@ -30,14 +30,39 @@ def test_a_copy_is_the_robot_itself(folder):
 ELBOW = "elbow: {range: [-3.14, 3.14]"
 # What: file, text in it, text in its place, what the message says.
 MISTAKES = {
-    "unknown key": (YAML, "carrying: [rail]", "carying: [rail]", ["carying: unknown key", "mean 'carrying'"]),
-    "missing limit": (YAML, "{range: [-1, 1], velocity: 2,", "{range: [-1, 1],", ["joints.rail.velocity: missing"]),
-    "degrees": (YAML, ELBOW, "elbow: {range: [-180, 180]", ["joints.elbow.range: got [-180, 180]", "not degrees"]),
-    "ends swapped": (YAML, ELBOW, "elbow: {range: [3.14, -3.14]", ["joints.elbow.range", "lower below upper"]),
-    "no number": (YAML, "acceleration: 15,", "acceleration: fast,", ["joints.elbow.acceleration: got 'fast'"]),
-    "negative speed": (YAML, "velocity: 2, acc", "velocity: -2, acc", ["joints.rail.velocity: got -2", "positive"]),
+    "unknown key": (
+        YAML,
+        "carrying: [rail]",
+        "carying: [rail]",
+        ["carying: expected one of the keys", "mean 'carrying'"],
+    ),
+    "missing limit": (
+        YAML,
+        "{range: [-1, 1], velocity: 2,",
+        "{range: [-1, 1],",
+        ["joints.rail.velocity: expected a number", "got nothing"],
+    ),
+    "degrees": (
+        YAML,
+        ELBOW,
+        "elbow: {range: [-180, 180]",
+        ["joints.elbow.range: expected radians, not degrees", "got [-180.0, 180.0]"],
+    ),
+    "ends swapped": (YAML, ELBOW, "elbow: {range: [3.14, -3.14]", ["joints.elbow.range", "below the upper"]),
+    "no number": (
+        YAML,
+        "acceleration: 15,",
+        "acceleration: fast,",
+        ["joints.elbow.acceleration: expected a number", "got 'fast'"],
+    ),
+    "negative speed": (
+        YAML,
+        "velocity: 2, acc",
+        "velocity: -2, acc",
+        ["joints.rail.velocity: expected a number of more than 0, got -2"],
+    ),
     "policy too fast": (YAML, "policy_velocity: 2,", "policy_velocity: 3,", ["joints.rail: policy_velocity 3", "2.0]"]),
-    "home outside": (YAML, "home: 0.1}", "home: 1.2}", ["joints.rail.home: got 1.2", "-0.99 to 0.99 m"]),
+    "home outside": (YAML, "home: 0.1}", "home: 1.2}", ["joints.rail.home: expected", "-0.99 to 0.99, got 1.2"]),
     "margin fills range": (YAML, "margin: 0.01", "margin: 1.5", ["joints.rail: range", "no room", "1.5"]),
     "no such joint": (YAML, "elbow:", "elbo:", ["joints.elbo: the MJCF has no such joint", "it has rail", "elbow"]),
     "slide not listed": (YAML, "carrying: [rail]", "carrying: []", ["carrying: joint rail is a slide", "list it"]),
@@ -49,8 +74,18 @@ MISTAKES = {
         "[col_base, col_wirst]",
         ["pairs: got 'col_wirst'", "col_wrist"],
     ),
-    "blade not watched": (YAML, "blade: [col_blade_axis,", "blade: [col_tip,", ["clearance.blade: got 'col_tip'"]),
-    "milliseconds": (YAML, "arm_action: [0.05,", "arm_action: [50,", ["latencies.arm_action: got [50", "in s"]),
+    "blade not watched": (
+        YAML,
+        "blade: [col_blade_axis,",
+        "blade: [col_tip,",
+        ["clearance.blade: expected capsules of table", "got 'col_tip'"],
+    ),
+    "milliseconds": (
+        YAML,
+        "arm_action: [0.05,",
+        "arm_action: [50,",
+        ["latencies.arm_action[0]: expected a number from 0 to 1 s, got 50"],
+    ),
     "unknown effect": (YAML, "clearance:", "drives: {elbow: {lagg: 0.1}}\nclearance:", ["drives.elbow.lagg", "lag,"]),
     "wider than MJCF": (
         YAML,
@@ -143,7 +178,7 @@ def test_a_mistake_is_refused_with_file_element_and_remedy(folder, what):
 def test_all_mistakes_of_a_file_are_named_at_once(folder):
     file = folder / YAML
     text = file.read_text(encoding="utf-8")
-    for before, after in (("velocity: 2, acc", "velocity: -2, acc"), ("home: 0.1}", "home: 9}"), ("[0.05,", "[50,")):
+    for before, after in (("velocity: 2, acc", "velocity: -2, acc"), ("home: 1.701}", "home: 9}"), ("[0.05,", "[50,")):
         assert before in text
         text = text.replace(before, after, 1)
     file.write_text(text, encoding="utf-8")

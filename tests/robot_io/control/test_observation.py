@@ -178,5 +178,5 @@ def test_nothing_is_observed_while_a_device_is_silent():
     assert observe(feedback, delays, 1.051) is None  # the joints' are too old
     for name in ("ball", "arm", "axes"):
         for seconds in (-0.001, 0.2, np.nan):
-            with pytest.raises(ValueError, match=f"{name} is .* allowed is 0 to 0.1"):
+            with pytest.raises(ValueError, match=f"{name}: expected 0 to 0.1 s, got"):
                 ObservationDelays(**{name: seconds})

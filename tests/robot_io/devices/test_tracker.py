@@ -195,7 +195,7 @@ def test_network_is_deterministic_and_keeps_its_probabilities():
 
     assert carried(1) == carried(1) != carried(2)
     assert len(carried(1)) == pytest.approx(5000 * 0.8 * 1.1, rel=0.03)
-    with pytest.raises(ValueError, match="loss is 1.2, allowed is 0 to 1"):
+    with pytest.raises(ValueError, match="loss: expected 0 to 1, got 1.2"):
         NetworkFaults(loss=1.2)
 
 
