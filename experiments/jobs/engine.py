@@ -73,6 +73,7 @@ class Engine:
     """Does jobs in workers, which see this process's heartbeat. ``engines`` has the two kinds.
 
     slots: jobs that it takes at a time
+    replaces: another worker goes on with the job of one that was ended
 
     Args:
         setup: preparation of each worker.
@@ -80,10 +81,11 @@ class Engine:
     """
 
     slots: int
+    replaces: bool
 
     def __init__(self, setup: Setup, folder: Path) -> None:
         self._heartbeat, self._failed = Heartbeat(folder.absolute() / FOLDER), False
-        self._session = worker.Session(setup.prepared, str(self._heartbeat.folder), str(Path.cwd()))
+        self._session = worker.Session(setup.prepared, str(self._heartbeat.folder), str(Path.cwd()), self.replaces)
 
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
         """Result of the function in a worker."""

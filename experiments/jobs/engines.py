@@ -29,6 +29,8 @@ HEARTBEAT_TIMEOUT = 60  # [s] without a sign after which a host is given up, or 
 class PoolEngine(Engine):
     """Processes of this machine, each on its share of the cores."""
 
+    replaces = False
+
     def __init__(self, setup: Setup, folder: Path, processes: int) -> None:
         super().__init__(setup, folder)
         self.slots, self._where = processes, folder
@@ -56,6 +58,8 @@ class PoolEngine(Engine):
 
 class ParslEngine(Engine):
     """Workers of a site. Raises ConfigError where the site's commands are not here."""
+
+    replaces = True
 
     def __init__(self, setup: Setup, folder: Path, site: Site, where: str) -> None:
         import parsl

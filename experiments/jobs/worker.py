@@ -40,11 +40,13 @@ class Session:
     prepare    returns the function that does a job; called once in each worker
     heartbeat  folder of the heartbeat
     folder     working directory of the process that gives jobs; paths are the same on all hosts
+    replaced   another worker goes on with the job of one that gets a SIGTERM from outside
     """
 
     prepare: Callable[[], Callable[..., Any]]
     heartbeat: str
     folder: str
+    replaced: bool
 
 
 _ready: dict[str, tuple[Callable[..., Any], Watchdog]] = {}  # by the session's heartbeat
@@ -73,7 +75,7 @@ def work(session: Session, name: str, arguments: tuple[Any, ...]) -> Any:
                     time.sleep(1.0)
             return Stopped("")
     except KeyboardInterrupt as stopped:
-        if watchdog.stopping:
+        if watchdog.stopping or not session.replaced:
             return Stopped(str(stopped))
         raise WorkerEndedError(f"{name}: {stopped or 'ended by SIGTERM'}") from None
 
