@@ -1,1 +1,1 @@
-"""Speed of training on this machine, beside other engines: ``make bench`` or ``python -m benchmarks.bench``."""
+"""Measurements by the command line; each module's ``main`` is a command, its docstring says what is measured."""

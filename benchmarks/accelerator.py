@@ -7,7 +7,6 @@ the accelerator and, in a process of its own, on the processor. Runs on whatever
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import sides
+from benchmarks.harness import run
 
 PAPER = ((200, 15), (800, 15), (3200, 15), (12800, 15))  # pairs, repeats
 BY_XLA = ((200, 15), (3200, 15))
@@ -29,17 +29,19 @@ FIRST_ORDER = (256, 4096, 32768)  # repeats of a pair
 AGREEMENT = (200, 15)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measures, prints and writes; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("accelerator.json"))
-    parser.add_argument("--seconds", type=float, default=3.0, help="of runs of each update, after its compilation")
-    parser.add_argument("--returns", type=Path, help="only write the returns of the compared episodes to this file")
-    parser.add_argument("--most", type=int, default=2**31, help="episodes of an update; larger ones are left out")
-    chosen = parser.parse_args(arguments)
-    if chosen.returns:
-        np.savez(chosen.returns, **returns())
-        return 0
+def main(
+    *, out: Path = Path("accelerator.json"), seconds: float = 3.0, returns: Path | None = None, most: int = 2**31
+) -> None:
+    """Measures, prints and writes.
+
+    Args:
+        seconds: of runs of each update, after its compilation
+        returns: only write the returns of the compared episodes to this file
+        most: episodes of an update; larger ones are left out
+    """
+    if returns:
+        np.savez(returns, **play_compared())
+        return
     report: dict[str, Any] = {"updates": []}
 
     def measured(name: str, make: Any) -> None:
@@ -51,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"{name}: {type(error).__name__}: {str(error)[:200]}", flush=True)
             return
         compiling, spent = time.perf_counter() - began, []
-        while len(spent) < 3 or sum(spent) < chosen.seconds:
+        while len(spent) < 3 or sum(spent) < seconds:
             before = time.perf_counter()
             work()
             spent.append(time.perf_counter() - before)
@@ -65,7 +67,7 @@ def main(arguments: list[str] | None = None) -> int:
             f"ready after {compiling:.0f} s",
             flush=True,
         )
-        chosen.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
     for by, what, sizes, make in (
         ("kernels", "roll-outs of paper.yaml", ROLLOUTS, sides.rollout),
@@ -74,25 +76,24 @@ def main(arguments: list[str] | None = None) -> int:
         ("XLA", "paper.yaml", BY_XLA, sides.update),
     ):
         for pairs, repeats in sizes:
-            if 2 * pairs * repeats <= chosen.most:
+            if 2 * pairs * repeats <= most:
                 changes = [f"optimiser.num_directions={pairs}", f"optimiser.repeats={repeats}"]
                 changes += ["task.lanes=false"] if by == "XLA" else []
                 measured(f"{what} by {by}, {pairs} pairs x {repeats}", lambda m=make, c=changes: m(c))
     for repeats in FIRST_ORDER:
-        if 2 * repeats <= chosen.most:
+        if 2 * repeats <= most:
             changes = [f"optimiser.repeats={repeats}"]
             measured(f"robust.yaml, first order, {repeats} repeats", lambda c=changes: sides.update(c, name="robust"))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "returns.npz"
         command = [sys.executable, "-m", "benchmarks.accelerator", "--returns", str(path)]
         subprocess.run(command, check=True, env=os.environ | {"JAX_PLATFORMS": "cpu"})
-        report["agreement"] = compared(returns(), dict(np.load(path)))
-    chosen.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    print(f"{report.get('device')}: {report['agreement']}\nwritten to {chosen.out}")
-    return 0
+        report["agreement"] = compared(play_compared(), dict(np.load(path)))
+    out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    print(f"{report.get('device')}: {report['agreement']}\nwritten to {out}")
 
 
-def returns() -> dict[str, np.ndarray]:
+def play_compared() -> dict[str, np.ndarray]:
     """Returns and outcomes of the same episodes wherever they are played."""
     pairs, repeats = AGREEMENT
     result = sides.played([f"optimiser.num_directions={pairs}", f"optimiser.repeats={repeats}"])
@@ -113,4 +114,4 @@ def compared(here: dict[str, np.ndarray], there: dict[str, np.ndarray]) -> dict[
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

@@ -1,6 +1,6 @@
 """The benchmark: physics against other engines, the time of an update and where it goes, memory, growth with the batch.
 
-    python -m benchmarks.bench --json bench.json
+    python -m benchmarks.bench --out bench.json
 
 Everything is measured in one run; sides that are compared take turns, and medians are compared. This process itself
 never starts JAX, so it disturbs nobody and its own memory is in no figure.
@@ -8,23 +8,17 @@ never starts JAX, so it disturbs nobody and its own memory is in no figure.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import os
 import platform
-import sys
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from ballmodel.io.atomic_files import replacing
-from benchmarks.worker import Worker, WorkerError, summary, take_turns
+from benchmarks.harness import Sides, Worker, WorkerError, print_table, run, summary
 
 
 @dataclass(frozen=True)
@@ -72,97 +66,93 @@ MJX_LIMIT = 1800.0  # [s] for compilation and first update with MJX, and for eac
 TRAINED = Path("runs/quickstart")  # measured too when it is there
 
 
-def main(console: Console, json_path: str | None = None, quick: bool = False) -> int:
-    """Measures, prints the tables and writes the JSON; returns the exit status."""
-    report = measure(QUICK if quick else FULL, console)
-    show(report, console)
-    if json_path is not None:
-        with replacing(Path(json_path)) as temporary:
+def main(*, out: Path | None = None, quick: bool = False) -> None:
+    """Measures and prints the tables.
+
+    Args:
+        out: file of all figures, as JSON
+        quick: fewer and shorter runs: a first impression in two minutes
+    """
+    report = measure(QUICK if quick else FULL)
+    show(report)
+    if out is not None:
+        with replacing(out) as temporary:
             temporary.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-        console.print(json_path, highlight=False)
-    return 0
+        print(out)
 
 
-def measure(sizes: Sizes, console: Console) -> dict:
+def measure(sizes: Sizes) -> dict[str, Any]:
     """All figures as plain data. Raises WorkerError when a side does not start."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
     report: dict[str, Any] = {"cpu": processor(), "cores": len(cores), "python": platform.python_version()}
-    console.print("physics steps per second of the robot alone ...")
+    print("physics steps per second of the robot alone ...")
     report |= measure_physics(sizes, len(cores))
-    console.print(f"one update: {2 * sizes.pairs} perturbations x {sizes.repeats} episodes ...")
+    print(f"one update: {2 * sizes.pairs} perturbations x {sizes.repeats} episodes ...")
     report |= measure_update(sizes, cores)
     pairs, repeats = sizes.engines
-    console.print(f"one update of {2 * pairs * repeats:,} episodes with each engine (MJX takes minutes) ...")
-    report |= measure_engines(pairs, repeats, sizes.turns, console)
-    console.print("parts of a control step ...")
+    print(f"one update of {2 * pairs * repeats:,} episodes with each engine (MJX takes minutes) ...")
+    report["engines"] = measure_engines(pairs, repeats, sizes.turns)
+    print("parts of a control step ...")
     rows, columns = sizes.block
     with Worker("breakdown", {cores[0]}, rows=rows, columns=columns, ticks=sizes.ticks) as worker:
         worker.wait_ready()
-        found = _run(worker)
+        worker.start()
+        found: Any = worker.finish()
     report["breakdown"] = found.pop("parts")
     report["roofline"] = found
-    report["batch_scaling"] = []
-    for pairs, repeats in sizes.scaling:
-        console.print(f"updates of {2 * pairs * repeats:,} episodes ...")
-        report["batch_scaling"].append(measure_batch(pairs, repeats, min(sizes.rounds, 5)))
+    print("updates by number of episodes ...")
+    report["batch_scaling"] = [measure_batch(*size, min(sizes.rounds, 5)) for size in sizes.scaling]
     return report
 
 
-def _run(worker: Worker) -> Any:
-    worker.start()
-    return worker.finish()
-
-
-def measure_physics(sizes: Sizes, cores: int) -> dict:
+def measure_physics(sizes: Sizes, cores: int) -> dict[str, Any]:
     """Physics steps per second by engine, on all cores, and the ratios of fused to the others."""
-    with ExitStack() as stack:
-
-        def side(name: str, copies: int = 1, **arguments: Any) -> list[Worker]:
-            return [stack.enter_context(Worker(name, **arguments)) for _ in range(copies)]
-
-        lanes, chunks, steps = sizes.fused
-        sides = {name: side(name, lanes=lanes, chunks=chunks, steps=steps) for name in ("fused", "fused_by_xla")}
-        lanes, chunks, steps = sizes.mjx
-        sides["mjx"] = side("mjx", lanes=lanes, chunks=chunks, steps=steps)
+    with Sides() as sides:
+        for name, (lanes, chunks, steps) in {
+            "fused": sizes.fused,
+            "fused_by_xla": sizes.fused,
+            "mjx": sizes.mjx,
+        }.items():
+            sides.add(name, name, lanes=lanes, chunks=chunks, steps=steps)
         robots, steps = sizes.rollout
-        sides["mujoco_rollout"] = side("mujoco_rollout", robots=robots, steps=steps, threads=cores)
+        sides.add("mujoco_rollout", "mujoco_rollout", robots=robots, steps=steps, threads=cores)
         if importlib.util.find_spec("mujoco.batch"):  # since MuJoCo 3.17
-            sides["mujoco_batch"] = side("mujoco_batch", robots=robots, steps=steps, threads=cores)
+            sides.add("mujoco_batch", "mujoco_batch", robots=robots, steps=steps, threads=cores)
         if importlib.util.find_spec("pybullet"):
-            sides["pybullet"] = side("pybullet", cores, steps=sizes.pybullet, seed=0)
-        about = {name: [worker.wait_ready() for worker in workers][0] for name, workers in sides.items()}
-        measured = take_turns(sides, sizes.rounds)
+            sides.add("pybullet", "pybullet", [None] * cores, steps=sizes.pybullet, seed=0)
+        measured = sides.measure(sizes.rounds)
     speed = {name: median(amount / seconds for seconds, amount in runs) for name, runs in measured.items()}
     return {
-        "device": about["fused"]["device"],
-        "versions": {name: content["version"] for name, content in about.items()},
+        "device": sides.about["fused"]["device"],
+        "versions": {name: content["version"] for name, content in sides.about.items()},
         "physics_steps_per_s": {name: speed.get(name) for name in PHYSICS},
         "ratios": {f"fused/{name}": speed["fused"] / speed[name] for name in speed if name != "fused"},
     }
 
 
-def measure_update(sizes: Sizes, cores: list[int]) -> dict:
+def scale(pairs: int, repeats: int) -> list[str]:
+    """Changes of an experiment that give an update this size."""
+    return [f"optimiser.num_directions={pairs}", f"optimiser.repeats={repeats}"]
+
+
+def seconds_of(runs: list[tuple[float, float]]) -> dict[str, float]:
+    """Summary of the seconds of runs."""
+    return summary([seconds for seconds, _ in runs])
+
+
+def measure_update(sizes: Sizes, cores: list[int]) -> dict[str, Any]:
     """Seconds per update at the start of training and under a trained policy, by number of devices; peak memory."""
-    scale = [f"optimiser.num_directions={sizes.pairs}", f"optimiser.repeats={sizes.repeats}"]
-    n, common = len(cores), "optimiser.common_random_numbers=true"
-    asked: dict[str, tuple[set[int] | None, dict[str, Any]]] = {
-        "all_devices": (None, dict(changes=scale, devices=n)),
-        "by_xla": (None, dict(changes=[*scale, "task.lanes=false"], devices=n)),
-        "common_random_numbers": (None, dict(changes=[*scale, common], devices=n)),
-        "one_device_all_cores": (None, dict(changes=scale, devices=1)),
-        "one_device_one_core": ({cores[0]}, dict(changes=scale, devices=1)),
-    }
-    if TRAINED.is_dir():
-        asked["trained_policy"] = (None, dict(changes=[*scale, f"initial_policy={TRAINED}"], devices=n))
-    with ExitStack() as stack:
-        sides = {
-            name: [stack.enter_context(Worker("update", cpus, **arguments))]
-            for name, (cpus, arguments) in asked.items()
-        }
-        for (worker,) in sides.values():
-            worker.wait_ready()
-        measured = take_turns(sides, sizes.rounds)
-    seconds = {name: summary([s for s, _ in runs]) for name, runs in measured.items()}
+    n, size = len(cores), scale(sizes.pairs, sizes.repeats)
+    with Sides() as sides:
+        sides.add("all_devices", "update", changes=size, devices=n)
+        sides.add("by_xla", "update", changes=[*size, "task.lanes=false"], devices=n)
+        common = "optimiser.common_random_numbers=true"
+        sides.add("common_random_numbers", "update", changes=[*size, common], devices=n)
+        sides.add("one_device_all_cores", "update", changes=size, devices=1)
+        sides.add("one_device_one_core", "update", [{cores[0]}], changes=size, devices=1)
+        if TRAINED.is_dir():
+            sides.add("trained_policy", "update", changes=[*size, f"initial_policy={TRAINED}"], devices=n)
+        seconds = {name: seconds_of(runs) for name, runs in sides.measure(sizes.rounds).items()}
     devices = {name: seconds[name]["median"] for name in ("one_device_one_core", "one_device_all_cores", "all_devices")}
     return {
         "update_episodes": 2 * sizes.pairs * sizes.repeats,
@@ -173,50 +163,41 @@ def measure_update(sizes: Sizes, cores: list[int]) -> dict:
         "update_trained_policy_s": seconds.get("trained_policy"),
         "devices_s": devices,
         "devices_speedup": devices["one_device_one_core"] / devices["all_devices"],
-        "peak_memory_mb": round(sides["all_devices"][0].peak_memory, 1),
+        "peak_memory_mb": sides.peak_memory("all_devices"),
     }
 
 
-def measure_engines(pairs: int, repeats: int, rounds: int, console: Console) -> dict:
+def measure_engines(pairs: int, repeats: int, rounds: int) -> dict[str, Any] | None:
     """Time and memory of an update with each engine, all devices; None where MJX exceeds MJX_LIMIT or the memory."""
-    scale = [f"optimiser.num_directions={pairs}", f"optimiser.repeats={repeats}"]
     try:
-        with ExitStack() as stack:
-            sides = {
-                engine: [
-                    stack.enter_context(Worker("update", limit=MJX_LIMIT, changes=[*scale, f"task.engine={engine}"]))
-                ]
-                for engine in ("fused", "mjx")
-            }
-            for (worker,) in sides.values():
-                worker.wait_ready()
-            measured = take_turns(sides, rounds)
+        with Sides() as sides:
+            for engine in ("fused", "mjx"):
+                changes = [*scale(pairs, repeats), f"task.engine={engine}"]
+                sides.add(engine, "update", limit=MJX_LIMIT, changes=changes)
+            measured = sides.measure(rounds)
     except WorkerError as error:
-        console.print(str(error), highlight=False)
-        return {"engines": None}
+        print(error)
+        return None
     return {
-        "engines": {
-            "episodes": 2 * pairs * repeats,
-            "update_s": {name: summary([s for s, _ in runs]) for name, runs in measured.items()},
-            "peak_memory_mb": {name: round(worker.peak_memory, 1) for name, (worker,) in sides.items()},
-        }
+        "episodes": 2 * pairs * repeats,
+        "update_s": {name: seconds_of(runs) for name, runs in measured.items()},
+        "peak_memory_mb": {name: sides.peak_memory(name) for name in measured},
     }
 
 
-def measure_batch(pairs: int, repeats: int, rounds: int) -> dict:
+def measure_batch(pairs: int, repeats: int, rounds: int) -> dict[str, Any]:
     """Time of an update and of its roll-outs, all devices, by the number of episodes."""
-    changes = [f"optimiser.num_directions={pairs}", f"optimiser.repeats={repeats}"]
-    with Worker("update", changes=changes) as update, Worker("rollout", changes=changes) as rollout:
-        update.wait_ready(), rollout.wait_ready()
-        measured = take_turns({"update": [update], "rollout": [rollout]}, rounds)
-    seconds = {name: median(s for s, _ in runs) for name, runs in measured.items()}
+    with Sides() as sides:
+        for name in ("update", "rollout"):
+            sides.add(name, name, changes=scale(pairs, repeats))
+        seconds = {name: seconds_of(runs)["median"] for name, runs in sides.measure(rounds).items()}
     episodes = 2 * pairs * repeats
     return {
         "episodes": episodes,
         "update_s": seconds["update"],
         "rollout_s": seconds["rollout"],
         "us_per_episode": seconds["update"] / episodes * 1e6,
-        "peak_memory_mb": round(update.peak_memory, 1),
+        "peak_memory_mb": sides.peak_memory("update"),
     }
 
 
@@ -229,107 +210,75 @@ def processor() -> str:
         return platform.processor() or platform.machine()
 
 
-def show(report: dict, console: Console) -> None:
+def show(report: dict[str, Any]) -> None:
     """The figures as tables."""
-    console.print(f"\n{report['cpu']}, {report['cores']} cores; JAX on {report['device']}", highlight=False)
-    table = _table("Robot alone, physics steps per second", "engine", "steps/s", "fused is faster by")
-    for name, speed in report["physics_steps_per_s"].items():
-        ratio = report["ratios"].get(f"fused/{name}")
-        table.add_row(name, f"{speed:,.0f}" if speed else "not installed", f"{ratio:.1f} x" if ratio else "")
-    console.print(table)
+    print(f"\n{report['cpu']}, {report['cores']} cores; JAX on {report['device']}")
+    ratios = {name: report["ratios"].get(f"fused/{name}") for name in report["physics_steps_per_s"]}
+    rows: list[tuple[Any, ...]] = [
+        (name, f"{speed:,.0f}" if speed else "not installed", ratios[name] and f"{ratios[name]:.1f} x")
+        for name, speed in report["physics_steps_per_s"].items()
+    ]
+    print_table("Robot alone, physics steps per second", ("engine", "steps/s", "fused is faster by"), rows)
 
-    table = _table(f"One update, {report['update_episodes']:,} episodes", "", "median [s]", "min", "max")
-    rows = {
-        "start of training": report["update_s"],
-        "control steps by XLA": report["update_by_xla_s"],
-        "common random numbers": report["update_common_random_numbers_s"],
-        "trained policy": report["update_trained_policy_s"],
+    updates = {
+        "start of training": "update_s",
+        "control steps by XLA": "update_by_xla_s",
+        "common random numbers": "update_common_random_numbers_s",
+        "trained policy": "update_trained_policy_s",
     }
-    for name, seconds in rows.items():
-        if seconds:
-            table.add_row(name, *(f"{seconds[key]:.3f}" for key in ("median", "min", "max")))
-    for name, seconds in report["devices_s"].items():
-        table.add_row(name.replace("_", " "), f"{seconds:.3f}")
-    console.print(table)
-    console.print(f"lane by lane against by XLA: {report['lanes_speedup']:.2f} x", highlight=False)
-    console.print(
-        f"all devices against one device on one core: {report['devices_speedup']:.2f} x; "
-        f"peak memory {report['peak_memory_mb']:,.0f} MB",
-        highlight=False,
-    )
+    rows = [(name, *_spread(report[key])) for name, key in updates.items() if report[key]]
+    rows += [(name.replace("_", " "), f"{seconds:.3f}") for name, seconds in report["devices_s"].items()]
+    print_table(f"One update, {report['update_episodes']:,} episodes", ("", "median [s]", "min", "max"), rows)
+    print(f"lane by lane against by XLA: {report['lanes_speedup']:.2f} x")
+    print(f"all devices against one device on one core: {report['devices_speedup']:.2f} x")
+    print(f"peak memory {report['peak_memory_mb']:,.0f} MB")
 
-    if report["engines"]:
-        engines = report["engines"]
+    if engines := report["engines"]:
+        memory = engines["peak_memory_mb"]
+        rows = [(name, *_spread(found), f"{memory[name]:,.0f}") for name, found in engines["update_s"].items()]
         title = f"One update of {engines['episodes']:,} episodes by engine"
-        table = _table(title, "engine", "median [s]", "min", "max", "peak memory [MB]")
-        for name, seconds in engines["update_s"].items():
-            figures = (f"{seconds[key]:.3f}" for key in ("median", "min", "max"))
-            table.add_row(name, *figures, f"{engines['peak_memory_mb'][name]:,.0f}")
-        console.print(table)
+        print_table(title, ("engine", "median [s]", "min", "max", "peak memory [MB]"), rows)
 
-    table = _table("Parts of a control step, one core", "part", "calls", "ns per episode", "share")
-    for row in report["breakdown"]:
-        table.add_row(row["part"], str(row["calls"]), f"{row['ns']:.0f}", f"{row['share']:.0%}")
-    console.print(table)
+    parts = report["breakdown"]
+    rows = [(row["part"], row["calls"], f"{row['ns']:.0f}", f"{row['share']:.0%}") for row in parts]
+    print_table("Parts of a control step, one core", ("part", "calls", "ns per episode", "share"), rows)
+    show_roofline(parts, report["roofline"])
 
-    show_roofline(report["breakdown"], report["roofline"], console)
-
-    table = _table("Batch", "episodes", "update [s]", "roll-outs [s]", "us per episode", "peak memory [MB]")
-    for row in report["batch_scaling"]:
-        table.add_row(
-            f"{row['episodes']:,}",
-            f"{row['update_s']:.4f}",
-            f"{row['rollout_s']:.4f}",
-            f"{row['us_per_episode']:.1f}",
-            f"{row['peak_memory_mb']:,.0f}",
-        )
-    console.print(table)
+    columns = {
+        "episodes": ",",
+        "update_s": ".4f",
+        "rollout_s": ".4f",
+        "us_per_episode": ".1f",
+        "peak_memory_mb": ",.0f",
+    }
+    rows = [tuple(format(row[key], form) for key, form in columns.items()) for row in report["batch_scaling"]]
+    print_table("Batch", ("episodes", "update [s]", "roll-outs [s]", "us per episode", "peak memory [MB]"), rows)
 
 
-def show_roofline(parts: list[dict], roofline: dict, console: Console) -> None:
+def _spread(seconds: dict[str, float]) -> list[str]:
+    return [f"{seconds[key]:.3f}" for key in ("median", "min", "max")]
+
+
+def show_roofline(parts: list[dict[str, Any]], roofline: dict[str, Any]) -> None:
     """Operations and bytes of each part per episode and control step, and the share of one core's peaks reached."""
-    peaks = roofline["peaks"]
-    title = "Roofline: an episode's control step, one core; shares of the peak and of the roof"
-    table = _table(title, "part", "kernels", "op", "kB", "op/B", "Gop/s", "peak", "roof")
+    peaks = {name: value / 1e9 for name, value in roofline["peaks"].items()}
+    rows = []
     for row in parts:
-        if "operations" not in row:
-            continue
-        rate, intensity = row["operations"] / row["ns"], row["operations"] / row["bytes"]
-        peak = peaks["fma_peak"] / 1e9
-        roof = min(peak, intensity * peaks["cache_bandwidth"] / 1e9)
-        table.add_row(
-            row["part"],
-            f"{row['kernels']:,.0f}",
-            f"{row['operations']:,.0f}",
-            f"{row['bytes'] / 1e3:.1f}",
-            f"{intensity:.2f}",
-            f"{rate:.1f}",
-            f"{rate / peak:.0%}",
-            f"{rate / roof:.0%}",
-        )
-    console.print(table)
-    best = {name: f"{value / 1e9:.1f}" for name, value in peaks.items()}
-    console.print(
-        f"peaks: {best['fma_peak']} Gop/s in multiply-adds of float32 (XLA {best['fma_xla']}, NumPy's matrix product "
-        f"{best['fma_blas']}); {best['cache_bandwidth']} GB/s at the {roofline['working_set_mb']:.1f} MB that a block "
-        f"of episodes uses, {best['memory_bandwidth']} GB/s in memory",
-        highlight=False,
+        if "operations" in row:
+            rate, intensity = row["operations"] / row["ns"], row["operations"] / row["bytes"]
+            roof = min(peaks["fma_peak"], intensity * peaks["cache_bandwidth"])
+            cells = (f"{row['kernels']:,.0f}", f"{row['operations']:,.0f}", f"{row['bytes'] / 1e3:.1f}")
+            shares = (f"{rate / peaks['fma_peak']:.0%}", f"{rate / roof:.0%}")
+            rows.append((row["part"], *cells, f"{intensity:.2f}", f"{rate:.1f}", *shares))
+    title = "Roofline: an episode's control step, one core; shares of the peak and of the roof"
+    print_table(title, ("part", "kernels", "op", "kB", "op/B", "Gop/s", "peak", "roof"), rows)
+    print(
+        f"peaks: {peaks['fma_peak']:.1f} Gop/s in multiply-adds of float32 (XLA {peaks['fma_xla']:.1f}, NumPy's matrix "
+        f"product {peaks['fma_blas']:.1f}); {peaks['cache_bandwidth']:.1f} GB/s at the "
+        f"{roofline['working_set_mb']:.1f} MB that a block of episodes uses, {peaks['memory_bandwidth']:.1f} GB/s in "
+        "memory"
     )
-
-
-def _table(title: str, first: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    table.add_column(first)
-    for column in columns:
-        table.add_column(column, justify="right")
-    return table
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser("python -m benchmarks.bench", description=__doc__.split("\n")[0])
-    parser.add_argument("--json", metavar="FILE", help="write the figures as JSON")
-    parser.add_argument(
-        "--quick", action="store_true", help="fewer and shorter runs: a first impression in two minutes"
-    )
-    options = parser.parse_args()
-    sys.exit(main(Console(), options.json, options.quick))
+    run(main)

@@ -5,44 +5,42 @@ Prints lateness and reply percentiles of the control process, what was lost, fau
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
-import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
+from benchmarks.harness import run
 from experiments.deploy import session
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Plays and prints; returns the session's exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("artefact", type=Path)
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--busy", type=int, default=2, help="processes that only compute")
-    parser.add_argument("--player", default="player3")
-    parser.add_argument("--backend", default="auto")
-    chosen = parser.parse_args(arguments)
-    others = [multiprocessing.Process(target=compute, daemon=True) for _ in range(chosen.busy)]
+def main(
+    artefact: Path, *, seconds: float = 600.0, busy: int = 2, player: str = "player3", backend: str = "auto"
+) -> int:
+    """Plays and prints; returns the session's exit status.
+
+    Args:
+        busy: processes that only compute
+    """
+    others = [multiprocessing.Process(target=compute, daemon=True) for _ in range(busy)]
     for other in others:
         other.start()
     with TemporaryDirectory() as folder:
         status = session.run(
-            chosen.artefact,
+            artefact,
             "rig",
             None,
             None,
-            chosen.backend,
+            backend,
             Path(folder),
             None,
             0,
-            chosen.seconds,
+            seconds,
             Console(),
-            player=chosen.player,
+            player=player,
         )
         report = json.loads(next(Path(folder).glob("*.json")).read_text("utf-8"))
     for other in others:
@@ -60,4 +58,4 @@ def compute() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

@@ -9,8 +9,6 @@ ball by ball.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,12 +23,13 @@ from ballmodel.io.deepmind import MeasuredStates
 from ballmodel.mixture import fit_mixture, save_mixture, start_states
 from ballmodel.sampling import KEPT, ROBOT_SIDE, SECOND_BOUNCE, BallPool, throw
 from ballmodel.state import BallState
+from benchmarks.harness import run
 from experiments.evaluation.evaluate import return_rate
 from experiments.runs import load_policy
 from experiments.stats import wilson
 from mjx_tt import platform
-from mjx_tt.env import reachability
 from mjx_tt.env.evaluator import Evaluator
+from mjx_tt.env.reachability import reachable as find_reachable
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import ModelFile, SimModel
@@ -40,44 +39,51 @@ LIFT = 1.33  # Magnus coefficient by which the authors estimated the spins (D'Am
 SIM_RATE = 300.0  # Hz
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Fits, or plays and prints; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("states", type=Path)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the fitted distributions")
-    parser.add_argument("--policies", nargs="+", default=[], help="runs or artefacts")
-    parser.add_argument("--reachable", type=int, default=0, metavar="N", help="seek motions for N of the strokes")
-    parser.add_argument("--short-balls", action="store_true", help="strokes that bounce twice are drawn as well")
-    parser.add_argument("--seed", type=int, default=0, help="of the strokes that are held out")
-    chosen = parser.parse_args(arguments)
+def main(
+    states: Path,
+    *,
+    out: Path,
+    policies: list[str] | None = None,
+    reachable: int = 0,
+    short_balls: bool = False,
+    seed: int = 0,
+) -> None:
+    """Fits, or plays and prints.
+
+    Args:
+        out: folder of the fitted distributions
+        policies: runs or artefacts
+        reachable: strokes for which motions are sought
+        short_balls: strokes that bounce twice are drawn as well
+        seed: of the strokes that are held out
+    """
     platform.configure()
-    chosen.out.mkdir(parents=True, exist_ok=True)
-    world = chosen.out / "lift.yaml"
+    out.mkdir(parents=True, exist_ok=True)
+    world = out / "lift.yaml"
     world.write_text(f"ball: {{flight: {{magnus_coefficient: {LIFT}}}}}\n")
     model = ModelFile.load(world).model
-    _, report = fit_human(read(chosen.states), model.ball)
+    _, report = fit_human(read(states), model.ball)
     rows = start_states(report.landed)
-    order = np.random.default_rng(chosen.seed).permutation(len(rows))
+    order = np.random.default_rng(seed).permutation(len(rows))
     held, known = rows[order[:HELD_OUT]], rows[order[HELD_OUT:]]
-    if not chosen.policies and not chosen.reachable:
-        fit(known, chosen.out, model, chosen.short_balls)
-        return 0
+    if not policies and not reachable:
+        fit(known, out, model, short_balls)
+        return
     simulator = Simulator(TaskConfig(sim_rate=SIM_RATE), jax.local_device_count())
-    key = jax.random.key(chosen.seed)
-    policies = {path: load_policy.load(path).policy for path in chosen.policies}
+    key = jax.random.key(seed)
+    loaded = {path: load_policy.load(path).policy for path in policies or ()}
     kinds = {"bounce once": pool(held, model, KEPT), "are short and bounce twice": pool(held, model, SECOND_BOUNCE)}
     for kind, balls in kinds.items():
         print(f"{balls.arrival.size:,} of {len(held):,} held-out strokes that land {kind}")
         evaluator = Evaluator(simulator, balls, model, ())
-        for path, policy in policies.items():
+        for path, policy in loaded.items():
             rate = return_rate(evaluator.play(policy, key))
             print(f"  {path}: {rate.value:.1%} ({rate.low:.1%} to {rate.high:.1%}) of them returned")
-    if chosen.reachable:
-        last = next(reversed(policies.values()), None)
-        found = reachability.reachable(simulator, kinds["bounce once"], model, key, chosen.reachable, last)
+    if reachable:
+        last = next(reversed(loaded.values()), None)
+        found = find_reachable(simulator, kinds["bounce once"], model, key, reachable, last)
         low, high = wilson(found.returned, found.balls)
         print(f"in reach, at least: {found.rate:.1%} ({low:.1%} to {high:.1%}) of {found.balls}")
-    return 0
 
 
 def fit(known: np.ndarray, out: Path, model: SimModel, short_balls: bool) -> None:
@@ -106,4 +112,4 @@ def pool(rows: np.ndarray, model: SimModel, outcome: int) -> BallPool:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

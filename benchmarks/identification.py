@@ -4,19 +4,16 @@ In each of several hidden realities, every second one from outside of the model'
 the joints and a hundred hits are logged and the simulation is identified. The shipped quickstart is trained on by
 first-order gradients, as ``robust.yaml`` does it, in the nominal world, in the prior alone, in the identified worlds
 without and with hits, and in the reality itself, on balls of the human model that is fitted to the logged balls, short
-ones included; all five then play in the reality, on the same balls. Resumable: what is finished is kept, ``--summary``
+ones included; all five then play in the reality, on the same balls. Resumable: what is finished is kept, ``--show``
 prints it.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +24,7 @@ from ballmodel.distribution import save_distribution
 from ballmodel.fit_distribution import fit_human
 from ballmodel.flight import ball_params
 from ballmodel.partial_params import without_nominal
+from benchmarks.harness import each_missing, read_all, run
 from experiments import measurements
 from experiments.config import build, experiment
 from experiments.config import study as studies
@@ -46,7 +44,8 @@ from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
 
 QUICKSTART = Path("experiments/shipped/policies/quickstart")
-WORLDS = ("nominal", "prior", "identified", "hits", "truth")
+World = Literal["nominal", "prior", "identified", "hits", "truth"]
+WORLDS: tuple[World, ...] = ("nominal", "prior", "identified", "hits", "truth")
 CLASSES = ((), ("lift",), (), ("bounce",), (), ("blade",), (), ("mount",), (), ("lift", "bounce", "blade", "mount"))
 BALLS, RALLIES, LANES = 4000, 80, 16  # balls of each evaluation; rallies of each policy, in lanes
 CAMERA_NOISE = 0.003  # [m]
@@ -54,81 +53,71 @@ BELIEVED = SimModel().latency.ball_observation  # [s]
 SHARED = {"lift": ("flight",), "bounce": ("restitution",), "blade": ("paddle.restitution",), "mount": ()}
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measures, prints and writes; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("runs/identification"))
-    parser.add_argument("--realities", type=int, default=10)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first reality")
-    parser.add_argument("--updates", type=int, default=600, help="of 512 balls, of each training")
-    parser.add_argument("--player", default="player3")
-    parser.add_argument("--balls", type=int, default=300, help="across the table, before the first play")
-    parser.add_argument("--seconds", type=float, default=60.0, help="of the joints' motion")
-    parser.add_argument("--worlds", nargs="+", choices=WORLDS, default=WORLDS, help="to train in")
-    parser.add_argument("--untrained", action="store_true", help="intervals alone: nothing is trained or played")
-    parser.add_argument("--summary", action="store_true", help="only print what is finished")
-    chosen = parser.parse_args(arguments)
+def main(
+    *,
+    out: Path = Path("runs/identification"),
+    realities: int = 10,
+    first: int = 0,
+    updates: int = 600,
+    player: str = "player3",
+    balls: int = 300,
+    seconds: float = 60.0,
+    worlds: tuple[World, ...] = WORLDS,
+    untrained: bool = False,
+    show: bool = False,
+) -> int:
+    """Measures, prints and writes; returns the exit status.
+
+    Args:
+        first: seed of the first reality
+        updates: of 512 balls, of each training
+        balls: across the table, before the first play
+        seconds: of the joints' motion
+        worlds: to train in
+        untrained: intervals alone: nothing is trained or played
+        show: only print what is finished
+    """
     platform.configure(devices=1)
-    if not chosen.summary:
-        measure(
-            chosen.out,
-            range(chosen.first, chosen.first + chosen.realities),
-            0 if chosen.untrained else chosen.updates,
-            chosen.player,
-            (chosen.balls, chosen.seconds),
-            tuple(world for world in WORLDS if world in chosen.worlds),
+    for seed, path in () if show else each_missing(out, "reality", range(first, first + realities)):
+        # In a process of its own: a dozen compiled programs each, and a process may map only so many of them.
+        given = (
+            path,
+            seed,
+            0 if untrained else updates,
+            player,
+            (balls, seconds),
+            tuple(w for w in WORLDS if w in worlds),
         )
-    found = [json.loads(path.read_text()) for path in sorted(chosen.out.glob("reality_*.json"))]
+        process = get_context("spawn").Process(target=_one, args=given)
+        process.start()
+        process.join()
+        if process.exitcode:
+            raise SystemExit(f"reality {seed}: the process ended with {process.exitcode}; run it again to go on")
+    found = read_all(out, "reality")
     if not found:
-        print(f"{chosen.out}: no reality is finished")
+        print(f"{out}: no reality is finished")
         return 1
-    if chosen.untrained:
+    if untrained:
         for title, outside in (("in class", False), ("outside", True)):
             some = [one for one in found if bool(one["outside"]) == outside]
             if some:
                 print("\n".join([f"{title}, {len(some)} realities", *coverage(some, ("identified", "hits"))]))
         return 0
     text = summary(found)
-    (chosen.out / "summary.txt").write_text(text + "\n", encoding="utf-8")
-    plot(found, chosen.out / "identification.png")
+    (out / "summary.txt").write_text(text + "\n", encoding="utf-8")
     print(text)
     return 0
 
 
-def measure(
-    out: Path, seeds: range, updates: int, player: str, logged: tuple[int, float], worlds: tuple[str, ...]
+def _one(
+    path: Path, seed: int, updates: int, player: str, logged: tuple[int, float], worlds: tuple[World, ...]
 ) -> None:
-    """Makes what is not finished, a JSON for each reality.
-
-    logged: balls before the first play, seconds of joints; worlds: to train in.
-    """
-    out.mkdir(parents=True, exist_ok=True)
-    left, began, spent = [s for s in seeds if not _file(out, s).exists()], time.monotonic(), 0
-    for seed in left:
-        # In a process of its own: a dozen compiled programs each, and a process may map only so many of them.
-        process = get_context("spawn").Process(target=_one, args=(out, seed, updates, player, logged, worlds))
-        process.start()
-        process.join()
-        if process.exitcode:
-            raise SystemExit(f"reality {seed}: the process ended with {process.exitcode}; run it again to go on")
-        result = json.loads(_file(out, seed).read_text(encoding="utf-8"))
-        spent += 1
-        rates = (
-            "intervals"
-            if not updates
-            else ", ".join(f"{world} {result['returned'][world]['rate']:.1%}" for world in worlds)
-        )
-        minutes = (time.monotonic() - began) / spent * (len(left) - spent) / 60.0
-        print(f"reality {seed} {result['outside'] or 'in class'}: {rates}; {minutes:.0f} min left", flush=True)
-
-
-def _one(out: Path, seed: int, updates: int, player: str, logged: tuple[int, float], worlds: tuple[str, ...]) -> None:
     platform.configure(devices=1)
-    run_dir.write_json(_file(out, seed), of_reality(out, seed, updates, player, logged, worlds))
+    run_dir.write_json(path, of_reality(path.parent, seed, updates, player, logged, worlds))
 
 
 def of_reality(
-    out: Path, seed: int, updates: int, player: str, logged: tuple[int, float], trained_in: tuple[str, ...]
+    out: Path, seed: int, updates: int, player: str, logged: tuple[int, float], trained_in: tuple[World, ...]
 ) -> dict[str, Any]:
     """Logs, identification, trainings and evaluations of one reality; without updates no trainings and evaluations."""
     outside = CLASSES[seed % len(CLASSES)]
@@ -292,29 +281,6 @@ def coverage(some: list[dict[str, Any]], worlds: tuple[str, ...]) -> list[str]:
     return lines
 
 
-def plot(found: list[dict[str, Any]], path: Path) -> None:
-    """Returned balls by world and reality; predicted against measured."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained")
-    worlds = [w for w in WORLDS if all(w in one["returned"] for one in found)]
-    for one in found:
-        rates = [100 * one["returned"][w]["rate"] for w in worlds]
-        left.plot(worlds, rates, "o--" if one["outside"] else "o-", label=f"{one['seed']} {'+'.join(one['outside'])}")
-        measured = [100 * one["returned"][w]["rate"] for w in one["returned"]]
-        right.plot(measured, [100 * one["predicted"][w] for w in one["returned"]], "o" if one["outside"] else "s")
-    left.set_ylabel("returned in the reality [%]")
-    left.legend(fontsize=7, title="reality")
-    right.plot([0, 100], [0, 100], "k", lw=0.5)
-    right.set_xlabel("measured [%]")
-    right.set_ylabel("predicted after identification with hits [%]")
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
-
-
 def _rate(x: np.ndarray) -> dict[str, float]:
     low, high = wilson(int(x.sum()), x.size)
     return {"rate": float(x.mean()), "low": low, "high": high}
@@ -331,9 +297,5 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def _file(out: Path, seed: int) -> Path:
-    return out / f"reality_{seed:03d}.json"
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

@@ -13,8 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from rich.console import Console
-
+from benchmarks.harness import print_table, run
 from experiments.config.site import Site
 from experiments.jobs import engine
 from experiments.jobs.engine import Job, Setup
@@ -42,20 +41,14 @@ def measure(workers: Workers, folder: Path) -> dict[str, float]:
     return {"start": ends[0] - began, "each": (rest[-1] - rest[0]) / (len(rest) - 1), "end": closed}
 
 
-def main(console: Console) -> None:
+def main() -> None:
     """Prints both engines."""
+    both = {"process pool": Workers(WORKERS), "Parsl": Workers(1, Site.model_validate(HERE), "here")}
     with tempfile.TemporaryDirectory() as folder:
-        for name, workers in {
-            "process pool": Workers(WORKERS),
-            "Parsl": Workers(1, Site.model_validate(HERE), "here"),
-        }.items():
-            took = measure(workers, Path(folder))
-            console.print(
-                f"{name}: {took['start']:.1f} s to the end of the first job, {1000 * took['each']:.1f} ms for each "
-                f"further one, {took['end']:.1f} s to end the workers",
-                highlight=False,
-            )
+        took = {name: measure(workers, Path(folder)) for name, workers in both.items()}
+    rows = [(name, *(f"{seconds:.4f}" for seconds in found.values())) for name, found in took.items()]
+    print_table("Seconds", ("engine", "to the end of the first job", "each further job", "end of the workers"), rows)
 
 
 if __name__ == "__main__":
-    main(Console())
+    run(main)

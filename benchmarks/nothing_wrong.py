@@ -1,4 +1,4 @@
-"""Logs in which nothing is wrong: ``python -m benchmarks.nothing_wrong [--logs 50] [--kind balls hits session]``.
+"""Logs in which nothing is wrong: ``python -m benchmarks.nothing_wrong [--logs 50] [--kinds balls hits session]``.
 
 ``balls``: 200 balls of the nominal simulator across its table and a minute of its joints. ``hits``: 120 balls of
 rallies in it, from the player over the hit to the return, with the joints of all of them. ``session``: such rallies as
@@ -8,18 +8,16 @@ Resumable: what is finished is kept in --out.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal
 
 import jax
 import numpy as np
 
+from benchmarks.harness import each_missing, read_all, run
 from experiments.config import study as studies
 from experiments.deploy import session_logs
 from experiments.runs import load_policy, run_dir
@@ -35,6 +33,8 @@ from mjx_tt.sim.model import LATENCIES, SimModel
 from robot_io import log
 
 QUICKSTART = Path("experiments/shipped/policies/quickstart")
+Kind = Literal["balls", "hits", "session"]
+KINDS: tuple[Kind, ...] = ("balls", "hits", "session")
 PLAYERS = ("player1", "player2", "player3", "player4", "player5")
 BALLS, SECONDS = 200, 60.0  # of the kind balls; of its joints [s]
 NOISE = 0.003  # [m] of the camera
@@ -93,14 +93,15 @@ def recorded(logs: Logs) -> Logs:
     return Logs(balls, joints, {})
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Answers and prints; 1 where one was not "none"."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("runs/nothing_wrong"))
-    parser.add_argument("--logs", type=int, default=50, help="of each kind")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first log")
-    parser.add_argument("--kind", nargs="+", default=["balls", "hits", "session"], choices=["balls", "hits", "session"])
-    chosen = parser.parse_args(arguments)
+def main(
+    *, out: Path = Path("runs/nothing_wrong"), logs: int = 50, first: int = 0, kinds: tuple[Kind, ...] = KINDS
+) -> int:
+    """Answers and prints; 1 where one was not "none".
+
+    Args:
+        logs: of each kind
+        first: seed of the first log
+    """
     platform.configure(devices=1)
     nominal = Nominal()
     makers: dict[str, Callable[[int], Logs]] = {
@@ -108,17 +109,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "hits": nominal.hits,
         "session": lambda seed: recorded(nominal.hits(seed)),
     }
-    chosen.out.mkdir(parents=True, exist_ok=True)
-    seeds = range(chosen.first, chosen.first + chosen.logs)
-    for kind in chosen.kind:
-        left = [seed for seed in seeds if not _file(chosen.out, kind, seed).exists()]
-        began = time.monotonic()
-        for done, seed in enumerate(left, 1):
-            run_dir.write_json(_file(chosen.out, kind, seed), answer(makers[kind](seed), seed))
-            minutes = (time.monotonic() - began) / done * (len(left) - done) / 60.0
-            last = json.loads(_file(chosen.out, kind, seed).read_text(encoding="utf-8"))
-            print(f"{kind} {seed}: {last['answer']} {last['why']}; {minutes:.0f} min left", flush=True)
-    text, good = summary(chosen.out)
+    for kind in kinds:
+        for seed, path in each_missing(out, kind, range(first, first + logs)):
+            run_dir.write_json(path, answer(makers[kind](seed), seed))
+    text, good = summary(out)
     print(text)
     return 0 if good else 1
 
@@ -135,8 +129,8 @@ def answer(logs: Logs, seed: int) -> dict:
 def summary(out: Path) -> tuple[str, bool]:
     """A line for each kind; True where every answer is "none"."""
     lines, good = [], True
-    for kind in ("balls", "hits", "session"):
-        found = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(out.glob(f"{kind}_*.json"))]
+    for kind in KINDS:
+        found = read_all(out, kind)
         if not found:
             continue
         none = sum(one["answer"] == "none" for one in found)
@@ -147,9 +141,5 @@ def summary(out: Path) -> tuple[str, bool]:
     return "\n".join(lines), good
 
 
-def _file(out: Path, kind: str, seed: int) -> Path:
-    return out / f"{kind}_{seed}.json"
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

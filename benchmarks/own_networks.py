@@ -5,8 +5,6 @@ Random policies of each network play the same episodes; the paper's network and 
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +17,7 @@ from jax.sharding import PartitionSpec
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
+from benchmarks.harness import run
 from mjx_tt import platform
 from mjx_tt.env import own
 from mjx_tt.env.policy import Policy, initial_theta
@@ -31,18 +30,14 @@ COLUMNS, REPEATS = 200, 10
 ROUNDS = 5
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measures and prints; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("definitions", type=Path)
-    parser.add_argument("--devices", type=int, default=1)
-    chosen = parser.parse_args(arguments)
-    platform.configure(devices=chosen.devices)
-    simulator = Simulator(TaskConfig(sim_rate=150.0), chosen.devices)
+def main(definitions: Path, *, devices: int = 1) -> None:
+    """Measures and prints episodes per second of each network in the file."""
+    platform.configure(devices=devices)
+    simulator = Simulator(TaskConfig(sim_rate=150.0), devices)
     model = SimModel()
     pool = sample_pool(jax.random.key(0), registry.resolve("player3/M0"), model.ball, 4096)
     networks: dict[str, own.Network | None] = {"the paper's": None}
-    networks |= own.load(chosen.definitions.read_text(encoding="utf-8"), str(chosen.definitions)).networks
+    networks |= own.load(definitions.read_text(encoding="utf-8"), str(definitions)).networks
     calls = {name: prepared(simulator, network, pool, model) for name, network in networks.items()}
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(ROUNDS):
@@ -56,7 +51,6 @@ def main(arguments: list[str] | None = None) -> int:
         middle = float(np.median(taken))
         rate = COLUMNS * REPEATS / middle
         print(f"{name}: {size} parameters, {rate:,.0f} episodes/s, {middle / base:.2f} x the paper's time")
-    return 0
 
 
 def prepared(simulator: Simulator, network: own.Network | None, pool: object, model: SimModel) -> Callable[[], None]:
@@ -83,4 +77,4 @@ def prepared(simulator: Simulator, network: own.Network | None, pool: object, mo
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

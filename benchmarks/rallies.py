@@ -6,8 +6,6 @@ All rallies are played to their ends in one compiled call, by five virtual playe
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from dataclasses import replace
 
@@ -15,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.harness import run
 from experiments.runs import load_policy as policies
 from mjx_tt import platform
 from mjx_tt.env.policy import Policy, initial_theta
@@ -25,33 +24,32 @@ from mjx_tt.rally.simulator import RallySimulator
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import N_OBSERVATION
 
-LANES = 200  # side by side; each plays its share one rally after the other
 RUNS = 3  # of which the fastest counts
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measures and prints; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--policy", help="run or artefact")
-    parser.add_argument("--rallies", type=int, default=1000)
-    parser.add_argument("--lanes", type=int, default=LANES)
-    parser.add_argument("--sim-rate", type=float, default=150.0, help="Hz")
-    chosen = parser.parse_args(arguments)
+def main(*, policy: str | None = None, rallies: int = 1000, lanes: int = 200, sim_rate: float = 150.0) -> None:
+    """Measures and prints rallies per second.
+
+    Args:
+        policy: run or artefact
+        lanes: rallies side by side; each lane plays its share one after the other
+        sim_rate: [Hz] of the physics
+    """
     platform.configure(devices=1)
-    if chosen.policy:
-        policy = policies.load(chosen.policy).policy
+    if policy:
+        played_by = policies.load(policy).policy
     else:
-        policy = Policy(initial_theta(jax.random.key(0)), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION))
-    each = -(-chosen.rallies // chosen.lanes)
+        played_by = Policy(initial_theta(jax.random.key(0)), np.zeros(N_OBSERVATION), np.ones(N_OBSERVATION))
+    each = -(-rallies // lanes)
     names = human_player.names()
-    people = human_player.stack([human_player.load(names[lane % len(names)]) for lane in range(chosen.lanes)])
-    policy = jax.tree.map(jnp.asarray, policy.astype(np.float32))
-    policy = replace(policy, theta=jnp.repeat(policy.theta[:, None], chosen.lanes, axis=1))
-    simulator = RallySimulator(TaskConfig(sim_rate=chosen.sim_rate))
+    people = human_player.stack([human_player.load(names[lane % len(names)]) for lane in range(lanes)])
+    played_by = jax.tree.map(jnp.asarray, played_by.astype(np.float32))
+    played_by = replace(played_by, theta=jnp.repeat(played_by.theta[:, None], lanes, axis=1))
+    simulator = RallySimulator(TaskConfig(sim_rate=sim_rate))
 
     def play(seed: int) -> tuple[float, np.ndarray, np.ndarray, float]:
         began = time.perf_counter()
-        result = simulator.play(policy, people, SimModel(), jax.random.key(seed), each)
+        result = simulator.play(played_by, people, SimModel(), jax.random.key(seed), each)
         length, end = np.asarray(result.length), np.asarray(result.end)
         return time.perf_counter() - began, length, end, float(result.seconds.sum())
 
@@ -68,8 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"length {length.mean():.1f} on average, {length.max()} at most; ended by:")
     for row, count in zip(*np.unique(end, return_counts=True), strict=True):
         print(f"  {count / end.size:6.1%}  {End(row).name.lower().replace('_', ' ')}")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

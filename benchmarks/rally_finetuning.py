@@ -7,9 +7,7 @@ start and its end must be those of the perturbation that it is credited to, for 
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,6 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from rich.console import Console
 
+from benchmarks.harness import run
 from experiments.config.finetuning import FineTuning
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.errors import RunError
@@ -67,34 +66,41 @@ class Watched(LockStepRallies):
         return played
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measures and prints; returns 1 when a ball was credited wrongly."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("policy", help="run or artefact")
-    parser.add_argument("--player", default="player3")
-    parser.add_argument("--updates", type=int, default=70)
-    parser.add_argument("--balls", type=int, default=100, help="in each of the evaluations before and after")
-    parser.add_argument("--pause", type=float, default=1.0, help="[s] longest between two rallies")
-    parser.add_argument("--minutes", type=float, default=120.0, help="after which what was played is checked")
-    parser.add_argument("--seed", type=int, default=1)
-    chosen = parser.parse_args(arguments)
+def main(
+    policy: str,
+    *,
+    player: str = "player3",
+    updates: int = 70,
+    balls: int = 100,
+    pause: float = 1.0,
+    minutes: float = 120.0,
+    seed: int = 1,
+) -> int:
+    """Measures and prints; returns 1 when a ball was credited wrongly.
+
+    Args:
+        policy: run or artefact
+        balls: in each of the evaluations before and after
+        pause: [s] longest between two rallies
+        minutes: after which what was played is checked
+    """
     platform.configure(devices=1)
     log = Memory()
-    params = RigParams(patient=False, pause=chosen.pause, seed=chosen.seed)
-    robot = Watched(VirtualPlayer(chosen.player, chosen.seed), params, log, chosen.minutes)
-    settings = FineTuning(updates=chosen.updates, evaluation_balls=chosen.balls)
+    params = RigParams(patient=False, pause=pause, seed=seed)
+    robot = Watched(VirtualPlayer(player, seed), params, log, minutes)
+    settings = FineTuning(updates=updates, evaluation_balls=balls)
     with TemporaryDirectory() as folder:
         found = None
         try:
-            found = loop.finetune(chosen.policy, settings, Run(folder), robot, Console())
+            found = loop.finetune(policy, settings, Run(folder), robot, Console())
         except (RefusedError, RunError) as error:
             print(f"ended early: {error}")
         journal = Journal(Path(folder) / loop.JOURNAL)
         journal.close()
     wrong, unplayed = 0, 0
-    for entry, (policy, number) in zip(journal.entries, robot.asked, strict=True):
+    for entry, (asked, number) in zip(journal.entries, robot.asked, strict=True):
         seen = log.observations.get(number, [])
-        replayed = StreamingPolicy(policy)
+        replayed = StreamingPolicy(asked)
         replayed.reset()
         same = all(np.array_equal(replayed.step(o), a) for o, a in zip(seen, log.actions.get(number, []), strict=True))
         wrong += entry.summary.number != number or not same
@@ -111,4 +117,4 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

@@ -7,17 +7,17 @@ intervals and how rallies ended; the bridge's counts are compared with what the 
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.harness import mean_interval, run
 from experiments.config.build import Experiment
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.finetuning import loop
@@ -35,7 +35,7 @@ from robot_io.control.rally import RallySummary
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.lockstep import LockStep
 from robot_io.emulator.opponent import Rallies
-from robot_io.emulator.tracker import IDENTITIES, TrackerParams
+from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.world import World
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.rally_ends import FILTERED, End
@@ -44,33 +44,40 @@ SCENE = str(paper().scene())
 LONGEST_RALLY = 60.0  # [s] per rally on average before something is wrong
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measures and prints; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("policy", help="run or artefact")
-    parser.add_argument("--player", default="player3")
-    parser.add_argument("--rallies", type=int, default=100, help="in the rig, for each tracker")
-    parser.add_argument("--simulated", type=int, default=2000, help="in the simulator")
-    parser.add_argument("--trackers", nargs="+", default=["ball"], choices=IDENTITIES, help="the first with each other")
-    parser.add_argument("--pairs", type=int, default=60, help="rallies by which two trackers are compared")
-    parser.add_argument("--noise", type=float, default=0.003, help="[m] of the tracker")
-    parser.add_argument("--seed", type=int, default=1)
-    chosen = parser.parse_args(arguments)
+def main(
+    policy: str,
+    *,
+    player: str = "player3",
+    rallies: int = 100,
+    simulated: int = 2000,
+    trackers: tuple[Literal["ball", "stroke", "lost"], ...] = ("ball",),
+    pairs: int = 60,
+    noise: float = 0.003,
+    seed: int = 1,
+) -> None:
+    """Measures and prints rallies in the simulator and in the rig.
+
+    Args:
+        policy: run or artefact
+        rallies: in the rig, for each tracker
+        simulated: in the simulator
+        trackers: the first with each other
+        pairs: rallies by which two trackers are compared
+        noise: [m] of the tracker
+    """
     platform.configure(devices=1)
-    experiment = loop.experiment_of(chosen.policy)
-    policy = load_policy.load(chosen.policy).policy.astype(np.float32)
+    experiment, loaded = loop.experiment_of(policy), load_policy.load(policy).policy.astype(np.float32)
     box = Box.of(experiment.distribution)
-    if chosen.simulated:
-        simulated(policy, chosen.player, experiment, box, chosen.simulated, chosen.seed)
-    tracker = TrackerParams(identity=chosen.trackers[0], noise=chosen.noise)
-    if chosen.rallies:
-        rig(policy, chosen.player, RigParams(tracker=tracker, seed=chosen.seed), box, chosen.rallies, chosen.seed)
-    for identity in chosen.trackers[1:]:
-        compare(policy, chosen.player, tracker, identity, box, chosen.pairs)
-    return 0
+    if simulated:
+        play_simulated(loaded, player, experiment, box, simulated, seed)
+    tracker = TrackerParams(identity=trackers[0], noise=noise)
+    if rallies:
+        play_rig(loaded, player, RigParams(tracker=tracker, seed=seed), box, rallies, seed)
+    for identity in trackers[1:]:
+        compare(loaded, player, tracker, identity, box, pairs)
 
 
-def simulated(policy: Policy, player: str, experiment: Experiment, box: Box, rallies: int, seed: int) -> None:
+def play_simulated(policy: Policy, player: str, experiment: Experiment, box: Box, rallies: int, seed: int) -> None:
     """Rallies of the simulator, 10 in each lane."""
     lanes = max(rallies // 10, 1)
     spread = jax.tree.map(jnp.asarray, policy)
@@ -108,12 +115,11 @@ def compare(policy: Policy, player: str, tracker: TrackerParams, identity: str, 
             found.append(pair)
     same = sum((a.length, a.end) == (b.length, b.end) for a, b in found)
     differences = np.array([b.length - a.length for a, b in found], float)
-    means = np.random.default_rng(0).choice(differences, (2000, len(found))).mean(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
+    mean, low, high = mean_interval(differences)
     share = wilson(same, len(found))
     print(
         f"{identity} and {tracker.identity}, noise {1e3 * tracker.noise:g} mm: {same} of {len(found)} rallies of equal "
-        f"length and end ({share[0]:.0%} to {share[1]:.0%}); lengths differ by {differences.mean():+.2f} "
+        f"length and end ({share[0]:.0%} to {share[1]:.0%}); lengths differ by {mean:+.2f} "
         f"({low:+.2f} to {high:+.2f}) touches; mean {np.mean([a.length for a, _ in found]):.2f}, longest "
         f"{max(a.length for a, _ in found)}"
     )
@@ -132,7 +138,7 @@ def bridge_config(box: Box) -> BridgeConfig:
     return BridgeConfig(RobotConfig().delays, box=rally.Box(tuple(box.low.tolist()), tuple(box.high.tolist())))
 
 
-def rig(policy: Policy, player: str, params: RigParams, box: Box, rallies: int, seed: int) -> None:
+def play_rig(policy: Policy, player: str, params: RigParams, box: Box, rallies: int, seed: int) -> None:
     """Rallies through the bridge in lock-step."""
     robot = LockStep(SCENE, VirtualPlayer(player, seed), StreamingPolicy(policy), params, bridge_config(box))
     robot.start()
@@ -152,14 +158,13 @@ def rig(policy: Policy, player: str, params: RigParams, box: Box, rallies: int, 
 def show(name: str, lengths: Sequence[int] | np.ndarray, ends: Counter[str], seconds: float) -> None:
     """Mean with its interval by the bootstrap, the longest, and the ends."""
     values = np.asarray(lengths, float)
-    means = np.random.default_rng(0).choice(values, (2000, values.size)).mean(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
+    mean, low, high = mean_interval(values)
     print(
-        f"{name}: {values.size} rallies, {values.mean():.2f} touches ({low:.2f} to {high:.2f}), longest "
+        f"{name}: {values.size} rallies, {mean:.2f} touches ({low:.2f} to {high:.2f}), longest "
         f"{values.max():.0f}, {seconds:.0f} s of play"
     )
     print("  " + ", ".join(f"{n / values.size:.0%} {end.lower().replace('_', ' ')}" for end, n in ends.most_common()))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run(main)

@@ -6,7 +6,7 @@ Folder of a comparison:
   <algorithm>/seed<K>/training.json   the curve, and under which conditions it came about
   <algorithm>/seed<K>/policy/         the controller's arrays
   <algorithm>/seed<K>/evaluation.json
-  comparison.json, curves.csv, *.png, comparison.md   the report (``report``)
+  comparison.json, curves.csv, *.png, comparison.html   the report (``report``)
 
 An algorithm with a seed is trained in one go: interrupted, that one begins again, and those that are finished stay.
 """
@@ -14,35 +14,33 @@ An algorithm with a seed is trained in one go: interrupted, that one begins agai
 from __future__ import annotations
 
 import json
-import math
 import os
 import time
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
-import yaml
-from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 
-from ballmodel.io.atomic_files import replacing
 from experiments.baselines import report
-from experiments.baselines.arena import Arena, draw_balls
-from experiments.baselines.bgs import Evolution
-from experiments.baselines.learner import MEASURED, Advance, Learner, S
-from experiments.baselines.off_policy import OffPolicyLearner
-from experiments.baselines.ppo import PpoLearner
-from experiments.baselines.qt_opt import QtOptAgent
-from experiments.baselines.sac import SacAgent
+from experiments.baselines.judge import Judge
+from experiments.baselines.learners import (
+    COUNTED,
+    BudgetSpent,
+    Counts,
+    EvolutionLearner,
+    Learner,
+    PpoLearner,
+    SacLearner,
+)
+from experiments.baselines.qt_opt import QtOptLearner
 from experiments.config import build
-from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison, Curve, Ppo, Sac
+from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison, Ppo, QtOpt
 from experiments.config.build import Experiment
-from experiments.config.experiment import Config, Task
+from experiments.config.experiment import Config
 from experiments.errors import RunError, checked
-from experiments.evaluation import evaluate
 from experiments.jobs import engine
 from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import ALONE, Workers
@@ -54,7 +52,6 @@ from mjx_tt.env.task import Controller
 from mjx_tt.sim.model import ModelFile
 
 STARTED = "started.json"
-RELATIVE = ("velocity", "acceleration", "jerk")  # reward terms: 1 - mean over joints and steps of |value| / limit
 
 
 @dataclass(frozen=True)
@@ -111,8 +108,7 @@ def compare(
     common = prepare(comparison, config, where, out, console)
     missing = unfinished(common)
     common.folder.mkdir(parents=True, exist_ok=True)
-    with replacing(common.folder / "comparison.yaml") as temporary:
-        temporary.write_text(yaml.safe_dump(common.comparison.to_dict(), sort_keys=False), encoding="utf-8")
+    run_dir.write_yaml(common.folder / "comparison.yaml", common.comparison.to_dict())
     for name, seeds in missing.items():
         if not seeds:
             console.print(f"{common.folder / name}: done before, skipped", highlight=False)
@@ -167,7 +163,7 @@ def unfinished(common: Common) -> dict[str, list[int]]:
     return {name: [k for k in seeds if not _finished(common, name, k)] for name in common.comparison.algorithms}
 
 
-def learner(settings: Algorithm, experiment: Experiment) -> Learner[Any]:
+def learner(settings: Algorithm, experiment: Experiment) -> Learner:
     """The algorithm on the experiment's task. Raises ConfigError."""
     config, model = experiment.config, experiment.model
     pool = build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool)
@@ -175,7 +171,7 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner[Any]:
     if isinstance(settings, Bgs):
         optimiser = settings.optimiser
         bgs = checked("optimiser", build.bgs_config, optimiser, settings.schedule_updates)
-        return Evolution(
+        return EvolutionLearner(
             KINDS[optimiser.gradient](
                 simulator,
                 bgs,
@@ -188,78 +184,98 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner[Any]:
             )
         )
     env = TableTennis(simulator, pool, model.model, model.randomise)
-    if isinstance(settings, Ppo):
-        return PpoLearner(settings, env)
-    sizes = env.observation_size, env.action_size
-    agent = SacAgent(settings, *sizes) if isinstance(settings, Sac) else QtOptAgent(settings, *sizes)
-    return OffPolicyLearner(settings.replay, env, agent)
-
-
-class Judge:
-    """Evaluates controllers: on the way, and in the end in simulation and in reality."""
-
-    def __init__(self, common: Common) -> None:
-        experiment = common.experiment
-        config = experiment.config
-        task = replace(experiment.task, sim_rate=config.evaluation.sim_rate or experiment.task.sim_rate)
-        self._arenas = {"simulation": Arena(task, experiment.model), "reality": Arena(task, common.reality)}
-        seed, on_the_way = config.training.seed, common.comparison.curve.episodes
-        self._progress_key = build.key(seed, build.PROGRESS_EPISODES)
-        self._progress_balls = draw_balls(experiment, build.key(seed, build.PROGRESS_BALLS), on_the_way)
-        seed = config.evaluation.seed
-        self._key = build.key(seed, build.EVALUATION_EPISODES)
-        self._balls = draw_balls(experiment, build.key(seed, build.EVALUATION_BALLS), config.evaluation.episodes)
-
-    def progress(self, controller: Controller) -> dict[str, Any]:
-        result = self._arenas["simulation"].play(controller, self._progress_balls, self._progress_key)
-        kept = ("return_rate", "low", "high", "hit_rate", "mean_return")
-        summary = evaluate.summary(result)
-        return {name: summary[name] for name in kept}
-
-    def final(self, controller: Controller) -> dict[str, Any]:
-        """Per world the summary of ``evaluate``, and how restless the motion is in simulation."""
-        found = {
-            world: evaluate.summary(arena.play(controller, self._balls, self._key))
-            for world, arena in self._arenas.items()
-        }
-        terms = found["simulation"]["terms"]
-        restless = {name: None if terms[name] is None else 1.0 - terms[name] for name in RELATIVE}
-        change = self._arenas["simulation"].action_change(controller, self._balls, self._key)
-        return found | {"restlessness": {"action_change": change if math.isfinite(change) else None} | restless}
+    if isinstance(settings, QtOpt):
+        return QtOptLearner(settings, env)
+    return PpoLearner(settings, env) if isinstance(settings, Ppo) else SacLearner(settings, env)
 
 
 class Trainings:
-    """Trainings of one process, one after the other: those of an algorithm share its compiled program."""
+    """Trainings of one process, one after the other: they share the programs of the evaluations."""
 
     def __init__(self, common: Common) -> None:
-        self._common, self._judge = common, Judge(common)
-        self._name = ""
-        self._algorithm: Learner[Any]
-        self._compiled: Advance[Any] | None = None
+        self._common = common
+        self._judge = Judge(common.experiment, common.reality, common.comparison.curve.episodes)
 
     def run(self, name: str, seed: int) -> str:
         """Does what is missing of training and evaluation; the return rates in words. Raises RunError."""
-        common, key = self._common, build.key(seed, build.INITIAL_STATE)
-        if name != self._name:
-            self._algorithm, self._compiled = learner(common.comparison.algorithms[name], common.trains_in[name]), None
-            self._name = name
-        algorithm, folder = self._algorithm, common.run_folder(name, seed)
+        common, folder = self._common, self._common.run_folder(name, seed)
+        algorithm = learner(common.comparison.algorithms[name], common.trains_in[name])
         if not (folder / "training.json").exists():
-            state = algorithm.init(key)
-            if self._compiled is None:
-                common.console.print(f"{folder}: compiling ...", highlight=False)
-                self._compiled = algorithm.compiled(state)
             folder.mkdir(parents=True, exist_ok=True)
-            run_dir.write_json(folder / STARTED, run_dir.provenance())
-            _train(common, self._judge, name, folder, algorithm, self._compiled, state)
-        template = jax.eval_shape(lambda key: algorithm.controller(algorithm.init(key)), key)
-        restored = checkpoint.load_latest(folder / "policy", template)
+            common.console.print(f"{folder}: compiling ...", highlight=False)
+            training = Training(common, self._judge, folder)
+            algorithm.train(seed, training.observe)
+            training.save(name)
+        restored = checkpoint.load_latest(folder / "policy", algorithm.template())
         if restored is None:
             raise RunError(f"{folder / 'policy'}: holds no policy, though training.json is there; remove {folder}")
         found = self._judge.final(restored[0])
         run_dir.write_json(folder / "evaluation.json", {"conditions": common.evaluation_conditions()} | found)
         rates = (f"{world} {found[world]['return_rate']:.1%}" for world in ("simulation", "reality"))
         return f"returned in {', in '.join(rates)}"
+
+
+class Training:
+    """The account of one training: what it has spent, and its curve of evenly spaced evaluations.
+
+    The first piece of learning contains the compilation, so it is charged with the mean time of those that follow.
+    """
+
+    def __init__(self, common: Common, judge: Judge, folder: Path) -> None:
+        self._common, self._judge, self._folder = common, judge, folder
+        self._curve: list[dict[str, Any]] = []
+        self._seconds = {"wall": 0.0, "cpu": 0.0}  # of all pieces but the first
+        self._pieces = -1
+        self._left = (0.0, 0.0)  # readings of both clocks when learning went on
+        self._share = 0.0  # of the budget that was spent
+        self._before = dict.fromkeys(COUNTED, 0.0)  # at the last point of the curve
+        self._controller: Controller
+        self._spent: dict[str, float] = {}
+
+    def observe(self, controller: Controller, counts: Counts) -> None:
+        """Notes a piece of learning. Raises BudgetSpent."""
+        now, comparison = (time.monotonic(), time.process_time()), self._common.comparison
+        self._pieces = 0 if counts["steps"] == 0 else max(self._pieces, 0) + 1
+        if self._pieces > 1:
+            for clock, before, after in zip(self._seconds, self._left, now, strict=True):
+                self._seconds[clock] += after - before
+        elif self._pieces == 1:
+            run_dir.write_json(self._folder / STARTED, run_dir.provenance())
+        scale = self._pieces / max(self._pieces - 1, 1)
+        self._controller = controller
+        self._spent = {
+            "seconds": scale * self._seconds["wall"],
+            "cpu_seconds": scale * self._seconds["cpu"],
+            "episodes": round(counts["episodes"]),
+            "steps": round(counts["steps"]),
+        }
+        share, points = min(_share(comparison.budget, self._spent), 1.0), comparison.curve.points
+        if not self._curve or int(points * share) > int(points * self._share):
+            self._add_point(controller, counts)
+        self._share = share
+        if share >= 1.0:
+            raise BudgetSpent
+        self._left = time.monotonic(), time.process_time()
+
+    def save(self, name: str) -> None:
+        """Writes the policy, then the curve."""
+        checkpoint.save(self._folder / "policy", 1, self._controller, {"algorithm": name, **self._spent})
+        data = {"conditions": self._common.conditions(name), "curve": self._curve, "provenance": run_dir.provenance()}
+        run_dir.write_json(self._folder / "training.json", data)
+
+    def _add_point(self, controller: Controller, counts: Counts) -> None:
+        since = {key: counts[key] - self._before[key] for key in COUNTED}
+        means = {key: since[key] / max(since["episodes"], 1.0) for key in ("hit", "returned", "episode_return")}
+        point = self._spent | self._judge.progress(controller) | {"training": means if since["steps"] else None}
+        self._curve.append(point)
+        self._before = counts
+        self._common.console.print(
+            f"{self._folder}: {point['episodes']:,} episodes, {point['seconds']:.0f} s: returned "
+            f"{point['return_rate']:.1%}, touched {point['hit_rate']:.1%}, mean return "
+            f"{point['mean_return'] or float('nan'):.2f}",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def trainings(comparison: Comparison, config: Config, where: str, out: Path) -> Callable[[str, int], str]:
@@ -272,7 +288,7 @@ def _finished(common: Common, name: str, seed: int) -> bool:
     folder = common.run_folder(name, seed)
     if not (folder / "training.json").exists():
         return False
-    before, now = _completed(json.loads((folder / "training.json").read_text())["conditions"]), common.conditions(name)
+    before, now = json.loads((folder / "training.json").read_text())["conditions"], common.conditions(name)
     differing = [key for key in now if before.get(key) != now[key]]
     if differing:
         raise RunError(
@@ -282,61 +298,9 @@ def _finished(common: Common, name: str, seed: int) -> bool:
     return path.exists() and json.loads(path.read_text())["conditions"] == common.evaluation_conditions()
 
 
-def _completed(conditions: dict[str, Any]) -> dict[str, Any]:
-    """Settings of an earlier training with the defaults of keys that did not exist then."""
-    completed = {"robot": None, "algorithm": {}} | conditions
-    models: dict[str, Any] = {"task": Task, "budget": Budget, "curve": Curve, "algorithm": Algorithm}
-    for key, model in models.items():
-        with suppress(ValidationError):  # a key that is gone: not the settings of now
-            completed[key] = TypeAdapter(model).validate_python(conditions.get(key)).model_dump(mode="json")
-    completed["algorithm"] = {key: completed["algorithm"][key] for key in completed["algorithm"] if key not in OWN}
-    return completed
-
-
-def _train(
-    common: Common, judge: Judge, name: str, folder: Path, algorithm: Learner[S], advance: Advance[S], state: S
-) -> None:
-    """Learns until the budget is spent; the curve has evenly spaced evaluations, the first before any learning."""
-    budget, points = common.comparison.budget, common.comparison.curve.points
-    spent = {"seconds": 0.0, "cpu_seconds": 0.0} | {name: 0 for name in ("episodes", "steps")}
-    curve = [spent | judge.progress(algorithm.controller(state)) | {"training": None}]
-    _say(common.console, folder, curve[-1])
-    since: dict[str, float] = dict.fromkeys(MEASURED, 0.0)
-    while (share := _share(budget, spent)) < 1.0:
-        started = time.monotonic(), time.process_time()
-        state, on_device = advance(state)
-        measured = {key: float(value) for key, value in jax.device_get(on_device).items()}
-        spent["seconds"] += time.monotonic() - started[0]
-        spent["cpu_seconds"] += time.process_time() - started[1]
-        for key in ("episodes", "steps"):
-            spent[key] += round(measured[key])
-        since = {key: since[key] + measured[key] for key in MEASURED}
-        if int(points * min(_share(budget, spent), 1.0)) > int(points * share):
-            ended = max(since["episodes"], 1.0)
-            training = {key: since[key] / ended for key in ("hit", "returned", "episode_return")}
-            curve.append(dict(spent) | judge.progress(algorithm.controller(state)) | {"training": training})
-            since = dict.fromkeys(MEASURED, 0.0)
-            _say(common.console, folder, curve[-1])
-    notes = {"algorithm": name, **spent}
-    checkpoint.save(folder / "policy", 1, algorithm.controller(state), notes)
-    run_dir.write_json(
-        folder / "training.json",
-        {"conditions": common.conditions(name), "curve": curve, "provenance": run_dir.provenance()},
-    )
-
-
 def _share(budget: Budget, spent: dict[str, float]) -> float:
     """Spent share of the budget; at 1 it is used up."""
     seconds = spent["seconds" if budget.clock == "wall" else "cpu_seconds"]
     by_time = 0.0 if budget.minutes is None else seconds / (60 * budget.minutes)
     by_episodes = 0.0 if budget.episodes is None else spent["episodes"] / budget.episodes
     return max(by_time, by_episodes)
-
-
-def _say(console: Console, folder: Path, point: dict[str, Any]) -> None:
-    console.print(
-        f"{folder}: {point['episodes']:,} episodes, {point['seconds']:.0f} s: returned {point['return_rate']:.1%}, "
-        f"touched {point['hit_rate']:.1%}, mean return {point['mean_return'] or float('nan'):.2f}",
-        highlight=False,
-        soft_wrap=True,
-    )

@@ -63,4 +63,4 @@ def compare(
     workers = Workers(1 if elsewhere else comparing.choose(loaded, processes), elsewhere, str(site))
     with interruptible():
         folder = comparing.compare(loaded, experiment, str(path), Path(out), screen, workers)
-    screen.print(f"{folder}/comparison.md, with its pictures beside it", highlight=False, soft_wrap=True)
+    screen.print(f"{folder}/comparison.html, with its figures beside it", highlight=False, soft_wrap=True)

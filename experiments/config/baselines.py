@@ -54,7 +54,7 @@ class Bgs(Learning):
 
 
 class Ppo(Learning):
-    """Proximal policy optimisation with brax's networks and loss."""
+    """Proximal policy optimisation by brax's training function."""
 
     kind: Literal["ppo"]
     """This algorithm."""
@@ -95,9 +95,9 @@ class Replay(Section):
     environments: Count = 64
     """Side by side."""
     capacity: Count = 300_000
-    """Transitions kept."""
+    """Transitions kept; once so many are there, brax's buffer moves all of them at every step (0.1 us each)."""
     random_steps: Count = 20_000
-    """Control steps, of all environments together, with random actions before learning begins."""
+    """Control steps, of all environments together, with actions of chance before learning begins."""
     gradient_steps: Count = 1
     """After every step of all environments."""
     batch: Count = 256
@@ -119,12 +119,21 @@ class OffPolicy(Learning):
 
 
 class Sac(OffPolicy):
-    """Soft actor-critic with brax's networks and losses."""
+    """Soft actor-critic by brax's training function; its first steps are of the untrained policy, not random."""
 
     kind: Literal["sac"]
     """This algorithm."""
-    first_entropy_weight: Positive = 0.1
-    """Weight of the policy's entropy before it is adapted."""
+    reward_scale: RewardScale = 10.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _gone(cls, data: Any) -> Any:
+        if isinstance(data, dict) and "first_entropy_weight" in data:
+            raise ValueError(
+                "first_entropy_weight: no key any more: brax's SAC begins with 1 and adapts it; leave it out, and "
+                "weigh rewards against entropy by reward_scale"
+            )
+        return data
 
 
 class QtOpt(OffPolicy):

@@ -20,7 +20,7 @@ from experiments.errors import ConfigError
 
 
 def _walltime(value: Any) -> Any:
-    """YAML reads 08:00:00 without quotes as 28800, and shorter forms mean different things to SLURM and PBS."""
+    """YAML reads 08:00:00 without quotes as 28800, and SLURM reads shorter forms as minutes."""
     if not isinstance(value, str) or not re.fullmatch(r"\d{1,3}:[0-5]\d:[0-5]\d", value):
         raise ValueError('hours:minutes:seconds in quotes, such as "08:00:00"')
     return value
@@ -61,53 +61,7 @@ class Slurm(Section):
     """Further options of sbatch, such as --nice=100."""
 
 
-class Pbs(Section):
-    """A PBS Pro cluster: a block is a host."""
-
-    kind: Literal["pbs"]
-    """Parsl's PBSProProvider."""
-    walltime: Walltime
-    """Longest time of a block as "HH:MM:SS"; a job that it cuts goes on in the next block from its checkpoint."""
-    queue: str | None = None
-    """Queue; null: the cluster's default."""
-    account: str | None = None
-    """Account that is charged."""
-    select: str = ""
-    """Further resources of each node's chunk, such as ngpus=1; cores and memory are asked for by themselves."""
-    options: list[BatchOption] = []
-    """Further options of qsub, such as -l filesystems=home."""
-
-
-class Kubernetes(Section):
-    """A Kubernetes cluster: a block is a pod."""
-
-    kind: Literal["kubernetes"]
-    """Parsl's KubernetesProvider."""
-    image: str
-    """Container image with mjx-tt[kubernetes] in it."""
-    volumes: Annotated[dict[str, str], Field(min_length=1)]
-    """Persistent volume claims, each with the folder at which pods see it; one holds the runs."""
-    namespace: str = "default"
-    """Namespace of the pods."""
-    service_account: str | None = None
-    """Service account of the pods."""
-    secret: str | None = None
-    """Image pull secret."""
-    user: int | None = None
-    """User id in the container; with group."""
-    group: int | None = None
-    """Group id in the container; with user."""
-    accelerator: str = "nvidia.com/gpu"
-    """Resource by which accelerators are asked for."""
-
-    @model_validator(mode="after")
-    def _owned(self) -> Kubernetes:
-        if (self.user is None) != (self.group is None):
-            raise ValueError(f"user {self.user} and group {self.group} are given together or not at all")
-        return self
-
-
-Provider = Annotated[Local | Slurm | Pbs | Kubernetes, Field(discriminator="kind")]
+Provider = Annotated[Local | Slurm, Field(discriminator="kind")]
 
 
 class Site(Section):
@@ -182,10 +136,6 @@ def load(path: str | os.PathLike) -> Site:
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: a site is a mapping with the keys {', '.join(Site.model_fields)}")
     site = files.validate(Site, data, str(path))
-    needed = {"parsl": "cluster"} | ({"kubernetes": "kubernetes"} if isinstance(site.provider, Kubernetes) else {})
-    for package, extra in needed.items():
-        if importlib.util.find_spec(package) is None:
-            raise ConfigError(
-                f"{path}: provider.kind {site.provider.kind} needs {package}: pip install 'mjx-tt[{extra}]'"
-            )
+    if importlib.util.find_spec("parsl") is None:
+        raise ConfigError(f"{path}: provider.kind {site.provider.kind} needs parsl: pip install 'mjx-tt[cluster]'")
     return site

@@ -1,4 +1,4 @@
-"""Common face of the engines that do jobs, and the order in which jobs are given to them.
+"""Jobs and their order, and the engine that does them.
 
 A job is known by its name and does what follows from files: killed at any moment and given again, it goes on from what
 it left. The process that was asked decides what is next and records what has ended; workers only do what they are told,
@@ -9,20 +9,22 @@ from __future__ import annotations
 
 import importlib
 import os
-import signal
-import threading
+import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
-from typing import Any, Protocol
+from typing import Any
 
+from experiments.jobs import worker
+from experiments.jobs.heartbeat import Heartbeat
+from experiments.jobs.worker import Stopped, sigterm_interrupts
 from mjx_tt import platform
 
 POLL = 0.5  # [s] between looks at whether a stop was asked for, and at which programs are compiled
+SAVING = 600.0  # [s] for jobs to save when they are asked to stop: a compilation comes first
+FOLDER = ".jobs"  # of the heartbeat and of Parsl's logs, in that of the results
 
 
 @dataclass(frozen=True)
@@ -67,36 +69,80 @@ class Job:
     compiled: Path | None = None
 
 
-@dataclass(frozen=True)
-class Stopped:
-    """Result of a job that saved what it had because it was asked to stop; ``text`` says what."""
-
-    text: str
-
-
-class JobEngine(Protocol):
-    """Workers that do jobs.
+class Engine:
+    """Does jobs in workers, which see this process's heartbeat. ``engines`` has the two kinds.
 
     slots: jobs that it takes at a time
+    replaces: another worker goes on with the job of one that was ended
+
+    Args:
+        setup: preparation of each worker.
+        folder: that of the results, which all hosts see at the same path.
     """
 
     slots: int
+    replaces: bool
+
+    def __init__(self, setup: Setup, folder: Path) -> None:
+        self._heartbeat, self._failed = Heartbeat(folder.absolute() / FOLDER), False
+        self._session = worker.Session(setup.prepared, str(self._heartbeat.folder), str(Path.cwd()), self.replaces)
+
+    def _call(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Result of the function in a worker."""
+        raise NotImplementedError
+
+    def _explain(self, job: Job, error: BaseException) -> BaseException:
+        """A job's error in words for the person who gave it, where it is not the job's own."""
+        raise NotImplementedError
+
+    def _end(self) -> None:
+        """Ends the workers."""
+        raise NotImplementedError
 
     def submit(self, job: Job) -> Future[Any]:
         """Result of the job, or ``Stopped``. Raises nothing; the future raises what the job does, or RunError."""
+        result: Future[Any] = Future()
+
+        def settle(done: Future[Any]) -> None:
+            error = None if done.cancelled() else done.exception()
+            if error is not None:
+                self._failed = True
+                result.set_exception(self._explain(job, error))
+            else:
+                result.set_result(Stopped("") if done.cancelled() else done.result())
+
+        try:
+            done = self._call(worker.work, self._session, job.name, job.arguments)
+        except RuntimeError as error:  # of a pool whose process was killed in another job
+            done = Future()
+            done.set_exception(error)
+        done.add_done_callback(settle)
+        return result
 
     def check(self) -> None:
-        """Raises KeyboardInterrupt where a stop was asked for in another way than by Ctrl-C."""
+        """Raises KeyboardInterrupt where the file ``stop`` asks for it."""
+        if self._heartbeat.asked_to_stop():
+            raise KeyboardInterrupt
 
     def stop(self, running: Iterable[Future[Any]], at_once: bool) -> None:
-        """Asks the workers to save and to stop, and waits for them; ``at_once``: ends them as they are."""
+        """Asks the workers to save and to stop, and waits for those that have begun; ``at_once``: ends them."""
+        if at_once:
+            self._heartbeat.close(keep=True)
+            return
+        self._heartbeat.stop()
+        until = time.monotonic() + SAVING
+        while time.monotonic() < until and self._heartbeat.busy():
+            wait(running, 0.2)
+        wait(running, 1.0)  # results under way
 
     def close(self) -> None:
         """Ends the workers, which are idle."""
+        self._end()
+        self._heartbeat.close(keep=self._failed)
 
 
 def run(
-    engine: JobEngine,
+    engine: Engine,
     jobs: Sequence[Job],
     ended: Callable[[Job, Any], None],
     failed: Callable[[Job, Exception], None] | None = None,
@@ -157,7 +203,7 @@ def _filled(path: Path | None) -> bool:
     return path is not None and path.exists() and path.stat().st_size > 0
 
 
-def _stop(engine: JobEngine, running: dict[Future[Any], Job]) -> list[str]:
+def _stop(engine: Engine, running: dict[Future[Any], Job]) -> list[str]:
     """Texts of the jobs that were asked to save and stop. A second Ctrl-C does not wait for them."""
     try:
         engine.stop(running, at_once=False)
@@ -165,20 +211,3 @@ def _stop(engine: JobEngine, running: dict[Future[Any], Job]) -> list[str]:
         engine.stop(running, at_once=True)
     ends = [f.result() for f in running if f.done() and not f.cancelled() and f.exception() is None]
     return [end.text for end in ends if isinstance(end, Stopped) and end.text]
-
-
-@contextmanager
-def sigterm_interrupts() -> Iterator[None]:
-    """Inside, SIGTERM is a Ctrl-C, also for a worker's job."""
-    if threading.current_thread() is not threading.main_thread():  # where nobody may set handlers
-        yield
-        return
-
-    def interrupt(_number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -9,9 +9,8 @@ from pathlib import Path
 import jax
 
 from experiments.config.site import OWN, Site
-from experiments.jobs.engine import JobEngine, Setup
-from experiments.jobs.parsl_engine import ParslEngine
-from experiments.jobs.process_pool import ProcessPool
+from experiments.jobs.engine import Engine, Setup
+from experiments.jobs.engines import ParslEngine, PoolEngine
 
 
 @dataclass(frozen=True)
@@ -49,12 +48,12 @@ class Workers:
         kinds = "processes" if self.site is None else f"workers of {self.where}"
         return f"{self.count} {kind if self.count == 1 else kinds} at a time"
 
-    def engine(self, setup: Setup, folder: Path) -> JobEngine:
+    def engine(self, setup: Setup, folder: Path) -> Engine:
         """Starts them; ``folder`` is that of the results. Raises ConfigError where the site cannot be used."""
         cache = jax.config.values["jax_compilation_cache_dir"]
         if self.site is None:
-            return ProcessPool(replace(setup, cache=cache), self.processes, str(folder))
-        return ParslEngine(replace(setup, cache=self.site.cache or cache), self.site, self.where, folder)
+            return PoolEngine(replace(setup, cache=cache), folder, self.processes)
+        return ParslEngine(replace(setup, cache=self.site.cache or cache), folder, self.site, self.where)
 
 
 ALONE = Workers()

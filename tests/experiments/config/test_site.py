@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
-import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 import yaml
@@ -14,15 +11,11 @@ import yaml
 from experiments import cli
 from experiments.config import site
 from experiments.errors import ConfigError
-from experiments.jobs import parsl_engine
+from experiments.jobs import engines
 
 CORES = len(os.sched_getaffinity(0))
 SLURM = {"provider": {"kind": "slurm", "walltime": "01:30:00"}, "workers_per_node": 16}
 LOCAL = {"provider": {"kind": "local"}, "workers_per_node": 1}
-KUBERNETES = {
-    "provider": {"kind": "kubernetes", "image": "registry/mjx-tt:1", "volumes": {"runs": "/shared"}},
-    "workers_per_node": 4,
-}
 
 
 def write(folder, data):
@@ -41,7 +34,7 @@ def write(folder, data):
         ({"provider": {"kind": "slurm", "walltime": "1:00:00"}}, r"workers_per_node: expected .*, got nothing"),
         (
             SLURM | {"provider": {"kind": "slurn"}},
-            r"kind: expected .*'pbs'.*, got 'slurn'; did you mean 'slurm'",
+            r"kind: expected .*'local'.*, got 'slurn'; did you mean 'slurm'",
         ),
         (SLURM | {"provider": {"walltime": "01:00:00"}}, r"provider\.kind: expected .*, got nothing"),
         (SLURM | {"provider": {"kind": "slurm"}}, r"provider\.walltime: expected .*, got nothing"),
@@ -64,12 +57,8 @@ def write(folder, data):
         (LOCAL | {"workers_per_node": 4096}, rf"workers_per_node 4096 x cores_per_worker 1: .*at most {CORES}"),
         (LOCAL | {"blocks": 2}, r"blocks 2: .*allowed: 1 with provider\.kind local"),
         (
-            {**KUBERNETES, "provider": {"kind": "kubernetes", "image": "a"}},
-            r"volumes: expected .*, got nothing",
-        ),
-        (
-            {**KUBERNETES, "provider": {**KUBERNETES["provider"], "user": 1000}},
-            r"provider: user 1000 and group None are given together",
+            SLURM | {"provider": {"kind": "pbs", "walltime": "01:00:00"}},
+            r"kind: expected .*'slurm'.*, got 'pbs'",
         ),
         ("- slurm", r"a site is a mapping with the keys provider, workers_per_node"),
         ("provider: {kind: slurm", r"cluster\.yaml"),
@@ -110,78 +99,14 @@ def test_a_command_refuses_what_does_not_go_with_a_site(tmp_path, arguments, mes
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("data, absent, extra", [(SLURM, "parsl", "cluster"), (KUBERNETES, "kubernetes", "kubernetes")])
-def test_without_parsl_the_extra_is_named(tmp_path, monkeypatch, data, absent, extra):
+def test_without_parsl_the_extra_is_named(tmp_path, monkeypatch):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == absent else find(name, *a))
-    with pytest.raises(ConfigError, match=rf"needs {absent}: pip install 'mjx-tt\[{extra}\]'"):
-        site.load(write(tmp_path, data))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "parsl" else find(name, *a))
+    with pytest.raises(ConfigError, match=r"needs parsl: pip install 'mjx-tt\[cluster\]'"):
+        site.load(write(tmp_path, SLURM))
 
 
 def test_workers_of_a_host_see_accelerators_of_their_own(tmp_path):
     two = site.load(write(tmp_path, SLURM | {"workers_per_node": 2, "accelerators_per_worker": 2}))
-    assert parsl_engine.accelerators(two) == ["0,1", "2,3"]
-    assert parsl_engine.accelerators(site.load(write(tmp_path, SLURM))) == []
-
-
-def test_pbs_is_asked_for_cores_memory_and_time(tmp_path):
-    """By the script that Parsl's provider fills, where no PBS runs."""
-    provider = {"kind": "pbs", "walltime": "02:00:00", "queue": "long", "select": "ngpus=1", "options": ["-l fs=home"]}
-    data = {"provider": provider, "workers_per_node": 3, "cores_per_worker": 2, "memory_per_worker": 1.5, "blocks": 4}
-    loaded = site.load(write(tmp_path, data))
-    asked = parsl_engine.provider(loaded)
-    assert (asked.cpus_per_node, asked.walltime, asked.queue, asked.max_blocks) == (6, "02:00:00", "long", 4)
-    assert asked.select_options == "mem=5gb:ngpus=1" and "#PBS -l fs=home" in asked.scheduler_options
-    assert loaded.workers == 12
-
-
-class Server(BaseHTTPRequestHandler):
-    """Keeps what is asked for, and answers as a Kubernetes API server that has accepted it."""
-
-    asked: list[tuple[str, dict]] = []
-
-    def do_POST(self) -> None:
-        body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        self.asked.append((self.path, body))
-        answer = json.dumps(body | {"status": {"phase": "Pending"}}).encode()
-        self.send_response(201)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(answer)))
-        self.end_headers()
-        self.wfile.write(answer)
-
-    def log_message(self, *_: object) -> None:
-        pass
-
-
-@pytest.mark.slow
-def test_kubernetes_is_asked_for_pods_of_that_size(tmp_path, monkeypatch):
-    """By the request that the Kubernetes client sends; the server is ours, no cluster starts the pod."""
-    import kubernetes.config.kube_config as kube_config
-
-    server = HTTPServer(("127.0.0.1", 0), Server)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    kubeconfig = {
-        "apiVersion": "v1",
-        "kind": "Config",
-        "current-context": "here",
-        "clusters": [{"name": "here", "cluster": {"server": f"http://127.0.0.1:{server.server_port}"}}],
-        "contexts": [{"name": "here", "context": {"cluster": "here", "user": "me"}}],
-        "users": [{"name": "me", "user": {}}],
-    }
-    (tmp_path / "config").write_text(yaml.safe_dump(kubeconfig))
-    monkeypatch.setattr(kube_config, "KUBE_CONFIG_DEFAULT_LOCATION", str(tmp_path / "config"))
-    data = {**KUBERNETES, "accelerators_per_worker": 1, "memory_per_worker": 2.5, "cores_per_worker": 2}
-    try:
-        parsl_engine.provider(site.load(write(tmp_path, data))).submit("true", 1)
-    finally:
-        server.shutdown()
-        server.server_close()
-    ((path, pod),) = Server.asked
-    assert path.startswith("/api/v1/namespaces/default/pods")
-    (container,) = pod["spec"]["containers"]
-    assert container["image"] == "registry/mjx-tt:1"
-    assert container["resources"]["limits"] == {"cpu": "8.0", "memory": "10Gi", "nvidia.com/gpu": "4"}
-    assert container["resources"]["requests"] == container["resources"]["limits"]
-    assert [mount["mountPath"] for mount in container["volumeMounts"]] == ["/shared"]
-    assert pod["spec"]["volumes"] == [{"name": "runs", "persistentVolumeClaim": {"claimName": "runs"}}]
+    assert engines.accelerators(two) == ["0,1", "2,3"]
+    assert engines.accelerators(site.load(write(tmp_path, SLURM))) == []

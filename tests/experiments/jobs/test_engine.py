@@ -19,7 +19,7 @@ from experiments.config import site
 from experiments.errors import RunError
 from experiments.jobs import engine
 from experiments.jobs.engine import Job, Setup
-from experiments.jobs.signs import OWNER, STOP, Owner
+from experiments.jobs.heartbeat import HEARTBEAT, STOP, Heartbeat
 from experiments.jobs.site import Workers
 from tests.support import one_node_slurm
 from tests.support.paths import ROOT
@@ -108,33 +108,33 @@ def test_jobs_wait_for_what_they_come_after_and_for_their_programs_first(tmp_pat
     assert ready([b, c], [], {"p"}) == "bc"
 
 
-def test_signs_of_a_dead_process_are_taken_away_and_those_of_a_living_one_stay(tmp_path):
-    living = Owner(tmp_path)
+def test_heartbeats_of_dead_processes_are_removed_and_those_of_a_living_one_stay(tmp_path):
+    living = Heartbeat(tmp_path)
     dead = tmp_path / "1234-0"
     (dead / "doing").mkdir(parents=True)
-    (dead / OWNER).write_text("17")
-    other = Owner(tmp_path)
+    (dead / HEARTBEAT).write_text("17")
+    other = Heartbeat(tmp_path)
     assert living.folder.exists() and not dead.exists()
     (living.folder / STOP).touch()
     assert living.asked_to_stop() and not other.asked_to_stop()
     living.stop()
-    assert (living.folder / OWNER).read_text().strip() == "stop"
+    assert (living.folder / HEARTBEAT).read_text().strip() == "stop"
     living.close(keep=False)
     other.close(keep=True)
     assert [path.name for path in tmp_path.iterdir()] == [other.folder.name]
-    assert not (other.folder / OWNER).exists(), "its workers end"
+    assert not (other.folder / HEARTBEAT).exists(), "its workers end"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gone, status, said", [(True, 1, ""), (False, 0, "saved")])
-def test_a_worker_ends_when_nobody_waits_for_it_and_saves_when_signs_stay_away(gone, status, said, tmp_path):
+def test_a_worker_ends_when_nobody_waits_for_it_and_saves_when_the_heartbeat_stays_away(gone, status, said, tmp_path):
     code = """
 import sys, time
 from pathlib import Path
-from experiments.jobs import signs
-from experiments.jobs.engine import sigterm_interrupts
-signs.BEAT, signs.SILENCE = 0.5, 2.0
-watch = signs.Watch(Path(sys.argv[1]))
+from experiments.jobs import heartbeat
+from experiments.jobs.worker import sigterm_interrupts
+heartbeat.PERIOD, heartbeat.TIMEOUT = 0.5, 2.0
+watch = heartbeat.Watchdog(Path(sys.argv[1]))
 try:
     with watch.doing("a/b"), sigterm_interrupts():
         time.sleep(60.0)
@@ -142,11 +142,11 @@ except KeyboardInterrupt:
     print("saved")
 """
     (tmp_path / "doing").mkdir()
-    (tmp_path / OWNER).write_text("17")
+    (tmp_path / HEARTBEAT).write_text("17")
     worker = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     wait_for(lambda: (tmp_path / "doing" / "a_b").exists())
     if gone:
-        (tmp_path / OWNER).unlink()
+        (tmp_path / HEARTBEAT).unlink()
     assert (worker.communicate(timeout=60)[0].strip(), worker.returncode) == (said, status)
 
 
@@ -183,7 +183,9 @@ def test_an_error_stops_all_or_costs_its_own_job_alone(kind, tmp_path):
 
 @pytest.mark.slow
 @needs_two
-@pytest.mark.parametrize("kind, how", [("pool", "SIGINT"), ("pool", "SIGTERM"), ("parsl", "SIGINT"), ("parsl", STOP)])
+@pytest.mark.parametrize(
+    "kind, how", [("pool", "SIGINT"), ("pool", "SIGTERM"), ("parsl", "SIGINT"), ("parsl", STOP)]
+)
 def test_a_stop_lets_the_jobs_save(kind, how, tmp_path):
     given = str(site_file(tmp_path)) if kind == "parsl" else None
     deeds = {"a": "long", "b": "long", "c": ""}
@@ -288,7 +290,7 @@ def test_a_batch_killed_and_resumed_by_parsl_has_the_pools_bits(by_the_pool, tmp
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stdout + done.stderr
     assert_equal(runs, by_the_pool)
-    assert not list((tmp_path / ".jobs").iterdir()), "neither the killed session's signs nor this one's are left"
+    assert not list((tmp_path / ".jobs").iterdir()), "neither the killed session's heartbeat nor this one's is left"
 
 
 def kill_the_worker_of(run: Path) -> int:

@@ -11,7 +11,7 @@ import pytest
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
-from experiments.baselines.arena import COLUMNS, ROWS, Arena
+from experiments.baselines.judge import COLUMNS, ROWS, World
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.make import load_policy
 from mjx_tt.env.rollout import Simulator
@@ -63,10 +63,10 @@ def test_a_ball_keeps_its_spin_beside_others(world, policy, pools):
     assert np.abs(together.landing - straight.landing).max() > 0.05  # spin matters here
 
 
-def test_the_arena_throws_the_balls_as_they_are(world, pools):
-    arena = Arena(TASK, ModelFile(world))
+def test_a_comparison_throws_the_balls_as_they_are(world, pools):
+    played = World(TASK, ModelFile(world))
     many = ROWS * COLUMNS
     wide = jax.tree.map(lambda x: jnp.resize(x, (*x.shape[:-1], many)) if x.shape[-1:] == (N,) else x, pools[0])
-    drawn = arena._draw(wide, jax.random.key(1)).ball
+    drawn = played.draw(wide, jax.random.key(1)).ball
     np.testing.assert_array_equal(np.asarray(drawn.spin).reshape(3, -1), np.asarray(wide.state.spin))
     np.testing.assert_array_equal(np.asarray(drawn.position).reshape(3, -1), np.asarray(wide.state.position))

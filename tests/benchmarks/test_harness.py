@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.worker import Worker, WorkerError
+from benchmarks.harness import Worker, WorkerError
 
 
 def test_a_side_is_ended_at_its_limit():
