@@ -20,7 +20,8 @@ from jax.sharding import PartitionSpec
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
 from mjx_tt import platform
-from mjx_tt.env import own
+from mjx_tt.env import user_defined
+from mjx_tt.env.network import Network
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
@@ -41,8 +42,8 @@ def main(arguments: list[str] | None = None) -> int:
     simulator = Simulator(TaskConfig(sim_rate=150.0), chosen.devices)
     model = SimModel()
     pool = sample_pool(jax.random.key(0), registry.resolve("player3/M0"), model.ball, 4096)
-    networks: dict[str, own.Network | None] = {"the paper's": None}
-    networks |= own.load(chosen.definitions.read_text(encoding="utf-8"), str(chosen.definitions)).networks
+    networks: dict[str, Network | None] = {"the paper's": None}
+    networks |= user_defined.load(chosen.definitions.read_text(encoding="utf-8"), str(chosen.definitions)).networks
     calls = {name: prepared(simulator, network, pool, model) for name, network in networks.items()}
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(ROUNDS):
@@ -59,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def prepared(simulator: Simulator, network: own.Network | None, pool: object, model: SimModel) -> Callable[[], None]:
+def prepared(simulator: Simulator, network: Network | None, pool: object, model: SimModel) -> Callable[[], None]:
     """One rollout of COLUMNS random policies, compiled and called once."""
     key = jax.random.key(1)
     size = n_parameters() if network is None else network.size

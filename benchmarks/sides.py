@@ -19,8 +19,8 @@ if TYPE_CHECKING:  # a side without JAX does not load it
     from jax import Array
 
     from experiments.training.update import Trainer, TrainState
+    from mjx_tt.env.episode import Episodes
     from mjx_tt.env.rollout import RolloutResult
-    from mjx_tt.env.task import Episodes
 
     State: TypeAlias = tuple[Array, Array]  # qpos, qvel
 
@@ -56,7 +56,7 @@ def _jax_engine(name: str, lanes: int, chunks: int, steps: int, by_lanes: bool =
 
     from mjx_tt.env.task import Task, TaskConfig
     from mjx_tt.lanes.loop import while_any
-    from mjx_tt.robot.scalar_algebra import materialise
+    from mjx_tt.robot.scalar_algebra import optimization_barrier
 
     task = Task(TaskConfig(engine=name, sim_rate=SIM_RATE))
     devices = jax.devices()
@@ -64,7 +64,7 @@ def _jax_engine(name: str, lanes: int, chunks: int, steps: int, by_lanes: bool =
 
     def period(tick: Array, state: tuple[Array, State], controls: Array, _: tuple) -> tuple[Array, State]:
         def step(_: int, s: State) -> State:
-            return materialise(task.engine.step(*s, control))
+            return optimization_barrier(task.engine.step(*s, control))
 
         control = jax.lax.dynamic_index_in_dim(controls, tick, keepdims=False)
         return state[0], jax.lax.fori_loop(0, SUBSTEPS, step, state[1])

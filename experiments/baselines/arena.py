@@ -12,9 +12,9 @@ import numpy as np
 from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
-from mjx_tt.env.episode import reshaped
+from mjx_tt.env.episode import Controller, Episodes, EpisodeState, Tick, reshape_episodes
 from mjx_tt.env.rollout import RolloutResult, Simulator
-from mjx_tt.env.task import Controller, Episodes, EpisodeState, TaskConfig, Tick
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import ModelFile
 
 ROWS, COLUMNS = 2, 256  # episodes of one compiled call
@@ -73,12 +73,12 @@ class Arena:
 
     def _action_change(self, controller: Controller, balls: BallPool, key: jax.Array) -> jax.Array:
         task, episodes = self._simulator.task, self._draw(balls, key)
-        episodes = reshaped(episodes, -1)
-        prepared, remembered = task.prepare(episodes), Remembered(controller, controller.mean)
+        episodes = reshape_episodes(episodes, -1)
+        constants, remembered = task.prepare(episodes), Remembered(controller, controller.mean)
 
         def advance(carry: Carry, tick: Tick) -> tuple[Carry, None]:
             state, total, count = carry
-            after = task.control_step(tick, state, episodes, prepared, remembered)
+            after = task.step(tick, state, episodes, constants, remembered)
             counted = (state.live & (tick > 0)).astype(total.dtype)
             change = jnp.mean((after.controller[1] - state.controller[1]) ** 2, axis=0)
             return (after, total + jnp.sum(counted * change), count + jnp.sum(counted)), None

@@ -15,7 +15,7 @@ from brax.training.types import Params, Policy, Transition
 from jax.typing import ArrayLike
 
 from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis, flatten
-from mjx_tt.env.task import Controller, Tick
+from mjx_tt.env.episode import Controller, Tick
 from robot_io.contract import HISTORY
 
 # Sums over the episodes that ended within a call of ``advance``, scalars on the device; "steps": control steps.

@@ -12,11 +12,11 @@ from experiments.config.experiment import Config, Rewards, apply_override, read_
 from experiments.config.optimiser import Constant, EliteFraction, EmaDecay, NumDirections, Optimiser, Shaping, Step
 from experiments.config.section import Count, Seed
 from experiments.errors import ConfigError
+from mjx_tt.env.reward_weights import MEASURED_WEIGHTS, SIM_WEIGHTS
 
 # Policies by first-order gradients return a third of their balls where the paper's sigma moves them, and learn from
 # that where to go (docs/results/fine-tuning.md).
 NEAR = {"sigma": 0.01, "step.learning_rate": 0.0015}
-MEASURED = ("state_transition", "net_clearance", "hit_and_land", "fault")  # terms that a real episode tells
 
 
 class FineTuning(Shaping):
@@ -86,11 +86,14 @@ def _check_rewards(rewards: str | Rewards, where: str) -> None:
     if isinstance(rewards, str) or rewards.base == "sim":
         raise ConfigError(
             f"{where}: rewards: the weights for simulation ask for terms that a robot does not measure; "
-            f"base them on real and weigh only {', '.join(MEASURED)}"
+            f"base them on real and weigh only {', '.join(MEASURED_WEIGHTS)}"
         )
-    for name, weight in rewards.model_dump(exclude={"base"}, exclude_none=True).items():
-        if weight and name not in MEASURED:
+    for name, weight in rewards.changed.items():
+        if name not in SIM_WEIGHTS:
+            allowed = f"{validation.nearest(name, SIM_WEIGHTS)}allowed: {', '.join(MEASURED_WEIGHTS)}"
+            raise ConfigError(f"{where}: rewards.{name}: unknown reward term; {allowed}")
+        if weight and name not in MEASURED_WEIGHTS:
             raise ConfigError(
                 f"{where}: rewards.{name} = {weight}: not measured on a robot, must be 0; "
-                f"terms with a weight: {', '.join(MEASURED)}"
+                f"terms with a weight: {', '.join(MEASURED_WEIGHTS)}"
             )

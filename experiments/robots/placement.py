@@ -28,7 +28,7 @@ from ballmodel.sampling import sample_pool
 from experiments.config import build
 from experiments.errors import ConfigError
 from experiments.robots.reach import blade
-from mjx_tt.env import rewards
+from mjx_tt.env.task import TARGET
 from mjx_tt.robot import robot as robots
 from mjx_tt.robot.kinematics import PaddleKinematics
 from mjx_tt.robot.robot import Robot
@@ -127,7 +127,7 @@ def meetings(robot: Robot, balls: Balls, samples: int, seed: int) -> Meetings:
     index = np.array([ticks for _, ticks in some])
     ball = np.array([number for number, _ in some])[:, None]
     where, arriving = position[index, :, ball], velocity[index, :, ball]
-    target = np.array([*rewards.TARGET, 0.0])
+    target = np.array([*TARGET, 0.0])
     leaving = (target - where) / RETURN_SECONDS + np.array([0.0, 0.0, 0.5 * GRAVITY * RETURN_SECONDS])
     change = leaving - arriving
     return Meetings((index + 1) * STEP, where, change / np.linalg.norm(change, axis=-1, keepdims=True))

@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 
 from bgs import normalizer, strategy
 from experiments.training.update import Inputs, Trainer, TrainState
-from mjx_tt.env.episode import reshaped
+from mjx_tt.env.episode import reshape_episodes
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import AXIS
 from mjx_tt.gradient.objective import Objective, Played
@@ -41,7 +41,7 @@ class FirstOrderTrainer(Trainer):
         population = strategy.ask(direction_key, state.bgs, config)
         shape = (self._repeats, 2 * config.num_directions)
         episodes = self._draw(episode_key, inputs, *shape)
-        mine = reshaped(simulator.local(episodes), -1)
+        mine = reshape_episodes(simulator.local(episodes), -1)
         mean, inv_std = normalizer.normaliser(state.statistics)
 
         def cost(members: jax.Array) -> tuple[jax.Array, Played]:

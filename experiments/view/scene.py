@@ -13,7 +13,7 @@ from mjviser import ViserMujocoScene
 
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from experiments.view.film import RATE, Film
-from mjx_tt.env.outgoing_ball import FLOOR
+from mjx_tt.env.return_flight import FLOOR
 from mjx_tt.robot.model import PADDLE_SITE
 from mjx_tt.robot.robot import Robot
 

@@ -19,9 +19,9 @@ from jax import Array
 from jaxtyping import Bool, Float, PRNGKeyArray
 
 from ballmodel.sampling import BallPool
+from mjx_tt.env.episode import RETURNED, Episodes, Tick
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import AXIS, RESULT_SPECS, RolloutResult, Simulator
-from mjx_tt.env.task import RETURNED, Episodes, Tick
 from mjx_tt.sim.model import SimModel
 
 BATCH = 32  # balls searched at a time
@@ -143,7 +143,7 @@ def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Bool
             knots.reshape(KNOTS, n, -1),
             jnp.tile(duration, CANDIDATES)[None],
             simulator.config.period,
-            jnp.zeros(contract.n_observation),
+            jnp.zeros(simulator.config.n_observation),
         )
         result = simulator.play(controller, many)
         score = jnp.nan_to_num(result.returns, nan=-1e3).reshape(CANDIDATES, mine)

@@ -19,7 +19,7 @@ from ballmodel import constants as c
 from ballmodel import flight
 from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
-from mjx_tt.env.outgoing_ball import FLOOR
+from mjx_tt.env.return_flight import FLOOR
 from mjx_tt.lanes.loop import while_any
 from mjx_tt.rally.human_player import OVER_TABLE, Incoming
 from robot_io.contract import LIMITS, JointLimits

@@ -189,7 +189,7 @@ def matrix(values: ArrayLike) -> ConstantMatrix:
     return vector(x), vector(y), vector(z)
 
 
-def materialise(tree: T) -> T:
+def optimization_barrier(tree: T) -> T:
     """The same nested scalars, with every array of it computed once and stored.
 
     Left alone, the compiler fuses a whole recursion into each of its results and computes shared terms again for every
@@ -198,6 +198,6 @@ def materialise(tree: T) -> T:
     leaves, structure = jax.tree.flatten(tree)
     arrays = [i for i, leaf in enumerate(leaves) if not isinstance(leaf, float)]
     if arrays:
-        for i, stored in zip(arrays, jax.lax.optimization_barrier([leaves[i] for i in arrays]), strict=True):
-            leaves[i] = stored
+        for i, kept in zip(arrays, jax.lax.optimization_barrier([leaves[i] for i in arrays]), strict=True):
+            leaves[i] = kept
     return jax.tree.unflatten(structure, leaves)

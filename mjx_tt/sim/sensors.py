@@ -65,13 +65,13 @@ class Camera:
     rows: tuple[tuple[Scalars, Scalars, Scalars], ...]  # 3 x 3, camera_scale Rz Ry Rx
     distortion: Scalars  # [1/m^2]
 
-    def seen(self, p: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
+    def project(self, p: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
         """Measured position (3, ...) [m] of a ball at p (3, ...) [m], without offset and noise."""
         p = p * row(1.0 + self.distortion * dot(p, p))
         return jnp.stack([dot(row, p) for row in self.rows])
 
 
-def camera(params: SensingParams) -> Camera | None:
+def make_camera(params: SensingParams) -> Camera | None:
     """The camera of these parameters; None where all of them are omitted."""
     names = ("camera_scale", *(f"camera_rotation_{axis}" for axis in "xyz"), "camera_distortion")
     values = [getattr(params, name) for name in names]
@@ -89,7 +89,7 @@ def camera(params: SensingParams) -> Camera | None:
     return Camera(tuple((scale * a, scale * b, scale * c) for a, b, c in rotation), distortion)
 
 
-def smoothed(
+def step_smoothing(
     time_constant: Scalars,
     filtered: Float[Array, "3 *batch"],
     before: Float[Array | np.ndarray, "3 *batch"],
@@ -126,7 +126,7 @@ class Lag:
     covariance: Covariance
 
     @classmethod
-    def settled(cls, dt: Scalars, memory: Scalars, like: Float[Array | np.ndarray, "3 *batch"]) -> Lag:
+    def settle(cls, dt: Scalars, memory: Scalars, like: Float[Array | np.ndarray, "3 *batch"]) -> Lag:
         """A filter that has watched a flight, measured every ``dt`` [s]: no lag. memory [s]."""
         zero = jnp.zeros_like(like)
         h = jnp.broadcast_to(dt / _shown(memory, dt), zero.shape[1:])
@@ -136,12 +136,12 @@ class Lag:
             covariance = _measured(grown, _gains(grown))
         return cls(zero, zero, zero, covariance)
 
-    def predicted(self, dt: Scalars, jump: Float[Array, "3 *batch"], since: Scalars) -> Lag:
+    def predict(self, dt: Scalars, jump: Float[Array, "3 *batch"], since: Scalars) -> Lag:
         """The lag after ``dt`` [s] without a measurement; jump: of the ball's velocity [m/s], ``since`` [s] ago."""
         moved = self.position + row(dt) * self.velocity + row(0.5 * dt**2) * self.acceleration - row(since) * jump
         return Lag(moved, self.velocity + row(dt) * self.acceleration - jump, self.acceleration, self.covariance)
 
-    def corrected(
+    def correct(
         self, dt: Scalars, usual: Scalars, memory: Scalars, gate: Scalars, blur: float | Array = SURPRISE
     ) -> Lag:
         """The lag after a measurement, ``dt`` [s] after the one before. memory [s], zero: no lag; gate [m].
@@ -220,17 +220,17 @@ class Filters:
     lag: Lag | None
 
     @classmethod
-    def at(cls, params: SensingParams, position: Float[Array | np.ndarray, "3 *batch"], timestep: float) -> Filters:
+    def settle(cls, params: SensingParams, position: Float[Array | np.ndarray, "3 *batch"], timestep: float) -> Filters:
         """Filters that have settled on a position [m], with a substep of ``timestep`` [s]."""
-        lag = None if params.filter_time is None else Lag.settled(timestep, params.filter_time, position)
+        lag = None if params.filter_time is None else Lag.settle(timestep, params.filter_time, position)
         return cls(None if params.smoothing is None else position, lag)
 
-    def seen(self, position: Float[Array | np.ndarray, "3 *batch"]) -> Float[Array | np.ndarray, "3 *batch"]:
+    def see(self, position: Float[Array | np.ndarray, "3 *batch"]) -> Float[Array | np.ndarray, "3 *batch"]:
         """The position [m] that the filters make of one."""
         seen = position if self.smooth is None else self.smooth
         return seen if self.lag is None else seen + self.lag.position
 
-    def stepped(
+    def step(
         self,
         params: SensingParams,
         before: BallState,
@@ -242,11 +242,11 @@ class Filters:
         """The filters a substep later. contact: True where something struck the ball in it, ``since`` [s] ago."""
         smooth, lag = self.smooth, self.lag
         if smooth is not None and params.smoothing is not None:
-            smooth = smoothed(params.smoothing, jnp.asarray(smooth), before.position, after.position, timestep)
+            smooth = step_smoothing(params.smoothing, jnp.asarray(smooth), before.position, after.position, timestep)
         if lag is not None and params.filter_time is not None:
             struck = jnp.where(contact, jump(before.velocity, after.velocity, timestep), 0.0)
             gate = value_or(params.filter_gate, FILTER_GATE)
-            lag = lag.predicted(timestep, struck, jnp.where(contact, since, 0.0)).corrected(
+            lag = lag.predict(timestep, struck, jnp.where(contact, since, 0.0)).correct(
                 timestep, timestep, params.filter_time, gate
             )
         return Filters(smooth, lag)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ballmodel.state import BallState
-from mjx_tt.env.task import HIT, MISSED, RETURNED
+from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.rally.ball_flights import Meeting, Sent
 from mjx_tt.rally.end_reasons import End, ending
 from mjx_tt.rally.human_player import Incoming

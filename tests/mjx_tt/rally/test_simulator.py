@@ -15,9 +15,10 @@ from ballmodel.flight import ball_params
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import sample_pool
 from ballmodel.state import BallState
+from mjx_tt.env.episode import MISSED, RETURNED, Episodes
 from mjx_tt.env.policy import Policy, PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import MISSED, RETURNED, Episodes, TaskConfig
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.rally import human_player
 from mjx_tt.rally.ball_flights import Sent, homeward, meeting
 from mjx_tt.rally.end_reasons import ROWS, End, ending
