@@ -103,7 +103,7 @@ def _walk(mistake: ErrorDetails, model: type[BaseModel]) -> tuple[str, type[Base
         elif holder:
             path, owner = f"{path}.{part}", holder
             candidates = _members(holder.model_fields[part].annotation)
-        elif sections and sections[0].model_config.get("extra") == "allow":
+        elif len(candidates) == 1 and sections and sections[0].model_config.get("extra") == "allow":
             path, candidates = f"{path}.{part}", []
         elif mistake["type"] == "extra_forbidden" and sections:
             path, owner = f"{path}.{part}", sections[0]

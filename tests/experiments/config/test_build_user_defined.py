@@ -191,7 +191,6 @@ def test_code_is_not_packed(trained, capsys):
             "rewards.calm_wrist: unknown reward term; allowed: .*the key definitions",
         ),
         ({"task.observations": "{speed: 1}"}, "observations: speed is not defined; allowed: none is defined"),
-        ({"task.observations": "{speed: 1}", "network": "null"}, "observations: speed: the paper's network takes ball"),
     ],
 )
 def test_mistakes_in_the_yaml_are_named(folder, changes, says):
@@ -213,5 +212,7 @@ def test_the_pages_observation_term_is_seen_by_a_network_of_its_size(folder, tmp
     (tmp_path / "my_task.py").write_text(text.replace(smaller, larger))
     experiment = build.experiment(config.load(folder / "my_task.yaml", overrides), "my_task.yaml")
     last = experiment.task.observations[-1]
+    with pytest.raises(ConfigError, match="observations: last_command: the paper's network takes ball and joints only"):
+        build.experiment(config.load(folder / "my_task.yaml", (*overrides, "network=null")), "my_task.yaml")
     assert (last.name, last.weight, experiment.task.n_observation) == ("last_command", 0.1, 19)
     assert experiment.network.size == 968 + 36 * 8

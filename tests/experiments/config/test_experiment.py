@@ -133,13 +133,13 @@ def test_a_mistake_is_named_with_file_path_and_hint(path, value, place, hint):
 
 @pytest.mark.parametrize(
     "path, value",
-    [("training.later_rewards", {"after": 0.5, "rewards": "real"}), ("task.rewards", {"own": {"mine": 1.0}})],
+    [("training.later_rewards", {"after": 0.5, "rewards": "real"}), ("task.rewards", {"mine": 1.0})],
 )
 def test_first_order_gradients_refuse_rewards_that_they_do_not_climb(path, value):
     data = with_value(path, value)
     data["optimiser"] = {"gradient": "first_order"}
     text = complaint(data)
-    assert f"{path.replace('task.rewards', 'task.rewards.own')}: optimiser.gradient first_order" in text
+    assert f"{path.replace('task.rewards', 'task.rewards.mine')}: optimiser.gradient first_order" in text
     assert "leave it out, or take gradient: zeroth_order" in text
 
 

@@ -262,21 +262,18 @@ def test_weights_and_ranges_are_the_papers():
 
 
 def test_a_further_observation_term_follows_the_contracts_rows():
-    """The command of the step before, scaled; the eleven rows before it are as without it."""
     further = (*CONTRACT_OBSERVATIONS, ObservationTerm("last_command", lambda sensed: sensed.command, 0.5))
     config = TaskConfig(sim_rate=75.0, observations=further)
     assert config.n_observation == 19
-    actions = np.random.default_rng(0).uniform(-1, 1, (6, N_JOINTS, 2))
-    hanging = episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(gravity=0.0, ball_noise=0.04), p=2)
-    records = [
-        play(Task(each), hanging, Script(jnp.asarray(actions), jnp.zeros(each.n_observation)), ticks=6)
-        for each in (config, TaskConfig(sim_rate=75.0))
-    ]
-    seen, plain = (record.controller for record in records)
-    before = np.concatenate([np.zeros((1, N_JOINTS, 2)), records[0].command[:-1]])
-    assert seen.shape == (6, 19, 2) and np.abs(before).max() > 0.1
-    np.testing.assert_allclose(seen[:, 11:], 0.5 * before, rtol=1e-6)
-    np.testing.assert_array_equal(seen[:, :11], plain)
+    hanging = episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(), p=2)
+    each, command = Task(config), np.random.default_rng(0).normal(size=(N_JOINTS, 2))
+    state = each.reset(hanging, Script(jnp.zeros((1, N_JOINTS, 2)), jnp.zeros(19)))
+    np.testing.assert_array_equal(state.controller[11:], 0.0)  # nothing was commanded before the first step
+    state = replace(state, command=jnp.asarray(command, jnp.float32))
+    seen = each.observe(1, state, hanging, each.prepare(hanging))
+    np.testing.assert_allclose(seen[:3], [[0.0] * 2, [1.0] * 2, [0.5] * 2], atol=1e-6)
+    np.testing.assert_allclose(seen[3:11], np.broadcast_to(each.home[:, None], (N_JOINTS, 2)), atol=1e-6)
+    np.testing.assert_allclose(seen[11:], 0.5 * command, rtol=1e-6)
 
 
 def test_ball_noise_is_two_diameters_wide_and_the_joints_have_none(flailing):

@@ -128,8 +128,8 @@ GOOD = "import jax.numpy as jnp\nfrom mjx_tt import network, observation_term, r
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("def f(:\n", r"my.py: line 1: invalid syntax"),
-        (GOOD + "import nothing_of_that_name\n", r"my.py: line 3: ModuleNotFoundError: No module named 'nothing_of"),
+        ("def f(:\n", r"line 1: invalid syntax"),
+        (GOOD + "import nothing_of_that_name\n", r"line 3: ModuleNotFoundError: No module named 'nothing_of"),
         (GOOD, "defines nothing"),
         (
             GOOD + "@reward_term('style')\ndef f(step):\n    return 0.0\n",
