@@ -14,6 +14,7 @@ from ballmodel import constants as c
 from ballmodel.partial_params import optional, value_or
 from ballmodel.state import BallState
 from ballmodel.vec import Scalars, dot, row
+from mjx_tt.sim.constant_acceleration import correct_covariance, predict_covariance
 
 SHORTEST = 1e-9  # [s], keeps the filters' exponents finite
 FILTER_GATE = 0.03  # [m]: ten deviations of a usual tracker's noise
@@ -103,10 +104,6 @@ def step_smoothing(
     return jnp.asarray(after) - behind + (filtered - before + behind) * jnp.exp(-timestep / tau)
 
 
-# xx, xv, xa, vv, va, aa; unit of length: the deviation of the measurements' noise, of time: the memory
-Covariance = Float[Array, "6 *batch"]
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Lag:
@@ -123,7 +120,8 @@ class Lag:
     position: Float[Array, "3 *batch"]  # [m]
     velocity: Float[Array, "3 *batch"]  # [m/s]
     acceleration: Float[Array, "3 *batch"]  # [m/s^2]
-    covariance: Covariance
+    # of ``constant_acceleration``; unit of length: the deviation of the measurements' noise, of time: the memory
+    covariance: Float[Array, "6 *batch"]
 
     @classmethod
     def settle(cls, dt: Scalars, memory: Scalars, like: Float[Array | np.ndarray, "3 *batch"]) -> Lag:
@@ -132,8 +130,8 @@ class Lag:
         h = jnp.broadcast_to(dt / _shown(memory, dt), zero.shape[1:])
         covariance = jnp.asarray(row(h) * jnp.stack([jnp.full_like(h, x) for x in SETTLED]))
         for _ in range(ROUNDS):
-            grown = _grown(covariance, h, h)
-            covariance = _measured(grown, _gains(grown))
+            _, after = correct_covariance(predict_covariance(tuple(covariance), h, h), 1.0)
+            covariance = jnp.stack(after)
         return cls(zero, zero, zero, covariance)
 
     def predict(self, dt: Scalars, jump: Float[Array, "3 *batch"], since: Scalars) -> Lag:
@@ -153,55 +151,25 @@ class Lag:
         surprise = jnp.sqrt(dot(self.position, self.position) + SHORTEST**2)
         share = jnp.clip(0.5 - 0.5 * (surprise - gate) / (SOFTNESS * blur), 0.0, 1.0)
         shut = share * share * (3.0 - 2.0 * share)  # of balls whose filter did not open
-        grown = _grown(self.covariance, dt / time, h)
-        opened = jnp.stack([grown[0] + FRESH, *grown[1:3], grown[3] + FRESH / h**2, grown[4], grown[5] + FRESH / h**4])
-        gains = [shut * a + (1.0 - shut) * b for a, b in zip(_gains(grown), _gains(opened), strict=True)]
-        mixed = row(shut) * _measured(grown, _gains(grown)) + row(1.0 - shut) * _measured(opened, _gains(opened))
+        # The noise's variance and the memory are the units: the jerk's density is the usual interval.
+        grown = predict_covariance(tuple(self.covariance), dt / time, h)
+        xx, xv, xa, vv, va, aa = grown
+        opened = xx + FRESH, xv, xa, vv + FRESH / h**2, va, aa + FRESH / h**4
+        (closed_gains, closed), (open_gains, wide) = (correct_covariance(each, 1.0) for each in (grown, opened))
+        gains = [shut * a + (1.0 - shut) * b for a, b in zip(closed_gains, open_gains, strict=True)]
+        mixed = jnp.stack([shut * a + (1.0 - shut) * b for a, b in zip(closed, wide, strict=True)])
         there = row(memory) > 0.0
         return Lag(
             jnp.where(there, row(1.0 - gains[0]) * self.position, 0.0),
             jnp.where(there, self.velocity - row(gains[1] / time) * self.position, 0.0),
             jnp.where(there, self.acceleration - row(gains[2] / time**2) * self.position, 0.0),
-            jnp.asarray(mixed),
+            mixed,
         )
 
 
 def _shown(memory: Scalars, usual: Scalars) -> Array:
     """The memory [s], where it is a share of the interval between measurements; below that no filter shows."""
     return jnp.maximum(memory, jnp.maximum(usual, SHORTEST) / LONGEST)
-
-
-def _grown(covariance: Covariance, h: Scalars, usual: Scalars) -> Covariance:
-    """The covariance before a measurement, ``h`` memories after the one before: F P F' + Q.
-
-    With the noise's variance and the memory as units the jerk's density is the usual interval, and
-    Q = usual h [h^4/20, h^3/8, h^2/6; ., h^2/3, h/2; ., ., 1].
-    """
-    xx, xv, xa, vv, va, aa = covariance
-    x0, x1, x2 = xx + h * xv + h**2 / 2.0 * xa, xv + h * vv + h**2 / 2.0 * va, xa + h * va + h**2 / 2.0 * aa
-    v1, v2 = vv + h * va, va + h * aa
-    return jnp.stack(
-        [
-            x0 + h * x1 + h**2 / 2.0 * x2 + usual * h**5 / 20.0,
-            x1 + h * x2 + usual * h**4 / 8.0,
-            x2 + usual * h**3 / 6.0,
-            v1 + h * v2 + usual * h**3 / 3.0,
-            v2 + usual * h**2 / 2.0,
-            aa + usual * h,
-        ]
-    )
-
-
-def _gains(grown: Covariance) -> Array:
-    """Gains (3, ...) of position, velocity and acceleration: P H' / (H P H' + 1)."""
-    return jnp.asarray(grown[:3] / row(grown[0] + 1.0))
-
-
-def _measured(grown: Covariance, gains: Array) -> Covariance:
-    """The covariance after a measurement: (1 - K H) P."""
-    k0, k1, k2 = gains
-    xx, xv, xa, vv, va, aa = grown
-    return jnp.stack([k0, (1.0 - k0) * xv, (1.0 - k0) * xa, vv - k1 * xv, va - k1 * xa, aa - k2 * xa])
 
 
 def jump(
