@@ -94,9 +94,9 @@ def mujoco_rollout(robots: int, steps: int, threads: int) -> Side:
     import mujoco
     from mujoco import rollout
 
-    from mjx_tt.robot import model as robot
+    from mjx_tt.robot import mjcf
 
-    model = robot.load_model()
+    model = mjcf.load_model()
     model.opt.timestep = 1.0 / SIM_RATE
     data = [mujoco.MjData(model) for _ in range(threads)]
     mujoco.mj_resetDataKeyframe(model, data[0], 0)
@@ -121,9 +121,9 @@ def mujoco_batch(robots: int, steps: int, threads: int) -> Side:
     import mujoco
     from mujoco import batch
 
-    from mjx_tt.robot import model as robot
+    from mjx_tt.robot import mjcf
 
-    model = robot.load_model()
+    model = mjcf.load_model()
     model.opt.timestep = 1.0 / SIM_RATE
     simulations = batch.Batch(model, nsim=robots, nthread=threads)
     control = simulations.bind("ctrl")

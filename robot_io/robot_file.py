@@ -15,7 +15,7 @@
       blade: [col_blade]
       pairs: [[col_base, col_blade]]
 
-NumPy and the standard library only, so that the robot's side may read it; ``mjx_tt.robot.robot`` adds the MJCF.
+NumPy and the standard library only, so that the robot's side may read it; ``mjx_tt.robot.robots`` adds the MJCF.
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ from mjx_tt.env.reward_weights import PRESETS
 from mjx_tt.env.task import CONTRACT_OBSERVATIONS, TaskConfig, weigh_rewards
 from mjx_tt.env.terms import ObservationTerm, RewardTerm
 from mjx_tt.env.user_defined import Definitions
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
 from mjx_tt.sim import model as models
 from mjx_tt.sim import randomisation
 from mjx_tt.sim.model import ModelFile, SimModel

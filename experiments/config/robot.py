@@ -28,7 +28,7 @@ from robot_io.ranges import is_number, outside
 
 if TYPE_CHECKING:  # a robot.yaml is read without JAX
     from ballmodel.registry import Balls
-    from mjx_tt.robot.robot import Robot
+    from mjx_tt.robot.robots import Robot
     from mjx_tt.sim.model import SimModel
 
 COMMISSIONING = 0.1  # speed_scale of a robot.yaml that sets none: full speed is asked for, not forgotten
@@ -56,9 +56,9 @@ def named(path: str | Path) -> str | None:
         return None
     if not isinstance(given, str):
         raise ConfigError(f"{path}: robot: got {_shown(given)}; allowed: a robot's name or folder")
-    from mjx_tt.robot import robot as simulated
+    from mjx_tt.robot import robots
 
-    return given if given in simulated.names() else str(Path(path).parent / given)
+    return given if given in robots.names() else str(Path(path).parent / given)
 
 
 def standing(path: str | Path) -> Contract:
@@ -66,9 +66,9 @@ def standing(path: str | Path) -> Contract:
     robot = named(path)
     if robot is None:
         return PAPER
-    from mjx_tt.robot import robot as simulated
+    from mjx_tt.robot import robots
 
-    return checked(f"{path}: robot", simulated.load, robot).contract
+    return checked(f"{path}: robot", robots.load, robot).contract
 
 
 def load_robot(path: str | Path, calibrated: bool = True, contract: Contract | None = None) -> RobotConfig:

@@ -29,9 +29,9 @@ from experiments.config import build
 from experiments.errors import ConfigError
 from experiments.robots.reach import blade
 from mjx_tt.env.task import TARGET
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from mjx_tt.robot.kinematics import PaddleKinematics
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.robots import Robot
 from robot_io.safety.clearance import RobotGeometry
 
 STEP = 1.0 / 150.0  # [s] of the balls' flights

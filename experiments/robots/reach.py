@@ -17,7 +17,7 @@ from mjx_tt.env import reachability
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import FACING, TaskConfig
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.robots import Robot
 from mjx_tt.viz import rendering
 from mjx_tt.viz.rendering import Moment
 from robot_io.contract import n_parameters

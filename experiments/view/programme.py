@@ -21,7 +21,7 @@ from mjx_tt.rally import human_player
 from mjx_tt.rally.ball_flights import homeward
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.rally.simulator import RallySimulator, ShotResult
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.robots import Robot
 from mjx_tt.sim.model import SimModel
 
 POOL = 512  # balls of a distribution

@@ -18,7 +18,7 @@ from ballmodel.io.formats import read
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
 from mjx_tt.diagnosis.tracks.frame import check
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.robots import Robot
 
 TURN = 0.15  # [m] that a ball comes back before it counts as hit
 ROBOT_FILES = ("command.csv", "state.csv")

@@ -21,8 +21,8 @@ from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.clearance import CapsuleClearance
 from mjx_tt.robot.dynamics_fused import FusedEngine
 from mjx_tt.robot.kinematics import Joints, PaddleKinematics
-from mjx_tt.robot.model import capsules, paddle_frame
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.mjcf import capsules, paddle_frame
+from mjx_tt.robot.robots import Robot
 from mjx_tt.robot.scalar_algebra import optimization_barrier
 from mjx_tt.sim import actuators, latency, sensors
 from mjx_tt.sim.actuators import DriveState

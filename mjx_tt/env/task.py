@@ -46,8 +46,8 @@ from mjx_tt.env.terms import (
 )
 from mjx_tt.env.user_defined import count_rows
 from mjx_tt.lanes.loop import while_any
-from mjx_tt.robot import robot
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
 from mjx_tt.robot.scalar_algebra import optimization_barrier
 from mjx_tt.sim import actuators, latency
 from mjx_tt.sim.sensors import Filters
@@ -243,7 +243,7 @@ class TaskConfig:
     max_action_latency: float = 0.13
     rewards: tuple[RewardTerm, ...] = field(default_factory=lambda: weigh_rewards(SIM_WEIGHTS))
     observations: tuple[ObservationTerm, ...] = CONTRACT_OBSERVATIONS
-    robot: Robot = field(default_factory=robot.paper)
+    robot: Robot = field(default_factory=robots.paper)
     lanes: bool = True  # compile control steps lane by lane on processors (``mjx_tt.lanes``); else XLA does
 
     def __post_init__(self) -> None:

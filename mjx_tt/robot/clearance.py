@@ -20,7 +20,7 @@ from ballmodel.contact import TABLE, Box, box_gap
 from ballmodel.vec import dot
 from mjx_tt.robot.chain import Frame
 from mjx_tt.robot.kinematics import LinkPose, PaddleKinematics, stack
-from mjx_tt.robot.model import Capsule
+from mjx_tt.robot.mjcf import Capsule
 from mjx_tt.robot.scalar_algebra import optimization_barrier
 from robot_io.robot_file import RobotFile
 from robot_io.safety.clearance import segment_distance

@@ -22,7 +22,7 @@ from mjx_tt.env import reward_weights
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig, weigh_rewards
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Samples, SimModel
 

@@ -24,8 +24,7 @@ from mjx_tt.env.task import (
     weigh_rewards,
 )
 from mjx_tt.env.terms import ObservationTerm, PlayedBall
-from mjx_tt.robot import model as robot
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import mjcf, robots
 from robot_io.contract import LIMITS, N_JOINTS
 from tests.oracles import ball_flight
 from tests.oracles.ball_flight import Touch, fly, on_blade, on_table, path
@@ -37,11 +36,11 @@ T = 1 / 75
 @pytest.fixture(scope="module")
 def blade():
     """Centre and normal of the blade at home, from MuJoCo."""
-    mj = robot.load_model()
+    mj = mjcf.load_model()
     data = mujoco.MjData(mj)
-    data.qpos[:] = robot.home_qpos(mj)
+    data.qpos[:] = mjcf.home_qpos(mj)
     mujoco.mj_kinematics(mj, data)
-    site = data.site(robot.PADDLE_SITE)
+    site = data.site(mjcf.PADDLE_SITE)
     return site.xpos.copy(), site.xmat.reshape(3, 3)[:, 2].copy()
 
 
@@ -204,8 +203,8 @@ def test_motion_terms_equal_a_recount_of_the_commands(flailing):
 
 def test_pose_terms_equal_a_recount_in_mujoco(flailing):
     """Steps in contact, with a low blade and with a blade that looks aside, by MuJoCo's poses and distances."""
-    mj = robot.load_model()
-    data, site = mujoco.MjData(mj), mj.site(robot.PADDLE_SITE).id
+    mj = mjcf.load_model()
+    data, site = mujoco.MjData(mj), mj.site(mjcf.PADDLE_SITE).id
     watched = robots.paper().file
     own = list(watched.pairs)
     table = [(name, "col_table") for name in watched.table]

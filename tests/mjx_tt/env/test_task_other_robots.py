@@ -15,7 +15,7 @@ from ballmodel.sampling import sample_pool
 from mjx_tt.env.policy import controller, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 from robot_io import contract

@@ -7,15 +7,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import model as robot
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot import scalar_algebra
-from mjx_tt.robot.chain import chain_from_model, site_frame
+from mjx_tt.robot import mjcf, robots, scalar_algebra
+from mjx_tt.robot.chain import body_frames, chain_from_model, site_frame
 from mjx_tt.robot.kinematics import PaddleKinematics
 from tests.oracles.chains import CART, CRANE, SKEW
 
 MODELS = [
-    *(pytest.param(robots.load_shipped(name).model(), robot.PADDLE_SITE, id=name) for name in robots.names()),
+    *(pytest.param(robots.load_shipped(name).model(), mjcf.PADDLE_SITE, id=name) for name in robots.names()),
     pytest.param(mujoco.MjModel.from_xml_string(SKEW), "tip", id="skew"),
     pytest.param(mujoco.MjModel.from_xml_string(CRANE), "tip", id="crane"),
     pytest.param(mujoco.MjModel.from_xml_string(CART), "tip", id="cart"),
@@ -70,7 +68,7 @@ def test_pose_and_velocity_of_a_site_match_mujoco(model, site, x64, atol):
 @pytest.mark.parametrize(("model", "site"), MODELS)
 def test_points_on_links_match_mujoco(model, site):
     """Every body's frame, through the link that carries it, including bodies that do not move."""
-    chain, frames = chain_from_model(model), robot.body_frames(model)
+    chain, frames = chain_from_model(model), body_frames(model)
     q, qd = random_states(model, 5, 1)
     point = np.array([0.1, -0.2, 0.3])
     with jax.enable_x64(True):

@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ballmodel.partial_params import without_nominal
-from mjx_tt.robot import model as robot
+from mjx_tt.robot import mjcf
 from mjx_tt.sim import actuators, model
 from mjx_tt.sim.actuators import DriveParams, Drives, JointDrive
 from mjx_tt.sim.model import Range, SimModel
@@ -114,9 +114,9 @@ def mean_velocities(command):
 
 def mujoco_path(velocities):
     """Joint path (steps + 1, 8) of MuJoCo C under velocities (steps, 8)."""
-    mj = robot.load_model()
+    mj = mjcf.load_model()
     data = mujoco.MjData(mj)
-    data.qpos[:] = robot.home_qpos(mj)
+    data.qpos[:] = mjcf.home_qpos(mj)
     path = [data.qpos.copy()]
     for velocity in velocities:
         data.ctrl[:] = velocity
@@ -142,7 +142,7 @@ def test_the_robot_follows_its_drives_equations_under_both_engines(engine):
         batch = episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=simulation())
         record = scripted_episodes.play(task(engine), batch, script(actions, TICKS), TICKS)
     times, ticked = np.arange(TICKS * SUBSTEPS + 1) * H, np.arange(TICKS) * T
-    mj = robot.load_model()
+    mj = mjcf.load_model()
     data, velocities = mujoco.MjData(mj), mean_velocities(record.command)
     nominal = mujoco_path(velocities[..., 0])
     for i, case in enumerate(CASES):
@@ -160,7 +160,7 @@ def test_the_robot_follows_its_drives_equations_under_both_engines(engine):
         for tick in (10, TICKS - 1):
             data.qpos[:] = carried[SUBSTEPS * (tick + 1)]
             mujoco.mj_kinematics(mj, data)
-            paddle = data.site(robot.PADDLE_SITE).xpos
+            paddle = data.site(mjcf.PADDLE_SITE).xpos
             np.testing.assert_allclose(record.paddle[tick, :, i], paddle, atol=1e-5, err_msg=str(case))
 
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import model as robot
+from mjx_tt.robot import mjcf
 from mjx_tt.sim import latency
 from mjx_tt.sim.model import LATENCIES
 from robot_io.contract import FESTO_JOINTS, N_JOINTS
@@ -117,14 +117,14 @@ def test_the_task_delays_every_device_by_its_own_time():
         record = play(task(), episodes(start, velocity, delays, model(gravity=0.0)), script(actions))
     assert record.live.all()
     ticked, times = np.arange(scripted_episodes.TICKS) * T, np.arange(scripted_episodes.TICKS * SUBSTEPS + 1) * H
-    mj, speed = robot.load_model(), np.linalg.norm(velocity)
+    mj, speed = mjcf.load_model(), np.linalg.norm(velocity)
     for i in range(P):
         moments = np.maximum(ticked - delays["ball_observation"][i], 0.0)
         way = np.log1p(DRAG * speed * moments) / DRAG
         np.testing.assert_allclose(
             record.controller[:, :3, i], start + way[:, None] * velocity / speed, atol=1e-6, err_msg="ball"
         )
-        data, path = mujoco.MjData(mj), [robot.home_qpos(mj)]
+        data, path = mujoco.MjData(mj), [mjcf.home_qpos(mj)]
         data.qpos[:] = path[0]
         device = ["festo" if joint in FESTO_JOINTS else "abb" for joint in range(N_JOINTS)]
         ctrl = [
