@@ -55,10 +55,10 @@ ROOMS = {
     "ballmodel": "constants state trajectory io .",
     "bgs": ".",
     "mjx_tt": (
-        ". sim robot diagnosis/description diagnosis/robust diagnosis/verdict diagnosis/joint diagnosis/tracks "
+        ". lanes sim robot diagnosis/description diagnosis/robust diagnosis/verdict diagnosis/joint diagnosis/tracks "
         "diagnosis/logs diagnosis/ball/effects diagnosis/ball/flights "
         "diagnosis/ball diagnosis/hits diagnosis/together diagnosis prediction "
-        "viz diagnosis/report lanes env gradient rally"
+        "viz diagnosis/report env gradient rally"
     ),
     "experiments": (
         "errors . config jobs runs view/film view/studio view/programme "
@@ -139,6 +139,12 @@ def test_imports_point_one_way(package):
         for name in imported(path):
             if within(name, PACKAGES) and not within(name, (package, *ALLOWED[package])):
                 pytest.fail(f"{path.relative_to(ROOT)} imports {name}; {package} may import {ALLOWED[package]}")
+
+
+def test_the_compiler_for_lanes_imports_nothing_of_the_rest():
+    for path in sources("mjx_tt/lanes"):
+        others = [name for name in imported(path) if within(name, PACKAGES) and not within(name, ("mjx_tt.lanes",))]
+        assert not others, f"{path.relative_to(ROOT)} imports {others}"
 
 
 def test_the_robots_side_needs_no_jax():

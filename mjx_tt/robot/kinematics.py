@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ballmodel.flight import PaddlePose
+from mjx_tt.lanes.functions import sin_cos
 from mjx_tt.robot import scalar_algebra as f
 from mjx_tt.robot.chain import WORLD, Chain, Frame
 
@@ -32,7 +33,7 @@ def centred_on_anchors(chain: Chain) -> Chain:
 
 def joint_transforms(chain: Chain, q: Joints) -> list[tuple[f.Matrix, f.Vector]]:
     """Rotation and origin of every link in its parent's frame at joint positions q (n, ...), folded scalars."""
-    sin, cos = f.optimization_barrier(f.sin_cos(q))  # of slides too: one loop over all joints is the cheapest
+    sin, cos = f.optimization_barrier(sin_cos(q))  # of slides too: one loop over all joints is the cheapest
     transforms: list[tuple[f.Matrix, f.Vector]] = []
     for i, link in enumerate(chain.links):
         if link.slide:

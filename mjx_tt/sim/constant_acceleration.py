@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
-Covariance: TypeAlias = tuple[Any, Any, Any, Any, Any, Any]
+Covariance: TypeAlias = Any  # six numbers, or an array of six rows
 
 
 def predict_covariance(covariance: Covariance, h: Any, density: Any) -> Covariance:
@@ -30,12 +30,14 @@ def predict_covariance(covariance: Covariance, h: Any, density: Any) -> Covarian
     )
 
 
-def correct_covariance(covariance: Covariance, noise: Any) -> tuple[tuple[Any, Any, Any], Covariance]:
-    """Gains of position, velocity and acceleration, and the covariance after a measurement of the position.
+def correct_covariance(covariance: Covariance, gains: Any, noise: Any) -> Covariance:
+    """The covariance after a measurement of the position: (1 - K H) P.
 
-    K = P H' / (H P H' + noise) and (1 - K H) P, with the variance of the measurement.
+    Args:
+        covariance: before it.
+        gains: K = P H' / (H P H' + noise) of position, velocity and acceleration.
+        noise: variance of the measurement.
     """
-    xx, xv, xa, vv, va, aa = covariance
-    total = xx + noise
-    k0, k1, k2 = xx / total, xv / total, xa / total
-    return (k0, k1, k2), (k0 * noise, (1.0 - k0) * xv, (1.0 - k0) * xa, vv - k1 * xv, va - k1 * xa, aa - k2 * xa)
+    _, xv, xa, vv, va, aa = covariance
+    k0, k1, k2 = gains
+    return k0 * noise, (1.0 - k0) * xv, (1.0 - k0) * xa, vv - k1 * xv, va - k1 * xa, aa - k2 * xa

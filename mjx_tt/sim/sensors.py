@@ -130,8 +130,7 @@ class Lag:
         h = jnp.broadcast_to(dt / _shown(memory, dt), zero.shape[1:])
         covariance = jnp.asarray(row(h) * jnp.stack([jnp.full_like(h, x) for x in SETTLED]))
         for _ in range(ROUNDS):
-            _, after = correct_covariance(predict_covariance(tuple(covariance), h, h), 1.0)
-            covariance = jnp.stack(after)
+            covariance = _correct(jnp.stack(predict_covariance(covariance, h, h)))[1]
         return cls(zero, zero, zero, covariance)
 
     def predict(self, dt: Scalars, jump: Float[Array, "3 *batch"], since: Scalars) -> Lag:
@@ -152,24 +151,29 @@ class Lag:
         share = jnp.clip(0.5 - 0.5 * (surprise - gate) / (SOFTNESS * blur), 0.0, 1.0)
         shut = share * share * (3.0 - 2.0 * share)  # of balls whose filter did not open
         # The noise's variance and the memory are the units: the jerk's density is the usual interval.
-        grown = predict_covariance(tuple(self.covariance), dt / time, h)
-        xx, xv, xa, vv, va, aa = grown
-        opened = xx + FRESH, xv, xa, vv + FRESH / h**2, va, aa + FRESH / h**4
-        (closed_gains, closed), (open_gains, wide) = (correct_covariance(each, 1.0) for each in (grown, opened))
+        grown = jnp.stack(predict_covariance(self.covariance, dt / time, h))
+        opened = jnp.stack([grown[0] + FRESH, *grown[1:3], grown[3] + FRESH / h**2, grown[4], grown[5] + FRESH / h**4])
+        (closed_gains, closed), (open_gains, wide) = _correct(grown), _correct(opened)
         gains = [shut * a + (1.0 - shut) * b for a, b in zip(closed_gains, open_gains, strict=True)]
-        mixed = jnp.stack([shut * a + (1.0 - shut) * b for a, b in zip(closed, wide, strict=True)])
+        mixed = row(shut) * closed + row(1.0 - shut) * wide
         there = row(memory) > 0.0
         return Lag(
             jnp.where(there, row(1.0 - gains[0]) * self.position, 0.0),
             jnp.where(there, self.velocity - row(gains[1] / time) * self.position, 0.0),
             jnp.where(there, self.acceleration - row(gains[2] / time**2) * self.position, 0.0),
-            mixed,
+            jnp.asarray(mixed),
         )
 
 
 def _shown(memory: Scalars, usual: Scalars) -> Array:
     """The memory [s], where it is a share of the interval between measurements; below that no filter shows."""
     return jnp.maximum(memory, jnp.maximum(usual, SHORTEST) / LONGEST)
+
+
+def _correct(grown: Float[Array, "6 *batch"]) -> tuple[Array, Array]:
+    """Gains (3, ...), and the covariance after a measurement whose noise is the unit."""
+    gains = jnp.asarray(grown[:3] / row(grown[0] + 1.0))
+    return gains, jnp.stack(correct_covariance(grown, gains, 1.0))
 
 
 def jump(

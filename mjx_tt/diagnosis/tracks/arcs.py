@@ -53,8 +53,9 @@ class _Filter:
     def take(self, sample: int, time: float, measured: np.ndarray, ahead: tuple[np.ndarray, Covariance]) -> None:
         """Moves on to a sample that belongs to the arc."""
         (expected, covariance), d = ahead, time - self.time
-        innovation = measured - expected
-        (gx, gv, ga), self.covariance = correct_covariance(covariance, self.noise)
+        innovation, (xx, xv, xa) = measured - expected, covariance[:3]
+        gx, gv, ga = (each / (xx + self.noise) for each in (xx, xv, xa))
+        self.covariance = correct_covariance(covariance, (gx, gv, ga), self.noise)
         self.v = self.v + d * self.a + gv * innovation
         self.a = self.a + ga * innovation
         self.x, self.time = expected + gx * innovation, time

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import mjcf, robots, scalar_algebra
+from mjx_tt.robot import mjcf, robots
 from mjx_tt.robot.chain import body_frames, chain_from_model, site_frame
 from mjx_tt.robot.kinematics import PaddleKinematics
 from tests.oracles.chains import CART, CRANE, SKEW
@@ -18,18 +18,6 @@ MODELS = [
     pytest.param(mujoco.MjModel.from_xml_string(CRANE), "tip", id="crane"),
     pytest.param(mujoco.MjModel.from_xml_string(CART), "tip", id="cart"),
 ]
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("largest", [np.pi, 8000.0])
-def test_sine_and_cosine_are_exact_to_rounding(dtype, largest):
-    angles = np.random.default_rng(2).uniform(-largest, largest, 100_000).astype(dtype)
-    angles[:9] = np.arange(-4, 5) * np.pi / 2
-    with jax.enable_x64(dtype == np.float64):
-        sin, cos = jax.jit(scalar_algebra.sin_cos)(angles)
-    assert sin.dtype == cos.dtype == dtype
-    for found, exact in ((sin, np.sin(angles.astype(float))), (cos, np.cos(angles.astype(float)))):
-        np.testing.assert_allclose(found, exact, rtol=0, atol=np.finfo(dtype).eps)
 
 
 def site_in_mujoco(model, name, q, qd):
