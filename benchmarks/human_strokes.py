@@ -25,11 +25,11 @@ from ballmodel.io.deepmind import MeasuredStates
 from ballmodel.mixture import fit_mixture, save_mixture, start_states
 from ballmodel.sampling import KEPT, ROBOT_SIDE, SECOND_BOUNCE, BallPool, throw
 from ballmodel.state import BallState
+from experiments.evaluation import reachability
 from experiments.evaluation.evaluate import return_rate
 from experiments.runs import load_policy
 from experiments.stats import wilson
 from mjx_tt import platform
-from mjx_tt.env import reachability
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig

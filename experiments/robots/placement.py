@@ -4,7 +4,7 @@ For each ball a few places are taken where it can be met after its bounce, with 
 face to send it to the middle of the human's half. A candidate is a mounting and a home pose. Its score is the share of
 balls for which, by inverse kinematics from home, some place can be taken in time, at the joints' speeds and
 accelerations and without contact, times how nearly the blade faces at home as most balls want it: a quick stand-in for
-the bound on what is in reach (``mjx_tt.env.reachability``), which takes minutes for a single candidate. The
+the bound on what is in reach (``experiments.evaluation.reachability``), which takes minutes for a single candidate. The
 cross-entropy method searches candidates.
 """
 

@@ -13,7 +13,7 @@ import numpy as np
 from ballmodel.registry import Balls
 from ballmodel.sampling import sample_pool
 from experiments.config import build
-from mjx_tt.env import reachability
+from experiments.evaluation import reachability
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import FACING, TaskConfig

@@ -70,7 +70,9 @@ class FirstOrderTrainer(Trainer):
         count = jnp.maximum(total["episodes"], 1.0)
         gradient = -total["slope"] / count
         norm = jnp.linalg.norm(gradient)
-        bgs = strategy.climb(state.bgs, gradient * jnp.minimum(1.0, LONGEST / jnp.maximum(norm, 1e-12)), config)
+        bgs = strategy.apply_gradient(
+            state.bgs, gradient * jnp.minimum(1.0, LONGEST / jnp.maximum(norm, 1e-12)), config
+        )
         # Without one finite episode a step would move on momentum alone.
         bgs = jax.tree.map(
             lambda new, old: jnp.where(total["episodes"] > 0, new, old),

@@ -33,7 +33,7 @@ from mjx_tt.env.episode import (
     Tick,
 )
 from mjx_tt.env.physics import ENGINES, Physics
-from mjx_tt.env.reward_weights import SIM_WEIGHTS
+from mjx_tt.env.reward_weights import SIM_WEIGHTS, TERMS
 from mjx_tt.env.terms import (
     REDUCTIONS,
     ControlStep,
@@ -175,19 +175,7 @@ def share_of_limit(values: Float[Array, "joints *batch"], limit: np.ndarray | tu
     return jnp.asarray(sum(parts)) / len(limit)
 
 
-BUILT_IN_REWARDS: tuple[RewardTerm, ...] = (
-    state_transition,
-    net_clearance,
-    hit_and_land,
-    fault,
-    jerk,
-    acceleration,
-    velocity,
-    joint_angle,
-    collision,
-    paddle_height,
-    style,
-)
+BUILT_IN_REWARDS: tuple[RewardTerm, ...] = tuple(globals()[name] for name in TERMS)
 
 
 def weigh_rewards(weights: Mapping[str, float], user: Iterable[RewardTerm] = ()) -> tuple[RewardTerm, ...]:

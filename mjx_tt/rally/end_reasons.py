@@ -13,7 +13,7 @@ from robot_io.rally_ends import End as End
 from robot_io.rally_ends import Evidence
 
 
-def ending(
+def find_end(
     first: Bool[Array, " L"],
     sent: Sent,
     outcome: Int[Array, " L"],

@@ -29,8 +29,8 @@ from mjx_tt.env.policy import controller as controller_of
 from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.task import Task, TaskConfig, evaluate_rewards
 from mjx_tt.rally import ball_flights, human_player
-from mjx_tt.rally.ball_flights import column, homeward
-from mjx_tt.rally.end_reasons import End, ending
+from mjx_tt.rally.ball_flights import drive_home, make_column
+from mjx_tt.rally.end_reasons import End, find_end
 from mjx_tt.rally.human_player import Player, PlayerState
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
@@ -217,7 +217,7 @@ class RallySimulator:
         lanes, limits = state.touches.shape[0], self.task.contract.limits
         keys = iter(jax.random.split(key, 8))
         ball, first = state.ball, state.touches == 1
-        sent = ball_flights.sent(model.ball, ball, self.config.period)
+        sent = ball_flights.fly_serve(model.ball, ball, self.config.period)
         robot = self._robot(next(keys), policy, model, ball, state.start)
         blind = first & (jax.random.uniform(next(keys), (lanes,)) < BLIND)
         finite = robot.finite
@@ -230,23 +230,23 @@ class RallySimulator:
         outcome = jnp.where(returned, RETURNED, jnp.where(hit, HIT, MISSED)).astype(jnp.int32)
 
         plane, height = human_player.wish(player, next(keys), (lanes,))
-        met = ball_flights.meeting(model.ball, robot.ball, returned, plane, height, self.config.period)
+        met = ball_flights.fly_to_player(model.ball, robot.ball, returned, plane, height, self.config.period)
         answer = human_player.answer(player, state.player, next(keys), met.incoming, model.ball.flight)
         answered = returned & met.reached & answer.hit
         goes_on = answered & (state.touches + 2 <= max_touches)
-        idle = jnp.all(robot.accumulators.peak_velocity < IDLE * column(limits.policy_velocity), axis=0)
+        idle = jnp.all(robot.accumulators.peak_velocity < IDLE * make_column(limits.policy_velocity), axis=0)
         inside = jnp.ones(lanes, bool) if box is None else box.holds(ball, jnp.where(sent.valid, sent.landing, 0.0))
-        end = ending(first, sent, outcome, fault, answered, met, blind | idle, inside)
+        end = find_end(first, sent, outcome, fault, answered, met, blind | idle, inside)
 
         learnt = jax.tree.map(partial(jnp.where, returned & met.reached), answer.state, state.player)
         rested = human_player.rested(player, learnt)
         fresh_ball = human_player.first_ball(player, rested, next(keys), (lanes,))
-        pose = homeward(self.task.home, robot.qpos, met.incoming.seconds, limits)
+        pose = drive_home(self.task.home, robot.qpos, met.incoming.seconds, limits)
         after = RallyState(
             player=jax.tree.map(partial(jnp.where, goes_on), learnt, rested),
             ball=where(goes_on, answer.ball, fresh_ball),
             touches=jnp.where(goes_on, state.touches + 2, 1),
-            start=jnp.where(goes_on, pose, column(self.task.home)),
+            start=jnp.where(goes_on, pose, make_column(self.task.home)),
             dummy=fault,
         )
         steps = robot.accumulators.steps * self.config.period
