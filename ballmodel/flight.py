@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.lax import optimization_barrier
 from jaxtyping import Bool, Float
 
 from ballmodel import contact
@@ -22,7 +23,7 @@ from ballmodel.aerodynamics import INTEGRATORS, FlightParams, acceleration
 from ballmodel.contact import NET, TABLE, Box, PaddleParams, SurfaceParams, box_gap, surface_frame, surface_gap
 from ballmodel.partial_params import value_or
 from ballmodel.state import BallState
-from ballmodel.vec import TINY, Scalars, Vec, components, cross, dot, select, stack, stored
+from ballmodel.vec import TINY, Scalars, Vec, components, cross, dot, select, stack
 
 
 @jax.tree_util.register_dataclass
@@ -133,7 +134,7 @@ def _box_time(
     if frame is not None:  # the same question in the surface's own axes, where the box is aligned
         start = _Ball(frame.place(surface, state.position), frame.to_surface(state.velocity), state.spin)
         end_position = frame.place(surface, end_position)
-        state, a, end_position = stored((start, frame.to_surface(a), end_position))
+        state, a, end_position = optimization_barrier((start, frame.to_surface(a), end_position))
         surface = replace(surface, height=0.0, tilt_x=None, tilt_y=None)
     gap0, distance0 = box_gap(box, surface.height, state.position)
     _, distance1 = box_gap(box, surface.height, end_position)
@@ -184,7 +185,7 @@ def _mounted(params: PaddleParams, pose: _Blade) -> _Blade:
     normal = Vec(*(n[i] * cos + down[i] * sin for i in range(3)))
     shift = normal * value_or(params.offset, 0.0)
     velocity = pose.velocity + cross(pose.angular_velocity, shift)
-    return stored(_Blade(pose.position + shift, normal, velocity, pose.angular_velocity))
+    return optimization_barrier(_Blade(pose.position + shift, normal, velocity, pose.angular_velocity))
 
 
 def _paddle_time(
@@ -233,7 +234,7 @@ def step(
     hit_any = t_first <= dt
     t = jnp.where(hit_any, t_first, dt)
     at = _move(ball, a, flight, t)
-    at, t, t_first, hit_any = stored((at, t, t_first, hit_any))
+    at, t, t_first, hit_any = optimization_barrier((at, t, t_first, hit_any))
 
     hit_paddle = jnp.zeros_like(hit_any) if paddle is None else hit_any & (t_paddle == t_first)
     hit_table = hit_any & (t_table == t_first) & ~hit_paddle
@@ -251,7 +252,7 @@ def step(
         if grips != (None, None):
             either["tangential_restitution"] = jnp.where(hit_table, value_or(grips[0], 0.0), value_or(grips[1], 0.0))
         surface = replace(params.table, **either)
-    normal = stored(normal)
+    normal = optimization_barrier(normal)
     velocity, spin = contact.surface_impact(surface, at.velocity, at.spin, normal, radius)
     if paddle is not None:
         w = t / dt
@@ -261,7 +262,7 @@ def step(
         blade_velocity = _mix(start.velocity, end.velocity, w) + cross(
             _mix(start.angular_velocity, end.angular_velocity, w), arm
         )
-        blade_normal, blade_velocity = stored((blade_normal, blade_velocity))
+        blade_normal, blade_velocity = optimization_barrier((blade_normal, blade_velocity))
         off_centre: Scalars = 0.0
         if params.paddle.rim_loss is not None:
             along = dot(arm, blade_normal)
@@ -271,7 +272,7 @@ def step(
         )
         velocity = select(hit_paddle, v_paddle, velocity)
         spin = select(hit_paddle, w_paddle, spin)
-    velocity, spin = stored((velocity, spin))
+    velocity, spin = optimization_barrier((velocity, spin))
     after = _free_step(flight, _Ball(at.position, velocity, spin), dt - t)
     events = Events(hit_table, hit_net, hit_paddle, t, stack(at.position))
     new = jax.tree.map(lambda x, y: jnp.where(hit_any, x, y), after, free)

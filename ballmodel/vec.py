@@ -62,14 +62,6 @@ def row(value: Scalars) -> Scalars:
     return jnp.asarray(value)[None] if jnp.ndim(value) else value
 
 
-def stored(tree: T) -> T:
-    """The same arrays, each computed once and kept: what several results share is otherwise computed for every one.
-
-    Takes effect where ``mjx_tt.platform`` has set XLA's flags; elsewhere it changes nothing.
-    """
-    return jax.lax.optimization_barrier(tree)
-
-
 def dot(a: Vector, b: Vector) -> Scalars:
     """a . b of Vecs or (3, ...) arrays: (...)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

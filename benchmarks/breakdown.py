@@ -20,12 +20,13 @@ from ballmodel.sampling import sample_pool
 from ballmodel.state import BallState
 from benchmarks import roofline
 from benchmarks.operations import count, count_lanes
+from mjx_tt.env.episode import EpisodeConstants, Episodes, EpisodeState
 from mjx_tt.env.policy import PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import Episodes, EpisodeState, Prepared, Task, TaskConfig
+from mjx_tt.env.task import Task, TaskConfig
 from mjx_tt.lanes import loop, machine
 from mjx_tt.lanes.loop import while_any
-from mjx_tt.robot.scalar_algebra import materialise
+from mjx_tt.robot.scalar_algebra import optimization_barrier
 from mjx_tt.sim import latency, noise
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import LIMITS, N_JOINTS, N_OBSERVATION, unflatten
@@ -80,7 +81,7 @@ def time_parts(rows: int, columns: int, ticks: int) -> Callable[[], dict]:
 
 def _compiled(step: Callable, start: Any, ticks: int) -> tuple[Callable, Any]:
     def loop(state: Any) -> Any:
-        return jax.lax.fori_loop(0, ticks, lambda tick, s: materialise(step(tick, s)), state)
+        return jax.lax.fori_loop(0, ticks, lambda tick, s: optimization_barrier(step(tick, s)), state)
 
     start = jax.block_until_ready(jax.tree.map(jnp.asarray, start))
     run = jax.jit(loop).lower(start).compile()
@@ -96,7 +97,7 @@ def _seconds(run: Callable, start: Any) -> float:
 
 def _block(
     config: TaskConfig, rows: int, columns: int
-) -> tuple[Task, Episodes, Prepared, PolicyController, EpisodeState]:
+) -> tuple[Task, Episodes, EpisodeConstants, PolicyController, EpisodeState]:
     """A block of episodes of random policies: what the loop over time needs, and their first state."""
     simulator, lanes = Simulator(config), rows * columns
     task = simulator.task
@@ -112,17 +113,17 @@ def _block(
 
 def _by_lanes(config: TaskConfig, rows: int, columns: int, ticks: int) -> tuple[Callable, Any]:
     """The whole compiled lane by lane: ``ticks`` control steps of every episode, whether it has ended or not."""
-    task, episodes, prepared, controller, first = _block(config, rows, columns)
+    task, episodes, constants, controller, first = _block(config, rows, columns)
 
     def step(tick: Array, now: tuple, by_lane: tuple, by_column: Any) -> tuple:
-        return now[0], task.control_step(tick, now[1], *by_lane, by_column)
+        return now[0], task.step(tick, now[1], *by_lane, by_column)
 
     def run(arguments: tuple) -> Any:
         state, by_lane, by_column = arguments
         going = jnp.ones(rows * columns, bool)
         return while_any(lambda now: now[0], step, (going, state), by_lane, by_column, limit=ticks)
 
-    arguments = jax.block_until_ready(jax.tree.map(jnp.asarray, (first, (episodes, prepared), controller)))
+    arguments = jax.block_until_ready(jax.tree.map(jnp.asarray, (first, (episodes, constants), controller)))
     compiled = jax.jit(run).lower(arguments).compile()
     _seconds(compiled, arguments)
     return compiled, arguments
@@ -131,7 +132,7 @@ def _by_lanes(config: TaskConfig, rows: int, columns: int, ticks: int) -> tuple[
 def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, Callable, object]]:
     """By name: calls per control step, a step (tick, state) -> state, its first state."""
     lanes, timestep = rows * columns, 1.0 / config.sim_rate
-    task, episodes, prepared, controller, first = _block(config, rows, columns)
+    task, episodes, constants, controller, first = _block(config, rows, columns)
     speeds = 0.1 * jax.random.normal(jax.random.key(4), (N_JOINTS, lanes))
     pose = task.kinematics.pose(first.qpos, speeds)
     observation = jnp.concatenate([first.ball.position, first.qpos])
@@ -143,7 +144,7 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
 
     def ball(_: Array, state: BallState) -> BallState:
         moved, events = flight.step(episodes.model.ball, state, timestep, (pose, pose))
-        events = materialise(events)
+        events = optimization_barrier(events)
         return jax.tree.map(lambda x: x + nothing * events.time, moved)
 
     def policy(tick: Array, state: tuple[Any, Array]) -> tuple[Any, Array]:
@@ -152,7 +153,7 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
         return memory, seen.at[:N_JOINTS].add(nothing * action)
 
     def clearance(_: Array, qpos: Array) -> Array:
-        gaps = task.clearance(materialise(task.kinematics.links(qpos)), qpos[0])
+        gaps = task.clearance(optimization_barrier(task.kinematics.links(qpos)), qpos[0])
         return qpos + nothing * (gaps.table + gaps.own + gaps.blade)
 
     def signals(tick: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -160,26 +161,26 @@ def _parts(config: TaskConfig, rows: int, columns: int) -> dict[str, tuple[int, 
         seen, sent, reference, previous, captured = state
         delayed = jnp.concatenate(
             [
-                latency.ring_read(seen[:, :3], tick - prepared.ball.periods),
-                latency.ring_read(seen[:, 3:], tick - prepared.joints.periods),
+                latency.read_ring(seen[:, :3], tick - constants.ball.periods),
+                latency.read_ring(seen[:, 3:], tick - constants.joints.periods),
             ]
         )
         u = noise.symmetric_uniform(episodes.seed, tick, 3)
-        observed = materialise(jnp.concatenate([delayed[:3] + 0.08 * u, delayed[3:]]))
+        observed = optimization_barrier(jnp.concatenate([delayed[:3] + 0.08 * u, delayed[3:]]))
         request = observed[3:] * jnp.asarray(LIMITS.policy_velocity)[:, None]
-        command = materialise(limit_velocity(request, previous, reference, config.period, xp=jnp))
-        sent = latency.ring_write(sent, tick, command)
-        old = latency.ring_read(sent, tick - prepared.action.periods - 1)
-        new = latency.ring_read(sent, tick - prepared.action.periods)
+        command = optimization_barrier(limit_velocity(request, previous, reference, config.period, xp=jnp))
+        sent = latency.write_ring(sent, tick, command)
+        old = latency.read_ring(sent, tick - constants.action.periods - 1)
+        new = latency.read_ring(sent, tick - constants.action.periods)
         for i in range(config.substeps):
-            share = latency.old_command_share(prepared.action, i, timestep)
-            control = materialise(new + share * (old - new))
-            weight = latency.capture_weight(prepared.joints, i, config.substeps, timestep)
+            share = latency.share_old_command(constants.action, i, timestep)
+            control = optimization_barrier(new + share * (old - new))
+            weight = latency.weigh_capture(constants.joints, i, config.substeps, timestep)
             captured = captured.at[3:].add(weight * control)
-        return latency.ring_write(seen, tick, nothing * captured), sent, reference, command, captured
+        return latency.write_ring(seen, tick, nothing * captured), sent, reference, command, captured
 
     def whole(tick: Array, state: EpisodeState) -> EpisodeState:
-        return task.control_step(tick, state, episodes, prepared, controller)
+        return task.step(tick, state, episodes, constants, controller)
 
     zeros = jnp.zeros_like(first.qpos)
     n = config.substeps

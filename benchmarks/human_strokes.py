@@ -15,6 +15,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mjx_tt.env.reachability import reachable as find_reachable
 
 from ballmodel.distribution import save_distribution
 from ballmodel.fit_distribution import fit_human
@@ -29,7 +30,6 @@ from experiments.runs import load_policy
 from experiments.stats import wilson
 from mjx_tt import platform
 from mjx_tt.env.evaluator import Evaluator
-from mjx_tt.env.reachability import reachable as find_reachable
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import ModelFile, SimModel

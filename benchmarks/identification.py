@@ -38,8 +38,8 @@ from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.target_domain.world import with_spin
 from experiments.training.loop import train
 from mjx_tt import platform
+from mjx_tt.env.episode import RETURNED
 from mjx_tt.env.policy import Policy
-from mjx_tt.env.task import RETURNED
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
 

@@ -19,7 +19,8 @@ from ballmodel import registry
 from ballmodel.sampling import sample_pool
 from benchmarks.harness import run
 from mjx_tt import platform
-from mjx_tt.env import own
+from mjx_tt.env import user_defined
+from mjx_tt.env.network import Network
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
@@ -36,8 +37,8 @@ def main(definitions: Path, *, devices: int = 1) -> None:
     simulator = Simulator(TaskConfig(sim_rate=150.0), devices)
     model = SimModel()
     pool = sample_pool(jax.random.key(0), registry.resolve("player3/M0"), model.ball, 4096)
-    networks: dict[str, own.Network | None] = {"the paper's": None}
-    networks |= own.load(definitions.read_text(encoding="utf-8"), str(definitions)).networks
+    networks: dict[str, Network | None] = {"the paper's": None}
+    networks |= user_defined.load(definitions.read_text(encoding="utf-8"), str(definitions)).networks
     calls = {name: prepared(simulator, network, pool, model) for name, network in networks.items()}
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(ROUNDS):
@@ -53,7 +54,7 @@ def main(definitions: Path, *, devices: int = 1) -> None:
         print(f"{name}: {size} parameters, {rate:,.0f} episodes/s, {middle / base:.2f} x the paper's time")
 
 
-def prepared(simulator: Simulator, network: own.Network | None, pool: object, model: SimModel) -> Callable[[], None]:
+def prepared(simulator: Simulator, network: Network | None, pool: object, model: SimModel) -> Callable[[], None]:
     """One rollout of COLUMNS random policies, compiled and called once."""
     key = jax.random.key(1)
     size = n_parameters() if network is None else network.size

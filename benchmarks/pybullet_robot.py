@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from mjx_tt.robot import model as robot
+from mjx_tt.robot import mjcf
 
 
 def urdf(model: mujoco.MjModel) -> str:
@@ -48,11 +48,11 @@ class PyBulletRobot:
         import pybullet
         from pybullet_utils.bullet_client import BulletClient
 
-        model = robot.load_model()
+        model = mjcf.load_model()
         self.version = str(pybullet.getAPIVersion())
         self.client = BulletClient(pybullet.DIRECT)
         self.joints = list(range(model.njnt))
-        self._home = robot.home_qpos(model)
+        self._home = mjcf.home_qpos(model)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "robot.urdf"
             path.write_text(urdf(model), encoding="utf-8")

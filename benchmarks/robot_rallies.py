@@ -27,7 +27,7 @@ from mjx_tt import platform
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
 from mjx_tt.rally.simulator import Box, RallySimulator
-from mjx_tt.robot.robot import paper
+from mjx_tt.robot.robots import paper
 from robot_io.control import rally
 from robot_io.control.config import RobotConfig
 from robot_io.control.interfaces import BridgeConfig

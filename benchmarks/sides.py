@@ -19,8 +19,8 @@ if TYPE_CHECKING:  # a side without JAX does not load it
     from jax import Array
 
     from experiments.training.update import Trainer, TrainState
+    from mjx_tt.env.episode import Episodes
     from mjx_tt.env.rollout import RolloutResult
-    from mjx_tt.env.task import Episodes
 
     State: TypeAlias = tuple[Array, Array]  # qpos, qvel
 
@@ -56,7 +56,7 @@ def _jax_engine(name: str, lanes: int, chunks: int, steps: int, by_lanes: bool =
 
     from mjx_tt.env.task import Task, TaskConfig
     from mjx_tt.lanes.loop import while_any
-    from mjx_tt.robot.scalar_algebra import materialise
+    from mjx_tt.robot.scalar_algebra import optimization_barrier
 
     task = Task(TaskConfig(engine=name, sim_rate=SIM_RATE))
     devices = jax.devices()
@@ -64,7 +64,7 @@ def _jax_engine(name: str, lanes: int, chunks: int, steps: int, by_lanes: bool =
 
     def period(tick: Array, state: tuple[Array, State], controls: Array, _: tuple) -> tuple[Array, State]:
         def step(_: int, s: State) -> State:
-            return materialise(task.engine.step(*s, control))
+            return optimization_barrier(task.engine.step(*s, control))
 
         control = jax.lax.dynamic_index_in_dim(controls, tick, keepdims=False)
         return state[0], jax.lax.fori_loop(0, SUBSTEPS, step, state[1])
@@ -94,9 +94,9 @@ def mujoco_rollout(robots: int, steps: int, threads: int) -> Side:
     import mujoco
     from mujoco import rollout
 
-    from mjx_tt.robot import model as robot
+    from mjx_tt.robot import mjcf
 
-    model = robot.load_model()
+    model = mjcf.load_model()
     model.opt.timestep = 1.0 / SIM_RATE
     data = [mujoco.MjData(model) for _ in range(threads)]
     mujoco.mj_resetDataKeyframe(model, data[0], 0)
@@ -121,9 +121,9 @@ def mujoco_batch(robots: int, steps: int, threads: int) -> Side:
     import mujoco
     from mujoco import batch
 
-    from mjx_tt.robot import model as robot
+    from mjx_tt.robot import mjcf
 
-    model = robot.load_model()
+    model = mjcf.load_model()
     model.opt.timestep = 1.0 / SIM_RATE
     simulations = batch.Batch(model, nsim=robots, nthread=threads)
     control = simulations.bind("ctrl")

@@ -179,7 +179,7 @@ def tell(
     shaped = shaping.shape(plus, minus, config.elite_fraction, config.rank, config.weighting, config.normalise)
     # Accelerators would otherwise multiply float32 in a shorter format.
     gradient = jnp.matmul(directions, shaped.weights, precision=jax.lax.Precision.HIGHEST)
-    after = climb(state, gradient, config)
+    after = apply_gradient(state, gradient, config)
     after = jax.tree.map(lambda new, old: jnp.where(shaped.n_elites > 0, new, old), after, _later(state))
     info = BGSInfo(
         gradient_norm=jnp.linalg.norm(gradient),
@@ -192,7 +192,7 @@ def tell(
     return after, info
 
 
-def climb(state: BGSState, gradient: Float[Array, " d"], config: BGSConfig) -> BGSState:
+def apply_gradient(state: BGSState, gradient: Float[Array, " d"], config: BGSConfig) -> BGSState:
     """The state after one ascent step along a gradient, wherever that comes from."""
     # optax descends, returns are to rise.
     with jax.numpy_dtype_promotion("standard"):  # optax raises floats to an integer count

@@ -6,8 +6,8 @@ import os
 from importlib import metadata, util
 from pathlib import Path
 
-# XLA's CPU pipeline throws optimisation barriers away before it fuses. Keeping them lets ``fold.materialise`` stop the
-# compiler from computing shared terms again in every fusion: 3 x the speed of the arm's dynamics. Unknown names are
+# XLA's CPU pipeline throws optimisation barriers away before it fuses. Keeping them lets ``optimization_barrier`` stop
+# the compiler from computing shared terms again in every fusion: 3 x the speed of the arm's dynamics. Unknown names are
 # ignored, so a future release that renames the pass loses the speed and nothing else. XLA's compilers for accelerators
 # cannot do without the pass.
 # (XLA's optional multi-output fusion, xla_cpu_use_multi_output_fusion, would bring a fifth more, but in jaxlib 0.10 it

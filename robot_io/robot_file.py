@@ -15,7 +15,7 @@
       blade: [col_blade]
       pairs: [[col_base, col_blade]]
 
-``mjx_tt.robot.robot`` adds the MJCF; the control process knows a robot by its contract and does not read this file.
+``mjx_tt.robot.robots`` adds the MJCF; the control process knows a robot by its contract and does not read this file.
 """
 
 from __future__ import annotations

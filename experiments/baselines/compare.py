@@ -47,8 +47,8 @@ from experiments.jobs.site import ALONE, Workers
 from experiments.runs import checkpoint, run_dir
 from experiments.training.trainers import KINDS
 from mjx_tt.env.brax import TableTennis
+from mjx_tt.env.episode import Controller
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import Controller
 from mjx_tt.sim.model import ModelFile
 
 STARTED = "started.json"

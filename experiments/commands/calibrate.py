@@ -102,7 +102,7 @@ def _standing(own: str) -> tuple[Contract, np.ndarray | None]:
     Raises ConfigError.
     """
     from ballmodel.constants import PADDLE_RADIUS
-    from mjx_tt.robot import robot as robots
+    from mjx_tt.robot import robots
     from robot_io.contract import PAPER
 
     robot = checked("", robots.load, own)

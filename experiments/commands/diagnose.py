@@ -22,8 +22,8 @@ from experiments.training import loop
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis import report
 from mjx_tt.diagnosis.report import Play, Rate, text
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
 from mjx_tt.sim.model import ModelFile
 from robot_io.contract import PAPER, Contract
 

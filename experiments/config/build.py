@@ -19,12 +19,14 @@ from experiments.config import prior
 from experiments.config.experiment import Config, Rewards, Task, Training
 from experiments.config.optimiser import Optimiser
 from experiments.errors import ConfigError, error_context
-from mjx_tt.env import own as user_file
-from mjx_tt.env import rewards
-from mjx_tt.env.own import Definitions, Network
-from mjx_tt.env.task import TaskConfig
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot.robot import Robot
+from mjx_tt.env import user_defined
+from mjx_tt.env.network import Network
+from mjx_tt.env.reward_weights import PRESETS
+from mjx_tt.env.task import CONTRACT_OBSERVATIONS, TaskConfig, weigh_rewards
+from mjx_tt.env.terms import ObservationTerm, RewardTerm
+from mjx_tt.env.user_defined import Definitions
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
 from mjx_tt.sim import model as models
 from mjx_tt.sim import randomisation
 from mjx_tt.sim.model import ModelFile, SimModel
@@ -79,7 +81,7 @@ def experiment(config: Config, where: str) -> Experiment:
     )
     if config.training.later_rewards is not None:
         with error_context(f"{where}: training.later_rewards"):
-            reward_weights(config.training.later_rewards.rewards, own)
+            reward_terms(config.training.later_rewards.rewards, own)
     with error_context(f"{where}: task"):
         task = task_config(config.task, own, robot)
     with error_context(f"{where}: optimiser"):
@@ -145,22 +147,31 @@ def definitions(config: Config, where: str) -> tuple[Definitions, str | None]:
     contract = robot_of(config, where)[0].contract
     with error_context(f"{where}: definitions"):
         if "\n" in given:
-            return user_file.load(given, f"definitions of {config.name}", contract), given
+            return user_defined.load(given, f"definitions of {config.name}", contract), given
         if not given.endswith(".py"):
             raise ValueError(f"expected a Python file, such as my_task.py, got {given}")
         text = Path(given).read_text(encoding="utf-8")
-        return user_file.load(text, given, contract), text
+        return user_defined.load(text, given, contract), text
 
 
 def network(config: Config, where: str) -> Network | None:
     """The experiment's own network; None: the paper's. Raises ConfigError."""
+    own, names = definitions(config, where)[0], config.task.observations
     if config.network is None:
+        if names:
+            raise ConfigError(
+                f"{where}: task.observations: {', '.join(names)}: the paper's network takes ball and joints only; "
+                "name a network of yours under the key network"
+            )
         return None
-    known = definitions(config, where)[0].networks
-    if config.network not in known:
+    if config.network not in own.networks:
+        known = own.networks
         allowed = f"one of {', '.join(known)}" if known else "a file that defines it under the key definitions"
         raise ConfigError(f"{where}: network: expected {allowed}, got {config.network}")
-    return known[config.network]
+    with error_context(f"{where}: task.observations"):
+        seen = user_defined.count_rows(observation_terms(config.task, own), own.contract)
+    with error_context(f"{where}: definitions"):
+        return own.checked_network(config.network, seen)
 
 
 def distribution(balls: str | dict[str, Any], where: str) -> Balls:
@@ -178,25 +189,24 @@ def task_config(
     robot: Robot | None = None,
 ) -> TaskConfig:
     """Settings of the task for a robot; None: the paper's. Raises ValueError where the numbers do not fit together."""
-    weights = reward_weights(task.rewards, own)
-    terms = tuple(own.terms.values())
-    return TaskConfig(
-        **_shared(task, TaskConfig), reward_weights=weights, own_terms=terms, robot=robot or robots.paper()
-    )
+    settings = _shared(task, TaskConfig) | {"rewards": reward_terms(task.rewards, own)}
+    return TaskConfig(**settings | {"observations": observation_terms(task, own), "robot": robot or robots.paper()})
 
 
-def reward_weights(chosen: str | Rewards, own: Definitions = Definitions()) -> tuple[float, ...]:  # noqa: B008
-    """Weights in the order of ``rewards.TERMS``, then of the user's own terms. Raises ValueError for an unknown one."""
-    base = chosen if isinstance(chosen, str) else chosen.base
-    weights = {"sim": rewards.SIM_WEIGHTS, "real": rewards.REAL_WEIGHTS}[base]
-    changed = {} if isinstance(chosen, str) else chosen.model_dump(exclude={"base", "own"}, exclude_none=True)
-    wanted = {} if isinstance(chosen, str) else chosen.own
-    for name in wanted:
-        if name not in own.terms:
-            allowed = ", ".join(own.terms) or "none is defined; name a file of yours under the key definitions"
-            raise ValueError(f"rewards.own: {name} is not defined; allowed: {allowed}")
-    eleven = (float(changed.get(name, weights[name])) for name in rewards.TERMS)
-    return (*eleven, *(float(wanted.get(name, 0.0)) for name in own.terms))
+def reward_terms(chosen: str | Rewards, own: Definitions = Definitions()) -> tuple[RewardTerm, ...]:  # noqa: B008
+    """The built-in terms and the user's, with their weights. Raises ValueError for an unknown one."""
+    base, changed = (chosen, {}) if isinstance(chosen, str) else (chosen.base, chosen.changed)
+    return weigh_rewards(PRESETS[base] | changed, own.rewards.values())
+
+
+def observation_terms(task: Task, own: Definitions) -> tuple[ObservationTerm, ...]:
+    """The contract's terms, and the user's that the task asks for. Raises ValueError for an unknown one."""
+    for name in task.observations:
+        if name not in own.observations:
+            allowed = ", ".join(own.observations) or "none is defined; name a file of yours under the key definitions"
+            raise ValueError(f"observations: {name} is not defined; allowed: {allowed}")
+    user = (replace(own.observations[name], weight=weight) for name, weight in task.observations.items())
+    return (*CONTRACT_OBSERVATIONS, *user)
 
 
 def later_weights(
@@ -205,7 +215,9 @@ def later_weights(
 ) -> tuple[int, tuple[float, ...]] | None:
     """The number of updates after which the reward weights change, and those weights."""
     later = training.later_rewards
-    return None if later is None else (round(later.after * training.updates), reward_weights(later.rewards, own))
+    if later is None:
+        return None
+    return round(later.after * training.updates), tuple(term.weight for term in reward_terms(later.rewards, own))
 
 
 def bgs_config(optimiser: Optimiser, updates: int) -> BGSConfig:

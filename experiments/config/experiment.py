@@ -10,43 +10,52 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from ballmodel.io import validation
 from ballmodel.io.validation import Count, Finite, Fraction, Name, Positive, Section, Seed
 from experiments.config import files
 from experiments.config.optimiser import Optimiser
+from mjx_tt.env.reward_weights import REAL_WEIGHTS, SIM_WEIGHTS
 
 
 class Rewards(Section):
-    """Weights of the eleven reward terms; a term that is left out keeps the weight of ``base``."""
+    """Weights of reward terms by name; a term that is left out, or null, keeps the weight of ``base``.
+
+    The names are those of the built-in terms and of those that the file of the key definitions has, which weigh 0 when
+    they are left out.
+    """
+
+    model_config = ConfigDict(extra="allow", json_schema_extra=lambda schema: schema["properties"].update(_weights()))
+    __pydantic_extra__: dict[str, Finite | None]
 
     base: Literal["sim", "real"] = "sim"
     """The paper's weights for simulation or for the real robot."""
-    state_transition: Finite | None = None
-    """Weight of nearing the ball, hitting it, and returning it over the net and on the table."""
-    net_clearance: Finite | None = None
-    """Weight of the return's height over the net."""
-    hit_and_land: Finite | None = None
-    """Weight of a ball that was hit and landed."""
-    fault: Finite | None = None
-    """Weight of a fault of the robot."""
-    jerk: Finite | None = None
-    """Weight of small jerk."""
-    acceleration: Finite | None = None
-    """Weight of small accelerations."""
-    velocity: Finite | None = None
-    """Weight of small velocities."""
-    joint_angle: Finite | None = None
-    """Weight of joints well inside their ranges."""
-    collision: Finite | None = None
-    """Weight of steps in contact with table or robot, which count -1 each."""
-    paddle_height: Finite | None = None
-    """Weight of steps with a low paddle, which count -1 each."""
-    style: Finite | None = None
-    """Weight of steps with a paddle that faces backwards, which count -1 each."""
-    own: dict[str, Finite] = {}
-    """Weights of terms that the file of the key definitions has, by their names; 0 for those left out."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flat(cls, data: Any) -> Any:
+        """Artefacts from before version 1 hold the weights of user-defined terms under ``own``."""
+        if isinstance(data, dict) and isinstance(data.get("own"), dict):
+            return {key: value for key, value in data.items() if key != "own"} | data["own"]
+        return data
+
+    @property
+    def changed(self) -> dict[str, float]:
+        """The weights that differ from the base's."""
+        return {name: float(weight) for name, weight in self.__pydantic_extra__.items() if weight is not None}
+
+
+def _weights() -> dict[str, Any]:
+    """JSON schema of the built-in terms' weights, for editors and the reference."""
+    return {
+        name: {
+            "type": "number",
+            "title": name,
+            "description": f"Weight of the term; {SIM_WEIGHTS[name]:g} in sim, {REAL_WEIGHTS[name]:g} in real.",
+        }
+        for name in SIM_WEIGHTS
+    }
 
 
 class Task(Section):
@@ -64,6 +73,9 @@ class Task(Section):
     """Control steps after which an episode ends."""
     rewards: Literal["sim", "real"] | Rewards = "sim"
     """The paper's weights by name, or a mapping that changes single ones."""
+    observations: dict[str, Finite] = {}
+    """Observation terms of the file of the key definitions that the policy sees besides ball and joints, and the number
+    by which each is multiplied."""
 
 
 class LaterRewards(Section):
@@ -146,18 +158,34 @@ class Config(Section):
     @model_validator(mode="after")
     def _of_one_kind(self) -> Config:
         refuse_rewards(self.optimiser, self.task, "", {"training.later_rewards": self.training.later_rewards})
+        if self.definitions is None:
+            refuse_unknown_terms("task.rewards", self.task.rewards)
+            if self.training.later_rewards is not None:
+                refuse_unknown_terms("training.later_rewards.rewards", self.training.later_rewards.rewards)
         return self
 
 
+def refuse_unknown_terms(key: str, rewards: str | Rewards) -> None:
+    """Raises ValueError for weights of other terms than the built-in ones. key: of the weights, for the message."""
+    for name in () if isinstance(rewards, str) else rewards.changed:
+        if name not in SIM_WEIGHTS:
+            raise ValueError(
+                f"{key}.{name}: unknown reward term; {validation.nearest(name, SIM_WEIGHTS)} allowed: "
+                f"{', '.join(SIM_WEIGHTS)}, and terms of a file that the key definitions names"
+            )
+
+
 def refuse_rewards(optimiser: Optimiser, task: Task, where: str, later: dict[str, LaterRewards | None]) -> None:
-    """Raises ValueError for rewards that first-order gradients do not know: own ones, and ``later`` ones by their key.
+    """Raises ValueError for rewards that first-order gradients do not know: user-defined ones, and ``later`` ones by
+    their key.
 
     where: before the other keys in the message.
     """
     if optimiser.gradient != "first_order":
         return
-    own = {} if isinstance(task.rewards, str) else task.rewards.own
-    for key, given in (*later.items(), (f"{where}task.rewards.own", own)):
+    changed = {} if isinstance(task.rewards, str) else task.rewards.changed
+    user = {f"{where}task.rewards.{name}": weight for name, weight in changed.items() if name not in SIM_WEIGHTS}
+    for key, given in (later | user).items():
         if given:
             raise ValueError(
                 f"{key}: {where}optimiser.gradient first_order climbs an objective of its own, in which it has no "

@@ -7,16 +7,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from ballmodel.io import validation
 from ballmodel.io.validation import Count, Seed
 from experiments.config import files
 from experiments.config.experiment import Config, Rewards
 from experiments.config.optimiser import Constant, EliteFraction, EmaDecay, NumDirections, Optimiser, Shaping, Step
 from experiments.errors import ConfigError
+from mjx_tt.env.reward_weights import MEASURED_WEIGHTS, SIM_WEIGHTS
 
 # Policies by first-order gradients return a third of their balls where the paper's sigma moves them, and learn from
 # that where to go (docs/results/fine-tuning.md).
 NEAR = {"sigma": 0.01, "step.learning_rate": 0.0015}
-MEASURED = ("state_transition", "net_clearance", "hit_and_land", "fault")  # terms that a real episode tells
 
 
 class FineTuning(Shaping):
@@ -79,10 +80,15 @@ def parse(data: dict[str, Any], where: str) -> FineTuning:
 def _check_rewards(rewards: str | Rewards, where: str) -> None:
     if isinstance(rewards, str) or rewards.base == "sim":
         raise ConfigError(
-            f"{where}: rewards: expected weights based on real, got sim; a robot measures only {', '.join(MEASURED)}"
+            f"{where}: rewards: expected weights based on real, got sim; a robot measures only "
+            f"{', '.join(MEASURED_WEIGHTS)}"
         )
-    for name, weight in rewards.model_dump(exclude={"base"}, exclude_none=True).items():
-        if weight and name not in MEASURED:
+    for name, weight in rewards.changed.items():
+        if name not in SIM_WEIGHTS:
+            allowed = f"{validation.nearest(name, SIM_WEIGHTS)} allowed: {', '.join(MEASURED_WEIGHTS)}"
+            raise ConfigError(f"{where}: rewards.{name}: unknown reward term; {allowed}")
+        if weight and name not in MEASURED_WEIGHTS:
             raise ConfigError(
-                f"{where}: rewards.{name}: expected 0, got {weight}; a robot measures only {', '.join(MEASURED)}"
+                f"{where}: rewards.{name}: expected 0, got {weight}; a robot measures only "
+                f"{', '.join(MEASURED_WEIGHTS)}"
             )

@@ -23,7 +23,7 @@ from robot_io.emulator.opponent import Throws
 
 if TYPE_CHECKING:  # a robot.yaml is read without JAX
     from ballmodel.registry import Balls
-    from mjx_tt.robot.robot import Robot
+    from mjx_tt.robot.robots import Robot
     from mjx_tt.sim.model import SimModel
 
 COMMISSIONING = 0.1  # speed_scale of a robot.yaml that sets none: full speed is asked for, not forgotten
@@ -40,7 +40,7 @@ def named(path: str | Path) -> str | None:
         return None
     if not isinstance(given, str):
         raise ConfigError(f"{path}: robot: expected a robot's name or folder, got {given!r}")
-    from mjx_tt.robot import robot as robots
+    from mjx_tt.robot import robots
 
     return given if given in robots.names() else str(Path(path).parent / given)
 
@@ -50,7 +50,7 @@ def standing(path: str | Path) -> Contract:
     robot = named(path)
     if robot is None:
         return PAPER
-    from mjx_tt.robot import robot as robots
+    from mjx_tt.robot import robots
 
     with error_context(f"{path}: robot"):
         return robots.load(robot).contract

@@ -211,6 +211,10 @@ class Study(Section):
         simulation = self.simulation
         later = {f"simulation.rounds.{k}.later_rewards": r.later_rewards for k, r in enumerate(simulation.rounds)}
         experiment.refuse_rewards(simulation.optimiser, simulation.task, "simulation.", later)
+        experiment.refuse_unknown_terms("simulation.task.rewards", simulation.task.rewards)
+        for key, given_later in later.items():
+            if given_later is not None:
+                experiment.refuse_unknown_terms(f"{key}.rewards", given_later.rewards)
         if self.robot is not None and self.bound:
             raise ValueError("bound: nobody knows all numbers of a robot; leave it false")
         missing = [player for player in self.players if player not in self.recordings]

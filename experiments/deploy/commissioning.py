@@ -14,7 +14,7 @@ from experiments.deploy import robot_attachment
 from experiments.deploy.operator_console import KEYS, QUIT, Key, Keyboard, View
 from experiments.deploy.session import Session
 from experiments.errors import ConfigError, checked
-from mjx_tt.robot import robot as simulated
+from mjx_tt.robot import robots as simulated
 from robot_io.calibrated import Calibration
 from robot_io.calibration import points
 from robot_io.contract import PAPER, Contract

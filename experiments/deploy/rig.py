@@ -16,8 +16,8 @@ from experiments.config import robot as robots
 from experiments.deploy.operator_console import Keyboard
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.errors import ConfigError, checked
-from mjx_tt.robot import robot as simulated
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots as simulated
+from mjx_tt.robot.robots import Robot
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import PAPER
 from robot_io.control.rally import Box

@@ -19,13 +19,13 @@ from rich.console import Console
 
 from experiments.deploy.rig import RECORDED, content_of
 from experiments.errors import ConfigError, checked
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
 from robot_io.contract import PAPER
 from robot_io.policy.artefact import Artefact
 
 NAME = "robot.zip"  # of the attachment
-CONTENT, MJCF = "robot.json", "robot.xml"  # in it: ``mjx_tt.robot.robot.content``, and where the MJCF belongs
+CONTENT, MJCF = "robot.json", "robot.xml"  # in it: ``mjx_tt.robot.robots.content``, and where the MJCF belongs
 LARGEST, UNPACKED = 32 << 20, 256 << 20  # bytes of the attachment, and of what is in it
 
 Attachments = tuple[tuple[str, bytes], ...]

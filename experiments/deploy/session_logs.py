@@ -10,8 +10,8 @@ from mcap.reader import make_reader
 
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint.log import SHORTEST, JointRecord
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
 from robot_io.log import SessionLog, read
 
 LONGEST_GAP = 0.1  # [s] without a sample that ends a flight

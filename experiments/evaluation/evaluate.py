@@ -11,14 +11,15 @@ import numpy as np
 from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
+from experiments.evaluation import reachability
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.stages import Stage, silent
 from experiments.stats import wilson
-from mjx_tt.env import reachability, rewards
+from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import COLUMNS, Evaluator
 from mjx_tt.env.policy import Policy
+from mjx_tt.env.reward_weights import TERMS
 from mjx_tt.env.rollout import RolloutResult, Simulator
-from mjx_tt.env.task import HIT, MISSED, RETURNED
 from mjx_tt.sim import randomisation
 
 OUTCOMES = {"missed": MISSED, "hit": HIT, "returned": RETURNED}
@@ -121,7 +122,7 @@ def _reachable(
     return {"return_rate": found.rate, "low": low, "high": high, "balls": found.balls, "by_policy": found.by_policy}
 
 
-def summary(result: RolloutResult, terms: tuple[str, ...] = rewards.TERMS) -> dict[str, Any]:
+def summary(result: RolloutResult, terms: tuple[str, ...] = TERMS) -> dict[str, Any]:
     """Rates over all episodes, a non-finite one counting as missed; means of return and terms over the finite ones."""
     rate = return_rate(result)
     counts = {name: int(np.sum(result.outcome == outcome)) for name, outcome in OUTCOMES.items()}
@@ -149,7 +150,7 @@ def return_rate(result: RolloutResult) -> Rate:
 
 def selection_score(result: RolloutResult) -> float:
     """``sparse_reward`` in simulation, where a robot faults when it touches itself or the table, or is not finite."""
-    collision = result.terms[rewards.TERMS.index("collision")]
+    collision = result.terms[TERMS.index("collision")]
     return sparse_reward(result.outcome, ~result.finite | (collision < 0))
 
 

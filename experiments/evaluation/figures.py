@@ -19,7 +19,7 @@ from matplotlib.patches import Rectangle
 from ballmodel import constants as c
 from ballmodel.io.atomic_files import replacing
 from experiments.evaluation.evaluate import Played
-from mjx_tt.env.task import HIT, MISSED, RETURNED
+from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from robot_io.contract import PAPER, Contract
 
 RETURNED_COLOUR, HIT_COLOUR, MISSED_COLOUR = "#1b7837", "#e08214", "#b2182b"

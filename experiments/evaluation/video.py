@@ -12,7 +12,7 @@ from experiments.runs.load_policy import TrainedPolicy
 from experiments.view.film import Film
 from experiments.view.programme import Play
 from experiments.view.studio import Studio
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.robots import Robot
 from mjx_tt.viz import rendering
 from mjx_tt.viz.caption import GOOD, POOR, Caption
 from mjx_tt.viz.rendering import Moment

@@ -8,6 +8,7 @@ for bit. The run's folder is a run like those of training: it can be evaluated, 
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import time
 from pathlib import Path
@@ -35,8 +36,11 @@ from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import CONFIG, Run
 from experiments.training import finalize
 from experiments.training.update import TrainState
-from mjx_tt.env import rewards
-from mjx_tt.env.own import Network
+from mjx_tt.env import task
+from mjx_tt.env.network import Network
+from mjx_tt.env.reward_weights import MEASURED_WEIGHTS
+from mjx_tt.env.terms import PlayedBall as RewardedBall
+from robot_io.contract import JOINT_NAMES
 from robot_io.control.episode import HIT, RETURNED, EpisodeSummary
 from robot_io.emulator.config import RigParams
 from robot_io.policy import jax_network
@@ -46,7 +50,6 @@ SETTINGS = "finetuning.yaml"
 JOURNAL = "journal.jsonl"
 HUMAN_BALLS = "human_balls.csv"
 CURVE = "finetuning.png"
-FAULT = -2.0  # paper: a fault of the robot
 STOPPED = "stopped"  # the bridge's word for an episode that the operator ended
 EVALUATION_EPISODES = 1_000_000  # number of the first evaluation's first episode: other balls than in fine-tuning
 LOCK_STEP_BALLS = 65536
@@ -114,17 +117,19 @@ def lock_step_robot(experiment: Experiment, params: RigParams | None = None, see
 
 
 def reward_terms(summary: EpisodeSummary) -> dict[str, float]:
-    """The terms of an episode on a robot, unweighted, by the formulas of the simulation; others are not measured."""
-    hit, returned = summary.outcome in (HIT, RETURNED), summary.outcome == RETURNED
-    landing = np.array(summary.landing, np.float32)
-    closest = np.float32(summary.closest)
-    nearing = rewards.state_transition(closest, hit, np.bool_(summary.crossed), returned, landing)
-    return {
-        "state_transition": float(nearing),
-        "net_clearance": float(rewards.net_clearance(np.bool_(hit), np.bool_(summary.crossed), summary.net_height)),
-        "hit_and_land": float(returned),
-        "fault": FAULT if summary.fault else 0.0,
-    }
+    """The terms of an episode on a robot, unweighted, by the functions of the simulation; others are not measured."""
+    played = RewardedBall(
+        hit=summary.outcome in (HIT, RETURNED),
+        crossed=np.bool_(summary.crossed),
+        returned=summary.outcome == RETURNED,
+        net_height=summary.net_height,
+        landing=np.array(summary.landing, np.float32),
+        closest=np.float32(summary.closest),
+        steps=math.nan,
+        peak_velocity=np.full(len(JOINT_NAMES), math.nan),
+        fault=bool(summary.fault),
+    )
+    return {term.name: float(term(played)) for term in task.BUILT_IN_REWARDS if term.name in MEASURED_WEIGHTS}
 
 
 class Session:
@@ -147,7 +152,7 @@ class Session:
         self._network = None if network is None else jax_network.exported(network)
         self._settings, self._run, self._robot, self._operator = settings, run, robot, operator
         self._bgs = build.bgs_config(settings.optimiser(), settings.updates)
-        self._weights = dict(zip(rewards.TERMS, build.reward_weights(settings.rewards), strict=True))
+        self._weights = {term.name: term.weight for term in build.reward_terms(settings.rewards)}
         found = checkpoint.load_latest(run.checkpoints, first)
         self.state, notes = found or (first, {"update": 0, "seconds": 0.0})
         self.update, self._seconds = notes["update"], notes["seconds"]

@@ -11,7 +11,7 @@ from experiments.commands.options import command, console, count, existing, opti
 from experiments.errors import ConfigError
 
 if TYPE_CHECKING:
-    from mjx_tt.robot.robot import Robot
+    from mjx_tt.robot.robots import Robot
 
 Balls = Annotated[str, option("NAME_OR_YAML", "balls that it should return (default: player3/M0)")]
 SOME = 32  # balls whose motions are searched
@@ -58,7 +58,7 @@ def new(
     from ballmodel.io.atomic_files import replacing
     from experiments.config import build
     from experiments.robots import draft
-    from mjx_tt.robot import robot as robots
+    from mjx_tt.robot import robots
 
     screen, file = console(), path.with_name(robots.YAML)
     if file.exists():
@@ -97,7 +97,7 @@ def new(
 @list_app.default
 def names() -> None:
     """Prints a line for each."""
-    from mjx_tt.robot import robot as robots
+    from mjx_tt.robot import robots
 
     screen = console()
     for name in robots.names():
@@ -123,7 +123,7 @@ def place(
     from experiments.config import build
     from experiments.errors import error_context
     from experiments.robots import placement
-    from mjx_tt.robot import robot as robots
+    from mjx_tt.robot import robots
 
     screen = console()
     with error_context():

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from experiments.errors import ConfigError
-from mjx_tt.robot.model import PADDLE_SITE, Capsule, capsules
+from mjx_tt.robot.mjcf import PADDLE_SITE, Capsule, capsules
 
 SPEED = {"m": 1.5, "rad": 2.5}  # [m/s], [rad/s] guessed
 ACCELERATION = {"m": 10.0, "rad": 10.0}  # [m/s^2], [rad/s^2] guessed

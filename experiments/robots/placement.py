@@ -4,7 +4,7 @@ For each ball a few places are taken where it can be met after its bounce, with 
 face to send it to the middle of the human's half. A candidate is a mounting and a home pose. Its score is the share of
 balls for which, by inverse kinematics from home, some place can be taken in time, at the joints' speeds and
 accelerations and without contact, times how nearly the blade faces at home as most balls want it: a quick stand-in for
-the bound on what is in reach (``mjx_tt.env.reachability``), which takes minutes for a single candidate. The
+the bound on what is in reach (``experiments.evaluation.reachability``), which takes minutes for a single candidate. The
 cross-entropy method searches candidates.
 """
 
@@ -28,10 +28,10 @@ from ballmodel.sampling import sample_pool
 from experiments.config import build
 from experiments.errors import ConfigError
 from experiments.robots.reach import blade
-from mjx_tt.env import rewards
-from mjx_tt.robot import robot as robots
+from mjx_tt.env.task import TARGET
+from mjx_tt.robot import robots
 from mjx_tt.robot.kinematics import PaddleKinematics
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.robots import Robot
 from robot_io.safety.clearance import RobotGeometry
 
 STEP = 1.0 / 150.0  # [s] of the balls' flights
@@ -127,7 +127,7 @@ def meetings(robot: Robot, balls: Balls, samples: int, seed: int) -> Meetings:
     index = np.array([ticks for _, ticks in some])
     ball = np.array([number for number, _ in some])[:, None]
     where, arriving = position[index, :, ball], velocity[index, :, ball]
-    target = np.array([*rewards.TARGET, 0.0])
+    target = np.array([*TARGET, 0.0])
     leaving = (target - where) / RETURN_SECONDS + np.array([0.0, 0.0, 0.5 * GRAVITY * RETURN_SECONDS])
     change = leaving - arriving
     return Meetings((index + 1) * STEP, where, change / np.linalg.norm(change, axis=-1, keepdims=True))

@@ -13,11 +13,11 @@ import numpy as np
 from ballmodel.registry import Balls
 from ballmodel.sampling import sample_pool
 from experiments.config import build
-from mjx_tt.env import reachability, rewards
+from experiments.evaluation import reachability
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import TaskConfig
-from mjx_tt.robot.robot import Robot
+from mjx_tt.env.task import FACING, TaskConfig
+from mjx_tt.robot.robots import Robot
 from mjx_tt.viz import rendering
 from mjx_tt.viz.rendering import Moment
 from robot_io.contract import n_parameters
@@ -43,7 +43,7 @@ def description(robot: Robot) -> Iterator[str]:
     yield f"blade at home: x {x:.2f}, y {y:.2f}, z {z:.2f} m; faces {(np.round(normal, 2) + 0.0).tolist()}"
     sideways, _, upwards = speed
     yield f"and moves there at up to {sideways:.1f} m/s across and {upwards:.1f} m/s up"
-    if normal[1] < rewards.FACING:
+    if normal[1] < FACING:
         yield "warning: the striking face looks away from the human (y below 0.3); turn the home pose or the site"
     if not PADDLE_HEIGHT[0] < z < PADDLE_HEIGHT[1] or not -2.4 < y < -1.2:
         yield "warning: balls come by at y -2.2 to -1.4 m and z 0 to 0.5 m; move mount or home: mjx-tt robot place"

@@ -17,7 +17,7 @@ from experiments.errors import RunError
 from experiments.runs import checkpoint
 from experiments.runs.locate import artefact_of, find_policy, is_exported
 from experiments.runs.run_dir import CONFIG, Run
-from mjx_tt.env import own
+from mjx_tt.env import user_defined
 from mjx_tt.env.policy import Policy
 from robot_io.policy import artefact as artefacts
 
@@ -78,7 +78,7 @@ def _from_artefact(folder: Path) -> TrainedPolicy:
     provenance = artefact.manifest["provenance"]
     recorded = provenance.get("config") if isinstance(provenance, dict) else None
     config = parse(recorded, f"{folder}: provenance.config") if recorded else None
-    policy = own.simulated(artefact.policy, str(folder), artefact.contract).astype(np.float32)
+    policy = user_defined.load_network(artefact.policy, str(folder), artefact.contract).astype(np.float32)
     return TrainedPolicy(policy, folder, config, provenance)
 
 

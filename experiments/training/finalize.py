@@ -83,12 +83,13 @@ def export_policy(
     folder: Path, trained: TrainedPolicy, experiment: Experiment, report: dict[str, Any] | None, console: Console
 ) -> bool:
     """Writes and verifies the artefact; False, with a line that says so, for a policy that the robot cannot run."""
-    rate = experiment.task.control_rate
-    if rate != contract.CONTROL_RATE:
-        console.print(
-            f"{folder}: not exported: the policy acts at {rate:g} Hz, the robot at {contract.CONTROL_RATE:g} Hz",
-            highlight=False,
-        )
+    rate, more = experiment.task.control_rate, ", ".join(experiment.config.task.observations)
+    reasons = {
+        f"the policy acts at {rate:g} Hz, the robot at {contract.CONTROL_RATE:g} Hz": rate != contract.CONTROL_RATE,
+        f"the policy observes {more}, the robot's side computes ball and joints only": bool(more),
+    }
+    for reason in (text for text, holds in reasons.items() if holds):
+        console.print(f"{folder}: not exported: {reason}", highlight=False)
         return False
     provenance = {
         "config": experiment.config.to_dict(),

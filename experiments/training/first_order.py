@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 
 from bgs import normalizer, strategy
 from experiments.training.update import Inputs, Trainer, TrainState
-from mjx_tt.env.episode import reshaped
+from mjx_tt.env.episode import reshape_episodes
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import AXIS
 from mjx_tt.gradient.objective import Objective, Played
@@ -41,7 +41,7 @@ class FirstOrderTrainer(Trainer):
         population = strategy.ask(direction_key, state.bgs, config)
         shape = (self._repeats, 2 * config.num_directions)
         episodes = self._draw(episode_key, inputs, *shape)
-        mine = reshaped(simulator.local(episodes), -1)
+        mine = reshape_episodes(simulator.local(episodes), -1)
         mean, inv_std = normalizer.normaliser(state.statistics)
 
         def cost(members: jax.Array) -> tuple[jax.Array, Played]:
@@ -70,7 +70,9 @@ class FirstOrderTrainer(Trainer):
         count = jnp.maximum(total["episodes"], 1.0)
         gradient = -total["slope"] / count
         norm = jnp.linalg.norm(gradient)
-        bgs = strategy.climb(state.bgs, gradient * jnp.minimum(1.0, LONGEST / jnp.maximum(norm, 1e-12)), config)
+        bgs = strategy.apply_gradient(
+            state.bgs, gradient * jnp.minimum(1.0, LONGEST / jnp.maximum(norm, 1e-12)), config
+        )
         # Without one finite episode a step would move on momentum alone.
         bgs = jax.tree.map(
             lambda new, old: jnp.where(total["episodes"] > 0, new, old),

@@ -19,11 +19,10 @@ from jax.typing import ArrayLike
 from ballmodel.sampling import BallPool
 from bgs import normalizer, strategy
 from bgs.strategy import BGSConfig, BGSState
-from mjx_tt.env.episode import Episodes
-from mjx_tt.env.own import Network
+from mjx_tt.env.episode import MISSED, RETURNED, Episodes
+from mjx_tt.env.network import Network
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.rollout import AXIS, RolloutResult, Simulator
-from mjx_tt.env.task import MISSED, RETURNED
 from mjx_tt.sim import model as models
 from mjx_tt.sim.arguments import Arguments, arguments
 from mjx_tt.sim.model import SimModel
@@ -91,12 +90,12 @@ class Trainer:
         Raises ValueError where theta is not this network's.
         """
         theta_key, run_key = jax.random.split(key)
-        contract = self.simulator.task.contract
-        size = n_parameters(contract.n_joints) if self.network is None else self.network.size
+        task = self.simulator.task
+        size = n_parameters(task.contract.n_joints) if self.network is None else self.network.size
         theta = initial_theta(theta_key, self._initial_scale, size) if theta is None else jnp.asarray(theta)
         if theta.shape != (size,):
             raise ValueError(f"the first policy has {theta.shape[0]} parameters, the network has {size}")
-        statistics = normalizer.empty(contract.n_observation) if statistics is None else statistics
+        statistics = normalizer.empty(task.config.n_observation) if statistics is None else statistics
         return self.simulator.replicate(TrainState(strategy.init(theta, self.bgs_config), statistics, run_key))
 
     def update(self, state: TrainState) -> tuple[TrainState, dict]:

@@ -16,9 +16,9 @@ from experiments.view.programme import Fixed
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.prediction.state_fit import SpinPrior, fit_states, fly_on, lift_known
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot.model import home_qpos, load_model
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots
+from mjx_tt.robot.mjcf import home_qpos, load_model
+from mjx_tt.robot.robots import Robot
 from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io.log import Episode, Level, SessionLog, read
 

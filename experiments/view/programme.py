@@ -18,10 +18,10 @@ from experiments.view.studio import LANES, Studio
 from mjx_tt.env.episode import MISSED, RETURNED
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
-from mjx_tt.rally.ball_flights import homeward
+from mjx_tt.rally.ball_flights import drive_home
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.rally.simulator import RallySimulator, ShotResult
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.robots import Robot
 from mjx_tt.sim.model import SimModel
 
 POOL = 512  # balls of a distribution
@@ -208,7 +208,7 @@ class Rally:
             at_hit = jnp.repeat(jnp.asarray(qpos[hit], jnp.float32)[:, None], len(film.time), axis=1)
             seconds = jnp.asarray(np.maximum(film.time - film.decided, 0.0), jnp.float32)
             home, limits = self._simulator.task.home, self._simulator.task.contract.limits
-            qpos[hit:] = np.asarray(homeward(home, at_hit, seconds, limits)).T[hit : last + 1]
+            qpos[hit:] = np.asarray(drive_home(home, at_hit, seconds, limits)).T[hit : last + 1]
         balls = {"ball": film.balls["ball"][: last + 1]}
         landing = next_landing(balls["ball"])
         return replace(

@@ -13,9 +13,9 @@ from mjviser import ViserMujocoScene
 
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from experiments.view.film import RATE, Film
-from mjx_tt.env.outgoing_ball import FLOOR
-from mjx_tt.robot.model import PADDLE_SITE
-from mjx_tt.robot.robot import Robot
+from mjx_tt.env.return_flight import FLOOR
+from mjx_tt.robot.mjcf import PADDLE_SITE
+from mjx_tt.robot.robots import Robot
 
 SPACING = -3.2  # [m] from the middle of a table to the next one's, which stands to its right for the person
 BALL_TRAIL, PADDLE_TRAIL = 0.25, 0.35  # [s]

@@ -19,8 +19,8 @@ from experiments.view.page import REST, Viewer
 from experiments.view.programme import Fixed, Play, Programme
 from experiments.view.scene import Scene
 from experiments.view.studio import Studio
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
 from mjx_tt.sim.model import ModelFile, SimModel
 
 EXPORTED_RATE = 30.0  # [Hz]

@@ -7,7 +7,7 @@ so the same ball meets the same latencies and noise under other parameters and a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -20,12 +20,12 @@ from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, where
 from experiments.view.film import RATE, Film, Series, next_landing, upsampled
 from mjx_tt import platform
-from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes, TaskConfig
-from mjx_tt.env.outgoing_ball import fly_out
+from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes
 from mjx_tt.env.policy import NetworkController, Policy, PolicyController
 from mjx_tt.env.policy import controller as controller_of
-from mjx_tt.env.reward_sums import reward_terms
+from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.rollout import Simulator
+from mjx_tt.env.task import TaskConfig, evaluate_rewards
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import LATENCIES, ModelFile, SimModel
 from robot_io.contract import JOINT_NAMES
@@ -105,13 +105,14 @@ class Watched:
     """The policy, remembering its last input and output."""
 
     policy: PolicyController | NetworkController
+    n_joints: int = field(metadata={"static": True})
 
     @property
     def mean(self) -> Array:
         return self.policy.mean
 
     def start(self, observation: Array) -> Any:
-        action = jnp.zeros((observation.shape[0] - 3, *observation.shape[1:]))
+        action = jnp.zeros((self.n_joints, *observation.shape[1:]))
         return self.policy.start(observation), observation, action
 
     def act(self, tick: Any, state: Any, observation: Array) -> tuple[Array, Any]:
@@ -188,13 +189,13 @@ class Studio:
     def _play(self, policy: Policy, episodes: Episodes) -> dict[str, Array]:
         """The episodes tick by tick (max_steps, ..., L), then balls that are over flying on alone, and the result."""
         task, config = self.simulator.task, self.simulator.config
-        controller = Watched(controller_of(policy))
-        prepared, start = task.prepare(episodes), task.reset(episodes, controller)
+        controller = Watched(controller_of(policy), len(self.joints))
+        constants, start = task.prepare(episodes), task.reset(episodes, controller)
         alone = replace(episodes.model.ball, flight=replace(episodes.model.ball.flight, integrator="midpoint"))
 
         def advance(carry: tuple, tick: Array) -> tuple[tuple, dict[str, Array]]:
             state, ball = carry
-            new = task.control_step(tick, state, episodes, prepared, controller)
+            new = task.step(tick, state, episodes, constants, controller)
             _, observation, action = new.controller
             shown = {
                 "qpos": state.qpos,
@@ -208,8 +209,8 @@ class Studio:
             return (new, where(state.live, new.ball, flown)), shown
 
         (state, _), shown = jax.lax.scan(advance, (start, start.ball), jnp.arange(config.max_steps))
-        back = fly_out(config, state.ball, state.hit & state.finite, episodes.model)
-        terms = reward_terms(state, back, self.simulator.config.own_terms)
+        back = fly_return(config, state.ball, state.hit & state.finite, episodes.model)
+        terms = evaluate_rewards(config.rewards, state, back)
         returned = state.hit & back.returned & state.finite
         outcome = jnp.where(returned, RETURNED, jnp.where(state.hit & state.finite, HIT, MISSED))
         return {**shown, "terms": terms, "outcome": outcome, "hit": state.hit, "landing": jnp.asarray(back.landing)}
@@ -246,7 +247,7 @@ class Studio:
             landing=next_landing(ball),
             series={
                 "Input: ball as seen [m]": Series(("x", "y", "z"), ticks[played], seen[:, :3]),
-                "Input: joints as seen [m, rad]": Series(joints, ticks[played], seen[:, 3:]),
+                "Input: joints as seen [m, rad]": Series(joints, ticks[played], seen[:, 3 : 3 + len(joints)]),
                 "Output: share of the joints' speed": Series(joints, ticks[played], r["action"][played]),
             },
             terms={

@@ -20,7 +20,7 @@ from ballmodel.io.spindoe import INDEX
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
 from mjx_tt.diagnosis.tracks.frame import align
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.robots import Robot
 
 GUESS = TrackOptions()
 TURN = 0.15  # [m] that a ball comes back before it counts as hit

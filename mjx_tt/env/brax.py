@@ -24,12 +24,10 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from ballmodel.sampling import BallPool
-from mjx_tt.env.episode import reshaped
-from mjx_tt.env.observation import observe
-from mjx_tt.env.outgoing_ball import fly_out
-from mjx_tt.env.reward_sums import reward_terms
+from mjx_tt.env.episode import Episodes, EpisodeState, FixedAction, Return, reshape_episodes
+from mjx_tt.env.return_flight import fly_return
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import Episodes, EpisodeState, Return, Tick
+from mjx_tt.env.task import add_weighted, evaluate_rewards
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
 from robot_io.contract import HISTORY, N_OBSERVATION
@@ -46,22 +44,7 @@ FEWEST_FLOWN = 16  # balls flown out together, at least
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Given:
-    """Controller with an action decided outside."""
-
-    action: Float[Array, "joints *batch"]
-    mean: Float[Array, "observed"]
-
-    def start(self, observation: Array) -> tuple[()]:
-        return ()
-
-    def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Float[Array, "joints *batch"], tuple[()]]:
-        return self.action, ()
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Playing:
+class EnvState:
     """State of an environment between steps; batch axes last."""
 
     tick: Int[Array, ""]  # common to the batch: where its rings stand
@@ -86,11 +69,11 @@ class TableTennis(Env):
     ) -> None:
         self._simulator, self._pool, self._model, self._randomise = simulator, pool, model, randomise
         self._task = simulator.task
-        self._unseen = jnp.zeros(self._task.contract.n_observation)
+        self._unseen = jnp.zeros(self._task.config.n_observation)
 
     @property
     def observation_size(self) -> int:
-        return HISTORY * self._task.contract.n_observation
+        return HISTORY * self._task.config.n_observation
 
     @property
     def action_size(self) -> int:
@@ -111,15 +94,15 @@ class TableTennis(Env):
     def draw(self, key: PRNGKeyArray, batch: tuple[int, ...]) -> Episodes:
         """Fresh episodes of the batch shape."""
         drawn = self._simulator.draw(key, self._pool, self._model, self._randomise, 1, int(np.prod(batch)))
-        return reshaped(drawn, *batch)
+        return reshape_episodes(drawn, *batch)
 
     def begin(self, episodes: Episodes, key: PRNGKeyArray) -> State:
         """The state before the first step of given episodes (...); ``key`` is for those that follow."""
         state, tick = self._start(episodes), jnp.int32(0)
-        seen = observe(tick, state, episodes, self._task.prepare(episodes))
+        seen = self._task.observe(tick, state, episodes, self._task.prepare(episodes))
         history = jnp.broadcast_to(seen, (HISTORY, *seen.shape))
         zero = jnp.zeros(episodes.seed.shape)
-        playing = Playing(tick, key, episodes, state, history, zero)
+        playing = EnvState(tick, key, episodes, state, history, zero)
         metrics = {"hit": zero, "returned": zero, "episode_return": zero}
         return State(playing, flatten(history), zero, zero, metrics, {"truncation": zero})
 
@@ -127,12 +110,12 @@ class TableTennis(Env):
         """One control period under ``action`` (..., 8)."""
         task, playing = self._task, state.pipeline_state
         episodes, before = playing.episodes, playing.state
-        controller = Given(jnp.clip(jnp.moveaxis(action, -1, 0), -1.0, 1.0), self._unseen)
-        after = task.control_step(playing.tick, before, episodes, task.prepare(episodes), controller)
-        done = ~after.live | (after.sums.steps >= task.config.max_steps)
-        back = self._fly_out(after, done & after.hit & after.finite, episodes)
-        terms = reward_terms(after, back, task.config.own_terms)
-        earned = sum(w * terms[i] for i, w in enumerate(task.config.reward_weights))
+        controller = FixedAction(jnp.clip(jnp.moveaxis(action, -1, 0), -1.0, 1.0), self._unseen)
+        after = task.step(playing.tick, before, episodes, task.prepare(episodes), controller)
+        done = ~after.live | (after.accumulators.steps >= task.config.max_steps)
+        back = self._fly_return(after, done & after.hit & after.finite, episodes)
+        rewards = task.config.rewards
+        earned = add_weighted(rewards, evaluate_rewards(rewards, after, back))
         finite = after.finite & jnp.isfinite(earned)
         reward = jnp.where(finite, earned - playing.earned, 0.0)
         metrics = {
@@ -146,9 +129,9 @@ class TableTennis(Env):
         episodes = _where(done, fresh, episodes)
         started = _where(done, self._start(episodes), after)
         tick = playing.tick + 1
-        seen = observe(tick, started, episodes, task.prepare(episodes))
+        seen = task.observe(tick, started, episodes, task.prepare(episodes))
         history = jnp.where(done, seen, jnp.concatenate([playing.history[1:], seen[None]]))
-        playing = Playing(tick, key, episodes, started, history, jnp.where(done, 0.0, earned))
+        playing = EnvState(tick, key, episodes, started, history, jnp.where(done, 0.0, earned))
         return state.replace(
             pipeline_state=playing,
             obs=flatten(history),
@@ -158,9 +141,9 @@ class TableTennis(Env):
         )
 
     def _start(self, episodes: Episodes) -> EpisodeState:
-        return self._task.reset(episodes, Given(jnp.zeros(self.action_size), self._unseen))
+        return self._task.reset(episodes, FixedAction(jnp.zeros(self.action_size), self._unseen))
 
-    def _fly_out(self, state: EpisodeState, hit: Bool[Array, "*batch"], episodes: Episodes) -> Return:
+    def _fly_return(self, state: EpisodeState, hit: Bool[Array, "*batch"], episodes: Episodes) -> Return:
         """Outcome of the balls that were hit in this step.
 
         Few of a batch are at any one step: they are gathered, some at a time, until none is left.
@@ -168,13 +151,13 @@ class TableTennis(Env):
         task, ball, batch = self._task, state.ball, hit.shape
         width = max(FEWEST_FLOWN, batch[0] // 16) if len(batch) == 1 else 0
         if width == 0 or width >= batch[0]:
-            return fly_out(task.config, ball, hit, episodes.model)
+            return fly_return(task.config, ball, hit, episodes.model)
 
         def fly_some(carry: tuple[Array, Return]) -> tuple[Array, Return]:
             left, back = carry
             index = jnp.nonzero(left, size=width, fill_value=batch[0])[0]
             some, model = jax.tree.map(lambda x: x[..., index] if x.ndim else x, (ball, episodes.model))
-            part = fly_out(task.config, some, index < batch[0], model)
+            part = fly_return(task.config, some, index < batch[0], model)
             back = jax.tree.map(lambda x, new: x.at[..., index].set(new, mode="drop"), back, part)
             return left.at[index].set(False, mode="drop"), back
 

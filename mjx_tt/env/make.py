@@ -13,12 +13,13 @@ from ballmodel import registry
 from ballmodel.distribution import BallDistribution
 from ballmodel.mixture import BallMixture
 from ballmodel.sampling import sample_pool
-from mjx_tt.env import own
+from mjx_tt.env import user_defined
 from mjx_tt.env.brax import TableTennis, register_environment
+from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import HIT, MISSED, RETURNED, TaskConfig
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io.policy import artefact
@@ -118,7 +119,7 @@ def load_policy(path: str | os.PathLike) -> Policy:
     if not os.path.isdir(path):
         return Policy.load(path)
     found = artefact.load(Path(path))
-    return own.simulated(found.policy, str(path), found.contract).astype(np.float32)
+    return user_defined.load_network(found.policy, str(path), found.contract).astype(np.float32)
 
 
 def _distribution(balls: Balls) -> registry.Balls:

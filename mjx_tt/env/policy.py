@@ -21,8 +21,8 @@ from jax import Array
 from jaxtyping import Float, PRNGKeyArray
 
 from mjx_tt.env.episode import Tick
-from mjx_tt.env.own import Network
-from mjx_tt.robot.scalar_algebra import materialise
+from mjx_tt.env.network import Network
+from mjx_tt.robot.scalar_algebra import optimization_barrier
 from robot_io.contract import DILATIONS, GATED, n_parameters
 from robot_io.policy.pytree import Policy as Policy
 
@@ -61,7 +61,7 @@ def _layer(layer: Layer, older: Float[Array, "inputs *batch"], newer: Float[Arra
             + spread(kernel[0, c]) * older[c].reshape(shape)[None]
             + spread(kernel[1, c]) * newer[c].reshape(shape)[None]
         )
-    z = materialise(z).reshape(-1, *newer.shape[1:])
+    z = optimization_barrier(z).reshape(-1, *newer.shape[1:])
     if not gated:
         return jnp.tanh(z)
     half = z.shape[0] // 2
@@ -85,8 +85,8 @@ def stream(
 ) -> tuple[Float[Array, "joints *batch"], PolicyState]:
     """One control step: normalised observation ``x`` (11, ...) -> action (8, ...) in [-1, 1] and the next state."""
     one, two, three = _layers(parameters)
-    h1 = materialise(_layer(one, state.inputs[0], x))
-    h2 = materialise(_layer(two, state.layer1[0], h1))
+    h1 = optimization_barrier(_layer(one, state.inputs[0], x))
+    h2 = optimization_barrier(_layer(two, state.layer1[0], h1))
     action = _layer(three, state.layer2[0], h2)
     return action, PolicyState(
         x[None], jnp.concatenate([state.layer1[1:], h1[None]]), jnp.concatenate([state.layer2[1:], h2[None]])

@@ -23,10 +23,10 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import BallPool
 from ballmodel.state import BallState
-from mjx_tt.env.outgoing_ball import fly_out
+from mjx_tt.env.episode import HIT, MISSED, RETURNED, Controller, Episodes
 from mjx_tt.env.policy import controller
-from mjx_tt.env.reward_sums import reward_terms
-from mjx_tt.env.task import HIT, MISSED, RETURNED, Controller, Episodes, Task, TaskConfig
+from mjx_tt.env.return_flight import fly_return
+from mjx_tt.env.task import Task, TaskConfig, add_weighted, evaluate_rewards
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Drawing, Randomised
@@ -197,15 +197,15 @@ class Simulator:
     def _block(self, episodes: Episodes, controller: Controller) -> tuple[dict[str, Array], Array, Array]:
         task, config = self.task, self.config
         state = task.play(controller, episodes)
-        back = fly_out(config, state.ball, state.hit & state.finite, episodes.model)
-        terms = reward_terms(state, back, config.own_terms)
-        weights = np.asarray(config.reward_weights, terms.dtype)
-        returns = sum(w * terms[i] for i, w in enumerate(weights))
+        back = fly_return(config, state.ball, state.hit & state.finite, episodes.model)
+        terms = evaluate_rewards(config.rewards, state, back)
+        returns = add_weighted(config.rewards, terms)
         finite = state.finite & jnp.isfinite(returns)
         returned = state.hit & back.returned & finite
         outcome = jnp.where(returned, RETURNED, jnp.where(state.hit & finite, HIT, MISSED)).astype(jnp.int32)
-        observed = jnp.where(finite, jnp.stack([state.sums.observation, state.sums.observation_sq]), 0.0)
-        steps = state.sums.steps.astype(jnp.int32)
+        sums = state.accumulators
+        observed = jnp.where(finite, jnp.stack([sums.observation, sums.observation_sq]), 0.0)
+        steps = sums.steps.astype(jnp.int32)
         result: dict[str, Array] = dict(
             terms=terms,
             returns=jnp.where(finite, returns, jnp.nan),
@@ -213,7 +213,7 @@ class Simulator:
             landing=jnp.asarray(back.landing),
             finite=finite,
             steps=steps,
-            peak_velocity=state.sums.peak_velocity,
+            peak_velocity=sums.peak_velocity,
         )
         return result, observed, jnp.where(finite, steps, 0)
 

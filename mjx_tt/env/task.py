@@ -1,113 +1,301 @@
-"""One ball, one return: the episode as pure functions over a batch of any shape.
+"""The task: what the policy observes, what it is rewarded for, when an episode ends and how it begins.
 
-Phase 1 runs robot, policy and incoming ball at the control rate until the paddle touches the ball or it is out of
-reach. Phase 2 flies the outgoing ball alone: as at the real robot, the policy's part ends with the contact.
+One episode is one ball and one return. In phase 1 robot, policy and incoming ball run at the control rate until the
+paddle touches the ball or the ball is out of reach. In phase 2 (``mjx_tt.env.return_flight``) the outgoing ball flies
+alone: as at the real robot, the policy's part ends with the contact.
+
+The paper gives names, ranges and weights of its eleven reward terms (appendix "Rewards in Simulation and the Real
+World"); what each of them measures in detail stands here. ``docs/how-to/define-a-task.md`` shows how to add a term.
+Everything is a pure function over a batch of any shape, the batch axes last.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from ballmodel import flight
-from ballmodel.state import BallState, where
-from ballmodel.vec import norm, row
+from ballmodel.flight import Events
+from ballmodel.state import BallState
 from mjx_tt.env import observation
-from mjx_tt.env.episode import HIT as HIT
-from mjx_tt.env.episode import MISSED as MISSED
-from mjx_tt.env.episode import RETURNED as RETURNED
-from mjx_tt.env.episode import Controller as Controller
-from mjx_tt.env.episode import Episodes as Episodes
-from mjx_tt.env.episode import EpisodeState as EpisodeState
-from mjx_tt.env.episode import Prepared as Prepared
-from mjx_tt.env.episode import Return as Return
-from mjx_tt.env.episode import Sums as Sums
-from mjx_tt.env.episode import TaskConfig as TaskConfig
-from mjx_tt.env.episode import Tick as Tick
-from mjx_tt.env.own import ControlStep
-from mjx_tt.env.reward_sums import accumulate
+from mjx_tt.env.episode import (
+    Accumulators,
+    Controller,
+    EpisodeConstants,
+    Episodes,
+    EpisodeState,
+    Return,
+    Tick,
+)
+from mjx_tt.env.physics import ENGINES, Physics
+from mjx_tt.env.reward_weights import SIM_WEIGHTS, TERMS
+from mjx_tt.env.terms import (
+    REDUCTIONS,
+    ControlStep,
+    ObservationTerm,
+    PlayedBall,
+    RewardTerm,
+    Sensed,
+    observation_term,
+    reward_term,
+)
+from mjx_tt.env.user_defined import count_rows
 from mjx_tt.lanes.loop import while_any
-from mjx_tt.robot.chain import chain_from_model
-from mjx_tt.robot.clearance import CapsuleClearance
-from mjx_tt.robot.dynamics_fused import FusedEngine
-from mjx_tt.robot.kinematics import Joints, PaddleKinematics
-from mjx_tt.robot.model import capsules, paddle_frame
-from mjx_tt.robot.scalar_algebra import materialise
-from mjx_tt.sim import actuators as drives
-from mjx_tt.sim import latency, sensors
-from mjx_tt.sim.actuators import DriveState
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
+from mjx_tt.robot.scalar_algebra import optimization_barrier
+from mjx_tt.sim import actuators, latency
 from mjx_tt.sim.sensors import Filters
 from robot_io.limits import limit_velocity
+
+# ---- Observation -----------------------------------------------------------------------------------------------------
+
+
+@observation_term("ball")
+def ball(sensed: Sensed) -> Array:
+    """Position of the ball [m]: rows 0 to 2."""
+    return sensed.ball
+
+
+@observation_term("joints")
+def joints(sensed: Sensed) -> Array:
+    """Positions of the joints [m], [rad]."""
+    return sensed.joints
+
+
+CONTRACT_OBSERVATIONS: tuple[ObservationTerm, ...] = (ball, joints)  # what the robot's side sees as well
+
+
+def compose_observation(terms: tuple[ObservationTerm, ...], sensed: Sensed) -> Float[Array, "observed *batch"]:
+    """The policy's input from what is sensed."""
+    return jnp.concatenate([term(sensed).astype(sensed.ball.dtype) for term in terms])
+
+
+# ---- Reward ----------------------------------------------------------------------------------------------------------
+
+TARGET = (0.0, 0.685)  # [m] x, y: centre of the human's half
+TARGET_RANGE = 0.7  # [m] e-folding distance of the bonus around the target
+APPROACH_RANGE = 0.25  # [m] e-folding distance of the closest approach of paddle and ball
+NET_TARGET = 0.35  # [m] height of the ball's centre over the net plane that earns the whole bonus
+NET_RANGE = 0.25  # [m] deviation from it that earns exp(-1)
+FAULT = -2.0  # of a robot that stopped itself, the paper's table of rewards
+BLADE_CLEARANCE = 0.05  # [m] between blade and table below which the paddle counts as low
+FACING = 0.3  # smallest y component of the blade's normal in good style (72 degrees from the table's axis)
+SOFT_RANGE = 0.05  # share of a joint's range at each end that the joint-angle term counts as unsafe
+
+
+@reward_term("state_transition", per="ball")
+def state_transition(ball: PlayedBall) -> Array:
+    """In [0, 5]: nearing the ball up to 3, hit 3, over the net 3.5, on the human's half 4, plus up to 1 more.
+
+    After a hit, coming down near the target is worth up to 0.5, and up to 1 once the ball lands on the human's half.
+    """
+    distance = jnp.hypot(ball.landing[0] - TARGET[0], ball.landing[1] - TARGET[1])
+    near = jnp.exp(-distance / TARGET_RANGE)
+    crossed = 0.5 * jnp.asarray(ball.crossed).astype(near.dtype)
+    after_hit = 3.0 + jnp.where(ball.returned, 1.0 + near, crossed + 0.5 * near)
+    return jnp.where(ball.hit, after_hit, 3.0 * jnp.exp(-ball.closest / APPROACH_RANGE))
+
+
+@reward_term("net_clearance", per="ball")
+def net_clearance(ball: PlayedBall) -> Array:
+    """In [0, 1]: the outgoing ball's height over the net plane against a target height."""
+    bonus = jnp.exp(-(((ball.net_height - NET_TARGET) / NET_RANGE) ** 2))
+    return jnp.where(jnp.asarray(ball.hit) & ball.crossed, bonus, 0.0)
+
+
+@reward_term("hit_and_land", per="ball")
+def hit_and_land(ball: PlayedBall) -> Array:
+    """1 for a ball that was returned."""
+    return jnp.where(ball.returned, 1.0, 0.0)
+
+
+@reward_term("fault", per="ball")
+def fault(ball: PlayedBall) -> Array:
+    """-2 for a fault of the robot."""
+    return jnp.where(ball.fault, FAULT, 0.0)
+
+
+@reward_term("jerk", reduce="one_minus_mean")
+def jerk(step: ControlStep) -> Array:
+    """Share of the jerk that full acceleration against full acceleration takes."""
+    return share_of_limit(step.jerk, 2.0 * np.asarray(step.limits.acceleration) / step.period)
+
+
+@reward_term("acceleration", reduce="one_minus_mean")
+def acceleration(step: ControlStep) -> Array:
+    """Share of the accelerations' limits."""
+    return share_of_limit(step.acceleration, step.limits.acceleration)
+
+
+@reward_term("velocity", reduce="one_minus_mean")
+def velocity(step: ControlStep) -> Array:
+    """Share of the velocities' limits."""
+    return share_of_limit(step.command, step.limits.velocity)
+
+
+@reward_term("joint_angle")
+def joint_angle(step: ControlStep) -> Array:
+    """Control steps with every joint well inside its range."""
+    lower, upper = np.asarray(step.limits.lower), np.asarray(step.limits.upper)
+    soft = SOFT_RANGE * (upper - lower)
+    inside = [(q > lower[i] + soft[i]) & (q < upper[i] - soft[i]) for i, q in enumerate(step.joints)]
+    safe = inside[0]
+    for each in inside[1:]:
+        safe = safe & each
+    return safe
+
+
+@reward_term("collision", reduce="minus_sum")
+def collision(step: ControlStep) -> Array:
+    """Control steps in contact with table or robot."""
+    return (step.table_gap <= 0.0) | (step.own_gap <= 0.0)
+
+
+@reward_term("paddle_height", reduce="minus_sum")
+def paddle_height(step: ControlStep) -> Array:
+    """Control steps with a low paddle."""
+    return step.blade_gap < BLADE_CLEARANCE
+
+
+@reward_term("style", reduce="minus_sum")
+def style(step: ControlStep) -> Array:
+    """Control steps with a paddle that faces backwards."""
+    return jnp.asarray(step.blade.normal[1] < FACING)
+
+
+def share_of_limit(values: Float[Array, "joints *batch"], limit: np.ndarray | tuple[float, ...]) -> Array:
+    """Mean over the joints of |value| / limit, at most 1 each."""
+    parts = [jnp.minimum(jnp.abs(values[i]) / limit[i], 1.0) for i in range(len(limit))]
+    return jnp.asarray(sum(parts)) / len(limit)
+
+
+BUILT_IN_REWARDS: tuple[RewardTerm, ...] = tuple(globals()[name] for name in TERMS)
+
+
+def weigh_rewards(weights: Mapping[str, float], user: Iterable[RewardTerm] = ()) -> tuple[RewardTerm, ...]:
+    """The built-in terms and the user's with these weights; a term without one weighs 0.
+
+    Raises ValueError for a name that no term has.
+    """
+    terms = (*BUILT_IN_REWARDS, *user)
+    unknown = weights.keys() - {term.name for term in terms}
+    if unknown:
+        raise ValueError(
+            f"rewards: {', '.join(sorted(unknown))} is no reward term; allowed: "
+            f"{', '.join(term.name for term in terms)}, and terms that the file of the key definitions has"
+        )
+    return tuple(replace(term, weight=float(weights.get(term.name, 0.0))) for term in terms)
+
+
+def evaluate_rewards(
+    terms: tuple[RewardTerm, ...], s: EpisodeState, back: Return, fault: Bool[Array, "*batch"] | bool = False
+) -> Float[Array, "terms *batch"]:
+    """The unweighted terms of episodes that are over."""
+    sums, steps = s.accumulators, jnp.maximum(s.accumulators.steps, 1.0)
+    returned = back.returned & s.hit
+    outcome = s.hit, back.crossed, returned, back.net_height, back.landing
+    played = PlayedBall(*outcome, sums.closest, sums.steps, sums.peak_velocity, fault)
+    values = (
+        jnp.asarray(term(played)) if term.per == "ball" else REDUCTIONS[term.reduce](sums.terms[term.name], steps)
+        for term in terms
+    )
+    return jnp.stack([jnp.broadcast_to(value.astype(steps.dtype), steps.shape) for value in values])
+
+
+def add_weighted(terms: tuple[RewardTerm, ...], values: Float[Array, "terms *batch"]) -> Float[Array, "*batch"]:
+    """The return: the sum of the weighted terms."""
+    return jnp.asarray(sum(term.weight * values[i] for i, term in enumerate(terms)))
+
+
+# ---- Configuration ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """Settings of an episode. Rates in Hz, times in seconds.
+
+    Raises ValueError for an unknown engine, a substep count that is not whole, or a name that two terms have.
+    """
+
+    engine: str = "fused"
+    control_rate: float = 75.0
+    sim_rate: float = 300.0
+    max_steps: int = 200  # control steps, both phases together
+    max_observation_latency: float = 0.1  # longer draws are cut: mean + 7 deviations of the ball's
+    max_action_latency: float = 0.13
+    rewards: tuple[RewardTerm, ...] = field(default_factory=lambda: weigh_rewards(SIM_WEIGHTS))
+    observations: tuple[ObservationTerm, ...] = CONTRACT_OBSERVATIONS
+    robot: Robot = field(default_factory=robots.paper)
+    lanes: bool = True  # compile control steps lane by lane on processors (``mjx_tt.lanes``); else XLA does
+
+    def __post_init__(self) -> None:
+        if self.engine not in ENGINES:
+            raise ValueError(f"engine {self.engine!r} is not one of {ENGINES}")
+        ratio = self.sim_rate / self.control_rate
+        if self.control_rate <= 0 or abs(ratio - round(ratio)) > 1e-9 or round(ratio) < 1:
+            raise ValueError(
+                f"sim_rate {self.sim_rate} Hz is not a whole multiple of control_rate {self.control_rate} Hz"
+            )
+        if self.max_steps < 1:
+            raise ValueError(f"max_steps is {self.max_steps}, at least 1 is needed")
+        if len(set(self.terms)) != len(self.terms):
+            raise ValueError(f"rewards has a name twice: {self.terms}")
+        if self.observations[: len(CONTRACT_OBSERVATIONS)] != CONTRACT_OBSERVATIONS:
+            raise ValueError("observations must begin with ball and joints, which the robot's contract has")
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of the reward terms."""
+        return tuple(term.name for term in self.rewards)
+
+    @property
+    def reward_weights(self) -> tuple[float, ...]:
+        return tuple(term.weight for term in self.rewards)
+
+    @cached_property
+    def n_observation(self) -> int:
+        """Rows of the policy's input: 11 for the paper's robot without further terms."""
+        return count_rows(self.observations, self.robot.contract)
+
+    @property
+    def substeps(self) -> int:
+        return round(self.sim_rate / self.control_rate)
+
+    @property
+    def period(self) -> float:
+        """Control period [s]."""
+        return 1.0 / self.control_rate
+
+
+# ---- Termination, reset and the control step -------------------------------------------------------------------------
 
 OUT_OF_REACH = (-2.9, -0.6)  # [m] y and z of an incoming ball below which nobody can play it
 
 
-class Engine(Protocol):
-    """Dynamics of the robot alone."""
-
-    @property
-    def name(self) -> str: ...
-
-    def step(self, qpos: Joints, qvel: Joints, ctrl: Joints) -> tuple[Joints, Joints]:
-        """Joint positions and velocities (n, ...) one substep later."""
-        ...
-
-
-class Task:
+class Task(Physics):
     """Episodes of one robot under one configuration."""
 
     def __init__(self, config: TaskConfig) -> None:
-        self.config, self.contract = config, config.robot.contract
-        model = config.robot.model()
-        chain = chain_from_model(model)
-        timestep = 1.0 / config.sim_rate
-        self.engine: Engine
-        if config.engine == "mjx":
-            from mjx_tt.robot.dynamics_mjx import MjxEngine  # MJX takes seconds to import
+        longest = config.max_observation_latency, config.max_action_latency
+        super().__init__(config.robot, config.engine, config.control_rate, config.sim_rate, longest)
+        self.config = config
 
-            self.engine = MjxEngine(model, timestep)
-        else:
-            self.engine = FusedEngine(chain, timestep)
-        self.home = config.robot.home
-        self.kinematics = PaddleKinematics(chain, paddle_frame(model))
-        self.clearance = CapsuleClearance(self.kinematics, capsules(model), config.robot.file)
-        self._observation_depth = latency.ring_depth(config.max_observation_latency, config.period)
-        self._action_depth = latency.ring_depth(config.max_action_latency, config.period)
-
-    def prepare(self, episodes: Episodes) -> Prepared:
-        """Splits the episodes' latencies, with what clock and drives add to them, and sorts drives and camera."""
-        config, model, seconds = self.config, episodes.model, episodes.latency
-        period, batch = config.period, seconds.shape[1:]
-        axes, n = self.contract.carrying, self.contract.n_joints
-        joints = jnp.stack([seconds[2 if i in axes else 1] for i in range(n)])
-        actions = jnp.stack([seconds[4 if i in axes else 3] for i in range(n)])
-        ball, by_effect = seconds[0], drives.by_effect(model.drives, batch, seconds.dtype, self.contract.joints)
-        if model.sensing.clock_rate is not None:
-            ball = jnp.clip(ball * model.sensing.clock_rate, 0.0, config.max_observation_latency)
-        if by_effect.observation_delay is not None:
-            joints = jnp.clip(joints + by_effect.observation_delay, 0.0, config.max_observation_latency)
-        if by_effect.action_delay is not None:
-            actions = jnp.clip(actions + by_effect.action_delay, 0.0, config.max_action_latency)
-        return Prepared(
-            latency.observation_delay(ball, period),
-            latency.observation_delay(joints, period),
-            latency.action_delay(actions, period),
-            by_effect,
-            sensors.camera(model.sensing),
-        )
+    def is_over(self, ball: BallState, events: Events, bounced: Bool[Array, "*batch"]) -> Bool[Array, "*batch"]:
+        """Termination: the ball is touched, in the net, down a second time or on the wrong side, or out of reach."""
+        own_side = events.table & (events.position[1] < 0.0)
+        over = (events.table & (bounced | ~own_side)) | events.net | events.paddle
+        y_min, z_min = OUT_OF_REACH
+        return over | (ball.position[1] < y_min) | (ball.position[2] < z_min)
 
     def reset(self, episodes: Episodes, controller: Controller) -> EpisodeState:
-        """Initial state: robot at rest at home (or ``episodes.start``), ball at its launch.
-
-        History buffers hold these values.
-        """
-        batch, dtype = episodes.ball.position.shape[1:], episodes.ball.position.dtype
+        """Robot at rest at home (or ``episodes.start``), ball at its launch; history buffers hold these values."""
+        batch, dtype, config = episodes.ball.position.shape[1:], episodes.ball.position.dtype, self.config
         n = self.contract.n_joints
 
         def full(value: float, *leading: int) -> Array:
@@ -118,9 +306,10 @@ class Task:
         home = jnp.broadcast_to(home if episodes.start is None else episodes.start, zeros.shape)
         seen = jnp.concatenate([episodes.ball.position, home])
         zero, false = full(0.0), jnp.broadcast_to(False, batch)
-        prepared, tracker = self.prepare(episodes), episodes.model.sensing
+        constants, tracker = self.prepare(episodes), episodes.model.sensing
         captured = seen if tracker.jitter is None else jnp.concatenate([seen, episodes.ball.velocity])
-        first = observation.measured(episodes, prepared, captured, 0)
+        sensed = observation.measure(episodes, constants, captured, zeros, 0)
+        depth = latency.count_slots(config.max_observation_latency, self.period)
         return EpisodeState(
             qpos=home,
             qvel=zeros,
@@ -128,30 +317,23 @@ class Task:
             command=zeros,
             command_acceleration=zeros,
             reference=home,
-            commands=full(0.0, self._action_depth, n),
-            observations=jnp.broadcast_to(captured, (self._observation_depth, *captured.shape)),
-            controller=controller.start(first),
-            drive=drives.at_rest(prepared.drives, home),
-            filters=Filters.at(tracker, episodes.ball.position, 1.0 / self.config.sim_rate),
+            commands=full(0.0, latency.count_slots(config.max_action_latency, self.period), n),
+            observations=jnp.broadcast_to(captured, (depth, *captured.shape)),
+            controller=controller.start(compose_observation(config.observations, sensed)),
+            drive=actuators.rest(constants.drives, home),
+            filters=Filters.settle(tracker, episodes.ball.position, self.timestep),
             ball=episodes.ball,
             bounced=false,
             hit=false,
             live=~false,
             finite=~false,
-            sums=Sums(
+            accumulators=Accumulators(
                 closest=full(3.0),
-                jerk=zero,
-                acceleration=zero,
-                velocity=zero,
-                safe_angle=zero,
-                collision=zero,
-                low_paddle=zero,
-                bad_style=zero,
                 steps=zero,
                 peak_velocity=zeros,
-                observation=full(0.0, self.contract.n_observation),
-                observation_sq=full(0.0, self.contract.n_observation),
-                own=tuple(zero for term in self.config.own_terms if term.per == "step"),
+                observation=full(0.0, config.n_observation),
+                observation_sq=full(0.0, config.n_observation),
+                terms={term.name: zero for term in config.rewards if term.per == "step"},
             ),
         )
 
@@ -160,50 +342,53 @@ class Task:
 
         Of an episode that ended before others the robot may have moved on; ball, outcome and sums are those of its end.
         """
-        prepared = self.prepare(episodes)
-
-        def step(
-            tick: Array, s: EpisodeState, by_lane: tuple[Episodes, Prepared], by_column: Controller
-        ) -> EpisodeState:
-            return self.control_step(tick, s, *by_lane, by_column)
-
+        by_lane = (episodes, self.prepare(episodes))
         return while_any(
             lambda s: s.live,
-            step,
+            lambda tick, s, by_lane, controller: self.step(tick, s, *by_lane, controller),
             self.reset(episodes, controller),
-            (episodes, prepared),
+            by_lane,
             controller,
             limit=self.config.max_steps,
             lanes=self.config.lanes and self.config.engine == "fused",
         )
 
-    def control_step(
-        self, tick: Tick, s: EpisodeState, episodes: Episodes, prepared: Prepared, controller: Controller
+    def observe(
+        self, tick: Tick, s: EpisodeState, episodes: Episodes, constants: EpisodeConstants
+    ) -> Float[Array, "observed *batch"]:
+        """The policy's input at control step ``tick``."""
+        sensed = observation.sense(tick, s, episodes, constants)
+        return optimization_barrier(compose_observation(self.config.observations, sensed))
+
+    def step(
+        self, tick: Tick, s: EpisodeState, episodes: Episodes, constants: EpisodeConstants, controller: Controller
     ) -> EpisodeState:
-        """One control period: observe, act, advance robot and ball by the substeps."""
-        period = self.config.period
-        seen = observation.observe(tick, s, episodes, prepared)
+        """One control period: observe, act, advance robot and ball by the substeps, count."""
+        seen = self.observe(tick, s, episodes, constants)
         action, controller_state = controller.act(tick, s.controller, seen)
-        limits = self.contract.limits
+        limits, period = self.contract.limits, self.period
         scale = np.asarray(limits.policy_velocity, action.dtype).reshape((-1,) + (1,) * (action.ndim - 1))
         # After the contact the robot is only braked: what the real one does before it returns home.
         request = jnp.where(s.live, action * scale, 0.0)
-        command = materialise(limit_velocity(request, s.command, s.reference, period, limits, xp=jnp))
+        command = optimization_barrier(limit_velocity(request, s.command, s.reference, period, limits, xp=jnp))
         reference = s.reference + command * period
-        commands = latency.ring_write(s.commands, tick, command)
-        old = latency.ring_read(commands, tick - prepared.action.periods - 1)
-        new = latency.ring_read(commands, tick - prepared.action.periods)
-        (qpos, qvel, pose, drive, filters, ball, flags, closest), captured = self._substeps(
-            s, episodes, prepared, old, new
+        commands = latency.write_ring(s.commands, tick, command)
+        in_force = (
+            latency.read_ring(commands, tick - constants.action.periods - 1),
+            latency.read_ring(commands, tick - constants.action.periods),
+        )
+        (qpos, qvel, pose, drive, filters, ball, flags, closest), captured = self.step_physics(
+            s, episodes, constants, in_force
         )
         bounced, hit, live = flags
-        command_acceleration = (command - s.command) / period
         carried = qpos if drive.output is None else drive.output
-        gaps = materialise(self.clearance(materialise(self.kinematics.links(carried)), carried[0]))
-        step = ControlStep(
+        gaps = optimization_barrier(self.clearance(optimization_barrier(self.kinematics.links(carried)), carried[0]))
+        acceleration = (command - s.command) / period
+        done = ControlStep(
             observation=seen,
             command=command,
-            acceleration=command_acceleration,
+            acceleration=acceleration,
+            jerk=(acceleration - s.command_acceleration) / period,
             joints=carried,
             blade=pose,
             ball_position=jnp.asarray(ball.position),
@@ -212,96 +397,51 @@ class Task:
             table_gap=gaps.table,
             own_gap=gaps.own,
             blade_gap=gaps.blade,
+            limits=limits,
+            period=period,
         )
-        sums = accumulate(s, step, period, controller.mean, closest, self.config.own_terms, limits)
         ok = jnp.isfinite(sum(qpos[i] for i in range(self.contract.n_joints)) + sum(ball.position[i] for i in range(3)))
         return EpisodeState(
-            qpos,
-            qvel,
-            pose,
-            command,
-            command_acceleration,
-            reference,
-            commands,
-            latency.ring_write(s.observations, tick, captured),
-            controller_state,
-            drive,
-            filters,
-            ball,
-            bounced,
-            hit,
-            live & ok,
-            s.finite & (ok | ~s.live),
-            sums,
+            qpos=qpos,
+            qvel=qvel,
+            pose=pose,
+            command=command,
+            command_acceleration=acceleration,
+            reference=reference,
+            commands=commands,
+            observations=latency.write_ring(s.observations, tick, captured),
+            controller=controller_state,
+            drive=drive,
+            filters=filters,
+            ball=ball,
+            bounced=bounced,
+            hit=hit,
+            live=live & ok,
+            finite=s.finite & (ok | ~s.live),
+            accumulators=self._accumulate(s, done, controller.mean, closest),
         )
 
-    def _substeps(
+    def _accumulate(
         self,
         s: EpisodeState,
-        episodes: Episodes,
-        prepared: Prepared,
-        old: Float[Array, "joints *batch"],
-        new: Float[Array, "joints *batch"],
-    ) -> tuple[tuple, Float[Array, "captured *batch"]]:
-        """Robot and ball through one control period, with what the delayed sensors capture on the way."""
-        n, timestep = self.config.substeps, 1.0 / self.config.sim_rate
-        params, tracker = episodes.model.ball, episodes.model.sensing
-        old, new = (drives.reachable(prepared.drives, command) for command in (old, new))
+        step: ControlStep,
+        shift: Float[Array, "observed *#batch"],
+        closest: Float[Array, "*batch"],
+    ) -> Accumulators:
+        """The running quantities after a control period. shift: value about which observations are summed."""
+        before, alive = s.accumulators, s.live.astype(step.command.dtype)
+        centred = step.observation - shift.reshape(shift.shape + (1,) * (step.observation.ndim - shift.ndim))
 
-        def captured_at(i: Tick, ball: BallState, filters: Filters, joints: Array) -> Array:
-            return observation.capture(episodes, prepared, self.config, i, ball, filters, joints)
+        def add(term: RewardTerm) -> Array:
+            # What a term says of a ball that is over, perhaps no number, must not reach the sum.
+            value = jnp.asarray(term(step)).astype(alive.dtype)
+            return before.terms[term.name] + jnp.where(s.live, value, 0.0)
 
-        def substep(i: Tick, carry: tuple) -> tuple:
-            (qpos, qvel, pose, drive, filters, ball, (bounced, hit, live), closest), captured = carry
-            robot, carried, (bent, bent_velocity) = self.moved(i, (qpos, qvel, drive), (old, new), episodes, prepared)
-            qpos, qvel, drive = robot
-            after = materialise(self.kinematics.pose(bent, bent_velocity))
-            moved, events = flight.step(params, ball, timestep, (pose, after))
-            moved, events = materialise((moved, events))
-            before, ball = ball, where(live, moved, ball)
-            struck = live & (events.table | events.paddle)
-            filters = filters.stepped(tracker, before, ball, struck, timestep - events.time, timestep)
-            own_side = events.table & (events.position[1] < 0.0)
-            over = (events.table & (bounced | ~own_side)) | events.net | events.paddle
-            y_min, z_min = OUT_OF_REACH
-            over = over | (ball.position[1] < y_min) | (ball.position[2] < z_min)
-            # A ball taken before its bounce is no hit: the point would be lost.
-            hit = hit | (live & events.paddle & bounced)
-            bounced = bounced | (live & own_side)
-            distance = norm(ball.position - after.position)
-            closest = jnp.where(live & bounced, jnp.minimum(closest, distance), closest)
-            live = live & ~over
-            captured = captured + captured_at(i + 1, ball, filters, carried)
-            return materialise(((qpos, qvel, after, drive, filters, ball, (bounced, hit, live), closest), captured))
-
-        start = (s.qpos, s.qvel, s.pose, s.drive, s.filters, s.ball, (s.bounced, s.hit, s.live), s.sums.closest)
-        captured = captured_at(0, s.ball, s.filters, s.qpos if s.drive.output is None else s.drive.output)
-        return jax.lax.fori_loop(0, n, substep, (start, captured))
-
-    def moved(
-        self,
-        i: Tick,
-        robot: tuple[Joints, Joints, DriveState],
-        commands: tuple[Joints, Joints],
-        episodes: Episodes,
-        prepared: Prepared,
-        advance: Callable[[Joints, Joints, Joints], tuple[Joints, Joints]] | None = None,
-    ) -> tuple[tuple[Joints, Joints, DriveState], Joints, tuple[Joints, Joints]]:
-        """The robot after substep ``i`` of a control period: its state, the joints as encoders see them, and positions
-        and velocities of the joints that carry the blade.
-
-        robot: positions, velocities (n, ...) and drives; commands: the older and the newer, as ``drives.reachable``;
-        advance: other dynamics than the engine's
-        """
-        (qpos, qvel, drive), (old, new) = robot, commands
-        params, timestep = prepared.drives, 1.0 / self.config.sim_rate
-        share = latency.old_command_share(prepared.action, i, timestep)
-        velocity, drive = drives.follow(params, drive, new + share * (old - new), timestep)
-        control = jnp.asarray(materialise(row(episodes.model.actuation.velocity_gain) * velocity))
-        was, (qpos, qvel) = qvel, (advance or self.engine.step)(qpos, qvel, control)
-        carried, carried_velocity, drive = drives.carry(params, drive, qpos, qvel, timestep)
-        drive = drives.swung(params, drive, was, qvel, timestep)
-        bent, bent_velocity = carried, carried_velocity
-        if drive.swing is not None:
-            bent, bent_velocity = carried + drive.swing[0], carried_velocity + drive.swing[1]
-        return (qpos, qvel, drive), carried, (bent, bent_velocity)
+        return Accumulators(
+            closest=closest,
+            steps=before.steps + alive,
+            peak_velocity=jnp.maximum(before.peak_velocity, alive[None] * jnp.abs(step.command)),
+            observation=before.observation + alive[None] * centred,
+            observation_sq=before.observation_sq + alive[None] * centred * centred,
+            terms={term.name: add(term) for term in self.config.rewards if term.per == "step"},
+        )

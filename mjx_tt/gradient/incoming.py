@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 from ballmodel import flight
 from ballmodel.state import BallState, where
 from mjx_tt.env import observation
-from mjx_tt.env.task import OUT_OF_REACH, Episodes, Prepared, Task
+from mjx_tt.env.episode import EpisodeConstants, Episodes
+from mjx_tt.env.task import Task
 from mjx_tt.sim.sensors import Filters
 
 
@@ -36,25 +37,22 @@ class Incoming:
     seen: Float[Array, "T captured L"]
 
 
-def incoming(task: Task, episodes: Episodes, prepared: Prepared, ticks: int) -> Incoming:
+def fly_incoming(task: Task, episodes: Episodes, constants: EpisodeConstants, ticks: int) -> Incoming:
     """The balls of episodes (L,) through ``ticks`` control periods."""
-    config, params, tracker = task.config, episodes.model.ball, episodes.model.sensing
-    n, timestep = config.substeps, 1.0 / config.sim_rate
+    params, tracker, n, timestep = episodes.model.ball, episodes.model.sensing, task.substeps, task.timestep
     nothing = jnp.zeros((task.contract.n_joints, *episodes.seed.shape), episodes.ball.position.dtype)
 
     def captured(i: int, ball: BallState, filters: Filters) -> Array:
-        whole = observation.capture(episodes, prepared, config, i, ball, filters, nothing)
+        whole = observation.capture(episodes, constants, n, timestep, i, ball, filters, nothing)
         return jnp.concatenate([whole[:3], whole[3 + nothing.shape[0] :]])
 
     def substep(ball: BallState, bounced: Array, live: Array, filters: Filters) -> tuple:
         moved, events = flight.step(params, ball, timestep)
         before, ball = ball, where(live, moved, ball)
-        filters = filters.stepped(tracker, before, ball, live & events.table, timestep - events.time, timestep)
-        own_side = events.table & (events.position[1] < 0.0)
-        y_min, z_min = OUT_OF_REACH
-        over = (events.table & (bounced | ~own_side)) | events.net
-        over = over | (ball.position[1] < y_min) | (ball.position[2] < z_min)
-        return ball, bounced | (live & own_side), live & ~over, filters
+        filters = filters.step(tracker, before, ball, live & events.table, timestep - events.time, timestep)
+        over = task.is_over(ball, events, bounced)
+        bounced = bounced | (live & events.table & (events.position[1] < 0.0))
+        return ball, bounced, live & ~over, filters
 
     def period(carry: tuple, _: None) -> tuple[tuple, tuple]:
         seen, passed = captured(0, carry[0], carry[3]), []
@@ -66,18 +64,18 @@ def incoming(task: Task, episodes: Episodes, prepared: Prepared, ticks: int) -> 
 
     false = jnp.zeros(episodes.seed.shape, bool)
     first = (episodes.ball, false, ~false)
-    filters = Filters.at(tracker, episodes.ball.position, timestep)
+    filters = Filters.settle(tracker, episodes.ball.position, timestep)
     _, (passed, seen) = jax.lax.scan(period, (*first, filters), None, length=ticks)
     whole = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y.reshape(-1, *y.shape[2:])]), first, passed)
     ball, bounced, live = whole
     at_rest = jnp.concatenate([episodes.ball.position, episodes.ball.velocity])[: seen.shape[1]]
     return Incoming(
-        jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), ball), bounced, live, _delayed(seen, at_rest, prepared)
+        jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), ball), bounced, live, _delay_captures(seen, at_rest, constants)
     )
 
 
-def _delayed(captured: Array, first: Array, prepared: Prepared) -> Array:
+def _delay_captures(captured: Array, first: Array, constants: EpisodeConstants) -> Array:
     """Captures (T, c, L), one in each control period, that have arrived at each control step; before, ``first``."""
-    tick = jnp.arange(captured.shape[0])[:, None] - prepared.ball.periods[None]
+    tick = jnp.arange(captured.shape[0])[:, None] - constants.ball.periods[None]
     arrived = jnp.take_along_axis(captured, jnp.maximum(tick, 0)[:, None], 0)
     return jnp.where((tick < 0)[:, None], first[None], arrived)

@@ -16,11 +16,11 @@ from jax import Array
 from jaxtyping import Float
 
 from mjx_tt.env import observation
-from mjx_tt.env.task import Controller, Episodes, Prepared, Task
+from mjx_tt.env.episode import Controller, EpisodeConstants, Episodes
+from mjx_tt.env.task import Task, compose_observation
 from mjx_tt.gradient.incoming import Incoming
 from mjx_tt.robot.kinematics import Joints
-from mjx_tt.sim import actuators as drives
-from mjx_tt.sim import latency
+from mjx_tt.sim import actuators, latency
 from robot_io.limits import limit_velocity
 
 
@@ -45,7 +45,7 @@ class Servos:
 
     def __init__(self, task: Task) -> None:
         self._engine, self._timestep = task.engine, 1.0 / task.config.sim_rate
-        self._gain = response(task)
+        self._gain = measure_response(task)
 
     def step(self, qpos: Joints, qvel: Joints, control: Joints) -> tuple[Joints, Joints]:
         exact = jax.lax.stop_gradient(self._engine.step(*jax.lax.stop_gradient((qpos, qvel, control))))
@@ -56,7 +56,7 @@ class Servos:
         return jax.tree.map(lambda there, loop: there + (loop - jax.lax.stop_gradient(loop)), exact, loops)
 
 
-def response(task: Task) -> np.ndarray:
+def measure_response(task: Task) -> np.ndarray:
     """Share (n,) of a step of the commanded velocity that each joint reaches within a substep, at home."""
     n, tiny = task.contract.n_joints, 1e-3
     with jax.ensure_compile_time_eval():
@@ -67,54 +67,57 @@ def response(task: Task) -> np.ndarray:
     return np.clip((np.diag(moved[:, :n]) - moved[:, n]) / tiny, 0.0, 1.0)
 
 
-def motion(
-    task: Task, servos: Servos, controller: Controller, episodes: Episodes, prepared: Prepared, ball: Incoming
+def simulate_motion(
+    task: Task, servos: Servos, controller: Controller, episodes: Episodes, constants: EpisodeConstants, ball: Incoming
 ) -> Motion:
     """The motion of the robot in episodes (L,), as ``Task.play`` has it until a ball is hit."""
-    config, limits, n = task.config, task.contract.limits, task.config.substeps
-    period, timestep, dtype = config.period, 1.0 / config.sim_rate, episodes.ball.position.dtype
+    config, limits, n = task.config, task.contract.limits, task.substeps
+    period, timestep, dtype = task.period, task.timestep, episodes.ball.position.dtype
     scale = jnp.asarray(np.asarray(limits.policy_velocity)[:, None], dtype)
     start = jnp.asarray(task.home, dtype)[:, None] if episodes.start is None else episodes.start
     home = jnp.broadcast_to(start, (task.contract.n_joints, *episodes.seed.shape))
     zero = jnp.zeros_like(home)
 
-    def observed(tick: Array | int, seen: Array, joints: Array) -> Array:
-        return observation.measured(episodes, prepared, jnp.concatenate([seen[:3], joints, seen[3:]]), tick)
+    def observe(tick: Array | int, seen: Array, joints: Array, command: Array) -> Array:
+        captured = jnp.concatenate([seen[:3], joints, seen[3:]])
+        return compose_observation(
+            config.observations, observation.measure(episodes, constants, captured, command, tick)
+        )
 
-    def captured(i: int, joints: Array) -> Array:
-        return latency.capture_weight(prepared.joints, i, n, timestep) * joints
+    def capture(i: int, joints: Array) -> Array:
+        return latency.weigh_capture(constants.joints, i, n, timestep) * joints
 
     def step(carry: tuple, now: tuple[Array, Array]) -> tuple[tuple, tuple]:
         robot, command, reference, commands, measured, policy = carry
         tick, seen = now
-        input_ = observed(tick, seen, _read(measured, tick - prepared.joints.periods))
+        input_ = observe(tick, seen, _read(measured, tick - constants.joints.periods), command)
         action, policy = controller.act(tick, policy, input_)
         command = limit_velocity(action * scale, command, reference, period, limits, xp=jnp)
         reference = reference + command * period
-        commands = latency.ring_write(commands, tick, command)
-        asked = [_read(commands, tick - prepared.action.periods - late) for late in (1, 0)]
-        old, new = (drives.reachable(prepared.drives, each) for each in asked)
+        commands = latency.write_ring(commands, tick, command)
+        asked = [_read(commands, tick - constants.action.periods - late) for late in (1, 0)]
+        old, new = (actuators.limit_command(constants.drives, each) for each in asked)
         drive = robot[2]
-        at_encoders, passed = captured(0, robot[0] if drive.output is None else drive.output), []
+        at_encoders, passed = capture(0, robot[0] if drive.output is None else drive.output), []
         for i in range(n):
-            robot, carried, bent = task.moved(i, robot, (old, new), episodes, prepared, servos.step)
-            at_encoders = at_encoders + captured(i + 1, carried)
+            robot, carried, bent = task.step_robot(i, robot, (old, new), episodes, constants, servos.step)
+            at_encoders = at_encoders + capture(i + 1, carried)
             passed.append(bent)
-        measured = latency.ring_write(measured, tick, at_encoders)
+        measured = latency.write_ring(measured, tick, at_encoders)
         return (robot, command, reference, commands, measured, policy), (
             *(jnp.stack(x) for x in zip(*passed, strict=True)),
             command,
             input_,
         )
 
-    depth = [latency.ring_depth(x, period) for x in (config.max_action_latency, config.max_observation_latency)]
+    depth = [latency.count_slots(x, period) for x in (config.max_action_latency, config.max_observation_latency)]
     carry = (
-        (home, zero, drives.at_rest(prepared.drives, home)),
+        (home, zero, actuators.rest(constants.drives, home)),
         zero,
         home,
         jnp.zeros((depth[0], *home.shape), dtype),
         jnp.broadcast_to(home, (depth[1], *home.shape)),
-        controller.start(observed(0, _first(episodes, ball), home)),
+        controller.start(observe(0, _first(episodes, ball), home, zero)),
     )
     _, (joints, velocities, commands, inputs) = jax.lax.scan(step, carry, (jnp.arange(ball.seen.shape[0]), ball.seen))
     return Motion(_with_start(home, joints), _with_start(zero, velocities), commands, inputs)
@@ -130,6 +133,6 @@ def _with_start(first: Array, by_tick: Array) -> Array:
 
 
 def _read(ring: Float[Array, "depth n L"], tick: Array) -> Float[Array, "n L"]:
-    """As ``latency.ring_read``; one selection, whose derivative is one selection as well."""
+    """As ``latency.read_ring``; one selection, whose derivative is one selection as well."""
     slots = jnp.arange(ring.shape[0]).reshape(-1, *(1,) * (ring.ndim - 1))
     return jnp.where(slots == jnp.mod(tick, ring.shape[0])[None], ring, 0.0).sum(0)

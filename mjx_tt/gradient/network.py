@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from mjx_tt.env.episode import Controller, Tick
 from mjx_tt.env.policy import controller, normalised
-from mjx_tt.env.task import Controller, Tick
 from robot_io.contract import DILATIONS, GATED
 from robot_io.policy.policy import Policy
 

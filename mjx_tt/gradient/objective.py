@@ -1,6 +1,6 @@
 """A smooth measure of play, whose derivatives lead where the paper's rewards only tell.
 
-Most of the eleven terms of ``mjx_tt.env.rewards`` are steps: a ball that is missed by a hand says nothing of where the
+Most of the eleven terms of ``mjx_tt.env.task`` are steps: a ball that is missed by a hand says nothing of where the
 blade should have been. Here a miss counts by its distance and by where the ball would have gone, a hit by where the
 ball goes. What the rewards have as means over time (jerk, acceleration, velocity) is taken over as it is. Contacts with
 table and robot, a low blade and bad style, which the rewards count by control steps, are counted as well, and weighed
@@ -19,12 +19,12 @@ from jaxtyping import Bool, Float, Int
 
 from ballmodel import constants as c
 from ballmodel.flight import PaddlePose
-from mjx_tt.env import rewards
-from mjx_tt.env.task import Episodes, Task
-from mjx_tt.gradient.incoming import incoming
-from mjx_tt.gradient.motion import Motion, Servos, motion
+from mjx_tt.env.episode import Episodes
+from mjx_tt.env.task import BLADE_CLEARANCE, FACING, Task
+from mjx_tt.gradient.incoming import fly_incoming
+from mjx_tt.gradient.motion import Motion, Servos, simulate_motion
 from mjx_tt.gradient.network import differentiable
-from mjx_tt.gradient.strike import Landing, Meeting, Strike, landing, meeting, strike
+from mjx_tt.gradient.strike import Landing, Meeting, Strike, find_landing, find_meeting, simulate_strike
 from mjx_tt.robot.kinematics import Joints
 from robot_io.policy.policy import Policy
 
@@ -81,18 +81,18 @@ class Objective:
     def play(self, policy: Policy, episodes: Episodes) -> Played:
         """Plays P policies, theta (size, P), on episodes (L,), L = R x P with P the faster index."""
         task, params = self.task, episodes.model.ball
-        prepared = task.prepare(episodes)
-        ball = jax.lax.stop_gradient(incoming(task, episodes, prepared, self.ticks))
-        moving = motion(task, self._servos, differentiable(policy), episodes, prepared, ball)
-        met = meeting(task, moving, ball, params)
+        constants = task.prepare(episodes)
+        ball = jax.lax.stop_gradient(fly_incoming(task, episodes, constants, self.ticks))
+        moving = simulate_motion(task, self._servos, differentiable(policy), episodes, constants, ball)
+        met = find_meeting(task, moving, ball, params)
         ends, steps = (substep // task.config.substeps + 1 for substep in (met.substep, met.last))
         worst, times, done = self._worst(moving, steps)
         # Three moments in one: what has derivatives is compiled once.
         substeps = jnp.stack([met.substep, met.substep + 1, worst])
-        joints, velocities = (_at(x, substeps) for x in (moving.joints, moving.velocities))
+        joints, velocities = (_take(x, substeps) for x in (moving.joints, moving.velocities))
         before, after, then = _split(task.kinematics.pose(joints, velocities))
-        struck = strike(met, ball, params, (before, after), 1.0 / task.config.sim_rate)
-        out = landing(params, struck.ball)
+        struck = simulate_strike(met, ball, params, (before, after), 1.0 / task.config.sim_rate)
+        out = find_landing(params, struck.ball)
         faults = times * self._weighted(self._shortfalls(joints[:, 2], then))
         cost = _play_cost(met, struck, out) + self._steadiness(moving, ends) + jnp.log1p(faults)
         seen = jnp.arange(self.ticks)[:, None] < ends[None]
@@ -136,9 +136,9 @@ class Objective:
         From 0, with a margin, to 1 where the rewards count a fault, and on.
         """
         gaps = self.task.clearance(self.task.kinematics.links(joints), joints[0])
-        wanted = ((gaps.table, 0.0), (gaps.own, 0.0), (gaps.blade, rewards.BLADE_CLEARANCE))
+        wanted = ((gaps.table, 0.0), (gaps.own, 0.0), (gaps.blade, BLADE_CLEARANCE))
         table, own, low = (jax.nn.relu(least + MARGIN - gap) / MARGIN for gap, least in wanted)
-        return table, own, low, jax.nn.relu(1.0 + (rewards.FACING - blade.normal[1]) / FACING_MARGIN)
+        return table, own, low, jax.nn.relu(1.0 + (FACING - blade.normal[1]) / FACING_MARGIN)
 
     def _weighted(self, shortfalls: tuple[Array, Array, Array, Array]) -> Array:
         """By the weights of the rewards that count them."""
@@ -147,7 +147,7 @@ class Objective:
         return sum(terms, jnp.zeros_like(shortfalls[0]))
 
 
-def _at(x: Float[Array, "S+1 n L"], substeps: Int[Array, "k L"]) -> Float[Array, "n k L"]:
+def _take(x: Float[Array, "S+1 n L"], substeps: Int[Array, "k L"]) -> Float[Array, "n k L"]:
     """Values at k substeps of each episode."""
     found = jnp.take_along_axis(x, jnp.broadcast_to(substeps[:, None], (substeps.shape[0], *x.shape[1:])), 0)
     return jnp.moveaxis(found, 1, 0)

@@ -72,7 +72,7 @@ class Landing:
     position: Float[Array, "2 L"]
 
 
-def meeting(task: Task, motion: Motion, ball: Incoming, params: BallParams) -> Meeting:
+def find_meeting(task: Task, motion: Motion, ball: Incoming, params: BallParams) -> Meeting:
     """Moments at which balls are hit, or are nearest to the blade. Without derivatives."""
     joints, velocities = jax.lax.stop_gradient([jnp.moveaxis(x, 1, 0) for x in (motion.joints, motion.velocities)])
     pose = task.kinematics.pose(joints, velocities)  # (3, S + 1, L)
@@ -90,7 +90,7 @@ def meeting(task: Task, motion: Motion, ball: Incoming, params: BallParams) -> M
     return Meeting(jnp.where(hit, first, nearest), last, open_.any(0), hit)
 
 
-def strike(
+def simulate_strike(
     met: Meeting, ball: Incoming, params: BallParams, blade: tuple[PaddlePose, PaddlePose], timestep: float
 ) -> Strike:
     """The impacts. blade: its pose at the start and at the end of the substep, which takes ``timestep`` [s]."""
@@ -123,7 +123,7 @@ def _nearest(
     return BallState(position, stack(velocity), stack(spin)), jnp.asarray(dot(away, away))
 
 
-def landing(params: BallParams, ball: BallState) -> Landing:
+def find_landing(params: BallParams, ball: BallState) -> Landing:
     """The way of balls (3, L) that were hit."""
     air = replace(params.flight, integrator="midpoint")
 

@@ -9,10 +9,29 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjx_tt.robot.scalar_algebra import sin_cos
-
 _F = np.float32
 _LOG2 = _F(0.693147180559945)
+
+
+def sin_cos(angle: Array) -> tuple[Array, Array]:
+    """Sine and cosine of angles [rad], |angle| < 8192, to rounding.
+
+    In float32 both together by Cephes' polynomials (Moshier, sinf.c), four times as fast as XLA's two general
+    functions.
+    """
+    if angle.dtype != jnp.float32:
+        return jnp.sin(angle), jnp.cos(angle)
+    quarter = jnp.round(angle * np.float32(2.0 / np.pi))
+    r = angle
+    for part in (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8):  # pi / 2 in pieces of few bits
+        r = r - quarter * np.float32(part)
+    z = r * r
+    sin = r + r * z * (-1.6666654611e-1 + z * (8.3321608736e-3 - z * 1.9515295891e-4))
+    cos = 1.0 - 0.5 * z + z * z * (4.166664568298827e-2 + z * (-1.388731625493765e-3 + z * 2.443315711809948e-5))
+    turn = quarter.astype(jnp.int32)
+    odd = (turn & 1) == 1
+    sin, cos = jnp.where(odd, cos, sin), jnp.where(odd, sin, cos)
+    return jnp.where((turn & 2) == 2, -sin, sin), jnp.where(((turn + 1) & 2) == 2, -cos, cos)
 
 
 def _horner(x: Array, *coefficients: float) -> Array:

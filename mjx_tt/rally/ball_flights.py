@@ -19,7 +19,7 @@ from ballmodel import constants as c
 from ballmodel import flight
 from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
-from mjx_tt.env.outgoing_ball import FLOOR
+from mjx_tt.env.return_flight import FLOOR
 from mjx_tt.lanes.loop import while_any
 from mjx_tt.rally.human_player import OVER_TABLE, Incoming
 from robot_io.contract import LIMITS, JointLimits
@@ -51,19 +51,19 @@ class Meeting:
     net: Bool[Array, " L"]  # touched it on the way
 
 
-def _alone(params: BallParams) -> BallParams:
+def _take_long_steps(params: BallParams) -> BallParams:
     """Alone in the air a ball needs no substeps if they are of second order."""
     return replace(params, flight=replace(params.flight, integrator="midpoint"))
 
 
-def _ticks(period: float) -> int:
+def _count_ticks(period: float) -> int:
     """Control periods that a ball is followed."""
     return math.ceil(LONGEST / period)
 
 
-def sent(params: BallParams, ball: BallState, period: float) -> Sent:
+def fly_serve(params: BallParams, ball: BallState, period: float) -> Sent:
     """Flies balls (3, L) until they come down, in steps of ``period`` [s]."""
-    params, false = _alone(params), jnp.zeros(ball.position.shape[1:], bool)
+    params, false = _take_long_steps(params), jnp.zeros(ball.position.shape[1:], bool)
     start = Sent(false, false, false, jnp.zeros((2, *false.shape)))
 
     def step(_: Array, state: tuple, params: BallParams, __: tuple) -> tuple:
@@ -80,10 +80,10 @@ def sent(params: BallParams, ball: BallState, period: float) -> Sent:
         live = live & ~valid & ~own & (new.position[2] > FLOOR)
         return where(live, new, ball), live, found
 
-    return while_any(lambda s: s[1], step, (ball, ~false, start), params, limit=_ticks(period))[2]
+    return while_any(lambda s: s[1], step, (ball, ~false, start), params, limit=_count_ticks(period))[2]
 
 
-def meeting(
+def fly_to_player(
     params: BallParams,
     ball: BallState,
     returned: Bool[Array, " L"],
@@ -95,7 +95,7 @@ def meeting(
 
     returned: which balls to fly. The contact is looked for once per ``period`` [s].
     """
-    params, zero = _alone(params), jnp.zeros_like(ball.position[0])
+    params, zero = _take_long_steps(params), jnp.zeros_like(ball.position[0])
     start = Meeting(Incoming(ball, jnp.zeros_like(ball.position[:2]), zero), zero > 1.0, zero > 1.0)
 
     def step(tick: Array, state: tuple, by_lane: tuple, _: tuple) -> tuple:
@@ -120,15 +120,15 @@ def meeting(
         return where(live, new, ball), live, since, Meeting(incoming, met.reached | contact, net)
 
     by_lane = (params, plane, height)
-    return while_any(lambda s: s[1], step, (ball, returned, zero, start), by_lane, limit=_ticks(period))[3]
+    return while_any(lambda s: s[1], step, (ball, returned, zero, start), by_lane, limit=_count_ticks(period))[3]
 
 
-def homeward(
+def drive_home(
     home: ArrayLike, qpos: Float[Array, "joints L"], seconds: Float[Array, " L"], limits: JointLimits = LIMITS
 ) -> Float[Array, "joints L"]:
     """Joint positions (n, L) ``seconds`` (L,) after the hit, on the way home (n,) as the bridge drives it."""
-    speed, braking = HOME_SPEED * column(limits.policy_velocity), HOME_BRAKING * column(limits.acceleration)
-    error, driven = column(home) - qpos, jnp.maximum(seconds - HOME_DELAY, 0.0)[None]
+    speed, braking = HOME_SPEED * make_column(limits.policy_velocity), HOME_BRAKING * make_column(limits.acceleration)
+    error, driven = make_column(home) - qpos, jnp.maximum(seconds - HOME_DELAY, 0.0)[None]
     distance = jnp.abs(error)
     # At full speed until the braking distance, then along the parabola b / 2 (T - t)^2 that is left.
     stop = jnp.minimum(speed**2 / (2.0 * braking), distance)
@@ -138,6 +138,6 @@ def homeward(
     return qpos + jnp.sign(error) * jnp.clip(moved, 0.0, distance)
 
 
-def column(values: ArrayLike) -> Float[Array, "joints 1"]:
+def make_column(values: ArrayLike) -> Float[Array, "joints 1"]:
     """Numbers of the joints as (n, 1)."""
     return jnp.asarray(np.asarray(values, np.float32))[:, None]

@@ -6,14 +6,14 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Int
 
-from mjx_tt.env.task import HIT, RETURNED
+from mjx_tt.env.episode import HIT, RETURNED
 from mjx_tt.rally.ball_flights import Meeting, Sent
 from robot_io.rally_ends import ROWS as ROWS
 from robot_io.rally_ends import End as End
 from robot_io.rally_ends import Evidence
 
 
-def ending(
+def find_end(
     first: Bool[Array, " L"],
     sent: Sent,
     outcome: Int[Array, " L"],

@@ -34,7 +34,7 @@ from ballmodel.io.ranges import FINITE
 from ballmodel.io.validation import Finite, Increasing, find, validate
 from ballmodel.state import BallState
 from ballmodel.vec import Scalars, row
-from mjx_tt.rally.shots import aimed, erring, fall_seconds, stroke_seconds
+from mjx_tt.rally.shots import aim_stroke, estimate_fall_seconds, estimate_stroke_seconds, perturb_stroke
 
 Number: TypeAlias = Annotated[jax.Array | float, FINITE]  # a file has one number
 
@@ -225,19 +225,19 @@ def first_ball(player: Player, state: PlayerState, key: PRNGKeyArray, shape: tup
     )
     start, ground = jnp.stack([x, y, z]), jnp.full(shape, c.BALL_RADIUS)
     straight = jnp.stack([x, landing, ground])
-    seconds = stroke_seconds(start, straight, forward, LOB_CLEARANCE)
-    seconds = jnp.clip(seconds, fall_seconds(first.climb.low, z), fall_seconds(first.climb.high, z))
+    seconds = estimate_stroke_seconds(start, straight, forward, LOB_CLEARANCE)
+    seconds = jnp.clip(seconds, estimate_fall_seconds(first.climb.low, z), estimate_fall_seconds(first.climb.high, z))
     flight, still = FlightParams(), jnp.zeros_like(start)
-    velocity = aimed(flight, start, straight, seconds, still)
+    velocity = aim_stroke(flight, start, straight, seconds, still)
     sideways = jnp.clip(sideways, (first.side.low - x) / seconds, (first.side.high - x) / seconds)
     velocity = jnp.stack([sideways, jnp.clip(velocity[1], -first.forward.high, -first.forward.low), velocity[2]])
     # A service: down at two fifths of the way to the net.
     own = jnp.stack([x, 0.6 * y, ground])
     serving = jax.random.uniform(next(keys), shape) < first.service
-    velocity = jnp.where(serving, aimed(flight, start, own, 0.4 * y / 4.5, still), velocity)
+    velocity = jnp.where(serving, aim_stroke(flight, start, own, 0.4 * y / 4.5, still), velocity)
     mishit = jax.random.uniform(next(keys), shape) < first.mishit
     errors = _errors(player, state, LOB_ERROR * jnp.where(mishit, 4.0, 1.0))
-    velocity = erring(next(keys), velocity, *errors)
+    velocity = perturb_stroke(next(keys), velocity, *errors)
     return BallState(start, velocity, LOB_SPIN * _spin(player.spin, next(keys), velocity))
 
 
@@ -277,15 +277,15 @@ def answer(player: Player, state: PlayerState, key: PRNGKeyArray, incoming: Inco
     wanted = wanted + strokes.attack * jnp.maximum(ball.position[2] - COMFORTABLE_HEIGHT, 0.0)
     wanted = jnp.clip(wanted, strokes.speed.low, strokes.speed.high)
     clearance = strokes.clearance.draw(next(keys), shape, strokes.steadiness, WIDE)
-    seconds = stroke_seconds(ball.position, target, wanted, clearance)
-    seconds = jnp.minimum(seconds, fall_seconds(strokes.climb, ball.position[2]))
+    seconds = estimate_stroke_seconds(ball.position, target, wanted, clearance)
+    seconds = jnp.minimum(seconds, estimate_fall_seconds(strokes.climb, ball.position[2]))
     spin = _spin(player.spin, next(keys), target - ball.position)
-    velocity = aimed(flight, ball.position, target, seconds, spin)
+    velocity = aim_stroke(flight, ball.position, target, seconds, spin)
     # Topspin of the incoming ball (about +x cross its direction) climbs off the paddle of who does not expect it.
     horizontal = jnp.sqrt(ball.velocity[0] ** 2 + ball.velocity[1] ** 2) + 1e-6
     topspin = (ball.spin[1] * ball.velocity[0] - ball.spin[0] * ball.velocity[1]) / horizontal
     bias = ability.misread * strange * topspin / SPIN_UNIT
-    velocity = erring(next(keys), velocity, *_errors(player, state, 1.0 + ability.growth * hard), bias)
+    velocity = perturb_stroke(next(keys), velocity, *_errors(player, state, 1.0 + ability.growth * hard), bias)
 
     person = player.person
     after = PlayerState(

@@ -22,7 +22,7 @@ from ballmodel.vec import Scalars
 SOLVER_STEPS, SOLVER_ROUNDS = 16, 4  # of the flight that aims a stroke: within a few millimetres
 
 
-def stroke_seconds(
+def estimate_stroke_seconds(
     start: Float[Array | np.ndarray, "3 *batch"], target: Float[Array, "3 *batch"], speed: Scalars, clearance: Scalars
 ) -> Float[Array, "*batch"]:
     """Time of flight [s] (...) from start to target (3, ...) [m] at a horizontal speed [m/s], or longer: over the net.
@@ -37,13 +37,13 @@ def stroke_seconds(
     return jnp.maximum(jnp.hypot(across, along) / speed, over_net)
 
 
-def fall_seconds(climb: Scalars, height: Scalars) -> Float[Array, "*batch"]:
+def estimate_fall_seconds(climb: Scalars, height: Scalars) -> Float[Array, "*batch"]:
     """Time [s] (...) without air until a ball that leaves at a height [m] with a climb [m/s] meets the table."""
     square = climb**2 + 2.0 * c.GRAVITY * (height - c.BALL_RADIUS)
     return jnp.asarray(climb + jnp.sqrt(jnp.maximum(square, 0.0))) / c.GRAVITY
 
 
-def aimed(
+def aim_stroke(
     flight: FlightParams,
     start: Float[Array | np.ndarray, "3 *batch"],
     target: Float[Array, "3 *batch"],
@@ -64,7 +64,7 @@ def aimed(
     return velocity
 
 
-def erring(
+def perturb_stroke(
     key: PRNGKeyArray,
     velocity: Float[Array, "3 *batch"],
     direction: Scalars,

@@ -23,21 +23,19 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from ballmodel.partial_params import without_nominal
 from ballmodel.registry import Balls, box_of
 from ballmodel.state import BallState, where
-from mjx_tt.env import rewards
-from mjx_tt.env.outgoing_ball import fly_out
+from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes, EpisodeState
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.policy import controller as controller_of
-from mjx_tt.env.reward_sums import reward_terms
-from mjx_tt.env.task import HIT, MISSED, RETURNED, Episodes, EpisodeState, Task, TaskConfig
+from mjx_tt.env.return_flight import fly_return
+from mjx_tt.env.task import Task, TaskConfig, evaluate_rewards
 from mjx_tt.rally import ball_flights, human_player
-from mjx_tt.rally.ball_flights import column, homeward
-from mjx_tt.rally.end_reasons import End, ending
+from mjx_tt.rally.ball_flights import drive_home, make_column
+from mjx_tt.rally.end_reasons import End, find_end
 from mjx_tt.rally.human_player import Player, PlayerState
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 
 ENDLESS = 1_000_000  # touches
-FAULT = -2.0  # reward of a robot's fault, the paper's table of rewards
 IDLE = 0.05  # share of the policy's velocity limits that a robot which "did not react" stays under
 BLIND = 0.003  # probability that the tracker loses a first ball and the robot does not react (estimate)
 BY_HAND = 0.5  # share of the dummy balls that are thrown by hand
@@ -219,40 +217,39 @@ class RallySimulator:
         lanes, limits = state.touches.shape[0], self.task.contract.limits
         keys = iter(jax.random.split(key, 8))
         ball, first = state.ball, state.touches == 1
-        sent = ball_flights.sent(model.ball, ball, self.config.period)
+        sent = ball_flights.fly_serve(model.ball, ball, self.config.period)
         robot = self._robot(next(keys), policy, model, ball, state.start)
         blind = first & (jax.random.uniform(next(keys), (lanes,)) < BLIND)
         finite = robot.finite
-        fault = ((robot.sums.collision > 0.0) | ~finite) & ~blind
+        fault = ((robot.accumulators.terms["collision"] > 0.0) | ~finite) & ~blind
         hit = robot.hit & finite & ~fault & ~blind
         played = replace(robot, hit=hit)
-        back = fly_out(self.config, robot.ball, hit, model)
+        back = fly_return(self.config, robot.ball, hit, model)
         returned = hit & back.returned
-        terms = reward_terms(played, back)
-        terms = terms.at[rewards.TERMS.index("fault")].set(jnp.where(fault, FAULT, 0.0))
+        terms = evaluate_rewards(self.config.rewards, played, back, fault)
         outcome = jnp.where(returned, RETURNED, jnp.where(hit, HIT, MISSED)).astype(jnp.int32)
 
         plane, height = human_player.wish(player, next(keys), (lanes,))
-        met = ball_flights.meeting(model.ball, robot.ball, returned, plane, height, self.config.period)
+        met = ball_flights.fly_to_player(model.ball, robot.ball, returned, plane, height, self.config.period)
         answer = human_player.answer(player, state.player, next(keys), met.incoming, model.ball.flight)
         answered = returned & met.reached & answer.hit
         goes_on = answered & (state.touches + 2 <= max_touches)
-        idle = jnp.all(robot.sums.peak_velocity < IDLE * column(limits.policy_velocity), axis=0)
+        idle = jnp.all(robot.accumulators.peak_velocity < IDLE * make_column(limits.policy_velocity), axis=0)
         inside = jnp.ones(lanes, bool) if box is None else box.holds(ball, jnp.where(sent.valid, sent.landing, 0.0))
-        end = ending(first, sent, outcome, fault, answered, met, blind | idle, inside)
+        end = find_end(first, sent, outcome, fault, answered, met, blind | idle, inside)
 
         learnt = jax.tree.map(partial(jnp.where, returned & met.reached), answer.state, state.player)
         rested = human_player.rested(player, learnt)
         fresh_ball = human_player.first_ball(player, rested, next(keys), (lanes,))
-        pose = homeward(self.task.home, robot.qpos, met.incoming.seconds, limits)
+        pose = drive_home(self.task.home, robot.qpos, met.incoming.seconds, limits)
         after = RallyState(
             player=jax.tree.map(partial(jnp.where, goes_on), learnt, rested),
             ball=where(goes_on, answer.ball, fresh_ball),
             touches=jnp.where(goes_on, state.touches + 2, 1),
-            start=jnp.where(goes_on, pose, column(self.task.home)),
+            start=jnp.where(goes_on, pose, make_column(self.task.home)),
             dummy=fault,
         )
-        steps = robot.sums.steps * self.config.period
+        steps = robot.accumulators.steps * self.config.period
         nowhere = jnp.full((2, lanes), jnp.nan)
         result = ShotResult(
             ball=ball,
@@ -265,7 +262,7 @@ class RallySimulator:
             fault=fault,
             end=end.astype(jnp.int8),
             return_landing=jnp.where(hit, back.landing, nowhere),
-            robot_peak=robot.sums.peak_velocity,
+            robot_peak=robot.accumulators.peak_velocity,
             seconds=steps + jnp.where(returned, met.incoming.seconds, 0.0),
         )
         return after, result, state.touches + hit.astype(jnp.int32)

@@ -20,8 +20,8 @@ from ballmodel.contact import TABLE, Box, box_gap
 from ballmodel.vec import dot
 from mjx_tt.robot.chain import Frame
 from mjx_tt.robot.kinematics import LinkPose, PaddleKinematics, stack
-from mjx_tt.robot.model import Capsule
-from mjx_tt.robot.scalar_algebra import materialise
+from mjx_tt.robot.mjcf import Capsule
+from mjx_tt.robot.scalar_algebra import optimization_barrier
 from robot_io.robot_file import RobotFile
 from robot_io.safety.clearance import segment_distance
 
@@ -38,7 +38,7 @@ def segment_box_distance(
         middle = 0.5 * (low + high)
         gap, _ = box_gap(box, 0.0, p + middle[None] * d)
         rising = dot(gap, d) > 0.0
-        low, high = materialise((jnp.where(rising, low, middle), jnp.where(rising, middle, high)))
+        low, high = optimization_barrier((jnp.where(rising, low, middle), jnp.where(rising, middle, high)))
     best = jnp.zeros_like(p[0]) + jnp.inf
     for s in (jnp.zeros_like(low), 0.5 * (low + high), jnp.ones_like(low)):
         best = jnp.minimum(best, box_gap(box, 0.0, p + s[None] * d)[1])
@@ -81,18 +81,18 @@ class CapsuleClearance:
 
     def __call__(self, poses: list[LinkPose], like: Float[jax.Array, "*batch"]) -> Clearances:
         """Clearances from links' world poses (``PaddleKinematics.links``); ``like`` gives the batch shape."""
-        ends = materialise(self.segments(poses, like))
+        ends = optimization_barrier(self.segments(poses, like))
         batch = (1,) * like.ndim
 
         # Both ends (3, len(names), ...) and the radii (len(names), 1...).
         def gather(names: Sequence[str]) -> tuple[jax.Array, jax.Array, np.ndarray]:
             p, q = (jnp.stack([ends[name][end] for name in names], axis=1) for end in (0, 1))
             radii = np.array([self._capsules[name].radius for name in names], like.dtype)
-            return *materialise((p, q)), radii.reshape(-1, *batch)
+            return *optimization_barrier((p, q)), radii.reshape(-1, *batch)
 
         file = self._file
         p, q, radius = gather(file.table)
-        to_table = materialise(segment_box_distance(TABLE, p, q) - radius)
+        to_table = optimization_barrier(segment_box_distance(TABLE, p, q) - radius)
         blade = _least([to_table[file.table.index(name)] for name in file.blade])
         if not file.pairs:
             return Clearances(_least(to_table), jnp.full_like(blade, jnp.inf), blade)

@@ -108,7 +108,7 @@ def _articulated_body(
             pw[i] = f.vsub(pw[i], f.cross(link.com, weight))
             pv[i] = f.vsub(pv[i], weight)
         # The bias terms are used once or twice: computing them there costs less than storing them here.
-        w, v, gravity = f.materialise((w, v, gravity))
+        w, v, gravity = f.optimization_barrier((w, v, gravity))
         w_parent, v_parent = w, v
 
     U: dict[int, tuple[f.Vector, f.Vector]] = {}
@@ -148,7 +148,7 @@ def _articulated_body(
         moved = f.matvec(R, force_v)
         pw[i - 1] = f.vadd(pw[i - 1], f.vadd(f.matvec(R, force_w), f.cross(pos[i], moved)))
         pv[i - 1] = f.vadd(pv[i - 1], moved)
-        A[i - 1], B[i - 1], C[i - 1], pw[i - 1], pv[i - 1] = f.materialise(
+        A[i - 1], B[i - 1], C[i - 1], pw[i - 1], pv[i - 1] = f.optimization_barrier(
             (A[i - 1], B[i - 1], C[i - 1], pw[i - 1], pv[i - 1])
         )
 
@@ -165,6 +165,6 @@ def _articulated_body(
             a_v = f.vadd(a_v, f.vscale(link.axis, qacc[i]))
         else:
             a_w = f.vadd(a_w, f.vscale(link.axis, qacc[i]))
-        qacc[i] = f.materialise(qacc[i])
-        aw, av = f.materialise((a_w, a_v)) if i % 2 else (a_w, a_v)  # storing every second is the cheapest
+        qacc[i] = f.optimization_barrier(qacc[i])
+        aw, av = f.optimization_barrier((a_w, a_v)) if i % 2 else (a_w, a_v)  # storing every second is the cheapest
     return qacc

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ballmodel.contact import TABLE
 from mjx_tt.robot.chain import WORLD, chain_from_model
 from mjx_tt.robot.kinematics import centred_on_anchors
-from mjx_tt.robot.model import capsules
+from mjx_tt.robot.mjcf import capsules
 from robot_io.robot_file import RobotFile
 from robot_io.safety.clearance import FIXED
 

@@ -13,8 +13,8 @@ import sys
 from importlib import resources
 from pathlib import Path
 
-from mjx_tt.robot import geometry, robot
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import geometry
+from mjx_tt.robot.robots import Robot
 
 
 def text(described: Robot) -> str:
@@ -40,7 +40,7 @@ def main(arguments: list[str]) -> int:
             f"unknown arguments {arguments}; usage: python -m mjx_tt.robot.geometry_export [--check]", file=sys.stderr
         )
         return 2
-    wanted, file = text(robot.paper()), path()
+    wanted, file = text(robots.paper()), path()
     if arguments:
         current = file.exists() and file.read_text(encoding="utf-8") == wanted
         print(f"{file} is {'current' if current else 'not current: run python -m mjx_tt.robot.geometry_export'}")

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ballmodel.flight import PaddlePose
+from mjx_tt.lanes.functions import sin_cos
 from mjx_tt.robot import scalar_algebra as f
 from mjx_tt.robot.chain import WORLD, Chain, Frame
 
@@ -32,7 +33,7 @@ def centred_on_anchors(chain: Chain) -> Chain:
 
 def joint_transforms(chain: Chain, q: Joints) -> list[tuple[f.Matrix, f.Vector]]:
     """Rotation and origin of every link in its parent's frame at joint positions q (n, ...), folded scalars."""
-    sin, cos = f.materialise(f.sin_cos(q))  # of slides too: one loop over all joints is the cheapest
+    sin, cos = f.optimization_barrier(sin_cos(q))  # of slides too: one loop over all joints is the cheapest
     transforms: list[tuple[f.Matrix, f.Vector]] = []
     for i, link in enumerate(chain.links):
         if link.slide:
@@ -41,7 +42,7 @@ def joint_transforms(chain: Chain, q: Joints) -> list[tuple[f.Matrix, f.Vector]]
             continue
         rot = f.matmul(link.rot, f.axis_rotation(link.axis, cos[i], sin[i]))
         # Where the entries are sine, cosine and their negatives there is nothing to store.
-        transforms.append((rot if f.are_signs(link.rot, link.axis) else f.materialise(rot), link.pos))
+        transforms.append((rot if f.are_signs(link.rot, link.axis) else f.optimization_barrier(rot), link.pos))
     return transforms
 
 
@@ -61,7 +62,7 @@ def forward(chain: Chain, q: Joints) -> list[LinkPose]:
     pos: f.Vector = f.ZERO3
     for r, p in joint_transforms(chain, q):
         pos = f.vadd(pos, f.matvec(rot, p))
-        rot, pos = f.materialise((f.matmul(rot, r), pos))
+        rot, pos = f.optimization_barrier((f.matmul(rot, r), pos))
         poses.append(LinkPose(rot, pos))
     return poses
 
@@ -89,7 +90,7 @@ def point_motion(
         point = f.vadd(f.matvec(rot, point), pos)
         direction, velocity, spin = (f.matvec(rot, x) for x in (direction, velocity, spin))
         if i % 3 == 0:  # storing every third is the cheapest
-            point, direction, velocity, spin = f.materialise((point, direction, velocity, spin))
+            point, direction, velocity, spin = f.optimization_barrier((point, direction, velocity, spin))
     return point, direction, velocity, spin
 
 

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
 
 import mujoco
 import numpy as np
 
 from mjx_tt.robot.chain import body_frames
 from mjx_tt.robot.checks import unsupported
-from mjx_tt.robot.model import PADDLE_SITE, capsules
+from mjx_tt.robot.mjcf import PADDLE_SITE, capsules
 from mjx_tt.sim.actuators import EFFECTS
-
-if TYPE_CHECKING:
-    from mjx_tt.robot.robot import Robot
+from robot_io.robot_file import RobotFile
 
 GRAVITY = (0.0, 0.0, -9.81)  # [m/s^2] of the court
 COURT_BODIES = 2  # the world and the ball
@@ -42,24 +39,38 @@ def needs_files(mjcf: str) -> bool:
     return _NEEDED_FILES.search(mjcf) is not None
 
 
-def mistakes(robot: Robot, where: str, yaml: str) -> Iterator[str]:
-    """One line for every mistake; ``where`` names the MJCF and ``yaml`` the YAML."""
-    yield from _drives(robot, yaml)
+def find_mistakes(
+    file: RobotFile,
+    own_spec: Callable[[], mujoco.MjSpec],
+    at_table: Callable[[], mujoco.MjModel],
+    where: str,
+    yaml: str,
+) -> Iterator[str]:
+    """One line for every mistake of a robot.
+
+    Args:
+        file: its YAML.
+        own_spec: gives the MJCF as its author wrote it.
+        at_table: compiles the robot at the table.
+        where: names the MJCF in messages.
+        yaml: names the YAML.
+    """
+    yield from _drives(file, yaml)
     try:
-        own = robot.own_spec()
+        own = own_spec()
         alone = own.compile()
     except ValueError as error:
         yield f"{where}: MuJoCo cannot compile it: {_one_line(error)}"
         return
     found = [
         *_options(alone, where),
-        *_joints(robot, alone, where, yaml),
-        *_actuators(robot, alone, where),
-        *_paddle(robot, alone, where, yaml),
+        *_joints(file, alone, where, yaml),
+        *_actuators(file, alone, where),
+        *_paddle(file, alone, where, yaml),
     ]
     yield from found
     try:
-        model = robot.model()
+        model = at_table()
     except ValueError as error:
         yield f"{where}: cannot stand at the table: {_one_line(error)}; rename it, the scene has one of that name"
         return
@@ -67,14 +78,14 @@ def mistakes(robot: Robot, where: str, yaml: str) -> Iterator[str]:
     for line in unsupported(model, carriers):
         remedy = next((f"; {text}" for words, text in _REMEDIES.items() if words in line), "")
         yield f"{where}: {line}{remedy}"
-    missing = list(_capsules(robot, model, where, yaml))
+    missing = list(_capsules(file, model, where, yaml))
     yield from missing
     if not found and not missing:
-        yield from _home(robot, model, yaml)
+        yield from _home(file, model, yaml)
 
 
-def _drives(robot: Robot, yaml: str) -> Iterator[str]:
-    for path, value in robot.file.model:
+def _drives(file: RobotFile, yaml: str) -> Iterator[str]:
+    for path, value in file.model:
         group, name, *effect = path.split(".")
         if group == "drives" and effect[0] not in EFFECTS:
             yield f"{yaml}: {path}: got {value!r}; allowed effects of {name}: {', '.join(EFFECTS)}"
@@ -92,8 +103,8 @@ def _options(model: mujoco.MjModel, where: str) -> Iterator[str]:
             yield f"{where}: option flag {flag.lower()}: is disabled; remove it, it must stay enabled"
 
 
-def _joints(robot: Robot, model: mujoco.MjModel, where: str, yaml: str) -> Iterator[str]:
-    file, wanted = robot.file, robot.file.contract.joints
+def _joints(file: RobotFile, model: mujoco.MjModel, where: str, yaml: str) -> Iterator[str]:
+    wanted = file.contract.joints
     found = [model.joint(i).name for i in range(model.njnt)]
     for i, name in enumerate(found):
         if not name:
@@ -124,8 +135,8 @@ def _joints(robot: Robot, model: mujoco.MjModel, where: str, yaml: str) -> Itera
         yield f"{where}: joint {found[slides.index(True)]}: a linear axis follows a hinge; axes must carry the arm"
 
 
-def _actuators(robot: Robot, model: mujoco.MjModel, where: str) -> Iterator[str]:
-    wanted = robot.file.contract.joints
+def _actuators(file: RobotFile, model: mujoco.MjModel, where: str) -> Iterator[str]:
+    wanted = file.contract.joints
     driven: list[str] = []
     for i in range(model.nu):
         name, joint = model.actuator(i).name or f"actuator {i}", model.joint(int(model.actuator_trnid[i, 0])).name
@@ -147,8 +158,8 @@ def _actuators(robot: Robot, model: mujoco.MjModel, where: str) -> Iterator[str]
         yield f"{where}: <actuator>: the order is {', '.join(driven)}; write them as the joints: {', '.join(wanted)}"
 
 
-def _paddle(robot: Robot, model: mujoco.MjModel, where: str, yaml: str) -> Iterator[str]:
-    name, sites = robot.file.paddle, [model.site(i).name for i in range(model.nsite)]
+def _paddle(file: RobotFile, model: mujoco.MjModel, where: str, yaml: str) -> Iterator[str]:
+    name, sites = file.paddle, [model.site(i).name for i in range(model.nsite)]
     if name not in sites:
         known = ", ".join(filter(None, sites)) or "none"
         yield (
@@ -164,8 +175,8 @@ def _paddle(robot: Robot, model: mujoco.MjModel, where: str, yaml: str) -> Itera
         yield f"{where}: site {name}: is moved by {carrier}; put it into a body that the last joint moves"
 
 
-def _capsules(robot: Robot, model: mujoco.MjModel, where: str, yaml: str) -> Iterator[str]:
-    file, known = robot.file, {capsule.name: capsule for capsule in capsules(model)}
+def _capsules(file: RobotFile, model: mujoco.MjModel, where: str, yaml: str) -> Iterator[str]:
+    known = {capsule.name: capsule for capsule in capsules(model)}
     geoms = {model.geom(i).name for i in range(model.ngeom)}
     named = {"table": file.table, "blade": file.blade, "pairs": tuple(dict.fromkeys(n for p in file.pairs for n in p))}
     for key, wanted in named.items():
@@ -184,12 +195,12 @@ def _capsules(robot: Robot, model: mujoco.MjModel, where: str, yaml: str) -> Ite
             yield f"{where}: geom {name}: a capsule of the blade must be moved by the last joint"
 
 
-def _home(robot: Robot, model: mujoco.MjModel, yaml: str) -> Iterator[str]:
+def _home(file: RobotFile, model: mujoco.MjModel, yaml: str) -> Iterator[str]:
     """Contact at home."""
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.file.home
+    data.qpos[:] = file.home
     mujoco.mj_kinematics(model, data)
-    names = [(name, "col_table") for name in robot.file.table] + list(robot.file.pairs)
+    names = [(name, "col_table") for name in file.table] + list(file.pairs)
     for first, second in names:
         pair = [model.geom(name).id for name in (first, second)]
         gap = mujoco.mj_geomDistance(model, data, pair[0], pair[1], 1.0, None)

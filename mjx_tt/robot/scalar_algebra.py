@@ -11,9 +11,7 @@ from collections.abc import Callable
 from typing import TypeAlias, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 Scalar: TypeAlias = float | jax.Array
@@ -156,27 +154,6 @@ def are_signs(*nested: Vector | Matrix) -> bool:
     return all(entry in (-1.0, 0.0, 1.0) for entry in jax.tree.leaves(nested))
 
 
-def sin_cos(angle: Float[jax.Array, "*batch"]) -> tuple[Float[jax.Array, "*batch"], Float[jax.Array, "*batch"]]:
-    """Sine and cosine of angles [rad], |angle| < 8192, to rounding.
-
-    In float32 both together by Cephes' polynomials (Moshier, sinf.c), four times as fast as XLA's two general
-    functions.
-    """
-    if angle.dtype != jnp.float32:
-        return jnp.sin(angle), jnp.cos(angle)
-    quarter = jnp.round(angle * np.float32(2.0 / np.pi))
-    r = angle
-    for part in (1.5703125, 4.837512969970703125e-4, 7.54978995489188216e-8):  # pi / 2 in pieces of few bits
-        r = r - quarter * np.float32(part)
-    z = r * r
-    sin = r + r * z * (-1.6666654611e-1 + z * (8.3321608736e-3 - z * 1.9515295891e-4))
-    cos = 1.0 - 0.5 * z + z * z * (4.166664568298827e-2 + z * (-1.388731625493765e-3 + z * 2.443315711809948e-5))
-    turn = quarter.astype(jnp.int32)
-    odd = (turn & 1) == 1
-    sin, cos = jnp.where(odd, cos, sin), jnp.where(odd, sin, cos)
-    return jnp.where((turn & 2) == 2, -sin, sin), jnp.where(((turn + 1) & 2) == 2, -cos, cos)
-
-
 def vector(values: ArrayLike) -> Constant:
     """Three numbers as floats."""
     x, y, z = np.asarray(values, float)
@@ -189,7 +166,7 @@ def matrix(values: ArrayLike) -> ConstantMatrix:
     return vector(x), vector(y), vector(z)
 
 
-def materialise(tree: T) -> T:
+def optimization_barrier(tree: T) -> T:
     """The same nested scalars, with every array of it computed once and stored.
 
     Left alone, the compiler fuses a whole recursion into each of its results and computes shared terms again for every
@@ -198,6 +175,6 @@ def materialise(tree: T) -> T:
     leaves, structure = jax.tree.flatten(tree)
     arrays = [i for i, leaf in enumerate(leaves) if not isinstance(leaf, float)]
     if arrays:
-        for i, stored in zip(arrays, jax.lax.optimization_barrier([leaves[i] for i in arrays]), strict=True):
-            leaves[i] = stored
+        for i, kept in zip(arrays, jax.lax.optimization_barrier([leaves[i] for i in arrays]), strict=True):
+            leaves[i] = kept
     return jax.tree.unflatten(structure, leaves)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from mujoco import rollout
 
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot.robots import Robot
 
 
 @dataclass(frozen=True)

@@ -129,7 +129,7 @@ class DriveState:
     swing: Float[Array, "2 joints *batch"] | None = None  # [m], [rad] of a flexible mount about it, and its velocity
 
 
-def by_effect(
+def sort_by_effect(
     params: Any | None, shape: tuple[int, ...], dtype: DTypeLike, joints: tuple[str, ...] = JOINT_NAMES
 ) -> Drives:
     """The numbers of drives, as ``drive_params`` of the joints holds them, as arrays (n, *shape)."""
@@ -144,7 +144,7 @@ def by_effect(
     return Drives(**{effect: column(effect) for effect in EFFECTS})
 
 
-def at_rest(drives: Drives, qpos: Float[Array, "joints *batch"]) -> DriveState:
+def rest(drives: Drives, qpos: Float[Array, "joints *batch"]) -> DriveState:
     """The drives of a robot that stands at qpos (n, ...), in the middle of every play."""
     return DriveState(
         jnp.zeros_like(qpos) if drives.follows else None,
@@ -153,7 +153,7 @@ def at_rest(drives: Drives, qpos: Float[Array, "joints *batch"]) -> DriveState:
     )
 
 
-def reachable(drives: Drives, command: Float[Array, "joints *batch"]) -> Float[Array, "joints *batch"]:
+def limit_command(drives: Drives, command: Float[Array, "joints *batch"]) -> Float[Array, "joints *batch"]:
     """Steps 2 to 5: the velocity (n, ...) that a delayed command (n, ...) asks of the drive in the end."""
     u = command
     if drives.deadband is not None:
@@ -167,7 +167,7 @@ def reachable(drives: Drives, command: Float[Array, "joints *batch"]) -> Float[A
     return u
 
 
-def follow(
+def step_lag(
     drives: Drives, state: DriveState, u: Float[Array, "joints *batch"], timestep: float
 ) -> tuple[Float[Array, "joints *batch"], DriveState]:
     """Steps 6 and 7 over one substep [s] of constant u (n, ...): the mean velocity in it, and the state at its end.
@@ -193,7 +193,7 @@ def follow(
     return way / timestep, dataclasses.replace(state, velocity=u - left * decay)
 
 
-def carry(
+def step_backlash(
     drives: Drives,
     state: DriveState,
     qpos: Float[Array, "joints *batch"],
@@ -211,7 +211,7 @@ def carry(
     return output, (output - state.output) / timestep, dataclasses.replace(state, output=output)
 
 
-def swung(
+def step_swing(
     drives: Drives,
     state: DriveState,
     before: Float[Array, "joints *batch"],

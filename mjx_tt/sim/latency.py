@@ -31,31 +31,31 @@ class Delay:
     rest: Float[Array, "*batch"]  # [s]
 
 
-def observation_delay(seconds: Float[ArrayLike, "*batch"], period: float) -> Delay:
+def split_observation_delay(seconds: Float[ArrayLike, "*batch"], period: float) -> Delay:
     """k and the phase p [s] of the captured moment within a control period, from a delay (...) in seconds."""
     d = jnp.maximum(seconds, SMALLEST)
     k = jnp.ceil(d / period)
     return Delay(k.astype(jnp.int32), k * period - d)
 
 
-def action_delay(seconds: Float[ArrayLike, "*batch"], period: float) -> Delay:
+def split_action_delay(seconds: Float[ArrayLike, "*batch"], period: float) -> Delay:
     """m and r [s], from a delay (...) in seconds."""
     seconds = jnp.asarray(seconds)
     m = jnp.floor(seconds / period)
     return Delay(m.astype(jnp.int32), seconds - m * period)
 
 
-def capture_weight(delay: Delay, s: Int[Array, ""] | int, substeps: int, timestep: float) -> Array:
+def weigh_capture(delay: Delay, s: Int[Array, ""] | int, substeps: int, timestep: float) -> Array:
     """Weight of the state at substep boundary ``s`` (0 .. substeps) in the captured state: linear interpolation."""
     return jnp.clip(1.0 - jnp.abs(delay.rest / timestep - s), 0.0, 1.0)
 
 
-def old_command_share(delay: Delay, s: Int[Array, ""] | int, timestep: float) -> Array:
+def share_old_command(delay: Delay, s: Int[Array, ""] | int, timestep: float) -> Array:
     """Share of substep ``s`` (0-based) during which the older of the two commands is still in force."""
     return jnp.clip((delay.rest - s * timestep) / timestep, 0.0, 1.0)
 
 
-def ring_write(
+def write_ring(
     ring: Shaped[Array, "depth n *batch"], tick: Int[Array, ""] | int, value: Shaped[Array, "n *batch"]
 ) -> Shaped[Array, "depth n *batch"]:
     """The ring (depth, n, ...) with ``value`` (n, ...) in the slot of control period ``tick``."""
@@ -63,7 +63,7 @@ def ring_write(
     return jax.lax.dynamic_update_index_in_dim(ring, value, slot, 0)
 
 
-def ring_read(ring: Shaped[Array, "depth n *batch"], tick: Int[Array, "..."]) -> Shaped[Array, "n *batch"]:
+def read_ring(ring: Shaped[Array, "depth n *batch"], tick: Int[Array, "..."]) -> Shaped[Array, "n *batch"]:
     """The entries (n, ...) of control periods ``tick`` (...), which may differ per episode.
 
     A sum of selections instead of a gather: it stays inside the vector loops.
@@ -76,6 +76,6 @@ def ring_read(ring: Shaped[Array, "depth n *batch"], tick: Int[Array, "..."]) ->
     return out
 
 
-def ring_depth(longest: float, period: float) -> int:
+def count_slots(longest: float, period: float) -> int:
     """Slots needed for delays up to ``longest`` seconds: one more than the periods that have to be remembered."""
     return math.ceil(longest / period) + 2

@@ -16,6 +16,7 @@ from ballmodel.io.ranges import Within
 from ballmodel.partial_params import optional, value_or
 from ballmodel.state import BallState
 from ballmodel.vec import Scalars, dot, row
+from mjx_tt.sim.constant_acceleration import correct_covariance, predict_covariance
 
 SHORTEST = 1e-9  # [s], keeps the filters' exponents finite
 FILTER_GATE = 0.03  # [m]: ten deviations of a usual tracker's noise
@@ -67,13 +68,13 @@ class Camera:
     rows: tuple[tuple[Scalars, Scalars, Scalars], ...]  # 3 x 3, camera_scale Rz Ry Rx
     distortion: Scalars  # [1/m^2]
 
-    def seen(self, p: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
+    def project(self, p: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
         """Measured position (3, ...) [m] of a ball at p (3, ...) [m], without offset and noise."""
         p = p * row(1.0 + self.distortion * dot(p, p))
         return jnp.stack([dot(row, p) for row in self.rows])
 
 
-def camera(params: SensingParams) -> Camera | None:
+def make_camera(params: SensingParams) -> Camera | None:
     """The camera of these parameters; None where all of them are omitted."""
     names = ("camera_scale", *(f"camera_rotation_{axis}" for axis in "xyz"), "camera_distortion")
     values = [getattr(params, name) for name in names]
@@ -91,7 +92,7 @@ def camera(params: SensingParams) -> Camera | None:
     return Camera(tuple((scale * a, scale * b, scale * c) for a, b, c in rotation), distortion)
 
 
-def smoothed(
+def step_smoothing(
     time_constant: Scalars,
     filtered: Float[Array, "3 *batch"],
     before: Float[Array | np.ndarray, "3 *batch"],
@@ -103,10 +104,6 @@ def smoothed(
     tau = row(jnp.maximum(time_constant, SHORTEST))
     behind = (after - before) * (tau / timestep)  # by which f follows a steady p
     return jnp.asarray(after) - behind + (filtered - before + behind) * jnp.exp(-timestep / tau)
-
-
-# xx, xv, xa, vv, va, aa; unit of length: the deviation of the measurements' noise, of time: the memory
-Covariance = Float[Array, "6 *batch"]
 
 
 @jax.tree_util.register_dataclass
@@ -125,25 +122,25 @@ class Lag:
     position: Float[Array, "3 *batch"]  # [m]
     velocity: Float[Array, "3 *batch"]  # [m/s]
     acceleration: Float[Array, "3 *batch"]  # [m/s^2]
-    covariance: Covariance
+    # of ``constant_acceleration``; unit of length: the deviation of the measurements' noise, of time: the memory
+    covariance: Float[Array, "6 *batch"]
 
     @classmethod
-    def settled(cls, dt: Scalars, memory: Scalars, like: Float[Array | np.ndarray, "3 *batch"]) -> Lag:
+    def settle(cls, dt: Scalars, memory: Scalars, like: Float[Array | np.ndarray, "3 *batch"]) -> Lag:
         """A filter that has watched a flight, measured every ``dt`` [s]: no lag. memory [s]."""
         zero = jnp.zeros_like(like)
         h = jnp.broadcast_to(dt / _shown(memory, dt), zero.shape[1:])
         covariance = jnp.asarray(row(h) * jnp.stack([jnp.full_like(h, x) for x in SETTLED]))
         for _ in range(ROUNDS):
-            grown = _grown(covariance, h, h)
-            covariance = _measured(grown, _gains(grown))
+            covariance = _correct(jnp.stack(predict_covariance(covariance, h, h)))[1]
         return cls(zero, zero, zero, covariance)
 
-    def predicted(self, dt: Scalars, jump: Float[Array, "3 *batch"], since: Scalars) -> Lag:
+    def predict(self, dt: Scalars, jump: Float[Array, "3 *batch"], since: Scalars) -> Lag:
         """The lag after ``dt`` [s] without a measurement; jump: of the ball's velocity [m/s], ``since`` [s] ago."""
         moved = self.position + row(dt) * self.velocity + row(0.5 * dt**2) * self.acceleration - row(since) * jump
         return Lag(moved, self.velocity + row(dt) * self.acceleration - jump, self.acceleration, self.covariance)
 
-    def corrected(
+    def correct(
         self, dt: Scalars, usual: Scalars, memory: Scalars, gate: Scalars, blur: float | Array = SURPRISE
     ) -> Lag:
         """The lag after a measurement, ``dt`` [s] after the one before. memory [s], zero: no lag; gate [m].
@@ -155,10 +152,12 @@ class Lag:
         surprise = jnp.sqrt(dot(self.position, self.position) + SHORTEST**2)
         share = jnp.clip(0.5 - 0.5 * (surprise - gate) / (SOFTNESS * blur), 0.0, 1.0)
         shut = share * share * (3.0 - 2.0 * share)  # of balls whose filter did not open
-        grown = _grown(self.covariance, dt / time, h)
+        # The noise's variance and the memory are the units: the jerk's density is the usual interval.
+        grown = jnp.stack(predict_covariance(self.covariance, dt / time, h))
         opened = jnp.stack([grown[0] + FRESH, *grown[1:3], grown[3] + FRESH / h**2, grown[4], grown[5] + FRESH / h**4])
-        gains = [shut * a + (1.0 - shut) * b for a, b in zip(_gains(grown), _gains(opened), strict=True)]
-        mixed = row(shut) * _measured(grown, _gains(grown)) + row(1.0 - shut) * _measured(opened, _gains(opened))
+        (closed_gains, closed), (open_gains, wide) = _correct(grown), _correct(opened)
+        gains = [shut * a + (1.0 - shut) * b for a, b in zip(closed_gains, open_gains, strict=True)]
+        mixed = row(shut) * closed + row(1.0 - shut) * wide
         there = row(memory) > 0.0
         return Lag(
             jnp.where(there, row(1.0 - gains[0]) * self.position, 0.0),
@@ -173,37 +172,10 @@ def _shown(memory: Scalars, usual: Scalars) -> Array:
     return jnp.maximum(memory, jnp.maximum(usual, SHORTEST) / LONGEST)
 
 
-def _grown(covariance: Covariance, h: Scalars, usual: Scalars) -> Covariance:
-    """The covariance before a measurement, ``h`` memories after the one before: F P F' + Q.
-
-    With the noise's variance and the memory as units the jerk's density is the usual interval, and
-    Q = usual h [h^4/20, h^3/8, h^2/6; ., h^2/3, h/2; ., ., 1].
-    """
-    xx, xv, xa, vv, va, aa = covariance
-    x0, x1, x2 = xx + h * xv + h**2 / 2.0 * xa, xv + h * vv + h**2 / 2.0 * va, xa + h * va + h**2 / 2.0 * aa
-    v1, v2 = vv + h * va, va + h * aa
-    return jnp.stack(
-        [
-            x0 + h * x1 + h**2 / 2.0 * x2 + usual * h**5 / 20.0,
-            x1 + h * x2 + usual * h**4 / 8.0,
-            x2 + usual * h**3 / 6.0,
-            v1 + h * v2 + usual * h**3 / 3.0,
-            v2 + usual * h**2 / 2.0,
-            aa + usual * h,
-        ]
-    )
-
-
-def _gains(grown: Covariance) -> Array:
-    """Gains (3, ...) of position, velocity and acceleration: P H' / (H P H' + 1)."""
-    return jnp.asarray(grown[:3] / row(grown[0] + 1.0))
-
-
-def _measured(grown: Covariance, gains: Array) -> Covariance:
-    """The covariance after a measurement: (1 - K H) P."""
-    k0, k1, k2 = gains
-    xx, xv, xa, vv, va, aa = grown
-    return jnp.stack([k0, (1.0 - k0) * xv, (1.0 - k0) * xa, vv - k1 * xv, va - k1 * xa, aa - k2 * xa])
+def _correct(grown: Float[Array, "6 *batch"]) -> tuple[Array, Array]:
+    """Gains (3, ...), and the covariance after a measurement whose noise is the unit."""
+    gains = jnp.asarray(grown[:3] / row(grown[0] + 1.0))
+    return gains, jnp.stack(correct_covariance(grown, gains, 1.0))
 
 
 def jump(
@@ -222,17 +194,17 @@ class Filters:
     lag: Lag | None
 
     @classmethod
-    def at(cls, params: SensingParams, position: Float[Array | np.ndarray, "3 *batch"], timestep: float) -> Filters:
+    def settle(cls, params: SensingParams, position: Float[Array | np.ndarray, "3 *batch"], timestep: float) -> Filters:
         """Filters that have settled on a position [m], with a substep of ``timestep`` [s]."""
-        lag = None if params.filter_time is None else Lag.settled(timestep, params.filter_time, position)
+        lag = None if params.filter_time is None else Lag.settle(timestep, params.filter_time, position)
         return cls(None if params.smoothing is None else position, lag)
 
-    def seen(self, position: Float[Array | np.ndarray, "3 *batch"]) -> Float[Array | np.ndarray, "3 *batch"]:
+    def see(self, position: Float[Array | np.ndarray, "3 *batch"]) -> Float[Array | np.ndarray, "3 *batch"]:
         """The position [m] that the filters make of one."""
         seen = position if self.smooth is None else self.smooth
         return seen if self.lag is None else seen + self.lag.position
 
-    def stepped(
+    def step(
         self,
         params: SensingParams,
         before: BallState,
@@ -244,11 +216,11 @@ class Filters:
         """The filters a substep later. contact: True where something struck the ball in it, ``since`` [s] ago."""
         smooth, lag = self.smooth, self.lag
         if smooth is not None and params.smoothing is not None:
-            smooth = smoothed(params.smoothing, jnp.asarray(smooth), before.position, after.position, timestep)
+            smooth = step_smoothing(params.smoothing, jnp.asarray(smooth), before.position, after.position, timestep)
         if lag is not None and params.filter_time is not None:
             struck = jnp.where(contact, jump(before.velocity, after.velocity, timestep), 0.0)
             gate = value_or(params.filter_gate, FILTER_GATE)
-            lag = lag.predicted(timestep, struck, jnp.where(contact, since, 0.0)).corrected(
+            lag = lag.predict(timestep, struck, jnp.where(contact, since, 0.0)).correct(
                 timestep, timestep, params.filter_time, gate
             )
         return Filters(smooth, lag)

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from mjx_tt.robot.model import load_model
+from mjx_tt.robot.mjcf import load_model
 from mjx_tt.viz.caption import Caption
 from mjx_tt.viz.opengl import offscreen
 

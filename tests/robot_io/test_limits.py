@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_tt.robot import model
+from mjx_tt.robot import mjcf
 from robot_io.contract import LIMITS, N_JOINTS
 from robot_io.limits import limit_velocity
 
@@ -34,7 +34,7 @@ def requests():
 
 
 def home(columns=COLUMNS):
-    return np.repeat(model.home_qpos(model.load_model())[:, None], columns, axis=1)
+    return np.repeat(mjcf.home_qpos(mjcf.load_model())[:, None], columns, axis=1)
 
 
 def integrate(limiter, requests, dtype):

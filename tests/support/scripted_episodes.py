@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ballmodel.state import ball_state
-from mjx_tt.env.outgoing_ball import fly_out
-from mjx_tt.env.reward_sums import reward_terms
-from mjx_tt.env.task import Episodes, EpisodeState, Return, Task, TaskConfig
+from mjx_tt.env.episode import Episodes, EpisodeState, Return
+from mjx_tt.env.return_flight import fly_return
+from mjx_tt.env.task import Task, TaskConfig, evaluate_rewards
 from mjx_tt.sim.model import LATENCIES, SimModel
 from robot_io.contract import N_JOINTS, N_OBSERVATION
 
@@ -87,16 +87,16 @@ def task(engine: str = "fused", sim_rate: float = 300.0) -> Task:
 @cache
 def _player(task: Task, ticks: int):
     def play(controller, episodes):
-        prepared = task.prepare(episodes)
+        constants = task.prepare(episodes)
 
         def advance(state, tick):
-            new = task.control_step(tick, state, episodes, prepared, controller)
+            new = task.step(tick, state, episodes, constants, controller)
             return new, (new.qpos, new.pose.position, new.ball.position, new.command, new.controller, new.live)
 
         state = task.reset(episodes, controller)
         last, kept = jax.lax.scan(advance, state, jnp.arange(ticks, dtype=jnp.int32))
-        back = fly_out(task.config, last.ball, last.hit, episodes.model)
-        return *kept, last, back, reward_terms(last, back)
+        back = fly_return(task.config, last.ball, last.hit, episodes.model)
+        return *kept, last, back, evaluate_rewards(task.config.rewards, last, back)
 
     return jax.jit(play)
 

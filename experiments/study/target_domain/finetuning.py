@@ -28,15 +28,14 @@ from experiments.config.study import Study
 from experiments.evaluation import evaluate
 from experiments.study.target_domain import hidden_effects
 from experiments.training.update import TrainState
-from mjx_tt.env import rewards
+from mjx_tt.env.episode import MISSED, RETURNED
 from mjx_tt.env.policy import Policy
-from mjx_tt.env.task import MISSED, RETURNED, TaskConfig
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.rally import human_player
 from mjx_tt.rally.human_player import Player
 from mjx_tt.rally.simulator import RallySimulator, RallyState, ShotResult
 from mjx_tt.sim.model import SimModel
 
-FAULT = -2.0  # paper: a fault of the robot
 SELECTION_LANES = 10  # sessions side by side in which policies are compared
 
 
@@ -63,8 +62,8 @@ class VirtualReality:
     def __init__(self, study: Study, seed: int) -> None:
         self._study, self._settings = study, study.fine_tuning
         self._draw(seed)
-        self._weights = build.reward_weights(self._settings.rewards)
-        self.simulator = RallySimulator(TaskConfig(sim_rate=study.reality.sim_rate, reward_weights=self._weights))
+        rewards = build.reward_terms(self._settings.rewards)
+        self.simulator = RallySimulator(TaskConfig(sim_rate=study.reality.sim_rate, rewards=rewards))
         # Cycles of different lengths share one compiled call of a length that divides all of them.
         self._chunk = math.gcd(*(r.real for r in study.simulation.rounds))
         self._updates = jax.jit(self._updates_of, static_argnames="config")
@@ -168,8 +167,8 @@ class VirtualReality:
 
     def _returns(self, shots: ShotResult) -> Array:
         """Weighted returns (L,) of what a robot measures; an episode that is not finite has none."""
-        terms = shots.terms.at[rewards.TERMS.index("fault")].set(jnp.where(shots.fault, FAULT, 0.0))
-        return jnp.where(shots.finite, sum(w * terms[i] for i, w in enumerate(self._weights) if w), jnp.nan)
+        weighted = [w * shots.terms[i] for i, w in enumerate(self.simulator.config.reward_weights) if w]
+        return jnp.where(shots.finite, sum(weighted), jnp.nan)
 
     def _shots_of(
         self, policy: Policy, player: Player, model: SimModel, key: PRNGKeyArray, turns: int

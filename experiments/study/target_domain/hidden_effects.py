@@ -193,8 +193,8 @@ def measure(model: SimModel, balls: BallState, noise: float, key: PRNGKeyArray) 
 
 def seen(model: SimModel, position: Array | np.ndarray, noise: float, key: PRNGKeyArray) -> np.ndarray:
     """Positions (3, ...) [m] as the reality's cameras give them: calibration and noise [m]."""
-    camera = sensors.camera(model.sensing)
-    place = jnp.asarray(position) if camera is None else camera.seen(jnp.asarray(position))
+    camera = sensors.make_camera(model.sensing)
+    place = jnp.asarray(position) if camera is None else camera.project(jnp.asarray(position))
     offset = jnp.array([getattr(model.sensing, f"ball_offset_{axis}") for axis in "xyz"])
     offset = offset.reshape((3,) + (1,) * (place.ndim - 1))
     return np.asarray(place + offset + noise * jax.random.normal(key, place.shape), np.float64)

@@ -32,8 +32,7 @@ from mjx_tt.env.policy import controller as controller_of
 from mjx_tt.env.task import Task
 from mjx_tt.rally.human_player import Player
 from mjx_tt.rally.simulator import RallySimulator
-from mjx_tt.sim import actuators as drives
-from mjx_tt.sim import latency
+from mjx_tt.sim import actuators, latency
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import FESTO_JOINTS
 
@@ -133,19 +132,19 @@ def _records(task: Task, model: SimModel, states: list[_States]) -> tuple[JointR
 def _watched(policy: Policy, episodes: Episodes, task: Task) -> tuple[Array, Array, Array]:
     """Positions of balls (3, T, L) at the camera's rate, commands (ticks, 8, L), and what encoders see, (8, T', L), at
     the simulator's own steps: positions between them would be another robot's."""
-    controller, prepared = controller_of(policy), task.prepare(episodes)
+    controller, constants = controller_of(policy), task.prepare(episodes)
     ticks = round(SECONDS / task.config.period) + 1
 
     def advance(s: EpisodeState, tick: Tick) -> tuple[EpisodeState, tuple]:
-        after = task.control_step(tick, s, episodes, prepared, controller)
+        after = task.step(tick, s, episodes, constants, controller)
         sent = (
-            latency.ring_read(after.commands, tick - prepared.action.periods - 1),
-            latency.ring_read(after.commands, tick - prepared.action.periods),
+            latency.read_ring(after.commands, tick - constants.action.periods - 1),
+            latency.read_ring(after.commands, tick - constants.action.periods),
         )
-        old, new = (drives.reachable(prepared.drives, command) for command in sent)
+        old, new = (actuators.limit_command(constants.drives, command) for command in sent)
 
         def substep(robot: tuple, i: Tick) -> tuple[tuple, tuple]:
-            robot, carried, (bent, bent_velocity) = task.moved(i, robot, (old, new), episodes, prepared)
+            robot, carried, (bent, bent_velocity) = task.step_robot(i, robot, (old, new), episodes, constants)
             return robot, (carried, bent, bent_velocity)
 
         _, states = jax.lax.scan(substep, (s.qpos, s.qvel, s.drive), jnp.arange(task.config.substeps))

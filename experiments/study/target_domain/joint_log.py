@@ -18,7 +18,6 @@ from jaxtyping import PRNGKeyArray
 
 from ballmodel.state import BallState
 from mjx_tt.diagnosis.joint import JointRecord
-from mjx_tt.env import observation
 from mjx_tt.env.episode import Episodes, EpisodeState, Tick
 from mjx_tt.env.task import Task
 from mjx_tt.sim import model as models
@@ -88,11 +87,11 @@ def _swept(model: SimModel, sweeps: Sweeps, task: Task) -> tuple[Array, Array]:
         seed=jnp.zeros((1,), jnp.uint32),
         model=model,
     )
-    prepared = task.prepare(episodes)
+    constants = task.prepare(episodes)
 
     def advance(s: EpisodeState, tick: Tick) -> tuple[EpisodeState, tuple[Array, Array]]:
-        seen = observation.observe(tick, s, episodes, prepared)
-        s = task.control_step(tick, s, episodes, prepared, sweeps)
+        seen = task.observe(tick, s, episodes, constants)
+        s = task.step(tick, s, episodes, constants, sweeps)
         kept = replace(s, ball=episodes.ball, live=jnp.ones_like(s.live))  # no ball is played
         return kept, (s.command[:, 0], seen[3:, 0])
 

@@ -16,7 +16,8 @@ from ballmodel.flight import PaddlePose
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.joint.forward_model import nominal_response
 from mjx_tt.diagnosis.joint.log import JointRecord
-from mjx_tt.robot import model as robot
+from mjx_tt.robot import mjcf
+from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.kinematics import PaddleKinematics
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import JOINT_NAMES
@@ -86,8 +87,8 @@ def poses(
 
 @cache
 def _kinematics() -> PaddleKinematics:
-    model = robot.load_model()
-    return PaddleKinematics(robot.chain_from_model(model), robot.paddle_frame(model))
+    model = mjcf.load_model()
+    return PaddleKinematics(chain_from_model(model), mjcf.paddle_frame(model))
 
 
 @jax.jit

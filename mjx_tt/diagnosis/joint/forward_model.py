@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
 from mjx_tt.robot.servo import servos
 from mjx_tt.sim.model import SimModel
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from mjx_tt.diagnosis.joint.forward_model import JointResponse, Motion
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot.robot import Robot
+from mjx_tt.robot import robots
+from mjx_tt.robot.robots import Robot
 
 WINDOW = 2.0  # [s] of a free offset and of one cluster of the errors, a tenth of a log of less than 20 s
 SAMPLES = 4000  # states of a joint that a fit looks at, evenly spread over the log

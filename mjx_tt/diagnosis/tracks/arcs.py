@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
+from mjx_tt.sim.constant_acceleration import Covariance, correct_covariance, predict_covariance
+
 GATE = 0.030  # [m] from where an arc expects it within which a sample belongs to it, however small the noise
 GATE_SIGMA = 4.5  # and in standard deviations of the expectation
 LEAST_NOISE, MOST_NOISE = 0.003, 0.020  # [m]; a track whose samples scatter by more holds two balls
@@ -36,45 +38,27 @@ class _Filter:
     noise: float  # [m^2] variance of a sample
     v: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     a: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    covariance: tuple[float, ...] = ()
+    covariance: Covariance = field(init=False)
     missed: int = 0
 
     def __post_init__(self) -> None:
         self.covariance = (self.noise, 0.0, 0.0, SPEED**2, 0.0, ACCELERATION**2)
 
-    def ahead(self, time: float) -> tuple[Float[np.ndarray, "3"], tuple[float, ...]]:
+    def ahead(self, time: float) -> tuple[Float[np.ndarray, "3"], Covariance]:
         """Expected position at a time, and the covariance there."""
         d = time - self.time
-        h = 0.5 * d * d
-        xx, xv, xa, vv, va, aa = self.covariance
-        q = WANDER
-        position = self.x + d * self.v + h * self.a
-        covariance = (
-            xx + 2 * d * xv + 2 * h * xa + d * d * vv + 2 * d * h * va + h * h * aa + q * d**5 / 20,
-            xv + d * vv + h * va + d * (xa + d * va + h * aa) + q * d**4 / 8,
-            xa + d * va + h * aa + q * d**3 / 6,
-            vv + 2 * d * va + d * d * aa + q * d**3 / 3,
-            va + d * aa + q * d * d / 2,
-            aa + q * d,
-        )
-        return position, covariance
+        position = self.x + d * self.v + 0.5 * d * d * self.a
+        return position, predict_covariance(self.covariance, d, WANDER)
 
-    def take(self, sample: int, time: float, measured: np.ndarray, ahead: tuple[np.ndarray, tuple[float, ...]]) -> None:
+    def take(self, sample: int, time: float, measured: np.ndarray, ahead: tuple[np.ndarray, Covariance]) -> None:
         """Moves on to a sample that belongs to the arc."""
-        expected, (xx, xv, xa, vv, va, aa) = ahead
-        d, innovation, total = time - self.time, measured - expected, xx + self.noise
-        gx, gv, ga = xx / total, xv / total, xa / total
+        (expected, covariance), d = ahead, time - self.time
+        innovation, (xx, xv, xa) = measured - expected, covariance[:3]
+        gx, gv, ga = (each / (xx + self.noise) for each in (xx, xv, xa))
+        self.covariance = correct_covariance(covariance, (gx, gv, ga), self.noise)
         self.v = self.v + d * self.a + gv * innovation
         self.a = self.a + ga * innovation
         self.x, self.time = expected + gx * innovation, time
-        self.covariance = (
-            xx - gx * xx,
-            xv - gx * xv,
-            xa - gx * xa,
-            vv - gv * xv,
-            va - gv * xa,
-            aa - ga * xa,
-        )
         self.samples.append(sample)
         self.missed = 0
 

@@ -12,7 +12,7 @@ import pytest
 from experiments import cli
 from experiments.config import robot as robots
 from experiments.errors import ConfigError
-from mjx_tt.robot import robot as simulated
+from mjx_tt.robot import robots as simulated
 from robot_io.calibrated import UNCALIBRATED
 from robot_io.calibration import contacts
 from robot_io.control.interfaces import BridgeConfig

@@ -20,7 +20,7 @@ from experiments.config.finetuning import FineTuning
 from experiments.config.prior import PRIOR
 from experiments.config.study import Study
 from experiments.errors import ConfigError
-from mjx_tt.env import rewards
+from mjx_tt.env import reward_weights
 from mjx_tt.env.task import TaskConfig
 
 SMALLEST = {"name": "a", "balls": "narrow"}
@@ -99,7 +99,9 @@ def test_schema_refuses_what_the_program_refuses():
             "optimiser.step.schedule.changes[0].rate: expected one of the keys update, learning_rate",
             "changes[0].learning_rate: expected a number of more than 0, got nothing",
         ),
-        ("task.rewards", {"styl": 1.0}, "task.rewards.styl: expected one of the keys", "did you mean 'style'?"),
+        ("task.rewards", {"styl": 1.0}, "task.rewards.styl: unknown reward term", "did you mean 'style'?"),
+        ("task.rewards", {"style": "1"}, "task.rewards.style: expected a", "got '1'"),
+        ("training.later_rewards", {"after": 0.5, "rewards": {"x": 1}}, "later_rewards.rewards.x: unknown", "style"),
         ("task.rewards", "simm", "task.rewards: expected 'sim' or 'real' or a mapping", "did you mean 'sim'?"),
         ("task", 4, "task: expected a mapping with the keys engine,", "got 4"),
         ("name", "two words", "name: expected text that matches", "got 'two words'"),
@@ -121,13 +123,13 @@ def test_a_mistake_is_named_with_file_path_and_hint(path, value, place, hint):
 
 @pytest.mark.parametrize(
     "path, value",
-    [("training.later_rewards", {"after": 0.5, "rewards": "real"}), ("task.rewards", {"own": {"mine": 1.0}})],
+    [("training.later_rewards", {"after": 0.5, "rewards": "real"}), ("task.rewards", {"mine": 1.0})],
 )
 def test_first_order_gradients_refuse_rewards_that_they_do_not_climb(path, value):
     data = with_value(path, value)
     data["optimiser"] = {"gradient": "first_order"}
     text = complaint(data)
-    assert f"{path.replace('task.rewards', 'task.rewards.own')}: optimiser.gradient first_order" in text
+    assert f"{path.replace('task.rewards', 'task.rewards.mine')}: optimiser.gradient first_order" in text
     assert "leave it out, or take gradient: zeroth_order" in text
 
 
@@ -174,8 +176,6 @@ def test_keys_and_choices_are_those_of_the_optimiser_and_the_task():
             assert get_args(section.model_fields[key].annotation) == allowed
     limits = {"max_observation_latency", "max_action_latency"}  # of memory, which no experiment sets
     assert {field.name for field in fields(TaskConfig)} - limits - {
-        "reward_weights",
-        "own_terms",
         "robot",
     } <= config.Task.model_fields.keys()
 
@@ -229,9 +229,14 @@ def test_samples_of_a_model_are_taken_in(tmp_path):
 def test_defaults_are_those_of_the_task_and_weights_follow_the_terms():
     experiment = build.experiment(config.parse(SMALLEST, "a"), "a")
     assert experiment.task == TaskConfig()
-    assert tuple(config.Rewards.model_fields)[1:] == (*rewards.TERMS, "own")
-    changed = build.reward_weights(config.Rewards(base="real", style=2.5))
-    assert dict(zip(rewards.TERMS, changed, strict=True)) == rewards.REAL_WEIGHTS | {"style": 2.5}
+    changed = build.reward_terms(config.Rewards(base="real", style=2.5, jerk=None))
+    assert {term.name: term.weight for term in changed} == reward_weights.REAL_WEIGHTS | {"style": 2.5}
+    properties = config.json_schema()["$defs"]["Rewards"]["properties"]
+    assert tuple(properties) == ("base", *reward_weights.TERMS)
+
+
+def test_an_older_artefacts_user_defined_weights_are_read():
+    assert config.Rewards(style=1.0, own={"calm": 0.5}).changed == {"style": 1.0, "calm": 0.5}
 
 
 def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_current_folder(tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ from rich.console import Console
 from experiments.config import robot as robots
 from experiments.deploy import commissioning
 from experiments.deploy.commissioning import Jogger
-from mjx_tt.robot import robot as simulated
+from mjx_tt.robot import robots as simulated
 from robot_io import log
 from robot_io.calibrated import Calibration
 from robot_io.contract import JOINT_NAMES, PAPER

@@ -16,7 +16,7 @@ from experiments.config import robot as robots
 from experiments.deploy import commissioning
 from experiments.deploy.commissioning import Jogger
 from experiments.errors import ConfigError
-from mjx_tt.robot import robot as simulated
+from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
 from robot_io import log
 from robot_io.contract import Contract, JointLimits

@@ -16,7 +16,7 @@ from experiments.deploy import session as play
 from experiments.errors import ConfigError
 from experiments.finetuning import session as tuning
 from experiments.runs import run_dir
-from mjx_tt.robot.robot import paper
+from mjx_tt.robot.robots import paper
 from robot_io.calibration import contacts
 from robot_io.control.config import RobotConfig
 from robot_io.log.messages import LogError

@@ -18,7 +18,7 @@ from experiments.deploy import rig as deploy_rig
 from experiments.deploy import robot_attachment, session
 from experiments.errors import ConfigError
 from experiments.view import measured, scene, show
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from mjx_tt.sim.model import SimModel
 from robot_io import log
 from robot_io.contract import n_parameters

@@ -23,7 +23,7 @@ from experiments.config import build, robot
 from experiments.deploy import rig as deploy_rig
 from experiments.deploy import session as play
 from experiments.errors import ConfigError, explained
-from mjx_tt.robot import robot as simulated
+from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
 from robot_io import contract, log
 from robot_io.control import process

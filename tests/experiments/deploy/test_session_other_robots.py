@@ -22,7 +22,7 @@ from experiments.errors import ConfigError
 from experiments.finetuning.robot import LockStepRobot
 from experiments.sharing import recordings
 from experiments.view import measured, show
-from mjx_tt.robot import robot as simulated
+from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
 from robot_io import log
 from robot_io.contract import CONTROL_RATE, PAPER, n_parameters

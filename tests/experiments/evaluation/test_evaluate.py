@@ -20,15 +20,16 @@ from experiments.evaluation.learning_curves import Curve, Mark
 from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
 from experiments.stats import wilson
-from mjx_tt.env import rewards
+from mjx_tt.env import reward_weights
+from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import Evaluator
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import RolloutResult, Simulator
-from mjx_tt.env.task import HIT, MISSED, OUT_OF_REACH, RETURNED
+from mjx_tt.env.task import OUT_OF_REACH
 from robot_io.contract import LIMITS, N_OBSERVATION, n_parameters
 from tests.oracles import ball_flight
 
-N_TERMS = len(rewards.TERMS)
+N_TERMS = len(reward_weights.TERMS)
 
 
 def result(outcome: list[int], finite: list[bool] | None = None, collision: list[float] | None = None) -> RolloutResult:
@@ -36,7 +37,7 @@ def result(outcome: list[int], finite: list[bool] | None = None, collision: list
     shape = (len(outcome), 1)
     finite = np.ones(shape, bool) if finite is None else np.array(finite).reshape(shape)
     terms = np.zeros((N_TERMS, *shape))
-    terms[rewards.TERMS.index("collision")] = 0 if collision is None else np.array(collision).reshape(shape)
+    terms[reward_weights.TERMS.index("collision")] = 0 if collision is None else np.array(collision).reshape(shape)
     terms[0] = np.where(finite, 2.0, np.nan)
     rng = np.random.default_rng(0)
     return RolloutResult(
@@ -76,7 +77,7 @@ def test_summary_counts_a_non_finite_episode_as_missed_and_leaves_it_out_of_mean
     assert report["non_finite"] == 1
     assert report["mean_return"] == 3.0
     assert report["terms"]["state_transition"] == 2.0
-    assert list(report["terms"]) == list(rewards.TERMS)
+    assert list(report["terms"]) == list(reward_weights.TERMS)
     json.dumps(report, allow_nan=False)
 
 

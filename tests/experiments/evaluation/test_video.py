@@ -10,7 +10,7 @@ from PIL import Image
 
 from experiments.evaluation import video
 from experiments.view.film import RATE, Film
-from mjx_tt.robot.model import home_qpos, load_model
+from mjx_tt.robot.mjcf import home_qpos, load_model
 from mjx_tt.viz.caption import GOOD, POOR
 from mjx_tt.viz.rendering import BRIGHT
 

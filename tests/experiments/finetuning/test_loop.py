@@ -130,7 +130,7 @@ def test_the_defaults_are_the_papers_real_settings():
     )
     assert chosen.step.kind == "sgd" and chosen.step.schedule.kind == "constant" and chosen.orthogonal
     assert chosen.updates in (60, 70) and chosen.episodes_per_update == 30
-    weights = dict(zip(loop.rewards.TERMS, build.reward_weights(chosen.rewards), strict=True))
+    weights = {term.name: term.weight for term in build.reward_terms(chosen.rewards)}
     assert {name: weight for name, weight in weights.items() if weight} == {
         "state_transition": 1.0,
         "net_clearance": 1.0,

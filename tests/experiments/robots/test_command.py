@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from experiments.cli import main
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from tests.support.paths import ROOT
 
 SHIPPED = ROOT / "mjx_tt" / "assets" / "robots"

@@ -23,7 +23,7 @@ from experiments.study.target_domain.finetuning import VirtualReality
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.together.hits import SEEN_HIGH
 from mjx_tt.env.task import Task, TaskConfig
-from mjx_tt.robot import model as robot
+from mjx_tt.robot import mjcf
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, Samples, SimModel
 from robot_io.contract import LIMITS
@@ -59,7 +59,7 @@ def test_sweeps_stay_within_the_limits_and_near_home():
     actions = joint_log.multisine(rng, 4500, period)
     assert np.abs(actions).max() <= 1.0 and not actions[:37].any()
     moved = np.cumsum(actions * LIMITS.policy_velocity, axis=0) * period
-    home = np.asarray(robot.home_qpos(robot.load_model()))
+    home = np.asarray(mjcf.home_qpos(mjcf.load_model()))
     assert np.all(home + moved < LIMITS.upper) and np.all(home + moved > LIMITS.lower)
     assert np.all(np.ptp(moved, axis=0) > 0.03 * (np.array(LIMITS.upper) - LIMITS.lower))
 

@@ -40,7 +40,7 @@ from experiments.study.target_domain import hidden_effects
 from experiments.study.target_domain.evaluation_on_robot import blind_steps
 from experiments.study.target_domain.finetuning import VirtualReality
 from experiments.study.workflow import Journal, Step, Waiting, remaining, run_all, unfinished
-from mjx_tt.env import rewards
+from mjx_tt.env import reward_weights
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.rally import human_player
 from mjx_tt.rally.simulator import Box
@@ -400,7 +400,7 @@ def test_an_update_is_the_papers_formula_of_what_the_robot_measures(virtual):
     settings = build.bgs_config(tuning.optimiser(), 2)
     frozen = [np.repeat(np.asarray(x)[:, None], lanes, axis=1) for x in normalizer.normaliser(statistics)]
     rally = virtual.simulator.start(person, virtual.known, rally_key, lanes)
-    weights = np.array(list(rewards.REAL_WEIGHTS.values()))
+    weights = np.array(list(reward_weights.REAL_WEIGHTS.values()))
     now = theta.astype(np.float64)
     for number in range(2):
         state = strategy.init(jnp.asarray(now, jnp.float32), settings)
@@ -416,7 +416,7 @@ def test_an_update_is_the_papers_formula_of_what_the_robot_measures(virtual):
         )
         assert np.asarray(shots.finite).all()
         terms = np.array(shots.terms, np.float64)
-        terms[rewards.TERMS.index("fault")] = np.where(shots.fault, -2.0, 0.0)
+        terms[reward_weights.TERMS.index("fault")] = np.where(shots.fault, -2.0, 0.0)
         returns = (weights @ terms).reshape(2 * pairs, tuning.repeats).mean(axis=1)
         difference = returns[:pairs] - returns[pairs:]
         elites = np.argsort(-np.abs(difference))[: int(0.6 * pairs)]

@@ -18,9 +18,10 @@ from experiments.config import build
 from experiments.config.experiment import load
 from experiments.training.first_order import FirstOrderTrainer
 from experiments.training.trainers import trainer as trainer_of
+from mjx_tt.env.episode import MISSED
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import MISSED, TaskConfig
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.gradient.objective import Objective
 from mjx_tt.sim.model import SimModel
 from tests.support.small_network import SMALL

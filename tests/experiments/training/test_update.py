@@ -18,11 +18,11 @@ from experiments.config import build, experiment, files
 from experiments.training import loop
 from experiments.training.trainers import trainer as trainer_of
 from experiments.training.update import Trainer
-from mjx_tt.env import rewards
+from mjx_tt.env import reward_weights
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import TaskConfig
-from mjx_tt.robot import robot as robots
+from mjx_tt.env.task import TaskConfig, weigh_rewards
+from mjx_tt.robot import robots
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Samples, SimModel
 
@@ -243,15 +243,16 @@ def test_mistakes_are_named(pool):
 @pytest.mark.slow
 def test_later_weights_take_over_after_their_update(trainer, run, pool):
     """Before it nothing changes; from then on the step is that of a task with these weights."""
-    weights = tuple(0.0 if name == "state_transition" else weight for name, weight in rewards.SIM_WEIGHTS.items())
+    changed = reward_weights.SIM_WEIGHTS | {"state_transition": 0.0}
+    weights = tuple(changed.values())
     changing = Trainer(Simulator(TASK), BGS, pool, SimModel(), repeats=REPEATS, later_weights=(2, weights))
-    other = Trainer(Simulator(replace(TASK, reward_weights=weights)), BGS, pool, SimModel(), repeats=REPEATS)
+    other = Trainer(Simulator(replace(TASK, rewards=weigh_rewards(changed))), BGS, pool, SimModel(), repeats=REPEATS)
     states, metrics = updates(changing)
     for i in (1, 2):
         np.testing.assert_allclose(states[i].bgs.theta, run[0][i].bgs.theta, rtol=0, atol=1e-6)
     expected, _ = other.update(states[2])
     np.testing.assert_allclose(states[3].bgs.theta, expected.bgs.theta, rtol=0, atol=1e-6)
     assert np.abs(np.asarray(states[3].bgs.theta - trainer.update(states[2])[0].bgs.theta)).max() > 1e-4
-    for measured, used in zip(metrics, (tuple(rewards.SIM_WEIGHTS.values()),) * 2 + (weights,), strict=True):
-        terms = [measured[f"reward/{name}"] for name in rewards.TERMS]
+    for measured, used in zip(metrics, (tuple(reward_weights.SIM_WEIGHTS.values()),) * 2 + (weights,), strict=True):
+        terms = [measured[f"reward/{name}"] for name in reward_weights.TERMS]
         assert measured["mean_return"] == pytest.approx(np.dot(used, terms), rel=1e-5)

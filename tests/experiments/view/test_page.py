@@ -31,7 +31,7 @@ from experiments.view.guard import Server
 from experiments.view.programme import Play
 from experiments.view.studio import Studio
 from mjx_tt.env.task import TaskConfig
-from mjx_tt.robot.model import home_qpos, load_model
+from mjx_tt.robot.mjcf import home_qpos, load_model
 from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io import log
 from tests.support.paths import ROOT

@@ -12,7 +12,8 @@ from ballmodel import registry
 from experiments.commands.render import SHIPPED
 from experiments.view.programme import Play
 from experiments.view.studio import Studio, sliders
-from mjx_tt.env.task import MISSED, RETURNED, TaskConfig
+from mjx_tt.env.episode import MISSED, RETURNED
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.sim.model import ModelFile, Range, Samples, SimModel, with_values
 from robot_io.contract import JOINT_NAMES

@@ -14,7 +14,7 @@ from mjx_tt.diagnosis.ball.diagnose import diagnose_balls
 from mjx_tt.diagnosis.hits.diagnose import diagnose_hits
 from mjx_tt.diagnosis.hits.paddle_path import joint_path
 from mjx_tt.diagnosis.joint import JointRecord
-from mjx_tt.robot import model
+from mjx_tt.robot import mjcf
 from mjx_tt.sim.model import SimModel, with_values
 from robot_io.contract import JOINT_NAMES
 
@@ -52,9 +52,9 @@ class Swing:
     """A robot that swings about its home pose; one that plays makes the same stroke at every ball."""
 
     def __init__(self, rng, plays: bool = False) -> None:
-        self.model = model.load_model()
+        self.model = mjcf.load_model()
         self.data = mujoco.MjData(self.model)
-        self.home = model.home_qpos(self.model)
+        self.home = mjcf.home_qpos(self.model)
         self.site = self.model.site("paddle").id
         self.size, self.rate = rng.uniform(0.06, 0.2, 8), rng.uniform(2.0, 6.0, 8)
         self.phase = rng.uniform(0, 2 * np.pi, 8)

@@ -13,7 +13,7 @@ from mjx_tt import diagnosis
 from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.diagnosis.logs import Logs
 from mjx_tt.env.task import Task, TaskConfig
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from mjx_tt.sim import model as models
 from robot_io.contract import JOINT_NAMES
 

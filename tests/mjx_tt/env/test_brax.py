@@ -10,9 +10,11 @@ import pytest
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
 from mjx_tt.env.brax import OBSERVATION_SIZE, TableTennis
+from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.policy import Policy, initial_theta
+from mjx_tt.env.reward_weights import TERMS
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import HIT, MISSED, RETURNED, TaskConfig
+from mjx_tt.env.task import TaskConfig, weigh_rewards
 from mjx_tt.sim.model import Range, SimModel
 from robot_io.contract import HISTORY, N_OBSERVATION
 from robot_io.policy.policy import forward
@@ -31,7 +33,8 @@ def pool():
 
 @pytest.fixture(scope="module")
 def env(pool):
-    task = TaskConfig(sim_rate=75.0, max_steps=110, reward_weights=tuple(np.linspace(0.4, 1.4, 11)))
+    weights = dict(zip(TERMS, np.linspace(0.4, 1.4, 11), strict=True))
+    task = TaskConfig(sim_rate=75.0, max_steps=110, rewards=weigh_rewards(weights))
     return TableTennis(Simulator(task, 1), pool, SimModel(), RANDOMISE)
 
 

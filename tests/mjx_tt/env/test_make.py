@@ -12,7 +12,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import mjx_tt.env.gymnasium as table_tennis
-from mjx_tt.env import evaluator, make, rewards
+from mjx_tt.env import evaluator, make, reward_weights
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import ModelFile, SimModel
@@ -38,12 +38,14 @@ def played(play, policy):
 
 
 def test_arrays_have_the_episode_first(played):
-    assert set(played.terms) == set(rewards.TERMS) and all(term.shape == (300,) for term in played.terms.values())
+    assert set(played.terms) == set(reward_weights.TERMS) and all(
+        term.shape == (300,) for term in played.terms.values()
+    )
     shapes = {"landing": (2,), "incoming": (2,), "ball": (6,), "peak_velocity": (8,)}
     for name in ("returns", "outcome", "seconds", "finite", *shapes):
         assert getattr(played, name).shape == (300, *shapes.get(name, ())), name
     assert set(played.outcome) <= {"missed", "hit", "returned"}
-    weighted = sum(w * played.terms[name] for w, name in zip(QUICK.reward_weights, rewards.TERMS, strict=True))
+    weighted = sum(w * played.terms[name] for w, name in zip(QUICK.reward_weights, reward_weights.TERMS, strict=True))
     np.testing.assert_allclose(played.returns[played.finite], weighted[played.finite], rtol=1e-5, atol=1e-5)
     # Balls fly from the person (y > 0) to the robot's half, inside the distribution's own box.
     assert (played.ball[:, 4] < 0).all() and (played.incoming[:, 1] < 0).all()

@@ -11,10 +11,11 @@ import pytest
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
-from mjx_tt.env import rewards, rollout
+from mjx_tt.env import reward_weights, rollout
+from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.policy import Policy, PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import HIT, MISSED, RETURNED, TaskConfig
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import Range, SimModel
 from robot_io.contract import N_OBSERVATION, unflatten
@@ -94,12 +95,12 @@ def test_equals_the_same_episodes_played_tick_by_tick(result, played):
     """So neither the loop nor the size of its blocks changes an episode."""
     assert not played.live[-1].any()  # so that 120 ticks are all of it
     np.testing.assert_allclose(flat(result.terms), played.terms, atol=2e-4)
-    weights = np.array(list(rewards.SIM_WEIGHTS.values()))
+    weights = np.array(list(reward_weights.SIM_WEIGHTS.values()))
     np.testing.assert_allclose(result.returns, np.tensordot(weights, result.terms, 1), atol=1e-5)
     np.testing.assert_array_equal(flat(result.steps), played.live.sum(axis=0) + 1)
     hit, returned = played.last.hit, played.back.returned & played.last.hit
     np.testing.assert_array_equal(flat(result.outcome), np.where(returned, RETURNED, np.where(hit, HIT, MISSED)))
-    np.testing.assert_allclose(flat(result.peak_velocity), played.last.sums.peak_velocity, rtol=1e-5)
+    np.testing.assert_allclose(flat(result.peak_velocity), played.last.accumulators.peak_velocity, rtol=1e-5)
     assert result.finite.all()
 
 

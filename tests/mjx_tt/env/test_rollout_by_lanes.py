@@ -12,23 +12,28 @@ import pytest
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
-from mjx_tt.env import own, rewards
+from mjx_tt.env import user_defined
 from mjx_tt.env.policy import Policy, initial_theta
+from mjx_tt.env.reward_weights import SIM_WEIGHTS
 from mjx_tt.env.rollout import RolloutResult, Simulator
-from mjx_tt.env.task import TaskConfig
+from mjx_tt.env.task import CONTRACT_OBSERVATIONS, TaskConfig, weigh_rewards
 from mjx_tt.sim import model as models
 from mjx_tt.sim.actuators import DriveParams
 from mjx_tt.sim.model import Range, SimModel
-from robot_io.contract import N_OBSERVATION, n_parameters
+from robot_io.contract import n_parameters
 from tests.support.small_network import SMALL
 
 R, P = 5, 13  # 65 lanes: four vectors and one lane more
 CONFIG = TaskConfig(sim_rate=150.0)
-OWN = (
-    SMALL
+USER_DEFINED = (
+    SMALL.replace("(11, 16)", "(14, 16)")
     + """
 import jax.numpy as jnp
-from mjx_tt.env.own import reward_term
+from mjx_tt.env.terms import observation_term, reward_term
+
+@observation_term("axes")
+def axes(sensed):
+    return sensed.command[:3]
 
 @reward_term("reach")
 def reach(step):
@@ -55,7 +60,7 @@ def both(config: TaskConfig, size: int, network=None, model=SimModel(), ranges=(
     """The same episodes of random policies by lanes and by XLA."""
     keys = jax.random.split(jax.random.key(2), P)
     theta = jnp.stack([initial_theta(key, 0.2, size) for key in keys], axis=-1)
-    policy = Policy(theta, jnp.full(N_OBSERVATION, 0.1), jnp.full(N_OBSERVATION, 1.5), network)
+    policy = Policy(theta, jnp.full(config.n_observation, 0.1), jnp.full(config.n_observation, 1.5), network)
     pool = sample_pool(jax.random.key(0), registry.resolve("player3/M0"), SimModel().ball, 256)
     results = []
     for lanes in (True, False):
@@ -95,19 +100,21 @@ def test_a_model_in_which_everything_varies(by_lanes):
     assert_alike(*both(CONFIG, n_parameters(), model=model, ranges=ranges))
 
 
-def test_a_users_network_and_term(by_lanes):
-    mine = own.load(OWN, "own.py")
-    weights = (*rewards.SIM_WEIGHTS.values(), 0.1)
-    config = replace(CONFIG, own_terms=tuple(mine.terms.values()), reward_weights=weights)
-    small = mine.networks["small"]
+def test_a_users_network_and_terms(by_lanes):
+    mine = user_defined.load(USER_DEFINED, "mine.py")
+    config = replace(
+        CONFIG,
+        rewards=weigh_rewards(SIM_WEIGHTS | {"reach": 0.1}, mine.rewards.values()),
+        observations=(*CONTRACT_OBSERVATIONS, *mine.observations.values()),
+    )
+    small = mine.checked_network("small", config.n_observation)
     assert_alike(*both(config, small.size, small))
 
 
 def test_an_operation_that_lanes_do_not_know_is_left_to_xla(caplog):
     caplog.set_level("INFO", logger="mjx_tt.lanes")
-    sorting = own.load(OWN.replace("jnp.tanh(jnp.tanh((x", "jnp.tanh(jnp.tanh((jnp.sort(x)"), "own.py").networks[
-        "small"
-    ]
+    text = SMALL.replace("jnp.tanh(jnp.tanh((x", "jnp.tanh(jnp.tanh((jnp.sort(x)")
+    sorting = user_defined.load(text, "mine.py").networks["small"]
     one, other = both(replace(CONFIG, sim_rate=75.0, max_steps=20), sorting.size, sorting)
     assert "left to XLA: the operation sort" in caplog.text
     np.testing.assert_array_equal(one.returns, other.returns)

@@ -6,20 +6,29 @@ from __future__ import annotations
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from scipy import stats
 
-from mjx_tt.env import rewards
-from mjx_tt.env.rewards import TERMS
-from mjx_tt.env.task import OUT_OF_REACH, TaskConfig
-from mjx_tt.robot import model as robot
-from mjx_tt.robot import robot as robots
+from mjx_tt.env.reward_weights import REAL_WEIGHTS, SIM_WEIGHTS, TERMS
+from mjx_tt.env.task import (
+    BUILT_IN_REWARDS,
+    CONTRACT_OBSERVATIONS,
+    OUT_OF_REACH,
+    Task,
+    TaskConfig,
+    net_clearance,
+    state_transition,
+    weigh_rewards,
+)
+from mjx_tt.env.terms import ObservationTerm, PlayedBall
+from mjx_tt.robot import mjcf, robots
 from robot_io.contract import LIMITS, N_JOINTS
 from tests.oracles import ball_flight
 from tests.oracles.ball_flight import Touch, fly, on_blade, on_table, path
-from tests.support.scripted_episodes import TICKS, P, episodes, model, play, script, task
+from tests.support.scripted_episodes import TICKS, P, Script, episodes, model, play, script, task
 
 T = 1 / 75
 
@@ -27,11 +36,11 @@ T = 1 / 75
 @pytest.fixture(scope="module")
 def blade():
     """Centre and normal of the blade at home, from MuJoCo."""
-    mj = robot.load_model()
+    mj = mjcf.load_model()
     data = mujoco.MjData(mj)
-    data.qpos[:] = robot.home_qpos(mj)
+    data.qpos[:] = mjcf.home_qpos(mj)
     mujoco.mj_kinematics(mj, data)
-    site = data.site(robot.PADDLE_SITE)
+    site = data.site(mjcf.PADDLE_SITE)
     return site.xpos.copy(), site.xmat.reshape(3, 3)[:, 2].copy()
 
 
@@ -122,10 +131,10 @@ def test_episodes_end_as_soon_as_nothing_more_can_happen(serves, record, blade):
     for i, (name, serve) in enumerate(serves.items()):
         time, late = end(name, serve, blade)
         steps = {int(moment // T) + 1 for moment in (time, time + late)}
-        assert record.last.sums.steps[i] in steps, name
+        assert record.last.accumulators.steps[i] in steps, name
         assert int(record.live[:, i].sum()) + 1 in steps, name
         assert (np.diff(record.live[:, i].astype(int)) <= 0).all()
-        after = record.ball[int(record.last.sums.steps[i]) :, :, i]
+        after = record.ball[int(record.last.accumulators.steps[i]) :, :, i]
         np.testing.assert_array_equal(after, np.broadcast_to(after[0], after.shape))  # the ball is left alone
 
 
@@ -184,7 +193,7 @@ def test_motion_terms_equal_a_recount_of_the_commands(flailing):
     for name, share in measures.items():
         assert share.max() <= 1 + 1e-9
         np.testing.assert_allclose(flailing.terms[TERMS.index(name)], 1 - share.mean(axis=(0, 1)), atol=1e-12)
-    np.testing.assert_allclose(flailing.last.sums.peak_velocity, np.abs(command).max(axis=0))
+    np.testing.assert_allclose(flailing.last.accumulators.peak_velocity, np.abs(command).max(axis=0))
     lower, upper = np.array(LIMITS.lower)[:, None], np.array(LIMITS.upper)[:, None]
     soft = 0.05 * (upper - lower)
     safe = ((flailing.qpos > lower + soft) & (flailing.qpos < upper - soft)).all(axis=1).mean(axis=0)
@@ -194,8 +203,8 @@ def test_motion_terms_equal_a_recount_of_the_commands(flailing):
 
 def test_pose_terms_equal_a_recount_in_mujoco(flailing):
     """Steps in contact, with a low blade and with a blade that looks aside, by MuJoCo's poses and distances."""
-    mj = robot.load_model()
-    data, site = mujoco.MjData(mj), mj.site(robot.PADDLE_SITE).id
+    mj = mjcf.load_model()
+    data, site = mujoco.MjData(mj), mj.site(mjcf.PADDLE_SITE).id
     watched = robots.paper().file
     own = list(watched.pairs)
     table = [(name, "col_table") for name in watched.table]
@@ -223,32 +232,47 @@ def test_commands_keep_the_kinematic_limits(flailing):
     assert (reference <= np.array(LIMITS.upper)[:, None]).all() and (reference >= np.array(LIMITS.lower)[:, None]).all()
 
 
+def played(closest=0.0, hit=True, crossed=True, returned=False, landing=(0.0, 0.685), net_height=0.0) -> PlayedBall:
+    return PlayedBall(hit, crossed, returned, net_height, np.array(landing), closest, 1.0, np.zeros(N_JOINTS))
+
+
 def test_weights_and_ranges_are_the_papers():
-    assert len(TERMS) == 11
-    assert list(rewards.SIM_WEIGHTS.values()) == [1.0, 1.0, 0.1, 0.0, 0.3, 0.3, 0.4, 1.0, 1.0, 0.5, 1.0]
-    assert [name for name, weight in rewards.REAL_WEIGHTS.items() if weight] == [
-        "state_transition",
-        "net_clearance",
-        "hit_and_land",
-        "fault",
-    ]
-    assert rewards.REAL_WEIGHTS["hit_and_land"] == 0.1 and rewards.REAL_WEIGHTS["fault"] == 1.0
+    assert tuple(term.name for term in BUILT_IN_REWARDS) == TERMS and len(TERMS) == 11
+    assert list(SIM_WEIGHTS.values()) == [1.0, 1.0, 0.1, 0.0, 0.3, 0.3, 0.4, 1.0, 1.0, 0.5, 1.0]
+    measured = {"state_transition": 1.0, "net_clearance": 1.0, "hit_and_land": 0.1, "fault": 1.0}
+    assert {name: weight for name, weight in REAL_WEIGHTS.items() if weight} == measured
+    assert TaskConfig().reward_weights == tuple(SIM_WEIGHTS.values())
     # Term 1 rises from approach to hit, crossing, return and aim, within [0, 5]; term 2 within [0, 1].
-    target = np.array([0.0, 0.685])
-    stages = [
-        rewards.state_transition(3.0, False, False, False, target),
-        rewards.state_transition(0.1, False, False, False, target),
-        rewards.state_transition(0.0, True, False, False, target + 9),
-        rewards.state_transition(0.0, True, True, False, target + 2),
-        rewards.state_transition(0.0, True, True, True, target + 0.6),
-        rewards.state_transition(0.0, True, True, True, target),
+    balls = [
+        played(closest=3.0, hit=False),
+        played(closest=0.1, hit=False),
+        played(crossed=False, landing=(9.0, 9.685)),
+        played(landing=(2.0, 2.685)),
+        played(returned=True, landing=(0.6, 1.285)),
+        played(returned=True),
     ]
-    assert (np.diff(stages) > 0).all() and min(stages) >= 0 and stages[-1] == 5
+    steps = [float(state_transition(ball)) for ball in balls]
+    assert (np.diff(steps) > 0).all() and min(steps) >= 0 and steps[-1] == 5
     heights = np.linspace(-0.5, 3, 50)
-    clearance = rewards.net_clearance(np.True_, np.True_, heights)
+    clearance = net_clearance(played(net_height=heights))
     assert ((clearance >= 0) & (clearance <= 1)).all()
     assert heights[np.argmax(clearance)] == pytest.approx(0.35, abs=0.05)
-    assert not rewards.net_clearance(np.False_, np.True_, heights).any()
+    assert not net_clearance(played(net_height=heights, hit=False)).any()
+
+
+def test_a_further_observation_term_follows_the_contracts_rows():
+    further = (*CONTRACT_OBSERVATIONS, ObservationTerm("last_command", lambda sensed: sensed.command, 0.5))
+    config = TaskConfig(sim_rate=75.0, observations=further)
+    assert config.n_observation == 19
+    hanging = episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(), p=2)
+    each, command = Task(config), np.random.default_rng(0).normal(size=(N_JOINTS, 2))
+    state = each.reset(hanging, Script(jnp.zeros((1, N_JOINTS, 2)), jnp.zeros(19)))
+    np.testing.assert_array_equal(state.controller[11:], 0.0)  # nothing was commanded before the first step
+    state = replace(state, command=jnp.asarray(command, jnp.float32))
+    seen = each.observe(1, state, hanging, each.prepare(hanging))
+    np.testing.assert_allclose(seen[:3], [[0.0] * 2, [1.0] * 2, [0.5] * 2], atol=1e-6)
+    np.testing.assert_allclose(seen[3:11], np.broadcast_to(each.home[:, None], (N_JOINTS, 2)), atol=1e-6)
+    np.testing.assert_allclose(seen[11:], 0.5 * command, rtol=1e-6)
 
 
 def test_ball_noise_is_two_diameters_wide_and_the_joints_have_none(flailing):
@@ -296,7 +320,10 @@ def test_mistakes_in_the_configuration_are_named():
         (dict(sim_rate=320.0), "sim_rate 320.0 Hz is not a whole multiple of control_rate 75.0 Hz"),
         (dict(sim_rate=50.0), "not a whole multiple"),
         (dict(max_steps=0), "max_steps is 0"),
-        (dict(reward_weights=(1.0,)), "reward_weights has 1 numbers, the terms are .*style"),
+        (dict(rewards=2 * weigh_rewards({})), "rewards has a name twice"),
+        (dict(observations=()), "observations must begin with ball and joints"),
     ):
         with pytest.raises(ValueError, match=message):
             TaskConfig(**change)
+    with pytest.raises(ValueError, match="rewards: styl is no reward term; allowed: .*style"):
+        weigh_rewards({"styl": 1.0})

@@ -15,7 +15,7 @@ from ballmodel.sampling import sample_pool
 from mjx_tt.env.policy import controller, initial_theta
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 from robot_io import contract
@@ -69,10 +69,10 @@ def played(request):
     def play(policy, pool):
         episodes = simulator.draw(jax.random.key(1), pool, model, (), 4, 1)
         task, plays = simulator.task, Overheard(controller(replace(policy, theta=policy.theta[:, None])))
-        prepared, state = task.prepare(episodes), task.reset(episodes, plays)
+        constants, state = task.prepare(episodes), task.reset(episodes, plays)
 
         def advance(state, tick):
-            after = task.control_step(tick, state, episodes, prepared, plays)
+            after = task.step(tick, state, episodes, constants, plays)
             return after, (*after.controller[1:], after.qpos, after.command, after.reference)
 
         return jax.lax.scan(advance, state, jnp.arange(TICKS))[1]
@@ -112,8 +112,8 @@ def test_latency_of_axes_and_arm_is_by_the_contract():
     values |= {f"latency.{name}_std": 0.0 for name in models.LATENCIES}
     model = models.with_values(SimModel(joints=robot.contract.joints), values)
     pool = sample_pool(jax.random.key(0), registry.resolve("player3/M0"), model.ball, 64)
-    prepared = simulator.task.prepare(simulator.draw(jax.random.key(1), pool, model, (), 2, 1))
-    delay = np.asarray(prepared.action.periods)[:, 0, 0]
+    constants = simulator.task.prepare(simulator.draw(jax.random.key(1), pool, model, (), 2, 1))
+    delay = np.asarray(constants.action.periods)[:, 0, 0]
     expected = np.full(7, 0.02)
     expected[0], expected[robot.contract.joints.index("elbow")] = 0.1, 0.05
     np.testing.assert_array_equal(delay, np.floor(expected * 75.0))

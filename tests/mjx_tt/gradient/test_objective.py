@@ -11,12 +11,12 @@ import pytest
 
 from ballmodel import registry
 from ballmodel.sampling import sample_pool
-from mjx_tt.env.episode import reshaped
+from mjx_tt.env.episode import MISSED, RETURNED, reshape_episodes
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import MISSED, RETURNED, TaskConfig
+from mjx_tt.env.task import TaskConfig, weigh_rewards
 from mjx_tt.gradient import motion as motions
-from mjx_tt.gradient.incoming import incoming
+from mjx_tt.gradient.incoming import fly_incoming
 from mjx_tt.gradient.network import differentiable
 from mjx_tt.gradient.objective import Objective
 from mjx_tt.sim.actuators import DriveParams, JointDrive
@@ -61,7 +61,7 @@ def episodes(pool, model=SimModel()):  # noqa: B008
 def test_it_hits_and_returns_the_balls_that_the_simulator_does(policy, pool, model):
     drawn = episodes(pool, model)
     simulator = Simulator(CONFIG)
-    played = jax.jit(Objective(simulator.task, TICKS).play)(policy, reshaped(drawn, -1))
+    played = jax.jit(Objective(simulator.task, TICKS).play)(policy, reshape_episodes(drawn, -1))
     wanted = jax.jit(simulator.rollout)(policy, drawn)
     hit, returned = (np.asarray(x).reshape(R, P) for x in (played.hit, played.returned))
     outcome = np.asarray(wanted.outcome)
@@ -84,7 +84,7 @@ def test_it_hits_and_returns_the_balls_that_the_simulator_does(policy, pool, mod
 def test_its_observations_are_those_of_the_simulator(policy, pool):
     drawn = episodes(pool)
     simulator = Simulator(CONFIG)
-    played = jax.jit(Objective(simulator.task, TICKS).play)(policy, reshaped(drawn, -1))
+    played = jax.jit(Objective(simulator.task, TICKS).play)(policy, reshape_episodes(drawn, -1))
     wanted = jax.jit(simulator.rollout)(policy, drawn)
     hit = np.asarray(wanted.outcome) != MISSED
     ends = np.asarray(played.ends).reshape(R, P)
@@ -124,10 +124,10 @@ def test_slopes_are_those_of_finite_differences_where_joints_are_independent(pol
     Without faults, whose number has none; of misses it is left out that the nearer ones say more.
     """
     faultless = dict(zip(CONFIG.terms, CONFIG.reward_weights, strict=True)) | dict.fromkeys(FAULTS, 0.0)
-    simulator = Simulator(replace(CONFIG, reward_weights=tuple(faultless.values())))
-    simulator.task.engine = Loops(simulator.task, motions.response(simulator.task))
+    simulator = Simulator(replace(CONFIG, rewards=weigh_rewards(faultless)))
+    simulator.task.engine = Loops(simulator.task, motions.measure_response(simulator.task))
     objective = Objective(simulator.task, TICKS)
-    drawn = reshaped(episodes(pool), -1)
+    drawn = reshape_episodes(episodes(pool), -1)
 
     def play(theta):
         played = objective.play(replace(policy, theta=theta), drawn)
@@ -150,12 +150,13 @@ def test_slopes_are_those_of_finite_differences_where_joints_are_independent(pol
 def test_the_loops_of_the_robot_predict_what_the_dynamics_do(policy, pool):
     """The motion's derivatives leave out how joints disturb each other: a hundredth of what the commands do."""
     simulator = Simulator(CONFIG)
-    task, drawn = simulator.task, reshaped(episodes(pool), -1)
-    prepared = task.prepare(drawn)
-    ball, servos = incoming(task, drawn, prepared, 60), motions.Servos(task)
+    task, drawn = simulator.task, reshape_episodes(episodes(pool), -1)
+    constants = task.prepare(drawn)
+    ball, servos = fly_incoming(task, drawn, constants, 60), motions.Servos(task)
 
     def joints(theta):
-        moved = motions.motion(task, servos, differentiable(replace(policy, theta=theta)), drawn, prepared, ball)
+        controller = differentiable(replace(policy, theta=theta))
+        moved = motions.simulate_motion(task, servos, controller, drawn, constants, ball)
         return moved.joints[-1]
 
     step = np.random.default_rng(2).normal(size=policy.theta.shape).astype(np.float32)

@@ -12,7 +12,7 @@ from ballmodel import constants as c
 from ballmodel.flight import PaddlePose, ball_params
 from ballmodel.state import ball_state
 from mjx_tt.gradient.incoming import Incoming
-from mjx_tt.gradient.strike import Meeting, landing, strike
+from mjx_tt.gradient.strike import Meeting, find_landing, simulate_strike
 
 STEP = 1 / 150
 AIRLESS = replace(ball_params(), flight=replace(ball_params().flight, air_density=0.0))
@@ -21,7 +21,7 @@ AIRLESS = replace(ball_params(), flight=replace(ball_params().flight, air_densit
 def test_without_air_a_ball_lands_where_its_parabola_does():
     start = np.array([[0.1, -0.3], [-1.2, -1.5], [0.3, 0.4]])  # two balls
     velocity = np.array([[0.4, -0.2], [4.0, 5.0], [2.0, 0.5]])
-    found = landing(AIRLESS, ball_state(jnp.asarray(start, jnp.float32), velocity))
+    found = find_landing(AIRLESS, ball_state(jnp.asarray(start, jnp.float32), velocity))
     fall = start[2] - c.BALL_RADIUS
     t = (velocity[2] + np.sqrt(velocity[2] ** 2 + 2 * c.GRAVITY * fall)) / c.GRAVITY
     np.testing.assert_allclose(found.position, start[:2] + velocity[:2] * t, atol=2e-3)
@@ -31,7 +31,7 @@ def test_without_air_a_ball_lands_where_its_parabola_does():
 
 
 def test_a_ball_that_falls_short_does_not_cross_the_net():
-    found = landing(AIRLESS, ball_state(jnp.array([[0.0], [-1.3], [0.3]]), jnp.array([[0.0], [1.0], [0.0]])))
+    found = find_landing(AIRLESS, ball_state(jnp.array([[0.0], [-1.3], [0.3]]), jnp.array([[0.0], [1.0], [0.0]])))
     assert found.down.all() and not found.crossed.any()
     t = np.sqrt(2 * (0.3 - c.BALL_RADIUS) / c.GRAVITY)
     np.testing.assert_allclose(found.position[:, 0], [0.0, -1.3 + t], atol=2e-3)
@@ -56,7 +56,7 @@ def passing(height: float) -> Incoming:
 def test_a_missed_ball_is_as_far_as_its_line_passes_the_blade(above):
     met = Meeting(jnp.array([0]), jnp.array([0]), jnp.array([True]), jnp.array([False]))
     blade = still_blade([0.0, 0.0, 0.0])
-    struck = strike(met, passing(above), AIRLESS, (blade, blade), STEP)
+    struck = simulate_strike(met, passing(above), AIRLESS, (blade, blade), STEP)
     np.testing.assert_allclose(np.sqrt(struck.distance), above, atol=2e-4)
     # Struck at the blade's middle it would have come straight back, slower by the rubber's restitution.
     np.testing.assert_allclose(struck.ball.velocity[[0, 2], 0], 0.0, atol=1e-5)
@@ -68,6 +68,6 @@ def test_a_hit_counts_from_the_blade_s_middle_in_its_plane():
     met = Meeting(jnp.array([0]), jnp.array([0]), jnp.array([True]), jnp.array([True]))
     blade = still_blade([0.03, 0.0, 0.0])
     ball = passing(0.04)
-    struck = strike(met, ball, AIRLESS, (blade, blade), STEP)
+    struck = simulate_strike(met, ball, AIRLESS, (blade, blade), STEP)
     np.testing.assert_allclose(np.sqrt(struck.distance), 0.05, atol=5e-4)
     assert float(struck.ball.velocity[1, 0]) > 2.5

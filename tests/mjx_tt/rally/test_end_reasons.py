@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from ballmodel.state import BallState
-from mjx_tt.env.task import HIT, MISSED, RETURNED
+from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.rally.ball_flights import Meeting, Sent
-from mjx_tt.rally.end_reasons import End, ending
+from mjx_tt.rally.end_reasons import End, find_end
 from mjx_tt.rally.human_player import Incoming
 from robot_io.control import episode
 from robot_io.control.rally import RallyCounter
 from robot_io.rally_ends import FILTERED
 
 LANDING, MIDDLE = (0.3, -0.9), (0.0, 0.7)  # [m] of the human's ball, of the robot's return
-ENDING = jax.jit(ending)
+ENDING = jax.jit(find_end)
 OUTCOMES = {MISSED: episode.MISSED, HIT: episode.HIT, RETURNED: episode.RETURNED}
 
 

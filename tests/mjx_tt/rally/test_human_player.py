@@ -55,7 +55,7 @@ def test_an_aimed_stroke_lands_where_it_was_aimed_by_an_ode_solver():
     target = np.stack([rng.uniform(-0.7, 0.7, n), rng.uniform(-1.3, -0.3, n), np.full(n, 0.02)])
     seconds, spin = rng.uniform(0.3, 0.7, n), rng.normal(0, 60, (3, n))
     flight = FlightParams(magnus_coefficient=1.0)
-    velocity = np.asarray(shots.aimed(flight, *map(jnp.asarray, (start, target, seconds, spin))))
+    velocity = np.asarray(shots.aim_stroke(flight, *map(jnp.asarray, (start, target, seconds, spin))))
     k_d, k_m = (k * 1.29 * 1.256e-3 / (2 * 0.0027) for k in (0.47, 0.02))
     for i in range(n):
 
@@ -71,7 +71,7 @@ def test_the_time_of_a_stroke_clears_the_net_on_a_parabola():
     rng = np.random.default_rng(1)
     start = np.stack([rng.uniform(-0.5, 0.5, N), rng.uniform(0.3, 2.0, N), rng.uniform(0.0, 0.9, N)])
     target = np.stack([rng.uniform(-0.5, 0.5, N), rng.uniform(-1.3, -0.3, N), np.full(N, 0.02)])
-    seconds = np.asarray(shots.stroke_seconds(jnp.asarray(start), jnp.asarray(target), 6.0, 0.1))
+    seconds = np.asarray(shots.estimate_stroke_seconds(jnp.asarray(start), jnp.asarray(target), 6.0, 0.1))
     vz = (target[2] - start[2]) / seconds + 0.5 * 9.81 * seconds
     at_net = seconds * start[1] / (start[1] - target[1])
     height = start[2] + vz * at_net - 0.5 * 9.81 * at_net**2
@@ -83,7 +83,7 @@ def test_the_time_of_a_stroke_clears_the_net_on_a_parabola():
 
 
 def test_the_fall_time_is_that_of_a_parabola():
-    seconds = float(shots.fall_seconds(2.0, 0.5))
+    seconds = float(shots.estimate_fall_seconds(2.0, 0.5))
     assert 0.5 + 2.0 * seconds - 0.5 * 9.81 * seconds**2 == pytest.approx(c.BALL_RADIUS, abs=1e-5)
 
 

@@ -14,12 +14,13 @@ from ballmodel.flight import ball_params
 from ballmodel.partial_params import without_nominal
 from ballmodel.sampling import sample_pool
 from ballmodel.state import BallState
+from mjx_tt.env.episode import MISSED, RETURNED, Episodes
 from mjx_tt.env.policy import Policy, PolicyController, initial_theta
 from mjx_tt.env.rollout import Simulator
-from mjx_tt.env.task import MISSED, RETURNED, Episodes, TaskConfig
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.rally import human_player
-from mjx_tt.rally.ball_flights import Sent, homeward, meeting
-from mjx_tt.rally.end_reasons import ROWS, End, ending
+from mjx_tt.rally.ball_flights import Sent, drive_home, fly_to_player
+from mjx_tt.rally.end_reasons import ROWS, End, find_end
 from mjx_tt.rally.human_player import Spread
 from mjx_tt.rally.simulator import Box, RallySimulator, RallyState
 from mjx_tt.sim.model import LATENCIES, SimModel, with_values
@@ -285,7 +286,7 @@ def test_players_meet_the_return_where_finer_steps_have_it():
     plane, height = np.array([1.3, 1.5, 1.6, 1.4]), np.array([0.2, -0.1, 0.25, 0.3])
     ball = BallState(*(jnp.asarray(x.T, jnp.float32) for x in (position, velocity, 0 * velocity)))
     fly = jax.jit(
-        lambda b: meeting(SimModel().ball, b, jnp.ones(4, bool), jnp.asarray(plane), jnp.asarray(height), 1 / 75)
+        lambda b: fly_to_player(SimModel().ball, b, jnp.ones(4, bool), jnp.asarray(plane), jnp.asarray(height), 1 / 75)
     )
     met = jax.tree.map(np.asarray, fly(ball))
     assert np.all(met.reached)
@@ -317,13 +318,13 @@ def test_corner_and_cord_of_the_robots_return():
     velocity = np.stack([aim(position[0], [0.7, 1.3, 0.02], 0.6), aim(position[1], [0.3, 0.0, 0.168], 0.25)])
     ball = BallState(*(jnp.asarray(x.T, jnp.float32) for x in (position, velocity, 0 * velocity)))
     wish = jnp.array([1.5, 1.5]), jnp.array([0.2, 0.2])
-    met = jax.jit(lambda b: meeting(SimModel().ball, b, jnp.ones(2, bool), *wish, 1 / 75))(ball)
+    met = jax.jit(lambda b: fly_to_player(SimModel().ball, b, jnp.ones(2, bool), *wish, 1 / 75))(ball)
     assert list(np.asarray(met.net)) == [False, True]
     side, line = 0.7625 - abs(float(met.incoming.landing[0, 0])), 1.37 - float(met.incoming.landing[1, 0])
     assert side < 0.25 and line < 0.25
     sent = Sent(*(jnp.array([flag] * 2) for flag in (False, False, True)), jnp.array([[0.3] * 2, [-0.9] * 2]))
     false = jnp.zeros(2, bool)
-    end = ending(false, sent, jnp.full(2, RETURNED), false, false, met, false, ~false)
+    end = find_end(false, sent, jnp.full(2, RETURNED), false, false, met, false, ~false)
     assert [End(e) for e in np.asarray(end)] == [End.ROBOT_CORNER, End.ROBOT_GRAZES_NET]
 
 
@@ -344,7 +345,9 @@ def test_the_robot_is_as_far_on_its_way_home_as_the_bridge_drives_it(simulator):
         at = at + moving * np.sign(error) * np.minimum(
             np.minimum(speed, np.sqrt(2 * braking * np.abs(error))) * dt, np.abs(error)
         )
-    found = np.asarray(homeward(simulator.task.home, jnp.asarray(qpos, jnp.float32), jnp.asarray(seconds, jnp.float32)))
+    found = np.asarray(
+        drive_home(simulator.task.home, jnp.asarray(qpos, jnp.float32), jnp.asarray(seconds, jnp.float32))
+    )
     np.testing.assert_allclose(found, at, atol=2e-3)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ballmodel.contact import TABLE
-from mjx_tt.robot import model as robot
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import mjcf, robots
+from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.clearance import (
     BISECTIONS,
     CapsuleClearance,
@@ -22,7 +22,7 @@ from mjx_tt.robot.kinematics import PaddleKinematics
 from robot_io.contract import LIMITS
 
 N = 4000
-RADIUS = {c.name: c.radius for c in robot.capsules(robot.load_model())}
+RADIUS = {c.name: c.radius for c in mjcf.capsules(mjcf.load_model())}
 WATCHED = robots.paper().file
 PAIRS = {frozenset(pair) for pair in WATCHED.pairs}
 
@@ -48,7 +48,7 @@ LEFT_OUT = {
 
 @pytest.fixture(scope="module")
 def model():
-    return robot.load_model()
+    return mjcf.load_model()
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def poses(model):
 def mujocos(model, poses):
     """MuJoCo's signed distance (N,) of every pair of collision geoms by the set of their names, and whether the axis of
     a capsule passes through the table, by its name."""
-    names = [c.name for c in robot.capsules(model)] + ["col_table"]
+    names = [c.name for c in mjcf.capsules(model)] + ["col_table"]
     geoms = {name: model.geom(name).id for name in names}
     distances = {frozenset(pair): np.empty(N) for pair in combinations(names, 2)}
     pierced = {name: np.empty(N, bool) for name in WATCHED.table}
@@ -96,8 +96,8 @@ def distances(mujocos):
 
 @pytest.fixture(scope="module")
 def clearances(model, poses):
-    kinematics = PaddleKinematics(robot.chain_from_model(model), robot.paddle_frame(model))
-    clearance = CapsuleClearance(kinematics, robot.capsules(model), WATCHED)
+    kinematics = PaddleKinematics(chain_from_model(model), mjcf.paddle_frame(model))
+    clearance = CapsuleClearance(kinematics, mjcf.capsules(model), WATCHED)
     q = poses.astype(np.float32)
     return jax.tree.map(np.asarray, jax.jit(lambda q: clearance(kinematics.links(q), q[0]))(q))
 
@@ -179,7 +179,7 @@ def test_segment_box_distance_by_hand():
 
 
 def test_a_model_without_its_capsules_is_refused(model):
-    kinematics = PaddleKinematics(robot.chain_from_model(model), robot.paddle_frame(model))
-    some = [c for c in robot.capsules(model) if c.name != "col_wrist"]
+    kinematics = PaddleKinematics(chain_from_model(model), mjcf.paddle_frame(model))
+    some = [c for c in mjcf.capsules(model) if c.name != "col_wrist"]
     with pytest.raises(ValueError, match=r"lacks the capsules \['col_wrist'\]; it has .*'col_base'"):
         CapsuleClearance(kinematics, some, WATCHED)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_tt.env.policy import PolicyController, initial_theta
-from mjx_tt.robot import model as robot
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import mjcf, robots
 from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.dynamics_fused import FusedEngine
 from mjx_tt.robot.dynamics_mjx import MjxEngine
@@ -63,7 +62,7 @@ def test_fused_equals_mujoco_c_in_float64(model, timestep):
 
 
 def test_fused_in_float32_stays_within_its_rounding():
-    model = robot.load_model()
+    model = mjcf.load_model()
     rng = np.random.default_rng(1)
     qpos, qvel, ctrl = rng.uniform(-2, 2, (3, model.nq, 1000))
     single = [x.astype(np.float32) for x in (qpos, qvel, ctrl)]
@@ -118,6 +117,6 @@ def test_fluid_forces_are_refused_by_both_engines(option):
 
 
 def test_the_robot_has_no_fluid():
-    model = robot.load_model()
+    model = mjcf.load_model()
     assert model.opt.density == 0 and model.opt.viscosity == 0 and not model.opt.wind.any()
     assert not model.geom_fluid.any()

@@ -7,31 +7,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import model as robot
-from mjx_tt.robot import robot as robots
-from mjx_tt.robot import scalar_algebra
-from mjx_tt.robot.chain import chain_from_model, site_frame
+from mjx_tt.robot import mjcf, robots
+from mjx_tt.robot.chain import body_frames, chain_from_model, site_frame
 from mjx_tt.robot.kinematics import PaddleKinematics
 from tests.oracles.chains import CART, CRANE, SKEW
 
 MODELS = [
-    *(pytest.param(robots.load_shipped(name).model(), robot.PADDLE_SITE, id=name) for name in robots.names()),
+    *(pytest.param(robots.load_shipped(name).model(), mjcf.PADDLE_SITE, id=name) for name in robots.names()),
     pytest.param(mujoco.MjModel.from_xml_string(SKEW), "tip", id="skew"),
     pytest.param(mujoco.MjModel.from_xml_string(CRANE), "tip", id="crane"),
     pytest.param(mujoco.MjModel.from_xml_string(CART), "tip", id="cart"),
 ]
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("largest", [np.pi, 8000.0])
-def test_sine_and_cosine_are_exact_to_rounding(dtype, largest):
-    angles = np.random.default_rng(2).uniform(-largest, largest, 100_000).astype(dtype)
-    angles[:9] = np.arange(-4, 5) * np.pi / 2
-    with jax.enable_x64(dtype == np.float64):
-        sin, cos = jax.jit(scalar_algebra.sin_cos)(angles)
-    assert sin.dtype == cos.dtype == dtype
-    for found, exact in ((sin, np.sin(angles.astype(float))), (cos, np.cos(angles.astype(float)))):
-        np.testing.assert_allclose(found, exact, rtol=0, atol=np.finfo(dtype).eps)
 
 
 def site_in_mujoco(model, name, q, qd):
@@ -70,7 +56,7 @@ def test_pose_and_velocity_of_a_site_match_mujoco(model, site, x64, atol):
 @pytest.mark.parametrize(("model", "site"), MODELS)
 def test_points_on_links_match_mujoco(model, site):
     """Every body's frame, through the link that carries it, including bodies that do not move."""
-    chain, frames = chain_from_model(model), robot.body_frames(model)
+    chain, frames = chain_from_model(model), body_frames(model)
     q, qd = random_states(model, 5, 1)
     point = np.array([0.1, -0.2, 0.3])
     with jax.enable_x64(True):

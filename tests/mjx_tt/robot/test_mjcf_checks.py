@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 
 YAML, MJCF = "description.yaml", "robot.xml"
 

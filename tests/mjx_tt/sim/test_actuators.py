@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ballmodel.partial_params import without_nominal
-from mjx_tt.robot import model as robot
+from mjx_tt.robot import mjcf
 from mjx_tt.sim import actuators, model
 from mjx_tt.sim.actuators import DriveParams, Drives, JointDrive
 from mjx_tt.sim.model import Range, SimModel
@@ -114,9 +114,9 @@ def mean_velocities(command):
 
 def mujoco_path(velocities):
     """Joint path (steps + 1, 8) of MuJoCo C under velocities (steps, 8)."""
-    mj = robot.load_model()
+    mj = mjcf.load_model()
     data = mujoco.MjData(mj)
-    data.qpos[:] = robot.home_qpos(mj)
+    data.qpos[:] = mjcf.home_qpos(mj)
     path = [data.qpos.copy()]
     for velocity in velocities:
         data.ctrl[:] = velocity
@@ -142,7 +142,7 @@ def test_the_robot_follows_its_drives_equations_under_both_engines(engine):
         batch = episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=simulation())
         record = scripted_episodes.play(task(engine), batch, script(actions, TICKS), TICKS)
     times, ticked = np.arange(TICKS * SUBSTEPS + 1) * H, np.arange(TICKS) * T
-    mj = robot.load_model()
+    mj = mjcf.load_model()
     data, velocities = mujoco.MjData(mj), mean_velocities(record.command)
     nominal = mujoco_path(velocities[..., 0])
     for i, case in enumerate(CASES):
@@ -160,7 +160,7 @@ def test_the_robot_follows_its_drives_equations_under_both_engines(engine):
         for tick in (10, TICKS - 1):
             data.qpos[:] = carried[SUBSTEPS * (tick + 1)]
             mujoco.mj_kinematics(mj, data)
-            paddle = data.site(robot.PADDLE_SITE).xpos
+            paddle = data.site(mjcf.PADDLE_SITE).xpos
             np.testing.assert_allclose(record.paddle[tick, :, i], paddle, atol=1e-5, err_msg=str(case))
 
 
@@ -186,7 +186,7 @@ def test_velocity_follows_exactly_over_a_substep_of_any_length(case):
     with jax.enable_x64(True):
         drive = effects(**{name: jnp.full(40, value) for name, value in case.items()})
         for seconds, fine in ((H, 1000), (0.5, 50_000)):
-            mean, state = actuators.follow(drive, actuators.DriveState(jnp.array(v), None), jnp.array(u), seconds)
+            mean, state = actuators.step_lag(drive, actuators.DriveState(jnp.array(v), None), jnp.array(u), seconds)
             velocity, way = respond(lag, a, v, u, seconds, fine)
             np.testing.assert_allclose(state.velocity, velocity, atol=1e-3 * np.abs(u - v).max())
             np.testing.assert_allclose(mean * seconds, way, atol=1e-5)
@@ -199,10 +199,10 @@ def test_a_flexible_mount_swings_as_the_differential_equation():
     v = np.cumsum(np.random.default_rng(3).normal(0.0, 0.1, steps + 1))
     with jax.enable_x64(True):
         drive = effects(resonance=jnp.array([frequency, 0.0]))
-        state = actuators.at_rest(drive, jnp.zeros(2))
+        state = actuators.rest(drive, jnp.zeros(2))
         wanted = np.zeros(2)
         for before, after in itertools.pairwise(v):
-            state = actuators.swung(drive, state, jnp.full(2, before), jnp.full(2, after), H)
+            state = actuators.step_swing(drive, state, jnp.full(2, before), jnp.full(2, after), H)
             a = (after - before) / H
 
             def motion(_, y, a=a):
@@ -211,7 +211,7 @@ def test_a_flexible_mount_swings_as_the_differential_equation():
             wanted = solve_ivp(motion, (0, H), wanted, rtol=1e-10, atol=1e-13).y[:, -1]
             np.testing.assert_allclose(state.swing[:, 0], wanted, rtol=1e-6, atol=1e-12)
     assert np.abs(wanted).max() > 0.0 and not np.any(state.swing[:, 1])
-    assert actuators.at_rest(effects(), jnp.zeros(2)).swing is None
+    assert actuators.rest(effects(), jnp.zeros(2)).swing is None
 
 
 def test_carried_joints_stay_within_the_play_and_move_with_the_joint_at_its_end():
@@ -219,9 +219,9 @@ def test_carried_joints_stay_within_the_play_and_move_with_the_joint_at_its_end(
     path = 0.3 * np.sin(4 * t)
     with jax.enable_x64(True):
         effect = effects(backlash=jnp.array(0.1))
-        state, carried = actuators.at_rest(effect, jnp.array(path[0])), [path[0]]
+        state, carried = actuators.rest(effect, jnp.array(path[0])), [path[0]]
         for q in path[1:]:
-            output, velocity, state = actuators.carry(effect, state, jnp.array(q), jnp.array(0.0), H)
+            output, velocity, state = actuators.step_backlash(effect, state, jnp.array(q), jnp.array(0.0), H)
             assert float(velocity) == pytest.approx((float(output) - carried[-1]) / H, abs=1e-12)
             carried.append(float(output))
     np.testing.assert_allclose(carried, play_in(0.1, path), atol=1e-12)
@@ -231,10 +231,10 @@ def test_carried_joints_stay_within_the_play_and_move_with_the_joint_at_its_end(
 def test_drives_are_those_of_the_contracts_joints_and_nominal_ones_cost_nothing():
     assert tuple(DriveParams.__dataclass_fields__) == JOINT_NAMES
     assert actuators.NO_VELOCITY_LIMIT > 2 * max(LIMITS.velocity)
-    nominal = actuators.by_effect(without_nominal(DriveParams()), (3,), jnp.float32)
+    nominal = actuators.sort_by_effect(without_nominal(DriveParams()), (3,), jnp.float32)
     assert jax.tree.leaves(nominal) == [] and not nominal.follows
     one = replace(DriveParams(), joint_3=JointDrive(lag=0.02))
-    only = actuators.by_effect(without_nominal(one), (3,), jnp.float32)
+    only = actuators.sort_by_effect(without_nominal(one), (3,), jnp.float32)
     assert len(jax.tree.leaves(only)) == 1
     wanted = np.where(np.array(JOINT_NAMES) == "joint_3", 0.02, 0.0)
     np.testing.assert_allclose(only.lag, np.repeat(wanted[:, None], 3, axis=1), rtol=1e-6)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import model as robot
+from mjx_tt.robot import mjcf
 from mjx_tt.sim import latency
 from mjx_tt.sim.model import LATENCIES
 from robot_io.contract import FESTO_JOINTS, N_JOINTS
@@ -35,18 +35,18 @@ def test_observation_is_the_interpolated_past(x64):
     rng = np.random.default_rng(1)
     path = rng.normal(size=TICKS * SUBSTEPS + 1)
     path[0] = 0.3
-    depth = latency.ring_depth(0.1, T)
+    depth = latency.count_slots(0.1, T)
 
     @jax.jit
     def run(delays, path):
-        delay = latency.observation_delay(delays, T)
+        delay = latency.split_observation_delay(delays, T)
 
         def period(ring, n):
-            read = latency.ring_read(ring, n - delay.periods)[0]
+            read = latency.read_ring(ring, n - delay.periods)[0]
             captured = sum(
-                latency.capture_weight(delay, s, SUBSTEPS, H) * path[n * SUBSTEPS + s] for s in range(SUBSTEPS + 1)
+                latency.weigh_capture(delay, s, SUBSTEPS, H) * path[n * SUBSTEPS + s] for s in range(SUBSTEPS + 1)
             )
-            return latency.ring_write(ring, n, captured[None]), read
+            return latency.write_ring(ring, n, captured[None]), read
 
         start = jnp.full((depth, 1, delays.shape[0]), path[0])
         return jax.lax.scan(period, start, jnp.arange(TICKS, dtype=jnp.int32))[1]
@@ -73,17 +73,17 @@ def test_command_keeps_its_impulse_and_its_substep(x64):
     """The command of each substep is the mean over it of the ideally delayed zero-order hold, so every impulse is."""
     rng = np.random.default_rng(2)
     commands = rng.normal(size=TICKS)
-    depth = latency.ring_depth(0.13, T)
+    depth = latency.count_slots(0.13, T)
 
     @jax.jit
     def run(delays, commands):
-        delay = latency.action_delay(delays, T)
+        delay = latency.split_action_delay(delays, T)
 
         def period(ring, n):
-            ring = latency.ring_write(ring, n, jnp.full((1, delays.shape[0]), commands[n]))
-            old = latency.ring_read(ring, n - delay.periods - 1)[0]
-            new = latency.ring_read(ring, n - delay.periods)[0]
-            share = [latency.old_command_share(delay, s, H) for s in range(SUBSTEPS)]
+            ring = latency.write_ring(ring, n, jnp.full((1, delays.shape[0]), commands[n]))
+            old = latency.read_ring(ring, n - delay.periods - 1)[0]
+            new = latency.read_ring(ring, n - delay.periods)[0]
+            share = [latency.share_old_command(delay, s, H) for s in range(SUBSTEPS)]
             return ring, jnp.stack([new + a * (old - new) for a in share])
 
         start = jnp.zeros((depth, 1, delays.shape[0]))
@@ -99,9 +99,9 @@ def test_command_keeps_its_impulse_and_its_substep(x64):
 
 def test_longest_delay_fits_the_ring():
     for longest in (0.0, 0.04, 0.1, 0.13, 7 * T):
-        depth = latency.ring_depth(longest, T)
-        observed = int(latency.observation_delay(np.float32(longest), T).periods)
-        acted = int(latency.action_delay(np.float32(longest), T).periods)
+        depth = latency.count_slots(longest, T)
+        observed = int(latency.split_observation_delay(np.float32(longest), T).periods)
+        acted = int(latency.split_action_delay(np.float32(longest), T).periods)
         # Observations of the periods n - k .. n - 1 and commands of n - m - 1 .. n have to be there.
         assert observed <= depth and acted + 2 <= depth
 
@@ -117,14 +117,14 @@ def test_the_task_delays_every_device_by_its_own_time():
         record = play(task(), episodes(start, velocity, delays, model(gravity=0.0)), script(actions))
     assert record.live.all()
     ticked, times = np.arange(scripted_episodes.TICKS) * T, np.arange(scripted_episodes.TICKS * SUBSTEPS + 1) * H
-    mj, speed = robot.load_model(), np.linalg.norm(velocity)
+    mj, speed = mjcf.load_model(), np.linalg.norm(velocity)
     for i in range(P):
         moments = np.maximum(ticked - delays["ball_observation"][i], 0.0)
         way = np.log1p(DRAG * speed * moments) / DRAG
         np.testing.assert_allclose(
             record.controller[:, :3, i], start + way[:, None] * velocity / speed, atol=1e-6, err_msg="ball"
         )
-        data, path = mujoco.MjData(mj), [robot.home_qpos(mj)]
+        data, path = mujoco.MjData(mj), [mjcf.home_qpos(mj)]
         data.qpos[:] = path[0]
         device = ["festo" if joint in FESTO_JOINTS else "abb" for joint in range(N_JOINTS)]
         ctrl = [

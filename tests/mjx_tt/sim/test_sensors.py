@@ -127,10 +127,10 @@ def test_a_fast_clock_stretches_the_trackers_latency(seen):
 
 def test_a_tracker_without_errors_is_left_out():
     left = dict.fromkeys((*CAMERA, "smoothing", "filter_time", "filter_gate", "jitter", "clock_rate"))
-    assert sensors.camera(replace(SensingParams(), **left)) is None
+    assert sensors.make_camera(replace(SensingParams(), **left)) is None
     assert without_nominal(SensingParams()) == replace(SensingParams(), **left)
-    one = sensors.camera(without_nominal(SensingParams(camera_scale=1.02)))
-    np.testing.assert_allclose(one.seen(START), 1.02 * START, rtol=1e-6)
+    one = sensors.make_camera(without_nominal(SensingParams(camera_scale=1.02)))
+    np.testing.assert_allclose(one.project(START), 1.02 * START, rtol=1e-6)
 
 
 def butterworth(t, memory):
@@ -143,12 +143,12 @@ def test_a_filter_of_constant_acceleration_fades_behind_a_jump_of_the_velocity()
     memory, step, kick = 0.02, 2e-5, np.array([1.0, -2.0, 4.0])
 
     def advance(lag, _):
-        lag = lag.predicted(step, still, 0.0).corrected(step, step, memory, 1e6)
+        lag = lag.predict(step, still, 0.0).correct(step, step, memory, 1e6)
         return lag, lag.position
 
     with jax.enable_x64(True):
         still = jnp.zeros(3)
-        lag = Lag.settled(step, memory, still).predicted(0.0, jnp.array(kick), 0.0)
+        lag = Lag.settle(step, memory, still).predict(0.0, jnp.array(kick), 0.0)
         _, error = jax.lax.scan(advance, lag, length=5000)
     wanted = butterworth(step * np.arange(1, 5001)[:, None], memory) * kick
     np.testing.assert_allclose(error, wanted, atol=5e-3 * np.abs(wanted).max())
@@ -166,7 +166,7 @@ def test_a_settled_filters_covariance_solves_riccatis_equation(memory):
     gain = before[:, :1] / (before[0, 0] + variance)
     after = (before - gain @ before[:1]) / variance * np.outer(*2 * [memory ** np.arange(3)])
     with jax.enable_x64(True):
-        covariance = Lag.settled(dt, memory, jnp.zeros(3)).covariance
+        covariance = Lag.settle(dt, memory, jnp.zeros(3)).covariance
     np.testing.assert_allclose(covariance, after[np.triu_indices(3)], rtol=2e-2)
 
 
@@ -178,7 +178,7 @@ def test_a_filter_follows_the_textbooks_recursion_after_it_opened():
     q = 0.008 / memory**6
     seen, wanted = [], []
     with jax.enable_x64(True):
-        lag = Lag.settled(0.008, memory, jnp.zeros(3))
+        lag = Lag.settle(0.008, memory, jnp.zeros(3))
         covariance = np.zeros((3, 3))
         covariance[np.triu_indices(3)] = lag.covariance
         covariance = covariance + np.triu(covariance, 1).T
@@ -186,7 +186,7 @@ def test_a_filter_follows_the_textbooks_recursion_after_it_opened():
         state = np.zeros(3)
         for i, (dt, gate) in enumerate(zip(times, gates, strict=True)):
             hit = kick if i == 0 else 0.0
-            lag = lag.predicted(dt, jnp.array([0.0, 0.0, hit]), dt).corrected(dt, 0.008, memory, gate)
+            lag = lag.predict(dt, jnp.array([0.0, 0.0, hit]), dt).correct(dt, 0.008, memory, gate)
             move = np.array([[1.0, dt, dt**2 / 2.0], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
             shape = [[dt**4 / 20, dt**3 / 8, dt**2 / 6], [dt**3 / 8, dt**2 / 3, dt / 2], [dt**2 / 6, dt / 2, 1.0]]
             state = move @ state - np.array([dt * hit, hit, 0.0])
@@ -203,18 +203,18 @@ def test_a_filter_follows_the_textbooks_recursion_after_it_opened():
 @pytest.mark.parametrize("memory", [0.0, 1e-9, 1e-6, 1e-4, 8e-4])
 def test_a_filter_of_hardly_any_memory_shows_nothing(memory):
     """Of 40 mm of surprise, and whatever came before."""
-    lag = Lag.settled(0.008, memory, jnp.zeros(3)).predicted(0.008, jnp.array([0.0, 0.0, 5.0]), 0.008)
+    lag = Lag.settle(0.008, memory, jnp.zeros(3)).predict(0.008, jnp.array([0.0, 0.0, 5.0]), 0.008)
     for _ in range(20):
-        lag = lag.corrected(0.008, 0.008, memory, 1.0)
+        lag = lag.correct(0.008, 0.008, memory, 1.0)
         assert float(jnp.abs(lag.position).max()) < 1e-5
-        lag = lag.predicted(0.008, jnp.zeros(3), 0.0)
+        lag = lag.predict(0.008, jnp.zeros(3), 0.0)
 
 
 def test_a_filter_that_is_surprised_starts_afresh():
     still, kick = jnp.zeros(3), jnp.array([0.0, 0.0, 5.0])
     left = []
     for gate in (0.02, 0.2):
-        lag = Lag.settled(0.008, 0.03, still).predicted(0.008, kick, 0.008).corrected(0.008, 0.008, 0.03, gate)
+        lag = Lag.settle(0.008, 0.03, still).predict(0.008, kick, 0.008).correct(0.008, 0.008, 0.03, gate)
         left.append(float(jnp.linalg.norm(lag.position)))
     assert left[0] < 2e-3  # of 40 mm
     assert left[1] > 0.015

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mjx_tt.robot.model import home_qpos, load_model
+from mjx_tt.robot.mjcf import home_qpos, load_model
 from mjx_tt.viz import opengl as back_end
 from mjx_tt.viz import rendering
 from mjx_tt.viz.caption import BACKGROUND, Caption

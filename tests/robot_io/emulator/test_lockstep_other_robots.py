@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from robot_io.control.interfaces import BridgeConfig
 from robot_io.devices.egm.messages import EgmError, EgmRobot, decode_robot, encode_robot
 from robot_io.emulator.config import RigParams

@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import clearance, geometry_export
-from mjx_tt.robot import model as robot
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import clearance, geometry_export, mjcf, robots
+from mjx_tt.robot.chain import chain_from_model
 from mjx_tt.robot.kinematics import PaddleKinematics
 from robot_io.contract import LIMITS
 from robot_io.safety import clearance as shipped
@@ -24,7 +23,7 @@ N = 2000
 
 @pytest.fixture(scope="module")
 def model():
-    return robot.load_model()
+    return mjcf.load_model()
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +44,8 @@ def poses():
 def simulated(model, poses):
     """The simulation's clearances in float64, each (N,)."""
     with jax.enable_x64(True):
-        kinematics = PaddleKinematics(robot.chain_from_model(model), robot.paddle_frame(model))
-        gaps = clearance.CapsuleClearance(kinematics, robot.capsules(model), robots.paper().file)
+        kinematics = PaddleKinematics(chain_from_model(model), mjcf.paddle_frame(model))
+        gaps = clearance.CapsuleClearance(kinematics, mjcf.capsules(model), robots.paper().file)
         return jax.tree.map(np.asarray, jax.jit(lambda q: gaps(kinematics.links(q), q[0]))(poses))
 
 
@@ -71,7 +70,7 @@ def test_the_shipped_file_is_current():
 
 
 def test_home_is_the_models(model, ours):
-    np.testing.assert_allclose(ours.home, robot.home_qpos(model), atol=1e-12)
+    np.testing.assert_allclose(ours.home, mjcf.home_qpos(model), atol=1e-12)
 
 
 def test_clearances_equal_the_simulations(model, ours, poses, monkeypatch):

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import model
+from mjx_tt.robot import mjcf
 from robot_io.contract import JOINT_NAMES, LIMITS
 from robot_io.errors import RefusedError
 from robot_io.limits import limit_velocity
@@ -150,7 +150,7 @@ class Distances:
     """MuJoCo's own distances of what the gate watches."""
 
     def __init__(self) -> None:
-        self.model = model.load_model()
+        self.model = mjcf.load_model()
         self.data = mujoco.MjData(self.model)
         names = [row.replace("the table", "col_table").replace("the ", "").split(" to ") for row in GEOMETRY.rows]
         self.pairs = [tuple(self.model.geom(n).id for n in pair) for pair in names]

@@ -214,8 +214,8 @@ def _fly(
         corner = jnp.where(hit, events.position, new.position)
         filtered = follow(follow(filtered, state.position, corner, t), corner, new.position, dt - t)
         kick = jnp.where(hit, jump(state.velocity, new.velocity, dt), 0.0)
-        lag, unmeasured = lag.predicted(dt, kick, dt - t), unmeasured + dt
-        met = lag.corrected(unmeasured, usual, memory, gate, surprise)
+        lag, unmeasured = lag.predict(dt, kick, dt - t), unmeasured + dt
+        met = lag.correct(unmeasured, usual, memory, gate, surprise)
         lag = jax.tree.map(lambda a, b: jnp.where(sampled, a, b), met, lag)
         unmeasured = jnp.where(sampled, 0.0, unmeasured)
         bounced = jnp.where(first, (elapsed + t) * rate, bounced)
@@ -234,7 +234,7 @@ def _fly(
     columns = jnp.arange(shape[0])
     frames = jnp.zeros((len(steps) + 1, *shape), bool).at[index, columns].set(True)[1:]
     usual = jnp.sum(steps, axis=0) / jnp.maximum(jnp.sum(frames, axis=0), 1)  # [s] between measurements
-    lag = Lag.settled(usual, memory, still)
+    lag = Lag.settle(usual, memory, still)
     carry = (state, filtered, (lag, zero), zero, zero + jnp.inf, still, still, zero + jnp.inf)
     ends = () if paddle is None else (slice(None, -1), slice(1, None))
     blades = tuple(jax.tree.map(lambda x, part=part: x[part], paddle) for part in ends)

@@ -10,7 +10,7 @@ import numpy as np
 from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.diagnosis.joint.coupling import coupling
 from mjx_tt.diagnosis.joint.forward_model import nominal_response
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import JOINT_NAMES, LIMITS
 

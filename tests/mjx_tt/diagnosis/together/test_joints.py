@@ -9,7 +9,7 @@ import pytest
 
 from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.diagnosis.together import joints
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from mjx_tt.robot.servo import servos
 from mjx_tt.sim.model import SimModel
 from robot_io.contract import FESTO_JOINTS, JOINT_NAMES, LIMITS

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import robots
 from robot_io.control.commissioning.homing import towards
 from robot_io.control.commissioning.way_home import WayHome
 from robot_io.safety.clearance import RobotGeometry

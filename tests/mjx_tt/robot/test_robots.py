@@ -10,8 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_tt.robot import model as paper_model
-from mjx_tt.robot import robot as robots
+from mjx_tt.robot import mjcf, robots
 from mjx_tt.robot.clearance import CapsuleClearance
 from mjx_tt.robot.kinematics import PaddleKinematics
 from robot_io import contract
@@ -24,10 +23,10 @@ OTHERS = [name for name in NAMES if name != robots.DEFAULT]
 
 def test_the_papers_robot_is_its_folder():
     """Limits and network of the YAML, and dynamics put at the table as any other robot's, are the constants'."""
-    paper, scene = robots.paper(), paper_model.load_model()
+    paper, scene = robots.paper(), mjcf.load_model()
     assert paper.contract is PAPER and paper.file.contract == PAPER
     assert robots.chain_from_model(paper.model()) == robots.chain_from_model(scene)
-    np.testing.assert_array_equal(paper.home, paper_model.home_qpos(scene))
+    np.testing.assert_array_equal(paper.home, mjcf.home_qpos(scene))
     assert contract.n_parameters() == 976
     assert contract.describe(PAPER) == contract.describe() and "robot" not in contract.describe()
 

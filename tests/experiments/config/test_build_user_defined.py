@@ -1,4 +1,4 @@
-"""The page "Define your own rewards and network", followed as it stands, to the robot's policy and back."""
+"""The page "Define your own rewards, observations and network", followed as it stands."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+import yaml
 
 from experiments import cli
 from experiments.config import build
@@ -58,7 +59,7 @@ def test_its_terms_are_measured_and_weigh(trained):
     assert list(report["terms"])[-2:] == ["calm_wrist", "deep"]
     experiment = build.experiment(config.load(trained / "my_task.yaml"), "my_task.yaml")
     assert experiment.task.reward_weights[-2:] == (0.2, 0.5)
-    own = build.definitions(experiment.config, "")[0]
+    own = build.definitions(experiment.config, "my_task.yaml")[0]
     assert build.later_weights(experiment.config.training, own)[1][-2:] == (0.0, 2.0)
 
 
@@ -183,12 +184,35 @@ def test_code_is_not_packed(trained, capsys):
         ({"network": "cnn"}, "network: expected one of gru, got cnn"),
         ({"definitions": "other.py"}, "definitions: .*No such file .*other.py"),
         ({"definitions": "my_task.txt"}, "definitions: expected a Python file"),
-        ({"task.rewards": "{own: {calm: 1}}"}, "task: rewards.own: calm is not defined; allowed: calm_wrist, deep"),
-        ({"training.later_rewards.rewards": "{own: {x: 1}}"}, "later_rewards: rewards.own: x is not defined"),
-        ({"definitions": "null"}, "rewards.own: deep is not defined; allowed: none is defined; name a file"),
+        ({"task.rewards": "{calm: 1}"}, "task: rewards: calm is no reward term; allowed: .*calm_wrist, deep"),
+        ({"training.later_rewards.rewards": "{x: 1}"}, "later_rewards: rewards: x is no reward term"),
+        (
+            {"definitions": "null"},
+            "rewards.calm_wrist: unknown reward term; allowed: .*the key definitions",
+        ),
+        ({"task.observations": "{speed: 1}"}, "observations: speed is not defined; allowed: none is defined"),
     ],
 )
 def test_mistakes_in_the_yaml_are_named(folder, changes, says):
     overrides = tuple(f"{key}={value}" for key, value in changes.items())
     with pytest.raises(ConfigError, match=says):
         build.experiment(config.load(folder / "my_task.yaml", overrides), "my_task.yaml")
+
+
+def test_the_pages_observation_term_is_seen_by_a_network_of_its_size(folder, tmp_path):
+    """The page's few further lines; the rows themselves are tested with the task."""
+    code, setting = re.search(r"## Observation terms.*?```python\n(.*?)```.*?```yaml\n(.*?)```", PAGE, re.S).groups()
+    observed = yaml.safe_load(setting)["task"]["observations"]
+    text = (folder / "my_task.py").read_text() + code
+    overrides = (f"task.observations={json.dumps(observed)}", f"definitions={tmp_path / 'my_task.py'}")
+    (tmp_path / "my_task.py").write_text(text)
+    with pytest.raises(ConfigError, match=r"(?s)network 'gru': line \d+.*dot_general"):
+        build.experiment(config.load(folder / "my_task.yaml", overrides), "my_task.yaml")
+    smaller, larger = re.search(r"`w` is `(.*?)` in place of `(.*?)`", PAGE).groups()[::-1]
+    (tmp_path / "my_task.py").write_text(text.replace(smaller, larger))
+    experiment = build.experiment(config.load(folder / "my_task.yaml", overrides), "my_task.yaml")
+    last = experiment.task.observations[-1]
+    with pytest.raises(ConfigError, match="observations: last_command: the paper's network takes ball and joints only"):
+        build.experiment(config.load(folder / "my_task.yaml", (*overrides, "network=null")), "my_task.yaml")
+    assert (last.name, last.weight, experiment.task.n_observation) == ("last_command", 0.1, 19)
+    assert experiment.network.size == 968 + 36 * 8

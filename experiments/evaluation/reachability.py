@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from ballmodel.sampling import BallPool
+from mjx_tt.env.episode import RETURNED, Episodes, Tick
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import AXIS, RESULT_SPECS, RolloutResult, Simulator
-from mjx_tt.env.task import RETURNED, Episodes, Tick
 from mjx_tt.sim.model import SimModel
 
 BATCH = 32  # balls searched at a time
@@ -38,15 +38,15 @@ FIRST_STD = 0.5  # of an action
 class MotionController:
     """Open-loop motions: knots (KNOTS, 8, P) of actions, evenly spaced over ``duration`` (1, P) seconds."""
 
-    knots: Float[Array, "knots joints P"]
-    duration: Float[Array, "1 P"]  # [s]
+    knots: Array  # (KNOTS, n, P)
+    duration: Array  # (1, P) [s]
     period: float = field(metadata={"static": True})  # [s]
-    mean: Float[Array, "observed"]
+    mean: Array  # (observed,)
 
     def start(self, observation: Array) -> tuple[()]:
         return ()
 
-    def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Float[Array, "joints P"], tuple[()]]:
+    def act(self, tick: Tick, state: tuple[()], observation: Array) -> tuple[Array, tuple[()]]:
         seconds = jnp.asarray(tick).astype(self.duration.dtype) * self.period
         place = jnp.clip(seconds / self.duration[0], 0.0, 1.0) * (KNOTS - 1)
         action = jnp.zeros_like(self.knots[0])
@@ -115,8 +115,8 @@ def _played(simulator: Simulator, policy: Policy, episodes: Episodes) -> np.ndar
     return simulator.gather(spread(*simulator.replicate((policy, episodes))).outcome)[0] == RETURNED
 
 
-def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Bool[Array, " P"]:
-    """True for those of this device's share of episodes (1, P) that an optimised motion returns."""
+def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Array:
+    """True (P,) for those of this device's share of episodes (1, P) that an optimised motion returns."""
     episodes = simulator.local(episodes)
     mine, contract = episodes.seed.shape[-1], simulator.task.contract
     n = contract.n_joints
@@ -143,7 +143,7 @@ def _search(simulator: Simulator, key: PRNGKeyArray, episodes: Episodes) -> Bool
             knots.reshape(KNOTS, n, -1),
             jnp.tile(duration, CANDIDATES)[None],
             simulator.config.period,
-            jnp.zeros(contract.n_observation),
+            jnp.zeros(simulator.config.n_observation),
         )
         result = simulator.play(controller, many)
         score = jnp.nan_to_num(result.returns, nan=-1e3).reshape(CANDIDATES, mine)

@@ -11,15 +11,16 @@ from jaxtyping import Bool
 from ballmodel import flight
 from ballmodel.flight import BallParams
 from ballmodel.state import BallState, where
-from mjx_tt.env.episode import Return, TaskConfig
+from mjx_tt.env.episode import Return
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.lanes.loop import while_any
-from mjx_tt.robot.scalar_algebra import materialise
+from mjx_tt.robot.scalar_algebra import optimization_barrier
 from mjx_tt.sim.model import SimModel
 
 FLOOR = -0.76  # [m]
 
 
-def fly_out(config: TaskConfig, ball: BallState, hit: Bool[Array, "*batch"], model: SimModel) -> Return:
+def fly_return(config: TaskConfig, ball: BallState, hit: Bool[Array, "*batch"], model: SimModel) -> Return:
     """Phase 2: flies the balls that were hit until they come down.
 
     Alone in the air the ball needs no substeps: one second-order step per control period moves its landing point
@@ -31,7 +32,7 @@ def fly_out(config: TaskConfig, ball: BallState, hit: Bool[Array, "*batch"], mod
 
     def step(_: Array, state: tuple, params: BallParams, __: tuple) -> tuple:
         ball, live, outcome = state
-        ball, outcome, live = fly_out_step(config, params, ball, live, outcome)
+        ball, outcome, live = step_return_flight(config, params, ball, live, outcome)
         return ball, live, outcome
 
     start = (ball, hit, outcome)
@@ -39,11 +40,11 @@ def fly_out(config: TaskConfig, ball: BallState, hit: Bool[Array, "*batch"], mod
     return while_any(lambda s: s[1], step, start, params, limit=config.max_steps, lanes=lanes)[2]
 
 
-def fly_out_step(
+def step_return_flight(
     config: TaskConfig, params: BallParams, ball: BallState, live: Bool[Array, "*batch"], outcome: Return
 ) -> tuple[BallState, Return, Bool[Array, "*batch"]]:
     """One control period of phase 2: the ball, the outcome so far and who still flies."""
-    new, events = materialise(flight.step(params, ball, config.period))
+    new, events = optimization_barrier(flight.step(params, ball, config.period))
     y0, y1 = ball.position[1], new.position[1]
     crossing = live & (y0 < 0.0) & (y1 >= 0.0)
     w = jnp.clip(-y0 / jnp.where(y1 > y0, y1 - y0, 1.0), 0.0, 1.0)

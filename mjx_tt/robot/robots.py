@@ -27,7 +27,7 @@ import numpy as np
 from ballmodel.io import yaml
 from mjx_tt.robot import geometry, mjcf_checks
 from mjx_tt.robot.chain import Chain, Frame, chain_from_model, site_frame
-from mjx_tt.robot.model import PADDLE_SITE, Capsule, capsules
+from mjx_tt.robot.mjcf import PADDLE_SITE, Capsule, capsules
 from robot_io import robot_file
 from robot_io.contract import PAPER, Contract
 from robot_io.robot_file import RobotFile
@@ -176,7 +176,8 @@ def from_content(data: Any, where: str, mjcf: str | None = None) -> Robot:
     if path is not None and (not Path(path).is_file() or Path(path).read_text(encoding="utf-8") != parsed.mjcf):
         raise ValueError(f"{where}: {path} is missing or was changed since; put the MJCF and its files back there")
     robot = Robot(parsed, parsed.mjcf, path)
-    mistakes = list(mjcf_checks.mistakes(robot, mjcf or path or f"{where}: mjcf", where))
+    origin = mjcf or path or f"{where}: mjcf"
+    mistakes = list(mjcf_checks.find_mistakes(parsed, robot.own_spec, robot.model, origin, where))
     if mistakes:
         raise ValueError("\n".join(mistakes))
     return robot

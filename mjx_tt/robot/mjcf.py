@@ -11,12 +11,7 @@ from importlib import resources
 import mujoco
 import numpy as np
 
-from mjx_tt.robot.chain import WORLD as WORLD
-from mjx_tt.robot.chain import Chain as Chain
-from mjx_tt.robot.chain import Frame as Frame
-from mjx_tt.robot.chain import Link as Link
-from mjx_tt.robot.chain import body_frames, site_frame
-from mjx_tt.robot.chain import chain_from_model as chain_from_model
+from mjx_tt.robot.chain import Frame, body_frames, site_frame
 
 PADDLE_SITE = "paddle"  # centre of the blade: x along the extension, z out of the striking face
 COLLISION_PREFIX = "col_"
@@ -24,7 +19,7 @@ COLLISION_PREFIX = "col_"
 
 @dataclass(frozen=True)
 class Capsule:
-    """A capsule fixed to a link: segment p0-p1, each (3,) [m] in the frame of ``link`` (``WORLD``: world frame)."""
+    """A capsule fixed to a link: segment p0-p1, each (3,) [m] in the frame of ``link`` (``chain.WORLD``: world)."""
 
     name: str
     link: int

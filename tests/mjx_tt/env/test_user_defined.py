@@ -8,14 +8,15 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_tt.env import make, own, rewards
+from mjx_tt.env import make, user_defined
 from mjx_tt.env.policy import Policy, initial_theta
-from mjx_tt.env.task import TaskConfig
+from mjx_tt.env.reward_weights import SIM_WEIGHTS, TERMS
+from mjx_tt.env.task import APPROACH_RANGE, TaskConfig, weigh_rewards
 from robot_io import contract
 
-TERMS = """
+MINE = """
 import jax.numpy as jnp
-from mjx_tt.env.own import reward_term
+from mjx_tt import reward_term
 from robot_io.contract import LIMITS
 
 @reward_term("slow")
@@ -23,9 +24,9 @@ def slow(step):  # the package's term "velocity", written by hand
     limit = jnp.array(LIMITS.velocity).reshape((8,) + (1,) * (step.command.ndim - 1))
     return 1.0 - jnp.minimum(jnp.abs(step.command) / limit, 1.0).mean(axis=0)
 
-@reward_term("clear_of_the_table")
+@reward_term("clear_of_the_table", reduce="minus_sum")
 def clear(step):
-    return -((step.table_gap <= 0.0) | (step.own_gap <= 0.0)).astype(float)
+    return (step.table_gap <= 0.0) | (step.own_gap <= 0.0)
 
 @reward_term("near", per="ball")
 def near(ball):
@@ -42,7 +43,7 @@ def always(ball):
 NETWORKS = '''
 import jax.numpy as jnp
 from jax.nn import sigmoid
-from mjx_tt.env.own import network
+from mjx_tt import network
 
 SHAPES = {"conv1/kernel": (2, 11, 16), "conv1/bias": (16,), "conv2/kernel": (2, 8, 24), "conv2/bias": (24,),
           "conv3/kernel": (2, 12, 8), "conv3/bias": (8,)}
@@ -79,31 +80,27 @@ def policy():
 
 
 def test_a_users_terms_are_the_packages_written_by_hand(policy):
-    terms = tuple(own.load(TERMS, "terms.py").terms.values())
-    weights = (*rewards.SIM_WEIGHTS.values(), 0.5, 0.0, 2.0, 0.0, 1.0)
-    with_terms = TaskConfig(sim_rate=75.0, reward_weights=weights, own_terms=terms)
-    found, plain = played(with_terms, policy), played(TaskConfig(sim_rate=75.0), policy)
-    assert tuple(found.terms) == (*rewards.TERMS, "slow", "clear_of_the_table", "near", "seconds", "always")
-    for name in rewards.TERMS:
-        np.testing.assert_array_equal(found.terms[name], plain.terms[name])
+    terms = user_defined.load(MINE, "terms.py").rewards.values()
+    weights = SIM_WEIGHTS | {"slow": 0.5, "near": 2.0, "always": 1.0}
+    found = played(TaskConfig(sim_rate=75.0, rewards=weigh_rewards(weights, terms)), policy)
+    assert tuple(found.terms) == (*TERMS, "slow", "clear_of_the_table", "near", "seconds", "always")
     np.testing.assert_allclose(found.terms["slow"], found.terms["velocity"], atol=1e-5)
-    steps = np.round(found.seconds * 75.0)
     assert (found.terms["collision"] < 0).any()  # the untrained robot hits something
-    np.testing.assert_allclose(found.terms["clear_of_the_table"] * steps, found.terms["collision"], atol=1e-3)
+    np.testing.assert_array_equal(found.terms["clear_of_the_table"], found.terms["collision"])
     np.testing.assert_allclose(found.terms["seconds"], found.seconds, rtol=1e-6)
     missed = found.outcome == "missed"
-    approached = 3.0 * np.exp(-found.terms["near"] / rewards.APPROACH_RANGE)
+    approached = 3.0 * np.exp(-found.terms["near"] / APPROACH_RANGE)
     np.testing.assert_allclose(approached[missed], found.terms["state_transition"][missed], rtol=1e-4)
-    added = 0.5 * found.terms["slow"] + 2.0 * found.terms["near"] + 2.0
-    np.testing.assert_allclose(found.returns, plain.returns + added, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(found.terms["always"], 2.0)
+    total = sum(weight * found.terms[name] for name, weight in weights.items())
+    np.testing.assert_allclose(found.returns, total, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.slow
 def test_a_term_that_is_no_number_is_masked_and_counted(policy):
-    text = TERMS + '\n@reward_term("bad", per="ball")\ndef bad(ball):\n    return jnp.where(ball.hit, 0.0, jnp.nan)\n'
-    terms = tuple(own.load(text, "bad.py").terms.values())
-    weights = (*rewards.SIM_WEIGHTS.values(), *[0.0] * (len(terms) - 1), 1.0)
-    found = played(TaskConfig(sim_rate=75.0, reward_weights=weights, own_terms=terms), policy)
+    text = GOOD + '\n@reward_term("bad", per="ball")\ndef bad(ball):\n    return jnp.where(ball.hit, 0.0, jnp.nan)\n'
+    terms = user_defined.load(text, "bad.py").rewards.values()
+    found = played(TaskConfig(sim_rate=75.0, rewards=weigh_rewards(SIM_WEIGHTS | {"bad": 1.0}, terms)), policy)
     plain = played(TaskConfig(sim_rate=75.0), policy)
     np.testing.assert_array_equal(found.finite, plain.outcome != "missed")
     assert np.isnan(found.returns[~found.finite]).all()
@@ -111,7 +108,7 @@ def test_a_term_that_is_no_number_is_masked_and_counted(policy):
 
 @pytest.mark.slow
 def test_the_papers_network_as_a_users_plays_as_the_packages(policy):
-    mine = own.load(NETWORKS, "networks.py").networks["paper"]
+    mine = user_defined.load(NETWORKS, "networks.py").networks["paper"]
     assert mine.size == contract.n_parameters()
     config = TaskConfig(sim_rate=75.0, max_steps=60)
     found, wanted = played(config, replace(policy, network=mine)), played(config, policy)
@@ -122,22 +119,32 @@ def test_the_papers_network_as_a_users_plays_as_the_packages(policy):
 
 
 def test_the_same_text_gives_the_same_objects():
-    assert own.load(TERMS, "terms.py") is own.load(TERMS, "a run's configuration")
+    assert user_defined.load(MINE, "terms.py") is user_defined.load(MINE, "a run's configuration")
 
 
-GOOD = "import jax.numpy as jnp\nfrom mjx_tt.env.own import network, reward_term\n"
+GOOD = "import jax.numpy as jnp\nfrom mjx_tt import network, observation_term, reward_term\n"
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("def f(:\n", r"my.py: line 1: invalid syntax"),
-        (GOOD + "import nothing_of_that_name\n", r"my.py: line 3: ModuleNotFoundError: No module named 'nothing_of"),
+        ("def f(:\n", r"line 1: invalid syntax"),
+        (GOOD + "import nothing_of_that_name\n", r"line 3: ModuleNotFoundError: No module named 'nothing_of"),
         (GOOD, "defines nothing"),
-        (GOOD + "@reward_term('style')\ndef f(step):\n    return 0.0\n", "'style': this is one of the package's own"),
+        (
+            GOOD + "@reward_term('style')\ndef f(step):\n    return 0.0\n",
+            "'style': the name is one of the package's own",
+        ),
         (GOOD + "@reward_term('a b')\ndef f(step):\n    return 0.0\n", "must be letters, digits"),
         (GOOD + "@reward_term('x', per='day')\ndef f(step):\n    return 0.0\n", "per is 'day', allowed: step, ball"),
-        (GOOD + 2 * "@reward_term('x')\ndef f(step):\n    return 0.0\n", "'x': defined twice"),
+        (GOOD + "@reward_term('x', reduce='max')\ndef f(step):\n    return 0.0\n", "'max', allowed: mean, one_minus"),
+        (
+            GOOD + "".join(f"@reward_term('x')\ndef {name}(step):\n    return 0.0\n" for name in "fg"),
+            "'x': defined twice",
+        ),
+        (GOOD + "@observation_term('x')\ndef f(sensed):\n    return sensed.bal\n", "line 5: AttributeError: .*bal"),
+        (GOOD + "@observation_term('x')\ndef f(sensed):\n    return sensed.ball[0]\n", "rows of numbers"),
+        (GOOD + "@observation_term('ball_x')\ndef f(sensed):\n    return sensed.ball\n", "the package's own"),
         (GOOD + "@reward_term('x')\ndef f(step):\n    return step.comand\n", "line 5: AttributeError: .*comand"),
         (GOOD + "@reward_term('x')\ndef f(step):\n    return step.command\n", r"returns an array \(8, 2, 3\)"),
         (
@@ -166,11 +173,11 @@ GOOD = "import jax.numpy as jnp\nfrom mjx_tt.env.own import network, reward_term
     ],
 )
 def test_a_mistake_in_the_file_is_named(text, says):
-    with pytest.raises(ValueError, match=f"(?s)my.py.*{says}|{says}"):
-        own.load(text, "my.py")
+    with pytest.raises(ValueError, match=f"(?s)my.py.*{says}"):
+        user_defined.load(text, "my.py").checked_network("n", 11)
 
 
 def test_theta_of_another_network_is_refused():
-    mine = own.load(NETWORKS, "networks.py").networks["paper"]
+    mine = user_defined.load(NETWORKS, "networks.py").networks["paper"]
     with pytest.raises(ValueError, match="theta has 5 parameters, the network 'paper' has 976"):
         mine.unflatten(np.zeros(5))

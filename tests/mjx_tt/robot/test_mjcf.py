@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from mjx_tt.robot import model as robot
+from mjx_tt.robot import mjcf
 from mjx_tt.robot.chain import chain_from_model, site_frame
 from robot_io.contract import JOINT_NAMES, LIMITS
 from tests.oracles.chains import CART, CRANE, SKEW, pendulum
@@ -15,13 +15,13 @@ from tests.oracles.chains import CART, CRANE, SKEW, pendulum
 
 @pytest.fixture(scope="module")
 def model():
-    return robot.load_model()
+    return mjcf.load_model()
 
 
 @pytest.fixture(scope="module")
 def home(model):
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.home_qpos(model)
+    data.qpos[:] = mjcf.home_qpos(model)
     mujoco.mj_forward(model, data)
     return data
 
@@ -42,7 +42,7 @@ def link_frames(chain, q):
 
 def chain_models():
     return [
-        pytest.param(robot.load_model(), robot.PADDLE_SITE, id="robot"),
+        pytest.param(mjcf.load_model(), mjcf.PADDLE_SITE, id="robot"),
         pytest.param(mujoco.MjModel.from_xml_string(SKEW), "tip", id="skew"),
         pytest.param(mujoco.MjModel.from_xml_string(CRANE), "tip", id="crane"),
         pytest.param(mujoco.MjModel.from_xml_string(CART), "tip", id="cart"),
@@ -183,7 +183,7 @@ def test_unknown_names_list_the_known_ones(model):
     with pytest.raises(ValueError, match="no site 'bat'.*'paddle'"):
         site_frame(model, "bat")
     with pytest.raises(ValueError, match="no keyframe named 'home'"):
-        robot.home_qpos(pendulum())
+        mjcf.home_qpos(pendulum())
 
 
 def test_joints_and_actuators_follow_the_contract(model):
@@ -263,7 +263,7 @@ def test_paddle_can_leave_home_at_1_m_per_s_without_turning(model, home, directi
 
 def test_base_stays_behind_the_table_within_the_gantry_stroke(model):
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.home_qpos(model)
+    data.qpos[:] = mjcf.home_qpos(model)
     data.qpos[1] = LIMITS.upper[1]
     mujoco.mj_forward(model, data)
     for name in ("col_base", "col_beam"):
@@ -275,7 +275,7 @@ def test_capsules_are_the_collision_geoms(model):
     data.qpos[:] = np.random.default_rng(2).uniform(LIMITS.lower, LIMITS.upper)
     mujoco.mj_forward(model, data)
     frames = link_frames(chain_from_model(model), data.qpos)
-    found = robot.capsules(model)
+    found = mjcf.capsules(model)
     named = [model.geom(i).name for i in range(model.ngeom)]
     assert [c.name for c in found] == [n for n in named if n.startswith("col_") and n != "col_table"]
     for capsule in found:
@@ -288,8 +288,8 @@ def test_capsules_are_the_collision_geoms(model):
 
 
 def test_blade_capsules_span_the_disc(model):
-    centre = robot.paddle_frame(model).pos
-    for capsule in robot.capsules(model):
+    centre = mjcf.paddle_frame(model).pos
+    for capsule in mjcf.capsules(model):
         if capsule.name.startswith("col_blade"):
             np.testing.assert_allclose((capsule.p0 + capsule.p1) / 2, centre, atol=1e-12)
             assert np.linalg.norm(capsule.p1 - capsule.p0) / 2 + capsule.radius == pytest.approx(0.076)
@@ -297,7 +297,7 @@ def test_blade_capsules_span_the_disc(model):
 
 def test_home_pose_is_clear_of_itself_and_the_table(model, home):
     """Capsules that are not neighbours on the chain keep 3 cm."""
-    found = robot.capsules(model)
+    found = mjcf.capsules(model)
     table = model.geom("col_table").id
     for i, a in enumerate(found):
         geom = model.geom(a.name).id
