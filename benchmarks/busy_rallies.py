@@ -15,7 +15,8 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from experiments.deploy import session
+from experiments.commands.options import RIG, RobotOptions
+from experiments.deploy import play
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -31,19 +32,8 @@ def main(arguments: list[str] | None = None) -> int:
     for other in others:
         other.start()
     with TemporaryDirectory() as folder:
-        status = session.run(
-            chosen.artefact,
-            "rig",
-            None,
-            None,
-            chosen.backend,
-            Path(folder),
-            None,
-            0,
-            chosen.seconds,
-            Console(),
-            player=chosen.player,
-        )
+        setup = RobotOptions(backend=chosen.backend, player=chosen.player)
+        status = play.run(chosen.artefact, RIG, Path(folder), Console(), setup, seconds=chosen.seconds)
         report = json.loads(next(Path(folder).glob("*.json")).read_text("utf-8"))
     for other in others:
         other.kill()

@@ -18,9 +18,10 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from rich.console import Console
 
+from experiments.commands.options import RobotOptions
+from experiments.deploy.control_session import ControlSession
 from experiments.deploy.recovery import Recovery
 from experiments.deploy.rig import rig_for
-from experiments.deploy.session import Session
 from robot_io import log
 from robot_io.contract import LIMITS, N_JOINTS
 from robot_io.control.messages import Refused, Status
@@ -44,9 +45,9 @@ def main(arguments: list[str] | None = None) -> int:
     random, found, looks = np.random.default_rng(chosen.seed), Counter[str](), []
     outside = 0.0
     loaded = artefacts.load(chosen.artefact)
-    with TemporaryDirectory() as folder, rig_for(loaded, None, None, chosen.seed) as rig:
+    with TemporaryDirectory() as folder, rig_for(loaded, RobotOptions(seed=chosen.seed)) as rig:
         options = ControlOptions(str(chosen.artefact), log_folder=folder, log_name="stalls")
-        with Session(rig.robot, options, Console()) as session:
+        with ControlSession(rig.robot, options, Console()) as session:
             try:
                 session.prepare(rig)
                 session.arm()
@@ -85,13 +86,13 @@ def main(arguments: list[str] | None = None) -> int:
     return int(found["recovered"] < found["faults"])
 
 
-def listen(session: Session, seconds: float) -> None:
+def listen(session: ControlSession, seconds: float) -> None:
     """Take what the control process sends."""
     for _ in session.messages(seconds):
         pass
 
 
-def watch(rig: Rig, session: Session, seconds: float) -> float:
+def watch(rig: Rig, session: ControlSession, seconds: float) -> float:
     """Farthest that a joint is outside its range [m], [rad] meanwhile."""
     end, worst = time.monotonic() + seconds, 0.0
     while time.monotonic() < end:
@@ -101,7 +102,7 @@ def watch(rig: Rig, session: Session, seconds: float) -> float:
     return worst
 
 
-def stall(rig: Rig, session: Session, kind: str, seconds: float) -> None:
+def stall(rig: Rig, session: ControlSession, kind: str, seconds: float) -> None:
     """Stop one of them for a while."""
     if kind == "tracker":
         rig.drop_out(seconds)
@@ -124,7 +125,7 @@ def pull(rig: Rig, kind: str, connected: bool) -> None:
             rig.connect_axis(axis, connected)
 
 
-def recovered(rig: Rig, session: Session) -> str:
+def recovered(rig: Rig, session: ControlSession) -> str:
     """The operator's one key, once the arm's controller is on again; why it failed, empty: it did not."""
     rig.switch_on()
     recovery = Recovery(time.monotonic(), session.status, emulated=True)

@@ -11,8 +11,8 @@ import numpy as np
 from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
+from experiments.progress import Stage, silent
 from experiments.runs.load_policy import TrainedPolicy
-from experiments.stages import Stage, silent
 from experiments.stats import wilson
 from mjx_tt.env import reachability, rewards
 from mjx_tt.env.evaluator import COLUMNS, Evaluator

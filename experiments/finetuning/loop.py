@@ -29,7 +29,8 @@ from experiments.errors import RunError
 from experiments.finetuning import report
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journal
 from experiments.finetuning.progress import FineTuningProgress
-from experiments.finetuning.robot import LockStepRobot, NoOperator, Operator, PlayedBall, Robot, thrown
+from experiments.finetuning.robot import LockStepRobot, Operator, PlayedBall, Robot, throws_of
+from experiments.progress import print_files
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import CONFIG, Run
@@ -79,9 +80,9 @@ def finetune(
     run.folder.mkdir(parents=True, exist_ok=True)
     with run.locked():
         _open(run, experiment, settings, robot, first, str(source))
-        session = Session(settings, run, robot, operator or NoOperator(), console, first, network)
+        tuning = FineTuningRun(settings, run, robot, operator or Operator(), console, first, network)
         try:
-            finished = session.run()
+            finished = tuning.run()
         except OSError as error:
             raise RunError(
                 f"{error.filename or run.folder}: cannot be written: {error.strerror or error}; every episode before "
@@ -90,11 +91,11 @@ def finetune(
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"{run.folder}: stopped; the same command continues it") from None
         finally:
-            session.close()
+            tuning.close()
         if not finished:
-            console.print(f"{run.folder}: stopped; the same command continues it", highlight=False)
+            console.print(f"{run.folder}: stopped; the same command continues it")
             return None
-        return conclude(experiment, settings, run, robot, console, session.journal.entries)
+        return conclude(experiment, settings, run, robot, console, tuning.journal.entries)
 
 
 def experiment_of(source: str | Path, balls: str | None = None) -> Experiment:
@@ -110,7 +111,7 @@ def lock_step_robot(experiment: Experiment, params: RigParams | None = None, see
     """The emulated robot with balls of the experiment's distribution; ``seed`` draws them."""
     pool = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), LOCK_STEP_BALLS)
     robot = experiment.task.robot
-    return LockStepRobot(thrown(pool.state), params, robot.scene(), robot.contract)
+    return LockStepRobot(throws_of(pool.state), params, robot.scene(), robot.contract)
 
 
 def reward_terms(summary: EpisodeSummary) -> dict[str, float]:
@@ -127,7 +128,7 @@ def reward_terms(summary: EpisodeSummary) -> dict[str, float]:
     }
 
 
-class Session:
+class FineTuningRun:
     """A fine-tuning between two starts of the program.
 
     journal  every episode so far
@@ -276,15 +277,13 @@ def conclude(
     exported = finalize.export_policy(run.artefact, load_policy.load(run.folder), experiment, result, console)
     run_dir.write_json(run.evaluation, result)
     report.print_result(console, result, str(run.folder))
-    lines = {
+    files = {
         "evaluation": run.evaluation,
         "curve": picture,
         "balls": f"{run.folder / HUMAN_BALLS} ({balls:,}; mjx-tt fit-human makes a distribution of them)",
-        "artefact": run.artefact if exported else "",
+        "artefact": run.artefact if exported else None,
     }
-    for name, value in lines.items():
-        if value:
-            console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
+    print_files(console, files)
     return result
 
 

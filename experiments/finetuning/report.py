@@ -7,10 +7,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,7 +15,7 @@ from rich.table import Table
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.csv import COLUMNS
-from experiments.evaluation.figures import HIT_COLOUR, INK, MISSED_COLOUR, RETURNED_COLOUR, STYLE
+from experiments.evaluation.figures import HIT_COLOUR, INK, MISSED_COLOUR, RETURNED_COLOUR, STYLE, save
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry
 from experiments.stats import t_interval, welch_interval, wilson
 from robot_io.control.episode import HIT, RETURNED
@@ -117,7 +113,6 @@ def print_result(console: Console, result: dict[str, Any], title: str) -> None:
     verdict = "" if d["significant"] else "; no significant change"
     console.print(
         f"mean return {d['mean_return']:+.2f} (95 % interval {d['low']:+.2f} to {d['high']:+.2f}, {how}){verdict}",
-        highlight=False,
         soft_wrap=True,
     )
 
@@ -140,11 +135,8 @@ def write_human_balls(path: Path, session: str, entries: list[Entry]) -> int:
 def draw(path: Path, entries: list[Entry], result: dict[str, Any], title: str) -> Path:
     """Writes the curve of the mean return per update with the evaluations at its ends, as PNG."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with plt.rc_context(STYLE), replacing(path) as temporary:
-        figure = _figure(entries, result, title)
-        figure.savefig(temporary, format="png")
-        plt.close(figure)
-    return path
+    with plt.rc_context(STYLE):
+        return save(path, _figure(entries, result, title))
 
 
 def _figure(entries: list[Entry], result: dict[str, Any], title: str) -> Figure:

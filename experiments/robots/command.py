@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands.options import command, console, count, existing, option, start_jax, suffix
+from experiments.commands.options import check_exists, check_suffix, command, count, option, start_jax
 from experiments.errors import ConfigError
+from experiments.progress import make_console
 
 if TYPE_CHECKING:
     from mjx_tt.robot.robot import Robot
@@ -50,9 +51,9 @@ def new(
     view: Annotated[bool, Parameter(help="show it in the browser (http://127.0.0.1:8080/)")] = False,
 ) -> int:
     """Returns 1 where the robot cannot be used as it is."""
-    existing(mjcf)
+    check_exists(mjcf)
     if picture is not None:
-        suffix(picture, ".png")
+        check_suffix(picture, ".png")
     path = Path(mjcf)
     start_jax(None)
     from ballmodel.io.atomic_files import replacing
@@ -60,35 +61,35 @@ def new(
     from experiments.robots import draft
     from mjx_tt.robot import robot as robots
 
-    screen, file = console(), path.with_name(robots.YAML)
+    screen, file = make_console(), path.with_name(robots.YAML)
     if file.exists():
-        screen.print(f"{file}: is there already; checked, not changed", highlight=False, soft_wrap=True)
+        screen.print(f"{file}: is there already; checked, not changed", soft_wrap=True)
     else:
         content = draft.text(path)
         with replacing(file) as temporary:
             temporary.write_text(content, encoding="utf-8")
-        screen.print(f"{file}: written; look at every line that says guess", highlight=False, soft_wrap=True)
+        screen.print(f"{file}: written; look at every line that says guess", soft_wrap=True)
     distribution = None if no_reachable else build.distribution(balls, "--balls")
     try:
         robot = robots.load(file)
     except ValueError as error:
         mistakes = str(error).splitlines()
         for line in mistakes:
-            screen.print(f"  {line}", highlight=False, soft_wrap=True)
+            screen.print(f"  {line}", soft_wrap=True)
         there = "this" if len(mistakes) == 1 else f"these {len(mistakes)}"
-        screen.print(f"mend {there}, then: mjx-tt robot new {mjcf}", highlight=False, soft_wrap=True)
+        screen.print(f"mend {there}, then: mjx-tt robot new {mjcf}", soft_wrap=True)
         return 1
     from experiments.robots import reach
 
     for line in reach.description(robot):
-        screen.print(f"  {line}", highlight=False, soft_wrap=True)
+        screen.print(f"  {line}", soft_wrap=True)
     if picture is not None:
         reach.draw(robot, Path(picture))
-        screen.print(f"  at home: {picture}", highlight=False, soft_wrap=True)
+        screen.print(f"  at home: {picture}", soft_wrap=True)
     if distribution is not None:
         found = reach.reachable(robot, distribution, SOME)
-        screen.print(f"  in reach, at least: {found.rate:.0%} of {found.balls} balls of {balls}", highlight=False)
-    screen.print(f"  use it: robot: {file.parent} in an experiment's YAML", highlight=False, soft_wrap=True)
+        screen.print(f"  in reach, at least: {found.rate:.0%} of {found.balls} balls of {balls}")
+    screen.print(f"  use it: robot: {file.parent} in an experiment's YAML", soft_wrap=True)
     if view:
         _view(robot, balls)
     return 0
@@ -99,11 +100,11 @@ def names() -> None:
     """Prints a line for each."""
     from mjx_tt.robot import robot as robots
 
-    screen = console()
+    screen = make_console()
     for name in robots.names():
         contract = robots.load_shipped(name).contract
         axes = ", ".join(contract.joints[i] for i in contract.carrying) or "no axis"
-        screen.print(f"{name:<16}{len(contract.arm)} joints on {axes}", highlight=False)
+        screen.print(f"{name:<16}{len(contract.arm)} joints on {axes}")
 
 
 @place_app.default
@@ -118,14 +119,14 @@ def place(
 ) -> int:
     """Returns 1 where no better place was found."""
     if out is not None:
-        suffix(out, ".yaml")
+        check_suffix(out, ".yaml")
     start_jax(None)
     from experiments.config import build
     from experiments.errors import checked
     from experiments.robots import placement
     from mjx_tt.robot import robot as robots
 
-    screen = console()
+    screen = make_console()
     path = checked("", robots.yaml_path, robot)
     if out is None and path.is_relative_to(robots.SHIPPED):
         raise ConfigError(f"{robot}: comes with the program and is not changed; name another file with --out")
@@ -133,13 +134,13 @@ def place(
     distribution = build.distribution(balls, "--balls")
     found = placement.search(before, distribution, samples, seed)
     if found.score <= found.before:
-        screen.print(f"{path}: no better place found (score {found.before:.3f}); nothing written", highlight=False)
+        screen.print(f"{path}: no better place found (score {found.before:.3f}); nothing written")
         return 1
     target = Path(out) if out else path
     placement.write(found.robot, path, target)
     for line in placement.description(before, found):
-        screen.print(line, highlight=False, soft_wrap=True)
-    screen.print(f"{target}: written", highlight=False, soft_wrap=True)
+        screen.print(line, soft_wrap=True)
+    screen.print(f"{target}: written", soft_wrap=True)
     return 0
 
 
@@ -148,11 +149,12 @@ def _view(robot: Robot, balls: str) -> None:
     import contextlib
 
     from experiments.robots import reach
-    from experiments.view import guard, show
+    from experiments.view import auth
+    from experiments.view.viewer import Viewer
 
-    server = guard.Server(guard.LOCAL, 8080)
-    viewer = show.viewer(server, reach.standing(robot, balls))
-    console().print(f"http://{guard.LOCAL}:{server.get_port()}/  (Ctrl+C ends it)", highlight=False)
+    server = auth.Server(auth.LOCAL, 8080)
+    viewer = Viewer(server, reach.standing(robot, balls))
+    make_console().print(f"http://{auth.LOCAL}:{server.get_port()}/  (Ctrl+C ends it)")
     with contextlib.suppress(KeyboardInterrupt):
         viewer.run()
     server.stop()

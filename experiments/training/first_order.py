@@ -39,7 +39,7 @@ class FirstOrderTrainer(Trainer):
         config, simulator = self.bgs_config, self.simulator
         direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
         population = strategy.ask(direction_key, state.bgs, config)
-        shape = (self._repeats, 2 * config.num_directions)
+        shape = (self._episodes_per_direction, 2 * config.num_directions)
         episodes = self._draw(episode_key, inputs, *shape)
         mine = reshaped(simulator.local(episodes), -1)
         mean, inv_std = normalizer.normaliser(state.statistics)
@@ -50,7 +50,7 @@ class FirstOrderTrainer(Trainer):
 
         (_, played), slopes = jax.value_and_grad(cost, has_aux=True)(simulator.local(population.members))
         whole = jnp.isfinite(slopes).all(0)
-        finite = jnp.isfinite(played.cost) & jnp.tile(whole, self._repeats)
+        finite = jnp.isfinite(played.cost) & jnp.tile(whole, self._episodes_per_direction)
         seen = (played.seen & finite)[:, None].astype(slopes.dtype)
         centred = (jnp.where(seen > 0, played.observations, mean[None, :, None]) - mean[None, :, None]) * seen
         shared = {

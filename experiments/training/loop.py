@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 
 from bgs import normalizer
-from experiments import stages
+from experiments import interrupts
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
@@ -52,7 +52,7 @@ def train(experiment: Experiment, run: Run, console: Console, ranks: Ranks = ALO
         run.open(experiment.config)
     with run.locked() if ranks.first else nullcontext():
         try:
-            return Session(experiment, run, console, ranks).train()
+            return TrainingRun(experiment, run, console, ranks).train()
         except OSError as error:  # of the measurements; checkpoints raise their own
             raise RunError(
                 f"{error.filename or run.metrics}: cannot be written: {error.strerror or error}; "
@@ -61,7 +61,7 @@ def train(experiment: Experiment, run: Run, console: Console, ranks: Ranks = ALO
             ) from error
 
 
-class Session:
+class TrainingRun:
     """A run between two starts of the program.
 
     state        after ``update`` updates
@@ -159,7 +159,7 @@ class Session:
         share = took / len(fetched)
         rows = [
             {"update": first + i, "seconds": round(self.seconds + (i + 1) * share, 4)}
-            | {name: _short(value) for name, value in row.items()}
+            | {name: _round(value) for name, value in row.items()}
             for i, row in enumerate(fetched)
         ]
         self.seconds += took
@@ -174,7 +174,7 @@ class Session:
         if log is None:
             return
         log.write(rows)
-        progress.show(self.update, len(rows), took, rows[-1]["return_rate"])
+        progress.updated(self.update, len(rows), took, rows[-1]["return_rate"])
         if time.monotonic() - self._saved[1] >= training.checkpoint_seconds:
             self._save(log)
 
@@ -277,7 +277,7 @@ def _of_first(ranks: Ranks, state: TrainState, notes: dict[str, Any]) -> tuple[T
     return jax.tree.unflatten(tree, whole), found
 
 
-def _short(value: ArrayLike) -> float | None:
+def _round(value: ArrayLike) -> float | None:
     """Six digits, None where not finite: JSON has no NaN."""
     number = float(np.asarray(value))
     return float(f"{number:.6g}") if np.isfinite(number) else None
@@ -289,10 +289,10 @@ def _stop_requests() -> Iterator[Callable[[], bool]]:
     received = []
 
     def note(number: int, _frame: FrameType | None) -> None:
-        stages.acted_on()
+        interrupts.mark_handled()
         received.append(number)
         if number == signal.SIGINT:
-            stages.say(
+            interrupts.write_line(
                 "Ctrl-C: saves a checkpoint and stops after this update or compilation; Ctrl-C again ends at once"
             )
         signal.signal(number, previous[signal.Signals(number)])

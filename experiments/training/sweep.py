@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from experiments.config import build
 from experiments.config.build import Experiment
@@ -22,6 +23,7 @@ from experiments.evaluation import evaluate
 from experiments.jobs import engine
 from experiments.jobs.engine import Setup
 from experiments.jobs.site import ALONE, Workers
+from experiments.progress import make_console
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
@@ -30,7 +32,7 @@ from experiments.training.finalize import finish
 from experiments.training.loop import train
 from experiments.training.ranks import Ranks
 
-WIDTH = 120  # [characters] of lines in a file
+WIDTH = 120  # [characters] of tables in a file
 SELECTION_EPISODES = 50  # Abeyruwan et al. 2022, appendix "Seed Selection for Rounds of Simulated Training"
 
 
@@ -95,7 +97,7 @@ def run_all(jobs: list[Job], console: Console, out: Path, workers: Workers = ALO
             result, failed = _run(job, console), False
         except Exception as error:  # even a bug in one job must not cost the night's other trainings
             if explained(error):
-                console.print(f"error: {error}", style="red", highlight=False, soft_wrap=True, markup=False)
+                console.print(f"error: {error}", style="red", soft_wrap=True)
             else:
                 console.print_exception()
             result, failed = f"{type(error).__name__}: {error}".splitlines()[0], True
@@ -112,7 +114,7 @@ def _run_side_by_side(jobs: list[Job], console: Console, out: Path, workers: Wor
     def note(name: str, state: str, result: str) -> None:
         outcomes[name] = (by_name[name], state, result)
         line = f"[{len(outcomes)}/{len(jobs)}] {name}: {'' if state == 'done' else 'failed: '}{result}"
-        console.print(line, style="red" if state == "failed" else None, highlight=False, soft_wrap=True, markup=False)
+        console.print(line, style="red" if state == "failed" else None, soft_wrap=True)
 
     left = []
     for name, job in by_name.items():
@@ -125,7 +127,6 @@ def _run_side_by_side(jobs: list[Job], console: Console, out: Path, workers: Wor
     if left:
         console.print(
             f"{len(left)} runs, {workers.text}; each writes its lines to {jobs[0].run.output.name} in its folder",
-            highlight=False,
             soft_wrap=True,
         )
         asked = max((c.devices for c in (job.config.training for job in jobs) if c.devices != "auto"), default=1)
@@ -148,7 +149,7 @@ def prepare() -> Callable[[Job], str]:
 def _run_into_file(job: Job) -> str:
     job.run.folder.mkdir(parents=True, exist_ok=True)
     with open(job.run.output, "a", encoding="utf-8") as file:
-        console = Console(file=file, width=WIDTH)
+        console = make_console(file, WIDTH)
         try:
             return _run(job, console)
         except Exception as error:
@@ -175,12 +176,12 @@ def run_together(job: Job, console: Console, ranks: Ranks) -> None:
     trained = bool(ranks.agree(ranks.first and run.trained(config))[0, 0])
     if not trained:
         reason = train(experiment, run, console, ranks)
-        console.print(f"{run.folder}: trained by {ranks.count} processes, ended by {reason}", highlight=False)
+        console.print(f"{run.folder}: trained by {ranks.count} processes, ended by {reason}")
     ranks.part()
     if not ranks.first:
         return
     if run.done(config):
-        console.print(f"{run.folder}: done before, skipped", highlight=False)
+        console.print(f"{run.folder}: done before, skipped")
     else:
         finish(experiment, run, console)
 
@@ -204,9 +205,7 @@ def select(folder: Path, jobs: list[Job], console: Console) -> None:
         "best": best,
     }
     run_dir.write_json(folder / SELECTION, selection)
-    console.print(
-        f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)", highlight=False
-    )
+    console.print(f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)")
 
 
 def _run(job: Job, console: Console) -> str:
@@ -215,11 +214,11 @@ def _run(job: Job, console: Console) -> str:
     run.check(config)
     if run.done(config):
         report = run.read_evaluation()
-        console.print(f"{run.folder}: done before, skipped", highlight=False)
+        console.print(f"{run.folder}: done before, skipped")
     else:
         if not run.trained(config):
             reason = train(experiment, run, console)
-            console.print(f"{run.folder}: trained, ended by {reason}", highlight=False)
+            console.print(f"{run.folder}: trained, ended by {reason}")
         report = finish(experiment, run, console)
     return f"{report['return_rate']:.1%} ({report['low']:.1%} to {report['high']:.1%})"
 
@@ -227,5 +226,5 @@ def _run(job: Job, console: Console) -> str:
 def _print_outcomes(outcomes: list[tuple[Job, str, str]], console: Console) -> None:
     table = Table("run", "", "return rate or error", title="Summary", title_justify="left")
     for job, state, result in outcomes:
-        table.add_row(str(job.run.folder), f"[{'green' if state == 'done' else 'red'}]{state}[/]", result)
+        table.add_row(str(job.run.folder), Text(state, "green" if state == "done" else "red"), result)
     console.print(table)

@@ -1,4 +1,4 @@
-"""Films of what was measured: sessions at the robot, and the balls of a diagnosis beside the models' flights."""
+"""Replays of what was measured: sessions at the robot, and the balls of a diagnosis beside the models' flights."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from ballmodel.trajectory import Trajectory
 from experiments.deploy import robot_attachment, session_logs
-from experiments.errors import ConfigError
-from experiments.view.film import RATE, Film, Series, next_landing
-from experiments.view.programme import Fixed
+from experiments.errors import ConfigError, checked
+from experiments.view.playlist import FixedPlaylist
+from experiments.view.replay import RATE, Replay, Series, next_landing
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.prediction.state_fit import SpinPrior, fit_states, fly_on, lift_known
@@ -30,10 +30,19 @@ TOLD = ("state", "operator")  # events besides warnings and faults
 VERDICT, EXTENDED = "verdict.json", "extended.yaml"
 
 
+def load(path: Path, model: str | None) -> FixedPlaylist:
+    """A session at the robot (an .mcap) or a diagnosis (a folder). Raises ConfigError."""
+    if path.is_dir():
+        if model is not None:
+            raise ConfigError(f"--model {model}: a diagnosis has its own two models")
+        return diagnosed(path)
+    return session(path, SimModel() if model is None else checked("--model", ModelFile.load, model).model)
+
+
 # -- sessions ----------------------------------------------------------------------------------------------------------
 
 
-def session(path: Path, model: SimModel) -> Fixed:
+def session(path: Path, model: SimModel) -> FixedPlaylist:
     """The episodes of a session, or all of it where there are none: measured joints and ball, what was commanded, what
     happened, and the ball as the model flies it on from the first moments of each flight.
 
@@ -48,9 +57,9 @@ def session(path: Path, model: SimModel) -> Fixed:
     flown = list(zip(strokes, _flights(strokes, model), strict=True))
     whole = Episode(1, float(log.joints.time[0]), float(log.joints.time[-1]), "", {}, {})
     episodes = log.episodes or (whole,)
-    films = [_episode(log, episode, flights, flown, robot) for episode in episodes]
+    replays = [_episode(log, episode, flights, flown, robot) for episode in episodes]
     captions = [f"{path.name}, episode {e.number} of {len(episodes)}" for e in episodes]
-    return Fixed([[film] for film in films], captions, robot)
+    return FixedPlaylist([[replay] for replay in replays], captions, robot)
 
 
 def played_by(log: SessionLog, path: Path) -> Robot:
@@ -77,7 +86,7 @@ def _episode(
     flights: Sequence[Trajectory],
     flown: Sequence[tuple[Trajectory, np.ndarray]],
     robot: Robot,
-) -> Film:
+) -> Replay:
     start = episode.start - BEFORE
     stop = min(float(log.joints.time[-1]), (episode.start + 2.0 if episode.end is None else episode.end) + AFTER)
     clock = np.arange(start, max(stop, start + 2 / RATE), 1.0 / RATE)
@@ -99,7 +108,7 @@ def _episode(
     events = [(e.time - start, _told(e.name, e.text, e.level)) for e in during]
     weights = {name: (float(value), 1.0) for name, value in episode.reward.items()}
     marks = np.concatenate([f.position.T[(f.time >= start) & (f.time <= stop)] for f in flights] or [np.empty((0, 3))])
-    return Film(
+    return Replay(
         time=clock - start,
         qpos=np.stack([_joint(log, j, clock, home) for j, home in enumerate(robot.home)], axis=1),
         balls={"measured": ball, "simulated": simulated},
@@ -149,7 +158,7 @@ def _told(name: str, text: str, level: Level) -> str:
 # -- diagnoses ---------------------------------------------------------------------------------------------------------
 
 
-def diagnosed(folder: Path) -> Fixed:
+def diagnosed(folder: Path) -> FixedPlaylist:
     """Measured flights of a diagnosis with those of its nominal and its extended model, the worst predicted first.
 
     Raises ConfigError where the logs that it was made from cannot be found or hold no balls.
@@ -166,15 +175,15 @@ def diagnosed(folder: Path) -> Fixed:
     order = np.argsort(-misses["nominal"])[:MOST]
     home = home_qpos(load_model())
     verdict = json.loads((folder / VERDICT).read_text(encoding="utf-8"))["verdict"]
-    films, captions = [], []
+    replays, captions = [], []
     for place, i in enumerate(order):
         t = strokes[i]
         clock = t.time[0] + np.arange(len(ways["nominal"][i])) / RATE
         measured = np.full((len(clock), 3), np.nan)
         _draw(measured, clock, t.time, t.position.T)
         text = ", ".join(f"{name} misses by {1e3 * misses[name][i]:.0f} mm" for name in ways)
-        films.append(
-            Film(
+        replays.append(
+            Replay(
                 time=clock - clock[0],
                 qpos=np.repeat(home[None], len(clock), axis=0),
                 balls={"measured": measured, **{name: flown[i] for name, flown in ways.items()}},
@@ -193,7 +202,7 @@ def diagnosed(folder: Path) -> Fixed:
             )
         )
         captions.append(f"{verdict}: {t.label}, {place + 1} of {len(order)}; {text}")
-    return Fixed([[film] for film in films], captions)
+    return FixedPlaylist([[replay] for replay in replays], captions)
 
 
 def _nominal(folder: Path, extended: ModelFile) -> SimModel:

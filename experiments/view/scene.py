@@ -12,7 +12,7 @@ import viser
 from mjviser import ViserMujocoScene
 
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
-from experiments.view.film import RATE, Film
+from experiments.view.replay import RATE, Replay
 from mjx_tt.env.outgoing_ball import FLOOR
 from mjx_tt.robot.model import PADDLE_SITE
 from mjx_tt.robot.robot import Robot
@@ -61,13 +61,13 @@ def segments(path: np.ndarray) -> np.ndarray:
     return pieces if len(pieces) else NOWHERE
 
 
-def first_ball(film: Film) -> np.ndarray:
+def first_ball(replay: Replay) -> np.ndarray:
     """Path (T, 3) of the ball that leaves the bright trail."""
-    return next(iter(film.balls.values()))
+    return next(iter(replay.balls.values()))
 
 
 class Scene:
-    """Shows one film per table."""
+    """Shows one replay per table."""
 
     def __init__(self, server: viser.ViserServer, count: int, robot: Robot) -> None:
         self.server, self.count = server, count
@@ -92,7 +92,7 @@ class Scene:
             plane_opacity=1.0,
             position=(0.0, 0.0, FLOOR),
         )
-        self._films: Sequence[Film] = ()
+        self._films: Sequence[Replay] = ()
         self._balls: dict[tuple[int, str], tuple[viser.IcosphereHandle, viser.MeshHandle]] = {}
         self._paddle_paths: list[np.ndarray] = []
         add = server.scene
@@ -160,10 +160,10 @@ class Scene:
         """x [m] of a table's middle."""
         return SPACING * table
 
-    def load(self, films: Sequence[Film]) -> None:
-        """Takes the films to show, one for each table."""
-        self._films = films
-        wanted = {(i, name) for i, film in enumerate(films) for name in film.balls}
+    def load(self, replays: Sequence[Replay]) -> None:
+        """Takes the replays to show, one for each table."""
+        self._films = replays
+        wanted = {(i, name) for i, replay in enumerate(replays) for name in replay.balls}
         for key in set(self._balls) - wanted:
             for part in self._balls.pop(key):
                 part.remove()
@@ -175,42 +175,42 @@ class Scene:
             ring = add.add_mesh_simple(f"/ring/{i}/{name}", shape.vertices, shape.faces, color=EDGE, side="back")
             self._balls[i, name] = ball, ring
         for name, way in self._ways.items():
-            paths = [segments(self._at(i, f.balls[name][::STRIDE])) for i, f in enumerate(films) if name in f.balls]
+            paths = [segments(self._at(i, f.balls[name][::STRIDE])) for i, f in enumerate(replays) if name in f.balls]
             way.points = np.concatenate(paths or [NOWHERE]).astype(np.float32)
-        marks = [self._at(i, film.marks) for i, film in enumerate(films) if len(film.marks)]
+        marks = [self._at(i, replay.marks) for i, replay in enumerate(replays) if len(replay.marks)]
         self._marks.points = np.concatenate(marks or [NOWHERE[0]]).astype(np.float32)
-        self._paddle_paths = [self._paddle_path(i, film) for i, film in enumerate(films)]
+        self._paddle_paths = [self._paddle_path(i, replay) for i, replay in enumerate(replays)]
 
     def show(self, t: float) -> None:
-        """Draws the moment ``t`` [s] of every film."""
+        """Draws the moment ``t`` [s] of every replay."""
         trails, paddles = [], []
-        frames = [film.frame(t) for film in self._films]
-        for i, (film, frame) in enumerate(zip(self._films, frames, strict=True)):
-            self._data.qpos[self._joints * i : self._joints * (i + 1)] = film.qpos[frame]
-            first = first_ball(film)
+        frames = [replay.frame(t) for replay in self._films]
+        for i, (replay, frame) in enumerate(zip(self._films, frames, strict=True)):
+            self._data.qpos[self._joints * i : self._joints * (i + 1)] = replay.qpos[frame]
+            first = first_ball(replay)
             behind = [max(0, frame - round(seconds * RATE)) for seconds in (BALL_TRAIL, PADDLE_TRAIL)]
             trails.append(segments(self._at(i, first[behind[0] : frame + 1 : STRIDE])))
             paddles.append(segments(self._paddle_paths[i][behind[1] // STRIDE : frame // STRIDE + 1]))
         mujoco.mj_kinematics(self._model, self._data)
         self._robots.update_from_mjdata(self._data)
         with self.server.atomic():
-            for i, (film, frame) in enumerate(zip(self._films, frames, strict=True)):
-                for name, path in film.balls.items():
+            for i, (replay, frame) in enumerate(zip(self._films, frames, strict=True)):
+                for name, path in replay.balls.items():
                     seen = bool(np.isfinite(path[frame]).all())
                     for part in self._balls[i, name]:
                         part.visible = seen
                         if seen:
                             part.position = self._at(i, path[frame])
-                landing = film.landing[frame] if len(film.landing) else np.full(2, np.nan)
+                landing = replay.landing[frame] if len(replay.landing) else np.full(2, np.nan)
                 self._landing[i].visible = bool(np.isfinite(landing).all())
                 if self._landing[i].visible:
                     self._landing[i].position = (self.offset(i) + landing[0], landing[1], 0.004)
-                at = first_ball(film)[frame]
+                at = first_ball(replay)[frame]
                 over = abs(at[0]) < TABLE_WIDTH / 2 and abs(at[1]) < TABLE_LENGTH / 2 and at[2] > 0.0
                 self._shadows[i].visible = bool(np.isfinite(at).all())
                 if self._shadows[i].visible:
                     self._shadows[i].position = (self.offset(i) + at[0], at[1], 0.003 if over else FLOOR + 0.003)
-                text = self._label(i, film, t)
+                text = self._label(i, replay, t)
                 if self._labels[i].text != text:
                     self._labels[i].text = text
             self._trail.points = np.concatenate(trails).astype(np.float32)
@@ -218,21 +218,21 @@ class Scene:
             self._paddle_trail.points = np.concatenate(paddles).astype(np.float32)
         self.server.flush()
 
-    def _label(self, table: int, film: Film, t: float) -> str:
+    def _label(self, table: int, replay: Replay, t: float) -> str:
         """Label above a table, short where labels stand beside each other; the panel has it in full."""
-        name = film.title if self.count <= NAMED else str(table + 1)
-        if not film.outcome or t < film.decided:
+        name = replay.title if self.count <= NAMED else str(table + 1)
+        if not replay.outcome or t < replay.decided:
             return name
         if self.count == 1:
-            return f"{name}\n{film.outcome}"  # a line each: a phone has no room for both in one
-        return f"{name}: {film.outcome.partition(',')[0]}"
+            return f"{name}\n{replay.outcome}"  # a line each: a phone has no room for both in one
+        return f"{name}: {replay.outcome.partition(',')[0]}"
 
     def _at(self, table: int, position: np.ndarray) -> np.ndarray:
         return np.asarray(position) + np.array([self.offset(table), 0.0, 0.0])
 
-    def _paddle_path(self, table: int, film: Film) -> np.ndarray:
+    def _paddle_path(self, table: int, replay: Replay) -> np.ndarray:
         path = []
-        for qpos in film.qpos[::STRIDE]:
+        for qpos in replay.qpos[::STRIDE]:
             self._data.qpos[self._joints * table : self._joints * (table + 1)] = qpos
             mujoco.mj_kinematics(self._model, self._data)
             path.append(self._data.site_xpos[self._paddles[table]].copy())

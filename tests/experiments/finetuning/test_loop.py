@@ -32,7 +32,7 @@ from experiments.errors import ConfigError, RunError
 from experiments.finetuning import loop
 from experiments.finetuning import report as finetune_report
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journal
-from experiments.finetuning.robot import LockStepRobot, NoOperator, PlayedBall
+from experiments.finetuning.robot import LockStepRobot, Operator, PlayedBall
 from experiments.runs import checkpoint, load_policy, metrics
 from experiments.runs.run_dir import Run
 from experiments.stats import t_interval, welch_interval
@@ -397,7 +397,7 @@ def test_a_finished_run_goes_on_when_more_updates_are_asked_for(source, tmp_path
 # The operator
 
 
-class Person(NoOperator):
+class Person(Operator):
     """Discards the balls of these numbers, stops after so many balls, pauses for some looks once."""
 
     def __init__(self, discards=(), stop_after: int | None = None, looks: int = 0) -> None:

@@ -36,7 +36,7 @@ def pool():
 
 
 def trainer_on(devices, pool, config=BGS, repeats=REPEATS):
-    return FirstOrderTrainer(Simulator(TASK, devices), config, pool, SimModel(), repeats=repeats)
+    return FirstOrderTrainer(Simulator(TASK, devices), config, pool, SimModel(), episodes_per_direction=repeats)
 
 
 @pytest.fixture(scope="module")

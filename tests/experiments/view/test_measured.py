@@ -1,4 +1,4 @@
-"""Films of a diagnosis: flights of a model that is known to be wrong, beside one that is known to be right."""
+"""Replays of a diagnosis: flights of a model that is known to be wrong, beside one that is known to be right."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ def folder(tmp_path):
 
 
 def test_the_extended_model_meets_the_measured_balls_and_the_nominal_one_misses_them(folder):
-    programme = measured.diagnosed(folder)
-    assert programme.count == 6 and programme.caption(0).startswith("the table is dead: trajectory s/")
+    playlist = measured.diagnosed(folder)
+    assert playlist.count == 6 and playlist.caption(0).startswith("the table is dead: trajectory s/")
     for n in range(6):
-        (film,) = programme.films(n)
-        last = np.isfinite(film.balls["measured"][:, 0]).nonzero()[0][-1]
-        true = film.balls["measured"][last]
-        assert np.linalg.norm(film.balls["extended"][last] - true) < 0.003
-        assert np.linalg.norm(film.balls["nominal"][last] - true) > 0.05
-        told = re.search(r"; nominal misses by (\d+) mm, extended misses by (\d+) mm$", programme.caption(n))
+        (replay,) = playlist.replays(n)
+        last = np.isfinite(replay.balls["measured"][:, 0]).nonzero()[0][-1]
+        true = replay.balls["measured"][last]
+        assert np.linalg.norm(replay.balls["extended"][last] - true) < 0.003
+        assert np.linalg.norm(replay.balls["nominal"][last] - true) > 0.05
+        told = re.search(r"; nominal misses by (\d+) mm, extended misses by (\d+) mm$", playlist.caption(n))
         for name, number in zip(("nominal", "extended"), told.groups(), strict=True):
-            assert abs(1e-3 * int(number) - np.linalg.norm(film.balls[name][last] - true)) < 0.03
+            assert abs(1e-3 * int(number) - np.linalg.norm(replay.balls[name][last] - true)) < 0.03
 
 
 def test_a_log_that_is_gone_is_named(folder):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.deploy import session
+from experiments.deploy import play
 from experiments.errors import RunError
 from experiments.study.analysis import scoring
 from experiments.study.target_domain import evaluation_on_robot
@@ -113,7 +113,7 @@ def run(tmp_path):
 def step_of(run, monkeypatch, plan, rallies=10):
     """The step of a zero-shot policy, and the sessions that it will have."""
     rig, folder = Sessions(plan), run.parent / "rallies"
-    monkeypatch.setattr(session, "run", rig.run)
+    monkeypatch.setattr(play, "run", rig.run)
     monkeypatch.setattr(evaluation_on_robot, "exported", lambda trained, console: run)
     who = (0, "player3", "player3", "zero_shot")
     return rally_step(folder, who, lambda: run, (), rallies, Console(file=io.StringIO())), rig
@@ -132,7 +132,7 @@ def test_a_failed_evaluation_goes_on_with_what_it_played(run, monkeypatch):
     assert (~counted.filtered).sum() == 10
 
 
-@pytest.mark.parametrize("end", [session.INTERRUPTED, OSError("the pipe broke"), None])
+@pytest.mark.parametrize("end", [play.INTERRUPTED, OSError("the pipe broke"), None])
 def test_a_session_that_is_stopped_or_raises_counts_if_it_has_a_report(run, monkeypatch, end):
     step, rig = step_of(run, monkeypatch, [(4, end), (9, 0), (1, 0)])
     with pytest.raises((KeyboardInterrupt, OSError, RefusedError)):

@@ -1,4 +1,4 @@
-"""Films of simulated balls against the rollouts of the Python face."""
+"""Replays of simulated balls against the rollouts of the Python face."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 
 import mjx_tt
 from ballmodel import registry
-from experiments.commands.render import SHIPPED
-from experiments.view.programme import Play
-from experiments.view.studio import Studio, sliders
+from experiments.commands.options import SHIPPED_POLICY
+from experiments.view.playlist import PolicyPlaylist
+from experiments.view.recorder import Recorder, slider_groups
 from mjx_tt.env.task import MISSED, RETURNED, TaskConfig
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.sim.model import ModelFile, Range, Samples, SimModel, with_values
@@ -22,55 +22,55 @@ CHANGED = {"ball.table.restitution": 0.7, "latency.abb_action": 0.1, "drives.joi
 
 @pytest.fixture(scope="module")
 def play():
-    studio = Studio(TaskConfig(sim_rate=150.0), ModelFile(SimModel()))
-    policy = mjx_tt.load_policy(SHIPPED)
-    return Play(studio, ["one", "other"], [policy, policy], registry.load("player3/M0"))
+    recorder = Recorder(TaskConfig(sim_rate=150.0), ModelFile(SimModel()))
+    policy = mjx_tt.load_policy(SHIPPED_POLICY)
+    return PolicyPlaylist(recorder, ["one", "other"], [policy, policy], registry.load("player3/M0"))
 
 
 def face(play, values):
     """Terms and outcomes of the first balls as ``Simulator.rollout`` plays them in the world with these values."""
     numbers = range(8)
     states = np.stack([play.state(n) for n in numbers], axis=1)
-    world = Studio(play.studio.simulator.config, ModelFile(with_values(SimModel(), values)))
+    world = Recorder(play.recorder.simulator.config, ModelFile(with_values(SimModel(), values)))
     episodes = world.episodes(world.draws(states, numbers, play.seed), {})
     episodes = jax.tree.map(lambda x: x[..., :, None] if jnp.ndim(x) else x, episodes)
     policy = play.policies[0]
     single = mjx_tt.Policy(policy.theta[:, None], policy.mean, policy.inv_std)
-    return mjx_tt.Simulator(play.studio.simulator.config).rollout(single, episodes)
+    return mjx_tt.Simulator(play.recorder.simulator.config).rollout(single, episodes)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("values", [{}, CHANGED], ids=["nominal", "moved"])
 def test_a_film_shows_what_the_rollout_does(play, values):
-    play.values = play.studio.nominal() | values
-    play.changed()
+    play.values = play.recorder.nominal() | values
+    play.clear()
     rollout = face(play, values)
     for n in range(8):
-        film = play.films(n)[0]
-        terms = np.array([value for value, _ in film.terms.values()])
+        replay = play.replays(n)[0]
+        terms = np.array([value for value, _ in replay.terms.values()])
         np.testing.assert_allclose(terms, np.asarray(rollout.terms)[:, n, 0], atol=2e-3)
-        assert film.outcome.startswith("returned") == (int(rollout.outcome[n, 0]) == RETURNED)
+        assert replay.outcome.startswith("returned") == (int(rollout.outcome[n, 0]) == RETURNED)
 
 
 def test_a_moved_slider_changes_the_play_and_compiles_nothing(play):
-    play.values = play.studio.nominal()
-    play.changed()
-    before = play.films(0)
+    play.values = play.recorder.nominal()
+    play.clear()
+    before = play.replays(0)
     np.testing.assert_array_equal(before[0].qpos, before[1].qpos)  # the same policy at both tables
-    programs = play.studio._record._cache_size()
+    programs = play.recorder._record._cache_size()
     for path, value in CHANGED.items():
-        play.values = play.studio.nominal() | {path: value}
-        play.changed()
-        assert np.abs(play.films(0)[0].qpos[:200] - before[0].qpos[:200]).max() > 1e-3, path
-    assert play.studio._record._cache_size() == programs == 1
+        play.values = play.recorder.nominal() | {path: value}
+        play.clear()
+        assert np.abs(play.replays(0)[0].qpos[:200] - before[0].qpos[:200]).max() > 1e-3, path
+    assert play.recorder._record._cache_size() == programs == 1
 
 
 def test_inputs_and_outputs_are_the_policys(play):
     """The shipped network, applied to the recorded inputs, gives the recorded outputs."""
-    play.values = play.studio.nominal()
-    play.changed()
-    film = play.films(0)[0]
-    ball, joints, output = film.series.values()
+    play.values = play.recorder.nominal()
+    play.clear()
+    replay = play.replays(0)[0]
+    ball, joints, output = replay.series.values()
     seen = np.concatenate([ball.values, joints.values], axis=1).T
     assert joints.names == JOINT_NAMES
     history = np.concatenate([np.repeat(seen[:, :1], 7, axis=1), seen], axis=1)
@@ -79,51 +79,51 @@ def test_inputs_and_outputs_are_the_policys(play):
 
 
 def test_balls_that_it_misses_are_missed_again_when_they_are_shown(play):
-    play.values = play.studio.nominal() | {"latency.ball_observation": 0.09}
+    play.values = play.recorder.nominal() | {"latency.ball_observation": 0.09}
     assert play.find_missed() > 0
-    assert all(not play.films(n)[0].outcome.startswith("returned") for n in range(len(play.missed)))
+    assert all(not play.replays(n)[0].outcome.startswith("returned") for n in range(len(play.missed)))
     play.missed = []
 
 
 def test_a_randomised_parameter_is_drawn_until_its_slider_is_moved():
     path = "ball.table.restitution"
-    studio = Studio(TaskConfig(), ModelFile(SimModel(), (Range(path, 0.8, 0.9),)))
-    draws = studio.draws(np.zeros((9, 6)), range(6), 0)
-    drawn = np.asarray(studio.model(draws, studio.nominal()).ball.table.restitution)
+    recorder = Recorder(TaskConfig(), ModelFile(SimModel(), (Range(path, 0.8, 0.9),)))
+    draws = recorder.draws(np.zeros((9, 6)), range(6), 0)
+    drawn = np.asarray(recorder.model(draws, recorder.nominal()).ball.table.restitution)
     assert len(set(drawn)) == 6 and (drawn >= 0.8).all() and (drawn <= 0.9).all()
-    moved = studio.model(draws, studio.nominal() | {path: 0.5})
+    moved = recorder.model(draws, recorder.nominal() | {path: 0.5})
     np.testing.assert_allclose(moved.ball.table.restitution, 0.5)
 
 
 def test_samples_are_shown_row_by_row():
     paths, values = ("ball.table.restitution", "ball.table.height"), np.array([[0.8, 0.001], [0.9, 0.002]])
-    studio = Studio(TaskConfig(), ModelFile(SimModel(), (Samples(paths, values, np.array([1.0, 3.0])),)))
-    table = studio.model(studio.draws(np.zeros((9, 40)), range(40), 0), studio.nominal()).ball.table
+    recorder = Recorder(TaskConfig(), ModelFile(SimModel(), (Samples(paths, values, np.array([1.0, 3.0])),)))
+    table = recorder.model(recorder.draws(np.zeros((9, 40)), range(40), 0), recorder.nominal()).ball.table
     rows = set(zip(np.round(table.restitution, 6).tolist(), np.round(table.height, 6).tolist(), strict=True))
     assert len(rows) == 2 and np.mean(np.asarray(table.restitution) > 0.85) > 0.5
-    assert np.isnan(studio.nominal()["ball.table.restitution"])
+    assert np.isnan(recorder.nominal()["ball.table.restitution"])
 
 
 def test_every_slider_is_a_parameter_of_the_model():
-    nominal = Studio(TaskConfig(), ModelFile(SimModel())).nominal()
-    for p in sliders():
+    nominal = Recorder(TaskConfig(), ModelFile(SimModel())).nominal()
+    for p in (slider for group in slider_groups().values() for slider in group):
         assert p.low <= nominal[p.path] / p.unit <= p.high, p.path
 
 
 @pytest.mark.slow
 def test_a_rally_is_shown_as_the_simulator_plays_it(play):
-    play.values, play.missed = play.studio.nominal(), []
+    play.values, play.missed = play.recorder.nominal(), []
     play.player = "player3"
     try:
         for n in range(6):
-            films = play.films(n)
+            replays = play.replays(n)
             rally = play._rallying()
             shot = rally.shots[n]
-            for i, film in enumerate(films):
-                assert film.outcome.startswith("missed") == (int(shot.outcome[i]) == MISSED)
+            for i, replay in enumerate(replays):
+                assert replay.outcome.startswith("missed") == (int(shot.outcome[i]) == MISSED)
                 if End(int(shot.end[i])) is End.NONE:
-                    assert abs(film.seconds - float(shot.seconds[i])) < 0.02
+                    assert abs(replay.seconds - float(shot.seconds[i])) < 0.02
                     ball = np.asarray(rally.shots[n].ball.position)[:, i]
-                    np.testing.assert_allclose(film.balls["ball"][0], ball, atol=1e-6)
+                    np.testing.assert_allclose(replay.balls["ball"][0], ball, atol=1e-6)
     finally:
         play.player = None

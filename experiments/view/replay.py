@@ -23,7 +23,7 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Film:
+class Replay:
     """One ball at one table.
 
     time     (T,) [s] from the start
@@ -61,7 +61,7 @@ class Film:
         return int(np.clip(np.searchsorted(self.time, t + 1e-9) - 1, 0, len(self.time) - 1))
 
 
-def upsampled(position: np.ndarray, velocity: np.ndarray, period: float, factor: int) -> np.ndarray:
+def upsample(position: np.ndarray, velocity: np.ndarray, period: float, factor: int) -> np.ndarray:
     """A ball's path (n, 3) [m] at ``factor`` times the rate, (factor (n - 1) + 1, 3).
 
     Between ticks without a contact it is the cubic through positions and velocities; with one, the two straight lines

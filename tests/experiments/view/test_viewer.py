@@ -24,12 +24,13 @@ from viser.transforms import SO3
 from ballmodel import registry
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from experiments import cli
-from experiments.commands.render import SHIPPED
+from experiments.commands.options import SHIPPED_POLICY
 from experiments.runs import load_policy
-from experiments.view import show
-from experiments.view.guard import Server
-from experiments.view.programme import Play
-from experiments.view.studio import Studio
+from experiments.view import measured
+from experiments.view import viewer as viewers
+from experiments.view.auth import Server
+from experiments.view.playlist import PolicyPlaylist
+from experiments.view.recorder import Recorder
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.robot.model import home_qpos, load_model
 from mjx_tt.sim.model import ModelFile, SimModel
@@ -91,12 +92,12 @@ def open_page(browser):
 
 @pytest.fixture
 def shown():
-    """Serves a programme and returns its viewer and address; stopped after the test."""
+    """Serves a playlist and returns its viewer and address; stopped after the test."""
     running = []
 
-    def serve(programme):
+    def serve(playlist):
         server = Server("127.0.0.1", 0)
-        viewer = show.viewer(server, programme)
+        viewer = viewers.Viewer(server, playlist)
         running.append((server, viewer, threading.Thread(target=viewer.run, daemon=True)))
         running[-1][2].start()
         return viewer, f"http://127.0.0.1:{server.get_port()}/"
@@ -109,14 +110,14 @@ def shown():
 
 
 @pytest.fixture(scope="module")
-def studio():
-    return Studio(TaskConfig(sim_rate=150.0), ModelFile(SimModel()))
+def recorder():
+    return Recorder(TaskConfig(sim_rate=150.0), ModelFile(SimModel()))
 
 
 @pytest.fixture
-def play(studio):
-    policy = load_policy.load(SHIPPED).policy
-    return Play(studio, ["quickstart"], [policy], registry.load("player3/M0"))
+def play(recorder):
+    policy = load_policy.load(SHIPPED_POLICY).policy
+    return PolicyPlaylist(recorder, ["quickstart"], [policy], registry.load("player3/M0"))
 
 
 def picture(page) -> np.ndarray:
@@ -169,15 +170,15 @@ def test_a_slider_moved_in_the_page_changes_what_the_simulation_does(shown, open
     thumb(page, "table's restitution").press("Home")
     until(lambda: play.values[RESTITUTION] == pytest.approx(0.5), "the slider's low end in the simulation")
     assert float(box.input_value()) == pytest.approx(0.5)
-    until(lambda: viewer.shown[0].balls["ball"] is not before, "a new film")
+    until(lambda: viewer.shown[0].balls["ball"] is not before, "a new replay")
     after = viewer.shown[0].balls["ball"]
     bounce = int(np.argmin(before[: len(before) // 2, 2]))
     np.testing.assert_allclose(after[: bounce - 8], before[: bounce - 8], atol=1e-5)  # the same flight until then
     rise = [np.diff(path[:, 2])[bounce + 5 : bounce + 20].mean() for path in (before, after)]
     assert rise[1] < 0.75 * rise[0]
     page.get_by_role("button", name="As the model has it").click()
-    until(lambda: play.values == play.studio.nominal(), "all values as before")
-    until(lambda: np.array_equal(viewer.shown[0].balls["ball"], before), "the film as before")
+    until(lambda: play.values == play.recorder.nominal(), "all values as before")
+    until(lambda: np.array_equal(viewer.shown[0].balls["ball"], before), "the replay as before")
 
 
 def test_steps_balls_and_misses_are_chosen_in_the_page(shown, open_page, play):
@@ -191,7 +192,7 @@ def test_steps_balls_and_misses_are_chosen_in_the_page(shown, open_page, play):
     step = [page.get_by_role("button", name=name, exact=True) for name in ("▶", "◀")]
     step[0].click()
     until(lambda: viewer.t == pytest.approx(1 / 75, abs=1e-6), "one control tick later")
-    viewer.later("rest", lambda: setattr(viewer, "t", viewer.seconds + 0.3))  # it rests on the last frame
+    viewer.enqueue("rest", lambda: setattr(viewer, "t", viewer.seconds + 0.3))  # it rests on the last frame
     until(lambda: viewer.t > viewer.seconds, "the rest after the ball")
     step[0].click()
     until(lambda: viewer.t == pytest.approx(viewer.seconds, abs=1e-6), "the end")
@@ -221,9 +222,9 @@ def pixel(client, point: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [WIDE, NARROW], ids=["wide", "narrow"])
-def test_four_tables_fit_into_the_picture_and_the_panel_says_whose_they_are(shown, open_page, studio, size):
-    policy, names = load_policy.load(SHIPPED).policy, ["one", "two", "three", "four"]
-    viewer, address = shown(Play(studio, names, [policy] * 4, registry.load("player3/M0")))
+def test_four_tables_fit_into_the_picture_and_the_panel_says_whose_they_are(shown, open_page, recorder, size):
+    policy, names = load_policy.load(SHIPPED_POLICY).policy, ["one", "two", "three", "four"]
+    viewer, address = shown(PolicyPlaylist(recorder, names, [policy] * 4, registry.load("player3/M0")))
     page = open_page(address, size)
     until(lambda: viewer.server.get_clients(), "the page's connection")
     (client,) = viewer.server.get_clients().values()
@@ -279,7 +280,7 @@ def test_the_start_of_the_ball_is_dragged(shown, open_page, play):
     until(lambda: start[0] - play.ball[0] > 0.2 * along[0], "its new start")
     assert start[0] - play.ball[0] < 1.4 * along[0] + 0.05
     np.testing.assert_allclose(play.ball[1:], start[1:], atol=1e-3)
-    until(lambda: abs(viewer.shown[0].balls["ball"][0, 0] - play.ball[0]) < 1e-4, "its film")
+    until(lambda: abs(viewer.shown[0].balls["ball"][0, 0] - play.ball[0]) < 1e-4, "its replay")
 
 
 def test_a_session_of_the_robot_is_replayed(shown, open_page, tmp_path):
@@ -297,14 +298,14 @@ def test_a_session_of_the_robot_is_replayed(shown, open_page, tmp_path):
             recorder.put(log.Command(k, now, np.zeros(8), np.full(8, 0.1), joints))
         recorder.put(log.Event(start + 0.7, log.Level.ERROR, "fault", "tracker: silent"))
         recorder.put(log.episode_end(start + 1.2, 1, "missed", {"hit": 0.0}))
-    programme = show.recorded(path, None)
-    film = programme.films(0)[0]
-    np.testing.assert_allclose(film.qpos[:, 2], home[2] + 0.2 * np.sin(2 * np.pi * film.time), atol=1e-3)
-    measured, simulated = film.balls["measured"], film.balls["simulated"]
-    flying = np.isfinite(measured[:, 0]) & np.isfinite(simulated[:, 0])
-    np.testing.assert_allclose(measured[flying, 1], 1.2 - 4.0 * film.time[flying], atol=1e-3)
-    assert np.abs(measured - simulated)[flying].max() < 0.1  # the logged ball knows no air
-    viewer, address = shown(programme)
+    playlist = measured.load(path, None)
+    replay = playlist.replays(0)[0]
+    np.testing.assert_allclose(replay.qpos[:, 2], home[2] + 0.2 * np.sin(2 * np.pi * replay.time), atol=1e-3)
+    seen, simulated = replay.balls["measured"], replay.balls["simulated"]
+    flying = np.isfinite(seen[:, 0]) & np.isfinite(simulated[:, 0])
+    np.testing.assert_allclose(seen[flying, 1], 1.2 - 4.0 * replay.time[flying], atol=1e-3)
+    assert np.abs(seen - simulated)[flying].max() < 0.1  # the logged ball knows no air
+    viewer, address = shown(playlist)
     page = open_page(address)
     moving(page)
     assert page.get_by_text("session.mcap, episode 1 of 1").count() == 1
@@ -322,7 +323,7 @@ evaluation: {episodes: 8, reachable_balls: null}
 """
 
 
-def test_a_training_is_followed_while_it_goes_on(shown, open_page, tmp_path, studio):
+def test_a_training_is_followed_while_it_goes_on(shown, open_page, tmp_path, recorder):
     (tmp_path / "tiny.yaml").write_text(TRAINING)
     command = [sys.executable, "-m", "experiments.cli", "train", str(tmp_path / "tiny.yaml"), "--out", str(tmp_path)]
     training = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -330,9 +331,9 @@ def test_a_training_is_followed_while_it_goes_on(shown, open_page, tmp_path, stu
         folder = tmp_path / "tiny"
         until(lambda: any((folder / "checkpoints").glob("*.npz")), "a checkpoint")
         trained = load_policy.load(folder)
-        play = Play(studio, [show.title(trained)], [trained.policy], registry.load("player5/M0"))
+        play = PolicyPlaylist(recorder, [viewers.title_of(trained)], [trained.policy], registry.load("player5/M0"))
         viewer, address = shown(play)
-        show.Followed(folder, viewer, play)
+        viewers.follow_training(folder, viewer)
         page = open_page(address)
         moving(page)
         first = viewer.shown[0]
