@@ -81,10 +81,8 @@ class Sessions:
     def __init__(self, plan) -> None:
         self.plan, self.chances, self.asked, self.length = list(plan), [], [], 0
 
-    def run(
-        self, artefact, robot, balls, distribution, backend, folder, params, seed, seconds, console, rallies, player
-    ):
-        self.chances.append(seed)
+    def run(self, artefact, robot, folder, console, setup, rallies):
+        self.chances.append(setup.seed)
         self.asked.append(rallies)
         count, end = self.plan.pop(0)
         told = [self._rally("FIRST_NET", True)]  # each session has one that is filtered
