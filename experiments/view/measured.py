@@ -12,7 +12,7 @@ from ballmodel.trajectory import Trajectory
 from experiments.deploy import robot_attachment, session_logs
 from experiments.errors import ConfigError, checked
 from experiments.view.playlist import FixedPlaylist
-from experiments.view.replay import RATE, Replay, Series, next_landing
+from experiments.view.replay import RATE, Replay, Series
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.prediction.state_fit import SpinPrior, fit_states, fly_on, lift_known
@@ -35,14 +35,14 @@ def load(path: Path, model: str | None) -> FixedPlaylist:
     if path.is_dir():
         if model is not None:
             raise ConfigError(f"--model {model}: a diagnosis has its own two models")
-        return diagnosed(path)
-    return session(path, SimModel() if model is None else checked("--model", ModelFile.load, model).model)
+        return load_diagnosis(path)
+    return load_session(path, SimModel() if model is None else checked("--model", ModelFile.load, model).model)
 
 
 # -- sessions ----------------------------------------------------------------------------------------------------------
 
 
-def session(path: Path, model: SimModel) -> FixedPlaylist:
+def load_session(path: Path, model: SimModel) -> FixedPlaylist:
     """The episodes of a session, or all of it where there are none: measured joints and ball, what was commanded, what
     happened, and the ball as the model flies it on from the first moments of each flight.
 
@@ -52,7 +52,7 @@ def session(path: Path, model: SimModel) -> FixedPlaylist:
     if log.joints.time.size < 2:
         raise ConfigError(f"{path}: holds no joints")
     flights = session_logs.flights(log)
-    robot = played_by(log, path)
+    robot = find_robot(log, path)
     strokes = [t for t in clean(flights)[0] if t.time[-1] - t.time[0] > FITTED] if flights else []
     flown = list(zip(strokes, _flights(strokes, model), strict=True))
     whole = Episode(1, float(log.joints.time[0]), float(log.joints.time[-1]), "", {}, {})
@@ -62,7 +62,7 @@ def session(path: Path, model: SimModel) -> FixedPlaylist:
     return FixedPlaylist([[replay] for replay in replays], captions, robot)
 
 
-def played_by(log: SessionLog, path: Path) -> Robot:
+def find_robot(log: SessionLog, path: Path) -> Robot:
     """The robot of a session, to be drawn: that in its log, or one that comes with the program. Raises ConfigError."""
     name, kept = log.robot.robot, log.attachments.get(robot_attachment.NAME)
     if kept is not None:
@@ -115,7 +115,6 @@ def _episode(
         title="measured (yellow), simulated (blue)",
         outcome=episode.outcome,
         decided=(episode.end or stop) - start,
-        landing=next_landing(simulated),
         marks=marks,
         series={heading: curves for heading, curves in series.items() if curves.time.size > 1},
         terms=weights,
@@ -158,7 +157,7 @@ def _told(name: str, text: str, level: Level) -> str:
 # -- diagnoses ---------------------------------------------------------------------------------------------------------
 
 
-def diagnosed(folder: Path) -> FixedPlaylist:
+def load_diagnosis(folder: Path) -> FixedPlaylist:
     """Measured flights of a diagnosis with those of its nominal and its extended model, the worst predicted first.
 
     Raises ConfigError where the logs that it was made from cannot be found or hold no balls.
@@ -189,7 +188,6 @@ def diagnosed(folder: Path) -> FixedPlaylist:
                 balls={"measured": measured, **{name: flown[i] for name, flown in ways.items()}},
                 title="measured (yellow), nominal (red), extended (green)",
                 decided=float(t.time[-1] - t.time[0]),
-                landing=next_landing(ways["extended"][i]),
                 marks=t.position.T,
                 series={
                     f"{axis} [m]": Series(

@@ -14,7 +14,7 @@ from ballmodel import registry
 from ballmodel.sampling import sample_pool
 from experiments.config import build
 from experiments.view.recorder import LANES, Recorder
-from experiments.view.replay import Replay, next_landing
+from experiments.view.replay import Replay
 from mjx_tt.env.episode import MISSED, RETURNED
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
@@ -210,10 +210,9 @@ class Rally:
             home, limits = self._simulator.task.home, self._simulator.task.contract.limits
             qpos[hit:] = np.asarray(homeward(home, at_hit, seconds, limits)).T[hit : last + 1]
         balls = {"ball": replay.balls["ball"][: last + 1]}
-        landing = next_landing(balls["ball"])
         outcome = f"{replay.outcome}; {text}"
         time = replay.time[: last + 1]
-        return replace(replay, time=time, qpos=qpos, balls=balls, landing=landing, outcome=outcome)
+        return replace(replay, time=time, qpos=qpos, balls=balls, outcome=outcome)
 
 
 def _words(end: End) -> str:

@@ -18,7 +18,7 @@ from jax import Array
 from ballmodel import flight
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, where
-from experiments.view.replay import RATE, Replay, Series, next_landing, upsample
+from experiments.view.replay import RATE, Replay, Series, upsample
 from mjx_tt import platform
 from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes, TaskConfig
 from mjx_tt.env.outgoing_ball import fly_out
@@ -239,7 +239,6 @@ class Recorder:
             outcome=text,
             decided=over * period,
             contact=over * period if r["hit"] else float("nan"),
-            landing=next_landing(ball),
             series={
                 "Input: ball as seen [m]": Series(("x", "y", "z"), ticks[played], seen[:, :3]),
                 "Input: joints as seen [m, rad]": Series(joints, ticks[played], seen[:, 3:]),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
+from ballmodel.io.atomic_files import replacing
 from mjx_tt.robot.model import load_model
 from mjx_tt.viz.caption import Caption
 from mjx_tt.viz.opengl import offscreen
@@ -72,8 +72,8 @@ def render_png(
     """
     path = _checked_path(path, (".png",))
     (frame,) = render_frames([moment], camera, size, model)
-    with _replacing(path) as temporary:
-        Image.fromarray(frame).save(temporary)
+    with replacing(path) as temporary:
+        Image.fromarray(frame).save(temporary, format="PNG")
 
 
 def render_video(
@@ -96,7 +96,7 @@ def render_video(
     if path.suffix == ".gif" and fps * _GIF_MIN_DELAY > 1.0 + 1e-9:
         raise ValueError(f"viewers show a GIF at {1.0 / _GIF_MIN_DELAY:.0f} frames per second at most, got fps {fps}")
     frames = render_frames(moments, camera, size, model)
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         (_write_gif if path.suffix == ".gif" else _write_mp4)(temporary, frames, fps)
 
 
@@ -144,7 +144,8 @@ def camera_names(model: mujoco.MjModel | None = None) -> list[str]:
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    with imageio.get_writer(path, fps=fps, codec="libx264", quality=8, macro_block_size=2) as writer:
+    options = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "output_params": ["-f", "mp4"]}
+    with imageio.get_writer(path, format="FFMPEG", fps=fps, **options) as writer:  # type: ignore[arg-type]
         for frame in frames:
             writer.append_data(frame)  # type: ignore[attr-defined]  # annotated as the base of readers and writers
 
@@ -161,7 +162,7 @@ def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     # Rounding the time of each frame, not its duration, keeps the video in real time.
     times = np.round(np.arange(len(images) + 1) / fps / _GIF_TICK)
     durations = [int(d) for d in np.diff(times) * _GIF_TICK * 1000]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
+    images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=durations, loop=0)
 
 
 def _add_ball(scene: mujoco.MjvScene, eye: np.ndarray, moment: Moment) -> None:
@@ -260,14 +261,3 @@ def _checked_array(name: str, values: np.ndarray, shape: tuple[int | None, ...])
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise ValueError(f"{name} needs the shape ({wanted}), got {values.shape}")
     return values
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A temporary file beside path, which replaces path when the block ends without an error."""
-    temporary = path.with_name(f".{path.stem}-{os.getpid()}{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -98,7 +98,7 @@ def test_the_viewers_layout_and_frames_are_the_robots(played):
     layout = json.loads(open(summary["layout"]).read())
     labels = [line["label"] for line in layout["configById"]["Plot!commands"]["paths"]]
     assert labels == [f"{name} sent" for name in robot.contract.joints]
-    replays = measured.session(path, SimModel())
+    replays = measured.load_session(path, SimModel())
     assert robot_of(replays) == robot and replays.count == BALLS
     (replay,) = replays.replays(0)
     assert replay.qpos.shape[1] == robot.contract.n_joints and np.isfinite(replay.qpos).all()
@@ -167,7 +167,7 @@ def test_a_session_of_a_robot_without_its_mjcf_is_not_shown(tmp_path):
     own = SimpleNamespace(name="mine", contract=contract)
     path = made_up(tmp_path, own)
     with pytest.raises(ConfigError, match="a session of mine, whose MJCF is not in the log"):
-        measured.session(path, SimModel())
+        measured.load_session(path, SimModel())
 
 
 def test_the_robot_of_a_policy_must_be_that_of_its_contract(tmp_path):

@@ -62,7 +62,7 @@ def folder(tmp_path):
 
 def drawn(robot):
     """The scene of the viewer, and its corners of meshes."""
-    model = scene.tables(1, robot)
+    model = scene.build_tables(1, robot)
     return model, [model.mesh(name).vertnum[0] for name in ("hood", "cap")]
 
 
@@ -138,7 +138,7 @@ def test_another_robot_than_the_sessions_is_refused(tmp_path):
         for k in range(2):
             recorder.put(log.Joints(k / 75, np.zeros(7), np.zeros(7)))
     with pytest.raises(ConfigError, match="robot.zip: a robot with the joints rail, .* allowed: the session's, joint1"):
-        measured.session(tmp_path / "a.mcap", SimModel())
+        measured.load_session(tmp_path / "a.mcap", SimModel())
 
 
 @pytest.mark.realtime
@@ -158,7 +158,7 @@ def test_a_session_on_the_rig_is_shown_when_the_robots_folder_is_gone(folder, tm
     shutil.rmtree(folder.parent)
     shutil.rmtree(tmp_path / "artefact")
     (path,) = (tmp_path / "log").glob("*.mcap")
-    replays = measured.session(path, SimModel())
+    replays = measured.load_session(path, SimModel())
     shown = robot_of(replays)
     assert shown.name == "mine" and shown.contract == contract and replays.count == 1
     model, corners = drawn(shown)

@@ -47,7 +47,7 @@ def folder(tmp_path):
 
 
 def test_the_extended_model_meets_the_measured_balls_and_the_nominal_one_misses_them(folder):
-    playlist = measured.diagnosed(folder)
+    playlist = measured.load_diagnosis(folder)
     assert playlist.count == 6 and playlist.caption(0).startswith("the table is dead: trajectory s/")
     for n in range(6):
         (replay,) = playlist.replays(n)
@@ -63,4 +63,4 @@ def test_the_extended_model_meets_the_measured_balls_and_the_nominal_one_misses_
 def test_a_log_that_is_gone_is_named(folder):
     (folder / "balls.csv").unlink()
     with pytest.raises(ConfigError, match="extended.yaml: provenance.logs .*balls.csv: no such file"):
-        measured.diagnosed(folder)
+        measured.load_diagnosis(folder)

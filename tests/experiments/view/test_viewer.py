@@ -31,6 +31,7 @@ from experiments.view import viewer as viewers
 from experiments.view.auth import Server
 from experiments.view.playlist import PolicyPlaylist
 from experiments.view.recorder import Recorder
+from experiments.view.scene import offset
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.robot.model import home_qpos, load_model
 from mjx_tt.sim.model import ModelFile, SimModel
@@ -229,7 +230,7 @@ def test_four_tables_fit_into_the_picture_and_the_panel_says_whose_they_are(show
     until(lambda: viewer.server.get_clients(), "the page's connection")
     (client,) = viewer.server.get_clients().values()
     x, y = 0.5 * TABLE_WIDTH, 0.5 * TABLE_LENGTH
-    corners = [np.array([at, side * y, 0.0]) for at in (x, viewer.scene.offset(3) - x) for side in (-1, 1)]
+    corners = [np.array([at, side * y, 0.0]) for at in (x, offset(3)[0] - x) for side in (-1, 1)]
 
     def whole() -> bool:
         seen, camera = np.array([pixel(client, corner) for corner in corners]), client.camera
