@@ -17,7 +17,7 @@ _handled = threading.Event()
 _interrupted = threading.Event()
 
 
-def mark_handled(_number: int = 0, _frame: FrameType | None = None) -> None:
+def mark_handled() -> None:
     """Tells ``interruptible`` that a Ctrl-C has reached its handler."""
     _handled.set()
 
@@ -59,27 +59,30 @@ def interruptible() -> Iterator[None]:
 
 
 @contextmanager
-def stop_requested() -> Iterator[threading.Event]:
-    """The event that the first Ctrl-C sets, for a loop that polls it; a second one raises KeyboardInterrupt.
+def stop_requested(*numbers: signal.Signals, message: str = "") -> Iterator[threading.Event]:
+    """The event that the first signal sets, for a loop that polls it; a second one acts as it did before.
 
     An exception could come between any two instructions: inside Rich it leaves a console that prints nothing any more.
+    numbers: which signals, Ctrl-C by default; message: answers a Ctrl-C.
     """
     requested = threading.Event()
     if not _is_main_thread():
         yield requested
         return
-    handler = signal.getsignal(signal.SIGINT)
 
-    def request(number: int, frame: FrameType | None) -> None:
-        if requested.is_set() and callable(handler):
-            handler(number, frame)
+    def request(number: int, _frame: FrameType | None) -> None:
+        mark_handled()
         requested.set()
+        if message and number == signal.SIGINT:
+            write_line(message)
+        signal.signal(number, before[signal.Signals(number)])
 
-    signal.signal(signal.SIGINT, request)
+    before = {number: signal.signal(number, request) for number in numbers or (signal.SIGINT,)}
     try:
         yield requested
     finally:
-        signal.signal(signal.SIGINT, handler)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def write_line(text: str) -> None:

@@ -295,6 +295,8 @@ def _examples(epilogue: str) -> tuple[list[str], list[str]]:
 def _arguments(command: App) -> list[str]:
     rows = []
     for argument in command.assemble_argument_collection():
+        if argument.children:  # a group of options, which follow
+            continue
         name, parameter = argument.names[0], argument.parameter
         value = parameter.metavar or (" or ".join(typing.get_args(argument.hint)) if name.startswith("--") else "")
         note = _cell(parameter.help or "") + (" (required)" if argument.required and name.startswith("--") else "")

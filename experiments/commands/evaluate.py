@@ -49,16 +49,15 @@ def evaluate(
     from experiments.progress import make_console, print_stages
     from experiments.runs import load_policy
     from experiments.training import finalize
-    from experiments.training.ranks import ALONE, join
 
     screen = make_console()
-    together = join(ranks.distributed, ranks.processes, ranks.process) if ranks.distributed else ALONE
-    screen.quiet = not together.first
+    together = ranks.join()
+    screen.quiet = not together.is_first
     trained = load_policy.load(policy)
     experiment = play.experiment(trained)
     settings = experiment.config.evaluation
     stage = print_stages(screen, str(trained.source))
-    with interruptible(), together.together():
+    with interruptible(), together.failing_fast():
         played = evaluation.evaluate(
             experiment,
             trained,
@@ -68,8 +67,8 @@ def evaluate(
             stage,
             jax.device_count(),
         )
-        together.part()
-        if not together.first:
+        together.disconnect()
+        if not together.is_first:
             return
         with stage("drawing pictures"):
             finalize.save_evaluation(folder, played, experiment)

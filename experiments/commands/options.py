@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from experiments.config.build import Experiment
     from experiments.config.site import Site as SiteFile
     from experiments.runs.load_policy import TrainedPolicy
+    from experiments.training.ranks import Ranks
 
 SHIPPED_POLICY = Path(__file__).parents[1] / "shipped" / "policies" / "quickstart"
 RIG, LOCK_STEP = "rig", "lockstep"  # values of --robot that are no file
@@ -111,6 +112,12 @@ class DistributedOptions:
         count("how many runs at a time (default: one per processor core); with HOST:PORT, how many take part"),
     ] = None
     process: Annotated[int | None, option("I", "which of them this one is, from 0 (with HOST:PORT)")] = None
+
+    def join(self) -> Ranks:
+        """Joins the processes, if there are others. Raises ConfigError."""
+        from experiments.training.ranks import ALONE, join
+
+        return join(self.distributed, self.processes, self.process) if self.distributed else ALONE
 
 
 @Parameter(name="*")

@@ -74,14 +74,13 @@ def train(
     from experiments.jobs.site import Workers
     from experiments.progress import make_console
     from experiments.training import sweep
-    from experiments.training.ranks import join
 
     screen = make_console()
     planned = sweep.plan(configs, seeds, Path(out))
     if ranks.distributed:
-        together = join(ranks.distributed, ranks.processes, ranks.process)
-        screen.quiet = not together.first
-        with interruptible(), together.together():
+        together = ranks.join()
+        screen.quiet = not together.is_first
+        with interruptible(), together.failing_fast():
             sweep.run_together(planned[0], screen, together)
         return 0
     side_by_side = 1 if elsewhere else sweep.choose(planned, ranks.processes, ranks.devices)

@@ -167,18 +167,18 @@ def run_together(job: Job, console: Console, ranks: Ranks) -> None:
     experiment = build.experiment(job.config, job.where)
     run, config = job.run, experiment.config
     read = hashlib.sha256(json.dumps(config.to_dict(), sort_keys=True).encode()).digest()
-    every = ranks.agree(int.from_bytes(read[:6], "big"))[:, 0]
+    every = ranks.gather(int.from_bytes(read[:6], "big"))[:, 0]
     if (every != every[0]).any():
         other = int(np.argmax(every != every[0]))
         raise ConfigError(f"{job.where}: process {other} reads something else than process 0; all need the same files")
-    if ranks.first:
+    if ranks.is_first:
         run.check(config)
-    trained = bool(ranks.agree(ranks.first and run.trained(config))[0, 0])
+    trained = bool(ranks.gather(ranks.is_first and run.trained(config))[0, 0])
     if not trained:
         reason = train(experiment, run, console, ranks)
         console.print(f"{run.folder}: trained by {ranks.count} processes, ended by {reason}")
-    ranks.part()
-    if not ranks.first:
+    ranks.disconnect()
+    if not ranks.is_first:
         return
     if run.done(config):
         console.print(f"{run.folder}: done before, skipped")

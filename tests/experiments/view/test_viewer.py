@@ -37,6 +37,7 @@ from mjx_tt.robot.model import home_qpos, load_model
 from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io import log
 from tests.support.paths import ROOT
+from tests.support.tiny_experiment import write_tiny
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (
@@ -314,19 +315,9 @@ def test_a_session_of_the_robot_is_replayed(shown, open_page, tmp_path):
     assert page.get_by_role("tab", name="Physics").count() == 0
 
 
-TRAINING = """
-name: tiny
-balls: player5/M0
-task: {max_steps: 60, sim_rate: 75.0}
-optimiser: {num_directions: 2, repeats: 2}
-training: {updates: 100000, pool: 64, evaluate_every: 100000, evaluate_episodes: 8, devices: 1, checkpoint_seconds: 1}
-evaluation: {episodes: 8, reachable_balls: null}
-"""
-
-
 def test_a_training_is_followed_while_it_goes_on(shown, open_page, tmp_path, recorder):
-    (tmp_path / "tiny.yaml").write_text(TRAINING)
-    command = [sys.executable, "-m", "experiments.cli", "train", str(tmp_path / "tiny.yaml"), "--out", str(tmp_path)]
+    yaml = write_tiny(tmp_path, updates=100_000, evaluate_every=100_000, checkpoint_seconds=1)
+    command = [sys.executable, "-m", "experiments.cli", "train", str(yaml), "--out", str(tmp_path)]
     training = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         folder = tmp_path / "tiny"
