@@ -45,7 +45,7 @@ def render(
 
     trained = load_policy.load(policy)
     experiment = play.experiment(trained)
-    played = video.replay(experiment, trained, episodes, play.seed_of(experiment))
+    played = video.record(experiment, trained, episodes, play.seed_of(experiment))
     for path in out:
         checked("", video.draw, Path(path), played, camera, experiment.task.robot)
         make_console().print(path)
