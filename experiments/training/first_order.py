@@ -13,13 +13,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
 from bgs import normalizer, strategy
-from experiments.training.update import Inputs, Trainer, TrainState
+from experiments.training.update import Inputs, Trainer, TrainState, sum_over_devices
 from mjx_tt.env.episode import reshaped
 from mjx_tt.env.policy import Policy
-from mjx_tt.env.rollout import AXIS
 from mjx_tt.gradient.objective import Objective, Played
 
 SECONDS = 1.7  # that are looked at: 99 of 100 balls of the widest boxes are out of reach by then
@@ -37,10 +35,7 @@ class FirstOrderTrainer(Trainer):
 
     def _update_local(self, state: TrainState, inputs: Inputs) -> tuple[TrainState, dict[str, jax.Array]]:
         config, simulator = self.bgs_config, self.simulator
-        direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
-        population = strategy.ask(direction_key, state.bgs, config)
-        shape = (self._episodes_per_direction, 2 * config.num_directions)
-        episodes = self._draw(episode_key, inputs, *shape)
+        population, episodes = self._draw(state, inputs, 2 * config.num_directions)
         mine = reshaped(simulator.local(episodes), -1)
         mean, inv_std = normalizer.normaliser(state.statistics)
 
@@ -65,8 +60,7 @@ class FirstOrderTrainer(Trainer):
             "seen": seen.sum(),
             "sums": jnp.stack([centred.sum((0, 2)), (centred * centred).sum((0, 2))]),
         }
-        flat, unravel = ravel_pytree(shared)
-        total = unravel(jax.lax.psum(flat, AXIS))  # one sum over devices: several at a time starve their threads
+        total = sum_over_devices(shared)
         count = jnp.maximum(total["episodes"], 1.0)
         gradient = -total["slope"] / count
         norm = jnp.linalg.norm(gradient)

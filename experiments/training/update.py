@@ -7,7 +7,7 @@ statistics are one compiled call from a ``TrainState`` to the next.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
 from robot_io.contract import n_parameters
 
+T = TypeVar("T")
 Inputs: TypeAlias = tuple[BallPool, Arguments]  # what trainings of one program differ in: balls, numbers
 
 
@@ -113,10 +114,7 @@ class Trainer:
 
     def _update_local(self, state: TrainState, inputs: Inputs) -> tuple[TrainState, dict[str, jax.Array]]:
         config, pairs = self.bgs_config, self.bgs_config.num_directions
-        direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
-        population = strategy.ask(direction_key, state.bgs, config)
-        columns = pairs if self._crn else 2 * pairs
-        episodes = self._draw(episode_key, inputs, self._episodes_per_direction, columns)
+        population, episodes = self._draw(state, inputs, pairs if self._crn else 2 * pairs)
         if self._crn:
             episodes = jax.tree.map(lambda x: jnp.concatenate([x, x], -1) if x.ndim >= 2 else x, episodes)
         mean, inv_std = normalizer.normaliser(state.statistics)
@@ -136,8 +134,7 @@ class Trainer:
         )
         sums, counts = result.observation_sums.sum(axis=-1), result.observation_counts.sum()
         shared = (members, sums, counts.astype(jnp.float32), totals(result))
-        flat, unravel = ravel_pytree(shared)
-        members, sums, counts, total = unravel(jax.lax.psum(flat, AXIS))
+        members, sums, counts, total = sum_over_devices(shared)
         member = jnp.where(members[1] > 0, jnp.nan, members[0])
         bgs, info = strategy.tell(state.bgs, population, member, config)
         seen = normalizer.from_sums(counts.astype(jnp.int32), mean, sums[0], sums[1])
@@ -147,10 +144,14 @@ class Trainer:
         }
         return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
 
-    def _draw(self, key: jax.Array, inputs: Inputs, repeats: int, columns: int) -> Episodes:
+    def _draw(self, state: TrainState, inputs: Inputs, columns: int) -> tuple[strategy.Population, Episodes]:
+        """Perturbed policies of the update of this state, and episodes (repeats, columns)."""
+        direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
+        population = strategy.ask(direction_key, state.bgs, self.bgs_config)
         pool, numbers = inputs
         model = models.with_values(self._model, numbers.numbers)
-        return self.simulator.draw(key, pool, model, numbers.drawing, repeats, columns)
+        repeats = self._episodes_per_direction
+        return population, self.simulator.draw(episode_key, pool, model, numbers.drawing, repeats, columns)
 
     def _apply_schedule(self, result: RolloutResult, updates: jax.Array) -> RolloutResult:
         """The result with the returns that the weights of this update give."""
@@ -160,6 +161,12 @@ class Trainer:
         returns = jnp.tensordot(jnp.array(weights, jnp.float32), jnp.where(result.finite, result.terms, 0.0), 1)
         later = jnp.where(result.finite, returns, jnp.nan)
         return replace(result, returns=jnp.where(updates >= after, later, result.returns))
+
+
+def sum_over_devices(tree: T) -> T:
+    """Sums of a tree's leaves in one collective: several at a time starve the threads of host devices."""
+    flat, unravel = ravel_pytree(tree)
+    return unravel(jax.lax.psum(flat, AXIS))
 
 
 def totals(result: RolloutResult) -> dict:

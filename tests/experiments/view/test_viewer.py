@@ -24,17 +24,13 @@ from viser.transforms import SO3
 from ballmodel import registry
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from experiments import cli
-from experiments.commands.options import SHIPPED_POLICY
 from experiments.runs import load_policy
 from experiments.view import measured
 from experiments.view import viewer as viewers
 from experiments.view.auth import Server
 from experiments.view.playlist import PolicyPlaylist
-from experiments.view.recorder import Recorder
 from experiments.view.scene import offset
-from mjx_tt.env.task import TaskConfig
 from mjx_tt.robot.model import home_qpos, load_model
-from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io import log
 from tests.support.paths import ROOT
 from tests.support.tiny_experiment import write_tiny
@@ -109,17 +105,6 @@ def shown():
         viewer.stop()
         thread.join()
         server.stop()
-
-
-@pytest.fixture(scope="module")
-def recorder():
-    return Recorder(TaskConfig(sim_rate=150.0), ModelFile(SimModel()))
-
-
-@pytest.fixture
-def play(recorder):
-    policy = load_policy.load(SHIPPED_POLICY).policy
-    return PolicyPlaylist(recorder, ["quickstart"], [policy], registry.load("player3/M0"))
 
 
 def picture(page) -> np.ndarray:
@@ -224,8 +209,8 @@ def pixel(client, point: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [WIDE, NARROW], ids=["wide", "narrow"])
-def test_four_tables_fit_into_the_picture_and_the_panel_says_whose_they_are(shown, open_page, recorder, size):
-    policy, names = load_policy.load(SHIPPED_POLICY).policy, ["one", "two", "three", "four"]
+def test_four_tables_fit_into_the_picture_and_the_panel_says_whose_they_are(shown, open_page, recorder, policy, size):
+    names = ["one", "two", "three", "four"]
     viewer, address = shown(PolicyPlaylist(recorder, names, [policy] * 4, registry.load("player3/M0")))
     page = open_page(address, size)
     until(lambda: viewer.server.get_clients(), "the page's connection")
