@@ -13,7 +13,7 @@ from experiments.errors import checked
 
 app = options.command(
     "bench-ball",
-    "compare predictors of the ball on measured sets, where they lie",
+    "compare predictors of the ball on measured sets",
     """\
   mjx-tt bench-ball launcher/topspin.hdf5 launcher/no_spin.hdf5 --out benchmark
   mjx-tt bench-ball rallies.csv --model diagnosis/extended.yaml --out benchmark

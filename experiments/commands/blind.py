@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 app = options.command(
     "blind",
-    "policies under code names, for people who evaluate them",
+    "let people evaluate policies under code names",
     """\
   mjx-tt blind make anna-evaluates is2r-ft100=runs/a/artefact s2r-ft100=runs/b/artefact --trainer anna --evaluator anna
   mjx-tt run anna-evaluates/policies/A --robot robot.yaml          and fill in anna-evaluates/sheet.csv; then B, C, ...
@@ -34,12 +34,12 @@ docs/how-to/evaluate-blind.md.
 @app.default
 def blind(
     action: Annotated[Literal["make", "sheet", "open"], Parameter("ACTION")],
-    folder: Annotated[str, Parameter("FOLDER", help="of the blind evaluation")],
+    folder: Annotated[str, Parameter("FOLDER", help="folder of the blind evaluation")],
     /,
-    *policies: Annotated[str, Parameter("MODEL=POLICY", help="of make: a name and its artefact or run")],
-    trainer: Annotated[str, option("NAME", "of make: who trained the policies")] = "",
-    evaluator: Annotated[str, option("NAME", "of make: who plays (default: the trainer)")] = "",
-    seed: Annotated[int, option("K", "of make: the study's seed that the policies belong to")] = 0,
+    *policies: Annotated[str, Parameter("MODEL=POLICY", help="make: a model's name and its artefact or run")],
+    trainer: Annotated[str, option("NAME", "make: who trained the policies")] = "",
+    evaluator: Annotated[str, option("NAME", "make: who plays (default: the trainer)")] = "",
+    seed: Annotated[int, option("K", "make: seed of the study that the policies belong to")] = 0,
 ) -> None:
     """Raises ConfigError for what cannot be done."""
     options.start_jax(1)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 app = options.command(
     "calibrate",
-    "find where tracker, robot and clock are, from measured points and logs",
+    "calibrate tracker, robot and clock from measured points and logs",
     """\
   mjx-tt calibrate tracker ball.csv              table_x, table_y, table_z and ball_x, ball_y, ball_z of every point
   mjx-tt calibrate robot touches.csv --robot robot.yaml        table_x, ... and gantry_x ... joint_6 of every touch
@@ -38,14 +38,12 @@ def calibrate(
     part: Annotated[Literal["tracker", "robot", "clock"], Parameter("PART")],
     source: Annotated[str, Parameter("FILE", help="CSV of points, or the log of a session")],
     name: Annotated[
-        str | None, Parameter("ROBOT", help="of robot: the one that stands there, by folder or name (the paper's)")
+        str | None, Parameter("ROBOT", help="robot: the installed one, by folder or name (default: the paper's)")
     ] = None,
     /,
     *,
-    robot: Annotated[
-        str | None, option("YAML", "robot.yaml, whose zeros of the axes are kept with the robot's")
-    ] = None,
-    out: Annotated[str, option("YAML", "calibration that is written or extended")] = "calibration.yaml",
+    robot: Annotated[str | None, option("YAML", "robot.yaml whose axis zeros are stored with the robot's")] = None,
+    out: Annotated[str, option("YAML", "calibration to write or extend")] = "calibration.yaml",
 ) -> int:
     """Returns the exit status."""
     options.check_exists(source, robot)

@@ -12,7 +12,7 @@ from experiments.commands.options import count
 
 app = options.command(
     "compare",
-    "several learning algorithms on one task, also where none has trained",
+    "compare learning algorithms on one task",
     """\
   mjx-tt compare compare_quick.yaml                         BGS, ARS, PPO, SAC, QT-Opt: three minutes each
   mjx-tt compare mine.yaml --set budget.minutes=60 --set seeds=[0,1,2]
@@ -33,7 +33,7 @@ def compare(
     overrides: options.Overrides = (),
     processes: Annotated[
         int | None,
-        count("trainings at a time (default: one, where minutes are the budget; else one per processor core)"),
+        count("trainings at a time (default: one for a budget of minutes, else one per processor core)"),
     ] = None,
     site: options.Site = None,
 ) -> None:

@@ -14,7 +14,7 @@ from experiments.runs.run_dir import Run
 
 app = options.command(
     "curves",
-    "the learning curves of several trainings in one picture",
+    "draw the learning curves of several trainings in one picture",
     "  mjx-tt curves runs/quickstart runs/paper --out curves.png\n",
 )
 

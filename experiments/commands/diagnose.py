@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 app = options.command(
     "diagnose",
-    "say what the simulation gets wrong about measured logs",
+    "find what the simulation gets wrong about measured logs",
     """\
   mjx-tt diagnose session1.csv session2.mcap --out diagnosis
   mjx-tt diagnose robot/ --out diagnosis                    a folder with command.csv and state.csv
@@ -47,21 +47,21 @@ class Request:
     """What is judged, and how."""
 
     out: Annotated[str, option("DIR", "where report, verdict and extended model go")]
-    model: Annotated[str | None, option("YAML", "the model to judge; the nominal one by default")] = None
+    model: Annotated[str | None, option("YAML", "the model to judge (default: the nominal one)")] = None
     spin: Annotated[
         Literal["auto", "none", "free"],
-        Parameter(help="whether balls may spin: free where the model has a Magnus force, else a cause (auto)"),
+        Parameter(help="whether balls may spin (auto: free where the model has a Magnus force, else a possible cause)"),
     ] = "auto"
     without: Annotated[tuple[str, ...], option("NAMES", "effects to leave out of the catalogue")] = ()
-    home: Annotated[
-        str, option("POSE", "where joints truly rest at first: home, or joint_1=0.52,gantry_x=0 [rad, m]")
-    ] = ""
-    randomise: Annotated[bool, Parameter(help="extended.yaml draws what the logs leave open")] = False
-    seed: Annotated[int, Parameter(help="of the bootstraps (0)")] = 0
-    policy: Annotated[str | None, option("POLICY", "a run or artefact: what the defect costs it in play")] = None
-    robot: Annotated[str | None, option("FOLDER", "whose joints were logged (default: the paper's)")] = None
-    retrain: Annotated[int, option("UPDATES", "and what this much retraining brings back")] = 0
-    episodes: Annotated[int, Parameter(help="of each evaluation (2000)")] = 2000
+    home: Annotated[str, option("POSE", "pose before the first motion: home, or joint_1=0.52,gantry_x=0 [rad, m]")] = ""
+    randomise: Annotated[bool, Parameter(help="randomise in extended.yaml what the logs do not determine")] = False
+    seed: Annotated[int, Parameter(help="seed of the bootstrap (default: 0)")] = 0
+    policy: Annotated[str | None, option("POLICY", "a run or artefact: measure what the defect costs in play")] = None
+    robot: Annotated[str | None, option("FOLDER", "robot whose joints were logged (default: the paper's)")] = None
+    retrain: Annotated[
+        int, option("UPDATES", "with --policy: retrain for so many updates under the extended model")
+    ] = 0
+    episodes: Annotated[int, Parameter(help="balls of each evaluation (default: 2000)")] = 2000
 
     def load_robot(self) -> Robot:
         """The robot whose joints were logged. Raises ConfigError."""

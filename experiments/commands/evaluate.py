@@ -32,8 +32,8 @@ def evaluate(
     *,
     play: options.PlayOptions = options.PLAY,
     episodes: Annotated[int | None, count("balls to play (default: the experiment's)")] = None,
-    no_reachable: Annotated[bool, Parameter(help="skip the minute that the bound on what is in reach takes")] = False,
-    out: Annotated[str | None, option("FOLDER", "for evaluation.json and plots/")] = None,
+    no_reachable: Annotated[bool, Parameter(help="skip the bound on what is in reach, which takes a minute")] = False,
+    out: Annotated[str | None, option("FOLDER", "folder of evaluation.json and plots/")] = None,
     ranks: options.DistributedOptions = options.ALONE,
 ) -> None:
     """Writes evaluation.json and plots, and prints the report."""

@@ -32,10 +32,10 @@ def finetune(
     *,
     robot: Annotated[str, option("YAML", 'a robot.yaml, "rig" or "lockstep"')],
     settings: Annotated[
-        str | None, option("YAML", "of the fine-tuning (default: the paper's, or nearer: docs/how-to/fine-tune.md)")
+        str | None, option("YAML", "settings of the fine-tuning (default: docs/how-to/fine-tune.md)")
     ] = None,
     overrides: options.Overrides = (),
-    out: Annotated[str | None, option("FOLDER", "of the run (default: POLICY-finetuned)")] = None,
+    out: Annotated[str | None, option("FOLDER", "folder of the run (default: POLICY-finetuned)")] = None,
     setup: options.RobotOptions = options.ROBOT,
 ) -> int:
     """Returns 130 where it was stopped."""

@@ -1,4 +1,4 @@
-"""``mjx-tt fit-human``: a human ball distribution from measured balls."""
+"""``mjx-tt fit-human``: fit a human ball distribution to measured balls."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 app = options.command(
     "fit-human",
-    "a human ball distribution from measured balls",
+    "fit a human ball distribution to measured balls",
     """\
   mjx-tt fit-human rallies.csv --out anna.yaml
   mjx-tt fit-human monday.mcap tuesday.mcap --out anna.yaml --name anna
@@ -44,27 +44,25 @@ def fit_human(
         str, Parameter("DATA", help=".csv, .mcap, .json (DeepMind) or .hdf5 (AIMY launcher)", required=True)
     ],
     out: Annotated[str, option("YAML", "the file to write")],
-    name: Annotated[str, option("NAME", "of the distribution (default: the name of the file written)")] = "",
+    name: Annotated[str, option("NAME", "name of the distribution (default: the output file's)")] = "",
     eps: Annotated[
-        float | None, option("R", "radius of DBSCAN in robust standard deviations (default: from the data)")
+        float | None, option("R", "radius of DBSCAN, in robust standard deviations (default: from the data)")
     ] = None,
     min_samples: Annotated[int, count("balls that make a cluster (default: 5)")] = 5,
     format: options.Format = None,
     fit: Annotated[
         Literal["gauss-newton", "nelder-mead"],
-        Parameter(help="of the flights: all at once, or one by one as the paper's; both minimise the same distance"),
+        Parameter(help="how flights are fitted: all at once, or one by one as in the paper"),
     ] = "gauss-newton",
     model: Annotated[
-        str | None, option("YAML", "simulation model in which the balls fly; one with lift finds each ball's spin")
+        str | None, option("YAML", "simulation model of the flights; with lift, spins are fitted too")
     ] = None,
-    serves: Annotated[
-        bool, Parameter(help="count balls that bounce on the person's own side first, from that bounce on")
-    ] = False,
+    serves: Annotated[bool, Parameter(help="count serves too, from their bounce on the person's side")] = False,
     short_balls: Annotated[
-        bool, Parameter(help="draw balls that would bounce twice on the robot's side as well, as the person plays them")
+        bool, Parameter(help="also draw balls that bounce twice on the robot's side, as the person plays them")
     ] = False,
     mixture: Annotated[
-        str | None, option("YAML", "file for a mixture over start states with spin, beside the box; with its picture")
+        str | None, option("YAML", "also fit a mixture over start states with spin; a picture is drawn beside it")
     ] = None,
 ) -> None:
     """Fits a distribution, writes its YAML and prints its 16 numbers beside those of the paper's players.

@@ -14,7 +14,7 @@ from experiments.errors import ConfigError
 
 app = options.command(
     "is2r",
-    "simulate, play, refine: the iterative loop and its study",
+    "run a study of the iterative loop: simulate, play, refine",
     """\
   mjx-tt is2r study_quick.yaml                              five virtual players, twenty minutes, ends in a report
   mjx-tt is2r study_full.yaml --set players=[player3]       the paper's number of balls
@@ -37,8 +37,8 @@ def is2r(
     processes: Annotated[
         int | None,
         count(
-            "how many do steps side by side, on a device each (default: one per processor core; one in all with "
-            "--devices, on an accelerator or a robot)"
+            "steps at a time, each on one device (default: one per processor core; one with --devices, an "
+            "accelerator or a robot)"
         ),
     ] = None,
     devices: options.Devices = None,

@@ -38,11 +38,11 @@ def log(
         str,
         Parameter(
             "LOG",
-            help="an .mcap or .mcap.part; for list a folder; for lerobot .mcap, balls, or a folder",
+            help="an .mcap or .mcap.part; list: a folder; lerobot: .mcap, balls, or a folder",
             required=True,
         ),
     ],
-    out: Annotated[str | None, option("PATH", "of salvage: the file; of export and lerobot: the folder")] = None,
+    out: Annotated[str | None, option("PATH", "salvage: the file; export and lerobot: the folder")] = None,
 ) -> int:
     """Returns 1 where a checked log is not sound."""
     from experiments.progress import make_console

@@ -52,18 +52,18 @@ def count(text: str) -> Parameter:
 
 # -- single options ----------------------------------------------------------------------------------------------------
 
-BallSeed = Annotated[int | None, option("K", "another seed means other balls")]
-Devices = Annotated[int | None, count("host devices to make (default: one per processor core)")]
+BallSeed = Annotated[int | None, option("K", "seed of the balls")]
+Devices = Annotated[int | None, count("host devices (default: one per processor core)")]
 Format = Annotated[str | None, option("NAME", "csv, mcap, deepmind or aimy (default: from the suffix)")]
 Model = Annotated[str | None, option("YAML", "another simulation model")]
 Overrides = Annotated[tuple[str, ...], option("KEY=VALUE", "change one key of the file; may be repeated", "--set")]
 PolicyFolder = Annotated[str, Parameter("RUN_OR_ARTEFACT", help="folder of a run or of an exported policy")]
 RigFile = Annotated[str | None, option("YAML", "another rig: world, delays, network faults")]
-RigSeed = Annotated[int, option("K", "of the balls that are thrown")]
+RigSeed = Annotated[int, option("K", "seed of the balls that are thrown (default: 0)")]
 RunsFolder = Annotated[str, option("FOLDER", "where the folders of runs go (default: runs)")]
 Site = Annotated[
     str | None,
-    option("local|YAML", "who does the jobs: processes of this machine (default), or the workers of a site's YAML"),
+    option("local|YAML", "where jobs run: this machine (default), or the workers of a site's YAML"),
 ]
 
 
@@ -105,13 +105,13 @@ class DistributedOptions:
     devices: Devices = None
     distributed: Annotated[
         str | None,
-        option("auto|HOST:PORT", "share the work with processes on any hosts: as the cluster says, or by address"),
+        option("auto|HOST:PORT", "share one training with other processes: as the cluster says, or by address"),
     ] = None
     processes: Annotated[
         int | None,
-        count("how many runs at a time (default: one per processor core); with HOST:PORT, how many take part"),
+        count("runs at a time (default: one per processor core); with HOST:PORT, number of processes"),
     ] = None
-    process: Annotated[int | None, option("I", "which of them this one is, from 0 (with HOST:PORT)")] = None
+    process: Annotated[int | None, option("I", "index of this process, from 0 (with HOST:PORT)")] = None
 
     def join(self) -> Ranks:
         """Joins the processes, if there are others. Raises ConfigError."""
@@ -126,10 +126,15 @@ class RobotOptions:
     """How a policy is computed on a robot; of the emulated one also what it is and who plays with it."""
 
     backend: Annotated[
-        Literal["auto", "numpy", "jit"], Parameter(help="computes the policy; auto: JAX unless it is missing or slow")
+        Literal["auto", "numpy", "jit"],
+        Parameter(help="what computes the policy (auto: JAX unless it is missing or slow)"),
     ] = "auto"
-    distribution: Annotated[str | None, option("NAME", "balls that are thrown (default: the policy's)")] = None
-    player: Annotated[str | None, option("NAME", "virtual player on the rig, player1 to player5, who answers")] = None
+    distribution: Annotated[
+        str | None, option("NAME", "distribution of the balls that are thrown (default: the policy's)")
+    ] = None
+    player: Annotated[
+        str | None, option("NAME", "virtual player on the rig instead of thrown balls: player1 to player5")
+    ] = None
     rig: RigFile = None
     seed: RigSeed = 0
 

@@ -11,7 +11,7 @@ from experiments.runs.locate import run_of
 
 app = options.command(
     "pack",
-    "make one file of a policy, to pass on: artefact, configuration, evaluation, a card",
+    "pack a policy into one file: artefact, configuration, evaluation, a card",
     """\
   mjx-tt pack runs/quickstart
   mjx-tt pack runs/quickstart --out anna.mjxtt.zip --licence CC-BY-4.0

@@ -13,7 +13,7 @@ from experiments.errors import ConfigError, checked
 
 app = options.command(
     "predict",
-    "where a log's balls are some time after their last sample, with the uncertainty",
+    "predict a log's balls some time ahead, with the uncertainty",
     """\
   mjx-tt predict rallies.csv --out predicted.csv
   mjx-tt predict rallies.csv --model diagnosis/extended.yaml --seen 0.15 --horizon 0.1 --horizon 0.3 --out predicted.csv
@@ -28,10 +28,10 @@ def predict(
     *data: Annotated[str, Parameter("DATA", help=".csv, .mcap or .hdf5", required=True)],
     out: Annotated[str, option("CSV", "the file to write")],
     model: options.Model = None,
-    horizon: Annotated[tuple[float, ...], option("S", "seconds after the last sample seen; may be repeated (0.3)")] = (
-        0.3,
-    ),
-    seen: Annotated[float | None, option("S", "use the first seconds of each stroke only")] = None,
+    horizon: Annotated[
+        tuple[float, ...], option("S", "seconds after the last sample used; may be repeated (default: 0.3)")
+    ] = (0.3,),
+    seen: Annotated[float | None, option("S", "use only the first S seconds of each stroke")] = None,
     format: options.Format = None,
 ) -> None:
     """Raises ConfigError for data that hold no strokes."""

@@ -14,7 +14,7 @@ from experiments.runs.locate import find_policy
 
 app = options.command(
     "render",
-    "a picture or a video of a policy at play, without a display",
+    "draw a picture or a video of a policy at play",
     """\
   mjx-tt render --out play.gif                     a policy that comes with the program
   mjx-tt render runs/quickstart --out episode.png --out episode.mp4

@@ -13,7 +13,7 @@ from experiments.commands.options import option
 
 app = options.command(
     "rig",
-    "the emulated robot alone, on real sockets",
+    "run the emulated robot alone, on real sockets",
     "  mjx-tt rig --out rig.yaml          and in another terminal:  mjx-tt run ARTEFACT --robot rig.yaml\n",
 )
 
@@ -29,14 +29,16 @@ def _parse_ports(_type: Any, tokens: Sequence[Token]) -> tuple[int, ...]:
 @app.default
 def rig(
     *,
-    ports: Annotated[tuple[int, ...], option("ARM,TRACKER,AXES", "of the devices", converter=_parse_ports)] = (
+    ports: Annotated[tuple[int, ...], option("ARM,TRACKER,AXES", "ports of the devices", converter=_parse_ports)] = (
         (6510, 6520, 5021, 5022)
     ),
     robot: Annotated[
-        str | None, option("NAME", "robot that stands there, by name or folder (default: the paper's)")
+        str | None, option("NAME", "the installed robot, by name or folder (default: the paper's)")
     ] = None,
-    out: Annotated[str, option("YAML", "where its robot.yaml is written")] = "rig-robot.yaml",
-    distribution: Annotated[str, option("NAME", "balls that are thrown (default: player3/M0)")] = "player3/M0",
+    out: Annotated[str, option("YAML", "where to write its robot.yaml")] = "rig-robot.yaml",
+    distribution: Annotated[
+        str, option("NAME", "distribution of the balls that are thrown (default: player3/M0)")
+    ] = "player3/M0",
     rig: options.RigFile = None,
     seed: options.RigSeed = 0,
 ) -> int:

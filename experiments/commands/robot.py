@@ -14,7 +14,7 @@ from experiments.runs.locate import artefact_of
 
 app = options.command(
     "robot",
-    "a robot of your own in simulation (new, place, list); bring one into service (check, jog)",
+    "define a robot (new, place, list), or bring one into service (check, jog)",
     """\
   mjx-tt robot new my_arm/my_arm.xml                                a first YAML for an MJCF, checked
   mjx-tt robot check --robot robot.yaml                             tracker and arm are heard, nothing is sent
@@ -32,14 +32,14 @@ def commission(
     action: Annotated[Literal["check", "jog"], Parameter("ACTION")],
     name: Annotated[
         str | None,
-        Parameter("ROBOT", help="robot that stands there, by folder or name (default: the policy's, or the paper's)"),
+        Parameter("ROBOT", help="the installed robot, by folder or name (default: the policy's, or the paper's)"),
     ] = None,
     /,
     *,
     robot: Annotated[str, option("YAML", "a robot.yaml")],
-    artefact: Annotated[str | None, option("FOLDER", "of check: a policy, or its run")] = None,
-    points: Annotated[str, option("CSV", "where points are noted")] = "points.csv",
-    log: Annotated[str, option("FOLDER", "for the MCAP log")] = "runs/robot",
+    artefact: Annotated[str | None, option("FOLDER", "check: a policy, or its run")] = None,
+    points: Annotated[str, option("CSV", "file that points are added to")] = "points.csv",
+    log: Annotated[str, option("FOLDER", "folder of the MCAP log")] = "runs/robot",
     seconds: Annotated[float | None, option("S", "end after S seconds")] = None,
 ) -> int:
     """Returns the exit status."""

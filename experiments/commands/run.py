@@ -13,7 +13,7 @@ from experiments.runs.locate import artefact_of
 
 app = options.command(
     "run",
-    "play: an exported policy on a robot, real or emulated",
+    "play with an exported policy on a robot, real or emulated",
     """\
   mjx-tt run runs/quickstart --robot rig --balls 30
   mjx-tt run runs/quickstart --robot rig --rallies 20 --player player3
@@ -35,7 +35,7 @@ def run(
     balls: Annotated[int | None, count("end after N balls (default: when the operator quits)")] = None,
     rallies: Annotated[int | None, count("end after N rallies that count")] = None,
     seconds: Annotated[float | None, option("S", "end after S seconds")] = None,
-    log: Annotated[str, option("FOLDER", "for the MCAP log and the summary")] = "runs/robot",
+    log: Annotated[str, option("FOLDER", "folder of the MCAP log and the summary")] = "runs/robot",
     setup: options.RobotOptions = options.ROBOT,
 ) -> int:
     """Returns the exit status."""

@@ -11,7 +11,7 @@ from experiments.commands import options
 
 app = options.command(
     "study-report",
-    "the report of a study, whole or under way: one HTML page",
+    "write the report of a study, finished or not, as one HTML page",
     """\
   mjx-tt study-report runs/study_quick
 

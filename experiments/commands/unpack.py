@@ -12,7 +12,7 @@ from experiments.commands.options import option
 
 app = options.command(
     "unpack",
-    "check a packed policy and put it into a folder, which stands for a run",
+    "check a packed policy and unpack it into a folder",
     """\
   mjx-tt unpack quickstart.mjxtt.zip
   mjx-tt unpack quickstart.mjxtt.zip --out runs/anna

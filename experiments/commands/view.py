@@ -43,13 +43,13 @@ def view(
     *what: Annotated[str, Parameter("WHAT", help="runs or artefacts (four at most), a session's .mcap, a diagnosis")],
     play: options.PlayOptions = options.PLAY,
     follow: Annotated[bool, Parameter(help="show each new checkpoint of the run")] = False,
-    export: Annotated[str | None, option("HTML", "write a page that needs no server, and end")] = None,
-    entries: Annotated[int, count("balls in that page (4)")] = 4,
-    host: Annotated[str, option("ADDRESS", "where to listen (127.0.0.1); others than this machine need a token")] = (
+    export: Annotated[str | None, option("HTML", "write a page that needs no server")] = None,
+    entries: Annotated[int, count("balls in that page (default: 4)")] = 4,
+    host: Annotated[str, option("ADDRESS", "address to listen on (default: 127.0.0.1); any other needs a token")] = (
         "127.0.0.1"
     ),
-    port: Annotated[int, option("PORT", "where to listen (8080)")] = 8080,
-    token: Annotated[str | None, option("TEXT", "what others give to look in (made up and printed)")] = None,
+    port: Annotated[int, option("PORT", "port to listen on (default: 8080)")] = 8080,
+    token: Annotated[str | None, option("TEXT", "token that others need (default: generated and printed)")] = None,
 ) -> None:
     """Serves the page until it is interrupted."""
     missing = [name for name in NEEDED if find_spec(name) is None]

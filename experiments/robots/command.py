@@ -14,12 +14,12 @@ from experiments.progress import make_console
 if TYPE_CHECKING:
     from mjx_tt.robot.robot import Robot
 
-Balls = Annotated[str, option("NAME_OR_YAML", "balls that it should return (default: player3/M0)")]
+Balls = Annotated[str, option("NAME_OR_YAML", "balls to return (default: player3/M0)")]
 SOME = 32  # balls whose motions are searched
 
 new_app = command(
     "new",
-    "a first YAML for the MJCF of a robot, checked",
+    "write a first YAML for a robot's MJCF and check it",
     """\
   mjx-tt robot new my_arm/my_arm.xml                        writes my_arm/description.yaml and names what is wrong
   mjx-tt robot new my_arm/my_arm.xml --balls anna.yaml      again, once mended, with what is in reach of which balls
@@ -29,7 +29,7 @@ new_app = command(
 A YAML that is there already is checked and never changed.
 """,
 )
-list_app = command("list", "the robots that come with the program", "  mjx-tt robot list\n")
+list_app = command("list", "list the robots that come with the program", "  mjx-tt robot list\n")
 place_app = command(
     "place",
     "find mounting and home pose for a ball distribution",
@@ -46,8 +46,8 @@ def new(
     /,
     *,
     balls: Balls = "player3/M0",
-    no_reachable: Annotated[bool, Parameter(help="skip the minutes that the bound on what is in reach takes")] = False,
-    picture: Annotated[str | None, option("PNG", "the robot at home, at the table")] = None,
+    no_reachable: Annotated[bool, Parameter(help="skip the bound on what is in reach, which takes minutes")] = False,
+    picture: Annotated[str | None, option("PNG", "draw the robot at home, at the table")] = None,
     view: Annotated[bool, Parameter(help="show it in the browser (http://127.0.0.1:8080/)")] = False,
 ) -> int:
     """Returns 1 where the robot cannot be used as it is."""
@@ -113,9 +113,9 @@ def place(
     /,
     *,
     balls: Balls = "player3/M0",
-    out: Annotated[str | None, option("YAML", "where the result goes (default: the robot's own YAML)")] = None,
-    seed: Annotated[int, option("K", "of the search (0)")] = 0,
-    samples: Annotated[int, count("balls that it is placed for (96)")] = 96,
+    out: Annotated[str | None, option("YAML", "file for the result (default: the robot's YAML)")] = None,
+    seed: Annotated[int, option("K", "seed of the search (default: 0)")] = 0,
+    samples: Annotated[int, count("balls to place it for (default: 96)")] = 96,
 ) -> int:
     """Returns 1 where no better place was found."""
     if out is not None:
