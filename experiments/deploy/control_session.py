@@ -74,9 +74,9 @@ class ControlSession:
             pass  # it has ended: the next message says so
 
     def beat(self, absence: float = 0.0) -> None:
-        """Show that the operator's keys are read, or will be again in so many seconds.
+        """Shows that the operator's keys are read, or will be again in so many seconds.
 
-        Only from where they are read: a thread that beats by itself would go on beside a terminal that hangs.
+        Called only where they are read: a thread of its own would keep beating beside a terminal that hangs.
         """
         self._beaten = time.monotonic()
         try:
@@ -89,7 +89,7 @@ class ControlSession:
     def messages(self, seconds: float) -> Iterator[Message]:
         """Messages that arrive within that time. Raises RefusedError when the control process has ended.
 
-        Whoever has armed the robot must call it again within ``robot_io.safety.owner_watch.LONGEST_SILENCE``.
+        With an armed robot it must be called again within ``robot_io.safety.owner_watch.LONGEST_SILENCE``.
         """
         while self._episodes:
             yield self._episodes.popleft()

@@ -159,8 +159,8 @@ class _Play:
             return
         if request is not None:
             self.session.send(request)
-        if recovery.word:
-            self.view.say(recovery.word)
+        if recovery.message:
+            self.view.say(recovery.message)
         if recovery.done:
             self.recovery = None
 

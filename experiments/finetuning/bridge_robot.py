@@ -38,7 +38,7 @@ class BridgeRobot(Operator):
         """Wait for the person's next ball. Raises RefusedError when the robot cannot be brought back after faults.
 
         The policy is exchanged while no new ball is taken; refused, because the ball before is still played, it is
-        handed over again. A ball that another version played counts for nobody.
+        handed over again. A ball that another version played does not count.
         """
         self._discarded = False
         self._version += 1

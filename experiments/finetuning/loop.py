@@ -155,7 +155,7 @@ class FineTuningRun:
         # Frozen: as float32 numbers they are those of the exported policy.
         self._normaliser = tuple(np.asarray(a) for a in normalizer.normaliser(first.statistics))
         self.journal = Journal(run.folder / JOURNAL)
-        self._played = {entry.place: entry for entry in self.journal.entries if not entry.discarded}
+        self._played = {entry.slot: entry for entry in self.journal.entries if not entry.discarded}
         if self.update > settings.updates:
             raise RunError(
                 f"{run.folder}: has {self.update} updates already, updates = {settings.updates} does not fit"
@@ -222,9 +222,9 @@ class FineTuningRun:
         self._progress.updated(number, row)
         return True
 
-    def _episode(self, place: tuple[str, int, int, int], theta: np.ndarray | None) -> Entry | None:
-        """The episode of that place: from the journal or played now; None when the operator stopped before it."""
-        while place not in self._played:
+    def _episode(self, slot: tuple[str, int, int, int], theta: np.ndarray | None) -> Entry | None:
+        """The episode of that slot: from the journal or played now; None when the operator stopped before it."""
+        while slot not in self._played:
             while self._operator.paused() and not self._operator.stopped():
                 self._progress.paused()
                 time.sleep(PAUSE_POLL)
@@ -235,15 +235,15 @@ class FineTuningRun:
                     f"{self.journal.path}: an episode of the evaluation before fine-tuning is missing, though updates "
                     "are done; restore the file or start a new run"
                 )
-            number = self._next_number(*place[:2])
+            number = self._next_number(*slot[:2])
             mean, inv_std = self._normaliser
             played = self._robot.play(Policy(np.ascontiguousarray(theta), mean, inv_std, self._network), number)
-            entry = self._entry(place, number, played)
+            entry = self._entry(slot, number, played)
             self.journal.append(entry)
             if not entry.discarded:
-                self._played[place] = entry
+                self._played[slot] = entry
             self._progress.played(entry)
-        return self._played[place]
+        return self._played[slot]
 
     def _next_number(self, phase: str, update: int) -> int:
         """A ball that is played again is another one: every attempt counts."""
@@ -252,7 +252,7 @@ class FineTuningRun:
         attempts = sum(entry.phase == phase and entry.update == update for entry in self.journal.entries)
         return EVALUATION_EPISODES + attempts  # the same balls before and after, where the robot can
 
-    def _entry(self, place: tuple[str, int, int, int], number: int, played: PlayedBall) -> Entry:
+    def _entry(self, slot: tuple[str, int, int, int], number: int, played: PlayedBall) -> Entry:
         summary = played.summary
         terms = reward_terms(summary)
         returns = sum(self._weights[name] * value for name, value in terms.items())
@@ -260,7 +260,7 @@ class FineTuningRun:
         # about the policy.
         discarded = self._operator.discarded() or summary.discarded or summary.fault == STOPPED
         discarded |= summary.human_fault is not None
-        return Entry(*place, number, summary, terms, returns, discarded, played.trajectory)
+        return Entry(*slot, number, summary, terms, returns, discarded, played.trajectory)
 
 
 def conclude(

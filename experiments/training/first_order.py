@@ -1,8 +1,7 @@
 """One update by first-order gradients: derivatives of a smooth objective through the simulation, compiled as a whole.
 
-The objective is averaged over the same perturbed policies as Blackbox Gradient Sensing compares, so that both climb the
-same kind of hill: a policy whose neighbours play as well. Where BGS learns one number of a policy and its balls, their
-return, here each of them tells its derivatives by all parameters.
+The objective is averaged over the same perturbed policies that Blackbox Gradient Sensing compares, so both optimise the
+same smoothed objective. BGS learns one number per policy, its return; here each episode gives a whole gradient.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ LONGEST = 1.0  # norm of a gradient: a few steep episodes must not decide where 
 
 
 class FirstOrderTrainer(Trainer):
-    """Updates of one training run. What a ``Trainer`` has for comparing returns (elites, pairs that meet the same
-    balls, later weights) is not used."""
+    """Updates of one training run. Elites, common random numbers and the reward schedule are not used."""
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)

@@ -248,7 +248,7 @@ def _start(config: Config, run: Run, trainer: Trainer, ranks: Ranks) -> tuple[Tr
 def _check_network(config: Config, trainer: Trainer, where: str) -> None:
     """Raises ConfigError where the policy to start from is another network's: its numbers would mean something else.
 
-    The file may have changed since: terms come and go, and of a network the name and the shapes are what it is told by.
+    Name and shapes decide: the file may have changed since.
     """
     networks = load_policy.load(str(config.initial_policy)).policy.network, trainer.network
     given, wanted = (None if n is None else (n.name, n.shapes) for n in networks)

@@ -220,7 +220,7 @@ class Viewer:
         self._events.content = "\n".join([*self._outcomes(), *past[-LISTED:]])
 
     def _outcomes(self) -> list[str]:
-        """Of replays side by side: whose each is, and how its ball ended; a single one has it in the picture."""
+        """Titles and outcomes of replays side by side; a single one has them in the picture."""
         if len(self.shown) < 2:
             return []
         ends = [f"{r.title}: {r.outcome}" if r.outcome and self.t >= r.decided else r.title for r in self.shown]

@@ -421,7 +421,7 @@ def test_discarded_balls_are_played_again_with_other_balls(source, tmp_path):
     found = entries(tmp_path / "run")
     assert report["discarded"] == 3 and [entry.discarded for entry in found[:9]] == [i in (1, 6, 7) for i in range(9)]
     kept = [entry for entry in found if not entry.discarded]
-    assert len(kept) == len({entry.place for entry in kept}) == 3 * 12 + 2 * 4
+    assert len(kept) == len({entry.slot for entry in kept}) == 3 * 12 + 2 * 4
     assert len({(entry.phase, entry.episode) for entry in found}) == len(found)
     assert not report["difference"]["paired"]  # other balls before than after
     rows = list(csv.DictReader(open(tmp_path / "run" / "human_balls.csv")))
