@@ -7,7 +7,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from experiments.config import robot as robots
@@ -88,38 +87,38 @@ class Jogger:
 
 
 def note(path: Path, found: Calibration, seen: messages.Marked, with_joints: bool, contract: Contract = PAPER) -> str:
-    """Add what tracker and joints reported, before any calibration, to a CSV of points; what was done, as a sentence.
+    """Adds what tracker and joints reported, before any calibration, to a CSV of points; returns a sentence about it.
 
     with_joints  False: the joints are not those of a robot
     contract     whose joints have the columns
     """
     left_out = {"ball": seen.ball.trouble(*STILL["ball"])}
-    ball = None if left_out["ball"] else found.tracker.inward(seen.ball.mean)
-    joints = None
+    values: dict[str, float] = {}
+    if not left_out["ball"]:
+        values |= zip(points.BALL, found.tracker.inward(seen.ball.mean), strict=True)
     if with_joints:
         left_out["joints"] = seen.axes.trouble(*STILL["joints"]) or seen.arm.trouble(*STILL["joints"])
         if not left_out["joints"]:
-            joints = np.concatenate([seen.axes.mean, seen.arm.mean - found.robot.zeros(len(contract.arm))])
+            arm = seen.arm.mean - found.robot.zeros(len(contract.arm))
+            values |= zip(contract.joints, (*seen.axes.mean, *arm), strict=True)
     reasons = "; ".join(f"no {what}: {trouble}" for what, trouble in left_out.items() if trouble)
-    if ball is None and joints is None:
+    if not values:
         return f"not noted: {reasons}"
     columns = [*points.TABLE, *points.BALL, *contract.joints]
     new = not path.exists()
     if not new and (there := _columns(path)) != columns:
         return f"not noted: {path} has the columns {', '.join(there)}; allowed with {contract.robot}: another file"
     with open(path, "a", encoding="utf-8", newline="") as stream:
-        lines = csv.writer(stream)
-        lines.writerows([columns] * new + [["", "", "", *_cells(ball, 3), *_cells(joints, contract.n_joints)]])
+        lines = csv.DictWriter(stream, columns, restval="")
+        if new:
+            lines.writeheader()
+        lines.writerow({name: f"{value:.6f}" for name, value in values.items()})
     return f"noted in {path}{reasons and f' ({reasons})'}; fill in table_x, table_y, table_z of its last line"
 
 
 def _columns(path: Path) -> list[str]:
     with open(path, encoding="utf-8", newline="") as stream:
         return next(csv.reader(stream), [])
-
-
-def _cells(values: np.ndarray | None, count: int) -> list[str]:
-    return [""] * count if values is None else [f"{value:.6f}" for value in values]
 
 
 @dataclass(frozen=True)

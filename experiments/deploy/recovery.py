@@ -11,8 +11,8 @@ LONGEST = 20.0  # [s] from the key, or from the end of the axes' search, until t
 class Recovery:
     """Steps from a fault to an armed robot, one per status of the control process.
 
-    Repairs (a cable, the emergency stop, the arm's controller) bring hands near the robot. It therefore homes and arms by
-    itself only if, from the key on, nothing was missing but what Prepare does: power and references of the axes.
+    Repairs (a cable, the emergency stop, the arm's controller) bring hands near the robot. It therefore homes and arms
+    by itself only if, from the key on, nothing was missing but what Prepare does: power and references of the axes.
     Otherwise it ends after the reset, and ``message`` asks for the operator's next key.
 
     status    the newest at the key, None: none has come

@@ -56,6 +56,10 @@ class Moment:
     dots: np.ndarray = field(default_factory=lambda: NO_PATH)
     caption: Caption | None = None
 
+    def __post_init__(self) -> None:
+        for name, shape in {"qpos": (None,), "ball": (3,), "trail": (None, 3), "dots": (None, 3)}.items():
+            object.__setattr__(self, name, _checked_array(name, getattr(self, name), shape))
+
 
 def render_png(
     path: str | os.PathLike,
@@ -111,7 +115,10 @@ def render_frames(
     Raises ValueError for a wrong shape or camera, RuntimeError when no OpenGL back end works.
     """
     model = load_model() if model is None else model
-    checked = [_checked_moment(moment, model.nq) for moment in moments]
+    moments = list(moments)
+    for moment in moments:
+        if len(moment.qpos) != model.nq:
+            raise ValueError(f"qpos needs {model.nq} joint positions, got {len(moment.qpos)}")
     if camera not in (names := camera_names(model)):
         raise ValueError(f"the scene has no camera {camera!r}; it has {names}")
     width, height = size
@@ -119,14 +126,14 @@ def render_frames(
         raise ValueError(f"size must be positive, got {size}")
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     data = mujoco.MjData(model)
-    drawn = max((2 * len(m.trail) + 2 * len(m.dots) for m in checked), default=0)
+    drawn = max((2 * len(m.trail) + 2 * len(m.dots) for m in moments), default=0)
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + drawn + 10)
     option, view, perturb = mujoco.MjvOption(), mujoco.MjvCamera(), mujoco.MjvPerturb()
     option.geomgroup[_BALL_GROUP] = False
     view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
     viewport, pixels = mujoco.MjrRect(0, 0, width, height), np.empty((height, width, 3), np.uint8)
     with offscreen(model, size) as context:
-        for moment in checked:
+        for moment in moments:
             data.qpos[:] = moment.qpos
             mujoco.mj_forward(model, data)
             mujoco.mjv_updateScene(model, data, option, perturb, view, mujoco.mjtCatBit.mjCAT_ALL, scene)
@@ -234,15 +241,6 @@ def _add(
     geom.category, geom.emission, geom.specular = mujoco.mjtCatBit.mjCAT_DECOR, 0.8, 0.0
     scene.ngeom += 1
     return geom
-
-
-def _checked_moment(moment: Moment, joints: int) -> Moment:
-    qpos = _checked_array("qpos", moment.qpos, (None,))
-    if len(qpos) != joints:
-        raise ValueError(f"qpos needs {joints} joint positions, got {len(qpos)}")
-    ball = _checked_array("ball", moment.ball, (3,))
-    trail, dots = (_checked_array(name, getattr(moment, name), (None, 3)) for name in ("trail", "dots"))
-    return Moment(qpos, ball, trail, dots, moment.caption)
 
 
 def _checked_path(path: str | os.PathLike, suffixes: tuple[str, ...]) -> Path:
