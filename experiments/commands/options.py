@@ -115,9 +115,9 @@ class DistributedOptions:
 
     def join(self) -> Ranks:
         """Joins the processes, if there are others. Raises ConfigError."""
-        from experiments.training.ranks import ALONE, join
+        from experiments.training.ranks import SINGLE, join
 
-        return join(self.distributed, self.processes, self.process) if self.distributed else ALONE
+        return join(self.distributed, self.processes, self.process) if self.distributed else SINGLE
 
 
 @Parameter(name="*")

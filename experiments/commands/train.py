@@ -81,7 +81,7 @@ def train(
         together = ranks.join()
         screen.quiet = not together.is_first
         with interruptible(), together.failing_fast():
-            sweep.run_together(planned[0], screen, together)
+            sweep.run_job(planned[0], screen, together)
         return 0
     side_by_side = 1 if elsewhere else sweep.choose(planned, ranks.processes, ranks.devices)
     with interruptible():

@@ -27,7 +27,7 @@ from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import Run
 from experiments.training.progress import TrainingProgress
-from experiments.training.ranks import ALONE, Ranks, Watchdog
+from experiments.training.ranks import SINGLE, Ranks, Watchdog
 from experiments.training.trainers import trainer
 from experiments.training.update import Trainer, TrainState
 from mjx_tt.env.evaluator import Evaluator
@@ -41,7 +41,7 @@ FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the d
 QUEUED = 16  # updates between fetches where several devices take part: hundreds of queued collectives may hang
 
 
-def train(experiment: Experiment, run: Run, console: Console, ranks: Ranks = ALONE) -> str:
+def train(experiment: Experiment, run: Run, console: Console, ranks: Ranks = SINGLE) -> str:
     """Trains until the configuration says stop, continuing from the last checkpoint; returns the setting that ended it.
 
     ranks: the processes that train it together; only the first one touches the run's folder. Ctrl-C or SIGTERM saves a
@@ -69,7 +69,7 @@ class TrainingRun:
     return_rate  of the last evaluation during training, None before the first
     """
 
-    def __init__(self, experiment: Experiment, run: Run, console: Console, ranks: Ranks = ALONE) -> None:
+    def __init__(self, experiment: Experiment, run: Run, console: Console, ranks: Ranks = SINGLE) -> None:
         self._config, self._run, self._console, self._ranks = experiment.config, run, console, ranks
         self._trainer = trainer(experiment)
         self.state, notes = _start(self._config, run, self._trainer, ranks)

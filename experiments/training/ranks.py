@@ -125,7 +125,7 @@ class Watchdog(threading.Thread):
                 self._on_silence(waited)
 
 
-ALONE = Ranks()
+SINGLE = Ranks()
 
 
 def join(where: str, processes: int | None, process: int | None) -> Ranks:

@@ -33,7 +33,7 @@ from experiments.config import build, experiment as config
 from experiments.runs.run_dir import Run
 from experiments.training import loop, ranks
 numbers = map(int, sys.argv[5:]) if sys.argv[5:] else (None, None)
-together = ranks.join(sys.argv[4], *numbers) if sys.argv[4:] else ranks.ALONE
+together = ranks.join(sys.argv[4], *numbers) if sys.argv[4:] else ranks.SINGLE
 with together.failing_fast():
     experiment = build.experiment(config.load(sys.argv[1]), sys.argv[1])
     loop.train(experiment, Run(sys.argv[2]), Console(), together)
@@ -153,8 +153,8 @@ def test_without_a_cluster_auto_says_so():
 
 
 def test_alone_there_is_nothing_to_agree_on():
-    assert ranks.ALONE.gather(1.0, 2.5).tolist() == [[1.0, 2.5]]
-    assert ranks.ALONE.broadcast([np.arange(3)])[0].tolist() == [0, 1, 2]
+    assert ranks.SINGLE.gather(1.0, 2.5).tolist() == [[1.0, 2.5]]
+    assert ranks.SINGLE.broadcast([np.arange(3)])[0].tolist() == [0, 1, 2]
 
 
 def test_the_watch_calls_once_signs_stop(monkeypatch):
