@@ -161,8 +161,8 @@ def _run_into_file(job: Job) -> str:
 def run_job(job: Job, console: Console, ranks: Ranks = SINGLE) -> str:
     """Trains, evaluates and exports one run, as far as that is not done yet; returns its return rate as text.
 
-    ranks: processes that train it together; the first one checks, evaluates, draws and exports alone. Raises ConfigError
-    where the processes do not read the same.
+    ranks: processes that train it together; the first one checks, evaluates, draws and exports alone. Raises
+    ConfigError where the processes do not read the same.
     """
     experiment = build.experiment(job.config, job.where)
     run, config = job.run, experiment.config
