@@ -31,7 +31,7 @@ from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journ
 from experiments.finetuning.progress import FineTuningProgress
 from experiments.finetuning.robot import LockStepRobot, Operator, PlayedBall, Robot, throws_of
 from experiments.progress import print_files
-from experiments.runs import checkpoint, load_policy, run_dir
+from experiments.runs import checkpoint, load_policy, metrics, run_dir
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import CONFIG, Run
 from experiments.training import finalize
@@ -270,7 +270,8 @@ def conclude(
     result = report.compare(entries, robot.repeatable)
     result |= {"settings": settings.model_dump(mode="json"), "robot": robot.describe()}
     kept = [entry for entry in entries if not entry.discarded]
-    picture = report.draw(run.plots / CURVE, kept, result, f"{run.folder.name}: fine-tuning on a robot")
+    title, rows = f"{run.folder.name}: fine-tuning on a robot", metrics.read(run.metrics)
+    picture = report.draw(run.plots / CURVE, rows, settings.episodes_per_update, result, title)
     # Balls that a repeatable robot meets before and after are the same.
     human = [entry for entry in kept if entry.phase != AFTER or not robot.repeatable]
     balls = report.write_human_balls(run.folder / HUMAN_BALLS, run.folder.name, human)
