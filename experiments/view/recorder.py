@@ -208,7 +208,7 @@ class Recorder:
         terms = reward_terms(state, back, self.simulator.config.own_terms)
         returned = state.hit & back.returned & state.finite
         outcome = jnp.where(returned, RETURNED, jnp.where(state.hit & state.finite, HIT, MISSED))
-        return {**shown, "terms": terms, "outcome": outcome, "hit": state.hit, "landing": jnp.asarray(back.landing)}
+        return {**shown, "terms": terms, "outcome": outcome, "hit": state.hit}
 
     def replays(self, recorded: dict[str, np.ndarray], titles: Sequence[str]) -> list[Replay]:
         """A replay of every episode."""
