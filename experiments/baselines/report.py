@@ -21,9 +21,10 @@ from matplotlib.ticker import LogLocator, NullFormatter, PercentFormatter
 
 from ballmodel.io.atomic_files import replacing
 from experiments.config.baselines import Comparison
-from experiments.evaluation.figures import INK, STYLE
+from experiments.evaluation.figures import STYLE
 from experiments.runs import run_dir
 from experiments.stats import wilson
+from mjx_tt.viz.html import INK
 
 COLOURS = ("#1b7837", "#7fbf7b", "#762a83", "#2166ac", "#b35806", "#b2182b", "#542788", "#4d4d4d")
 WORLDS = {"simulation": "in simulation", "reality": "in a world that it has never seen"}

@@ -15,9 +15,10 @@ from rich.table import Table
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.csv import COLUMNS
-from experiments.evaluation.figures import HIT_COLOUR, INK, MISSED_COLOUR, RETURNED_COLOUR, STYLE, save
+from experiments.evaluation.figures import HIT_COLOUR, MISSED_COLOUR, RETURNED_COLOUR, STYLE, save
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry
 from experiments.stats import t_interval, welch_interval, wilson
+from mjx_tt.viz.html import INK
 from robot_io.control.episode import HIT, RETURNED
 
 CURVE_COLOUR = "#4575b4"
