@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from datetime import timedelta
-from typing import IO
+from typing import IO, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -68,7 +68,7 @@ class ProgressBar:
         )
         self._live = Progress(*columns, console=console, expand=True, disable=not console.is_terminal)
 
-    def __enter__(self) -> ProgressBar:
+    def __enter__(self) -> Self:
         self._live.start()
         self._task = self._live.add_task(self._name, total=self._total, completed=self._done, text=self._text)
         return self

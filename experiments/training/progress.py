@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 from rich.console import Console
 
 from experiments.progress import ProgressBar, seconds_left
@@ -16,7 +18,7 @@ class TrainingProgress(ProgressBar):
         self._rate: float | None = None
         self._text = "compiling ..."
 
-    def __enter__(self) -> TrainingProgress:
+    def __enter__(self) -> Self:
         super().__enter__()
         if not self._console.is_terminal:
             self.note(self._text)

@@ -36,14 +36,15 @@ class Controls:
             rallies = tuple(RALLY + name for name in human_player.names())
             own = () if play.distribution.name in registry.names() else (play.balls or "",)
             choices: tuple[str, ...] = (*own, *registry.names(), ONE_BALL, *rallies)
-            self._balls = gui.add_dropdown("balls", choices, initial_value=play.balls)
+            # Any: viser declares the values of its inputs as read-only.
+            self._balls: Any = gui.add_dropdown("balls", choices, initial_value=play.balls)
             misses = gui.add_button("Give me the balls that it misses", icon=viser.Icon.TARGET)
             with gui.add_folder("One ball"):
                 gui.add_markdown("Drag the arrows at its start, or:")
-                self._state = [gui.add_slider(*given, max(given[1], 0.0)) for given in STATE]
+                self._state: list[Any] = [gui.add_slider(*given, max(given[1], 0.0)) for given in STATE]
         with tabs.add_tab("Physics"):
             reset = gui.add_button("As the model has it", icon=viser.Icon.RESTORE)
-            self._sliders: dict[str, tuple[Slider, viser.GuiSliderHandle]] = {}
+            self._sliders: dict[str, tuple[Slider, Any]] = {}
             for group, sliders in slider_groups(play.recorder.joints).items():
                 with gui.add_folder(group, expand_by_default=group != DRIVES):
                     for slider in sliders:
@@ -62,7 +63,7 @@ class Controls:
         """Enqueues the action when somebody at the page changes the input, and not when the program does."""
         handle.on_update(lambda event: self._viewer.enqueue(key, action) if event.client is not None else None)
 
-    def _add_slider(self, s: Slider) -> viser.GuiSliderHandle:
+    def _add_slider(self, s: Slider) -> Any:
         value = round(self._play.values[s.path] / s.unit, 6)
         hint = s.path if np.isfinite(value) else f"{s.path}: drawn anew for every ball until it is moved"
         value = value if np.isfinite(value) else (s.low + s.high) / 2

@@ -86,7 +86,7 @@ class Scene:
         add.configure_environment_map(None)
         add.configure_default_lights(cast_shadow=False)
         add.add_light_hemisphere("/light", ground_color=(225, 225, 220), intensity=3.0)
-        floor = {"cell_color": (228, 228, 228), "section_color": (205, 205, 205), "plane_color": (246, 246, 244)}
+        floor: Any = {"cell_color": (228, 228, 228), "section_color": (205, 205, 205), "plane_color": (246, 246, 244)}
         add.add_grid(
             "/floor", infinite_grid=True, fade_distance=14.0, plane_opacity=1.0, position=(0.0, 0.0, FLOOR), **floor
         )
@@ -99,10 +99,11 @@ class Scene:
         }
         self._marks = add.add_point_cloud("/marks", NOWHERE[0], MARK_COLOUR, point_size=0.007, point_shape="circle")
         tables = range(count)
-        landing, shadow = {"color": LANDING_COLOUR, "opacity": 0.8}, {"color": (20, 25, 40), "opacity": 0.5}
+        landing: Any = {"color": LANDING_COLOUR, "opacity": 0.8}
+        shadow: Any = {"color": (20, 25, 40), "opacity": 0.5}
         self._landing = [add.add_cylinder(f"/landing/{i}", 0.06, 0.004, **landing) for i in tables]
         self._shadows = [add.add_cylinder(f"/shadow/{i}", SHOWN_RADIUS, 0.002, **shadow) for i in tables]
-        style = {"anchor": "bottom-center", "font_screen_scale": 1.2}
+        style: Any = {"anchor": "bottom-center", "font_screen_scale": 1.2}
         self._labels = [
             add.add_label(f"/label/{i}", "", position=offset(i) + (0.0, -1.0, 1.0 + 0.35 * (i % 2)), **style)
             for i in tables

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
@@ -68,7 +69,7 @@ class Viewer:
         gui.main_panel.set_width(PANEL)
         self._caption = gui.add_markdown("")
         self._events = gui.add_markdown("")
-        self._time = gui.add_slider("time [s]", 0.0, 1.0, 0.001, 0.0)
+        self._time: Any = gui.add_slider("time [s]", 0.0, 1.0, 0.001, 0.0)
         self._play = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         steps = gui.add_button_group("step", ("◀ ball", "◀", "▶", "ball ▶"))
         self._speed = gui.add_slider("speed", 0.02, 1.0, 0.02, 1.0)
