@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-import imageio.v2 as imageio
+import imageio_ffmpeg
 import mujoco
 import numpy as np
 from PIL import Image
@@ -101,7 +103,10 @@ def render_video(
         raise ValueError(f"viewers show a GIF at {1.0 / _GIF_MIN_DELAY:.0f} frames per second at most, got fps {fps}")
     frames = render_frames(moments, camera, size, model)
     with replacing(path) as temporary:
-        (_write_gif if path.suffix == ".gif" else _write_mp4)(temporary, frames, fps)
+        if path.suffix == ".gif":
+            _write_gif(temporary, frames, fps)
+        else:
+            _write_mp4(temporary, frames, fps, size)
 
 
 def render_frames(
@@ -150,11 +155,12 @@ def camera_names(model: mujoco.MjModel | None = None) -> list[str]:
     return [model.camera(i).name for i in range(model.ncam)]
 
 
-def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    options = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "output_params": ["-f", "mp4"]}
-    with imageio.get_writer(path, format="FFMPEG", fps=fps, **options) as writer:  # type: ignore[arg-type]
+def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float, size: tuple[int, int]) -> None:
+    options: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "output_params": ["-f", "mp4"]}
+    with closing(imageio_ffmpeg.write_frames(path, size, fps=fps, **options)) as writer:
+        writer.send(None)  # starts the encoder
         for frame in frames:
-            writer.append_data(frame)  # type: ignore[attr-defined]  # annotated as the base of readers and writers
+            writer.send(np.ascontiguousarray(frame))
 
 
 def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
