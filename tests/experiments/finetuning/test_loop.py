@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 import yaml
 from rich.console import Console
-from scipy.stats import t as student
 
 from ballmodel.distribution import load_distribution
 from bgs import strategy
@@ -35,7 +34,6 @@ from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journ
 from experiments.finetuning.robot import LockStepRobot, Operator, PlayedBall
 from experiments.runs import checkpoint, load_policy, metrics
 from experiments.runs.run_dir import Run
-from experiments.stats import t_interval, welch_interval
 from mjx_tt.env.policy import Policy, initial_theta
 from robot_io import contract
 from robot_io.control.episode import EpisodeSummary
@@ -458,18 +456,6 @@ def test_fewer_updates_than_planned_are_an_end_too(source, tmp_path):
 
 
 # Measurements
-
-
-def test_intervals_are_those_of_student_and_welch():
-    chance = np.random.default_rng(0)
-    a, b = chance.normal(1, 1, 30), chance.normal(2, 3, 20)
-    half = student.ppf(0.975, 29) * a.std(ddof=1) / np.sqrt(30)
-    assert t_interval(a) == pytest.approx((a.mean(), a.mean() - half, a.mean() + half))
-    spreads, sizes = np.array([a.var(ddof=1) / 30, b.var(ddof=1) / 20]), np.array([30, 20])
-    half = student.ppf(0.975, spreads.sum() ** 2 / (spreads**2 / (sizes - 1)).sum()) * np.sqrt(spreads.sum())
-    mean = b.mean() - a.mean()
-    assert welch_interval(a, b) == pytest.approx((mean, mean - half, mean + half))
-    assert t_interval([2.0, 2.0]) == (2.0, 2.0, 2.0) and welch_interval([1.0, 1.0], [3.0, 3.0]) == (2.0, 2.0, 2.0)
 
 
 @pytest.mark.slow
