@@ -49,9 +49,10 @@ def evaluate(
     from experiments.progress import make_console, print_stages
     from experiments.runs import load_policy
     from experiments.training import finalize
+    from experiments.training.ranks import join
 
     screen = make_console()
-    together = ranks.join()
+    together = join(ranks.distributed, ranks.processes, ranks.process)
     screen.quiet = not together.is_first
     trained = load_policy.load(policy)
     experiment = play.experiment(trained)

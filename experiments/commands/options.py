@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from experiments.config.build import Experiment
     from experiments.config.site import Site as SiteFile
     from experiments.runs.load_policy import TrainedPolicy
-    from experiments.training.ranks import Ranks
 
 SHIPPED_POLICY = Path(__file__).parents[1] / "shipped" / "policies" / "quickstart"
 RIG, LOCK_STEP = "rig", "lockstep"  # values of --robot that are no file
@@ -112,12 +111,6 @@ class DistributedOptions:
         count("runs at a time (default: one per processor core); with HOST:PORT, number of processes"),
     ] = None
     process: Annotated[int | None, option("I", "index of this process, from 0 (with HOST:PORT)")] = None
-
-    def join(self) -> Ranks:
-        """Joins the processes, if there are others. Raises ConfigError."""
-        from experiments.training.ranks import SINGLE, join
-
-        return join(self.distributed, self.processes, self.process) if self.distributed else SINGLE
 
 
 @Parameter(name="*")

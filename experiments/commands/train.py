@@ -74,11 +74,12 @@ def train(
     from experiments.jobs.site import Workers
     from experiments.progress import make_console
     from experiments.training import sweep
+    from experiments.training.ranks import join
 
     screen = make_console()
     planned = sweep.plan(configs, seeds, Path(out))
     if ranks.distributed:
-        together = ranks.join()
+        together = join(ranks.distributed, ranks.processes, ranks.process)
         screen.quiet = not together.is_first
         with interruptible(), together.failing_fast():
             sweep.run_job(planned[0], screen, together)

@@ -128,12 +128,14 @@ class Watchdog(threading.Thread):
 SINGLE = Ranks()
 
 
-def join(where: str, processes: int | None, process: int | None) -> Ranks:
+def join(where: str | None, processes: int | None, process: int | None) -> Ranks:
     """Joins the processes; JAX must be configured and not yet running.
 
     where: "auto" under SLURM, Open MPI or Kubernetes, which say who takes part; otherwise HOST:PORT of the first
-    process, which listens there and nowhere else. Raises ConfigError.
+    process, which listens there and nowhere else; None: there are no others. Raises ConfigError.
     """
+    if where is None:
+        return SINGLE
     given = f"--distributed {where}"
     if where != AUTO and (processes is None or process is None):
         raise ConfigError(f"{given}: needs --processes N and --process I, I from 0 to N - 1")
