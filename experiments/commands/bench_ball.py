@@ -9,7 +9,6 @@ from cyclopts import Parameter
 
 from experiments.commands import options
 from experiments.commands.options import option
-from experiments.errors import checked
 
 app = options.command(
     "bench-ball",
@@ -36,9 +35,8 @@ def bench_ball(
     options.start_jax(1)
     from experiments.evaluation import ball_benchmark
     from experiments.progress import make_console
-    from mjx_tt.sim.model import ModelFile
 
-    worlds = {Path(path).stem: checked("--model", ModelFile.load, path).model for path in model}
+    worlds = {Path(path).stem: options.load_model(path) for path in model}
     found = ball_benchmark.score(data, worlds)
     screen = make_console()
     for b, licence in found:

@@ -90,7 +90,6 @@ def fit_human(
     from experiments.measurements import read_all, start_states
     from experiments.progress import make_console
     from mjx_tt import diagnosis
-    from mjx_tt.sim.model import ModelFile
 
     screen, path = make_console(), Path(out)
     measured = read_all(list(data), format)
@@ -98,7 +97,7 @@ def fit_human(
         raise ConfigError(
             f"{', '.join(data)}: holds start states, which need no fit; --fit {fit} is for trajectories, leave it out"
         )
-    world = checked("--model", ModelFile.load, model).model if model else None
+    world = options.load_model(model) if model else None
     if world is not None and isinstance(measured, Dataset):
         checked("", diagnosis.check, measured.trajectories, measured.source)
         measured, lines = start_states(measured, world)

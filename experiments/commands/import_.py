@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from experiments.commands import options
 from experiments.commands.options import option
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError
 
 app = options.command(
     "import",
@@ -33,15 +33,12 @@ def import_measurements(
     options.check_exists(data)
     options.check_suffix(out, ".csv", ".mcap")
     options.start_jax(1)
-    from ballmodel.io import read, write_mcap
-    from ballmodel.trajectory import Dataset
-    from experiments.measurements import write_csv
+    from ballmodel.io import write_mcap
+    from experiments.measurements import read_trajectories, write_csv
     from experiments.progress import make_console
 
     path = Path(out)
-    measured = checked("", read, data, format)
-    if not isinstance(measured, Dataset):
-        raise ConfigError(f"{data}: holds start states, not trajectories; mjx-tt fit-human takes it as it is")
+    measured = read_trajectories([data], format)
     if path.exists() and path.samefile(data):
         raise ConfigError(f"--out {path}: is the file to be converted")
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter, Token
 
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, checked
 
 if TYPE_CHECKING:
     from experiments.config.build import Experiment
     from experiments.config.site import Site as SiteFile
     from experiments.runs.load_policy import TrainedPolicy
+    from mjx_tt.sim.model import SimModel
 
 SHIPPED_POLICY = Path(__file__).parents[1] / "shipped" / "policies" / "quickstart"
 RIG, LOCK_STEP = "rig", "lockstep"  # values of --robot that are no file
@@ -187,6 +188,13 @@ def load_site(name: str | None, **others: Any) -> SiteFile | None:
                 f"--{option_name} {value}: with --site {name} its workers_per_node, cores_per_worker and blocks say so"
             )
     return loaded
+
+
+def load_model(path: str | None) -> SimModel:
+    """The simulation model of a file, None: the nominal one. Raises ConfigError."""
+    from mjx_tt.sim.model import ModelFile, SimModel
+
+    return SimModel() if path is None else checked("--model", ModelFile.load, path).model
 
 
 def find_shipped(name: str, shipped: dict[str, Path]) -> Path:

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from experiments.commands import options
 from experiments.commands.options import option
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError
 
 app = options.command(
     "predict",
@@ -40,15 +40,10 @@ def predict(
     if any(not 0.0 < h < 5.0 for h in horizon):
         raise ConfigError(f"--horizon {', '.join(f'{h:g}' for h in horizon)}: seconds above 0 and below 5 are wanted")
     options.start_jax(1)
-    from ballmodel.trajectory import Dataset
     from experiments.evaluation import ball_predictions
-    from experiments.measurements import read_all
+    from experiments.measurements import read_trajectories
     from experiments.progress import make_console
-    from mjx_tt.sim.model import ModelFile, SimModel
 
-    measured = read_all(list(data), format)
-    if not isinstance(measured, Dataset):
-        raise ConfigError(f"{measured.source}: holds start states; measured trajectories are needed")
-    world = checked("--model", ModelFile.load, model).model if model else SimModel()
-    lines = ball_predictions.write(Path(out), measured, world, tuple(sorted(horizon)), seen)
+    measured = read_trajectories(data, format)
+    lines = ball_predictions.write(Path(out), measured, options.load_model(model), tuple(sorted(horizon)), seen)
     make_console().print(*lines, sep="\n")

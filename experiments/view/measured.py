@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ballmodel.trajectory import Trajectory
+from experiments.commands import options
 from experiments.deploy import robot_attachment, session_logs
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError
 from experiments.view.playlist import FixedPlaylist
 from experiments.view.replay import RATE, Replay, Series
 from mjx_tt import diagnosis
@@ -36,7 +37,7 @@ def load(path: Path, model: str | None) -> FixedPlaylist:
         if model is not None:
             raise ConfigError(f"--model {model}: a diagnosis has its own two models")
         return load_diagnosis(path)
-    return load_session(path, SimModel() if model is None else checked("--model", ModelFile.load, model).model)
+    return load_session(path, options.load_model(model))
 
 
 # -- sessions ----------------------------------------------------------------------------------------------------------
