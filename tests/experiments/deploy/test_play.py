@@ -127,18 +127,8 @@ def as_in_a_terminal():
 
 def started(policy, folder, *more):
     """``mjx-tt run`` on the rig as a group of its own, after its first ball."""
-    command = [
-        sys.executable,
-        "-m",
-        "experiments.cli",
-        "run",
-        str(policy),
-        "--robot",
-        "rig",
-        "--log",
-        str(folder),
-        *more,
-    ]
+    program = [sys.executable, "-m", "experiments.cli"]
+    command = [*program, "run", str(policy), "--robot", "rig", "--log", str(folder), *more]
     pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     running = subprocess.Popen(command, cwd=ROOT, start_new_session=True, preexec_fn=as_in_a_terminal, **pipe)
     for line in running.stdout:

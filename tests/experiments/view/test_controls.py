@@ -51,10 +51,13 @@ def test_time_passes_at_the_speed_that_is_chosen_and_the_next_ball_follows(viewe
     viewer.advance(SECONDS + REST)
     assert (viewer.number, viewer.t, viewer._caption.content) == (1, 0.0, "**second**")
     viewer.go(-1)
-    assert viewer.number == 1
-    viewer.toggle()
+    assert viewer.number == 1 and viewer.controls is None
+    viewer.t = SECONDS + 0.3  # it rests on the last frame
+    for button, t in (("▶", SECONDS), ("◀", SECONDS - 1 / 75), ("◀", SECONDS - 2 / 75)):
+        viewer._step(button)
+        assert viewer.t == pytest.approx(t)
     viewer.advance(1.0)
-    assert viewer.t == 0.0
+    assert not viewer.playing and viewer.t == pytest.approx(SECONDS - 2 / 75)
 
 
 def test_the_scene_shows_ball_trail_and_label_at_the_moment(viewer):
@@ -109,6 +112,9 @@ def test_controls_choose_balls_and_physics(server, play):
     controls._balls.value = "narrow"
     controls._choose_balls()
     assert play.balls == "narrow" and "Ball 1 of narrow" in viewer._caption.content
+    play.values["latency.ball_observation"] = 0.09
+    controls._find_misses()
+    assert "Missed ball 1" in viewer._caption.content and not viewer.shown[0].outcome.startswith("returned")
     play.values[slider.path] = 0.5
     controls._reset()
     assert play.values == play.recorder.nominal() and handle.value == pytest.approx(play.values[slider.path], abs=1e-5)

@@ -1,4 +1,4 @@
-"""Replays of a diagnosis: flights of a model that is known to be wrong, beside one that is known to be right."""
+"""Replays of a session at the robot, and of a diagnosis whose nominal model is known to be wrong."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import pytest
 
 from experiments.errors import ConfigError
 from experiments.view import measured
+from mjx_tt.robot.model import home_qpos, load_model
 from mjx_tt.sim.model import ModelFile, SimModel, with_values
+from robot_io import log
 from tests.oracles.ball_flight import RADIUS, TABLE_MU, Touch, bounce, fly, path
 
 DEAD = 0.8  # restitution of the table that the balls were measured on
@@ -64,3 +66,29 @@ def test_a_log_that_is_gone_is_named(folder):
     (folder / "balls.csv").unlink()
     with pytest.raises(ConfigError, match="extended.yaml: provenance.logs .*balls.csv: no such file"):
         measured.load_diagnosis(folder)
+
+
+def test_a_session_of_the_robot_is_replayed_as_it_was_logged(tmp_path):
+    start, home = 50.0, home_qpos(load_model())
+    with log.FileRecorder.start(tmp_path, "session", {}, {}, start, 0) as recorder:
+        recorder.put(log.episode_start(start + 0.2, 1))
+        for k in range(120):
+            t, now = k / 75, start + k / 75
+            flown = np.array([0.2, 1.2 - 4.0 * t, 0.3 + 1.0 * t - 4.905 * t**2])
+            if flown[2] > 0.02:
+                recorder.put(log.Ball(now, now, flown, 1))
+            joints = home + np.eye(8)[2] * 0.2 * np.sin(2 * np.pi * t)
+            recorder.put(log.Joints(now, joints, np.zeros(8), now))
+            recorder.put(log.Command(k, now, np.zeros(8), np.full(8, 0.1), joints))
+        recorder.put(log.Event(start + 0.7, log.Level.ERROR, "fault", "tracker: silent"))
+        recorder.put(log.episode_end(start + 1.2, 1, "missed", {"hit": 0.0}))
+    playlist = measured.load(tmp_path / "session.mcap", None)
+    (replay,) = playlist.replays(0)
+    assert playlist.caption(0) == "session.mcap, episode 1 of 1" and replay.outcome == "missed"
+    np.testing.assert_allclose(replay.qpos[:, 2], home[2] + 0.2 * np.sin(2 * np.pi * replay.time), atol=1e-3)
+    seen, simulated = replay.balls["measured"], replay.balls["simulated"]
+    flying = np.isfinite(seen[:, 0]) & np.isfinite(simulated[:, 0])
+    np.testing.assert_allclose(seen[flying, 1], 1.2 - 4.0 * replay.time[flying], atol=1e-3)
+    assert np.abs(seen - simulated)[flying].max() < 0.1  # the logged ball knows no air
+    np.testing.assert_allclose(replay.series["Commands sent [m/s, rad/s]"].values, 0.1)
+    assert replay.events == ((pytest.approx(0.7), "FAULT: tracker: silent"),)
