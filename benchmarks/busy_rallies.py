@@ -14,7 +14,8 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 
 from benchmarks.harness import run
-from experiments.deploy import session
+from experiments.commands.options import RIG, RobotOptions
+from experiments.deploy import play
 
 
 def main(
@@ -29,19 +30,8 @@ def main(
     for other in others:
         other.start()
     with TemporaryDirectory() as folder:
-        status = session.run(
-            artefact,
-            "rig",
-            None,
-            None,
-            backend,
-            Path(folder),
-            None,
-            0,
-            seconds,
-            Console(),
-            player=player,
-        )
+        setup = RobotOptions(backend=backend, player=player)
+        status = play.run(artefact, RIG, Path(folder), Console(), setup, seconds=seconds)
         report = json.loads(next(Path(folder).glob("*.json")).read_text("utf-8"))
     for other in others:
         other.kill()

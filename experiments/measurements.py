@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +38,9 @@ def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
     raise ConfigError(f"several files must all hold trajectories ({kinds}); fit the others one by one")
 
 
-def read_trajectories(paths: list[Path]) -> Dataset:
+def read_trajectories(paths: Iterable[str | Path], format: str | None = None) -> Dataset:
     """Trajectories of several files together. Raises ConfigError as ``read_all`` does, and for start states."""
-    measured = read_all([str(path) for path in paths], None)
+    measured = read_all([str(path) for path in paths], format)
     if not isinstance(measured, Dataset):
         raise ConfigError(f"{measured.source}: holds start states; measured trajectories are needed")
     return measured

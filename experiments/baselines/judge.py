@@ -14,9 +14,9 @@ from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.evaluation import evaluate
-from mjx_tt.env.episode import reshaped
+from mjx_tt.env.episode import Controller, Episodes, EpisodeState, Tick, reshape_episodes
 from mjx_tt.env.rollout import RolloutResult, Simulator
-from mjx_tt.env.task import Controller, Episodes, EpisodeState, TaskConfig, Tick
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.sim.model import ModelFile
 
 ROWS, COLUMNS = 2, 256  # episodes of one compiled call
@@ -78,12 +78,12 @@ class World:
         return replace(drawn, ball=replace(thrown, spin=thrown.spin + drawn.ball.spin))
 
     def _action_change(self, controller: Controller, episodes: Episodes) -> jax.Array:
-        task, episodes = self._simulator.task, reshaped(episodes, -1)
-        prepared, last = task.prepare(episodes), LastAction(controller, controller.mean)
+        task, episodes = self._simulator.task, reshape_episodes(episodes, -1)
+        constants, last = task.prepare(episodes), LastAction(controller, controller.mean)
 
         def advance(carry: Carry, tick: Tick) -> tuple[Carry, None]:
             state, total, count = carry
-            after = task.control_step(tick, state, episodes, prepared, last)
+            after = task.step(tick, state, episodes, constants, last)
             counted = (state.live & (tick > 0)).astype(total.dtype)
             change = jnp.mean((after.controller[1] - state.controller[1]) ** 2, axis=0)
             return (after, total + jnp.sum(counted * change), count + jnp.sum(counted)), None

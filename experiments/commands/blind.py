@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from experiments.commands.options import command, console, option, start_jax
+from experiments.commands import options
+from experiments.commands.options import option
 from experiments.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -15,9 +16,9 @@ if TYPE_CHECKING:
 
     from experiments.study.analysis.scoring import Rallies
 
-app = command(
+app = options.command(
     "blind",
-    "policies under code names, for people who evaluate them",
+    "let people evaluate policies under code names",
     """\
   mjx-tt blind make anna-evaluates is2r-ft100=runs/a/artefact s2r-ft100=runs/b/artefact --trainer anna --evaluator anna
   mjx-tt run anna-evaluates/policies/A --robot robot.yaml          and fill in anna-evaluates/sheet.csv; then B, C, ...
@@ -33,18 +34,19 @@ docs/how-to/evaluate-blind.md.
 @app.default
 def blind(
     action: Annotated[Literal["make", "sheet", "open"], Parameter("ACTION")],
-    folder: Annotated[str, Parameter("FOLDER", help="of the blind evaluation")],
+    folder: Annotated[str, Parameter("FOLDER", help="folder of the blind evaluation")],
     /,
-    *policies: Annotated[str, Parameter("MODEL=POLICY", help="of make: a name and its artefact or run")],
-    trainer: Annotated[str, option("NAME", "of make: who trained the policies")] = "",
-    evaluator: Annotated[str, option("NAME", "of make: who plays (default: the trainer)")] = "",
-    seed: Annotated[int, option("K", "of make: the study's seed that the policies belong to")] = 0,
+    *policies: Annotated[str, Parameter("MODEL=POLICY", help="make: a model's name and its artefact or run")],
+    trainer: Annotated[str, option("NAME", "make: who trained the policies")] = "",
+    evaluator: Annotated[str, option("NAME", "make: who plays (default: the trainer)")] = "",
+    seed: Annotated[int, option("K", "make: seed of the study that the policies belong to")] = 0,
 ) -> None:
     """Raises ConfigError for what cannot be done."""
-    start_jax(1)
+    options.start_jax(1)
+    from experiments.progress import make_console
     from experiments.study.blind import protocol
 
-    screen, place = console(), Path(folder)
+    screen, place = make_console(), Path(folder)
     if action == "make":
         _make(place, policies, trainer, evaluator or trainer, seed, screen)
         return
@@ -78,16 +80,9 @@ def _make(folder: Path, given: tuple[str, ...], trainer: str, evaluator: str, se
             "such as --trainer player3; --evaluator is the trainer where it is left out"
         )
     codes = protocol.make(folder, policies, trainer, evaluator, seed)
-    console.print(
-        f"{len(codes)} policies under {folder / protocol.POLICIES}, to be tested in this order: {' '.join(codes)}",
-        highlight=False,
-        soft_wrap=True,
-    )
-    console.print(
-        f"sheet: {folder / protocol.SHEET}; the key is sealed in {folder / protocol.KEY}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    where = f"{len(codes)} policies under {folder / protocol.POLICIES}"
+    console.print(f"{where}, to be tested in this order: {' '.join(codes)}", soft_wrap=True)
+    console.print(f"sheet: {folder / protocol.SHEET}; the key is sealed in {folder / protocol.KEY}", soft_wrap=True)
 
 
 def _show_progress(folder: Path, console: Console) -> None:
@@ -116,6 +111,4 @@ def _show_opened(rallies: Rallies, folder: Path, console: Console) -> None:
         mean = t_mean(mine.length)
         table.add_row(str(mine.blind[0]), model, str(mean.n), f"{mean.value:.1f} ({mean.low:.1f} to {mean.high:.1f})")
     console.print(table)
-    console.print(
-        f"{folder / protocol.EVALUATIONS}, key in {folder / protocol.OPENED}", highlight=False, soft_wrap=True
-    )
+    console.print(f"{folder / protocol.EVALUATIONS}, key in {folder / protocol.OPENED}", soft_wrap=True)

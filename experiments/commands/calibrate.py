@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from experiments.commands.options import command, console, existing, option, writable
+from experiments.commands import options
+from experiments.commands.options import option
 from experiments.errors import ConfigError, checked
 
 if TYPE_CHECKING:
@@ -17,9 +18,9 @@ if TYPE_CHECKING:
     from robot_io.calibrated import Calibration, ClockCalibration, RobotCalibration, TrackerCalibration
     from robot_io.contract import Contract
 
-app = command(
+app = options.command(
     "calibrate",
-    "find where tracker, robot and clock are, from measured points and logs",
+    "calibrate tracker, robot and clock from measured points and logs",
     """\
   mjx-tt calibrate tracker ball.csv              table_x, table_y, table_z and ball_x, ball_y, ball_z of every point
   mjx-tt calibrate robot touches.csv --robot robot.yaml        table_x, ... and gantry_x ... joint_6 of every touch
@@ -36,39 +37,38 @@ mjx-tt robot check writes the ball's columns of the points, robot jog the joints
 def calibrate(
     part: Annotated[Literal["tracker", "robot", "clock"], Parameter("PART")],
     source: Annotated[str, Parameter("FILE", help="CSV of points, or the log of a session")],
-    own: Annotated[
-        str | None, Parameter("ROBOT", help="of robot: the one that stands there, by folder or name (the paper's)")
+    name: Annotated[
+        str | None, Parameter("ROBOT", help="robot: the installed one, by folder or name (default: the paper's)")
     ] = None,
     /,
     *,
-    robot: Annotated[
-        str | None, option("YAML", "robot.yaml, whose zeros of the axes are kept with the robot's")
-    ] = None,
-    out: Annotated[str, option("YAML", "calibration that is written or extended")] = "calibration.yaml",
+    robot: Annotated[str | None, option("YAML", "robot.yaml whose axis zeros are stored with the robot's")] = None,
+    out: Annotated[str, option("YAML", "calibration to write or extend")] = "calibration.yaml",
 ) -> int:
     """Returns the exit status."""
-    existing(source, robot)
-    if own is not None and part != "robot":
-        raise ConfigError(f"{own}: the {part}'s calibration is of no robot; allowed with calibrate robot")
+    options.check_exists(source, robot)
+    if name is not None and part != "robot":
+        raise ConfigError(f"{name}: the {part}'s calibration is of no robot; allowed with calibrate robot")
     target = Path(out)
-    writable(target.parent)
+    options.check_writable(target.parent)
     from dataclasses import asdict
     from datetime import date
 
     from experiments.config import robot as robots
+    from experiments.progress import make_console
     from experiments.runs import run_dir
     from robot_io.calibrated import Calibration
     from robot_io.contract import PAPER
     from robot_io.control.config import RobotConfig
 
-    path, today, screen = Path(source), date.today().isoformat(), console()
+    path, today, screen = Path(source), date.today().isoformat(), make_console()
     known = robots.load_calibration(target) if target.exists() else Calibration()
     found: TrackerCalibration | RobotCalibration | ClockCalibration
     if part == "tracker":
         found = _tracker(path, today, screen)
     elif part == "robot":
-        own = own or (robots.named(robot) if robot else None)
-        contract, end = (PAPER, None) if own is None else _standing(own)
+        name = name or (robots.named(robot) if robot else None)
+        contract, end = (PAPER, None) if name is None else _load_standing(name)
         config = robots.load_robot(robot, False, contract) if robot else RobotConfig.of(contract)
         found = _robot(path, tuple(axis.zero for axis in config.axes), today, screen, contract, end)
     else:
@@ -77,7 +77,7 @@ def calibrate(
     known = robots.fill(Calibration, robots.plain(known) | {part: asdict(found)}, str(target))
     target.parent.mkdir(parents=True, exist_ok=True)
     run_dir.write_yaml(target, robots.plain(known))
-    screen.print(f"{target}: {part} written; robot.yaml names it: calibration: {target.name}", highlight=False)
+    screen.print(f"{target}: {part} written; robot.yaml names it: calibration: {target.name}")
     return 0
 
 
@@ -90,13 +90,12 @@ def _tracker(path: Path, today: str, screen: Console) -> TrackerCalibration:
     position, turn = 1e3 * fit.deviation[:3], 1e3 * fit.deviation[3:]
     screen.print(
         f"residual {1e3 * fit.calibration.residual:.2f} mm; standard deviations: {position[0]:.2f} mm at the points' "
-        f"centre, turned about x, y, z {turn[0]:.2f}, {turn[1]:.2f}, {turn[2]:.2f} mrad",
-        highlight=False,
+        f"centre, turned about x, y, z {turn[0]:.2f}, {turn[1]:.2f}, {turn[2]:.2f} mrad"
     )
     return fit.calibration
 
 
-def _standing(own: str) -> tuple[Contract, np.ndarray | None]:
+def _load_standing(name: str) -> tuple[Contract, np.ndarray | None]:
     """Contract of a robot by its folder or name, and the end (3,) [m] of its blade in the last joint's frame.
 
     Raises ConfigError.
@@ -105,7 +104,7 @@ def _standing(own: str) -> tuple[Contract, np.ndarray | None]:
     from mjx_tt.robot import robots
     from robot_io.contract import PAPER
 
-    robot = checked("", robots.load, own)
+    robot = checked("", robots.load, name)
     if robot.contract == PAPER:
         return PAPER, None
     frame = robot.paddle()
@@ -124,10 +123,10 @@ def _robot(
     values = (*found.joint_zeros, *found.base_position, *found.base_rotation, *found.tip)
     for name, value, deviation in zip(robot.names(contract), values, fit.deviation, strict=True):
         unit = "mrad" if "zero" in name or "turned" in name else "mm"
-        screen.print(f"  {name:24} {1e3 * value:+8.2f} +- {1e3 * deviation:.2f} {unit}", highlight=False)
-    screen.print(f"residual {1e3 * found.residual:.2f} mm", highlight=False)
+        screen.print(f"  {name:24} {1e3 * value:+8.2f} +- {1e3 * deviation:.2f} {unit}")
+    screen.print(f"residual {1e3 * found.residual:.2f} mm")
     for text in fit.unknown:
-        screen.print(f"not separated by these poses, left near 0: {text}", style="yellow", highlight=False)
+        screen.print(f"not separated by these poses, left near 0: {text}", style="yellow")
     return found
 
 
@@ -145,12 +144,12 @@ def _clock(path: Path, known: Calibration, today: str, screen: Console) -> Clock
         known = robots.fill(Calibration, read_yaml(then.decode(), where) or {}, where)
     found, told = checked(str(path), clock.fit, session, known, today)
     for line in told:
-        screen.print(line, highlight=False)
+        screen.print(line)
     return found
 
 
 def _show_points(screen: Console, path: Path, lines: list[int], residuals: np.ndarray, used: np.ndarray) -> None:
     for line, residual, good in zip(lines, residuals, used, strict=True):
         if not good:
-            screen.print(f"{path}: line {line}: {1e3 * residual:.1f} mm off: not used", style="yellow", highlight=False)
-    screen.print(f"{int(used.sum())} of {len(lines)} points used", highlight=False)
+            screen.print(f"{path}: line {line}: {1e3 * residual:.1f} mm off: not used", style="yellow")
+    screen.print(f"{int(used.sum())} of {len(lines)} points used")

@@ -7,22 +7,12 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands.options import (
-    Site,
-    changes,
-    command,
-    console,
-    count,
-    option,
-    shipped_or_own,
-    site_of,
-    start_jax,
-    writable,
-)
+from experiments.commands import options
+from experiments.commands.options import count
 
-app = command(
+app = options.command(
     "compare",
-    "several learning algorithms on one task, also where none has trained",
+    "compare learning algorithms on one task",
     """\
   mjx-tt compare compare_quick.yaml                         BGS, ARS, PPO, SAC, QT-Opt: three minutes each
   mjx-tt compare mine.yaml --set budget.minutes=60 --set seeds=[0,1,2]
@@ -39,27 +29,28 @@ def compare(
     comparison: Annotated[str, Parameter("YAML", help="docs/how-to/compare-algorithms.md explains it")],
     /,
     *,
-    out: Annotated[str, option("FOLDER", "where its folder goes (default: runs)")] = "runs",
-    overrides: Annotated[tuple[str, ...], changes("change one key")] = (),
+    out: options.RunsFolder = "runs",
+    overrides: options.Overrides = (),
     processes: Annotated[
         int | None,
-        count("trainings at a time (default: one, where minutes are the budget; else one per processor core)"),
+        count("trainings at a time (default: one for a budget of minutes, else one per processor core)"),
     ] = None,
-    site: Site = None,
+    site: options.Site = None,
 ) -> None:
     """Prints where the comparison is."""
     from experiments.config import baselines
 
-    path = shipped_or_own(comparison, baselines.shipped())
+    path = options.find_shipped(comparison, baselines.shipped())
     loaded, experiment = baselines.load(path, overrides)
-    elsewhere = site_of(site, processes=processes)
-    writable(out)
-    start_jax(1, elsewhere is not None)
+    elsewhere = options.load_site(site, processes=processes)
+    options.check_writable(out)
+    options.start_jax(1, elsewhere is not None)
     from experiments.baselines import compare as comparing
+    from experiments.interrupts import interruptible
     from experiments.jobs.site import Workers
-    from experiments.stages import interruptible
+    from experiments.progress import make_console
 
-    screen = console()
+    screen = make_console()
     workers = Workers(1 if elsewhere else comparing.choose(loaded, processes), elsewhere, str(site))
     with interruptible():
         folder = comparing.compare(loaded, experiment, str(path), Path(out), screen, workers)

@@ -4,48 +4,69 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from rich.console import Console
+from cyclopts import Parameter
 
-from experiments.config import build
-from experiments.deploy import session_logs
+from experiments.commands import options
+from experiments.commands.options import option
 from experiments.errors import ConfigError, checked
-from experiments.evaluation import evaluate
-from experiments.runs.load_policy import TrainedPolicy, load
-from experiments.runs.run_dir import Run
-from experiments.training import loop
-from mjx_tt import diagnosis
-from mjx_tt.diagnosis import report
-from mjx_tt.diagnosis.report import Play, Rate, text
-from mjx_tt.robot import robots
-from mjx_tt.robot.robots import Robot
-from mjx_tt.sim.model import ModelFile
-from robot_io.contract import PAPER, Contract
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from experiments.runs.load_policy import TrainedPolicy
+    from mjx_tt import diagnosis
+    from mjx_tt.diagnosis.report import Play, Rate
+    from mjx_tt.robot.robots import Robot
+    from robot_io.contract import Contract
+
+app = options.command(
+    "diagnose",
+    "find what the simulation gets wrong about measured logs",
+    """\
+  mjx-tt diagnose session1.csv session2.mcap --out diagnosis
+  mjx-tt diagnose robot/ --out diagnosis                    a folder with command.csv and state.csv
+  mjx-tt diagnose robot/ --home home --out diagnosis        and the encoders' zeros: it began to move at home
+  mjx-tt diagnose session1.csv --policy runs/quickstart --out diagnosis          what the defect costs in play
+  mjx-tt train my.yaml --set model=diagnosis/extended.yaml                       train with what was found
+
+Writes report.html (look at it first), verdict.json, extended.yaml and plots. Ball logs: session,trajectory,t,x,y,z as
+CSV, MCAP, or the launcher's HDF5; robot logs: command.csv (t,joint,velocity) and state.csv (t,joint,position).
+""",
+)
 
 
-@dataclass(frozen=True)
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
 class Request:
-    """Arguments of the command line."""
+    """What is judged, and how."""
 
-    logs: Sequence[str]
-    out: Path
-    model: str | None = None
-    spin: str = "auto"
-    without: Sequence[str] = ()
-    seed: int = 0
-    randomise: bool = False
-    policy: str | None = None
-    retrain: int = 0
-    home: str = ""
-    robot: str | None = None  # another one than the paper's
+    out: Annotated[str, option("DIR", "where report, verdict and extended model go")]
+    model: Annotated[str | None, option("YAML", "the model to judge (default: the nominal one)")] = None
+    spin: Annotated[
+        Literal["auto", "none", "free"],
+        Parameter(help="whether balls may spin (auto: free where the model has a Magnus force, else a possible cause)"),
+    ] = "auto"
+    without: Annotated[tuple[str, ...], option("NAMES", "effects to leave out of the catalogue")] = ()
+    home: Annotated[str, option("POSE", "pose before the first motion: home, or joint_1=0.52,gantry_x=0 [rad, m]")] = ""
+    randomise: Annotated[bool, Parameter(help="randomise in extended.yaml what the logs do not determine")] = False
+    seed: Annotated[int, Parameter(help="seed of the bootstrap (default: 0)")] = 0
+    policy: Annotated[str | None, option("POLICY", "a run or artefact: measure what the defect costs in play")] = None
+    robot: Annotated[str | None, option("FOLDER", "robot whose joints were logged (default: the paper's)")] = None
+    retrain: Annotated[
+        int, option("UPDATES", "with --policy: retrain for so many updates under the extended model")
+    ] = 0
+    episodes: Annotated[int, Parameter(help="balls of each evaluation (default: 2000)")] = 2000
 
-    def the_robot(self) -> Robot:
+    def load_robot(self) -> Robot:
         """The robot whose joints were logged. Raises ConfigError."""
+        from mjx_tt.robot import robots
+
         return robots.paper() if self.robot is None else checked("--robot", robots.load, self.robot)
 
     def check(self) -> None:
@@ -56,18 +77,39 @@ class Request:
             raise ConfigError("--retrain needs --policy: the run or artefact that is to be trained on")
         if self.retrain < 0:
             raise ConfigError(f"--retrain {self.retrain}: a number of updates is wanted")
-        if self.policy is not None and load(self.policy).config is None:
-            raise ConfigError(f"{self.policy}: does not say how it was trained; give the run that it came from")
-        resting_pose(self.home, self.the_robot())
-        existing = next(p for p in (self.out, *self.out.absolute().parents) if p.exists())
-        if not existing.is_dir():
-            raise ConfigError(f"--out {self.out}: {existing} is a file, a folder is wanted")
-        if not os.access(existing, os.W_OK):
-            raise ConfigError(f"--out {self.out}: {existing} cannot be written to")
+        if self.policy is not None:
+            from experiments.runs.load_policy import load
+
+            options.PLAY.experiment(load(self.policy))
+        resting_pose(self.home, self.load_robot())
+        options.check_writable(self.out)
+
+
+@app.default
+def diagnose(
+    *logs: Annotated[str, Parameter("LOG", help="a file, or a folder of files", required=True)], request: Request
+) -> None:
+    """Writes report, verdict and extended model."""
+    options.start_jax(1)
+    from experiments.progress import make_console
+    from mjx_tt.diagnosis import report
+
+    screen, folder = make_console(), Path(request.out)
+    request.check()
+    found = run(logs, request, screen)
+    extended = save(found, folder)
+    show(found, screen, request.load_robot().contract)
+    cost = play(extended, request, screen) if request.policy else None
+    report.write_report(folder, found, ", ".join(Path(p).name for p in logs), cost)
+    for name in ("report.html", "verdict.json", "extended.yaml", "spins.csv"):
+        if (folder / name).exists():
+            screen.print(f"  {folder / name}")
 
 
 def resting_pose(text: str, robot: Robot | None = None) -> dict[str, float]:
     """Positions [rad], [m] by joint: the robot's home pose, or pairs joint=position. Raises ConfigError."""
+    from mjx_tt.robot import robots
+
     robot = robots.paper() if robot is None else robot
     joints = robot.contract.joints
     if text in ("", "home"):
@@ -93,6 +135,9 @@ def read_logs(paths: Sequence[str], robot: Robot | None = None) -> diagnosis.Log
 
     Raises ValueError or FileNotFoundError naming the file.
     """
+    from experiments.deploy import session_logs
+    from mjx_tt import diagnosis
+
     files = diagnosis.hashes(paths)
     sessions = [f for f in files if session_logs.is_session(f)]
     others = [f for f in files if f not in sessions]
@@ -112,25 +157,25 @@ def read_logs(paths: Sequence[str], robot: Robot | None = None) -> diagnosis.Log
     )
 
 
-def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
-    """Runs the diagnosis and writes its files. Raises ConfigError for bad logs before anything is written."""
-    request.check()
-    robot = request.the_robot()
+def run(logs: Sequence[str], request: Request, console: Console) -> diagnosis.Diagnosis:
+    """Runs the diagnosis. Raises ConfigError for bad logs."""
+    from experiments.config import build
+    from mjx_tt import diagnosis
+    from mjx_tt.sim.model import ModelFile
+
+    robot = request.load_robot()
     nominal = ModelFile(build.nominal_model(robot))
     if request.model:
         nominal = checked("--model", ModelFile.load, request.model, nominal.model)
-    logs = checked("", read_logs, request.logs, robot)
-    balls, joints = len(logs.balls), len(logs.joints)
+    found = checked("", read_logs, logs, robot)
     home = resting_pose(request.home, robot)
-    if home and not joints:
+    if home and not found.joints:
         raise ConfigError(f"--home {request.home}: the logs hold no joints")
-    console.print(
-        f"{balls} trajectories, {joints} joints from {', '.join(str(p) for p in request.logs)}", highlight=False
-    )
+    console.print(f"{len(found.balls)} trajectories, {len(found.joints)} joints from {', '.join(logs)}")
     began = time.perf_counter()
 
     def say(text: str) -> None:
-        console.print(f"  {time.perf_counter() - began:5.1f} s  {text}", highlight=False)
+        console.print(f"  {time.perf_counter() - began:5.1f} s  {text}")
 
     provenance = {
         "made_by": "mjx-tt diagnose",
@@ -141,12 +186,12 @@ def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
     if request.model:
         provenance["model_sha256"] = hashlib.sha256(Path(request.model).read_bytes()).hexdigest()
     return checked(
-        ", ".join(request.logs),
+        ", ".join(logs),
         diagnosis.diagnose,
-        logs,
+        found,
         nominal.model,
         request.spin,
-        tuple(request.without),
+        tuple(name for part in request.without for name in part.split(",") if name),
         request.seed,
         say,
         provenance,
@@ -155,30 +200,28 @@ def diagnose(request: Request, console: Console) -> diagnosis.Diagnosis:
     )
 
 
-def play(extended: Path, request: Request, episodes: int, console: Console) -> Play | None:
-    """Cost of the defect to a policy: return rates with 95 % intervals under the nominal and the extended model.
-
-    None without a policy.
+def play(extended: Path, request: Request, console: Console) -> Play:
+    """Cost of the defect to the policy: return rates with 95 % intervals under the nominal and the extended model.
 
     extended: the model file that was written, under which the policy is trained on for ``request.retrain`` updates; the
     run of that training is kept beside the model file.
     """
-    folder = request.policy
-    if folder is None:
-        return None
-    trained = load(folder)
-    config = trained.config
-    if config is None:
-        raise ConfigError(f"{folder}: does not record how it was trained; give the run that it came from")
+    from experiments.config import build
+    from experiments.evaluation import evaluate
+    from experiments.runs.load_policy import load
+    from experiments.runs.run_dir import Run
+    from experiments.training import loop
 
-    def rate(name: str, who: TrainedPolicy, model_path: str | None) -> Rate:
-        changes = {"initial_policy": None} | ({"model": model_path} if model_path else {})
-        experiment = build.experiment(config.model_copy(update=changes), folder)
-        found = evaluate.evaluate(experiment, who, episodes, config.evaluation.seed, None).report
+    folder = str(request.policy)
+    trained = load(folder)
+    config = options.PLAY.experiment(trained).config
+
+    def rate(name: str, who: TrainedPolicy, model: str | None) -> Rate:
+        experiment = options.PlayOptions(model=model).experiment(trained)
+        found = evaluate.evaluate(experiment, who, request.episodes, config.evaluation.seed, None).report
         console.print(
             f"  {name}: {found['return_rate']:.1%} of {found['episodes']} balls returned "
-            f"({found['low']:.1%} to {found['high']:.1%})",
-            highlight=False,
+            f"({found['low']:.1%} to {found['high']:.1%})"
         )
         return {"rate": found["return_rate"], "low": found["low"], "high": found["high"]}
 
@@ -186,16 +229,16 @@ def play(extended: Path, request: Request, episodes: int, console: Console) -> P
         "nominal": rate("nominal model", trained, request.model),
         "extended": rate("extended model", trained, str(extended)),
         "retrained": None,
-        "balls": episodes,
+        "balls": request.episodes,
     }
     if request.retrain:
         training = config.training.model_copy(update={"updates": request.retrain, "later_rewards": None})
         later = config.model_copy(
             update={"model": str(extended), "initial_policy": folder, "training": training, "name": "retrained"}
         )
-        run = Run(extended.parent / "retrained")
-        loop.train(build.experiment(later, folder), run, console)
-        rates["retrained"] = rate("retrained", load(run.folder), str(extended))
+        retrained = Run(extended.parent / "retrained")
+        loop.train(build.experiment(later, folder), retrained, console)
+        rates["retrained"] = rate("retrained", load(retrained.folder), str(extended))
     return rates
 
 
@@ -209,48 +252,35 @@ def save(found: diagnosis.Diagnosis, folder: Path) -> Path:
     return folder / "extended.yaml"
 
 
-def draw(found: diagnosis.Diagnosis, folder: Path, title: str, console: Console, cost: Play | None = None) -> None:
-    """Writes report.html and its pictures, and prints the paths."""
-    report.write_report(folder, found, title, cost)
-    for name in ("report.html", "verdict.json", "extended.yaml", "spins.csv"):
-        if (folder / name).exists():
-            console.print(f"  {folder / name}", highlight=False)
+def show(found: diagnosis.Diagnosis, console: Console, contract: Contract | None = None) -> None:
+    """Prints the verdict in a few lines; contract: of the robot that was logged, None: the paper's."""
+    from mjx_tt.diagnosis.report import text
+    from robot_io.contract import PAPER
 
-
-def show(found: diagnosis.Diagnosis, console: Console, contract: Contract = PAPER) -> None:
-    """Prints the verdict in a few lines; contract: of the robot that was logged."""
+    contract = contract or PAPER
     v, units = found.verdict, dict(zip(contract.joints, contract.units, strict=True))
     console.print(f"verdict: {v.verdict}", style="bold")
     for warning in v.warnings:
-        console.print(f"  note: {warning}", highlight=False)
+        console.print(f"  note: {warning}")
     for c in v.causes:
         unit = next((f"m{units[joint]}" for joint in units if c.name.startswith(f"{joint}.")), "mrad")
         size = f"{unit} rms" if "." in c.name else "mm at the end of a flight"
-        console.print(f"  {c.name}: {c.effect_mm:.1f} {size}, confidence {c.confidence:.0%}", highlight=False)
+        console.print(f"  {c.name}: {c.effect_mm:.1f} {size}, confidence {c.confidence:.0%}")
         for path, e in c.parameters.items():
-            console.print(
-                f"    {path} {e.nominal:.6g} -> {e.estimate:.6g} ({e.low:.6g} to {e.high:.6g}) {e.unit}",
-                highlight=False,
-            )
+            interval = f"({e.low:.6g} to {e.high:.6g}) {e.unit}"
+            console.print(f"    {path} {e.nominal:.6g} -> {e.estimate:.6g} {interval}")
         if len(c.group) > 1:
-            console.print(
-                f"    cannot be told from {', '.join(c.group[1:])}: {c.separating_measurement}", highlight=False
-            )
+            console.print(f"    cannot be told from {', '.join(c.group[1:])}: {c.separating_measurement}")
     if v.unexplained:
         u = v.unexplained
-        console.print(
-            f"  no entry of the catalogue explains: {u.block}, {u.where}, along {u.direction}, {u.size}",
-            highlight=False,
-        )
+        console.print(f"  no entry of the catalogue explains: {u.block}, {u.where}, along {u.direction}, {u.size}")
     if v.held_out:
         h = v.held_out
-        console.print(
-            f"  held out: {h.before:.2f} -> {h.after:.2f} mm, gain {h.low:.2f} to {h.high:.2f}", highlight=False
-        )
+        console.print(f"  held out: {h.before:.2f} -> {h.after:.2f} mm, gain {h.low:.2f} to {h.high:.2f}")
     steps = v.next_experiment[:2]
     common, own = text.advice(steps)
     for step, tells in zip(steps, own, strict=True):
         beside = f" {'also ' if common else ''}tells {tells}" if tells else ""
-        console.print(f"  next: {step.what}{beside}", highlight=False)
+        console.print(f"  next: {step.what}{beside}")
     if common:
-        console.print(f"  each of these tells {common}", highlight=False)
+        console.print(f"  each of these tells {common}")

@@ -7,21 +7,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands.options import (
-    RigFile,
-    RigSeed,
-    changes,
-    command,
-    console,
-    existing,
-    option,
-    start_jax,
-    writable,
-)
-from experiments.commands.run import Backend, Distribution, Player, known_player
+from experiments.commands import options
+from experiments.commands.options import option
 from experiments.runs.locate import find_policy
 
-app = command(
+app = options.command(
     "finetune",
     "fine-tune a policy on a robot while a person plays",
     """\
@@ -42,36 +32,30 @@ def finetune(
     *,
     robot: Annotated[str, option("YAML", 'a robot.yaml, "rig" or "lockstep"')],
     settings: Annotated[
-        str | None,
-        option("YAML", "of the fine-tuning (default: the paper's, or nearer: docs/how-to/fine-tune.md)"),
+        str | None, option("YAML", "settings of the fine-tuning (default: docs/how-to/fine-tune.md)")
     ] = None,
-    overrides: Annotated[tuple[str, ...], changes("change one setting")] = (),
-    out: Annotated[str | None, option("FOLDER", "of the run (default: POLICY-finetuned)")] = None,
-    backend: Backend = "auto",
-    distribution: Distribution = None,
-    player: Player = None,
-    rig: RigFile = None,
-    seed: RigSeed = 0,
+    overrides: options.Overrides = (),
+    out: Annotated[str | None, option("FOLDER", "folder of the run (default: POLICY-finetuned)")] = None,
+    setup: options.RobotOptions = options.ROBOT,
 ) -> int:
     """Returns 130 where it was stopped."""
     from experiments.config import finetuning
 
     finetuning.load(settings, overrides)  # a mistake in it is told at once
     find_policy(policy)
-    existing(None if robot in ("rig", "lockstep") else robot, key="--robot")
-    existing(rig, key="--rig")
-    known_player(player, robot, distribution)
+    setup.check(robot)
     folder = out or f"{Path(policy).resolve().name}-finetuned"
-    writable(folder)
-    start_jax(1)
-    from experiments.finetuning import session
+    options.check_writable(folder)
+    options.start_jax(1)
+    from experiments.finetuning import on_robot
+    from experiments.progress import make_console
     from experiments.runs import load_policy
     from experiments.runs.run_dir import Run
 
-    trained = load_policy.load(policy).config
+    screen, trained = make_console(), load_policy.load(policy).config
     chosen = finetuning.load(settings, overrides, trained)
     if finetuning.near(trained):
         rate = chosen.step.learning_rate
-        console().print(f"sigma {chosen.sigma}, step {rate}: the policy was trained by first-order gradients")
-    report = session.finetune(policy, chosen, Run(folder), robot, distribution, rig, backend, seed, console(), player)
+        screen.print(f"sigma {chosen.sigma}, step {rate}: the policy was trained by first-order gradients")
+    report = on_robot.finetune(policy, chosen, Run(folder), robot, screen, setup)
     return 0 if report is not None else 130

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from experiments.commands.options import command, console, existing, option
+from experiments.commands import options
+from experiments.commands.options import option
 from experiments.errors import ConfigError, checked
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-app = command(
+app = options.command(
     "log",
     "list, check, salvage or export the logs of a robot",
     """\
@@ -37,14 +38,16 @@ def log(
         str,
         Parameter(
             "LOG",
-            help="an .mcap or .mcap.part; for list a folder; for lerobot .mcap, balls, or a folder",
+            help="an .mcap or .mcap.part; list: a folder; lerobot: .mcap, balls, or a folder",
             required=True,
         ),
     ],
-    out: Annotated[str | None, option("PATH", "of salvage: the file; of export and lerobot: the folder")] = None,
+    out: Annotated[str | None, option("PATH", "salvage: the file; export and lerobot: the folder")] = None,
 ) -> int:
     """Returns 1 where a checked log is not sound."""
-    screen, target = console(), Path(out) if out else None
+    from experiments.progress import make_console
+
+    screen, target = make_console(), Path(out) if out else None
     if action == "list":
         list_logs(Path(paths[0]), screen)
     elif action == "check":
@@ -88,15 +91,12 @@ def check(paths: list[Path], console: Console) -> int:
         overview = checked("", log.check, path)
         faulty += overview.state != "sound"
         console.print(
-            f"{path}: {overview.state}, {overview.messages:,} messages in {overview.duration:.1f} s",
-            highlight=False,
-            soft_wrap=True,
-            markup=False,
+            f"{path}: {overview.state}, {overview.messages:,} messages in {overview.duration:.1f} s", soft_wrap=True
         )
         for fault in overview.faults:
-            console.print(f"  {fault}", highlight=False, soft_wrap=True, markup=False)
+            console.print(f"  {fault}", soft_wrap=True)
         for topic, count in sorted(overview.counts.items()):
-            console.print(f"  {topic:20} {count:>10,}", highlight=False)
+            console.print(f"  {topic:20} {count:>10,}")
     return faulty
 
 
@@ -105,14 +105,9 @@ def salvage(path: Path, out: Path | None, console: Console) -> Path:
     from robot_io import log
 
     overview = checked("", log.salvage, path, out)
-    console.print(
-        f"{overview.path}: {overview.messages:,} messages, {overview.duration:.1f} s",
-        highlight=False,
-        soft_wrap=True,
-        markup=False,
-    )
+    console.print(f"{overview.path}: {overview.messages:,} messages, {overview.duration:.1f} s", soft_wrap=True)
     for line in overview.metadata["salvage"]["faults"].splitlines():
-        console.print(f"  lost: {line}", highlight=False, soft_wrap=True, markup=False)
+        console.print(f"  lost: {line}", soft_wrap=True)
     return overview.path
 
 
@@ -124,9 +119,9 @@ def export(path: Path, out: Path | None, console: Console) -> list[Path]:
     session = checked("", log.read, path)
     written = checked("", log.export, session, out or path.with_name(path.name.removesuffix(SUFFIX)))
     for table in written:
-        console.print(table, highlight=False, soft_wrap=True, markup=False)
+        console.print(table, soft_wrap=True)
     balls = len(log.trajectories(session.ball))
-    console.print(f"{balls:,} balls; mjx-tt fit-human {written[0]} makes a distribution of them", highlight=False)
+    console.print(f"{balls:,} balls; mjx-tt fit-human {written[0]} makes a distribution of them")
     return written
 
 
@@ -136,7 +131,7 @@ def lerobot(paths: Sequence[str], out: Path | None, console: Console) -> None:
         raise ConfigError("log lerobot needs pyarrow: pip install 'mjx-tt[lerobot]'")
     if out is None:
         raise ConfigError("log lerobot needs --out: the folder of the data set")
-    existing(*paths)
+    options.check_exists(*paths)
     from experiments.sharing import lerobot as data_sets
     from experiments.sharing import recordings
 
@@ -145,7 +140,7 @@ def lerobot(paths: Sequence[str], out: Path | None, console: Console) -> None:
     frames = sum(len(episode.columns["next.done"]) for episode in recording.episodes)
     lines = (f"{out}: {len(recording.episodes):,} episodes, {frames:,} frames at 75 Hz", *recording.notes)
     for line in lines:
-        console.print(line, highlight=False, soft_wrap=True, markup=False)
+        console.print(line, soft_wrap=True)
 
 
 def _logs_in(folder: Path) -> list[Path]:

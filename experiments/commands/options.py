@@ -1,33 +1,35 @@
-"""Options that several commands share, and what commands do first."""
+"""Options that several commands share, and the refusals that come before anything heavy is imported.
+
+A group is a dataclass whose fields are options; a command names it as the type of an argument.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import sys
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter, Token
 
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, checked
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from experiments.config.build import Experiment
     from experiments.config.site import Site as SiteFile
     from experiments.runs.load_policy import TrainedPolicy
+    from mjx_tt.sim.model import SimModel
 
-SHIPPED_HINT = (
-    "\nA file name without a folder that is not in the current folder is looked up among the shipped experiments.\n"
-)
+SHIPPED_POLICY = Path(__file__).parents[1] / "shipped" / "policies" / "quickstart"
+RIG, LOCK_STEP = "rig", "lockstep"  # values of --robot that are no file
 
 
 def command(name: str, summary: str, examples: str) -> App:
-    """A command without its function, which ``@app.default`` gives it."""
+    """A command whose function ``@app.default`` sets."""
     return App(name, help=summary, help_epilogue=f"examples:\n{examples}")
 
 
@@ -36,59 +38,130 @@ def option(metavar: str, text: str, name: str | None = None, converter: Callable
     return Parameter(name, metavar=metavar, help=text, converter=converter, n_tokens=converter and 1)
 
 
-def at_least_one(_type: Any, tokens: Sequence[Token]) -> int:
-    """A converter. Raises ValueError."""
-    text = tokens[0].value
-    if not text.isdigit() or int(text) < 1:
-        raise ValueError(f"{text!r}: a whole number of at least 1 is needed")
-    return int(text)
-
-
-def count(text: str, metavar: str = "N") -> Parameter:
+def count(text: str) -> Parameter:
     """A parameter that takes a whole number of at least 1."""
-    return option(metavar, text, converter=at_least_one)
+
+    def convert(_type: Any, tokens: Sequence[Token]) -> int:
+        value = tokens[0].value
+        if not value.isdigit() or int(value) < 1:
+            raise ValueError(f"expected a whole number of at least 1, got {value!r}")
+        return int(value)
+
+    return option("N", text, converter=convert)
 
 
-def changes(text: str) -> Parameter:
-    """The option --set, which may be repeated."""
-    return option("KEY=VALUE", text, "--set")
+# -- single options ----------------------------------------------------------------------------------------------------
 
-
-Devices = Annotated[int | None, count("host devices to make (default: one per processor core)")]
-Distributed = Annotated[
-    str | None,
-    option("auto|HOST:PORT", "share the work with other processes, on any hosts: as the cluster says, or by address"),
-]
-Processes = Annotated[
-    int | None, count("how many runs at a time (default: one per processor core); with HOST:PORT, how many take part")
-]
+BallSeed = Annotated[int | None, option("K", "seed of the balls")]
+Devices = Annotated[int | None, count("host devices (default: one per processor core)")]
+Format = Annotated[str | None, option("NAME", "csv, mcap, deepmind or aimy (default: from the suffix)")]
+Model = Annotated[str | None, option("YAML", "another simulation model")]
+Overrides = Annotated[tuple[str, ...], option("KEY=VALUE", "change one key of the file; may be repeated", "--set")]
+PolicyFolder = Annotated[str, Parameter("RUN_OR_ARTEFACT", help="folder of a run or of an exported policy")]
+RigFile = Annotated[str | None, option("YAML", "another rig: world, delays, network faults")]
+RigSeed = Annotated[int, option("K", "seed of the balls that are thrown (default: 0)")]
+RunsFolder = Annotated[str, option("FOLDER", "where the folders of runs go (default: runs)")]
 Site = Annotated[
     str | None,
-    option("local|YAML", "who does the jobs: processes of this machine (default), or the workers of a site's YAML"),
+    option("local|YAML", "where jobs run: this machine (default), or the workers of a site's YAML"),
 ]
-Process = Annotated[int | None, option("I", "which of them this one is, from 0 (with HOST:PORT)")]
-PolicyFolder = Annotated[str, Parameter("RUN_OR_ARTEFACT", help="folder of a run or of an exported policy")]
-Balls = Annotated[str | None, option("NAME_OR_YAML", "other balls, such as player1/M1")]
-Model = Annotated[str | None, option("YAML", "another simulation model")]
-BallSeed = Annotated[int | None, option("K", "another seed means other balls")]
-Format = Annotated[str | None, option("NAME", "csv, mcap, deepmind or aimy (default: from the suffix)")]
-RigFile = Annotated[str | None, option("YAML", "another rig: world, delays, network faults")]
-RigSeed = Annotated[int, option("K", "of the balls that are thrown")]
 
 
-def console() -> Console:
-    """Output of a command. A file or a pipe gets whole lines: only a terminal's width is one to break them at."""
-    from rich.console import Console
+# -- groups ------------------------------------------------------------------------------------------------------------
 
-    return Console(soft_wrap=not sys.stdout.isatty())
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class PlayOptions:
+    """Balls and world in which a policy plays."""
+
+    balls: Annotated[str | None, option("NAME_OR_YAML", "other balls, such as player1/M1")] = None
+    model: Model = None
+    seed: BallSeed = None
+
+    def check(self) -> None:
+        check_exists(self.model, key="--model")
+
+    def experiment(self, trained: TrainedPolicy) -> Experiment:
+        """The experiment that trained a policy, with these balls and this model. Raises ConfigError."""
+        from experiments.config import build
+
+        if trained.config is None:
+            raise ConfigError(f"{trained.source}: does not say how it was trained; name the run that it came from")
+        given = {key: value for key, value in (("balls", self.balls), ("model", self.model)) if value}
+        config = trained.config.model_copy(update={**given, "initial_policy": None})
+        return build.experiment(config, str(trained.source))
+
+    def seed_of(self, experiment: Experiment) -> int:
+        """Seed of the balls: the given one, or that of the experiment's evaluation."""
+        return experiment.config.evaluation.seed if self.seed is None else self.seed
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class DistributedOptions:
+    """Devices of this process, and other processes that share the work."""
+
+    devices: Devices = None
+    distributed: Annotated[
+        str | None,
+        option("auto|HOST:PORT", "share one training with other processes: as the cluster says, or by address"),
+    ] = None
+    processes: Annotated[
+        int | None,
+        count("runs at a time (default: one per processor core); with HOST:PORT, number of processes"),
+    ] = None
+    process: Annotated[int | None, option("I", "index of this process, from 0 (with HOST:PORT)")] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class RobotOptions:
+    """How a policy is computed on a robot; of the emulated one also what it is and who plays with it."""
+
+    backend: Annotated[
+        Literal["auto", "numpy", "jit"],
+        Parameter(help="what computes the policy (auto: JAX unless it is missing or slow)"),
+    ] = "auto"
+    distribution: Annotated[
+        str | None, option("NAME", "distribution of the balls that are thrown (default: the policy's)")
+    ] = None
+    player: Annotated[
+        str | None, option("NAME", "virtual player on the rig instead of thrown balls: player1 to player5")
+    ] = None
+    rig: RigFile = None
+    seed: RigSeed = 0
+
+    def check(self, robot: str) -> None:
+        """Refuses files and players that do not exist, or do not go with ``robot``. Raises ConfigError."""
+        emulated = robot in (RIG, LOCK_STEP)
+        check_exists(None if emulated else robot, key="--robot")
+        check_exists(self.rig, key="--rig")
+        if self.player is None:
+            return
+        given = f"--player {self.player}"
+        if not emulated:
+            raise ConfigError(f"{given}: virtual players play on the rig only; --robot is {robot}")
+        if self.distribution is not None:
+            raise ConfigError(f"{given}, --distribution {self.distribution}: a player has balls of their own; give one")
+        folder = resources.files("mjx_tt") / "assets" / "virtual_players"
+        names = sorted(Path(str(path)).stem for path in folder.iterdir() if str(path).endswith(".yaml"))
+        if self.player not in names:
+            raise ConfigError(f"{given}: unknown; allowed: {', '.join(names)}")
+
+
+PLAY, ALONE, ROBOT = PlayOptions(), DistributedOptions(), RobotOptions()  # where nothing is given
+
+
+# -- before the work ---------------------------------------------------------------------------------------------------
 
 
 def start_jax(devices: int | None, elsewhere: bool = False) -> None:
-    """Configures JAX; called from a process that runs it already, a command takes the devices that are there.
+    """Configures JAX; in a process that runs it already, its devices stay.
 
     elsewhere: others do the jobs, so this process leaves accelerators to them.
     """
-    # XLA reports slow compilations and the like on stderr; what goes wrong comes as an exception all the same.
+    # XLA reports slow compilations and the like on stderr; what goes wrong is raised as well.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     from mjx_tt import platform
 
@@ -102,7 +175,7 @@ def start_jax(devices: int | None, elsewhere: bool = False) -> None:
     warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called", category=RuntimeWarning)
 
 
-def site_of(name: str | None, **others: Any) -> SiteFile | None:
+def load_site(name: str | None, **others: Any) -> SiteFile | None:
     """The site, None for this machine; ``others`` are options that do not go with a site. Raises ConfigError."""
     from experiments.config import site
 
@@ -117,23 +190,27 @@ def site_of(name: str | None, **others: Any) -> SiteFile | None:
     return loaded
 
 
-# Refusals before anything heavy is imported
+def load_model(path: str | None) -> SimModel:
+    """The simulation model of a file, None: the nominal one. Raises ConfigError."""
+    from mjx_tt.sim.model import ModelFile, SimModel
+
+    return SimModel() if path is None else checked("--model", ModelFile.load, path).model
 
 
-def shipped_or_own(name: str, shipped: dict[str, Path]) -> Path:
+def find_shipped(name: str, shipped: dict[str, Path]) -> Path:
     """The file of that name, or the one of that name that comes with the program."""
     path = Path(name)
     return path if path.exists() or path.parent != Path() else shipped.get(path.stem, path)
 
 
-def existing(*paths: str | Path | None, key: str = "") -> None:
+def check_exists(*paths: str | Path | None, key: str = "") -> None:
     """Raises ConfigError where one of the paths does not exist; ``key`` is the option that gave them."""
     for path in paths:
         if path is not None and not Path(path).exists():
             raise ConfigError(f"{key and f'{key} '}{path}: no such file or folder")
 
 
-def writable(folder: str | Path) -> None:
+def check_writable(folder: str | Path) -> None:
     """Raises ConfigError where the folder cannot be made or written to."""
     near = next(place for place in (Path(folder), *Path(folder).absolute().parents) if place.exists())
     if not near.is_dir() or not os.access(near, os.W_OK):
@@ -141,21 +218,8 @@ def writable(folder: str | Path) -> None:
         raise ConfigError(f"{folder}: cannot be written: {reason}; choose another --out")
 
 
-def suffix(path: str | Path, *allowed: str) -> None:
+def check_suffix(path: str | Path, *allowed: str) -> None:
     """Raises ConfigError for a file to be written with another suffix."""
     given = Path(path).suffix
     if given not in allowed:
         raise ConfigError(f"--out {path}: suffix {given!r}; allowed: {', '.join(allowed)}")
-
-
-# A policy's experiment
-
-
-def experiment_of(trained: TrainedPolicy, balls: str | None = None, model: str | None = None) -> Experiment:
-    """The experiment that trained a policy, with the balls and model of the command line in place of its own."""
-    from experiments.config import build
-
-    if trained.config is None:
-        raise ConfigError(f"{trained.source}: does not say how it was trained; evaluate the run that it came from")
-    given = {key: value for key, value in (("balls", balls), ("model", model)) if value}
-    return build.experiment(trained.config.model_copy(update={**given, "initial_policy": None}), str(trained.source))

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import csv
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from experiments.config import robot as robots
 from experiments.deploy import robot_attachment
+from experiments.deploy.control_session import ControlSession
 from experiments.deploy.operator_console import KEYS, QUIT, Key, Keyboard, View
-from experiments.deploy.session import Session
 from experiments.errors import ConfigError, checked
 from mjx_tt.robot import robots as simulated
 from robot_io.calibrated import Calibration
@@ -31,30 +31,6 @@ STEPS = ((0.001, 0.002), (0.005, 0.01), (0.02, 0.05))  # [m], [rad] of small, mi
 DIGITS = 9  # joints that a digit chooses
 NEXT = "n"
 CHECK_KEYS = {**{key: KEYS[key] for key in ("a", " ", "r")}, "m": MARK, QUIT: KEYS[QUIT]}
-
-
-def check(
-    robot: Path,
-    artefact: Path | None,
-    log_folder: Path,
-    noted: Path,
-    seconds: float | None,
-    console: Console,
-    own: str | None = None,
-) -> int:
-    """Compute and log everything, send nothing: tracker and arm are heard, arm and axes move in thought.
-
-    robot  a robot.yaml; own: name or folder of the robot that stands there, None: the one that robot.yaml names, the
-           policy's, or the paper's
-    """
-    return _operate(robot, artefact, log_folder, noted, seconds, console, True, own)
-
-
-def jog(
-    robot: Path, log_folder: Path, noted: Path, seconds: float | None, console: Console, own: str | None = None
-) -> int:
-    """Move the robot in small steps through the safety gate; ``robot`` and ``own`` as of ``check``."""
-    return _operate(robot, None, log_folder, noted, seconds, console, False, own)
 
 
 def jog_keys(contract: Contract) -> dict[str, Key]:
@@ -111,28 +87,32 @@ class Jogger:
 
 
 def note(path: Path, found: Calibration, seen: messages.Marked, with_joints: bool, contract: Contract = PAPER) -> str:
-    """Add what tracker and joints reported, before any calibration, to a CSV of points; what was done, as a sentence.
+    """Adds what tracker and joints reported, before any calibration, to a CSV of points; returns a sentence about it.
 
     with_joints  False: the joints are not those of a robot
     contract     whose joints have the columns
     """
     left_out = {"ball": seen.ball.trouble(*STILL["ball"])}
-    ball = None if left_out["ball"] else found.tracker.inward(seen.ball.mean)
-    joints = None
+    values: dict[str, float] = {}
+    if not left_out["ball"]:
+        values |= zip(points.BALL, found.tracker.inward(seen.ball.mean), strict=True)
     if with_joints:
         left_out["joints"] = seen.axes.trouble(*STILL["joints"]) or seen.arm.trouble(*STILL["joints"])
         if not left_out["joints"]:
-            joints = np.concatenate([seen.axes.mean, seen.arm.mean - found.robot.zeros(len(contract.arm))])
+            arm = seen.arm.mean - found.robot.zeros(len(contract.arm))
+            values |= zip(contract.joints, (*seen.axes.mean, *arm), strict=True)
     reasons = "; ".join(f"no {what}: {trouble}" for what, trouble in left_out.items() if trouble)
-    if ball is None and joints is None:
+    if not values:
         return f"not noted: {reasons}"
     columns = [*points.TABLE, *points.BALL, *contract.joints]
     new = not path.exists()
     if not new and (there := _columns(path)) != columns:
         return f"not noted: {path} has the columns {', '.join(there)}; allowed with {contract.robot}: another file"
     with open(path, "a", encoding="utf-8", newline="") as stream:
-        lines = csv.writer(stream)
-        lines.writerows([columns] * new + [["", "", "", *_cells(ball, 3), *_cells(joints, contract.n_joints)]])
+        lines = csv.DictWriter(stream, columns, restval="")
+        if new:
+            lines.writeheader()
+        lines.writerow({name: f"{value:.6f}" for name, value in values.items()})
     return f"noted in {path}{reasons and f' ({reasons})'}; fill in table_x, table_y, table_z of its last line"
 
 
@@ -141,90 +121,92 @@ def _columns(path: Path) -> list[str]:
         return next(csv.reader(stream), [])
 
 
-def _robot_of(
-    artefact: Path | None, own: str | None, console: Console
-) -> tuple[Contract, robot_attachment.Attachments]:
-    """Contract of the robot that stands there, the named one, the policy's or the paper's, and the robot for the log.
+@dataclass(frozen=True)
+class Commissioning:
+    """A robot that is brought into service.
 
-    Raises ConfigError.
+    robot       a robot.yaml
+    log_folder  for the MCAP log
+    points      CSV to which points for a calibration are added
+    seconds     end after so many, None: when the operator quits
+    name        of the robot that stands there, or its folder; None: the one that robot.yaml names, the policy's, or the
+                paper's
     """
-    loaded = None if artefact is None else artefacts.load(artefact)
-    if own is None:
-        return (PAPER, ()) if loaded is None else (loaded.contract, robot_attachment.of_policy(loaded, console))
-    contract = checked("", simulated.load, own).contract
-    if loaded is not None and loaded.contract != contract:
-        raise ConfigError(
-            f"--artefact {artefact}: a policy for another robot than {own} as it is now; allowed: one of "
-            f"{contract.robot}, exported since it was changed last"
+
+    robot: Path
+    log_folder: Path
+    points: Path
+    seconds: float | None = None
+    name: str | None = None
+
+    def check(self, console: Console, policy: Path | None = None) -> int:
+        """Computes and logs everything and sends nothing: tracker and arm are heard, arm and axes are simulated."""
+        return self._operate(console, policy, dry=True)
+
+    def jog(self, console: Console) -> int:
+        """Moves the robot in small steps through the safety gate."""
+        return self._operate(console, None, dry=False)
+
+    def _operate(self, console: Console, policy: Path | None, dry: bool) -> int:
+        contract, attached = self._load_contract(policy, console)
+        config = robots.load_robot(self.robot, contract=contract)
+        self.log_folder.mkdir(parents=True, exist_ok=True)
+        options = process.ControlOptions(
+            None if policy is None else str(policy),
+            log_folder=str(self.log_folder),
+            log_name=f"{time.strftime('%Y%m%d-%H%M%S')}-{'check' if dry else 'jog'}",
+            attachments=(
+                ("robot.yaml", self.robot.read_text(encoding="utf-8")),
+                ("calibration.yaml", robots.to_yaml(config.calibration)),
+                *attached,
+            ),
+            dry=dry,
+            jog=not dry,
+            contract=contract,
         )
-    kept = () if contract == PAPER else robot_attachment.of_content(simulated.content(own), own, console)
-    return contract, kept
+        title = f"{config.name}: nothing is sent" if dry else f"{config.name}: by hand"
+        keys, jogger = CHECK_KEYS if dry else jog_keys(contract), Jogger(contract)
+        with ControlSession(config, options, console) as session:
+            for line in session.report:
+                console.print(f"  {line}")
+            end = time.monotonic() + (float("inf") if self.seconds is None else self.seconds)
+            with Keyboard() as keyboard, View(console, title, keys) as view:
+                while time.monotonic() < end:
+                    for message in session.messages(0.1):
+                        view.take(message)
+                        if isinstance(message, messages.Marked):
+                            view.say(note(self.points, config.calibration, message, not dry, contract))
+                    key = keyboard.pressed() or ""
+                    if key == QUIT:
+                        break
+                    request = keys[key].request if key in keys else None
+                    if not dry and key and request is None:
+                        request = jogger.pressed(key)
+                        view.say(str(jogger))
+                    if request is not None:
+                        session.send(request)
+            status = session.status
+        if status is None:
+            raise RefusedError("the control process sent no status")
+        ball = "no ball" if status.ball is None else "ball at {:+.3f} {:+.3f} {:+.3f} m".format(*status.ball)
+        frames, arm = status.tracker_counts, status.egm
+        refused = sum(n for why, n in frames.items() if why not in ("accepted", "lost"))
+        console.print(
+            f"{ball} in the table frame; tracker {frames.get('accepted', 0)} frames, {refused} refused; "
+            f"arm {arm['accepted']} packets, {arm['replies']} answered; log {session.log_file}"
+        )
+        return 0
 
-
-def _cells(values: np.ndarray | None, count: int) -> list[str]:
-    return [""] * count if values is None else [f"{value:.6f}" for value in values]
-
-
-def _operate(
-    robot: Path,
-    artefact: Path | None,
-    log_folder: Path,
-    noted: Path,
-    seconds: float | None,
-    console: Console,
-    dry: bool,
-    own: str | None,
-) -> int:
-    contract, kept = _robot_of(artefact, own or robots.named(robot), console)
-    config, name = robots.load_robot(robot, contract=contract), time.strftime("%Y%m%d-%H%M%S")
-    attachments: tuple[tuple[str, str | bytes], ...] = (
-        ("robot.yaml", robot.read_text(encoding="utf-8")),
-        ("calibration.yaml", robots.to_yaml(config.calibration)),
-        *kept,
-    )
-    folder = None if artefact is None else str(artefact)
-    title = f"{config.name}: nothing is sent" if dry else f"{config.name}: by hand"
-    log_folder.mkdir(parents=True, exist_ok=True)
-    log_name = f"{name}-{'check' if dry else 'jog'}"
-    options = process.ControlOptions(
-        folder,
-        log_folder=str(log_folder),
-        log_name=log_name,
-        attachments=attachments,
-        dry=dry,
-        jog=not dry,
-        contract=contract,
-    )
-    keys, jogger = CHECK_KEYS if dry else jog_keys(contract), Jogger(contract)
-    with Session(config, options, console) as session:
-        for line in session.report:
-            console.print(f"  {line}", highlight=False)
-        end = time.monotonic() + (float("inf") if seconds is None else seconds)
-        with Keyboard() as keyboard, View(console, title, keys) as view:
-            while time.monotonic() < end:
-                for message in session.messages(0.1):
-                    view.take(message)
-                    if isinstance(message, messages.Marked):
-                        view.say(note(noted, config.calibration, message, not dry, contract))
-                key = keyboard.pressed() or ""
-                if key == QUIT:
-                    break
-                request = keys[key].request if key in keys else None
-                if not dry and key and request is None:
-                    request = jogger.pressed(key)
-                    view.say(str(jogger))
-                if request is not None:
-                    session.send(request)
-        status = session.status
-    if status is None:
-        raise RefusedError("the control process sent no status")
-    ball = "no ball" if status.ball is None else "ball at {:+.3f} {:+.3f} {:+.3f} m".format(*status.ball)
-    frames, arm = status.tracker_counts, status.egm
-    refused = sum(n for why, n in frames.items() if why not in ("accepted", "lost"))
-    console.print(
-        f"{ball} in the table frame; tracker {frames.get('accepted', 0)} frames, "
-        f"{refused} refused; arm {arm['accepted']} packets, "
-        f"{arm['replies']} answered; log {process.log_path(options)}",
-        highlight=False,
-    )
-    return 0
+    def _load_contract(self, policy: Path | None, console: Console) -> tuple[Contract, robot_attachment.Attachments]:
+        """Contract of the robot that stands there, and the robot for the log. Raises ConfigError."""
+        loaded, name = None if policy is None else artefacts.load(policy), self.name or robots.named(self.robot)
+        if name is None:
+            return (PAPER, ()) if loaded is None else (loaded.contract, robot_attachment.of_policy(loaded, console))
+        contract = checked("", simulated.load, name).contract
+        if loaded is not None and loaded.contract != contract:
+            raise ConfigError(
+                f"--artefact {policy}: a policy for another robot than {name} as it is now; allowed: one of "
+                f"{contract.robot}, exported since it was changed last"
+            )
+        content = () if contract == PAPER else robot_attachment.of_content(simulated.content(name), name, console)
+        return contract, content

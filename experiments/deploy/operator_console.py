@@ -153,7 +153,7 @@ class View:
         head = Text.assemble(
             (f"{self._title}  ", "bold"),
             (s.state.upper(), COLOURS[s.state]),
-            "  in thought" if s.dry else "  holding" if s.paused else "",
+            "  dry run" if s.dry else "  holding" if s.paused else "",
             "  at home" if s.at_home else "",
         )
         lines = [head]

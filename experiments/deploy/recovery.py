@@ -11,28 +11,28 @@ LONGEST = 20.0  # [s] from the key, or from the end of the axes' search, until t
 class Recovery:
     """Steps from a fault to an armed robot, one per status of the control process.
 
-    What somebody else has to mend (a cable, the emergency stop, the arm's controller) is mended by a hand near the
-    robot. So it moves by itself, homing or armed, only if from the key on nothing was missing but what Prepare does:
-    power and references of the axes. Otherwise it ends after the reset, and ``word`` asks for the operator's next key.
+    Repairs (a cable, the emergency stop, the arm's controller) bring hands near the robot. It therefore homes and arms
+    by itself only if, from the key on, nothing was missing but what Prepare does: power and references of the axes.
+    Otherwise it ends after the reset, and ``message`` asks for the operator's next key.
 
     status    the newest at the key, None: none has come
-    emulated  nothing real moves: it waits for whatever is missing, and goes on by itself
-    word      what the operator is to be told at the end; empty: nothing
+    emulated  nothing real moves: it waits for whatever is missing, and continues by itself
+    message   for the operator at the end; empty: nothing
     """
 
     def __init__(self, now: float, status: Status | None, emulated: bool = False) -> None:
-        self.done, self.word = False, ""
+        self.done, self.message = False, ""
         self._emulated = emulated
         self._by_itself = emulated or (status is not None and only_unprepared(status))
         self._end, self._refusal = now + LONGEST, ""
         self._prepared = self._reset = False  # asked for once
         self._again = False  # Prepare, which was refused or could not home before the reset
 
-    def refused(self, message: Refused) -> bool:
+    def refused(self, refusal: Refused) -> bool:
         """Take a refusal; True when it ends the recovery."""
-        if not isinstance(message.request, Prepare):
+        if not isinstance(refusal.request, Prepare):
             return True
-        self._again, self._refusal = True, message.sentence
+        self._again, self._refusal = True, refusal.sentence
         return False
 
     def step(self, status: Status, now: float) -> Request | None:
@@ -53,7 +53,7 @@ class Recovery:
                 self._end_with(f"not armed: {reasons}")
             return Prepare()
         if status.state == "fault":
-            return self._out_of_the_fault(status)
+            return self._leave_fault(status)
         if not self._by_itself:
             self._end_with(f"reset, not armed: {reasons}" if reasons else "all is well: press a to arm")
             return None
@@ -65,7 +65,7 @@ class Recovery:
         self.done = True
         return Arm()
 
-    def _out_of_the_fault(self, status: Status) -> Request | None:
+    def _leave_fault(self, status: Status) -> Request | None:
         if not status.present and not self._reset:
             self._reset = self._again = True
             return Reset()
@@ -74,8 +74,8 @@ class Recovery:
             return Prepare()
         return None
 
-    def _end_with(self, word: str) -> None:
-        self.done, self.word = True, word
+    def _end_with(self, message: str) -> None:
+        self.done, self.message = True, message
 
 
 def only_unprepared(status: Status) -> bool:

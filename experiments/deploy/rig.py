@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ import numpy as np
 from rich.console import Console
 
 from ballmodel import registry
+from experiments.commands.options import RobotOptions
 from experiments.config import build
 from experiments.config import robot as robots
-from experiments.deploy.operator_console import Keyboard
+from experiments.deploy.operator_console import QUIT, Keyboard
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.errors import ConfigError, checked
 from mjx_tt.robot import robots as simulated
@@ -25,27 +27,28 @@ from robot_io.emulator.opponent import Opponent, Throws
 from robot_io.emulator.processes import Ports, Rig
 from robot_io.policy import artefact as artefacts
 
-RIG = "rig"
 RECORDED = "provenance.config.robot"  # key of an artefact's manifest
 THROWS = 4096  # balls that the rig can throw before it begins anew
 
 
-def rig_for(
-    artefact: artefacts.Artefact, balls: str | None, params_path: str | None, seed: int, player: str | None = None
-) -> Rig:
+def rig_for(policy: artefacts.Artefact, setup: RobotOptions) -> Rig:
     """A rig with a virtual player, or that throws balls of a distribution: the named one, or that of the training.
 
     The robot that stands there is the one that the policy was trained for.
     """
-    robot = robot_of(artefact)
-    params = robots.load_rig(params_path, robot)
-    thrower: Opponent | Throws
-    if player is not None:
-        thrower = VirtualPlayer(player, seed)
+    robot = robot_of(policy)
+    params = robots.load_rig(setup.rig, robot)
+    opponent: Opponent | Throws
+    if setup.player is not None:
+        opponent = VirtualPlayer(setup.player, setup.seed)
     else:
-        distribution = build.distribution(balls or _trained_on(artefact), "--distribution")
-        thrower = robots.throws_of(distribution, SimModel(), THROWS, seed)
-    return Rig(str(robot.scene()), thrower, params, None, robot.contract)
+        balls = setup.distribution or _recorded(policy).get("balls")
+        if balls is None:
+            raise ConfigError(
+                f"{policy.folder}: does not say on which balls it was trained; name some with --distribution"
+            )
+        opponent = robots.throws_of(build.distribution(balls, "--distribution"), SimModel(), THROWS, setup.seed)
+    return Rig(str(robot.scene()), opponent, params, None, robot.contract)
 
 
 def robot_of(artefact: artefacts.Artefact) -> Robot:
@@ -65,7 +68,7 @@ def robot_of(artefact: artefacts.Artefact) -> Robot:
 
 def content_of(artefact: artefacts.Artefact) -> dict[str, Any]:
     """Plain data of the robot that a policy is for, from its recorded configuration. Raises ConfigError."""
-    given = ((artefact.manifest.get("provenance") or {}).get("config") or {}).get("robot")
+    given = _recorded(artefact).get("robot")
     if isinstance(given, dict):
         return given
     if given in simulated.names():
@@ -78,24 +81,20 @@ def content_of(artefact: artefacts.Artefact) -> dict[str, Any]:
 
 def box_of(artefact: artefacts.Artefact) -> Box | None:
     """Bounds of the balls that the policy was trained for; None where its artefact does not say."""
-    config = (artefact.manifest.get("provenance") or {}).get("config") or {}
-    if "balls" not in config:
+    balls = _recorded(artefact).get("balls")
+    if balls is None:
         return None
-    d = registry.box_of(build.distribution(config["balls"], str(artefact.folder)))
+    d = registry.box_of(build.distribution(balls, str(artefact.folder)))
     low, high = (*d.position_min, *d.velocity_min, *d.landing_min), (*d.position_max, *d.velocity_max, *d.landing_max)
     return Box(tuple(map(float, low)), tuple(map(float, high)))
 
 
-def _trained_on(artefact: artefacts.Artefact) -> str | dict[str, Any]:
-    config = (artefact.manifest.get("provenance") or {}).get("config") or {}
-    if "balls" not in config:
-        raise ConfigError(
-            f"{artefact.folder}: does not say on which balls it was trained; name some with --distribution"
-        )
-    return config["balls"]
+def _recorded(artefact: artefacts.Artefact) -> dict[str, Any]:
+    """The configuration that an artefact records, empty where it does not."""
+    return (artefact.manifest.get("provenance") or {}).get("config") or {}
 
 
-def rig(
+def serve(
     balls: str,
     rig_params: str | None,
     seed: int,
@@ -104,7 +103,7 @@ def rig(
     console: Console,
     robot: str | None = None,
 ) -> int:
-    """The rig alone, for a bridge that runs elsewhere; until the operator quits.
+    """Runs the rig alone, for a bridge that runs elsewhere, until the operator quits.
 
     robot: name or folder of the robot that stands there, None: the paper's. Raises ConfigError.
     """
@@ -114,46 +113,40 @@ def rig(
         raise ConfigError(f"--ports: got {len(ports)}; allowed: {2 + axes}, of arm, tracker and {axes} linear axes")
     throws = robots.throws_of(build.distribution(balls, "--distribution"), SimModel(), THROWS, seed)
     chosen = Ports(ports[0], ports[1], ports[2 : 2 + axes])
-    keys: dict[str, tuple[str, str]] = {
-        "o": ("switch_on", "switch the arm on"),
-        "b": ("throw", "throw balls, or stop"),
-        "e": ("motors_off", "emergency stop"),
-        "f": ("fault", "drive fault"),
-        "c": ("cable", "pull or plug an axis's cable"),
-        "t": ("drop_out", "tracker silent for 1 s"),
-        "q": ("quit", "end"),
-    }
-    for key in ("f", "c") if not axes else ():
-        del keys[key]
+    named = robot if robot is None or robot in simulated.names() else str(Path(robot).resolve())
     params = robots.load_rig(rig_params, standing)
     with Rig(str(standing.scene()), throws, params, chosen, standing.contract) as running, Keyboard() as keyboard:
-        out.write_text(robots.to_yaml(replace(running.robot, robot=_named(robot))), encoding="utf-8")
-        console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}", highlight=False)
-        console.print("   ".join(f"\\[{k}] {text}" for k, (_, text) in keys.items()), highlight=False)
+        out.write_text(robots.to_yaml(replace(running.robot, robot=named)), encoding="utf-8")
+        console.print(f"the rig runs; {out} is its robot.yaml: mjx-tt run ARTEFACT --robot {out}")
         throwing, connected = False, True
+
+        def throw() -> None:
+            nonlocal throwing
+            throwing = not throwing
+            running.throw(throwing)
+
+        def plug() -> None:
+            nonlocal connected
+            connected = not connected
+            running.connect_axis(0, connected)
+
+        keys: dict[str, tuple[str, Callable[[], object]]] = {
+            "o": ("switch the arm on", running.switch_on),
+            "b": ("throw balls, or stop", throw),
+            "e": ("emergency stop", running.motors_off),
+            **({"f": ("drive fault", lambda: running.drive_fault(0, 0x31))} if axes else {}),
+            **({"c": ("pull or plug an axis's cable", plug)} if axes else {}),
+            "t": ("tracker silent for 1 s", lambda: running.drop_out(1.0)),
+        }
+        console.print("   ".join(f"[{key}] {text}" for key, (text, _) in keys.items()) + "   [q] end")
         while True:
             time.sleep(0.1)
             running.check()
-            request = keys.get(keyboard.pressed() or "", ("",))[0]
-            if request == "quit":
+            key = keyboard.pressed()
+            if key == QUIT:
                 return 0
-            if request == "throw":
-                throwing = not throwing
-                running.throw(throwing)
-            elif request == "fault":
-                running.drive_fault(0, 0x31)
-            elif request == "cable":
-                connected = not connected
-                running.connect_axis(0, connected)
-            elif request == "drop_out":
-                running.drop_out(1.0)
-            elif request:
-                getattr(running, request)()
-            if request:
+            if key in keys:
+                text, act = keys[key]
+                act()
                 qpos, _ = running.state()
-                console.print(f"{request}; {running.thrown} balls thrown; joints {np.round(qpos, 3)}", highlight=False)
-
-
-def _named(robot: str | None) -> str | None:
-    """The key ``robot`` of a robot.yaml, wherever that is, from what the command line says."""
-    return robot if robot is None or robot in simulated.names() else str(Path(robot).resolve())
+                console.print(f"{text}; {running.thrown} balls thrown; joints {np.round(qpos, 3)}")

@@ -50,7 +50,7 @@ def of_content(content: dict[str, Any], where: str, console: Console) -> Attachm
 
 
 def _left_out(error: ConfigError, console: Console) -> Attachments:
-    console.print(f"the log will not hold the robot for mjx-tt view: {error}", style="yellow", highlight=False)
+    console.print(f"the log will not hold the robot for mjx-tt view: {error}", style="yellow")
     return ()
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from experiments.progress import print_files
 from experiments.stats import t_interval, wilson
 from robot_io.control.config import RobotConfig
 from robot_io.control.episode import EpisodeSummary
@@ -123,9 +124,6 @@ def show(console: Console, report: dict[str, Any], path: Path) -> None:
     if report["axes_cycles"] is not None:
         table.add_row("linear axes", f"{report['axes_cycles']:,} exchanges, {report['axes_late']:,} late")
     console.print(table)
-    for name, value in {"summary": path, "log": report["log"]}.items():
-        if value:
-            console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
-    if report["log"]:
-        layout = report.get("layout") or resources.files("robot_io.log") / "layout.json"
-        console.print(f"  to see it  Foxglove or Lichtblick, with the layout {layout}", highlight=False, soft_wrap=True)
+    layout = report.get("layout") or resources.files("robot_io.log") / "layout.json"
+    viewers = f"Foxglove or Lichtblick, with the layout {layout}" if report["log"] else None
+    print_files(console, {"summary": path, "log": report["log"], "to see it": viewers})

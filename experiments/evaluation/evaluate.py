@@ -12,8 +12,8 @@ from ballmodel.sampling import BallPool
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.evaluation import reachability
+from experiments.progress import Stage, silent
 from experiments.runs.load_policy import TrainedPolicy
-from experiments.stages import Stage, silent
 from experiments.stats import wilson
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import COLUMNS, Evaluator

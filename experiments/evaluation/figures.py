@@ -20,27 +20,18 @@ from ballmodel import constants as c
 from ballmodel.io.atomic_files import replacing
 from experiments.evaluation.evaluate import Played
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
+from mjx_tt.viz import html
+from mjx_tt.viz.html import INK
 from robot_io.contract import PAPER, Contract
 
 RETURNED_COLOUR, HIT_COLOUR, MISSED_COLOUR = "#1b7837", "#e08214", "#b2182b"
-TABLE_COLOUR, INK = "#e9eff7", "#303030"
+TABLE_COLOUR = "#e9eff7"
 LANDING_FRAME = (-1.2, 1.2), (-1.45, 1.9)  # [m] x and y shown
 FEWEST_BALLS = 5  # in a cell whose rate is shown
 
 STYLE = RcParams(
-    {
-        "font.size": 10,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.edgecolor": INK,
-        "axes.labelcolor": INK,
-        "axes.titlesize": 11,
-        "axes.titleweight": "bold",
-        "axes.titlelocation": "left",
-        "figure.constrained_layout.use": True,
-        "legend.frameon": False,
-        "savefig.dpi": 150,
-    }
+    html.STYLE
+    | {"axes.titlesize": 11, "axes.titleweight": "bold", "figure.constrained_layout.use": True, "savefig.dpi": 150}
 )
 
 

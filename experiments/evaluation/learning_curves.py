@@ -14,9 +14,10 @@ from matplotlib.figure import Figure
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.errors import RunError
-from experiments.evaluation.figures import HIT_COLOUR, INK, RETURNED_COLOUR, STYLE, save
+from experiments.evaluation.figures import HIT_COLOUR, RETURNED_COLOUR, STYLE, save
 from experiments.runs import metrics
 from experiments.runs.run_dir import Run
+from mjx_tt.viz.html import INK
 
 SMOOTHING = 25  # updates
 NAMED = 2  # reward weights of a change that are written out

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from experiments.deploy.control_session import RECOVERIES, ControlSession
 from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, Keyboard, View
-from experiments.deploy.session import RECOVERIES, Session
-from experiments.finetuning.robot import PlayedBall
+from experiments.finetuning.robot import Operator, PlayedBall
 from robot_io.control.messages import Beat, Discard, Pause, Played, PolicySet, Refused, SetPolicy, Stop
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
@@ -16,8 +16,8 @@ from robot_io.safety.owner_watch import LONGEST_ABSENCE
 COMPUTING = LONGEST_ABSENCE  # for an update between two balls, the compilation of the first one included
 
 
-class BridgeRobot:
-    """A robot behind a control process, and its operator: both protocols of ``experiments.finetuning.robot``.
+class BridgeRobot(Operator):
+    """A robot behind a control process, and its operator.
 
     It takes balls only while an episode is asked for, and credits only those that the policy of that episode played.
     rig: None for a real robot, whose operator recovers from faults.
@@ -25,20 +25,20 @@ class BridgeRobot:
 
     repeatable = False
 
-    def __init__(self, session: Session, rig: Rig | None, keyboard: Keyboard, view: View, name: str) -> None:
-        self._session, self._rig, self._keyboard, self._view, self._name = session, rig, keyboard, view, name
+    def __init__(self, session: ControlSession, rig: Rig | None, keyboard: Keyboard, view: View) -> None:
+        self._session, self._rig, self._keyboard, self._view = session, rig, keyboard, view
         self._paused = self._stopped = self._discarded = False
         self._version = 0
         session.send(Pause(True))
 
     def describe(self) -> dict[str, Any]:
-        return {"robot": self._name}
+        return {"robot": self._session.robot.name}
 
     def play(self, policy: Policy, episode_number: int) -> PlayedBall:
         """Wait for the person's next ball. Raises RefusedError when the robot cannot be brought back after faults.
 
         The policy is exchanged while no new ball is taken; refused, because the ball before is still played, it is
-        handed over again. A ball that another version played counts for nobody.
+        handed over again. A ball that another version played does not count.
         """
         self._discarded = False
         self._version += 1

@@ -49,7 +49,7 @@ class Entry:
     trajectory: np.ndarray
 
     @property
-    def place(self) -> tuple[str, int, int, int]:
+    def slot(self) -> tuple[str, int, int, int]:
         """The part of the fine-tuning that the episode was played for."""
         return self.phase, self.update, self.member, self.repeat
 

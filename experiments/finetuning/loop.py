@@ -30,8 +30,9 @@ from experiments.errors import RunError
 from experiments.finetuning import report
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry, Journal
 from experiments.finetuning.progress import FineTuningProgress
-from experiments.finetuning.robot import LockStepRobot, NoOperator, Operator, PlayedBall, Robot, thrown
-from experiments.runs import checkpoint, load_policy, run_dir
+from experiments.finetuning.robot import LockStepRobot, Operator, PlayedBall, Robot, throws_of
+from experiments.progress import print_files
+from experiments.runs import checkpoint, load_policy, metrics, run_dir
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import CONFIG, Run
 from experiments.training import finalize
@@ -82,9 +83,9 @@ def finetune(
     run.folder.mkdir(parents=True, exist_ok=True)
     with run.locked():
         _open(run, experiment, settings, robot, first, str(source))
-        session = Session(settings, run, robot, operator or NoOperator(), console, first, network)
+        tuning = FineTuningRun(settings, run, robot, operator or Operator(), console, first, network)
         try:
-            finished = session.run()
+            finished = tuning.run()
         except OSError as error:
             raise RunError(
                 f"{error.filename or run.folder}: cannot be written: {error.strerror or error}; every episode before "
@@ -93,11 +94,11 @@ def finetune(
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"{run.folder}: stopped; the same command continues it") from None
         finally:
-            session.close()
+            tuning.close()
         if not finished:
-            console.print(f"{run.folder}: stopped; the same command continues it", highlight=False)
+            console.print(f"{run.folder}: stopped; the same command continues it")
             return None
-        return conclude(experiment, settings, run, robot, console, session.journal.entries)
+        return conclude(experiment, settings, run, robot, console, tuning.journal.entries)
 
 
 def experiment_of(source: str | Path, balls: str | None = None) -> Experiment:
@@ -113,7 +114,7 @@ def lock_step_robot(experiment: Experiment, params: RigParams | None = None, see
     """The emulated robot with balls of the experiment's distribution; ``seed`` draws them."""
     pool = build.pool(experiment, build.key(seed, build.EVALUATION_BALLS), LOCK_STEP_BALLS)
     robot = experiment.task.robot
-    return LockStepRobot(thrown(pool.state), params, robot.scene(), robot.contract)
+    return LockStepRobot(throws_of(pool.state), params, robot.scene(), robot.contract)
 
 
 def reward_terms(summary: EpisodeSummary) -> dict[str, float]:
@@ -132,7 +133,7 @@ def reward_terms(summary: EpisodeSummary) -> dict[str, float]:
     return {term.name: float(term(played)) for term in task.BUILT_IN_REWARDS if term.name in MEASURED_WEIGHTS}
 
 
-class Session:
+class FineTuningRun:
     """A fine-tuning between two starts of the program.
 
     journal  every episode so far
@@ -159,7 +160,7 @@ class Session:
         # Frozen: as float32 numbers they are those of the exported policy.
         self._normaliser = tuple(np.asarray(a) for a in normalizer.normaliser(first.statistics))
         self.journal = Journal(run.folder / JOURNAL)
-        self._played = {entry.place: entry for entry in self.journal.entries if not entry.discarded}
+        self._played = {entry.slot: entry for entry in self.journal.entries if not entry.discarded}
         if self.update > settings.updates:
             raise RunError(
                 f"{run.folder}: has {self.update} updates already, updates = {settings.updates} does not fit"
@@ -226,9 +227,9 @@ class Session:
         self._progress.updated(number, row)
         return True
 
-    def _episode(self, place: tuple[str, int, int, int], theta: np.ndarray | None) -> Entry | None:
-        """The episode of that place: from the journal or played now; None when the operator stopped before it."""
-        while place not in self._played:
+    def _episode(self, slot: tuple[str, int, int, int], theta: np.ndarray | None) -> Entry | None:
+        """The episode of that slot: from the journal or played now; None when the operator stopped before it."""
+        while slot not in self._played:
             while self._operator.paused() and not self._operator.stopped():
                 self._progress.paused()
                 time.sleep(PAUSE_POLL)
@@ -239,15 +240,15 @@ class Session:
                     f"{self.journal.path}: an episode of the evaluation before fine-tuning is missing, though updates "
                     "are done; restore the file or start a new run"
                 )
-            number = self._next_number(*place[:2])
+            number = self._next_number(*slot[:2])
             mean, inv_std = self._normaliser
             played = self._robot.play(Policy(np.ascontiguousarray(theta), mean, inv_std, self._network), number)
-            entry = self._entry(place, number, played)
+            entry = self._entry(slot, number, played)
             self.journal.append(entry)
             if not entry.discarded:
-                self._played[place] = entry
+                self._played[slot] = entry
             self._progress.played(entry)
-        return self._played[place]
+        return self._played[slot]
 
     def _next_number(self, phase: str, update: int) -> int:
         """A ball that is played again is another one: every attempt counts."""
@@ -256,7 +257,7 @@ class Session:
         attempts = sum(entry.phase == phase and entry.update == update for entry in self.journal.entries)
         return EVALUATION_EPISODES + attempts  # the same balls before and after, where the robot can
 
-    def _entry(self, place: tuple[str, int, int, int], number: int, played: PlayedBall) -> Entry:
+    def _entry(self, slot: tuple[str, int, int, int], number: int, played: PlayedBall) -> Entry:
         summary = played.summary
         terms = reward_terms(summary)
         returns = sum(self._weights[name] * value for name, value in terms.items())
@@ -264,7 +265,7 @@ class Session:
         # about the policy.
         discarded = self._operator.discarded() or summary.discarded or summary.fault == STOPPED
         discarded |= summary.human_fault is not None
-        return Entry(*place, number, summary, terms, returns, discarded, played.trajectory)
+        return Entry(*slot, number, summary, terms, returns, discarded, played.trajectory)
 
 
 def conclude(
@@ -274,22 +275,21 @@ def conclude(
     result = report.compare(entries, robot.repeatable)
     result |= {"settings": settings.model_dump(mode="json"), "robot": robot.describe()}
     kept = [entry for entry in entries if not entry.discarded]
-    picture = report.draw(run.plots / CURVE, kept, result, f"{run.folder.name}: fine-tuning on a robot")
+    title, rows = f"{run.folder.name}: fine-tuning on a robot", metrics.read(run.metrics)
+    picture = report.draw(run.plots / CURVE, rows, settings.episodes_per_update, result, title)
     # Balls that a repeatable robot meets before and after are the same.
     human = [entry for entry in kept if entry.phase != AFTER or not robot.repeatable]
     balls = report.write_human_balls(run.folder / HUMAN_BALLS, run.folder.name, human)
     exported = finalize.export_policy(run.artefact, load_policy.load(run.folder), experiment, result, console)
     run_dir.write_json(run.evaluation, result)
     report.print_result(console, result, str(run.folder))
-    lines = {
+    files = {
         "evaluation": run.evaluation,
         "curve": picture,
         "balls": f"{run.folder / HUMAN_BALLS} ({balls:,}; mjx-tt fit-human makes a distribution of them)",
-        "artefact": run.artefact if exported else "",
+        "artefact": run.artefact if exported else None,
     }
-    for name, value in lines.items():
-        if value:
-            console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
+    print_files(console, files)
     return result
 
 

@@ -7,10 +7,6 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,12 +15,18 @@ from rich.table import Table
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.tables import COLUMNS
-from experiments.evaluation.figures import HIT_COLOUR, INK, MISSED_COLOUR, RETURNED_COLOUR, STYLE
+from experiments.evaluation.figures import HIT_COLOUR, MISSED_COLOUR, RETURNED_COLOUR, STYLE, save
 from experiments.finetuning.journal import AFTER, BEFORE, TRAINING, Entry
 from experiments.stats import t_interval, welch_interval, wilson
+from mjx_tt.viz.html import INK
 from robot_io.control.episode import HIT, RETURNED
 
 CURVE_COLOUR = "#4575b4"
+RATES = (
+    ("hit_rate", HIT_COLOUR, "touched"),
+    ("return_rate", RETURNED_COLOUR, "returned"),
+    ("fault_rate", MISSED_COLOUR, "faults"),
+)
 SMOOTHING = 7  # updates
 SHORTEST = 2  # samples of a ball that is worth keeping
 
@@ -117,7 +119,6 @@ def print_result(console: Console, result: dict[str, Any], title: str) -> None:
     verdict = "" if d["significant"] else "; no significant change"
     console.print(
         f"mean return {d['mean_return']:+.2f} (95 % interval {d['low']:+.2f} to {d['high']:+.2f}, {how}){verdict}",
-        highlight=False,
         soft_wrap=True,
     )
 
@@ -137,49 +138,26 @@ def write_human_balls(path: Path, session: str, entries: list[Entry]) -> int:
     return count
 
 
-def draw(path: Path, entries: list[Entry], result: dict[str, Any], title: str) -> Path:
-    """Writes the curve of the mean return per update with the evaluations at its ends, as PNG."""
+def draw(path: Path, rows: list[dict[str, Any]], balls: int, result: dict[str, Any], title: str) -> Path:
+    """Writes the curve of the mean return per update with the evaluations at its ends, as PNG.
+
+    rows: of metrics.jsonl; balls: of an update.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with plt.rc_context(STYLE), replacing(path) as temporary:
-        figure = _figure(entries, result, title)
-        figure.savefig(temporary, format="png")
-        plt.close(figure)
-    return path
+    with plt.rc_context(STYLE):
+        return save(path, _figure(rows, balls, result, title))
 
 
-def _figure(entries: list[Entry], result: dict[str, Any], title: str) -> Figure:
-    by_update: dict[int, list[Entry]] = {}
-    for entry in entries:
-        if entry.phase == TRAINING:
-            by_update.setdefault(entry.update, []).append(entry)
-    updates = np.array(sorted(by_update))
-    rows = [update_row(by_update[u]) for u in updates]
+def _figure(rows: list[dict[str, Any]], balls: int, result: dict[str, Any], title: str) -> Figure:
     figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(2, 1))
     column = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
     if rows:
-        count = len(by_update[updates[0]])
-        upper.fill_between(updates, column["low"], column["high"], color=CURVE_COLOUR, alpha=0.18, linewidth=0)
-        upper.plot(
-            updates,
-            column["mean_return"],
-            "o",
-            color=CURVE_COLOUR,
-            markersize=3,
-            alpha=0.7,
-            label=f"perturbed policies, {count} balls an update, 95 %",
-        )
-        upper.plot(
-            updates,
-            smooth(column["mean_return"]),
-            color=CURVE_COLOUR,
-            linewidth=1.8,
-            label=f"mean over {SMOOTHING} updates",
-        )
-        for name, colour, label in (
-            ("hit_rate", HIT_COLOUR, "touched"),
-            ("return_rate", RETURNED_COLOUR, "returned"),
-            ("fault_rate", MISSED_COLOUR, "faults"),
-        ):
+        updates, mean, style = column["update"], column["mean_return"], {"color": CURVE_COLOUR}
+        upper.fill_between(updates, column["low"], column["high"], alpha=0.18, linewidth=0, **style)
+        label = f"perturbed policies, {balls} balls an update, 95 %"
+        upper.plot(updates, mean, "o", markersize=3, alpha=0.7, label=label, **style)
+        upper.plot(updates, smooth(mean), linewidth=1.8, label=f"mean over {SMOOTHING} updates", **style)
+        for name, colour, label in RATES:
             lower.plot(updates, smooth(column[name]), color=colour, label=label, linewidth=1.5)
     ends = (0, result["updates"] + 1)
     for at, name in zip(ends, (BEFORE, AFTER), strict=True):

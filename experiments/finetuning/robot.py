@@ -62,29 +62,19 @@ class Robot(Protocol):
         """Its description as plain JSON data; a run is continued on a robot of the same description."""
 
 
-class Operator(Protocol):
-    """The person at the robot, asked between episodes."""
+class Operator:
+    """The person at the robot, asked between episodes; this one lets everything run."""
 
     def discarded(self) -> bool:
         """True for a ball that is to be played again; called once after every ball."""
+        return False
 
     def paused(self) -> bool:
         """True while the fine-tuning is to wait; polled."""
+        return False
 
     def stopped(self) -> bool:
         """True to stop here; the same command continues later."""
-
-
-class NoOperator:
-    """Lets everything run."""
-
-    def discarded(self) -> bool:
-        return False
-
-    def paused(self) -> bool:
-        return False
-
-    def stopped(self) -> bool:
         return False
 
 
@@ -228,6 +218,6 @@ class BallRecorder(NullRecorder):
         return np.array(samples, float).reshape(-1, 4)
 
 
-def thrown(state: BallState) -> Throws:
+def throws_of(state: BallState) -> Throws:
     """Balls of a pool, ``BallState`` of arrays (3, n), for the rig's thrower."""
     return Throws(*(np.asarray(part, float) for part in (state.position, state.velocity, state.spin)))

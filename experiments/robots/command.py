@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands.options import command, console, count, existing, option, start_jax, suffix
+from experiments.commands.options import check_exists, check_suffix, command, count, option, start_jax
 from experiments.errors import ConfigError
+from experiments.progress import make_console
 
 if TYPE_CHECKING:
     from mjx_tt.robot.robots import Robot
 
-Balls = Annotated[str, option("NAME_OR_YAML", "balls that it should return (default: player3/M0)")]
+Balls = Annotated[str, option("NAME_OR_YAML", "balls to return (default: player3/M0)")]
 SOME = 32  # balls whose motions are searched
 
 new_app = command(
     "new",
-    "a first YAML for the MJCF of a robot, checked",
+    "write a first YAML for a robot's MJCF and check it",
     """\
   mjx-tt robot new my_arm/my_arm.xml                        writes my_arm/description.yaml and names what is wrong
   mjx-tt robot new my_arm/my_arm.xml --balls anna.yaml      again, once mended, with what is in reach of which balls
@@ -28,7 +29,7 @@ new_app = command(
 A YAML that is there already is checked and never changed.
 """,
 )
-list_app = command("list", "the robots that come with the program", "  mjx-tt robot list\n")
+list_app = command("list", "list the robots that come with the program", "  mjx-tt robot list\n")
 place_app = command(
     "place",
     "find mounting and home pose for a ball distribution",
@@ -45,14 +46,14 @@ def new(
     /,
     *,
     balls: Balls = "player3/M0",
-    no_reachable: Annotated[bool, Parameter(help="skip the minutes that the bound on what is in reach takes")] = False,
-    picture: Annotated[str | None, option("PNG", "the robot at home, at the table")] = None,
+    no_reachable: Annotated[bool, Parameter(help="skip the bound on what is in reach, which takes minutes")] = False,
+    picture: Annotated[str | None, option("PNG", "draw the robot at home, at the table")] = None,
     view: Annotated[bool, Parameter(help="show it in the browser (http://127.0.0.1:8080/)")] = False,
 ) -> int:
     """Returns 1 where the robot cannot be used as it is."""
-    existing(mjcf)
+    check_exists(mjcf)
     if picture is not None:
-        suffix(picture, ".png")
+        check_suffix(picture, ".png")
     path = Path(mjcf)
     start_jax(None)
     from ballmodel.io.atomic_files import replacing
@@ -60,35 +61,35 @@ def new(
     from experiments.robots import draft
     from mjx_tt.robot import robots
 
-    screen, file = console(), path.with_name(robots.YAML)
+    screen, file = make_console(), path.with_name(robots.YAML)
     if file.exists():
-        screen.print(f"{file}: is there already; checked, not changed", highlight=False, soft_wrap=True)
+        screen.print(f"{file}: is there already; checked, not changed", soft_wrap=True)
     else:
         content = draft.text(path)
         with replacing(file) as temporary:
             temporary.write_text(content, encoding="utf-8")
-        screen.print(f"{file}: written; look at every line that says guess", highlight=False, soft_wrap=True)
+        screen.print(f"{file}: written; look at every line that says guess", soft_wrap=True)
     distribution = None if no_reachable else build.distribution(balls, "--balls")
     try:
         robot = robots.load(file)
     except ValueError as error:
         mistakes = str(error).splitlines()
         for line in mistakes:
-            screen.print(f"  {line}", highlight=False, soft_wrap=True)
+            screen.print(f"  {line}", soft_wrap=True)
         there = "this" if len(mistakes) == 1 else f"these {len(mistakes)}"
-        screen.print(f"mend {there}, then: mjx-tt robot new {mjcf}", highlight=False, soft_wrap=True)
+        screen.print(f"mend {there}, then: mjx-tt robot new {mjcf}", soft_wrap=True)
         return 1
     from experiments.robots import reach
 
     for line in reach.description(robot):
-        screen.print(f"  {line}", highlight=False, soft_wrap=True)
+        screen.print(f"  {line}", soft_wrap=True)
     if picture is not None:
         reach.draw(robot, Path(picture))
-        screen.print(f"  at home: {picture}", highlight=False, soft_wrap=True)
+        screen.print(f"  at home: {picture}", soft_wrap=True)
     if distribution is not None:
         found = reach.reachable(robot, distribution, SOME)
-        screen.print(f"  in reach, at least: {found.rate:.0%} of {found.balls} balls of {balls}", highlight=False)
-    screen.print(f"  use it: robot: {file.parent} in an experiment's YAML", highlight=False, soft_wrap=True)
+        screen.print(f"  in reach, at least: {found.rate:.0%} of {found.balls} balls of {balls}")
+    screen.print(f"  use it: robot: {file.parent} in an experiment's YAML", soft_wrap=True)
     if view:
         _view(robot, balls)
     return 0
@@ -99,11 +100,11 @@ def names() -> None:
     """Prints a line for each."""
     from mjx_tt.robot import robots
 
-    screen = console()
+    screen = make_console()
     for name in robots.names():
         contract = robots.load_shipped(name).contract
         axes = ", ".join(contract.joints[i] for i in contract.carrying) or "no axis"
-        screen.print(f"{name:<16}{len(contract.arm)} joints on {axes}", highlight=False)
+        screen.print(f"{name:<16}{len(contract.arm)} joints on {axes}")
 
 
 @place_app.default
@@ -112,20 +113,20 @@ def place(
     /,
     *,
     balls: Balls = "player3/M0",
-    out: Annotated[str | None, option("YAML", "where the result goes (default: the robot's own YAML)")] = None,
-    seed: Annotated[int, option("K", "of the search (0)")] = 0,
-    samples: Annotated[int, count("balls that it is placed for (96)")] = 96,
+    out: Annotated[str | None, option("YAML", "file for the result (default: the robot's YAML)")] = None,
+    seed: Annotated[int, option("K", "seed of the search (default: 0)")] = 0,
+    samples: Annotated[int, count("balls to place it for (default: 96)")] = 96,
 ) -> int:
     """Returns 1 where no better place was found."""
     if out is not None:
-        suffix(out, ".yaml")
+        check_suffix(out, ".yaml")
     start_jax(None)
     from experiments.config import build
     from experiments.errors import error_context
     from experiments.robots import placement
     from mjx_tt.robot import robots
 
-    screen = console()
+    screen = make_console()
     with error_context():
         path = robots.yaml_path(robot)
         before = robots.load(path)
@@ -134,13 +135,13 @@ def place(
     distribution = build.distribution(balls, "--balls")
     found = placement.search(before, distribution, samples, seed)
     if found.score <= found.before:
-        screen.print(f"{path}: no better place found (score {found.before:.3f}); nothing written", highlight=False)
+        screen.print(f"{path}: no better place found (score {found.before:.3f}); nothing written")
         return 1
     target = Path(out) if out else path
     placement.write(found.robot, path, target)
     for line in placement.description(before, found):
-        screen.print(line, highlight=False, soft_wrap=True)
-    screen.print(f"{target}: written", highlight=False, soft_wrap=True)
+        screen.print(line, soft_wrap=True)
+    screen.print(f"{target}: written", soft_wrap=True)
     return 0
 
 
@@ -149,11 +150,12 @@ def _view(robot: Robot, balls: str) -> None:
     import contextlib
 
     from experiments.robots import reach
-    from experiments.view import guard, show
+    from experiments.view import auth
+    from experiments.view.viewer import Viewer
 
-    server = guard.Server(guard.LOCAL, 8080)
-    viewer = show.viewer(server, reach.standing(robot, balls))
-    console().print(f"http://{guard.LOCAL}:{server.get_port()}/  (Ctrl+C ends it)", highlight=False)
+    server = auth.Server(auth.LOCAL, 8080)
+    viewer = Viewer(server, reach.standing(robot, balls))
+    make_console().print(f"http://{auth.LOCAL}:{server.get_port()}/  (Ctrl+C ends it)")
     with contextlib.suppress(KeyboardInterrupt):
         viewer.run()
     server.stop()

@@ -23,7 +23,7 @@ from mjx_tt.viz.rendering import Moment
 from robot_io.contract import n_parameters
 
 if TYPE_CHECKING:
-    from experiments.view.programme import Play
+    from experiments.view.playlist import PolicyPlaylist
 
 SIM_RATE = 150.0  # [Hz]
 POOL = 1024
@@ -83,11 +83,11 @@ def still(robot: Robot) -> Policy:
     return Policy(np.zeros(n_parameters(contract.n_joints), np.float32), zeros, zeros)
 
 
-def standing(robot: Robot, balls: str) -> Play:
-    """Programme of the viewer: the robot stands at home while balls come."""
-    from experiments.view.programme import Play  # needs the packages of the viewer
-    from experiments.view.studio import Studio
+def standing(robot: Robot, balls: str) -> PolicyPlaylist:
+    """Playlist of the viewer: the robot stands at home while balls come."""
+    from experiments.view.playlist import PolicyPlaylist  # needs the packages of the viewer
+    from experiments.view.recorder import Recorder
     from mjx_tt.sim.model import ModelFile
 
-    studio = Studio(TaskConfig(robot=robot), ModelFile(build.nominal_model(robot)))
-    return Play(studio, [robot.name], [still(robot)], build.distribution(balls, "--balls"), 0)
+    recorder = Recorder(TaskConfig(robot=robot), ModelFile(build.nominal_model(robot)))
+    return PolicyPlaylist(recorder, [robot.name], [still(robot)], build.distribution(balls, "--balls"), 0)

@@ -21,8 +21,6 @@ from mjx_tt.env import user_defined
 from mjx_tt.env.policy import Policy
 from robot_io.policy import artefact as artefacts
 
-# Where runs and artefacts lie in a folder of trainings, a study's folder and those in it.
-
 
 @dataclass(frozen=True)
 class TrainedPolicy:

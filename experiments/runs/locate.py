@@ -58,7 +58,7 @@ def artefact_of(folder: str | Path) -> Path:
 def is_exported(folder: str | Path) -> bool:
     """True for an artefact, and for a run's folder that was passed on: with an artefact, without states of training."""
     folder = Path(folder)
-    if (folder / CONFIG).is_file() and any(Run(folder).checkpoints.glob("[0-9]*.npz")):
+    if (folder / CONFIG).is_file() and Run(folder).newest_checkpoint():
         return False
     return any((folder / place / MANIFEST).is_file() for place in ("", "artefact"))
 

@@ -142,6 +142,10 @@ class Run:
         """True where nothing is left to do under this configuration: trained, exported and evaluated."""
         return self.trained(config) and self.evaluation.exists()
 
+    def newest_checkpoint(self) -> str:
+        """Name of the last checkpoint, "" before the first."""
+        return max((path.name for path in self.checkpoints.glob("[0-9]*.npz")), default="")
+
     def read_evaluation(self) -> dict[str, Any]:
         """Content of evaluation.json."""
         return json.loads(self.evaluation.read_text())

@@ -11,10 +11,10 @@ from rich.table import Table
 from experiments.config.build import Experiment
 from experiments.evaluation import evaluate, figures, learning_curves, video
 from experiments.evaluation.evaluate import Played
+from experiments.progress import Stage, print_files, print_stages
 from experiments.runs import load_policy, metrics, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
-from experiments.stages import Stage, printed
 from robot_io import contract
 from robot_io.policy import export
 
@@ -27,7 +27,7 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
     Returns the report. Raises ArtefactError when the policy's exported forms disagree, OSError when the disk refuses.
     """
     trained, evaluation = load_policy.load(run.folder), experiment.config.evaluation
-    stage = printed(console, str(run.folder))
+    stage = print_stages(console, str(run.folder))
     played = evaluate.evaluate(
         experiment,
         trained,
@@ -49,15 +49,13 @@ def finish(experiment: Experiment, run: Run, console: Console) -> dict[str, Any]
         exported = export_policy(run.artefact, trained, experiment, played.report, console)
     run_dir.write_json(run.evaluation, played.report)
     print_report(console, played.report, str(run.folder))
-    lines = {
+    files = {
         "evaluation": run.evaluation,
         "pictures": f"{run.plots} ({', '.join(p.name for p in pictures)})",
         "episodes": ", ".join(str(path) for path in shown),
-        "artefact": run.artefact if exported else "",
+        "artefact": run.artefact if exported else None,
     }
-    for name, value in lines.items():
-        if value:
-            console.print(f"  {name:<11}{value}", highlight=False, soft_wrap=True)
+    print_files(console, files)
     return played.report
 
 
@@ -66,7 +64,7 @@ def show_episodes(
 ) -> list[Path]:
     """Writes the pictures that this machine can draw; says why where it cannot."""
     with stage("compiling and playing the episodes to be drawn"):
-        played = video.replay(experiment, trained, EPISODES_SHOWN, experiment.config.evaluation.seed)
+        played = video.record(experiment, trained, EPISODES_SHOWN, experiment.config.evaluation.seed)
     drawn, failed = [], {}
     with stage(f"drawing {' and '.join(path.name for path in paths)}"):
         for path in paths:
@@ -75,7 +73,7 @@ def show_episodes(
             except RuntimeError as error:
                 failed[path] = error
     for path, reason in failed.items():
-        console.print(f"{path}: not drawn: {reason}", highlight=False)
+        console.print(f"{path}: not drawn: {reason}")
     return drawn
 
 
@@ -89,7 +87,7 @@ def export_policy(
         f"the policy observes {more}, the robot's side computes ball and joints only": bool(more),
     }
     for reason in (text for text, holds in reasons.items() if holds):
-        console.print(f"{folder}: not exported: {reason}", highlight=False)
+        console.print(f"{folder}: not exported: {reason}")
         return False
     provenance = {
         "config": experiment.config.to_dict(),

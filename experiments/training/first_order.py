@@ -1,8 +1,7 @@
 """One update by first-order gradients: derivatives of a smooth objective through the simulation, compiled as a whole.
 
-The objective is averaged over the same perturbed policies as Blackbox Gradient Sensing compares, so that both climb the
-same kind of hill: a policy whose neighbours play as well. Where BGS learns one number of a policy and its balls, their
-return, here each of them tells its derivatives by all parameters.
+The objective is averaged over the same perturbed policies that Blackbox Gradient Sensing compares, so both optimise the
+same smoothed objective. BGS learns one number per policy, its return; here each episode gives a whole gradient.
 """
 
 from __future__ import annotations
@@ -13,13 +12,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
 from bgs import normalizer, strategy
-from experiments.training.update import Inputs, Trainer, TrainState
+from experiments.training.update import Inputs, Trainer, TrainState, sum_over_devices
 from mjx_tt.env.episode import reshape_episodes
 from mjx_tt.env.policy import Policy
-from mjx_tt.env.rollout import AXIS
 from mjx_tt.gradient.objective import Objective, Played
 
 SECONDS = 1.7  # that are looked at: 99 of 100 balls of the widest boxes are out of reach by then
@@ -27,8 +24,7 @@ LONGEST = 1.0  # norm of a gradient: a few steep episodes must not decide where 
 
 
 class FirstOrderTrainer(Trainer):
-    """Updates of one training run. What a ``Trainer`` has for comparing returns (elites, pairs that meet the same
-    balls, later weights) is not used."""
+    """Updates of one training run. Elites, common random numbers and the reward schedule are not used."""
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
@@ -37,10 +33,7 @@ class FirstOrderTrainer(Trainer):
 
     def _update_local(self, state: TrainState, inputs: Inputs) -> tuple[TrainState, dict[str, jax.Array]]:
         config, simulator = self.bgs_config, self.simulator
-        direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
-        population = strategy.ask(direction_key, state.bgs, config)
-        shape = (self._repeats, 2 * config.num_directions)
-        episodes = self._draw(episode_key, inputs, *shape)
+        population, episodes = self._draw(state, inputs, 2 * config.num_directions)
         mine = reshape_episodes(simulator.local(episodes), -1)
         mean, inv_std = normalizer.normaliser(state.statistics)
 
@@ -50,7 +43,7 @@ class FirstOrderTrainer(Trainer):
 
         (_, played), slopes = jax.value_and_grad(cost, has_aux=True)(simulator.local(population.members))
         whole = jnp.isfinite(slopes).all(0)
-        finite = jnp.isfinite(played.cost) & jnp.tile(whole, self._repeats)
+        finite = jnp.isfinite(played.cost) & jnp.tile(whole, self._episodes_per_direction)
         seen = (played.seen & finite)[:, None].astype(slopes.dtype)
         centred = (jnp.where(seen > 0, played.observations, mean[None, :, None]) - mean[None, :, None]) * seen
         shared = {
@@ -65,8 +58,7 @@ class FirstOrderTrainer(Trainer):
             "seen": seen.sum(),
             "sums": jnp.stack([centred.sum((0, 2)), (centred * centred).sum((0, 2))]),
         }
-        flat, unravel = ravel_pytree(shared)
-        total = unravel(jax.lax.psum(flat, AXIS))  # one sum over devices: several at a time starve their threads
+        total = sum_over_devices(shared)
         count = jnp.maximum(total["episodes"], 1.0)
         gradient = -total["slope"] / count
         norm = jnp.linalg.norm(gradient)

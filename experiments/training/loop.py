@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import signal
+import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
-from types import FrameType
+from contextlib import nullcontext
 from typing import Any, NoReturn
 
 import jax
@@ -18,17 +17,17 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 
 from bgs import normalizer
-from experiments import stages
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
 from experiments.errors import CheckpointError, ConfigError, RunError, checked
 from experiments.evaluation.evaluate import draw_balls, return_rate
+from experiments.interrupts import stop_requested
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.run_dir import Run
 from experiments.training.progress import TrainingProgress
-from experiments.training.ranks import ALONE, Ranks, Watch
+from experiments.training.ranks import SINGLE, Ranks, Watchdog
 from experiments.training.trainers import trainer
 from experiments.training.update import Trainer, TrainState
 from mjx_tt.env.evaluator import Evaluator
@@ -37,22 +36,23 @@ from mjx_tt.env.rollout import held_here
 from mjx_tt.sim import arguments
 
 _programs: dict[str, Compiled] = {}  # compiled updates by what decides them
+CTRL_C = "Ctrl-C: saves a checkpoint and stops after this update or compilation; Ctrl-C again ends at once"
 FETCH_SECONDS = 1.0  # between fetches of measurements: each one waits for the device, which then idles for a moment
 QUEUED = 16  # updates between fetches where several devices take part: hundreds of queued collectives may hang
 
 
-def train(experiment: Experiment, run: Run, console: Console, ranks: Ranks = ALONE) -> str:
+def train(experiment: Experiment, run: Run, console: Console, ranks: Ranks = SINGLE) -> str:
     """Trains until the configuration says stop, continuing from the last checkpoint; returns the setting that ended it.
 
     ranks: the processes that train it together; only the first one touches the run's folder. Ctrl-C or SIGTERM saves a
     checkpoint first and then raises KeyboardInterrupt. Raises RunError, ConfigError or CheckpointError with a message
     for the person at the terminal.
     """
-    if ranks.first:
+    if ranks.is_first:
         run.open(experiment.config)
-    with run.locked() if ranks.first else nullcontext():
+    with run.locked() if ranks.is_first else nullcontext():
         try:
-            return Session(experiment, run, console, ranks).train()
+            return TrainingRun(experiment, run, console, ranks).train()
         except OSError as error:  # of the measurements; checkpoints raise their own
             raise RunError(
                 f"{error.filename or run.metrics}: cannot be written: {error.strerror or error}; "
@@ -61,7 +61,7 @@ def train(experiment: Experiment, run: Run, console: Console, ranks: Ranks = ALO
             ) from error
 
 
-class Session:
+class TrainingRun:
     """A run between two starts of the program.
 
     state        after ``update`` updates
@@ -69,7 +69,7 @@ class Session:
     return_rate  of the last evaluation during training, None before the first
     """
 
-    def __init__(self, experiment: Experiment, run: Run, console: Console, ranks: Ranks = ALONE) -> None:
+    def __init__(self, experiment: Experiment, run: Run, console: Console, ranks: Ranks = SINGLE) -> None:
         self._config, self._run, self._console, self._ranks = experiment.config, run, console, ranks
         self._trainer = trainer(experiment)
         self.state, notes = _start(self._config, run, self._trainer, ranks)
@@ -80,29 +80,33 @@ class Session:
         self._evaluator = self._make_evaluator(experiment)
 
     def train(self) -> str:
-        name, training, first = str(self._run.folder), self._config.training, self._ranks.first
+        name, training, first = str(self._run.folder), self._config.training, self._ranks.is_first
         log = MetricsLog(self._run.metrics, self._run.tensorboard, self.update) if first else None
         progress = TrainingProgress(
             self._console, name, training.updates, self.update, self._trainer.episodes_per_update
         )
         try:
-            with progress, _stop_requests() as stop_wanted, self._ranks.watched(self._others_are_silent) as watch:
+            with (
+                progress,
+                stop_requested(signal.SIGINT, signal.SIGTERM, message=CTRL_C) as stop,
+                self._ranks.watch(self._exit_stuck) as watchdog,
+            ):
                 if self.update:
                     progress.note(f"continues after update {self.update}")
                 began = time.monotonic()
                 compiled = _compiled(self._config, self._trainer, self.state)
                 progress.note(f"compiled in {time.monotonic() - began:.1f} s")
                 while True:
-                    stopped = self._agree(stop_wanted())
-                    reason = self._ended()
+                    stopped = self._agree(stop.is_set())
+                    reason = run_dir.training_ended(self._config, self.update, self.seconds, self.return_rate)
                     if stopped or reason is not None:
                         break
-                    self._advance(compiled, log, progress, stop_wanted, watch)
+                    self._advance(compiled, log, progress, stop, watchdog)
                 self._save(log)
         except (RuntimeError, ValueError) as error:  # as which JAX raises what gloo says differs
-            if self._ranks.alone or "Gloo" not in str(error):
+            if self._ranks.is_alone or "Gloo" not in str(error):
                 raise
-            self._end_without(f"another process is lost ({str(error).splitlines()[0]})")
+            self._exit_alone(f"another process is lost ({str(error).splitlines()[0]})")
         finally:
             if log is not None:
                 log.close()
@@ -114,14 +118,14 @@ class Session:
 
     def _agree(self, stop: bool) -> bool:
         """True where a process was asked to stop; all go on with the first one's seconds and pace."""
-        every = self._ranks.agree(stop, self.seconds, self._batch)
+        every = self._ranks.gather(stop, self.seconds, self._batch)
         self.seconds, self._batch = float(every[0, 1]), int(every[0, 2])
         return bool(every[:, 0].any())
 
-    def _others_are_silent(self, seconds: float) -> NoReturn:
-        self._end_without(f"another process is stuck: no update for {seconds:.0f} s")
+    def _exit_stuck(self, seconds: float) -> NoReturn:
+        self._exit_alone(f"another process is stuck: no update for {seconds:.0f} s")
 
-    def _end_without(self, text: str) -> NoReturn:
+    def _exit_alone(self, text: str) -> NoReturn:
         """Ends this process after the others: whoever reaches the run's folder saves what is complete."""
         state, notes = self._done
         try:
@@ -130,18 +134,15 @@ class Session:
             text += f"; the checkpoint after update {checkpoint.newest(self._run.checkpoints)} is kept"
         except (OSError, CheckpointError) as error:
             text += f"; no checkpoint: {error}"
-        self._ranks.leave(f"{text}. The same command continues, with as many processes as you like")
-
-    def _ended(self) -> str | None:
-        return run_dir.training_ended(self._config, self.update, self.seconds, self.return_rate)
+        self._ranks.exit(f"{text}. The same command continues, with as many processes as you like")
 
     def _advance(
         self,
         compiled: Compiled,
         log: MetricsLog | None,
         progress: TrainingProgress,
-        stop_wanted: Callable[[], bool],
-        watch: Watch,
+        stop: threading.Event,
+        watchdog: Watchdog,
     ) -> None:
         """Updates until it is time to look at them; then measurements, evaluation and checkpoint as they are due."""
         training, every = self._config.training, self._config.training.evaluate_every
@@ -151,7 +152,7 @@ class Session:
             waiting.append(measured)
             self.update += 1
             evaluation_due = every is not None and self.update % every == 0
-            stopped = self._ranks.alone and stop_wanted()  # several would stop at different updates
+            stopped = self._ranks.is_alone and stop.is_set()  # several would stop at different updates
             if evaluation_due or self.update == training.updates or len(waiting) >= self._batch or stopped:
                 break
         fetched = jax.device_get(waiting)
@@ -159,7 +160,7 @@ class Session:
         share = took / len(fetched)
         rows = [
             {"update": first + i, "seconds": round(self.seconds + (i + 1) * share, 4)}
-            | {name: _short(value) for name, value in row.items()}
+            | {name: _round(value) for name, value in row.items()}
             for i, row in enumerate(fetched)
         ]
         self.seconds += took
@@ -167,14 +168,14 @@ class Session:
         if self._trainer.simulator.devices > 1:
             self._batch = min(self._batch, QUEUED)
         self._done = (self.state, self._notes())
-        watch.alive()
+        watchdog.beat()
         if evaluation_due and self._evaluator is not None:
-            watch.pause()
+            watchdog.pause()
             rows[-1] |= self._evaluate(self._evaluator)
         if log is None:
             return
         log.write(rows)
-        progress.show(self.update, len(rows), took, rows[-1]["return_rate"])
+        progress.updated(self.update, len(rows), took, rows[-1]["return_rate"])
         if time.monotonic() - self._saved[1] >= training.checkpoint_seconds:
             self._save(log)
 
@@ -237,9 +238,9 @@ def _start(config: Config, run: Run, trainer: Trainer, ranks: Ranks) -> tuple[Tr
     key = build.key(config.training.seed, build.INITIAL_STATE)
     state = checked(f"initial_policy: {config.initial_policy}", trainer.init, key, theta, statistics)
     notes: dict[str, Any] = {"update": 0, "seconds": 0.0, "return_rate": None}
-    if ranks.first:
+    if ranks.is_first:
         state, notes = checkpoint.load_latest(run.checkpoints, state) or (state, notes)
-    state, notes = _of_first(ranks, state, notes)
+    state, notes = _broadcast(ranks, state, notes)
     # Where the update leaves its results: compiled for this placement, it can be fed what it returns.
     return trainer.simulator.replicate(state), notes
 
@@ -247,7 +248,7 @@ def _start(config: Config, run: Run, trainer: Trainer, ranks: Ranks) -> tuple[Tr
 def _check_network(config: Config, trainer: Trainer, where: str) -> None:
     """Raises ConfigError where the policy to start from is another network's: its numbers would mean something else.
 
-    The file may have changed since: terms come and go, and of a network the name and the shapes are what it is told by.
+    Name and shapes decide: the file may have changed since.
     """
     networks = load_policy.load(str(config.initial_policy)).policy.network, trainer.network
     given, wanted = (None if n is None else (n.name, n.shapes) for n in networks)
@@ -259,15 +260,15 @@ def _check_network(config: Config, trainer: Trainer, where: str) -> None:
         )
 
 
-def _of_first(ranks: Ranks, state: TrainState, notes: dict[str, Any]) -> tuple[TrainState, dict[str, Any]]:
+def _broadcast(ranks: Ranks, state: TrainState, notes: dict[str, Any]) -> tuple[TrainState, dict[str, Any]]:
     """The first process' state and notes, which alone reads the run's folder."""
-    if ranks.alone:
+    if ranks.is_alone:
         return state, notes
     leaves, tree = jax.tree.flatten(held_here(state))
     keys = [jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for leaf in leaves]
     arrays = [np.asarray(jax.random.key_data(x) if is_key else x) for x, is_key in zip(leaves, keys, strict=True)]
     rate = np.nan if notes["return_rate"] is None else notes["return_rate"]
-    *arrays, numbers = ranks.of_first([*arrays, np.array([notes["update"], notes["seconds"], rate])])
+    *arrays, numbers = ranks.broadcast([*arrays, np.array([notes["update"], notes["seconds"], rate])])
     whole = [
         jax.random.wrap_key_data(jnp.asarray(x), impl=jax.random.key_impl(leaf)) if is_key else jnp.asarray(x)
         for x, leaf, is_key in zip(arrays, leaves, keys, strict=True)
@@ -277,29 +278,7 @@ def _of_first(ranks: Ranks, state: TrainState, notes: dict[str, Any]) -> tuple[T
     return jax.tree.unflatten(tree, whole), found
 
 
-def _short(value: ArrayLike) -> float | None:
+def _round(value: ArrayLike) -> float | None:
     """Six digits, None where not finite: JSON has no NaN."""
     number = float(np.asarray(value))
     return float(f"{number:.6g}") if np.isfinite(number) else None
-
-
-@contextmanager
-def _stop_requests() -> Iterator[Callable[[], bool]]:
-    """Yields a function that is true once Ctrl-C or SIGTERM has come; a second one acts at once."""
-    received = []
-
-    def note(number: int, _frame: FrameType | None) -> None:
-        stages.acted_on()
-        received.append(number)
-        if number == signal.SIGINT:
-            stages.say(
-                "Ctrl-C: saves a checkpoint and stops after this update or compilation; Ctrl-C again ends at once"
-            )
-        signal.signal(number, previous[signal.Signals(number)])
-
-    previous = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(received)
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

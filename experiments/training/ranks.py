@@ -23,7 +23,7 @@ from jax.experimental import multihost_utils
 from experiments.errors import ConfigError, explained
 
 AUTO = "auto"
-SILENCE = 20.0  # [s] without an update, or PATIENT times the longest wait so far, until a process counts as stuck
+SILENCE = 20.0  # [s] without an update, or PATIENT times the longest wait so far: a process is stuck
 PATIENT = 5.0
 HEARTBEAT = 60  # [s] after which JAX itself ends all processes of a lost one: where nobody counts updates
 ENDING = 20  # [s] to wait for the others at the end
@@ -31,110 +31,111 @@ ENDING = 20  # [s] to wait for the others at the end
 
 @dataclass(frozen=True)
 class Ranks:
-    """Processes that compute together; ``own`` counts from 0, the first one."""
+    """Processes that compute together; ``index`` counts from 0, the first one."""
 
     count: int = 1
-    own: int = 0
+    index: int = 0
 
     @property
-    def first(self) -> bool:
-        return self.own == 0
+    def is_first(self) -> bool:
+        return self.index == 0
 
     @property
-    def alone(self) -> bool:
+    def is_alone(self) -> bool:
         return self.count == 1
 
-    def agree(self, *values: float) -> np.ndarray:
+    def gather(self, *values: float) -> np.ndarray:
         """(count, n) the values of every process, to the last bit; each one waits here for all."""
         mine = np.array(values, np.float64)[None]
-        return mine if self.alone else _gathered(mine.view(np.uint8)).view(np.float64)
+        return mine if self.is_alone else _gather_bytes(mine.view(np.uint8)).view(np.float64)
 
-    def of_first(self, arrays: list[np.ndarray]) -> list[np.ndarray]:
+    def broadcast(self, arrays: list[np.ndarray]) -> list[np.ndarray]:
         """The first process' arrays in place of each one's own, which have the same shapes and types."""
-        if self.alone:
+        if self.is_alone:
             return arrays
         mine = np.frombuffer(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), np.uint8)
-        theirs, out, place = _gathered(mine[None])[0].tobytes(), [], 0
+        theirs, out, start = _gather_bytes(mine[None])[0].tobytes(), [], 0
         for a in arrays:
-            out.append(np.frombuffer(theirs, a.dtype, a.size, place).reshape(a.shape))
-            place += a.nbytes
+            out.append(np.frombuffer(theirs, a.dtype, a.size, start).reshape(a.shape))
+            start += a.nbytes
         return out
 
-    def part(self) -> None:
-        """The end of the common work, for which each one waits; afterwards every process has its own devices only."""
-        if not self.alone:
+    def disconnect(self) -> None:
+        """Ends the common work, for which each one waits; afterwards every process has its own devices only."""
+        if not self.is_alone:
             jax.distributed.shutdown()
 
     @contextmanager
-    def together(self) -> Iterator[None]:
+    def failing_fast(self) -> Iterator[None]:
         """Inside, an error of one process ends it at once, so that the others notice instead of waiting for it."""
         try:
             yield
         except Exception as error:
-            if self.alone:
+            if self.is_alone:
                 raise
             if not explained(error):
                 traceback.print_exc()
-            self.leave(str(error) or type(error).__name__)
+            self.exit(str(error) or type(error).__name__)
 
-    def leave(self, text: str) -> NoReturn:
+    def exit(self, text: str) -> NoReturn:
         """Ends this process, from any thread, without the wait for the others that a usual end begins with."""
-        print(f"error: process {self.own} of {self.count}: {text}", file=sys.stderr, flush=True)
+        print(f"error: process {self.index} of {self.count}: {text}", file=sys.stderr, flush=True)
         sys.stdout.flush()
         os._exit(1)
 
     @contextmanager
-    def watched(self, silent: Callable[[float], NoReturn]) -> Iterator[Watch]:
-        """A watch over the others; ``silent`` is called with the seconds waited, from another thread."""
-        watch = Watch(silent)
-        if not self.alone:
-            watch.start()
+    def watch(self, on_silence: Callable[[float], NoReturn]) -> Iterator[Watchdog]:
+        """A watchdog over the others, which calls ``on_silence`` from another thread with the seconds waited."""
+        watchdog = Watchdog(on_silence)
+        if not self.is_alone:
+            watchdog.start()
         try:
-            yield watch
+            yield watchdog
         finally:
-            watch.end()
+            watchdog.stop()
 
 
-class Watch(threading.Thread):
-    """Calls out when nothing was heard for too long: a process that hangs leaves the others waiting inside a call.
+class Watchdog(threading.Thread):
+    """Calls out when no heartbeat came for too long: a process that hangs leaves the others waiting inside a call.
 
-    It begins with the second sign of life, since the first updates wait for compilations.
+    It begins with the second heartbeat, since the first updates wait for compilations.
     """
 
-    def __init__(self, silent: Callable[[float], NoReturn]) -> None:
+    def __init__(self, on_silence: Callable[[float], NoReturn]) -> None:
         super().__init__(daemon=True)
-        self._silent, self._over = silent, threading.Event()
+        self._on_silence, self._over = on_silence, threading.Event()
         self._heard, self._longest = float("inf"), 0.0
 
-    def alive(self) -> None:
-        """A sign of life."""
+    def beat(self) -> None:
         now = time.monotonic()
         self._longest = max(self._longest, now - self._heard)
         self._heard = now
 
     def pause(self) -> None:
-        """No sign is due until the next one."""
+        """No heartbeat is due until the next one."""
         self._heard = float("inf")
 
-    def end(self) -> None:
+    def stop(self) -> None:
         self._over.set()
 
     def run(self) -> None:
         while not self._over.wait(0.5):
             waited = time.monotonic() - self._heard
             if waited > max(SILENCE, PATIENT * self._longest):
-                self._silent(waited)
+                self._on_silence(waited)
 
 
-ALONE = Ranks()
+SINGLE = Ranks()
 
 
-def join(where: str, processes: int | None, process: int | None) -> Ranks:
+def join(where: str | None, processes: int | None, process: int | None) -> Ranks:
     """Joins the processes; JAX must be configured and not yet running.
 
     where: "auto" under SLURM, Open MPI or Kubernetes, which say who takes part; otherwise HOST:PORT of the first
-    process, which listens there and nowhere else. Raises ConfigError.
+    process, which listens there and nowhere else; None: there are no others. Raises ConfigError.
     """
+    if where is None:
+        return SINGLE
     given = f"--distributed {where}"
     if where != AUTO and (processes is None or process is None):
         raise ConfigError(f"{given}: needs --processes N and --process I, I from 0 to N - 1")
@@ -160,7 +161,7 @@ def join(where: str, processes: int | None, process: int | None) -> Ranks:
         raise ConfigError(f"{given}: {error}{hint}") from None
     ranks = Ranks(jax.process_count(), jax.process_index())
     with _quiet_output():  # gloo greets each connection there
-        ranks.agree(0.0)
+        ranks.gather(0.0)
     return ranks
 
 
@@ -178,6 +179,6 @@ def _quiet_output() -> Iterator[None]:
         os.close(kept)
 
 
-def _gathered(mine: np.ndarray) -> np.ndarray:
+def _gather_bytes(mine: np.ndarray) -> np.ndarray:
     """(count, bytes) of every process."""
     return np.ascontiguousarray(multihost_utils.process_allgather(mine, tiled=True))

@@ -13,24 +13,25 @@ import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from experiments.config import build
-from experiments.config.build import Experiment
 from experiments.config.experiment import Config
 from experiments.errors import ConfigError, RunError, explained
 from experiments.evaluation import evaluate
 from experiments.jobs import engine
 from experiments.jobs.engine import Setup
 from experiments.jobs.site import ALONE, Workers
+from experiments.progress import make_console
 from experiments.runs import load_policy, run_dir
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
 from experiments.training import loop
 from experiments.training.finalize import finish
 from experiments.training.loop import train
-from experiments.training.ranks import Ranks
+from experiments.training.ranks import SINGLE, Ranks
 
-WIDTH = 120  # [characters] of lines in a file
+WIDTH = 120  # [characters] of tables in a file
 SELECTION_EPISODES = 50  # Abeyruwan et al. 2022, appendix "Seed Selection for Rounds of Simulated Training"
 
 
@@ -92,10 +93,10 @@ def run_all(jobs: list[Job], console: Console, out: Path, workers: Workers = ALO
     outcomes: list[tuple[Job, str, str]] = []
     for job in jobs:
         try:
-            result, failed = _run(job, console), False
+            result, failed = run_job(job, console), False
         except Exception as error:  # even a bug in one job must not cost the night's other trainings
             if explained(error):
-                console.print(f"error: {error}", style="red", highlight=False, soft_wrap=True, markup=False)
+                console.print(f"error: {error}", style="red", soft_wrap=True)
             else:
                 console.print_exception()
             result, failed = f"{type(error).__name__}: {error}".splitlines()[0], True
@@ -112,12 +113,12 @@ def _run_side_by_side(jobs: list[Job], console: Console, out: Path, workers: Wor
     def note(name: str, state: str, result: str) -> None:
         outcomes[name] = (by_name[name], state, result)
         line = f"[{len(outcomes)}/{len(jobs)}] {name}: {'' if state == 'done' else 'failed: '}{result}"
-        console.print(line, style="red" if state == "failed" else None, highlight=False, soft_wrap=True, markup=False)
+        console.print(line, style="red" if state == "failed" else None, soft_wrap=True)
 
     left = []
     for name, job in by_name.items():
         if job.run.done(job.config):
-            note(name, "done", _run(job, console))
+            note(name, "done", run_job(job, console))
         else:
             # Runs of one program: the first compiles it for all.
             program = hashlib.sha256(loop.program(job.config, job.config.training.devices).encode()).hexdigest()
@@ -125,7 +126,6 @@ def _run_side_by_side(jobs: list[Job], console: Console, out: Path, workers: Wor
     if left:
         console.print(
             f"{len(left)} runs, {workers.text}; each writes its lines to {jobs[0].run.output.name} in its folder",
-            highlight=False,
             soft_wrap=True,
         )
         asked = max((c.devices for c in (job.config.training for job in jobs) if c.devices != "auto"), default=1)
@@ -148,9 +148,9 @@ def prepare() -> Callable[[Job], str]:
 def _run_into_file(job: Job) -> str:
     job.run.folder.mkdir(parents=True, exist_ok=True)
     with open(job.run.output, "a", encoding="utf-8") as file:
-        console = Console(file=file, width=WIDTH)
+        console = make_console(file, WIDTH)
         try:
-            return _run(job, console)
+            return run_job(job, console)
         except Exception as error:
             if explained(error):
                 raise
@@ -158,31 +158,34 @@ def _run_into_file(job: Job) -> str:
             raise RunError(f"{type(error).__name__}: {error}; see {job.run.output}") from None
 
 
-def run_together(job: Job, console: Console, ranks: Ranks) -> None:
-    """One run by several processes; the first one evaluates, draws and exports alone when training has ended.
+def run_job(job: Job, console: Console, ranks: Ranks = SINGLE) -> str:
+    """Trains, evaluates and exports one run, as far as that is not done yet; returns its return rate as text.
 
-    Raises ConfigError where the processes do not read the same, and what a run alone raises.
+    ranks: processes that train it together; the first one checks, evaluates, draws and exports alone. Raises
+    ConfigError where the processes do not read the same.
     """
     experiment = build.experiment(job.config, job.where)
     run, config = job.run, experiment.config
     read = hashlib.sha256(json.dumps(config.to_dict(), sort_keys=True).encode()).digest()
-    every = ranks.agree(int.from_bytes(read[:6], "big"))[:, 0]
+    every = ranks.gather(int.from_bytes(read[:6], "big"))[:, 0]
     if (every != every[0]).any():
         other = int(np.argmax(every != every[0]))
         raise ConfigError(f"{job.where}: process {other} reads something else than process 0; all need the same files")
-    if ranks.first:
+    if ranks.is_first:
         run.check(config)
-    trained = bool(ranks.agree(ranks.first and run.trained(config))[0, 0])
-    if not trained:
+    if not ranks.gather(ranks.is_first and run.trained(config))[0, 0]:
         reason = train(experiment, run, console, ranks)
-        console.print(f"{run.folder}: trained by {ranks.count} processes, ended by {reason}", highlight=False)
-    ranks.part()
-    if not ranks.first:
-        return
+        by = "" if ranks.is_alone else f" by {ranks.count} processes"
+        console.print(f"{run.folder}: trained{by}, ended by {reason}")
+    ranks.disconnect()
+    if not ranks.is_first:
+        return ""
     if run.done(config):
-        console.print(f"{run.folder}: done before, skipped", highlight=False)
+        console.print(f"{run.folder}: done before, skipped")
+        report = run.read_evaluation()
     else:
-        finish(experiment, run, console)
+        report = finish(experiment, run, console)
+    return f"{report['return_rate']:.1%} ({report['low']:.1%} to {report['high']:.1%})"
 
 
 def select(folder: Path, jobs: list[Job], console: Console) -> None:
@@ -204,28 +207,11 @@ def select(folder: Path, jobs: list[Job], console: Console) -> None:
         "best": best,
     }
     run_dir.write_json(folder / SELECTION, selection)
-    console.print(
-        f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)", highlight=False
-    )
-
-
-def _run(job: Job, console: Console) -> str:
-    experiment: Experiment = build.experiment(job.config, job.where)
-    run, config = job.run, experiment.config
-    run.check(config)
-    if run.done(config):
-        report = run.read_evaluation()
-        console.print(f"{run.folder}: done before, skipped", highlight=False)
-    else:
-        if not run.trained(config):
-            reason = train(experiment, run, console)
-            console.print(f"{run.folder}: trained, ended by {reason}", highlight=False)
-        report = finish(experiment, run, console)
-    return f"{report['return_rate']:.1%} ({report['low']:.1%} to {report['high']:.1%})"
+    console.print(f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)")
 
 
 def _print_outcomes(outcomes: list[tuple[Job, str, str]], console: Console) -> None:
     table = Table("run", "", "return rate or error", title="Summary", title_justify="left")
     for job, state, result in outcomes:
-        table.add_row(str(job.run.folder), f"[{'green' if state == 'done' else 'red'}]{state}[/]", result)
+        table.add_row(str(job.run.folder), Text(state, "green" if state == "done" else "red"), result)
     console.print(table)

@@ -7,7 +7,7 @@ statistics are one compiled call from a ``TrainState`` to the next.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from mjx_tt.sim.model import SimModel
 from mjx_tt.sim.randomisation import Randomised
 from robot_io.contract import n_parameters
 
+T = TypeVar("T")
 Inputs: TypeAlias = tuple[BallPool, Arguments]  # what trainings of one program differ in: balls, numbers
 
 
@@ -45,11 +46,11 @@ class TrainState:
 class Trainer:
     """Updates of one training run.
 
-    repeats                episodes per perturbation
+    episodes_per_direction episodes of each perturbed policy
     common_random_numbers  both members of a pair meet the same balls, latencies and noise
     initial_scale          standard deviation of the random first weights
-    later_weights          after how many updates the rewards get other weights, and these; None: never
-    network                one of the user's own; None: the paper's
+    reward_schedule        after how many updates the rewards get other weights, and these; None: never
+    network                user-defined; None: the paper's
     """
 
     def __init__(
@@ -59,25 +60,29 @@ class Trainer:
         pool: BallPool,
         model: SimModel,
         randomise: tuple[Randomised, ...] = (),
-        repeats: int = 15,
+        episodes_per_direction: int = 15,
         common_random_numbers: bool = False,
         initial_scale: float = 0.1,
-        later_weights: tuple[int, tuple[float, ...]] | None = None,
+        reward_schedule: tuple[int, tuple[float, ...]] | None = None,
         network: Network | None = None,
     ) -> None:
-        if repeats < 1:
-            raise ValueError(f"repeats is {repeats}, at least 1 is needed")
+        if episodes_per_direction < 1:
+            raise ValueError(f"repeats: expected at least 1, got {episodes_per_direction}")
         self.simulator, self.bgs_config, self.pool = simulator, bgs_config, simulator.replicate(pool)
         self._model = model
         self.inputs: Inputs = self.pool, simulator.replicate(arguments(model, randomise))
-        self._repeats, self._crn, self._initial_scale = repeats, common_random_numbers, initial_scale
-        self._later = later_weights
+        self._episodes_per_direction, self._crn, self._initial_scale = (
+            episodes_per_direction,
+            common_random_numbers,
+            initial_scale,
+        )
+        self._reward_schedule = reward_schedule
         self.network = network
         self._update = jax.jit(simulator.on_devices(self._update_local, out_specs=PartitionSpec()))
 
     @property
     def episodes_per_update(self) -> int:
-        return 2 * self.bgs_config.num_directions * self._repeats
+        return 2 * self.bgs_config.num_directions * self._episodes_per_direction
 
     def init(
         self,
@@ -108,10 +113,7 @@ class Trainer:
 
     def _update_local(self, state: TrainState, inputs: Inputs) -> tuple[TrainState, dict[str, jax.Array]]:
         config, pairs = self.bgs_config, self.bgs_config.num_directions
-        direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
-        population = strategy.ask(direction_key, state.bgs, config)
-        columns = pairs if self._crn else 2 * pairs
-        episodes = self._draw(episode_key, inputs, self._repeats, columns)
+        population, episodes = self._draw(state, inputs, pairs if self._crn else 2 * pairs)
         if self._crn:
             episodes = jax.tree.map(lambda x: jnp.concatenate([x, x], -1) if x.ndim >= 2 else x, episodes)
         mean, inv_std = normalizer.normaliser(state.statistics)
@@ -119,7 +121,7 @@ class Trainer:
         result = simulator.rollout(
             Policy(simulator.local(population.members), mean, inv_std, self.network), simulator.local(episodes)
         )
-        result = self._weighed(result, state.bgs.updates)
+        result = self._apply_schedule(result, state.bgs.updates)
         # Everything that the devices have to share, in one sum: each fills in its own members.
         member = result.returns.mean(axis=0)  # NaN when one of its episodes was not finite
         failed = ~jnp.isfinite(member)
@@ -131,8 +133,7 @@ class Trainer:
         )
         sums, counts = result.observation_sums.sum(axis=-1), result.observation_counts.sum()
         shared = (members, sums, counts.astype(jnp.float32), totals(result))
-        flat, unravel = ravel_pytree(shared)
-        members, sums, counts, total = unravel(jax.lax.psum(flat, AXIS))
+        members, sums, counts, total = sum_over_devices(shared)
         member = jnp.where(members[1] > 0, jnp.nan, members[0])
         bgs, info = strategy.tell(state.bgs, population, member, config)
         seen = normalizer.from_sums(counts.astype(jnp.int32), mean, sums[0], sums[1])
@@ -142,19 +143,29 @@ class Trainer:
         }
         return TrainState(bgs, normalizer.merge(state.statistics, seen), state.key), metrics
 
-    def _draw(self, key: jax.Array, inputs: Inputs, repeats: int, columns: int) -> Episodes:
+    def _draw(self, state: TrainState, inputs: Inputs, columns: int) -> tuple[strategy.Population, Episodes]:
+        """Perturbed policies of the update of this state, and episodes (repeats, columns)."""
+        direction_key, episode_key = jax.random.split(jax.random.fold_in(state.key, state.bgs.updates))
+        population = strategy.ask(direction_key, state.bgs, self.bgs_config)
         pool, numbers = inputs
         model = models.with_values(self._model, numbers.numbers)
-        return self.simulator.draw(key, pool, model, numbers.drawing, repeats, columns)
+        repeats = self._episodes_per_direction
+        return population, self.simulator.draw(episode_key, pool, model, numbers.drawing, repeats, columns)
 
-    def _weighed(self, result: RolloutResult, updates: jax.Array) -> RolloutResult:
+    def _apply_schedule(self, result: RolloutResult, updates: jax.Array) -> RolloutResult:
         """The result with the returns that the weights of this update give."""
-        if self._later is None:
+        if self._reward_schedule is None:
             return result
-        after, weights = self._later
+        after, weights = self._reward_schedule
         returns = jnp.tensordot(jnp.array(weights, jnp.float32), jnp.where(result.finite, result.terms, 0.0), 1)
         later = jnp.where(result.finite, returns, jnp.nan)
         return replace(result, returns=jnp.where(updates >= after, later, result.returns))
+
+
+def sum_over_devices(tree: T) -> T:
+    """Sums of a tree's leaves in one collective: several at a time starve the threads of host devices."""
+    flat, unravel = ravel_pytree(tree)
+    return unravel(jax.lax.psum(flat, AXIS))
 
 
 def totals(result: RolloutResult) -> dict:

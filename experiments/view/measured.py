@@ -1,4 +1,4 @@
-"""Films of what was measured: sessions at the robot, and the balls of a diagnosis beside the models' flights."""
+"""Replays of what was measured: sessions at the robot, and the balls of a diagnosis beside the models' flights."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from ballmodel.trajectory import Trajectory
+from experiments.commands import options
 from experiments.deploy import robot_attachment, session_logs
 from experiments.errors import ConfigError
-from experiments.view.film import RATE, Film, Series, next_landing
-from experiments.view.programme import Fixed
+from experiments.view.playlist import FixedPlaylist
+from experiments.view.replay import RATE, Replay, Series
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.prediction.state_fit import SpinPrior, fit_states, fly_on, lift_known
@@ -30,10 +31,19 @@ TOLD = ("state", "operator")  # events besides warnings and faults
 VERDICT, EXTENDED = "verdict.json", "extended.yaml"
 
 
+def load(path: Path, model: str | None) -> FixedPlaylist:
+    """A session at the robot (an .mcap) or a diagnosis (a folder). Raises ConfigError."""
+    if path.is_dir():
+        if model is not None:
+            raise ConfigError(f"--model {model}: a diagnosis has its own two models")
+        return load_diagnosis(path)
+    return load_session(path, options.load_model(model))
+
+
 # -- sessions ----------------------------------------------------------------------------------------------------------
 
 
-def session(path: Path, model: SimModel) -> Fixed:
+def load_session(path: Path, model: SimModel) -> FixedPlaylist:
     """The episodes of a session, or all of it where there are none: measured joints and ball, what was commanded, what
     happened, and the ball as the model flies it on from the first moments of each flight.
 
@@ -43,17 +53,17 @@ def session(path: Path, model: SimModel) -> Fixed:
     if log.joints.time.size < 2:
         raise ConfigError(f"{path}: holds no joints")
     flights = session_logs.flights(log)
-    robot = played_by(log, path)
+    robot = find_robot(log, path)
     strokes = [t for t in clean(flights)[0] if t.time[-1] - t.time[0] > FITTED] if flights else []
     flown = list(zip(strokes, _flights(strokes, model), strict=True))
     whole = Episode(1, float(log.joints.time[0]), float(log.joints.time[-1]), "", {}, {})
     episodes = log.episodes or (whole,)
-    films = [_episode(log, episode, flights, flown, robot) for episode in episodes]
+    replays = [_episode(log, episode, flights, flown, robot) for episode in episodes]
     captions = [f"{path.name}, episode {e.number} of {len(episodes)}" for e in episodes]
-    return Fixed([[film] for film in films], captions, robot)
+    return FixedPlaylist([[replay] for replay in replays], captions, robot)
 
 
-def played_by(log: SessionLog, path: Path) -> Robot:
+def find_robot(log: SessionLog, path: Path) -> Robot:
     """The robot of a session, to be drawn: that in its log, or one that comes with the program. Raises ConfigError."""
     name, kept = log.robot.robot, log.attachments.get(robot_attachment.NAME)
     if kept is not None:
@@ -77,7 +87,7 @@ def _episode(
     flights: Sequence[Trajectory],
     flown: Sequence[tuple[Trajectory, np.ndarray]],
     robot: Robot,
-) -> Film:
+) -> Replay:
     start = episode.start - BEFORE
     stop = min(float(log.joints.time[-1]), (episode.start + 2.0 if episode.end is None else episode.end) + AFTER)
     clock = np.arange(start, max(stop, start + 2 / RATE), 1.0 / RATE)
@@ -99,14 +109,13 @@ def _episode(
     events = [(e.time - start, _told(e.name, e.text, e.level)) for e in during]
     weights = {name: (float(value), 1.0) for name, value in episode.reward.items()}
     marks = np.concatenate([f.position.T[(f.time >= start) & (f.time <= stop)] for f in flights] or [np.empty((0, 3))])
-    return Film(
+    return Replay(
         time=clock - start,
         qpos=np.stack([_joint(log, j, clock, home) for j, home in enumerate(robot.home)], axis=1),
         balls={"measured": ball, "simulated": simulated},
         title="measured (yellow), simulated (blue)",
         outcome=episode.outcome,
         decided=(episode.end or stop) - start,
-        landing=next_landing(simulated),
         marks=marks,
         series={heading: curves for heading, curves in series.items() if curves.time.size > 1},
         terms=weights,
@@ -149,7 +158,7 @@ def _told(name: str, text: str, level: Level) -> str:
 # -- diagnoses ---------------------------------------------------------------------------------------------------------
 
 
-def diagnosed(folder: Path) -> Fixed:
+def load_diagnosis(folder: Path) -> FixedPlaylist:
     """Measured flights of a diagnosis with those of its nominal and its extended model, the worst predicted first.
 
     Raises ConfigError where the logs that it was made from cannot be found or hold no balls.
@@ -166,21 +175,20 @@ def diagnosed(folder: Path) -> Fixed:
     order = np.argsort(-misses["nominal"])[:MOST]
     home = home_qpos(load_model())
     verdict = json.loads((folder / VERDICT).read_text(encoding="utf-8"))["verdict"]
-    films, captions = [], []
+    replays, captions = [], []
     for place, i in enumerate(order):
         t = strokes[i]
         clock = t.time[0] + np.arange(len(ways["nominal"][i])) / RATE
         measured = np.full((len(clock), 3), np.nan)
         _draw(measured, clock, t.time, t.position.T)
         text = ", ".join(f"{name} misses by {1e3 * misses[name][i]:.0f} mm" for name in ways)
-        films.append(
-            Film(
+        replays.append(
+            Replay(
                 time=clock - clock[0],
                 qpos=np.repeat(home[None], len(clock), axis=0),
                 balls={"measured": measured, **{name: flown[i] for name, flown in ways.items()}},
                 title="measured (yellow), nominal (red), extended (green)",
                 decided=float(t.time[-1] - t.time[0]),
-                landing=next_landing(ways["extended"][i]),
                 marks=t.position.T,
                 series={
                     f"{axis} [m]": Series(
@@ -193,7 +201,7 @@ def diagnosed(folder: Path) -> Fixed:
             )
         )
         captions.append(f"{verdict}: {t.label}, {place + 1} of {len(order)}; {text}")
-    return Fixed([[film] for film in films], captions)
+    return FixedPlaylist([[replay] for replay in replays], captions)
 
 
 def _nominal(folder: Path, extended: ModelFile) -> SimModel:

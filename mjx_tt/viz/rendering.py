@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-import imageio.v2 as imageio
+import imageio_ffmpeg
 import mujoco
 import numpy as np
 from PIL import Image
 
+from ballmodel.io.atomic_files import replacing
 from mjx_tt.robot.mjcf import load_model
 from mjx_tt.viz.caption import Caption
 from mjx_tt.viz.opengl import offscreen
@@ -56,6 +58,10 @@ class Moment:
     dots: np.ndarray = field(default_factory=lambda: NO_PATH)
     caption: Caption | None = None
 
+    def __post_init__(self) -> None:
+        for name, shape in {"qpos": (None,), "ball": (3,), "trail": (None, 3), "dots": (None, 3)}.items():
+            object.__setattr__(self, name, _checked_array(name, getattr(self, name), shape))
+
 
 def render_png(
     path: str | os.PathLike,
@@ -72,8 +78,8 @@ def render_png(
     """
     path = _checked_path(path, (".png",))
     (frame,) = render_frames([moment], camera, size, model)
-    with _replacing(path) as temporary:
-        Image.fromarray(frame).save(temporary)
+    with replacing(path) as temporary:
+        Image.fromarray(frame).save(temporary, format="PNG")
 
 
 def render_video(
@@ -96,8 +102,11 @@ def render_video(
     if path.suffix == ".gif" and fps * _GIF_MIN_DELAY > 1.0 + 1e-9:
         raise ValueError(f"viewers show a GIF at {1.0 / _GIF_MIN_DELAY:.0f} frames per second at most, got fps {fps}")
     frames = render_frames(moments, camera, size, model)
-    with _replacing(path) as temporary:
-        (_write_gif if path.suffix == ".gif" else _write_mp4)(temporary, frames, fps)
+    with replacing(path) as temporary:
+        if path.suffix == ".gif":
+            _write_gif(temporary, frames, fps)
+        else:
+            _write_mp4(temporary, frames, fps, size)
 
 
 def render_frames(
@@ -111,7 +120,10 @@ def render_frames(
     Raises ValueError for a wrong shape or camera, RuntimeError when no OpenGL back end works.
     """
     model = load_model() if model is None else model
-    checked = [_checked_moment(moment, model.nq) for moment in moments]
+    moments = list(moments)
+    for moment in moments:
+        if len(moment.qpos) != model.nq:
+            raise ValueError(f"qpos needs {model.nq} joint positions, got {len(moment.qpos)}")
     if camera not in (names := camera_names(model)):
         raise ValueError(f"the scene has no camera {camera!r}; it has {names}")
     width, height = size
@@ -119,14 +131,14 @@ def render_frames(
         raise ValueError(f"size must be positive, got {size}")
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
     data = mujoco.MjData(model)
-    drawn = max((2 * len(m.trail) + 2 * len(m.dots) for m in checked), default=0)
+    drawn = max((2 * len(m.trail) + 2 * len(m.dots) for m in moments), default=0)
     scene = mujoco.MjvScene(model, maxgeom=model.ngeom + drawn + 10)
     option, view, perturb = mujoco.MjvOption(), mujoco.MjvCamera(), mujoco.MjvPerturb()
     option.geomgroup[_BALL_GROUP] = False
     view.type, view.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(camera).id
     viewport, pixels = mujoco.MjrRect(0, 0, width, height), np.empty((height, width, 3), np.uint8)
     with offscreen(model, size) as context:
-        for moment in checked:
+        for moment in moments:
             data.qpos[:] = moment.qpos
             mujoco.mj_forward(model, data)
             mujoco.mjv_updateScene(model, data, option, perturb, view, mujoco.mjtCatBit.mjCAT_ALL, scene)
@@ -143,10 +155,12 @@ def camera_names(model: mujoco.MjModel | None = None) -> list[str]:
     return [model.camera(i).name for i in range(model.ncam)]
 
 
-def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    with imageio.get_writer(path, fps=fps, codec="libx264", quality=8, macro_block_size=2) as writer:
+def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float, size: tuple[int, int]) -> None:
+    options: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "output_params": ["-f", "mp4"]}
+    with closing(imageio_ffmpeg.write_frames(path, size, fps=fps, **options)) as writer:
+        writer.send(None)  # starts the encoder
         for frame in frames:
-            writer.append_data(frame)  # type: ignore[attr-defined]  # annotated as the base of readers and writers
+            writer.send(np.ascontiguousarray(frame))
 
 
 def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
@@ -161,7 +175,7 @@ def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     # Rounding the time of each frame, not its duration, keeps the video in real time.
     times = np.round(np.arange(len(images) + 1) / fps / _GIF_TICK)
     durations = [int(d) for d in np.diff(times) * _GIF_TICK * 1000]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
+    images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=durations, loop=0)
 
 
 def _add_ball(scene: mujoco.MjvScene, eye: np.ndarray, moment: Moment) -> None:
@@ -235,15 +249,6 @@ def _add(
     return geom
 
 
-def _checked_moment(moment: Moment, joints: int) -> Moment:
-    qpos = _checked_array("qpos", moment.qpos, (None,))
-    if len(qpos) != joints:
-        raise ValueError(f"qpos needs {joints} joint positions, got {len(qpos)}")
-    ball = _checked_array("ball", moment.ball, (3,))
-    trail, dots = (_checked_array(name, getattr(moment, name), (None, 3)) for name in ("trail", "dots"))
-    return Moment(qpos, ball, trail, dots, moment.caption)
-
-
 def _checked_path(path: str | os.PathLike, suffixes: tuple[str, ...]) -> Path:
     path = Path(path)
     if path.suffix not in suffixes:
@@ -260,14 +265,3 @@ def _checked_array(name: str, values: np.ndarray, shape: tuple[int | None, ...])
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise ValueError(f"{name} needs the shape ({wanted}), got {values.shape}")
     return values
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A temporary file beside path, which replaces path when the block ends without an error."""
-    temporary = path.with_name(f".{path.stem}-{os.getpid()}{path.suffix}")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

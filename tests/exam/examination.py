@@ -31,7 +31,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from experiments.commands.options import site_of
+from experiments.commands.options import load_site
 from experiments.errors import ConfigError
 from experiments.jobs import engine
 from experiments.jobs.engine import Job, Setup
@@ -350,7 +350,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not 1 <= part <= parts:
         parser.error(f"--part {options.part}: K of K/N runs from 1 to N")
     try:
-        elsewhere = site_of(options.site, processes=options.processes)
+        elsewhere = load_site(options.site, processes=options.processes)
     except ConfigError as error:
         parser.error(str(error))
     workers = Workers(options.processes or 1, elsewhere, str(options.site))

@@ -23,16 +23,9 @@ from experiments.runs import checkpoint, load_policy, locate
 from experiments.training import finalize
 from robot_io.policy import artefact
 from tests.support.paths import ROOT
+from tests.support.tiny_experiment import write_tiny
 
 COMMANDS = [command.name[0] for command in cli.COMMANDS]
-EXPERIMENT = """
-name: tiny
-balls: player5/M0
-task: {max_steps: 60, sim_rate: 75.0}
-optimiser: {num_directions: 2, repeats: 2}
-training: {updates: 3, pool: 64, evaluate_every: 2, evaluate_episodes: 8, devices: 1}
-evaluation: {episodes: 8, reachable_balls: null}
-"""
 
 
 def mjx_tt(*arguments) -> subprocess.CompletedProcess:
@@ -62,8 +55,7 @@ def short_videos():
 def trained(tmp_path_factory):
     """(experiment YAML, folder of runs, output) of one whole ``mjx-tt train``."""
     folder = tmp_path_factory.mktemp("cli")
-    yaml = folder / "tiny.yaml"
-    yaml.write_text(EXPERIMENT)
+    yaml = write_tiny(folder, evaluate_every=2)
     done = mjx_tt("train", yaml, "--out", folder / "runs", "--devices", 1)
     assert done.returncode == 0, done.stdout + done.stderr
     return yaml, folder / "runs", done.stdout

@@ -33,8 +33,8 @@ def terminals(tmp_path):
         arguments = ("run", str(artefact), "--robot", str(robot), "--backend", "numpy", "--log", str(tmp_path / "log"))
         with Terminal(*arguments) as operator:
             operator.wait(DISARMED)
-            done(rig, "o", "switch_on")
-            done(rig, "b", "throw")
+            done(rig, "o", "switch the arm on")
+            done(rig, "b", "throw balls, or stop")
             operator.press("p")
             operator.wait(r"DISARMED\s+balls")  # nothing that it waits for between them
             operator.press("a")
@@ -57,7 +57,11 @@ def after_the_fault(operator, folder):
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     ("breaks", "mends"),
-    [(("c", "cable"), ("c", "cable")), (("e", "motors_off"), ("o", "switch_on")), (("f", "fault"), None)],
+    [
+        (("c", "axis.s cable"), ("c", "axis.s cable")),
+        (("e", "emergency stop"), ("o", "switch the arm on")),
+        (("f", "drive fault"), None),
+    ],
     ids=["cable", "emergency stop", "drive"],
 )
 def test_what_a_hand_mends_at_the_robot_is_followed_by_no_motion(terminals, breaks, mends):
@@ -84,7 +88,7 @@ def test_what_a_hand_mends_at_the_robot_is_followed_by_no_motion(terminals, brea
 def test_a_fault_that_is_over_is_left_by_one_key(terminals):
     """The tracker was silent for a second and is heard again: nobody has to mend anything."""
     operator, rig, folder = terminals
-    done(rig, "t", "drop_out")
+    done(rig, "t", "tracker silent for 1 s")
     operator.wait(FAULT)
     operator.read(1.5)
     operator.press("c")

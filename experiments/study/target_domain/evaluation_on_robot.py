@@ -11,8 +11,8 @@ from typing import Any
 
 from rich.console import Console
 
-from experiments.deploy import session
-from experiments.deploy.rig import RIG
+from experiments.commands.options import RIG, RobotOptions
+from experiments.deploy import play
 from experiments.errors import ConfigError, RunError
 from experiments.finetuning import loop
 from experiments.runs import load_policy, run_dir
@@ -124,12 +124,11 @@ def rally_step(
             found = replace(found, begun=found.begun + 1)
             found.save(folder)
             try:
-                status = session.run(
-                    artefact, RIG, None, None, "numpy", folder, None, chance, None, console, left, evaluator
-                )
+                setup = RobotOptions(backend="numpy", seed=chance, player=evaluator)
+                status = play.run(artefact, RIG, folder, console, setup, rallies=left)
             finally:
                 found = _played(folder, digest)
-            if status == session.INTERRUPTED:
+            if status == play.INTERRUPTED:
                 raise KeyboardInterrupt(f"{name}: stopped")
             left = rallies - found.counted
             if left <= 0 or status == 0:  # all are played, or somebody ended it by a key

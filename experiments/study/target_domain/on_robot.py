@@ -18,13 +18,13 @@ from rich.console import Console
 from ballmodel.io import read
 from ballmodel.trajectory import Dataset, Trajectory
 from experiments import measurements
+from experiments.commands.options import LOCK_STEP, RIG, RobotOptions
 from experiments.config import robot as robots
 from experiments.config.study import Study
-from experiments.deploy import session, session_logs
-from experiments.deploy.rig import RIG
+from experiments.deploy import play, session_logs
 from experiments.errors import ConfigError, RunError, checked
 from experiments.finetuning import loop
-from experiments.finetuning import session as tuning
+from experiments.finetuning import on_robot as tuning
 from experiments.finetuning.robot import LockStepRobot
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
@@ -39,7 +39,7 @@ BALLS, AROUND = 120, 1.0  # of a fine-tuning of which everything is kept; [s] of
 
 def look_up(study: Study, robot: str) -> None:
     """Raises ConfigError where the robot's YAML or a recording is missing or cannot be read."""
-    if robot not in (RIG, tuning.LOCK_STEP):
+    if robot not in (RIG, LOCK_STEP):
         try:
             robots.load_robot(robot)
         except ConfigError as error:
@@ -88,18 +88,9 @@ class RobotWorld:
             highlight=False,
             soft_wrap=True,
         )
-        found = tuning.finetune(
-            str(source),
-            settings,
-            Run(folder),
-            self._robot,
-            None,
-            None,
-            "numpy",
-            seed_of(name),
-            self._console,
-            player if self._robot == RIG else None,
-        )
+        opponent = player if self._robot == RIG else None
+        setup = RobotOptions(backend="numpy", seed=seed_of(name), player=opponent)
+        found = tuning.finetune(str(source), settings, Run(folder), self._robot, self._console, setup)
         if found is None:
             raise Waiting(f"{name}: fine-tuning with {player} is not finished; the same command goes on with it")
         measured = measurements.read_trajectories([folder / loop.HUMAN_BALLS])
@@ -129,13 +120,14 @@ class RobotWorld:
     def _score(self, player: str, name: str, trained: TrainedPolicy) -> float:
         balls, robot = self._study.simulation.selection_episodes, self._robot
         experiment = loop.experiment_of(trained.source)
-        if robot == tuning.LOCK_STEP:
+        if robot == LOCK_STEP:
             emulated = loop.lock_step_robot(experiment, seed=seed_of(name))
             return float(np.mean([_lock_step(emulated, trained, n) for n in range(balls)]))
         artefact = exported(trained, self._console)
         logs = trained.source / "selection"
         self._console.print(f"{name}: {player} plays {balls} balls with {trained.source.name}", highlight=False)
-        session.run(artefact, robot, balls, None, "numpy", logs, None, seed_of(name), None, self._console)
+        setup = RobotOptions(backend="numpy", seed=seed_of(name))
+        play.run(artefact, robot, logs, self._console, setup, balls)
         found = json.loads(max(logs.glob("*.json")).read_text(encoding="utf-8"))
         if found["episodes"] < balls:
             raise Waiting(

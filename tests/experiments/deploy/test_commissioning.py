@@ -16,7 +16,7 @@ from rich.console import Console
 
 from experiments.config import robot as robots
 from experiments.deploy import commissioning
-from experiments.deploy.commissioning import Jogger
+from experiments.deploy.commissioning import Commissioning, Jogger
 from mjx_tt.robot import robots as simulated
 from robot_io import log
 from robot_io.calibrated import Calibration
@@ -88,7 +88,7 @@ def test_a_dry_run_hears_everything_notes_the_ball_and_sends_nothing(tmp_path, m
     console = Console(record=True, width=300)
     monkeypatch.setattr(commissioning, "Keyboard", lambda: Keys((1.5, "m"), (2.0, "q")))
     try:
-        assert commissioning.check(path, None, tmp_path, tmp_path / "points.csv", 20.0, console, own) == 0
+        assert Commissioning(path, tmp_path, tmp_path / "points.csv", 20.0, own).check(console) == 0
     finally:
         finish.set()
         thread.join()
@@ -145,7 +145,7 @@ def test_keys_move_the_blade_only_once_armed_and_note_where_it_is(tmp_path, monk
     monkeypatch.setattr(commissioning, "Keyboard", lambda: keys)
     monkeypatch.setattr(commissioning, "View", View)
     thread.start()
-    assert commissioning.jog(tmp_path / "robot.yaml", tmp_path, tmp_path / "points.csv", 60.0, console) == 0
+    assert Commissioning(tmp_path / "robot.yaml", tmp_path, tmp_path / "points.csv", 60.0).jog(console) == 0
     thread.join(10.0)
     assert not thread.is_alive() and not any("nan" in text for text in said)
     (line,) = csv.DictReader(open(tmp_path / "points.csv", encoding="utf-8"))

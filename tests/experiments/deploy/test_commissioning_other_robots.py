@@ -14,7 +14,7 @@ from rich.console import Console
 from experiments.config import build
 from experiments.config import robot as robots
 from experiments.deploy import commissioning
-from experiments.deploy.commissioning import Jogger
+from experiments.deploy.commissioning import Commissioning, Jogger
 from experiments.errors import ConfigError
 from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
@@ -22,7 +22,7 @@ from robot_io import log
 from robot_io.contract import Contract, JointLimits
 from robot_io.control import messages
 from robot_io.emulator.processes import Rig
-from tests.experiments.deploy.test_session_other_robots import exported
+from tests.experiments.deploy.test_play_other_robots import exported
 
 FR3, UR10E = "fr3_pedestal", "ur10e_rail"
 REST = 0.4  # [s] over which a robot that stands does not move
@@ -86,7 +86,7 @@ def jog(robot, rig, operator, folder, monkeypatch):
     monkeypatch.setattr(commissioning, "Keyboard", lambda: operator)
     monkeypatch.setattr(commissioning, "View", lambda *_: operator)
     console = Console(record=True, width=300)
-    assert commissioning.jog(path, folder, folder / "points.csv", 40.0, console, robot.name) == 0
+    assert Commissioning(path, folder, folder / "points.csv", 40.0, robot.name).jog(console) == 0
     assert not operator.steps, f"never came to {len(operator.steps)} keys: {operator.said}, {operator.status}"
     return console.export_text()
 
@@ -252,10 +252,14 @@ def test_keys_of_many_joints():
 
 def test_a_policy_for_another_robot_and_a_file_of_other_points_are_refused(tmp_path):
     policy = exported(tmp_path / "artefact", FR3)
+
+    def job(name):
+        return Commissioning(tmp_path / "robot.yaml", tmp_path, tmp_path / "p.csv", 1.0, name)
+
     with pytest.raises(ConfigError, match="a policy for another robot than ur10e_rail as it is now"):
-        commissioning.check(tmp_path / "robot.yaml", policy, tmp_path, tmp_path / "p.csv", 1.0, Console(), UR10E)
+        job(UR10E).check(Console(), policy)
     with pytest.raises(ConfigError, match="nowhere: no robot; allowed: a folder"):
-        commissioning.jog(tmp_path / "robot.yaml", tmp_path, tmp_path / "p.csv", 1.0, Console(), "nowhere")
+        job("nowhere").jog(Console())
     (tmp_path / "robot.yaml").write_text("axes: [{}, {}]\n")
     with pytest.raises(ConfigError, match="robot.yaml: axes: expected 1 entries for ur10e_rail, .*rail, got 2"):
-        commissioning.jog(tmp_path / "robot.yaml", tmp_path, tmp_path / "p.csv", 1.0, Console(), UR10E)
+        job(UR10E).jog(Console())

@@ -54,7 +54,7 @@ def test_the_view_shows_state_faults_joints_and_counts():
     text = console.export_text()
     for shown in (
         "ball +0.100 -0.200 +0.020 m in the table frame; tracker's clock +40.0 ppm over 60 s",
-        "in thought",
+        "dry run",
         "FAULT estop: the button is pressed",
         "STOPPED: not heard for 2 s",
         "balls 3: 2 returned, 1 missed",

@@ -29,7 +29,7 @@ def steps(recovery, *statuses):
 def test_where_nothing_is_missing_each_step_is_sent_once_up_to_arming():
     recovery = Recovery(0.0, status())
     sent = steps(recovery, status(), status(), status(), status("disarmed"))
-    assert sent == [Prepare(), Reset(), None, Arm()] and recovery.done and not recovery.word
+    assert sent == [Prepare(), Reset(), None, Arm()] and recovery.done and not recovery.message
 
 
 def test_a_lost_reference_is_found_after_the_reset():
@@ -68,14 +68,14 @@ def test_nothing_moves_because_somebody_else_mends_something(mended, at_the_key)
     assert set(steps(recovery, *[missing] * 9)) <= {None, Reset()}
     sent = steps(recovery, status(), status(), status("disarmed"), status("disarmed"))
     assert not {Arm(), Prepare()} & set(sent)
-    assert recovery.done and recovery.word == "all is well: press a to arm"
+    assert recovery.done and recovery.message == "all is well: press a to arm"
 
 
 def test_what_still_has_to_be_homed_then_is_told():
     recovery = Recovery(0.0, status(**UNPLUGGED))
     sent = steps(recovery, status(**UNPLUGGED), status(**UNHOMED), status("disarmed", **UNHOMED))
     assert sent == [Prepare(), Reset(), None]
-    assert recovery.word == "reset, not armed: axes: x is not homed"
+    assert recovery.message == "reset, not armed: axes: x is not homed"
 
 
 def test_a_key_that_comes_before_any_status_arms_nothing():
@@ -88,14 +88,14 @@ def test_without_a_fault_nothing_is_reset():
     assert steps(recovery, status("disarmed"), status("disarmed")) == [Prepare(), Arm()] and recovery.done
     recovery = Recovery(0.0, status("disarmed", tracker="silent"))
     assert steps(recovery, status("disarmed", tracker="silent")) == [Prepare()]
-    assert recovery.done and recovery.word == "not armed: tracker: silent"
+    assert recovery.done and recovery.message == "not armed: tracker: silent"
 
 
 @pytest.mark.parametrize("state", ["ready", "active"])
 def test_a_robot_that_is_armed_is_left_alone(state):
     """A fault seconds later would be reset unseen."""
     recovery = Recovery(0.0, status(state))
-    assert steps(recovery, status(state)) == [None] and recovery.done and "nothing to recover" in recovery.word
+    assert steps(recovery, status(state)) == [None] and recovery.done and "nothing to recover" in recovery.message
 
 
 def test_a_second_fault_is_not_reset():
@@ -125,7 +125,7 @@ def test_axes_that_do_not_answer_yet_are_prepared_again():
 def test_the_emulated_rig_waits_and_goes_on_by_itself():
     recovery = Recovery(0.0, status(**SILENT), emulated=True)
     sent = steps(recovery, status(**SILENT), status(**SILENT), status(), status(), status("disarmed"))
-    assert sent == [Prepare(), None, Reset(), None, Arm()] and recovery.done and not recovery.word
+    assert sent == [Prepare(), None, Reset(), None, Arm()] and recovery.done and not recovery.message
     recovery = Recovery(0.0, None, emulated=True)
     assert steps(recovery, status("disarmed", **UNPLUGGED))[0] == Prepare()
     recovery.refused(Refused(Prepare(), RefusedError("one of them does not answer yet")))

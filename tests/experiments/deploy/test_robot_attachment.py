@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.deploy import rig as deploy_rig
-from experiments.deploy import robot_attachment, session
+from experiments.commands.options import RIG, RobotOptions
+from experiments.deploy import play, robot_attachment
 from experiments.errors import ConfigError
-from experiments.view import measured, scene, show
+from experiments.view import measured, scene
+from experiments.view.viewer import robot_of
 from mjx_tt.robot import robots
 from mjx_tt.sim.model import SimModel
 from robot_io import log
@@ -61,7 +62,7 @@ def folder(tmp_path):
 
 def drawn(robot):
     """The scene of the viewer, and its corners of meshes."""
-    model = scene.tables(1, robot)
+    model = scene.build_tables(1, robot)
     return model, [model.mesh(name).vertnum[0] for name in ("hood", "cap")]
 
 
@@ -137,7 +138,7 @@ def test_another_robot_than_the_sessions_is_refused(tmp_path):
         for k in range(2):
             recorder.put(log.Joints(k / 75, np.zeros(7), np.zeros(7)))
     with pytest.raises(ConfigError, match="robot.zip: a robot with the joints rail, .* allowed: the session's, joint1"):
-        measured.session(tmp_path / "a.mcap", SimModel())
+        measured.load_session(tmp_path / "a.mcap", SimModel())
 
 
 @pytest.mark.realtime
@@ -151,20 +152,18 @@ def test_a_session_on_the_rig_is_shown_when_the_robots_folder_is_gone(folder, tm
         tmp_path / "artefact", Policy(theta, np.zeros(seen), np.ones(seen)), {"config": config}, robot=robot.contract
     )
     console = Console(record=True, width=200)
-    status = session.run(
-        tmp_path / "artefact", deploy_rig.RIG, 1, None, "numpy", tmp_path / "log", None, 0, None, console
-    )
+    status = play.run(tmp_path / "artefact", RIG, tmp_path / "log", console, RobotOptions(backend="numpy"), 1)
     assert status == 0, console.export_text()
     contract, home = robot.contract, robot.home
     shutil.rmtree(folder.parent)
     shutil.rmtree(tmp_path / "artefact")
     (path,) = (tmp_path / "log").glob("*.mcap")
-    films = measured.session(path, SimModel())
-    shown = show.robot_of(films)
-    assert shown.name == "mine" and shown.contract == contract and films.count == 1
+    replays = measured.load_session(path, SimModel())
+    shown = robot_of(replays)
+    assert shown.name == "mine" and shown.contract == contract and replays.count == 1
     model, corners = drawn(shown)
     assert corners == [4, 4] and model.nq == n
-    (film,) = films.films(0)
-    np.testing.assert_allclose(film.qpos[0], home, atol=0.05)
+    (replay,) = replays.replays(0)
+    np.testing.assert_allclose(replay.qpos[0], home, atol=0.05)
     kept = json.loads(zipfile.ZipFile(io.BytesIO(log.read(path).attachments["robot.zip"])).read("robot.json"))
     assert str(tmp_path) not in json.dumps(kept)  # nothing of where it was

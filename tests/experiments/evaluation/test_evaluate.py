@@ -9,7 +9,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.stats import norm
 
 from experiments.config import build
 from experiments.config import experiment as config
@@ -19,7 +18,6 @@ from experiments.evaluation.evaluate import Played
 from experiments.evaluation.learning_curves import Curve, Mark
 from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
-from experiments.stats import wilson
 from mjx_tt.env import reward_weights
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import Evaluator
@@ -51,21 +49,6 @@ def result(outcome: list[int], finite: list[bool] | None = None, collision: list
         observation_sums=np.zeros((2, 11, 1)),
         observation_counts=np.zeros(1, int),
     )
-
-
-@pytest.mark.parametrize("successes, trials", [(0, 10), (10, 10), (1, 3), (1871, 2000), (1, 100_000)])
-def test_wilson_interval_is_where_the_score_test_turns(successes, trials):
-    """Its ends are the shares p whose distance to the measured one is 1.96 of their own standard deviations."""
-    share = successes / trials
-    for p, at_bound in zip(wilson(successes, trials), (0.0, 1.0), strict=True):
-        distance = norm.ppf(0.975) * np.sqrt(p * (1 - p) / trials)
-        assert abs(p - share) == pytest.approx(distance, abs=1e-12) or (p == at_bound == share)
-
-
-@pytest.mark.parametrize("successes, trials", [(1, 0), (3, 2), (-1, 2)])
-def test_wilson_refuses_impossible_counts(successes, trials):
-    with pytest.raises(ValueError, match=f"{successes} successes in {trials} trials"):
-        wilson(successes, trials)
 
 
 def test_summary_counts_a_non_finite_episode_as_missed_and_leaves_it_out_of_means():

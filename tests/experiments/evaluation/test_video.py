@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from experiments.evaluation import video
-from experiments.view.film import RATE, Film
+from experiments.view.replay import RATE, Replay
 from mjx_tt.robot.mjcf import home_qpos, load_model
 from mjx_tt.viz.caption import GOOD, POOR
 from mjx_tt.viz.rendering import BRIGHT
@@ -18,19 +18,19 @@ CONTACT, SECONDS, SPEED = 0.5, 1.0, 5.0
 
 
 @pytest.fixture
-def film():
+def replay():
     """A ball that flies at 5 m/s towards the robot for half a second, and back."""
     time = np.arange(round(SECONDS * RATE) + 1) / RATE
     y = -1.3 + SPEED * np.abs(time - CONTACT)
     ball = np.stack([np.full_like(y, 0.3), y, np.full_like(y, 0.3)], axis=1)
     qpos = np.tile(home_qpos(load_model()), (len(time), 1))
     outcome = "returned, 5.0 m/s in, 5.0 m/s out"
-    return Film(time, qpos, {"ball": ball}, "", outcome, decided=CONTACT, contact=CONTACT)
+    return Replay(time, qpos, {"ball": ball}, "", outcome, decided=CONTACT, contact=CONTACT)
 
 
-def test_video_is_in_real_time_but_for_the_contact(film):
+def test_video_is_in_real_time_but_for_the_contact(replay):
     rate = 30.0
-    moments = list(video.video_moments(film, 3, rate))
+    moments = list(video.video_moments(replay, 3, rate))
     slow = [m for m in moments if m.caption.note]
     away = [abs(m.ball[1] + 1.3) / SPEED for m in moments]
     assert all(bool(m.caption.note) == (t < video.NEAR_CONTACT) for m, t in zip(moments, away, strict=True))
@@ -42,40 +42,40 @@ def test_video_is_in_real_time_but_for_the_contact(film):
     steps = np.abs(np.diff([m.ball[1] for m in slow]))
     assert np.median(steps) == pytest.approx(
         SPEED / 8 / rate, rel=0.01
-    )  # smooth, though films have 300 frames a second
+    )  # smooth, though replays have 300 frames a second
 
 
-def test_caption_has_number_speed_and_outcome_and_does_not_know_it_before(film):
-    moments = list(video.video_moments(film, 3, 25.0))
+def test_caption_has_number_speed_and_outcome_and_does_not_know_it_before(replay):
+    moments = list(video.video_moments(replay, 3, 25.0))
     before = [m for m in moments if m.caption.text == "5.0 m/s in"]
-    after = [m for m in moments if m.caption.text == film.outcome]
+    after = [m for m in moments if m.caption.text == replay.outcome]
     assert len(before) + len(after) == len(moments)
     assert {m.caption.title for m in moments} == {"Ball 3"}
     assert after[0].caption.colour == GOOD
     assert before[-1].ball[1] == pytest.approx(-1.3, abs=SPEED / 8 / 25 + 1e-9)
-    missed = replace(film, outcome="missed, 5.0 m/s", contact=float("nan"))
+    missed = replace(replay, outcome="missed, 5.0 m/s", contact=float("nan"))
     assert list(video.video_moments(missed, 1, 25.0))[-1].caption.colour == POOR
     assert not any(m.caption.note for m in video.video_moments(missed, 1, 25.0))
 
 
-def test_trail_is_the_balls_last_third_of_a_second_and_ends_at_it(film):
-    moment = next(m for m in video.video_moments(film, 1, 25.0) if m.caption.note)
+def test_trail_is_the_balls_last_third_of_a_second_and_ends_at_it(replay):
+    moment = next(m for m in video.video_moments(replay, 1, 25.0) if m.caption.note)
     flown = np.linalg.norm(np.diff(moment.trail, axis=0), axis=1).sum()
     assert flown == pytest.approx(video.TRAIL * SPEED, abs=0.05)
     np.testing.assert_array_equal(moment.trail[-1], moment.ball)
 
 
-def test_picture_is_of_the_contact_with_the_whole_way(film, tmp_path):
-    moment = video.at_contact(film)
+def test_picture_is_of_the_contact_with_the_whole_way(replay, tmp_path):
+    moment = video.at_contact(replay)
     assert moment.ball[1] == pytest.approx(-1.3)
     assert np.ptp(moment.trail[:, 1]) == pytest.approx(CONTACT * SPEED)
     apart = np.linalg.norm(np.diff(moment.dots, axis=0), axis=1)
     np.testing.assert_allclose(apart, SPEED * video.DOTS_APART)
     assert moment.dots[-1, 1] == pytest.approx(1.2, abs=0.2)
-    falling = film.balls["ball"] - np.outer(film.time > 0.8, [0.0, 0.0, 1.0])
-    assert video.at_contact(replace(film, balls={"ball": falling})).dots[:, 2].min() > 0.0
+    falling = replay.balls["ball"] - np.outer(replay.time > 0.8, [0.0, 0.0, 1.0])
+    assert video.at_contact(replace(replay, balls={"ball": falling})).dots[:, 2].min() > 0.0
     try:
-        video.draw(tmp_path / "a.png", [film])
+        video.draw(tmp_path / "a.png", [replay])
     except RuntimeError as error:
         pytest.skip(str(error))
     image = np.asarray(Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
@@ -83,6 +83,6 @@ def test_picture_is_of_the_contact_with_the_whole_way(film, tmp_path):
     assert (np.abs(image - 255 * np.array(BRIGHT)) < 60).all(axis=-1).sum() > 1000
 
 
-def test_suffix_is_checked_before_anything_is_drawn(film, tmp_path):
+def test_suffix_is_checked_before_anything_is_drawn(replay, tmp_path):
     with pytest.raises(ValueError, match=r"a\.webp: suffix '\.webp'; allowed: \.png, \.mp4, \.gif"):
-        video.draw(tmp_path / "a.webp", [film])
+        video.draw(tmp_path / "a.webp", [replay])

@@ -83,7 +83,7 @@ class Nobody:
 def test_a_ball_is_credited_to_the_policy_that_played_it(gap):
     """Balls in quick succession, also while the outcome of the one before is open."""
     session = Session([12.0 + gap * i for i in range(20)])
-    robot = BridgeRobot(session, None, Nobody(), Nobody(), "made up")
+    robot = BridgeRobot(session, None, Nobody(), Nobody())
     bridge, played = session.simulation.bridge, {}
     step = Constant.step
 

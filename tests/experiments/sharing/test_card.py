@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from experiments.commands.render import SHIPPED
+from experiments.commands.options import SHIPPED_POLICY
 from experiments.errors import RunError
 from experiments.sharing import card
 from robot_io.policy import artefact as artefacts
@@ -21,7 +21,7 @@ def wilson(k: int, n: int) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def artefact():
-    return artefacts.load(SHIPPED)
+    return artefacts.load(SHIPPED_POLICY)
 
 
 def write(artefact, evaluation) -> str:

@@ -17,8 +17,8 @@ import pytest
 import yaml
 
 from experiments import cli
-from experiments.commands.evaluate import _folder
-from experiments.commands.render import SHIPPED
+from experiments.commands.evaluate import default_folder
+from experiments.commands.options import SHIPPED_POLICY
 from experiments.config.experiment import parse
 from experiments.errors import RunError
 from experiments.runs import load_policy
@@ -32,8 +32,8 @@ from robot_io.policy import artefact as artefacts
 def run(tmp_path_factory):
     """A run as training leaves it, but for its checkpoints and pictures: of the policy that comes with the program."""
     folder = tmp_path_factory.mktemp("runs") / "anna"
-    shutil.copytree(SHIPPED, folder / "artefact")
-    provenance = json.loads((SHIPPED / "manifest.json").read_text())["provenance"]
+    shutil.copytree(SHIPPED_POLICY, folder / "artefact")
+    provenance = json.loads((SHIPPED_POLICY / "manifest.json").read_text())["provenance"]
     (folder / "config.yaml").write_text(yaml.safe_dump(provenance["config"]))
     (folder / "evaluation.json").write_text(json.dumps(provenance["evaluation"]))
     return folder
@@ -90,7 +90,7 @@ def test_what_was_unpacked_stands_for_a_run(run, file, tmp_path):
     assert loaded.config == original.config is not None
     theta, _ = load_policy.load_statistics(folder)
     np.testing.assert_array_equal(theta, original.policy.theta)
-    assert _folder(folder) == tmp_path / "anna-evaluation"  # the figures that it came with stay
+    assert default_folder(folder) == tmp_path / "anna-evaluation"  # the figures that it came with stay
 
 
 def test_the_cards_code_runs_with_numpy_alone(file, tmp_path):

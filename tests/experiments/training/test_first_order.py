@@ -22,7 +22,6 @@ from mjx_tt.env.episode import MISSED
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.env.task import TaskConfig
-from mjx_tt.gradient.objective import Objective
 from mjx_tt.sim.model import SimModel
 from tests.support.small_network import SMALL
 
@@ -37,15 +36,20 @@ def pool():
 
 
 def trainer_on(devices, pool, config=BGS, repeats=REPEATS):
-    return FirstOrderTrainer(Simulator(TASK, devices), config, pool, SimModel(), repeats=repeats)
+    return FirstOrderTrainer(Simulator(TASK, devices), config, pool, SimModel(), episodes_per_direction=repeats)
 
 
 @pytest.fixture(scope="module")
-def updated(pool):
+def trainers(pool):
+    """By number of devices."""
+    return {devices: trainer_on(devices, pool) for devices in (1, 2)}
+
+
+@pytest.fixture(scope="module")
+def updated(trainers):
     """By number of devices, the state before and after one update, and its metrics."""
     found = {}
-    for devices in (1, 2):
-        trainer = trainer_on(devices, pool)
+    for devices, trainer in trainers.items():
         before = trainer.init(jax.random.key(1))
         after, metrics = trainer.update(before)
         found[devices] = before, after, jax.tree.map(float, metrics)
@@ -58,9 +62,9 @@ def test_two_devices_learn_what_one_learns(updated):
     assert metrics_of_two == pytest.approx(metrics, rel=1e-3, abs=1e-6)
 
 
-def test_an_update_repeats_bit_for_bit(updated, pool):
+def test_an_update_repeats_bit_for_bit(updated, trainers):
     before, after, _ = updated[1]
-    again, _ = trainer_on(1, pool).update(before)
+    again, _ = trainers[1].update(before)
     np.testing.assert_array_equal(again.bgs.theta, after.bgs.theta)
     np.testing.assert_array_equal(again.statistics.mean, after.statistics.mean)
 
@@ -87,31 +91,33 @@ def test_its_statistics_are_those_of_what_the_policies_saw(updated):
     assert np.isfinite(inv_std).all() and (np.asarray(inv_std) > 0).all()
 
 
-def test_episodes_without_a_finite_cost_are_counted_and_do_not_learn(pool, monkeypatch):
-    play = Objective.play
+def poisoned(trainer, pool, balls):
+    """What an update reads, with balls (k,) of the pool that fly nowhere."""
+    position = pool.state.position.at[0, balls].set(jnp.nan)
+    pool = replace(pool, state=replace(pool.state, position=position))
+    return trainer.simulator.replicate(pool), trainer.inputs[1]
 
-    def broken(self, policy, episodes):
-        played = play(self, policy, episodes)
-        second = jnp.arange(played.cost.shape[0]) % (2 * PAIRS) == 1  # all episodes of the second policy
-        return replace(played, cost=played.cost * jnp.where(second, jnp.nan, 1.0))
 
-    monkeypatch.setattr(Objective, "play", broken)
-    trainer = trainer_on(1, pool)
-    before = trainer.init(jax.random.key(1))
-    after, metrics = trainer.update(before)
-    assert float(metrics["non_finite"]) == REPEATS
+def test_policies_that_meet_a_ball_without_a_finite_cost_are_counted_and_do_not_learn(updated, trainers, pool):
+    trainer, (before, whole, _) = trainers[1], updated[1]
+    _, episodes = trainer._draw(before, trainer.inputs, 2 * PAIRS)
+    thrown, x = np.asarray(episodes.ball.position[0]), np.asarray(pool.state.position[0])
+    ball = next(i for i in range(len(x)) if (thrown == x[i]).any())
+    failed = int((thrown == x[ball]).any(axis=0).sum())
+    assert 0 < failed < 2 * PAIRS
+    after, metrics = trainer._update(before, poisoned(trainer, pool, [ball]))
+    assert float(metrics["non_finite"]) == failed * REPEATS
     assert np.isfinite(np.asarray(after.bgs.theta)).all() and float(metrics["update_norm"]) > 0.0
+    assert np.abs(np.asarray(after.bgs.theta - whole.bgs.theta)).max() > 0.0
 
 
-def test_without_one_finite_episode_nothing_changes(pool, monkeypatch):
-    play = Objective.play
-    monkeypatch.setattr(Objective, "play", lambda *given: replace(played := play(*given), cost=played.cost * jnp.nan))
-    trainer = trainer_on(1, pool, replace(BGS, step=optimizers.make("adam", 0.01)))
-    before = trainer.init(jax.random.key(1))
-    after, metrics = trainer.update(before)
+def test_without_one_finite_episode_nothing_changes(updated, trainers, pool):
+    trainer, (_, before, _) = trainers[1], updated[1]
+    after, metrics = trainer._update(before, poisoned(trainer, pool, np.arange(64)))
     np.testing.assert_array_equal(after.bgs.theta, before.bgs.theta)
     np.testing.assert_array_equal(after.bgs.average, before.bgs.average)
-    assert float(metrics["non_finite"]) == 2 * PAIRS * REPEATS and int(after.bgs.updates) == 1
+    assert np.abs(np.asarray(before.bgs.average - before.bgs.theta)).max() > 0.0  # a step would move it
+    assert float(metrics["non_finite"]) == 2 * PAIRS * REPEATS and int(after.bgs.updates) == 2
 
 
 OTHERS = {

@@ -14,15 +14,9 @@ import pytest
 from experiments.runs import checkpoint
 from experiments.runs.metrics import read
 from tests.support.paths import ROOT
+from tests.support.tiny_experiment import write_tiny
 
 UPDATES = 600
-EXPERIMENT = """
-name: tiny
-balls: player5/M0
-task: {max_steps: 60, sim_rate: 75.0}
-optimiser: {num_directions: 2, repeats: 2}
-training: {updates: %d, pool: 64, evaluate_every: null, checkpoint_seconds: 0.2, devices: 1}
-"""
 # The training itself without what follows it; a limit on the size of files stands for a full disk.
 DRIVER = """
 import resource, sys
@@ -72,9 +66,8 @@ def wait_for_checkpoint(process: subprocess.Popen, folder: Path, updates: int = 
 
 @pytest.fixture(scope="module")
 def yaml(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("experiment") / "tiny.yaml"
-    path.write_text(EXPERIMENT % UPDATES)
-    return path
+    folder = tmp_path_factory.mktemp("experiment")
+    return write_tiny(folder, updates=UPDATES, evaluate_every=None, checkpoint_seconds=0.2)
 
 
 @pytest.fixture(scope="module")

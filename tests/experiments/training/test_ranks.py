@@ -19,16 +19,9 @@ from experiments.training import ranks
 from tests.support import one_node_slurm
 from tests.support.one_node_slurm import free_ports
 from tests.support.paths import ROOT
+from tests.support.tiny_experiment import write_tiny
 
 UPDATES = 120
-EXPERIMENT = f"""
-name: tiny
-balls: player5/M0
-task: {{max_steps: 60, sim_rate: 75.0}}
-optimiser: {{num_directions: 2, repeats: 2}}
-training: {{updates: {UPDATES}, pool: 64, evaluate_every: 40, evaluate_episodes: 16, checkpoint_seconds: 1000}}
-evaluation: {{episodes: 16, sim_rate: 75.0, reachable_balls: null}}
-"""
 PROGRAM = [sys.executable, "-c", "from experiments.cli import program; program()", "train"]
 # The training itself without the evaluation, pictures and export that follow it.
 DRIVER = """
@@ -40,20 +33,20 @@ from experiments.config import build, experiment as config
 from experiments.runs.run_dir import Run
 from experiments.training import loop, ranks
 numbers = map(int, sys.argv[5:]) if sys.argv[5:] else (None, None)
-together = ranks.join(sys.argv[4], *numbers) if sys.argv[4:] else ranks.ALONE
-with together.together():
+together = ranks.join(sys.argv[4], *numbers) if sys.argv[4:] else ranks.SINGLE
+with together.failing_fast():
     experiment = build.experiment(config.load(sys.argv[1]), sys.argv[1])
     loop.train(experiment, Run(sys.argv[2]), Console(), together)
-    together.part()
+    together.disconnect()
 """
 TRAINING = [sys.executable, "-c", DRIVER]
 
 
 @pytest.fixture(scope="module")
 def yaml(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("experiment") / "tiny.yaml"
-    path.write_text(EXPERIMENT)
-    return path
+    training = {"updates": UPDATES, "evaluate_every": 40, "evaluate_episodes": 16, "checkpoint_seconds": 1000}
+    evaluation = {"episodes": 16, "sim_rate": 75.0}
+    return write_tiny(tmp_path_factory.mktemp("experiment"), evaluation, devices="auto", **training)
 
 
 def pair(*command: str) -> list[subprocess.Popen]:
@@ -160,23 +153,23 @@ def test_without_a_cluster_auto_says_so():
 
 
 def test_alone_there_is_nothing_to_agree_on():
-    assert ranks.ALONE.agree(1.0, 2.5).tolist() == [[1.0, 2.5]]
-    assert ranks.ALONE.of_first([np.arange(3)])[0].tolist() == [0, 1, 2]
+    assert ranks.SINGLE.gather(1.0, 2.5).tolist() == [[1.0, 2.5]]
+    assert ranks.SINGLE.broadcast([np.arange(3)])[0].tolist() == [0, 1, 2]
 
 
 def test_the_watch_calls_once_signs_stop(monkeypatch):
     monkeypatch.setattr(ranks, "SILENCE", 0.6)
     called: list[float] = []
-    with ranks.Ranks(2, 0).watched(called.append) as watch:  # type: ignore[arg-type] - it returns here
+    with ranks.Ranks(2, 0).watch(called.append) as watchdog:  # type: ignore[arg-type] - it returns here
         time.sleep(1.2)
         assert not called, "before the first sign, which waits for compilations"
         for _ in range(8):
-            watch.alive()
+            watchdog.beat()
             time.sleep(0.2)
         assert not called
-        watch.pause()
+        watchdog.pause()
         time.sleep(1.2)
         assert not called, "nor in a pause"
-        watch.alive()
+        watchdog.beat()
         time.sleep(1.6)
         assert called and called[0] > 0.6

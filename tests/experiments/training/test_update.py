@@ -38,7 +38,7 @@ def pool():
 
 @pytest.fixture(scope="module")
 def trainer(pool):
-    return Trainer(Simulator(TASK), BGS, pool, SimModel(), repeats=REPEATS)
+    return Trainer(Simulator(TASK), BGS, pool, SimModel(), episodes_per_direction=REPEATS)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,9 @@ def test_a_program_compiled_for_some_samples_serves_others(pool):
     metrics = [program(state, one.inputs)[1]["mean_return"] for one in (first, second)]
     assert metrics[0] != metrics[1]  # the samples do something
     # All samples alike are a number of the model.
-    known = Trainer(Simulator(TASK), BGS, pool, models.with_values(SimModel(), {PATH: 0.2}), repeats=REPEATS)
+    known = Trainer(
+        Simulator(TASK), BGS, pool, models.with_values(SimModel(), {PATH: 0.2}), episodes_per_direction=REPEATS
+    )
     theta, same = (x[0].bgs.theta for x in (program(state, second.inputs), known.update(state)))
     np.testing.assert_allclose(theta, same, atol=1e-5)
 
@@ -115,7 +117,7 @@ def test_each_robot_has_a_program_of_its_own():
 
 @pytest.fixture(scope="module")
 def trainer_on_two(pool):
-    return Trainer(Simulator(TASK, devices=2), BGS, pool, SimModel(), repeats=REPEATS)
+    return Trainer(Simulator(TASK, devices=2), BGS, pool, SimModel(), episodes_per_direction=REPEATS)
 
 
 @pytest.fixture(scope="module")
@@ -236,8 +238,8 @@ def test_at_the_papers_size_mjx_makes_the_update_of_the_fused_engine():
 
 
 def test_mistakes_are_named(pool):
-    with pytest.raises(ValueError, match="repeats is 0, at least 1 is needed"):
-        Trainer(Simulator(TASK), BGS, pool, SimModel(), repeats=0)
+    with pytest.raises(ValueError, match="repeats: expected at least 1, got 0"):
+        Trainer(Simulator(TASK), BGS, pool, SimModel(), episodes_per_direction=0)
 
 
 @pytest.mark.slow
@@ -245,8 +247,12 @@ def test_later_weights_take_over_after_their_update(trainer, run, pool):
     """Before it nothing changes; from then on the step is that of a task with these weights."""
     changed = reward_weights.SIM_WEIGHTS | {"state_transition": 0.0}
     weights = tuple(changed.values())
-    changing = Trainer(Simulator(TASK), BGS, pool, SimModel(), repeats=REPEATS, later_weights=(2, weights))
-    other = Trainer(Simulator(replace(TASK, rewards=weigh_rewards(changed))), BGS, pool, SimModel(), repeats=REPEATS)
+    changing = Trainer(
+        Simulator(TASK), BGS, pool, SimModel(), episodes_per_direction=REPEATS, reward_schedule=(2, weights)
+    )
+    other = Trainer(
+        Simulator(replace(TASK, rewards=weigh_rewards(changed))), BGS, pool, SimModel(), episodes_per_direction=REPEATS
+    )
     states, metrics = updates(changing)
     for i in (1, 2):
         np.testing.assert_allclose(states[i].bgs.theta, run[0][i].bgs.theta, rtol=0, atol=1e-6)

@@ -190,7 +190,7 @@ def test_sessions_and_other_logs_are_read_together(tmp_path, monkeypatch):
         (["--seed", "-3"], "--seed -3"),
         (["--retrain", "5"], "--retrain needs --policy"),
         (["--policy", "nowhere"], "nowhere"),
-        (["--out", "log.csv"], "log.csv is a file"),
+        (["--out", "log.csv"], "log.csv: cannot be written: Not a directory"),
         (["--model", "log.csv"], "log.csv"),
     ],
 )
@@ -221,11 +221,11 @@ def test_a_wrong_zero_of_an_encoder_is_named_where_the_pose_at_rest_is_given(tmp
     )
     (tmp_path / "command.csv").write_text("\n".join(command))
     (tmp_path / "state.csv").write_text("\n".join(state))
-    request = diagnose.Request([str(tmp_path)], tmp_path / "out", home="home")
-    (cause,) = diagnose.diagnose(request, Console(quiet=True)).verdict.causes
+    request, logs = diagnose.Request(out=str(tmp_path / "out"), home="home"), [str(tmp_path)]
+    (cause,) = diagnose.run(logs, request, Console(quiet=True)).verdict.causes
     estimate = cause.parameters["joint_2.joint_offset"]
     assert cause.name == "joint_2.joint_offset" and estimate.low <= 0.012 <= estimate.high
-    without = diagnose.diagnose(replace(request, home=""), Console(quiet=True)).verdict
+    without = diagnose.run(logs, replace(request, home=""), Console(quiet=True)).verdict
     assert not without.causes and any("joint_2.joint_offset" in why for why in without.not_identifiable)
 
 

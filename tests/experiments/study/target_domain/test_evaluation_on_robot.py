@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.deploy import session
+from experiments.deploy import play
 from experiments.errors import RunError
 from experiments.study.analysis import scoring
 from experiments.study.target_domain import evaluation_on_robot
@@ -81,10 +81,8 @@ class Sessions:
     def __init__(self, plan) -> None:
         self.plan, self.chances, self.asked, self.length = list(plan), [], [], 0
 
-    def run(
-        self, artefact, robot, balls, distribution, backend, folder, params, seed, seconds, console, rallies, player
-    ):
-        self.chances.append(seed)
+    def run(self, artefact, robot, folder, console, setup, rallies):
+        self.chances.append(setup.seed)
         self.asked.append(rallies)
         count, end = self.plan.pop(0)
         told = [self._rally("FIRST_NET", True)]  # each session has one that is filtered
@@ -113,7 +111,7 @@ def run(tmp_path):
 def step_of(run, monkeypatch, plan, rallies=10):
     """The step of a zero-shot policy, and the sessions that it will have."""
     rig, folder = Sessions(plan), run.parent / "rallies"
-    monkeypatch.setattr(session, "run", rig.run)
+    monkeypatch.setattr(play, "run", rig.run)
     monkeypatch.setattr(evaluation_on_robot, "exported", lambda trained, console: run)
     who = (0, "player3", "player3", "zero_shot")
     return rally_step(folder, who, lambda: run, (), rallies, Console(file=io.StringIO())), rig
@@ -132,7 +130,7 @@ def test_a_failed_evaluation_goes_on_with_what_it_played(run, monkeypatch):
     assert (~counted.filtered).sum() == 10
 
 
-@pytest.mark.parametrize("end", [session.INTERRUPTED, OSError("the pipe broke"), None])
+@pytest.mark.parametrize("end", [play.INTERRUPTED, OSError("the pipe broke"), None])
 def test_a_session_that_is_stopped_or_raises_counts_if_it_has_a_report(run, monkeypatch, end):
     step, rig = step_of(run, monkeypatch, [(4, end), (9, 0), (1, 0)])
     with pytest.raises((KeyboardInterrupt, OSError, RefusedError)):

@@ -19,9 +19,12 @@ import pytest
 from mcap.reader import make_reader
 from rich.console import Console
 
+from experiments.commands.options import RIG, RobotOptions
 from experiments.config import build, robot
-from experiments.deploy import rig as deploy_rig
-from experiments.deploy import session as play
+from experiments.deploy import control_session as sessions
+from experiments.deploy import play
+from experiments.deploy.control_session import ControlSession
+from experiments.deploy.rig import rig_for
 from experiments.errors import ConfigError, explained
 from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
@@ -52,7 +55,7 @@ def run(policy, log_folder, balls=None) -> tuple[int, str]:
     """Exit status and everything printed, as the command line gives them."""
     console = Console(record=True, width=200)
     try:
-        status = play.run(policy, deploy_rig.RIG, balls, None, "numpy", log_folder, None, 0, None, console)
+        status = play.run(policy, RIG, log_folder, console, RobotOptions(backend="numpy"), balls)
     except Exception as error:
         if not explained(error):
             raise
@@ -81,8 +84,7 @@ def test_plays_on_the_rig_and_leaves_a_log_and_a_summary(policy, tmp_path):
 def test_a_virtual_player_rallies_in_real_time(policy, tmp_path):
     """The policy misses; the person serves again, and log and summary agree on the rallies."""
     console = Console(record=True, width=200)
-    options = {"rallies": 2, "player": "player3"}
-    status = play.run(policy, deploy_rig.RIG, None, None, "auto", tmp_path, None, 0, None, console, **options)
+    status = play.run(policy, RIG, tmp_path, console, RobotOptions(player="player3"), rallies=2)
     text = console.export_text()
     assert status == 0 and "policy comp" in text, text  # compiled by JAX, or on a busy machine computed by NumPy
     (summary,) = (json.loads(path.read_text()) for path in tmp_path.glob("*.json"))
@@ -125,18 +127,8 @@ def as_in_a_terminal():
 
 def started(policy, folder, *more):
     """``mjx-tt run`` on the rig as a group of its own, after its first ball."""
-    command = [
-        sys.executable,
-        "-m",
-        "experiments.cli",
-        "run",
-        str(policy),
-        "--robot",
-        "rig",
-        "--log",
-        str(folder),
-        *more,
-    ]
+    program = [sys.executable, "-m", "experiments.cli"]
+    command = [*program, "run", str(policy), "--robot", "rig", "--log", str(folder), *more]
     pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     running = subprocess.Popen(command, cwd=ROOT, start_new_session=True, preexec_fn=as_in_a_terminal, **pipe)
     for line in running.stdout:
@@ -275,13 +267,13 @@ def test_port_in_use_is_refused(policy):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", ports.tracker))
         with pytest.raises(RefusedError, match=f"127.0.0.1:{ports.tracker}.*end the program"):
-            play.Session(robot_at(ports), process.ControlOptions(str(policy)), Console())
+            ControlSession(robot_at(ports), process.ControlOptions(str(policy)), Console())
 
 
 @pytest.mark.realtime
 def test_missing_devices_are_named_and_arming_is_refused(policy, monkeypatch):
-    monkeypatch.setattr(play, "PREPARE_TIME", 1.0)
-    with play.Session(robot_at(free_ports()), process.ControlOptions(str(policy)), Console()) as session:
+    monkeypatch.setattr(sessions, "PREPARE_TIME", 1.0)
+    with ControlSession(robot_at(free_ports()), process.ControlOptions(str(policy)), Console()) as session:
         with pytest.raises(RefusedError, match="arm: No EGM packet.*axes: gantry_x is lost.*tracker: silent"):
             session.prepare(None)
         with pytest.raises(RefusedError, match="not armed: arm: No EGM packet"):
@@ -310,9 +302,9 @@ def test_arming_that_is_refused_after_a_reset_can_be_tried_again(policy, monkeyp
 
     thread = threading.Thread(target=control, daemon=True)
     monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
-    monkeypatch.setattr(play, "SETTLE", 0.0)
+    monkeypatch.setattr(sessions, "SETTLE", 0.0)
     thread.start()
-    with play.Session(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:
+    with ControlSession(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:
         until(session, lambda status: not status.missing and not status.present)
         session.arm()
         for _ in range(3):
@@ -351,9 +343,9 @@ def test_a_robot_that_was_left_where_it_cannot_be_armed_is_jogged(policy, monkey
     thread = threading.Thread(target=control, daemon=True)
     monkeypatch.setattr(simulated.control.bridge, "arm", arm_there)
     monkeypatch.setattr(process, "start", lambda *_: (thread, simulated.pipe))
-    monkeypatch.setattr(play, "SETTLE", 0.0)
+    monkeypatch.setattr(sessions, "SETTLE", 0.0)
     thread.start()
-    with play.Session(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:
+    with ControlSession(RobotConfig(), process.ControlOptions(str(policy)), Console()) as session:
         until(session, lambda status: not status.missing and not status.present)
         session.recover(SimpleNamespace(switch_on=lambda: None, jog=lambda: jogged.append(True)))
         assert len(jogged) == 1 and session.status.state == "ready"
@@ -363,9 +355,9 @@ def test_a_robot_that_was_left_where_it_cannot_be_armed_is_jogged(policy, monkey
 def playing(policy, tmp_path):
     """A rig whose robot is armed, and its session."""
     artefact_ = artefact.load(policy)
-    with deploy_rig.rig_for(artefact_, None, None, 0) as rig:
+    with rig_for(artefact_, RobotOptions()) as rig:
         options = process.ControlOptions(str(policy), log_folder=str(tmp_path), log_name="session")
-        with play.Session(rig.robot, options, Console()) as session:
+        with ControlSession(rig.robot, options, Console()) as session:
             session.prepare(rig)
             try:
                 session.arm()

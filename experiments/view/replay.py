@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -23,16 +24,15 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Film:
+class Replay:
     """One ball at one table.
 
     time     (T,) [s] from the start
     qpos     (T, 8) [m], [rad]
-    balls    positions (T, 3) [m] by name, NaN where there is none; the first one leaves the bright trail
+    balls    positions (T, 3) [m] by name, NaN where there is none: the first leaves a trail, the last shows its landing
     title    of whom it is
     outcome  "returned", ..., with speeds; shown from ``decided`` [s] on
     contact  [s] of the paddle's contact, NaN without one
-    landing  (T, 2) [m] where the first ball will come down next, NaN where it will not
     marks    (M, 3) [m] measured positions
     series   curves by heading
     terms    reward term by name: value, weight
@@ -46,7 +46,6 @@ class Film:
     outcome: str = ""
     decided: float = 0.0
     contact: float = float("nan")
-    landing: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
     marks: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     series: dict[str, Series] = field(default_factory=dict)
     terms: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -56,12 +55,22 @@ class Film:
     def seconds(self) -> float:
         return float(self.time[-1])
 
+    @property
+    def trail(self) -> np.ndarray:
+        """Path (T, 3) [m] of the first ball."""
+        return next(iter(self.balls.values()))
+
+    @cached_property
+    def landing(self) -> np.ndarray:
+        """Place (T, 2) [m] where the last ball will come down next, NaN where it will not."""
+        return next_landing(list(self.balls.values())[-1])
+
     def frame(self, t: float) -> int:
         """Index of the frame at a time [s]."""
         return int(np.clip(np.searchsorted(self.time, t + 1e-9) - 1, 0, len(self.time) - 1))
 
 
-def upsampled(position: np.ndarray, velocity: np.ndarray, period: float, factor: int) -> np.ndarray:
+def upsample(position: np.ndarray, velocity: np.ndarray, period: float, factor: int) -> np.ndarray:
     """A ball's path (n, 3) [m] at ``factor`` times the rate, (factor (n - 1) + 1, 3).
 
     Between ticks without a contact it is the cubic through positions and velocities; with one, the two straight lines

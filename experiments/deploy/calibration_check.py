@@ -1,4 +1,4 @@
-"""Calibrations against the contacts of ball and paddle in the last session that was played with them."""
+"""A calibration against the contacts of ball and paddle in the last session that was played with it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SESSIONS = Path("runs/robot")  # where mjx-tt run leaves them unless told otherw
 SPREAD = 0.015  # [m] of the gaps at contacts, beyond which tracker or robot is not where it is said to be
 
 
-def observed(config: RobotConfig, log_file: Path | None) -> dict[str, float | None] | None:
+def measure(config: RobotConfig, log_file: Path | None) -> dict[str, float | None] | None:
     """Contacts in a session's log, null where too few tell; None without a log, or where nothing is calibrated.
 
     Raises LogError.

@@ -1,9 +1,8 @@
-"""Lines about stages, and a Ctrl-C while a library computes and Python's own handlers wait."""
+"""A Ctrl-C while a library computes and Python's own handlers wait."""
 
 from __future__ import annotations
 
 import io
-import re
 import signal
 import subprocess
 import sys
@@ -12,26 +11,16 @@ import time
 import pytest
 from rich.console import Console
 
-from experiments import stages
+from experiments import interrupts
 from tests.support.paths import ROOT
 
 DEAF = """
 import hashlib, sys
-from experiments.stages import interruptible
+from experiments.interrupts import interruptible
 with interruptible():
     print("ready", flush=True)
     hashlib.pbkdf2_hmac("sha256", b"", b"", 60_000_000)  # C code that never looks for signals
 """
-
-
-def test_a_stage_says_what_and_how_long():
-    text = io.StringIO()
-    stage = stages.printed(Console(file=text), "run")
-    with stage("compiling"):
-        assert text.getvalue() == "run: compiling ..."
-    with pytest.raises(ZeroDivisionError), stage("failing"):
-        raise ZeroDivisionError
-    assert re.fullmatch(r"run: compiling \.\.\. \d+\.\d s\nrun: failing \.\.\.\n", text.getvalue())
 
 
 @pytest.mark.realtime
@@ -58,7 +47,7 @@ def test_ctrl_c_is_answered_where_python_does_not_run_and_the_second_one_ends():
 def test_ctrl_c_where_python_runs_is_an_interruption_as_ever():
     outside = signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by what runs in the background
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), stages.interruptible():
+    with pytest.raises(KeyboardInterrupt), interrupts.interruptible():
         signal.raise_signal(signal.SIGINT)
         time.sleep(5.0)
     assert signal.getsignal(signal.SIGINT) is before
@@ -77,7 +66,7 @@ def test_an_orderly_end_is_asked_for_by_the_first_ctrl_c_and_forced_by_the_secon
                     signal.raise_signal(signal.SIGINT)
                 return text.write(words)
 
-        with stages.orderly() as asked:
+        with interrupts.stop_requested() as asked:
             assert not asked.is_set()
             console = Console(file=Interrupting())
             console.print("played")

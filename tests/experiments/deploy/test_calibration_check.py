@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from experiments.commands.options import ROBOT
 from experiments.config import robot as robots
 from experiments.config.finetuning import FineTuning
-from experiments.deploy import contradictions
-from experiments.deploy import session as play
+from experiments.deploy import calibration_check, play
 from experiments.errors import ConfigError
-from experiments.finetuning import session as tuning
+from experiments.finetuning import on_robot as tuning
 from experiments.runs import run_dir
 from mjx_tt.robot.robots import paper
 from robot_io.calibration import contacts
@@ -34,21 +34,21 @@ def session(folder, name, found, **contacts):
 
 def test_only_the_newest_session_with_the_same_calibration_counts(tmp_path):
     found, good = config(), {"count": 20, "lag": 0.035, "lag_deviation": 0.001, "spread": 0.006}
-    contradictions.check(found, "robot.yaml", tmp_path)
+    calibration_check.check(found, "robot.yaml", tmp_path)
     session(tmp_path, "1.json", found, **good | {"lag": 0.045})
     with pytest.raises(
         ConfigError, match=r"robot.yaml: calibration.clock.lag is 0.034 s, in .*1.json 20 contacts .*0.045"
     ):
-        contradictions.check(found, "robot.yaml", tmp_path)
-    contradictions.check(config(0.044), "robot.yaml", tmp_path)  # calibrated again
+        calibration_check.check(found, "robot.yaml", tmp_path)
+    calibration_check.check(config(0.044), "robot.yaml", tmp_path)  # calibrated again
     session(tmp_path, "2.json", found, **good)
     (tmp_path / "3.json").write_text("[")
-    contradictions.check(found, "robot.yaml", tmp_path)
+    calibration_check.check(found, "robot.yaml", tmp_path)
     session(tmp_path, "4.json", found, **good | {"spread": 0.023})
     with pytest.raises(ConfigError, match=r"calibration.tracker.position .*spread by 23.0 mm"):
-        contradictions.check(found, "robot.yaml", tmp_path)
+        calibration_check.check(found, "robot.yaml", tmp_path)
     session(tmp_path, "5.json", found, count=3, lag=None, lag_deviation=None, spread=None)
-    contradictions.check(found, "robot.yaml", tmp_path)
+    calibration_check.check(found, "robot.yaml", tmp_path)
 
 
 def summary():
@@ -67,8 +67,8 @@ def test_a_session_keeps_its_summary_whatever_its_contacts_tell(tmp_path, monkey
 
     log_file, path, console = tmp_path / "1.mcap", tmp_path / "1.json", Console(record=True)
     log_file.touch()
-    monkeypatch.setattr(contradictions.log, "read", lambda _: None)
-    monkeypatch.setattr(contradictions.contacts, "measure", measure)
+    monkeypatch.setattr(calibration_check.log, "read", lambda _: None)
+    monkeypatch.setattr(calibration_check.contacts, "measure", measure)
     play._finish(summary(), config(), log_file, path, console)
     written = json.loads(path.read_text())
     assert written["calibration"]["clock"]["lag"] == 0.034
@@ -76,7 +76,7 @@ def test_a_session_keeps_its_summary_whatever_its_contacts_tell(tmp_path, monkey
         assert "contacts" not in written and "not measured: " + type(seen).__name__ in console.export_text()
     else:
         assert written["contacts"] == {"count": 3, "lag": None, "lag_deviation": None, "spread": None}
-    contradictions.check(config(), "robot.yaml", tmp_path)
+    calibration_check.check(config(), "robot.yaml", tmp_path)
 
 
 def test_fine_tuning_refuses_what_a_session_contradicts(tmp_path, monkeypatch):
@@ -90,4 +90,4 @@ def test_fine_tuning_refuses_what_a_session_contradicts(tmp_path, monkeypatch):
         monkeypatch.setattr(
             tuning.loop, "experiment_of", lambda *_: SimpleNamespace(task=SimpleNamespace(robot=paper()))
         )
-        tuning.finetune("nowhere", FineTuning(), run, "robot.yaml", None, None, "numpy", 0, Console())
+        tuning.finetune("nowhere", FineTuning(), run, "robot.yaml", Console(), ROBOT)

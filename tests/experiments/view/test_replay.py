@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from experiments.view.film import RATE, next_landing, upsampled
+from experiments.view.replay import RATE, next_landing, upsample
 
 PERIOD, G = 1 / 75, 9.81
 
@@ -23,7 +23,7 @@ def falling(time: np.ndarray, bounce: float) -> tuple[np.ndarray, np.ndarray]:
 def test_between_ticks_a_ball_flies_its_parabola_and_turns_where_it_bounces():
     ticks, frames = np.arange(40) * PERIOD, np.arange(4 * 39 + 1) / RATE
     bounce = 18.3 * PERIOD
-    path = upsampled(*falling(ticks, bounce), PERIOD, 4)
+    path = upsample(*falling(ticks, bounce), PERIOD, 4)
     true, _ = falling(frames, bounce)
     free = np.abs(frames - bounce) > PERIOD
     np.testing.assert_allclose(path[free], true[free], atol=1e-9)

@@ -14,18 +14,22 @@ import yaml
 from rich.console import Console
 
 from experiments.commands import diagnose
+from experiments.commands.options import RIG, RobotOptions
 from experiments.config import build
 from experiments.config import robot as robots
+from experiments.deploy import play
 from experiments.deploy import rig as deploy_rig
-from experiments.deploy import session as play
+from experiments.deploy.control_session import ControlSession
 from experiments.errors import ConfigError
 from experiments.finetuning.robot import LockStepRobot
 from experiments.sharing import recordings
-from experiments.view import measured, show
+from experiments.view import measured
+from experiments.view.viewer import robot_of
 from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
 from robot_io import log
 from robot_io.contract import CONTROL_RATE, PAPER, n_parameters
+from robot_io.control import process
 from robot_io.control.config import AxisConfig, RobotConfig
 from robot_io.emulator.config import RigParams, for_robot
 from robot_io.errors import RefusedError
@@ -58,7 +62,7 @@ def played(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("rig")
     policy = exported(folder / "artefact", request.param)
     console = Console(record=True, width=200)
-    status = play.run(policy, deploy_rig.RIG, BALLS, None, "numpy", folder / "log", None, 0, None, console)
+    status = play.run(policy, RIG, folder / "log", console, RobotOptions(backend="numpy"), BALLS)
     assert status == 0, console.export_text()
     (path,) = (folder / "log").glob("*.mcap")
     summary = json.loads((folder / "log" / f"{path.stem}.json").read_text())
@@ -94,10 +98,10 @@ def test_the_viewers_layout_and_frames_are_the_robots(played):
     layout = json.loads(open(summary["layout"]).read())
     labels = [line["label"] for line in layout["configById"]["Plot!commands"]["paths"]]
     assert labels == [f"{name} sent" for name in robot.contract.joints]
-    films = measured.session(path, SimModel())
-    assert show.robot_of(films) == robot and films.count == BALLS
-    (film,) = films.films(0)
-    assert film.qpos.shape[1] == robot.contract.n_joints and np.isfinite(film.qpos).all()
+    replays = measured.load_session(path, SimModel())
+    assert robot_of(replays) == robot and replays.count == BALLS
+    (replay,) = replays.replays(0)
+    assert replay.qpos.shape[1] == robot.contract.n_joints and np.isfinite(replay.qpos).all()
 
 
 @pytest.mark.realtime
@@ -163,7 +167,7 @@ def test_a_session_of_a_robot_without_its_mjcf_is_not_shown(tmp_path):
     own = SimpleNamespace(name="mine", contract=contract)
     path = made_up(tmp_path, own)
     with pytest.raises(ConfigError, match="a session of mine, whose MJCF is not in the log"):
-        measured.session(path, SimModel())
+        measured.load_session(path, SimModel())
 
 
 def test_the_robot_of_a_policy_must_be_that_of_its_contract(tmp_path):
@@ -204,11 +208,11 @@ def test_an_arm_that_egm_does_not_carry_is_refused():
 
 def test_the_control_process_says_which_robot_it_was_given(tmp_path):
     policy = exported(tmp_path / "artefact", UR10E)
-    options = play.process.ControlOptions(str(policy), contract=simulated.load_shipped(UR10E).contract)
+    options = process.ControlOptions(str(policy), contract=simulated.load_shipped(UR10E).contract)
     with pytest.raises(RefusedError, match="axes: expected 1 entries for ur10e_rail, .*rail, got 2"):
-        play.Session(RobotConfig(), options, Console())
+        ControlSession(RobotConfig(), options, Console())
     with pytest.raises(RefusedError, match="a policy for ur10e_rail, and robot.yaml is of irb120_gantry: contract"):
-        play.Session(RobotConfig(), play.process.ControlOptions(str(policy)), Console())
+        ControlSession(RobotConfig(), process.ControlOptions(str(policy)), Console())
 
 
 def loosened(folder):
@@ -230,9 +234,9 @@ def test_a_policy_does_not_bring_the_limits_that_guard_against_it(tmp_path, how)
     console = Console(record=True, width=200)
     with pytest.raises((artefacts.ArtefactError, ConfigError, RefusedError)) as error:
         if how == "run":
-            play.run(policy, str(path), 1, None, "numpy", tmp_path / "log", None, 0, None, console)
+            play.run(policy, str(path), tmp_path / "log", console, RobotOptions(backend="numpy"), 1)
         else:
-            play.Session(robots.load_robot(path), play.process.ControlOptions(str(policy)), console)
+            ControlSession(robots.load_robot(path), process.ControlOptions(str(policy)), console)
     said = str(error.value)
     assert "contract.limits.velocity[2]: found 21.8" in said and "contract.robot: found 'mine', not expected" in said
     assert "contract.geometry" in said and not (tmp_path / "log").exists()

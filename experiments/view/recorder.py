@@ -1,4 +1,4 @@
-"""Films of simulated balls: whole episodes in one compiled call, with parameters that are traced.
+"""Replays of simulated balls: whole episodes in one compiled call, with parameters that are traced.
 
 Moving a slider changes numbers and never the program. What is random in an episode belongs to the number of its ball,
 so the same ball meets the same latencies and noise under other parameters and another policy.
@@ -18,7 +18,7 @@ from jax import Array
 from ballmodel import flight
 from ballmodel.partial_params import without_nominal
 from ballmodel.state import BallState, where
-from experiments.view.film import RATE, Film, Series, next_landing, upsampled
+from experiments.view.replay import RATE, Replay, Series, upsample
 from mjx_tt import platform
 from mjx_tt.env.episode import HIT, MISSED, RETURNED, Episodes
 from mjx_tt.env.policy import NetworkController, Policy, PolicyController
@@ -30,19 +30,19 @@ from mjx_tt.sim import model as models
 from mjx_tt.sim.model import LATENCIES, ModelFile, SimModel
 from robot_io.contract import JOINT_NAMES
 
-# Few episodes are computed: a program that is compiled in a third of the time is worth more than a fast one.
-QUICKLY = {
+# Few episodes are computed: a program that compiles in a third of the time is worth more than a fast one.
+FAST_COMPILE = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
 } | ({"xla_cpu_use_fusion_emitters": False} if platform.older_fusion() else {})
 LANES = 32  # episodes of one call, whatever the number of policies
-FLOOR = -0.72  # [m] of the ball's centre, where a film ends
+FLOOR = -0.72  # [m] of the ball's centre, where a replay ends
 OUTCOMES = {MISSED: "missed", HIT: "hit, not returned", RETURNED: "returned"}
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """A slider: path in SimModel, label, range in the label's unit, and that unit in SI."""
+class Slider:
+    """A slider of a parameter: path in SimModel, label, range in the label's unit, and that unit in SI."""
 
     path: str
     label: str
@@ -53,38 +53,33 @@ class Parameter:
 
 
 MILLI = 1e-3
-_COMMON: dict[str, tuple[Parameter, ...]] = {
+DRIVES = "Gains of the drives"
+COMMON_SLIDERS = {
     "Latencies": (
-        Parameter("latency.ball_observation", "ball [ms]", 0.0, 100.0, 1.0, MILLI),
-        Parameter("latency.abb_observation", "arm's joints [ms]", 0.0, 100.0, 1.0, MILLI),
-        Parameter("latency.festo_observation", "axes [ms]", 0.0, 100.0, 1.0, MILLI),
-        Parameter("latency.abb_action", "arm's action [ms]", 0.0, 130.0, 1.0, MILLI),
-        Parameter("latency.festo_action", "axes' action [ms]", 0.0, 130.0, 1.0, MILLI),
+        Slider("latency.ball_observation", "ball [ms]", 0.0, 100.0, 1.0, MILLI),
+        Slider("latency.abb_observation", "arm's joints [ms]", 0.0, 100.0, 1.0, MILLI),
+        Slider("latency.festo_observation", "axes [ms]", 0.0, 100.0, 1.0, MILLI),
+        Slider("latency.abb_action", "arm's action [ms]", 0.0, 130.0, 1.0, MILLI),
+        Slider("latency.festo_action", "axes' action [ms]", 0.0, 130.0, 1.0, MILLI),
     ),
     "Ball": (
-        Parameter("ball.table.restitution", "table's restitution", 0.5, 1.0, 0.01),
-        Parameter("ball.table.friction", "table's friction", 0.0, 0.6, 0.01),
-        Parameter("ball.paddle.restitution", "rubber's restitution", 0.3, 1.2, 0.01),
-        Parameter("ball.flight.magnus_coefficient", "lift of spin", 0.0, 2.5, 0.05),
-        Parameter("ball.flight.drag_coefficient", "drag", 0.0, 1.0, 0.01),
+        Slider("ball.table.restitution", "table's restitution", 0.5, 1.0, 0.01),
+        Slider("ball.table.friction", "table's friction", 0.0, 0.6, 0.01),
+        Slider("ball.paddle.restitution", "rubber's restitution", 0.3, 1.2, 0.01),
+        Slider("ball.flight.magnus_coefficient", "lift of spin", 0.0, 2.5, 0.05),
+        Slider("ball.flight.drag_coefficient", "drag", 0.0, 1.0, 0.01),
     ),
     "Noise": (
-        Parameter("sensing.ball_noise", "tracker [mm]", 0.0, 150.0, 1.0, MILLI),
-        Parameter("latency.ball_observation_std", "ball's latency [ms]", 0.0, 30.0, 0.5, MILLI),
+        Slider("sensing.ball_noise", "tracker [mm]", 0.0, 150.0, 1.0, MILLI),
+        Slider("latency.ball_observation_std", "ball's latency [ms]", 0.0, 30.0, 0.5, MILLI),
     ),
 }
-DRIVES = "Gains of the drives"
 
 
-def groups(joints: tuple[str, ...] = JOINT_NAMES) -> dict[str, tuple[Parameter, ...]]:
+def slider_groups(joints: tuple[str, ...] = JOINT_NAMES) -> dict[str, tuple[Slider, ...]]:
     """The sliders of a robot with these joints, in the order of the page."""
-    gains = (Parameter(f"drives.{joint}.velocity_gain", joint, 0.5, 1.5, 0.01) for joint in joints)
-    return _COMMON | {DRIVES: tuple(gains)}
-
-
-def sliders(joints: tuple[str, ...] = JOINT_NAMES) -> list[Parameter]:
-    """Every slider, in the order of the page."""
-    return [parameter for group in groups(joints).values() for parameter in group]
+    gains = tuple(Slider(f"drives.{joint}.velocity_gain", joint, 0.5, 1.5, 0.01) for joint in joints)
+    return COMMON_SLIDERS | {DRIVES: gains}
 
 
 @jax.tree_util.register_dataclass
@@ -101,7 +96,7 @@ class Draws:
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class Watched:
+class RecordingController:
     """The policy, remembering its last input and output."""
 
     policy: PolicyController | NetworkController
@@ -120,13 +115,13 @@ class Watched:
         return action, (inner, observation, action)
 
 
-class Studio:
+class Recorder:
     """Plays balls in one world; compiles once."""
 
     def __init__(self, task: TaskConfig, world: ModelFile) -> None:
         self.simulator, self.world = Simulator(task), world
         self.episodes = jax.jit(self._episodes)
-        self._record = jax.jit(self._play, compiler_options=QUICKLY if jax.default_backend() == "cpu" else None)
+        self._record = jax.jit(self._play, compiler_options=FAST_COMPILE if jax.default_backend() == "cpu" else None)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -137,7 +132,8 @@ class Studio:
         """Values of the sliders in this world; NaN for a parameter that is drawn for every episode."""
         known = models.paths(self.world.model)
         drawn = {path for one in self.world.randomise for path in one.paths}
-        return {p.path: float("nan") if p.path in drawn else float(known[p.path]) for p in sliders(self.joints)}
+        paths = [slider.path for group in slider_groups(self.joints).values() for slider in group]
+        return {path: float("nan") if path in drawn else float(known[path]) for path in paths}
 
     def draws(self, state: np.ndarray, numbers: Sequence[int], seed: int) -> Draws:
         """Balls with position, velocity and spin ``state`` (9, n), each with its number's chance."""
@@ -189,7 +185,7 @@ class Studio:
     def _play(self, policy: Policy, episodes: Episodes) -> dict[str, Array]:
         """The episodes tick by tick (max_steps, ..., L), then balls that are over flying on alone, and the result."""
         task, config = self.simulator.task, self.simulator.config
-        controller = Watched(controller_of(policy), len(self.joints))
+        controller = RecordingController(controller_of(policy))
         constants, start = task.prepare(episodes), task.reset(episodes, controller)
         alone = replace(episodes.model.ball, flight=replace(episodes.model.ball.flight, integrator="midpoint"))
 
@@ -213,13 +209,13 @@ class Studio:
         terms = evaluate_rewards(config.rewards, state, back)
         returned = state.hit & back.returned & state.finite
         outcome = jnp.where(returned, RETURNED, jnp.where(state.hit & state.finite, HIT, MISSED))
-        return {**shown, "terms": terms, "outcome": outcome, "hit": state.hit, "landing": jnp.asarray(back.landing)}
+        return {**shown, "terms": terms, "outcome": outcome, "hit": state.hit}
 
-    def films(self, recorded: dict[str, np.ndarray], titles: Sequence[str]) -> list[Film]:
-        """A film of every episode."""
-        return [self._film({k: v[..., i] for k, v in recorded.items()}, title) for i, title in enumerate(titles)]
+    def replays(self, recorded: dict[str, np.ndarray], titles: Sequence[str]) -> list[Replay]:
+        """A replay of every episode."""
+        return [self._replay({k: v[..., i] for k, v in recorded.items()}, title) for i, title in enumerate(titles)]
 
-    def _film(self, r: dict[str, np.ndarray], title: str) -> Film:
+    def _replay(self, r: dict[str, np.ndarray], title: str) -> Replay:
         period = self.simulator.config.period
         factor = round(RATE * period)
         over = int(np.argmin(r["live"])) if not r["live"].all() else len(r["live"]) - 1
@@ -227,7 +223,7 @@ class Studio:
         last = min(over + int(grounded[0]) + 1 if grounded.size else len(r["ball"]), len(r["ball"])) - 1
         ticks = np.arange(last + 1) * period
         time = np.arange(factor * last + 1) / RATE
-        ball = upsampled(r["ball"][: last + 1], r["velocity"][: last + 1], period, factor)
+        ball = upsample(r["ball"][: last + 1], r["velocity"][: last + 1], period, factor)
         qpos = np.stack([np.interp(time, ticks, q) for q in r["qpos"][: last + 1].T], axis=1)
         played = slice(0, over + 1)
         speeds = np.linalg.norm(r["velocity"], axis=1)
@@ -236,7 +232,7 @@ class Studio:
             text += f" in, {speeds[over]:.1f} m/s out"
         weights = self.simulator.config.reward_weights
         seen, joints = r["observation"][played], self.joints
-        return Film(
+        return Replay(
             time=time,
             qpos=qpos,
             balls={"ball": ball},
@@ -244,7 +240,6 @@ class Studio:
             outcome=text,
             decided=over * period,
             contact=over * period if r["hit"] else float("nan"),
-            landing=next_landing(ball),
             series={
                 "Input: ball as seen [m]": Series(("x", "y", "z"), ticks[played], seen[:, :3]),
                 "Input: joints as seen [m, rad]": Series(joints, ticks[played], seen[:, 3 : 3 + len(joints)]),

@@ -24,17 +24,13 @@ from viser.transforms import SO3
 from ballmodel import registry
 from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from experiments import cli
-from experiments.commands.render import SHIPPED
 from experiments.runs import load_policy
-from experiments.view import show
-from experiments.view.guard import Server
-from experiments.view.programme import Play
-from experiments.view.studio import Studio
-from mjx_tt.env.task import TaskConfig
-from mjx_tt.robot.mjcf import home_qpos, load_model
-from mjx_tt.sim.model import ModelFile, SimModel
-from robot_io import log
+from experiments.view import viewer as viewers
+from experiments.view.auth import Server
+from experiments.view.playlist import PolicyPlaylist
+from experiments.view.scene import offset
 from tests.support.paths import ROOT
+from tests.support.tiny_experiment import write_tiny
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (
@@ -91,12 +87,12 @@ def open_page(browser):
 
 @pytest.fixture
 def shown():
-    """Serves a programme and returns its viewer and address; stopped after the test."""
+    """Serves a playlist and returns its viewer and address; stopped after the test."""
     running = []
 
-    def serve(programme):
+    def serve(playlist):
         server = Server("127.0.0.1", 0)
-        viewer = show.viewer(server, programme)
+        viewer = viewers.Viewer(server, playlist)
         running.append((server, viewer, threading.Thread(target=viewer.run, daemon=True)))
         running[-1][2].start()
         return viewer, f"http://127.0.0.1:{server.get_port()}/"
@@ -106,17 +102,6 @@ def shown():
         viewer.stop()
         thread.join()
         server.stop()
-
-
-@pytest.fixture(scope="module")
-def studio():
-    return Studio(TaskConfig(sim_rate=150.0), ModelFile(SimModel()))
-
-
-@pytest.fixture
-def play(studio):
-    policy = load_policy.load(SHIPPED).policy
-    return Play(studio, ["quickstart"], [policy], registry.load("player3/M0"))
 
 
 def picture(page) -> np.ndarray:
@@ -169,18 +154,18 @@ def test_a_slider_moved_in_the_page_changes_what_the_simulation_does(shown, open
     thumb(page, "table's restitution").press("Home")
     until(lambda: play.values[RESTITUTION] == pytest.approx(0.5), "the slider's low end in the simulation")
     assert float(box.input_value()) == pytest.approx(0.5)
-    until(lambda: viewer.shown[0].balls["ball"] is not before, "a new film")
+    until(lambda: viewer.shown[0].balls["ball"] is not before, "a new replay")
     after = viewer.shown[0].balls["ball"]
     bounce = int(np.argmin(before[: len(before) // 2, 2]))
     np.testing.assert_allclose(after[: bounce - 8], before[: bounce - 8], atol=1e-5)  # the same flight until then
     rise = [np.diff(path[:, 2])[bounce + 5 : bounce + 20].mean() for path in (before, after)]
     assert rise[1] < 0.75 * rise[0]
     page.get_by_role("button", name="As the model has it").click()
-    until(lambda: play.values == play.studio.nominal(), "all values as before")
-    until(lambda: np.array_equal(viewer.shown[0].balls["ball"], before), "the film as before")
+    until(lambda: play.values == play.recorder.nominal(), "all values as before")
+    until(lambda: np.array_equal(viewer.shown[0].balls["ball"], before), "the replay as before")
 
 
-def test_steps_balls_and_misses_are_chosen_in_the_page(shown, open_page, play):
+def test_balls_are_chosen_in_the_page(shown, open_page, play):
     viewer, address = shown(play)
     page = open_page(address)
     page.get_by_role("button", name="Pause").click()
@@ -188,25 +173,15 @@ def test_steps_balls_and_misses_are_chosen_in_the_page(shown, open_page, play):
     shown_before = viewer.number
     page.get_by_role("button", name="ball ▶").click()
     until(lambda: viewer.number == shown_before + 1 and viewer.t == 0.0, "the next ball's start")
-    step = [page.get_by_role("button", name=name, exact=True) for name in ("▶", "◀")]
-    step[0].click()
+    page.get_by_role("button", name="▶", exact=True).click()
     until(lambda: viewer.t == pytest.approx(1 / 75, abs=1e-6), "one control tick later")
-    viewer.later("rest", lambda: setattr(viewer, "t", viewer.seconds + 0.3))  # it rests on the last frame
-    until(lambda: viewer.t > viewer.seconds, "the rest after the ball")
-    step[0].click()
-    until(lambda: viewer.t == pytest.approx(viewer.seconds, abs=1e-6), "the end")
-    step[1].click()
-    until(lambda: viewer.t == pytest.approx(viewer.seconds - 1 / 75, abs=1e-6), "one control tick before the end")
     play.values["latency.ball_observation"] = 0.09
     page.get_by_role("button", name="Give me the balls that it misses").click()
-    until(lambda: play.missed, "balls that are missed")
     until(lambda: "Missed ball 1" in page.content(), "the caption")
-    assert not viewer.shown[0].outcome.startswith("returned")
     box = number(page, "velocity y [m/s]")
     box.fill("-4.5")
     box.press("Enter")
     until(lambda: play.balls is None and play.ball[4] == pytest.approx(-4.5), "one ball, thrown by hand")
-    until(lambda: "One ball, again and again" in page.content(), "its caption")
     page.get_by_label("balls").or_(page.locator("input[value='one ball']")).first.click()
     page.get_by_role("option", name="narrow", exact=True).click()
     until(lambda: play.balls == "narrow" and "Ball 1 of narrow" in page.content(), "another distribution")
@@ -221,14 +196,14 @@ def pixel(client, point: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [WIDE, NARROW], ids=["wide", "narrow"])
-def test_four_tables_fit_into_the_picture_and_the_panel_says_whose_they_are(shown, open_page, studio, size):
-    policy, names = load_policy.load(SHIPPED).policy, ["one", "two", "three", "four"]
-    viewer, address = shown(Play(studio, names, [policy] * 4, registry.load("player3/M0")))
+def test_four_tables_fit_into_the_picture_and_the_panel_says_whose_they_are(shown, open_page, recorder, policy, size):
+    names = ["one", "two", "three", "four"]
+    viewer, address = shown(PolicyPlaylist(recorder, names, [policy] * 4, registry.load("player3/M0")))
     page = open_page(address, size)
     until(lambda: viewer.server.get_clients(), "the page's connection")
     (client,) = viewer.server.get_clients().values()
     x, y = 0.5 * TABLE_WIDTH, 0.5 * TABLE_LENGTH
-    corners = [np.array([at, side * y, 0.0]) for at in (x, viewer.scene.offset(3) - x) for side in (-1, 1)]
+    corners = [np.array([at, side * y, 0.0]) for at in (x, offset(3)[0] - x) for side in (-1, 1)]
 
     def whole() -> bool:
         seen, camera = np.array([pixel(client, corner) for corner in corners]), client.camera
@@ -279,60 +254,20 @@ def test_the_start_of_the_ball_is_dragged(shown, open_page, play):
     until(lambda: start[0] - play.ball[0] > 0.2 * along[0], "its new start")
     assert start[0] - play.ball[0] < 1.4 * along[0] + 0.05
     np.testing.assert_allclose(play.ball[1:], start[1:], atol=1e-3)
-    until(lambda: abs(viewer.shown[0].balls["ball"][0, 0] - play.ball[0]) < 1e-4, "its film")
+    until(lambda: abs(viewer.shown[0].balls["ball"][0, 0] - play.ball[0]) < 1e-4, "its replay")
 
 
-def test_a_session_of_the_robot_is_replayed(shown, open_page, tmp_path):
-    start, home = 50.0, home_qpos(load_model())
-    path = tmp_path / "session.mcap"
-    with log.FileRecorder.start(tmp_path, "session", {}, {}, start, 0) as recorder:
-        recorder.put(log.episode_start(start + 0.2, 1))
-        for k in range(120):
-            now = start + k / 75
-            flown = np.array([0.2, 1.2 - 4.0 * k / 75, 0.3 + 1.0 * k / 75 - 4.905 * (k / 75) ** 2])
-            if flown[2] > 0.02:
-                recorder.put(log.Ball(now, now, flown, 1))
-            joints = home + np.eye(8)[2] * 0.2 * np.sin(2 * np.pi * k / 75)
-            recorder.put(log.Joints(now, joints, np.zeros(8), now))
-            recorder.put(log.Command(k, now, np.zeros(8), np.full(8, 0.1), joints))
-        recorder.put(log.Event(start + 0.7, log.Level.ERROR, "fault", "tracker: silent"))
-        recorder.put(log.episode_end(start + 1.2, 1, "missed", {"hit": 0.0}))
-    programme = show.recorded(path, None)
-    film = programme.films(0)[0]
-    np.testing.assert_allclose(film.qpos[:, 2], home[2] + 0.2 * np.sin(2 * np.pi * film.time), atol=1e-3)
-    measured, simulated = film.balls["measured"], film.balls["simulated"]
-    flying = np.isfinite(measured[:, 0]) & np.isfinite(simulated[:, 0])
-    np.testing.assert_allclose(measured[flying, 1], 1.2 - 4.0 * film.time[flying], atol=1e-3)
-    assert np.abs(measured - simulated)[flying].max() < 0.1  # the logged ball knows no air
-    viewer, address = shown(programme)
-    page = open_page(address)
-    moving(page)
-    assert page.get_by_text("session.mcap, episode 1 of 1").count() == 1
-    until(lambda: "FAULT: tracker: silent" in page.content(), "the fault")
-    assert page.get_by_role("tab", name="Physics").count() == 0
-
-
-TRAINING = """
-name: tiny
-balls: player5/M0
-task: {max_steps: 60, sim_rate: 75.0}
-optimiser: {num_directions: 2, repeats: 2}
-training: {updates: 100000, pool: 64, evaluate_every: 100000, evaluate_episodes: 8, devices: 1, checkpoint_seconds: 1}
-evaluation: {episodes: 8, reachable_balls: null}
-"""
-
-
-def test_a_training_is_followed_while_it_goes_on(shown, open_page, tmp_path, studio):
-    (tmp_path / "tiny.yaml").write_text(TRAINING)
-    command = [sys.executable, "-m", "experiments.cli", "train", str(tmp_path / "tiny.yaml"), "--out", str(tmp_path)]
+def test_a_training_is_followed_while_it_goes_on(shown, open_page, tmp_path, recorder):
+    yaml = write_tiny(tmp_path, updates=100_000, evaluate_every=100_000, checkpoint_seconds=1)
+    command = [sys.executable, "-m", "experiments.cli", "train", str(yaml), "--out", str(tmp_path)]
     training = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         folder = tmp_path / "tiny"
         until(lambda: any((folder / "checkpoints").glob("*.npz")), "a checkpoint")
         trained = load_policy.load(folder)
-        play = Play(studio, [show.title(trained)], [trained.policy], registry.load("player5/M0"))
+        play = PolicyPlaylist(recorder, [viewers.title_of(trained)], [trained.policy], registry.load("player5/M0"))
         viewer, address = shown(play)
-        show.Followed(folder, viewer, play)
+        viewers.follow_training(folder, viewer)
         page = open_page(address)
         moving(page)
         first = viewer.shown[0]

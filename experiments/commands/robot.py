@@ -1,0 +1,56 @@
+"""``mjx-tt robot``: bring a robot into service; ``new``, ``place`` and ``list`` are in ``experiments.robots``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from experiments.commands import options
+from experiments.commands.options import option
+from experiments.errors import ConfigError
+from experiments.runs.locate import artefact_of
+
+app = options.command(
+    "robot",
+    "define a robot (new, place, list), or bring one into service (check, jog)",
+    """\
+  mjx-tt robot new my_arm/my_arm.xml                                a first YAML for an MJCF, checked
+  mjx-tt robot check --robot robot.yaml                             tracker and arm are heard, nothing is sent
+  mjx-tt robot check --robot robot.yaml --artefact runs/quickstart  and a policy plays the balls, simulated
+  mjx-tt robot jog --robot robot.yaml                               armed, slow, in small steps
+  mjx-tt robot jog my_arm --robot robot.yaml                        a robot of your own; or one that comes with it
+
+m notes where ball and joints are, for mjx-tt calibrate.
+""",
+)
+
+
+@app.default
+def commission(
+    action: Annotated[Literal["check", "jog"], Parameter("ACTION")],
+    name: Annotated[
+        str | None,
+        Parameter("ROBOT", help="the installed robot, by folder or name (default: the policy's, or the paper's)"),
+    ] = None,
+    /,
+    *,
+    robot: Annotated[str, option("YAML", "a robot.yaml")],
+    artefact: Annotated[str | None, option("FOLDER", "check: a policy, or its run")] = None,
+    points: Annotated[str, option("CSV", "file that points are added to")] = "points.csv",
+    log: Annotated[str, option("FOLDER", "folder of the MCAP log")] = "runs/robot",
+    seconds: Annotated[float | None, option("S", "end after S seconds")] = None,
+) -> int:
+    """Returns the exit status."""
+    options.check_exists(robot, key="--robot")
+    options.check_writable(log)
+    if action == "jog" and artefact is not None:
+        raise ConfigError(f"--artefact {artefact}: jog plays no balls; allowed with check only")
+    policy = None if artefact is None else Path(artefact_of(artefact))
+    options.start_jax(1)
+    from experiments.deploy import commissioning
+    from experiments.progress import make_console
+
+    job = commissioning.Commissioning(Path(robot), Path(log), Path(points), seconds, name)
+    return job.check(make_console(), policy) if action == "check" else job.jog(make_console())

@@ -1,0 +1,199 @@
+"""``mjx-tt run``: an exported policy plays on a robot, real or emulated, through the same bridge."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from experiments.commands.options import RIG, RobotOptions
+from experiments.config import robot as robots
+from experiments.deploy import calibration_check, session_report
+from experiments.deploy.control_session import RECOVERIES, ControlSession, load_installed, open_session
+from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, RECOVER, Keyboard, View
+from experiments.deploy.recovery import Recovery
+from experiments.deploy.session_report import PlayedSession
+from experiments.interrupts import stop_requested
+from experiments.runs import run_dir
+from robot_io.contract import PAPER
+from robot_io.control.config import RobotConfig
+from robot_io.control.messages import Message, Pause, Played, RallyOver, Refused, Status
+from robot_io.emulator.processes import Rig
+from robot_io.errors import RefusedError
+from robot_io.log import view as log_view
+from robot_io.policy import artefact as artefacts
+
+QUIET = 30.0  # [s] without a ball on the rig, after which something is wrong
+INTERRUPTED = 130  # exit status after Ctrl-C, as a shell gives it
+
+
+def run(
+    artefact: Path,
+    robot: str,
+    log_folder: Path,
+    console: Console,
+    setup: RobotOptions,
+    balls: int | None = None,
+    rallies: int | None = None,
+    seconds: float | None = None,
+) -> int:
+    """Plays a policy; returns the exit status.
+
+    Ends when ``balls`` outcomes are known, ``rallies`` that count are over, ``seconds`` have passed, or the operator
+    quits. 0: all went well, 1: it ended early, 130: ended by Ctrl-C; the summary is written in any case.
+    """
+    policy = artefacts.load(artefact)
+    installed = None if robot == RIG else load_installed(robot, artefact, policy.contract, log_folder)
+    played = PlayedSession()
+    with open_session(policy, robot, installed, log_folder, console, setup) as (session, rig):
+        if rig is not None:
+            session.prepare(rig)
+            session.arm()
+            rig.throw(True)
+        else:
+            console.print("press p to prepare the axes, a to arm; space stops")
+        try:
+            with (
+                stop_requested() as stop,
+                Keyboard() as keyboard,
+                View(console, f"{artefact} on {session.robot.name}") as view,
+            ):
+                problem = _Play(session, rig, keyboard, view, played, balls, rallies, seconds, stop).run()
+            if stop.is_set():
+                raise KeyboardInterrupt
+            status = 1 if problem else 0
+        except KeyboardInterrupt:
+            status, problem = INTERRUPTED, "stopped by Ctrl-C"
+        session.close()
+    summary = session_report.summary(policy, session.robot, played, session.status, session.timings, session.log_file)
+    summary |= {"faults": [asdict(fault) for fault in played.faults], "player": setup.player}
+    path = log_folder / f"{session.options.log_name}.json"
+    if policy.contract != PAPER:  # the shipped layout of the viewers is for the paper's robot's log
+        summary["layout"] = str(path.with_suffix(".layout.json"))
+        run_dir.write_json(path.with_suffix(".layout.json"), log_view.layout(policy.contract))
+    _finish(summary, session.robot, session.log_file, path, console)
+    if problem:
+        console.print(problem, style="red")
+    return status
+
+
+def _finish(summary: dict[str, Any], config: RobotConfig, log_file: Path | None, path: Path, console: Console) -> None:
+    """Writes and shows a session's summary, then adds the contacts in its log, without which it is whole as well."""
+    summary["calibration"] = robots.plain(config.calibration)
+    run_dir.write_json(path, summary)
+    try:
+        contacts = calibration_check.measure(config, log_file)
+        if contacts is not None:
+            run_dir.write_json(path, summary | {"contacts": contacts})
+    except (Exception, KeyboardInterrupt) as error:  # whatever it is, what was played is not to be lost
+        reason = f"{type(error).__name__}: {error}".removesuffix(": ")
+        console.print(f"contacts of ball and paddle not measured: {reason}", style="yellow")
+    session_report.show(console, summary, path)
+
+
+@dataclass
+class _Play:
+    """The loop between the first ball and the last."""
+
+    session: ControlSession
+    rig: Rig | None
+    keyboard: Keyboard
+    view: View
+    played: PlayedSession
+    balls: int | None
+    rallies: int | None
+    seconds: float | None
+    stop: threading.Event
+    recovery: Recovery | None = None
+    faults_in_a_row: int = 0
+    heard: float = 0.0  # when the last ball was played
+
+    def run(self) -> str | None:
+        """Plays until the end or until ``stop`` is set; returns the reason why it ended early."""
+        self.heard = time.monotonic()
+        end = self.heard + (math.inf if self.seconds is None else self.seconds)
+        while time.monotonic() < end and not self.stop.is_set():
+            enough = len(self.played.episodes) >= (self.balls or math.inf)
+            if enough or len(self.played.counted) >= (self.rallies or math.inf):
+                break
+            for message in self.session.messages(0.1):
+                self._take(message)
+            if self._press(self.keyboard.pressed()):
+                break
+            if self.rig is not None and (problem := self._watch_rig(self.rig)):
+                return problem
+        return None
+
+    def _take(self, message: Message) -> None:
+        self.view.take(message)
+        console = self.session.console
+        if isinstance(message, Refused) and self.recovery is not None and self.recovery.refused(message):
+            self.recovery = None
+        elif isinstance(message, Status) and self.recovery is not None:
+            self._continue(self.recovery, message)
+        elif isinstance(message, Played):
+            self.heard = time.monotonic()
+            self.played.episodes.append(message.summary)
+            self.faults_in_a_row = self.faults_in_a_row if message.summary.fault else 0
+            if not console.is_terminal:
+                console.print(f"ball {len(self.played.episodes)}: {message.summary.outcome}")
+        elif isinstance(message, RallyOver):
+            rally = message.summary
+            self.played.rallies.append(rally)
+            if not console.is_terminal and self.balls is None:  # who counts balls may have a launcher
+                touches = f"{rally.length} touch{'es' * (rally.length != 1)}"
+                console.print(f"rally {rally.number}: {touches}: {rally.text}")
+
+    def _continue(self, recovery: Recovery, status: Status) -> None:
+        """One step of a recovery."""
+        try:
+            request = recovery.step(status, time.monotonic())
+        except TimeoutError as error:
+            self.view.say(str(error))
+            self.recovery = None
+            return
+        if request is not None:
+            self.session.send(request)
+        if recovery.message:
+            self.view.say(recovery.message)
+        if recovery.done:
+            self.recovery = None
+
+    def _press(self, key: str | None) -> bool:
+        """Does what a key asks for; True for the one that ends."""
+        session = self.session
+        if key is not None:  # whatever it is, the operator wants something else
+            emulated = self.rig is not None
+            self.recovery = Recovery(time.monotonic(), session.status, emulated) if key == RECOVER else None
+        if key == QUIT:
+            return True
+        if key == PAUSE:
+            session.send(Pause(not (session.status and session.status.paused)))
+        elif key in KEYS and (request := KEYS[key].request) is not None:
+            session.send(request)
+        if key in KEYS:
+            self.view.say(KEYS[key].text)
+        return False
+
+    def _watch_rig(self, rig: Rig) -> str | None:
+        """Brings the rig back after a fault; returns the reason where that fails, or where no ball comes."""
+        rig.check()
+        if self.session.status and (fault := self.session.status.halt):
+            self.faults_in_a_row += 1
+            text = f"{fault.cause}: {fault.text}"
+            if self.faults_in_a_row > RECOVERIES:
+                return f"stopped by {self.faults_in_a_row} faults in a row, the last: {text}"
+            self.played.faults.append(fault)
+            self.session.console.print(f"fault, reset and resumed: {text}", style="red")
+            try:
+                self.session.recover(rig)
+            except RefusedError as error:
+                return f"not brought back after {text}: {error}"
+        if time.monotonic() - self.heard > QUIET:
+            return f"no ball was played for {QUIET:g} s"
+        return None

@@ -1,0 +1,36 @@
+"""Lines about stages, and progress where there is no terminal."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+
+from experiments.progress import ProgressBar, print_stages
+
+
+def test_a_stage_says_what_and_how_long():
+    text = io.StringIO()
+    stage = print_stages(Console(file=text), "run")
+    with stage("compiling"):
+        assert text.getvalue() == "run: compiling ..."
+    with pytest.raises(ZeroDivisionError), stage("failing"):
+        raise ZeroDivisionError
+    assert re.fullmatch(r"run: compiling \.\.\. \d+\.\d s\nrun: failing \.\.\.\n", text.getvalue())
+
+
+def test_without_a_terminal_progress_is_a_line_now_and_then_and_at_the_end():
+    text = io.StringIO()
+    with ProgressBar(Console(file=text), "run", 1200, unit=" balls") as bar:
+        bar.show(1, "first")
+        bar.show(2, "too soon")
+        bar.show(3, "asked for", plain=True)
+        bar.show(1200, "last")
+        bar.show(1200, "not asked for", plain=False)
+    assert text.getvalue().splitlines() == [
+        "run: 1/1,200 balls  first",
+        "run: 3/1,200 balls  asked for",
+        "run: 1,200/1,200 balls  last",
+    ]
