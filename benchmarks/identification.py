@@ -36,8 +36,7 @@ from experiments.stats import wilson
 from experiments.study import identification
 from experiments.study.analysis.identified import LOGS, estimates, holds
 from experiments.study.target_domain import hidden_effects, hit_log, joint_log
-from experiments.study.target_domain.finetuning import VirtualReality
-from experiments.study.target_domain.world import with_spin
+from experiments.study.target_domain.virtual import VirtualReality, with_spin
 from experiments.training.loop import train
 from mjx_tt import platform
 from mjx_tt.env.policy import Policy
@@ -145,7 +144,7 @@ def of_reality(
     policy = load_policy.load(QUICKSTART).policy
     log = hit_log.record(reality.simulator, reality.known, person, policy, keys[2], "hits", CAMERA_NOISE, BELIEVED)
     identification.write_hits(folder / "hits", log.balls, log.joints)
-    prior = identification.prior(studies.PRIOR, "prior")
+    prior = identification.read_prior(studies.PRIOR, "prior")
     worlds = {"nominal": ModelFile(SimModel()), "prior": ModelFile(SimModel(), prior)}
     seconds: dict[str, float] = {}
     logs = [folder / "D0.csv", folder / "joints"]

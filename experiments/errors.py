@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -39,9 +40,16 @@ def explained(error: Exception) -> bool:
     return isinstance(error, (ExperimentError, ArtefactError, OSError, RefusedError, DeviceError, EgmError, LogError))
 
 
-def checked(where: str, function: Callable[..., T], *arguments: Any) -> T:
-    """Result of ``function``; its complaint about its arguments becomes a ConfigError that begins with ``where``."""
+@contextmanager
+def error_context(where: str = "") -> Iterator[None]:
+    """A ValueError, OSError or RuntimeError in the block becomes a ConfigError that begins with ``where``."""
     try:
-        return function(*arguments)
+        yield
     except (ValueError, OSError, RuntimeError) as error:
         raise ConfigError(f"{where}: {error}" if where else str(error)) from None
+
+
+def checked(where: str, function: Callable[..., T], *arguments: Any) -> T:
+    """Result of ``function`` within ``error_context(where)``."""
+    with error_context(where):
+        return function(*arguments)

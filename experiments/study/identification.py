@@ -47,7 +47,7 @@ class Identified:
     settled: bool  # False: the fit of the balls still moved when its rounds were over
 
 
-def prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
+def read_prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
     """Ranges of the prior by dotted path. Raises ValueError naming ``where`` and the path at fault."""
     found = models.from_dict({"randomise": dict(data)}, where).randomise
     for one in found:
@@ -56,10 +56,10 @@ def prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
     return tuple(one for one in found if isinstance(one, Range))
 
 
-def unknown(model: Mapping[str, Any], ranges: Mapping[str, Any]) -> ModelFile:
+def prior_world(model: Mapping[str, Any], ranges: Mapping[str, Any]) -> ModelFile:
     """The world of a model YAML's content with these ranges in place of what it draws. Raises ValueError."""
     plain = {key: value for key, value in model.items() if key != "randomise"}
-    return ModelFile(models.from_dict(plain, "simulation.model").model, prior(ranges, "identification.prior"))
+    return ModelFile(models.from_dict(plain, "simulation.model").model, read_prior(ranges, "identification.prior"))
 
 
 def identify(

@@ -10,18 +10,18 @@ from rich.console import Console
 from experiments.config import build
 from experiments.config.experiment import read_yaml
 from experiments.config.study import Study, parse
-from experiments.errors import RunError, checked
+from experiments.errors import RunError, error_context
 from experiments.jobs.site import ALONE, Workers
 from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
 from experiments.study import identification, training
-from experiments.study.pipeline import REPORT, Loop
-from experiments.study.schedule import Simulated, items
+from experiments.study.paths import JOURNAL, REPORT, SESSIONS, SETTINGS
+from experiments.study.pipeline import Pipeline
+from experiments.study.schedule import Simulated, list_items
 from experiments.study.target_domain import on_robot
 from experiments.study.workers import run_side_by_side
-from experiments.study.workflow import JOURNAL, Journal, Waiting, run_all
+from experiments.study.workflow import Journal, Waiting, run_all
 
-SETTINGS, SESSIONS = "study.yaml", "study.json"
 CHANGEABLE = ("players", "seeds", "simulation.checkpoint_seconds", "simulation.devices")
 
 
@@ -36,10 +36,10 @@ def run(study: Study, folder: Path, console: Console, workers: Workers = ALONE) 
     with Run(folder).locked():
         if not Journal(folder / JOURNAL).entries:  # later on, what is no longer read may be gone
             look_up(study)
-        loop = Loop(study, folder, console)
+        pipeline = Pipeline(study, folder, console)
         _open(study, folder)
         try:
-            steps, journal = loop.steps(), Journal(folder / JOURNAL)
+            steps, journal = pipeline.steps(), Journal(folder / JOURNAL)
             if workers.alone:
                 run_all(steps, journal, console)
             else:
@@ -64,11 +64,12 @@ def look_up(study: Study) -> None:
     """Raises ConfigError for what a study names and is not there, before hours are spent on its first steps."""
     for balls in study.ablation.balls if study.ablation else ():
         build.distribution(balls, "ablation.balls")
-    for item in items(study, study.players[0]):
+    for item in list_items(study, study.players[0]):
         if isinstance(item, Simulated) and item.source is None:
             build.experiment(training.configuration(study, item, "narrow", None, 0), "simulation")
     if study.identification is not None:
-        checked("identification", identification.prior, study.identification.prior, "prior")
+        with error_context("identification"):
+            identification.read_prior(study.identification.prior, "prior")
     if study.robot is not None:
         on_robot.look_up(study, study.robot)
 
@@ -78,19 +79,20 @@ def _open(study: Study, folder: Path) -> None:
 
     Where no step is done yet there is nothing that belongs to another study.
     """
-    path = folder / SETTINGS
+    path, sessions = folder / SETTINGS, folder / SESSIONS
     if path.exists() and Journal(folder / JOURNAL).entries:
-        found = parse(read_yaml(checked(str(path), path.read_text, "utf-8"), str(path)), str(path))
-        changed = run_dir.differences(found.to_dict(), study.to_dict(), CHANGEABLE.__contains__, "study")
+        recorded = parse(_read(path), str(path))
+        changed = run_dir.differences(recorded.to_dict(), study.to_dict(), CHANGEABLE.__contains__, "study")
         if changed:
             raise RunError(f"{folder}: is another study:\n{changed}\nRestore these values or choose another --out")
     run_dir.write_yaml(path, study.to_dict())
-    sessions = folder / SESSIONS
-    before: list[dict[str, Any]] = []
-    if sessions.exists():
-        found = read_yaml(checked(str(sessions), sessions.read_text, "utf-8"), str(sessions))
-        listed = found.get("sessions") if isinstance(found, dict) else None
-        if not isinstance(listed, list):
-            raise RunError(f"{sessions}: holds no list of sessions; restore the file or remove it")
-        before = listed
-    run_dir.write_json(sessions, {"sessions": [*before, run_dir.provenance()]})
+    content = _read(sessions) if sessions.exists() else {"sessions": []}
+    if not isinstance(content, dict) or not isinstance(content.get("sessions"), list):
+        raise RunError(f"{sessions}: holds no list of sessions; restore the file or remove it")
+    run_dir.write_json(sessions, {"sessions": [*content["sessions"], run_dir.provenance()]})
+
+
+def _read(path: Path) -> Any:
+    with error_context(str(path)):
+        text = path.read_text("utf-8")
+    return read_yaml(text, str(path))

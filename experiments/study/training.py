@@ -16,10 +16,9 @@ from experiments.runs import load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
-from experiments.study.schedule import Simulated, updates
+from experiments.study.paths import POLICY
+from experiments.study.schedule import Simulated, count_updates
 from experiments.training.loop import train
-
-POLICY = "policy.npz"
 
 
 def configuration(
@@ -35,7 +34,7 @@ def configuration(
     if recipe.step is not None:
         optimiser = optimiser.model_copy(update={"step": recipe.step})
     training = Training(
-        updates=updates(study, item),
+        updates=count_updates(study, item),
         later_rewards=recipe.later_rewards,
         seed=seed,
         pool=simulation.pool,
@@ -89,4 +88,4 @@ def simulate(
     run_dir.write_json(folder / SELECTION, {"best": f"training/{best}", "scores": scores})
     worth = f", worth {scores[best]:.2f} of 2 in reality" if scores else ""
     among = f", best of {len(scores)}" if len(scores) > 1 else ""
-    return f"{updates(study, item)} updates{among}{worth}"
+    return f"{count_updates(study, item)} updates{among}{worth}"

@@ -19,7 +19,7 @@ from experiments.errors import ConfigError
 from experiments.jobs import engine
 from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import Workers
-from experiments.study.workflow import Journal, Ledger, Step, perform
+from experiments.study.workflow import Journal, Session, Step, perform
 
 
 def choose(study: Study, processes: int | None, devices: int | None) -> int:
@@ -49,16 +49,16 @@ def run_side_by_side(
     Ctrl-C and SIGTERM stop the workers, which save what they train, and then raise KeyboardInterrupt; so does the first
     error of a step, which is raised when the others have stopped. Raises RunError when a worker was killed.
     """
-    ledger = Ledger(steps, journal, console, workers.count)
-    if not ledger.left:
+    session = Session(steps, journal, console, workers.count)
+    if not session.left:
         return
-    by_name = {step.name: step for step in ledger.left}
+    by_name = {step.name: step for step in session.left}
     setup = Setup("experiments.study.workers:prepare", (study, folder))
 
     def ended(job: Job, result: tuple[str, float]) -> None:
-        ledger.ended(by_name[job.name], *result)
+        session.mark(by_name[job.name], *result)
 
-    engine.run(workers.engine(setup, folder), jobs(ledger.left), ended)
+    engine.run(workers.engine(setup, folder), jobs(session.left), ended)
 
 
 def jobs(steps: list[Step]) -> list[Job]:
@@ -78,10 +78,10 @@ def jobs(steps: list[Step]) -> list[Job]:
 
 def prepare(study: Study, folder: Path) -> Callable[[str], tuple[str, float]]:
     """The function that does a step of that name, in a worker."""
-    from experiments.study.pipeline import Loop
+    from experiments.study.pipeline import Pipeline
 
     simulation = study.simulation.model_copy(update={"devices": 1})
     console = Console(force_terminal=False)  # live bars of several processes would overwrite each other
-    loop = Loop(study.model_copy(update={"simulation": simulation}), folder, console)
-    steps = {step.name: step for step in loop.steps()}
+    pipeline = Pipeline(study.model_copy(update={"simulation": simulation}), folder, console)
+    steps = {step.name: step for step in pipeline.steps()}
     return lambda name: perform(steps[name])

@@ -8,7 +8,7 @@ seeds it would draw a handful of points, which are no 95 %: there it is the boot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -139,6 +139,11 @@ class Bootstrap:
         first, second = (self._mean([cell for cell in side if cell[:2] in both]) for side in found)
         return first, second
 
+    def pooled(self, model: str, trainers: Iterable[str]) -> np.ndarray:
+        """(n,) the values of a model with its own trainers."""
+        found = [self.cells[cell] for cell in self._find(model, trainers, True)]
+        return np.concatenate(found) if found else np.zeros(0)
+
     def _find(self, models: Models, trainers: Iterable[str], own: bool | None) -> list[Cell]:
         models, trainers = (models,) if isinstance(models, str) else tuple(models), tuple(trainers)
         return [cell for cell in self.cells if cell[3] in models and cell[1] in trainers and _is(own, cell)]
@@ -185,7 +190,7 @@ def normalised_by_player(rallies: Rallies) -> np.ndarray:
 
     ``rallies``: own evaluations of the ten models. NaN where all lengths of a player are equal.
     """
-    return _standardised(rallies, lambda cell: (cell[0], cell[1]))
+    return _standardise(rallies, ("seed", "trainer"), rallies.selected)
 
 
 def normalised_by_model(rallies: Rallies) -> np.ndarray:
@@ -194,24 +199,17 @@ def normalised_by_model(rallies: Rallies) -> np.ndarray:
 
     ``rallies``: own and cross-evaluations; NaN where the trainer did not evaluate the model.
     """
-    return _standardised(rallies, lambda cell: (cell[0], cell[1], cell[3]), own_only=True)
+    return _standardise(rallies, ("seed", "trainer", "model"), rallies.selected & rallies.own)
 
 
-def _standardised(
-    rallies: Rallies, group: Callable[[Cell], tuple[int | str, ...]], own_only: bool = False
-) -> np.ndarray:
-    length = rallies.length.astype(float)
-    columns = zip(*(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")), strict=True)
-    names = [group(cell) for cell in columns]
-    out, based = np.full(length.size, np.nan), rallies.selected & (rallies.own | (not own_only))
-    index: dict[tuple[int | str, ...], list[int]] = {}
-    for i, name in enumerate(names):
-        index.setdefault(name, []).append(i)
-    for numbers in index.values():
-        members = np.array(numbers)
-        base = length[members[based[members]]]
+def _standardise(rallies: Rallies, group: Sequence[str], reference: np.ndarray) -> np.ndarray:
+    """(n,) lengths standardised by the reference rallies, (n,) bool, of their group."""
+    out, columns = np.full(len(rallies), np.nan), [getattr(rallies, name) for name in group]
+    for names in set(zip(*(column.tolist() for column in columns), strict=True)):
+        members = np.all([column == name for column, name in zip(columns, names, strict=True)], axis=0)
+        base = rallies.length[members & reference].astype(float)
         if base.size > 1 and base.std(ddof=1) > 0.0:
-            out[members] = (length[members] - base.mean()) / base.std(ddof=1)
+            out[members] = (rallies.length[members] - base.mean()) / base.std(ddof=1)
     return out
 
 

@@ -5,7 +5,7 @@ left out keeps what training believes. The draw depends on the seed and on the p
 effect changes no other. Balls spin as the player hits them; training believes that none does. Effects from outside of
 the model's class are added only where a study names them.
 
-What was drawn is sealed (``study.blind.protocol``) when a study begins and opened when it is over. The learner gets
+What was drawn is sealed (``study.blind_protocol``) when a study begins and opened when it is over. The learner gets
 measured balls and rewards.
 """
 

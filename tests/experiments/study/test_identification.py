@@ -19,7 +19,7 @@ from experiments.study.analysis import delays
 from experiments.study.analysis.identified import BELIEVED, LOGS, estimates, holds
 from experiments.study.analysis.identified import PRIOR as DRAWN
 from experiments.study.target_domain import hit_log, joint_log
-from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.study.target_domain.virtual import VirtualReality
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.together.hits import SEEN_HIGH
 from mjx_tt.env.task import Task, TaskConfig
@@ -76,7 +76,7 @@ def identified(task, tmp_path_factory):
     folder, slow = tmp_path_factory.mktemp("logs"), {"drives.joint_2.lag": 0.018, "drives.gantry_x.velocity_gain": 0.95}
     identification.write_joints(folder / "joints", swept(task, models.with_values(SimModel(), slow)))
     measurements.write_csv(folder / "D0.csv", balls(World(friction=0.19, height=0.006)))
-    logs, before = [folder / "D0.csv", folder / "joints"], identification.prior(PRIOR, "prior")
+    logs, before = [folder / "D0.csv", folder / "joints"], identification.read_prior(PRIOR, "prior")
     found = identification.identify(logs, 100, ModelFile(SimModel()), before)
     truth = {**slow, "ball.table.friction": 0.19, SEEN_HIGH: 0.006}
     return folder, found, truth
@@ -127,7 +127,7 @@ def test_hits_of_real_play_decide_the_rubber_and_the_delay(tmp_path):
     # The clock is one: a ball's track and its joints cover the same time.
     assert all(log.joints[0].state_time[0] < t.time[-1] < log.joints[0].state_time[-1] for t in log.balls)
     identification.write_hits(tmp_path / "hits", log.balls, log.joints)
-    logs, before = [tmp_path / "D0.csv", tmp_path / "joints"], identification.prior(PRIOR, "prior")
+    logs, before = [tmp_path / "D0.csv", tmp_path / "joints"], identification.read_prior(PRIOR, "prior")
     found = identification.identify(logs, 400, ModelFile(SimModel()), before, [tmp_path / "hits"])
     assert found.hits > 40 and found.world.provenance["identified"]["hits"] == found.hits
     rows = {row["parameter"]: row for row in estimates(found.world)}
@@ -141,13 +141,13 @@ def test_hits_of_real_play_decide_the_rubber_and_the_delay(tmp_path):
 
 def test_a_prior_with_an_unknown_path_is_refused():
     with pytest.raises(ValueError, match="identification.prior.*did you mean 'ball.table.friction'"):
-        identification.prior({"ball.table.fricton": [0.1, 0.2]}, "identification.prior")
+        identification.read_prior({"ball.table.fricton": [0.1, 0.2]}, "identification.prior")
 
 
 def test_rows_of_a_world_name_what_moved_or_is_drawn():
     world = ModelFile(
         models.with_values(SimModel(), {"ball.table.friction": 0.2}),
-        identification.prior({"ball.paddle.restitution": [0.8, 0.9]}, "prior"),
+        identification.read_prior({"ball.paddle.restitution": [0.8, 0.9]}, "prior"),
     )
     rows = {row["parameter"]: (row["low"], row["high"]) for row in estimates(world)}
     assert rows == {"ball.table.friction": (0.2, 0.2), "ball.paddle.restitution": (0.8, 0.9)}

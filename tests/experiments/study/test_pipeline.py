@@ -31,14 +31,14 @@ from experiments.config import build, experiment
 from experiments.config import study as study_config
 from experiments.errors import ConfigError, RunError
 from experiments.runs import load_policy
-from experiments.study import evaluation, schedule, session, training, workers
-from experiments.study import pipeline as is2r
+from experiments.study import blind_protocol, evaluation, paths, schedule, session, training, workers
 from experiments.study.analysis import effect_costs, scoring
-from experiments.study.blind import protocol
+from experiments.study.analysis.paper import TEN
+from experiments.study.pipeline import Pipeline
 from experiments.study.schedule import Human, Identified, Real, Simulated
 from experiments.study.target_domain import hidden_effects
 from experiments.study.target_domain.evaluation_on_robot import blind_steps
-from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.study.target_domain.virtual import VirtualReality
 from experiments.study.workflow import Journal, Step, Waiting, remaining, run_all, unfinished
 from mjx_tt.env import rewards
 from mjx_tt.env.policy import Policy, initial_theta
@@ -195,12 +195,12 @@ def test_what_a_study_names_is_looked_up_before_it_begins(tmp_path, changes, mes
 def test_a_start_that_came_to_no_step_does_not_block_another(tmp_path):
     session._open(study(), tmp_path)
     session._open(study(first_balls=61), tmp_path)
-    assert "first_balls: 61" in (tmp_path / session.SETTINGS).read_text()
+    assert "first_balls: 61" in (tmp_path / paths.SETTINGS).read_text()
     Journal(tmp_path / "steps.jsonl").append(Step("seed0/player3/D0", "first balls", 1, (), (), lambda: ""), 1.0)
     with pytest.raises(RunError, match="first_balls: the study has 61, now 62"):
         session._open(study(first_balls=62), tmp_path)
     for content in (b"[1]", b"\x80", b"{"):
-        (tmp_path / session.SESSIONS).write_bytes(content)
+        (tmp_path / paths.SESSIONS).write_bytes(content)
         with pytest.raises((RunError, ConfigError), match="study.json"):
             session._open(study(first_balls=61), tmp_path)
 
@@ -217,7 +217,7 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
     }
     for player in whole.players:
         made: set[str] = {"D0", "large", "medium", "narrow", "prior", "reality"}
-        for item in schedule.items(whole, player):
+        for item in schedule.list_items(whole, player):
             assert {n for n in needs[type(item)](item) if n is not None} <= made, item
             made |= (
                 {item.name}
@@ -225,20 +225,20 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
                 else {item.key} | ({item.data} if isinstance(item, Real) else set())
             )
         assert {"world2", "id-ft100", "prior-ft100", "bound-ft100"} <= made
-        assert set(schedule.MODELS) <= made
+        assert set(TEN) <= made
     # "fine-tuned for 70 updates per cycle for the last two cycles and 60 for the first": 200, oracle 35 %.
     by_key = {item.key: item for item in (*schedule.LOOP, *schedule.COMPARED) if not isinstance(item, Human)}
     spent = {}
     for key, item in by_key.items():
         before = spent.get(item.source, 0) if item.source else 0
-        spent[key] = before + (schedule.updates(whole, item) if isinstance(item, Real) else 0)
+        spent[key] = before + (schedule.count_updates(whole, item) if isinstance(item, Real) else 0)
     assert spent["is2r-ft100"] == spent["s2r-ft100"] == 200 and spent["oracle-ft"] == 0.35 * 200
-    assert schedule.updates(whole, by_key["oracle-sim"]) == 40000
+    assert schedule.count_updates(whole, by_key["oracle-sim"]) == 40000
 
 
 def test_the_loop_alone_is_compared_with_its_variants():
     changes = ("baselines=is2r", "identification={}", "ablation=null", "evaluation={cross: false, effects: false}")
-    found = schedule.pairings(study_config.load(study_config.shipped()["study_night"], changes))
+    found = schedule.list_pairings(study_config.load(study_config.shipped()["study_night"], changes))
     of_one = {model for trainer, player, model in found if trainer == player == "player4"}
     rounds = ("sim1", "ft35", "sim2", "ft65", "sim3", "ft100")
     loops = {f"{loop}-{step}" for loop in ("is2r", "id") for step in rounds}
@@ -248,16 +248,16 @@ def test_the_loop_alone_is_compared_with_its_variants():
 
 def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
     whole = study_config.load(study_config.shipped()["study_full"], ("fresh=false", "ablation=null"))
-    pairs = schedule.pairings(whole)
+    pairs = schedule.list_pairings(whole)
     for player in whole.players:
         assert sum(t == e == player for t, e, _ in pairs) == 10
         others = [(t, m) for t, e, m in pairs if e == player != t]
         assert len(others) == len(set(others)) == 6 and len({t for t, _ in others}) == 2
-    codes = evaluation.code_names(0, pairs)
+    codes = evaluation.draw_codes(0, pairs)
     for player in whole.players:
         mine = [code for code, (_, e, _) in zip(codes, pairs, strict=True) if e == player]
         assert len(set(mine)) == 16
-    assert codes != evaluation.code_names(1, pairs)
+    assert codes != evaluation.draw_codes(1, pairs)
 
 
 def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
@@ -287,7 +287,7 @@ def test_the_papers_study_trains_as_the_papers_training():
         (5000, 70, None, None),
     ]
     assert study_.simulation.rounds[0].simulated == paper.training.updates
-    item = next(i for i in schedule.items(study_, "player1") if isinstance(i, Simulated))
+    item = next(i for i in schedule.list_items(study_, "player1") if isinstance(i, Simulated))
     assert training.configuration(study_, item, "narrow", None, 0).training.later_rewards is None
 
 
@@ -508,25 +508,25 @@ def loop(what: study_config.Study, folder: Path) -> None:
     """The study without its report, which has tests of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     session._open(what, folder)
-    run_all(is2r.Loop(what, folder, quiet()).steps_of_play(), Journal(folder / "steps.jsonl"), quiet())
+    run_all(Pipeline(what, folder, quiet()).steps_of_play(), Journal(folder / "steps.jsonl"), quiet())
 
 
 @pytest.mark.slow
 def test_a_study_leaves_what_it_says(finished):
     player = finished / "seed0" / "player3"
-    for key in schedule.MODELS:
-        kept = Policy.load(player / key / training.POLICY)
+    for key in TEN:
+        kept = Policy.load(player / key / paths.POLICY)
         assert kept.theta.shape == (976,) and kept.mean.shape == kept.inv_std.shape == (N_OBSERVATION,)
         assert np.isfinite(kept.theta).all()
     # Weights are carried on: from simulation to reality and back.
     tuned, trained, other = (
-        Policy.load(player / key / training.POLICY).theta for key in ("is2r-ft35", "is2r-sim1", "oracle-sim")
+        Policy.load(player / key / paths.POLICY).theta for key in ("is2r-ft35", "is2r-sim1", "oracle-sim")
     )
     assert cosine(tuned, trained) > 0.9 and abs(cosine(other, trained)) < 0.3
     started = load_policy.load(player / "is2r-sim2" / "training" / "seed0").config.initial_policy
     assert started == str((player / "is2r-ft35").resolve())
     rallies = scoring.read(finished / "evaluations.csv")
-    assert set(rallies.model.tolist()) == set(schedule.MODELS) and len(rallies) == 50 * 10
+    assert set(rallies.model.tolist()) == set(TEN) and len(rallies) == 50 * 10
     with open(finished / "evaluations.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     with np.load(finished / "evaluations" / "0_player3_player3_is2r-ft100.npz") as log:
@@ -550,7 +550,7 @@ def test_a_study_leaves_what_it_says(finished):
     drawn = hidden_effects.draw(0, ("drives", "encoders"))
     assert f"ball.paddle.restitution: {drawn.ball.paddle.restitution}" in opened
     assert str(drawn.ball.paddle.restitution) not in (finished / "seed0" / "reality.sealed").read_text()
-    assert protocol.unseal(finished / "seed0" / "reality.sealed")["seed"] == 0
+    assert blind_protocol.unseal(finished / "seed0" / "reality.sealed")["seed"] == 0
 
 
 def test_worlds_side_by_side_are_those_that_were_drawn():
@@ -578,7 +578,7 @@ def test_an_effect_is_left_out_for_the_policy_it_says(finished):
     rows = effect_costs.read(finished / "seed0" / effect_costs.FILE)
     assert [(r.model, r.without) for r in rows] == [(m, w) for m in effect_costs.MODELS for w in effect_costs.WORLDS]
     player = finished / "seed0" / "player3"
-    policies = [Policy.load(player / model / training.POLICY) for model in effect_costs.MODELS]
+    policies = [Policy.load(player / model / paths.POLICY) for model in effect_costs.MODELS]
     human = {"is2r-sim1": "M0", "s2r-ft100": "M0"}
     boxes = [load_distribution(player / "balls" / f"human_{human.get(m, 'M2')}.yaml") for m in effect_costs.MODELS]
     layout = np.array([(w, m) for w in range(len(effect_costs.WORLDS)) for m in range(6) for _ in range(lanes)]).T
@@ -618,7 +618,7 @@ def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
     assert text.startswith("6 updates")
     assert not compiled
     places = tmp_path / "again", finished / "seed0" / "player3" / "is2r-sim1"
-    one, two = (Policy.load(place / training.POLICY).theta for place in places)
+    one, two = (Policy.load(place / paths.POLICY).theta for place in places)
     assert np.abs(one - two).max() > 1e-3  # another seed and other balls
 
 
@@ -712,7 +712,7 @@ def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
         recordings={"player3": str(finished / "seed0" / "player3" / "balls" / "D0.csv")},
     )
     console, folder = quiet(), tmp_path / "robot"
-    steps = is2r.Loop(what, folder, console).steps_of_play()
+    steps = Pipeline(what, folder, console).steps_of_play()
     names = [step.name for step in steps]
     assert "seed0/reality" not in names and names[-1] == "evaluations"
     first = names.index("seed0/player3/is2r-ft35") + 1
@@ -721,7 +721,7 @@ def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
     measured = (folder / "seed0" / "player3" / "balls" / "D1.csv").read_text().splitlines()
     assert measured[0] == "session,trajectory,t,x,y,z" and len(measured) > 20
     assert (folder / "seed0" / "player3" / "is2r-ft35" / "journal.jsonl").read_text().count("\n") == 2 + 2 + 2
-    theta = Policy.load(folder / "seed0" / "player3" / "is2r-ft35" / training.POLICY).theta
+    theta = Policy.load(folder / "seed0" / "player3" / "is2r-ft35" / paths.POLICY).theta
     assert np.isfinite(theta).all()
 
 
@@ -733,16 +733,16 @@ def test_people_play_under_code_names_and_the_key_opens_when_the_sheet_is_full(f
     journal = Journal(tmp_path / "steps.jsonl")
     with pytest.raises(Waiting, match=r"player4 plays rallies with .*policies/CODE --robot robot.yaml.*A has 0 of 50"):
         run_all([make, count], journal, quiet())
-    sheet = folder / protocol.SHEET
+    sheet = folder / blind_protocol.SHEET
     lines = sheet.read_text().splitlines()
     length = {"A": 3, "B": 8}
     filled = [f"{line[:-2]},{length[line[0]]},13" if line.endswith(",,") else line for line in lines]
     sheet.write_text("\n".join(filled) + "\n")
     assert [step.name for step in unfinished([make, count], journal)] == [count.name]
     run_all([make, count], journal, quiet())
-    rallies = scoring.read(folder / protocol.EVALUATIONS)
-    codes = protocol.unseal(folder / protocol.KEY)["codes"]
+    rallies = scoring.read(folder / blind_protocol.EVALUATIONS)
+    codes = blind_protocol.unseal(folder / blind_protocol.KEY)["codes"]
     for model, code in codes.items():
         assert set(rallies.length[rallies.model == model].tolist()) == {length[code]}
-    played = load_policy.load(folder / protocol.POLICIES / codes["is2r-ft65"])
-    np.testing.assert_array_equal(played.policy.theta, Policy.load(player / "is2r-ft65" / training.POLICY).theta)
+    played = load_policy.load(folder / blind_protocol.POLICIES / codes["is2r-ft65"])
+    np.testing.assert_array_equal(played.policy.theta, Policy.load(player / "is2r-ft65" / paths.POLICY).theta)

@@ -114,7 +114,7 @@ def step_of(run, monkeypatch, plan, rallies=10):
     """The step of a zero-shot policy, and the sessions that it will have."""
     rig, folder = Sessions(plan), run.parent / "rallies"
     monkeypatch.setattr(session, "run", rig.run)
-    monkeypatch.setattr(evaluation_on_robot, "exported", lambda trained, console: run)
+    monkeypatch.setattr(evaluation_on_robot, "export_once", lambda trained, console: run)
     who = (0, "player3", "player3", "zero_shot")
     return rally_step(folder, who, lambda: run, (), rallies, Console(file=io.StringIO())), rig
 
