@@ -62,7 +62,8 @@ ROOMS = {
     ),
     "experiments": (
         "errors . config jobs runs view/film view/studio view/programme "
-        "evaluation training baselines deploy finetuning study/paths study/workflow study/analysis study/blind_protocol "
+        "evaluation training baselines deploy finetuning study/paths study/workflow study/analysis "
+        "study/blind_protocol "
         "study/target_domain study/report study view sharing commands robots cli"
     ),
 }

@@ -104,7 +104,7 @@ class Pipeline:
     # -- realities and worlds
 
     def _reality(self, seed: int) -> dict[str, Any]:
-        """What is sealed: the reality as plain data."""
+        """Content that is sealed: the reality as plain data."""
         without, outside = tuple(self.study.reality.without), tuple(self.study.reality.outside)
         return hidden_effects.content(hidden_effects.draw(seed, without, outside), seed, without, outside)
 

@@ -61,26 +61,16 @@ def write(path: Path, outcomes: list[Outcome]) -> None:
 
 def read(path: Path) -> list[Outcome]:
     """Outcomes from the file of ``write``. Raises ConfigError naming file and line."""
+    out = []
     try:
         with open(path, newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+            for number, row in enumerate(csv.DictReader(file), 2):
+                try:
+                    counts = int(row["rallies"]), float(row["length"])
+                    out.append(Outcome(int(row["seed"]), row["player"], row["model"], row["without"], *counts))
+                except (KeyError, TypeError, ValueError) as error:
+                    wanted = ", ".join(f.name for f in fields(Outcome))
+                    raise ConfigError(f"{path}: line {number}: {row}: {error!r}; wanted are {wanted}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path}: not readable as CSV in UTF-8: {error}") from None
-    out = []
-    for number, row in enumerate(rows, 2):
-        try:
-            out.append(
-                Outcome(
-                    int(row["seed"]),
-                    row["player"],
-                    row["model"],
-                    row["without"],
-                    int(row["rallies"]),
-                    float(row["length"]),
-                )
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(
-                f"{path}: line {number}: {row}: {error!r}; wanted are {', '.join(f.name for f in fields(Outcome))}"
-            ) from None
     return out

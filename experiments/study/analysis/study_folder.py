@@ -31,7 +31,7 @@ from mjx_tt.rally.human_player import FOLDER as VIRTUAL_PLAYERS
 ROUNDS = ("M0", "M1", "M2")
 DATASETS = ("D0", "D1", "D2")
 QUANTITIES = tuple(f"{part} {axis}" for part, axes in AXES.items() for axis in axes)
-"""What a human model bounds: position and velocity at the start, landing point."""
+"""Quantities that a human model bounds: position and velocity at the start, landing point."""
 NUMBERS = tuple(f"{quantity} {end}" for quantity in QUANTITIES for end in ("min", "max"))
 """Names of the 16 numbers of a human model."""
 

@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from experiments.study.analysis.paper import ABLATION, BY_KEY, COLOURS, SHORT, level, of_level
-from experiments.study.analysis.statistics import Estimate, Interval
+from experiments.study.analysis.statistics import Bootstrap, Estimate, Interval
 from mjx_tt.viz.html import FAINT, INK
 from mjx_tt.viz.html import STYLE as PAGE_STYLE
 
@@ -26,6 +26,9 @@ STYLE = PAGE_STYLE | {"figure.constrained_layout.use": True, "axes.titleweight":
 HUMAN_MODEL_COLOURS = {"M0": "#9ecae1", "M1": "#4292c6", "M2": "#08519c"}
 HOLLOW = {"facecolor": "white", "edgecolor": INK, "linewidth": 0.9}
 DIAMOND = {"marker": "D", "color": INK, "markerfacecolor": "white", "linestyle": ""}
+LENGTH, MEAN, NORMALISED = "rally length", "mean rally length, 95 %", "normalised rally length"
+STAGES = ("sim1", "ft35", "sim2", "ft65", "sim3", "ft100")
+STAGE_LABELS = ("sim 1", "fine-tuned\n35 %", "sim 2", "fine-tuned\n65 %", "sim 3", "fine-tuned\n100 %")
 Colour = str | tuple[float, ...]
 Measured = Estimate | Interval | None  # with a value and an interval, or missing
 
@@ -36,6 +39,12 @@ def colour(key: str) -> tuple[float, ...]:
     rgb = to_rgb(COLOURS[model.method])
     pale = not model.fine_tuned and model.method != ABLATION
     return tuple(share + 0.55 * (1.0 - share) for share in rgb) if pale else rgb
+
+
+def held(boot: Bootstrap, keys: Sequence[str]) -> list[str]:
+    """Those of the models that a bootstrap holds."""
+    there = {cell[3] for cell in boot.cells}
+    return [key for key in keys if key in there]
 
 
 def level_label(group: str) -> str:
@@ -62,26 +71,26 @@ def error_lengths(interval: Interval) -> list[list[float]]:
 def draw_bars(
     axes: Axes,
     groups: Sequence[Sequence[Measured]],
-    colours: Sequence[Sequence[Colour]],
+    keys: Sequence[Sequence[str]],
     labels: Sequence[str],
     ylabel: str = "",
     hatches: Sequence[str | None] | None = None,
-    total_width: float = 0.8,
     **label_style: object,
 ) -> None:
     """Groups of bars with their intervals, a group at each of 0, 1, 2 ... on the x axis.
 
-    groups, colours: by group and by bar within it; hatches: by bar within a group; missing bars leave a gap.
+    groups, keys: values and their models, by group and by bar within it; hatches: by bar within a group. A missing
+    value leaves a gap.
     """
-    for x, (group, shades) in enumerate(zip(groups, colours, strict=True)):
-        width = total_width / len(group)
-        for k, (measured, shade) in enumerate(zip(group, shades, strict=True)):
+    for x, (group, models) in enumerate(zip(groups, keys, strict=True)):
+        width = 0.8 / len(group)
+        for k, (measured, key) in enumerate(zip(group, models, strict=True)):
             interval = interval_of(measured)
             if interval is None:
                 continue
             at, hatch = x + (k - 0.5 * (len(group) - 1)) * width, hatches and hatches[k]
             edge = {"hatch": hatch, "edgecolor": "white"} if hatch else {}
-            axes.bar(at, interval.value, 0.95 * width, color=shade, linewidth=0, **edge)
+            axes.bar(at, interval.value, 0.95 * width, color=colour(key), linewidth=0, **edge)
             axes.errorbar(at, interval.value, error_lengths(interval), color=INK, linewidth=1.1, capsize=2.5)
     axes.set_xticks(range(len(labels)), labels, **label_style)
     axes.set_ylabel(ylabel)
@@ -93,8 +102,20 @@ def draw_model_bars(
     axes: Axes, means: Sequence[Measured], keys: Sequence[str], ylabel: str, labelled: bool = True
 ) -> None:
     """One bar with its interval for every model."""
-    draw_bars(axes, [[mean] for mean in means], [[colour(key)] for key in keys], [""] * len(keys), ylabel)
+    draw_bars(axes, [[mean] for mean in means], [[key] for key in keys], [""] * len(keys), ylabel)
     _label_models(axes, keys, labelled)
+
+
+def draw_grouped_means(
+    axes: Axes,
+    boot: Bootstrap,
+    groups: Sequence[Sequence[str]],
+    players: Sequence[str],
+    labels: Sequence[str],
+    **label_style: object,
+) -> None:
+    """Bars of the mean length of groups of models."""
+    draw_bars(axes, [[boot.mean(key, players) for key in group] for group in groups], groups, labels, **label_style)
 
 
 def draw_boxes(

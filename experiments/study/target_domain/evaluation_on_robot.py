@@ -136,8 +136,8 @@ def rally_step(
         if found.counted < rallies:
             raise RunError(
                 f"{name}: {rallies} rallies that count are needed, {rallies - found.counted} are missing; the last "
-                f"session is {found.newest_report(folder)}. Make the machine quiet; the same command goes on with these "
-                "rallies"
+                f"session is {found.newest_report(folder)}. Make the machine quiet; the same command goes on with "
+                "these rallies"
             )
         played = [(one["length"], End[one["end"]]) for one in found.rallies]
         scored = scoring.scored(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
