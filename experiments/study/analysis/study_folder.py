@@ -256,7 +256,7 @@ def load(folder: Path) -> StudyFolder:
 
 
 def _suggestion(folder: Path) -> str:
-    """What to do with a folder that is no study."""
+    """A clause that says what to do with a folder that is no study."""
     runs = [path.parent for path in sorted([*folder.glob(CONFIG), *folder.glob(f"*/{CONFIG}")])]
     if not runs:
         return "" if folder.is_dir() else "; there is no such folder"

@@ -267,7 +267,7 @@ def tabulate_models(m: Measurements) -> Table:
 
 
 def tabulate_rallies(m: Measurements) -> Table:
-    """How many rallies each model has."""
+    """Numbers of rallies of each model."""
     r, rows = m.study.rallies, []
     for model in BY_KEY:
         mine = r.take(r.model == model)

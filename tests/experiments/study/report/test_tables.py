@@ -10,7 +10,7 @@ import pytest
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis.claims import Measurements
 from experiments.study.analysis.study_folder import StudyFolder
-from experiments.study.report import figures, tables
+from experiments.study.report import comparisons, tables
 from mjx_tt.sim.model import ModelFile, Range, SimModel
 from mjx_tt.sim.randomisation import Samples
 
@@ -71,6 +71,6 @@ def test_one_seeds_effects_have_no_interval_and_are_drawn(tmp_path):
     table = tables.tabulate_effects(Measurements(study))
     (row,) = table.rows
     assert row[:2] == ("spin", "2.05") and "to" not in "".join(row)
-    figure = figures.draw_effects(Measurements(study))
+    figure = comparisons.draw_effects(Measurements(study))
     (text,) = figure.axes[0].texts
     assert text.get_text() == "2.05" and text.get_fontweight() == "normal"

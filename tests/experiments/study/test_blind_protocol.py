@@ -208,7 +208,7 @@ def test_a_blind_evaluation_needs_a_trainer(tmp_path, artefacts, capsys):
 @pytest.mark.parametrize("separator, encoding", [(";", "utf-8-sig"), ("\t", "utf-16"), (",", "utf-8"), (";", "cp1252")])
 def test_a_sheet_is_read_as_spreadsheets_save_it(tmp_path, separator, encoding):
     path = tmp_path / "sheet.csv"
-    blind_protocol.blank_sheet(path, ("A", "B"), 3)
+    blind_protocol.write_blank_sheet(path, ("A", "B"), 3)
     lines = [line if line.startswith("#") else line.replace(",", separator) for line in path.read_text().splitlines()]
     lines = [line.replace(f"A{separator}2{separator * 2}", f"A{separator}2{separator}5{separator}13") for line in lines]
     lines = [f'"{line}"{separator * 3}' if line.startswith("#") else line for line in lines] + [separator * 3]
