@@ -78,9 +78,11 @@ def is2r(
     start_jax(devices or (None if own == "auto" else own), elsewhere is not None)
     from experiments.jobs.site import Workers
     from experiments.stages import interruptible
-    from experiments.study import session, workers
+    from experiments.study import session
 
-    side_by_side = Workers(1 if elsewhere else workers.choose(loaded, processes, devices), elsewhere, str(site))
+    side_by_side = Workers(
+        1 if elsewhere else session.choose_processes(loaded, processes, devices), elsewhere, str(site)
+    )
     with interruptible() if loaded.robot is None else nullcontext():
         return 0 if session.run(loaded, Path(out) / loaded.name, console(), side_by_side) else 130
 

@@ -22,7 +22,7 @@ def estimates(world: ModelFile, truth: Mapping[str, float] | None = None) -> lis
     delays as ``delays.in_sums`` has them.
     """
     nominal, values = models.paths(), models.paths(world.model)
-    shown = [delays.as_shown(x, values[delays.AXES]) if isinstance(x, Samples) else x for x in world.randomise]
+    shown = [delays.restore_command(x, values[delays.AXES]) if isinstance(x, Samples) else x for x in world.randomise]
     drawn = {path: ends for one in shown for path, ends in one.ends().items()}
     alone = (world.provenance or {}).get("identified", {}).get(PRIOR_ALONE, ())
     logged = {path for one in shown if isinstance(one, Samples) for path in one.paths} - set(alone)

@@ -105,7 +105,11 @@ def draw_checkpoints(m: Measurements) -> Figure | None:
     for axes, group in zip(figure.subplots(1, 3), paper.LEVELS, strict=True):
         for method, keys in CURVES.items():
             found = [(i, key, mean) for i, key in enumerate(keys) if key and (mean := _mean(m.raw, key, group))]
-            if method == paper.FRESH and not any(paper.BY_KEY[key].method == paper.FRESH for _, key, _ in found):
+            if (
+                not found
+                or method == paper.FRESH
+                and not any(paper.BY_KEY[key].method == paper.FRESH for _, key, _ in found)
+            ):
                 continue
             shade = paper.COLOURS[method]
             for i, key, mean in found:

@@ -103,7 +103,7 @@ def test_a_world_is_what_the_logs_say_and_the_prior_for_the_rest(identified, tmp
         wanted = np.percentile(np.random.default_rng(6).uniform(*PRIOR[path], 100_000) - arm, [5, 95])
         assert [rows[path]["low"], rows[path]["high"]] == pytest.approx(list(wanted), abs=0.004)
         assert rows[path]["decided by"] == DRAWN
-    for path in ("drives.joint_1.lag", "latency.abb_action", delays.TOLD):
+    for path in ("drives.joint_1.lag", "latency.abb_action", delays.AXES_COMMAND):
         assert rows[path]["high"] - rows[path]["low"] < 0.002
     friction = rows["ball.table.friction"]
     assert friction["low"] < 0.19 < friction["high"] < friction["low"] + 0.02 and friction["truth"] == 0.19

@@ -31,7 +31,7 @@ from experiments.config import build, experiment
 from experiments.config import study as study_config
 from experiments.errors import ConfigError, RunError
 from experiments.runs import load_policy
-from experiments.study import blind_protocol, evaluation, paths, schedule, session, training, workers
+from experiments.study import blind_protocol, evaluation, paths, schedule, session, training
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis.paper import TEN
 from experiments.study.pipeline import Pipeline
@@ -118,8 +118,6 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
         ({"players": ["player3", "player3"]}, "different entries"),
         ({"players": ["anna"]}, "got 'anna'"),
         ({"reality": {"without": ["magic"]}}, "got 'magic'"),
-        ({"ablation": {"player": "player4"}}, "ablation.player 'player4'"),
-        ({"evaluation": {"rallies": 50, "lanes": 7}}, "multiple of its lanes 7"),
         ({"robot": "lockstep"}, "recordings of the first balls of player3"),
         ({"robot": "lockstep", "identification": {}}, "logs no session; take robot: rig"),
         ({"evaluation": {"rallies": 40, "lanes": 8}}, "evaluation.rallies 40 is less than 50"),
@@ -485,13 +483,13 @@ def test_the_remaining_time_follows_from_what_the_same_kind_took(tmp_path):
 def test_who_does_the_steps(tmp_path):
     many = study_config.parse(TINY | {"simulation": {**TINY["simulation"], "devices": "auto"}}, "test")
     if jax.default_backend() == "cpu":
-        assert workers.choose(many, None, None) == len(os.sched_getaffinity(0))
-    assert workers.choose(many, 3, None) == 3
-    assert workers.choose(many, None, 2) == workers.choose(study(), None, None) == 1
+        assert session.choose_processes(many, None, None) == len(os.sched_getaffinity(0))
+    assert session.choose_processes(many, 3, None) == 3
+    assert session.choose_processes(many, None, 2) == session.choose_processes(study(), None, None) == 1
     with_robot = study(robot="lockstep", recordings={"player3": str(tmp_path / "balls.csv")})
-    assert workers.choose(with_robot, None, None) == 1
+    assert session.choose_processes(with_robot, None, None) == 1
     with pytest.raises(ConfigError, match="--processes 2: with a robot .* allowed: 1"):
-        workers.choose(with_robot, 2, None)
+        session.choose_processes(with_robot, 2, None)
 
 
 # The whole loop

@@ -523,7 +523,7 @@ def test_a_line_that_is_being_written_is_left_out(small, tmp_path):
     assert study.metrics(0, "player5", "is2r-ft35") == [{"update": 1, "return_rate": 0.5}]
 
 
-def test_a_log_with_arrays_of_other_shapes_is_named(small, tmp_path):
+def test_a_log_with_other_arrays_is_named(small, tmp_path):
     name = "0_player5_player5_is2r-ft100.npz"
     with np.load(small / "evaluations" / name) as data:
         arrays = dict(data)
@@ -534,15 +534,7 @@ def test_a_log_with_arrays_of_other_shapes_is_named(small, tmp_path):
         np.savez(tmp_path / "evaluations" / name, **arrays | {array: wrong})
         with pytest.raises(ConfigError, match=f"array {array} is .* are wanted"):
             study.log(0, "player5", "player5", "is2r-ft100")
-
-
-def test_a_log_without_an_array_is_named(whole, tmp_path):
-    source = whole / "evaluations" / "0_player3_player3_is2r-ft100.npz"
-    with np.load(source) as data:
-        kept = {name: data[name] for name in data if name != "returned"}
-    folder = tmp_path / "evaluations"
-    folder.mkdir()
-    np.savez(folder / source.name, **kept)
-    study = study_data.StudyFolder(tmp_path, {}, {}, scoring.join([]))
+    del arrays["returned"]
+    np.savez(tmp_path / "evaluations" / name, **arrays)
     with pytest.raises(ConfigError, match="has no array returned"):
-        study.log(0, "player3", "player3", "is2r-ft100")
+        study.log(0, "player5", "player5", "is2r-ft100")
