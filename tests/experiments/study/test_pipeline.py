@@ -622,18 +622,23 @@ def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
 
 @pytest.mark.slow
 def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tmp_path):
-    """Its steps done by two processes, stopped as a batch system does, gone on with, killed, and ended by this one."""
-    folder = tmp_path / "tiny"
+    """Two processes are stopped as a batch system does, then killed; Parsl goes on, is killed, and ends the study."""
+    folder, site = tmp_path / "tiny", tmp_path / "here.yaml"
     player = folder / "seed0" / "player3"
+    site.write_text(yaml.safe_dump({"provider": {"kind": "local"}, "workers_per_node": 1, "memory_per_worker": 1.0}))
+    command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder)]
 
-    def start_and_end(sign: Path, number: int) -> tuple[int, str]:
+    def steps_done() -> list[str]:
+        return [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
+
+    def start_and_end(sign: Path, number: int, *more: str) -> tuple[int, str]:
         """Exit status and message of a session that gets a signal when ``sign`` is there."""
-        command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder)]
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL if more else subprocess.PIPE}
+        process = subprocess.Popen([*command, *more], cwd=ROOT, text=True, **streams)
         while not sign.exists() and process.poll() is None:
             time.sleep(0.005)
         time.sleep(0.1)
-        assert process.poll() is None, process.stderr.read()
+        assert process.poll() is None, more or process.stderr.read()
         os.kill(process.pid, number)
         _, message = process.communicate(timeout=120)  # its end means that no worker lives: each holds the pipe
         return process.returncode, message
@@ -641,14 +646,17 @@ def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tm
     status, message = start_and_end(player / "is2r-sim1" / "training" / "seed0" / "metrics.jsonl", signal.SIGTERM)
     assert status != 0 and re.search(r"is2r-sim1.*: stopped after update \d", message), message
     assert f"{folder}: stopped; the same command continues the study" in message
-    assert [e["step"] for e in Journal(folder / "steps.jsonl").entries][-1] == "seed0/player3/M0"
+    assert steps_done()[-1] == "seed0/player3/M0"
     status, message = start_and_end(player / "is2r-ft35" / "checkpoints", signal.SIGKILL)
     assert status == -signal.SIGKILL, message
-    before = Journal(folder / "steps.jsonl").entries
-    assert before and len(before) < 10  # of 20
-    loop(study(), folder)
-    entries = [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
-    assert len(entries) == len(set(entries))  # nothing was done twice
+    training_ = player / "is2r-sim2" / "training" / "seed0" / "metrics.jsonl"
+    assert start_and_end(training_, signal.SIGKILL, str(site))[0] == -signal.SIGKILL
+    before = steps_done()
+    assert "seed0/player3/M1" in before and len(before) < 14  # of 20
+    done = subprocess.run([*command, str(site)], cwd=ROOT, capture_output=True, text=True, timeout=1200)
+    assert done.returncode == 0, done.stdout + done.stderr
+    entries = steps_done()
+    assert entries[: len(before)] == before and len(entries) == len(set(entries))  # nothing was done twice
     assert_same_bits(folder, finished)
 
 
@@ -664,29 +672,6 @@ def assert_same_bits(folder: Path, finished: Path) -> None:
                         np.testing.assert_array_equal(a[name], b[name], err_msg=f"{path}: {name}")
             else:
                 assert path.read_bytes() == mine.read_bytes(), path
-
-
-@pytest.mark.slow
-def test_a_study_by_parsl_killed_and_resumed_ends_as_one_by_this_process(finished, tmp_path):
-    """The process that was asked is killed while a worker trains; the same command ends the study."""
-    folder = tmp_path / "tiny"
-    here = {"provider": {"kind": "local"}, "workers_per_node": 1, "memory_per_worker": 1.0}
-    (tmp_path / "here.yaml").write_text(yaml.safe_dump(here))
-    command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder), str(tmp_path / "here.yaml")]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
-    measured = folder / "seed0" / "player3" / "is2r-sim1" / "training" / "seed0" / "metrics.jsonl"
-    while not measured.exists():
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.kill()
-    process.wait()
-    before = len(Journal(folder / "steps.jsonl").entries)
-    assert 0 < before < 10  # of 20
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200)
-    assert done.returncode == 0, done.stdout + done.stderr
-    entries = [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
-    assert len(entries) == len(set(entries)) > before
-    assert_same_bits(folder, finished)
 
 
 @pytest.mark.slow
