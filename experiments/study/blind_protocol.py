@@ -253,7 +253,7 @@ def _parse_rally(rally: str, length: str, end: str) -> Played:
     if not _WHOLE.fullmatch(rally) or not _WHOLE.fullmatch(length):
         raise ValueError(f"rally and length are whole numbers, got {rally!r} and {length!r}")
     try:
-        played = Played(int(rally), int(length), scoring.end_of(end))
+        played = Played(int(rally), int(length), scoring.parse_end(end))
     except ValueError as error:
         raise ValueError(f"end: {error}") from None
     if not played.length and played.end not in scoring.FILTERED:
@@ -300,7 +300,7 @@ def open_key(folder: Path) -> scoring.Rallies:
         if artefact.load(folder / POLICIES / code).digest != key["digests"][model]:
             raise ConfigError(f"{folder / POLICIES / code}: is not the policy that was sealed under this code")
         rally, length, end = (np.array(column, int) for column in zip(*map(astuple, sheet[code]), strict=True))
-        one = scoring.scored(key["seed"], key["trainer"], key["evaluator"], model, code, length, end)
+        one = scoring.score_rallies(key["seed"], key["trainer"], key["evaluator"], model, code, length, end)
         parts.append(replace(one, rally=rally))
     rallies = scoring.join(parts)
     scoring.write(folder / EVALUATIONS, rallies)

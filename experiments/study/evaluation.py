@@ -88,7 +88,7 @@ def play_without(
     result = reality.simulator.play(
         policy,
         jax.tree.map(lambda leaf: jnp.repeat(leaf, sessions), human_player.stack(people)),
-        hidden_effects.side_by_side(worlds, len(models) * sessions),
+        hidden_effects.stack_worlds(worlds, len(models) * sessions),
         build.key(seed, EFFECTS),
         settings.rallies // sessions,
         box,
@@ -131,7 +131,9 @@ def score(seed: int, pairings: Pairings, result: RallyResult, sessions: int) -> 
     parts = []
     for i, (pairing, code) in enumerate(zip(pairings, draw_codes(seed, pairings), strict=True)):
         mine = slice(i * sessions, (i + 1) * sessions)
-        parts.append(scoring.scored(seed, *pairing, code, result.length[:, mine].ravel(), result.end[:, mine].ravel()))
+        parts.append(
+            scoring.score_rallies(seed, *pairing, code, result.length[:, mine].ravel(), result.end[:, mine].ravel())
+        )
     return scoring.join(parts)
 
 

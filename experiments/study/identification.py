@@ -84,17 +84,17 @@ def identify(
         balls = tuple(balls[i] for i in np.sort(np.random.default_rng(0).permutation(len(balls))[:most]))
     ranges = {one.path: (one.low, one.high) for one in before}
     arm, axes = (models.paths(believed.model)[path] for path in (delays.ARM, delays.AXES))
-    known = delays.moments(ranges, arm)
+    known = delays.compute_moments(ranges, arm)
     seen = {HEIGHT if path == SEEN_HIGH else path: normal for path, normal in known.items()}
     balls_fit = of_balls.fit(balls, believed.model, seen, say)
     say("fitting the drives")
-    joints_fit = of_joints.fit(middle(found.joints, seconds), believed.model, known) if found.joints else None
+    joints_fit = of_joints.fit(cut_middle(found.joints, seconds), believed.model, known) if found.joints else None
     say("fitting the hits")
     hits_fit = _fit_hits(balls_fit, hits, believed.model, known)
     parts = [] if joints_fit is None else [joints_fit.samples()]
     lift = np.random.default_rng(1).normal(0.0, of_balls.LIFT_ERROR, of_balls.DRAWS)
     if hits_fit is not None:
-        shown, lift = hits_fit.samples(delays.against_the_arm(ranges, arm))
+        shown, lift = hits_fit.samples(delays.shift_to_arm(ranges, arm))
         parts.append(shown)
     sampled = {path for one in parts for path in one.paths}
     # Against the arm, whose delay is as believed; which other ranges know nothing of.
@@ -114,7 +114,7 @@ def identify(
     return Identified(world, flights, hit, left, balls_fit.posterior.converged)
 
 
-def middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRecord, ...]:
+def cut_middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRecord, ...]:
     """The middle ``seconds`` of records that are longer by more than a second."""
     first = max(r.state_time[0] for r in records)
     last = min(r.state_time[-1] for r in records)

@@ -28,7 +28,7 @@ from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
 from experiments.study import blind_protocol, evaluation, identification, training
 from experiments.study.analysis import effect_costs, scoring
-from experiments.study.analysis.identified import estimates
+from experiments.study.analysis.identified import list_estimates
 from experiments.study.analysis.study_folder import ROUNDS, changes_of
 from experiments.study.paths import CONVERGENCE, EVALUATIONS, JOINTS, POLICY, PRIOR, REALITY, REPORT, StudyPaths
 from experiments.study.schedule import (
@@ -43,7 +43,7 @@ from experiments.study.schedule import (
     list_pairings,
 )
 from experiments.study.target_domain import hidden_effects, on_robot
-from experiments.study.target_domain.evaluation_on_robot import blind_steps, rally_step
+from experiments.study.target_domain.evaluation_on_robot import make_blind_steps, make_rally_step
 from experiments.study.target_domain.virtual import VirtualReality, VirtualWorld, World
 from experiments.study.workflow import Step
 from mjx_tt.diagnosis.logs import ROBOT_FILES
@@ -106,7 +106,7 @@ class Pipeline:
     def _reality(self, seed: int) -> dict[str, Any]:
         """Content that is sealed: the reality as plain data."""
         without, outside = tuple(self.study.reality.without), tuple(self.study.reality.outside)
-        return hidden_effects.content(hidden_effects.draw(seed, without, outside), seed, without, outside)
+        return hidden_effects.describe(hidden_effects.draw(seed, without, outside), seed, without, outside)
 
     def _seal_reality(self, seed: int) -> Step:
         path = self.paths.seed(seed) / "reality.sealed"
@@ -153,7 +153,7 @@ class Pipeline:
         path, name = self.paths.world(seed, player, REALITY), f"seed{seed}/{player}/{REALITY} as a world"
 
         def run() -> str:
-            ModelFile(self._virtual[seed].with_spin(player, name)).save(path)
+            ModelFile(self._virtual[seed].add_spin(player, name)).save(path)
             return "for the bound alone"
 
         return Step(name, "worlds", 1, (), (path,), run)
@@ -209,7 +209,7 @@ class Pipeline:
                     [*data, *motion], settings.balls, believed, prior, hits, settings.seconds
                 )
             found.world.save(path)
-            count = len(estimates(found.world))
+            count = len(list_estimates(found.world))
             doubt = "" if found.settled else "; the balls' fit did not settle: its intervals are wider by its last step"
             return f"{found.flights} flights, {found.hits} hits; {count} parameters moved or drawn{doubt}"
 
@@ -235,7 +235,7 @@ class Pipeline:
         def run() -> str:
             source = None if item.source is None else self.paths.run(seed, player, item.source)
             score = self._world[seed].score(player, name)
-            return training.simulate(self.study, item, folder, human, source, name, self.console, score, world)
+            return training.train_seeds(self.study, item, folder, human, source, name, self.console, score, world)
 
         simulation = self.study.simulation
         episodes = simulation.optimiser.num_directions * simulation.optimiser.repeats
@@ -323,7 +323,7 @@ class Pipeline:
             policy, who = self._policy_of(seed, trainer, model), (seed, trainer, evaluator, model)
             run_of = partial(self.paths.run, seed, trainer, policy.parent.name)
             folder = self.paths.seed(seed) / "rallies" / "-".join(who[1:])
-            found.append(rally_step(folder, who, run_of, (policy,), self.study.evaluation.rallies, self.console))
+            found.append(make_rally_step(folder, who, run_of, (policy,), self.study.evaluation.rallies, self.console))
         return found
 
     def _play_blind(self, seed: int, robot: str) -> list[Step]:
@@ -338,7 +338,7 @@ class Pipeline:
             }
             folder = self.paths.seed(seed) / "blind" / f"{trainer}-{evaluator}"
             inputs = tuple(dict.fromkeys(policies.values()))
-            found += blind_steps(folder, seed, trainer, evaluator, runs_of, inputs, robot, self.console)
+            found += make_blind_steps(folder, seed, trainer, evaluator, runs_of, inputs, robot, self.console)
         return found
 
     def _join_evaluations(self, before: list[Step]) -> Step:

@@ -76,7 +76,7 @@ def look_up(study: Study) -> None:
         build.distribution(balls, "ablation.balls")
     for item in list_items(study, study.players[0]):
         if isinstance(item, Simulated) and item.source is None:
-            build.experiment(training.configuration(study, item, "narrow", None, 0), "simulation")
+            build.experiment(training.make_config(study, item, "narrow", None, 0), "simulation")
     if study.identification is not None:
         with error_context("identification"):
             identification.read_prior(study.identification.prior, "prior")

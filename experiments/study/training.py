@@ -21,7 +21,7 @@ from experiments.study.schedule import Simulated, count_updates
 from experiments.training.loop import train
 
 
-def configuration(
+def make_config(
     study: Study, item: Simulated, balls: str | dict, source: Path | None, seed: int, world: Path | None = None
 ) -> Config:
     """The training YAML of a model: balls by name or content, initial policy from ``source``, the round's recipe.
@@ -54,7 +54,7 @@ def configuration(
     )
 
 
-def simulate(
+def train_seeds(
     study: Study,
     item: Simulated,
     folder: Path,
@@ -69,13 +69,13 @@ def simulate(
 
     human: YAML of the human model; None: the distribution that the item names. source: run to start from. name: of the
     step, which decides the seeds. score: what a policy is worth in reality, needed to choose among seeds. world: as in
-    ``configuration``.
+    ``make_config``.
     """
     balls = item.balls if human is None else load_distribution(human).to_dict()
     scores: dict[str, float] = {}
     for k in range(study.simulation.seeds):
         seed = zlib.crc32(f"{name}/{k}".encode()) >> 1  # another one for every player, model and study seed
-        config = configuration(study, item, balls, source, seed, world)
+        config = make_config(study, item, balls, source, seed, world)
         experiment, run = build.experiment(config, name), Run(folder / "training" / f"seed{k}")
         run.check(experiment.config)
         if not run.trained(experiment.config):

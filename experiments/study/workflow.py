@@ -96,7 +96,7 @@ class Journal:
         return {kind: statistics.median(each) for kind, each in rates.items()}
 
 
-def unfinished(steps: list[Step], journal: Journal) -> list[Step]:
+def list_unfinished(steps: list[Step], journal: Journal) -> list[Step]:
     """The steps that are still to be done, in their order."""
     makers = {path: step for step in steps for path in step.outputs}
     left: list[Step] = []
@@ -132,7 +132,7 @@ class Session:
 
     def __init__(self, steps: list[Step], journal: Journal, console: Console, processes: int = 1) -> None:
         self._journal, self._console, self._processes = journal, console, processes
-        self.left, self._total = unfinished(steps, journal), len(steps)
+        self.left, self._total = list_unfinished(steps, journal), len(steps)
         done = self._total - len(self.left)
         if done:
             console.print(f"{done} of {self._total} steps were done before, {len(self.left)} are left", highlight=False)
@@ -141,7 +141,7 @@ class Session:
         """Marks a step that took ``seconds`` as done. Raises OSError."""
         self._journal.append(step, seconds)
         self.left.remove(step)
-        number, rest = self._total - len(self.left), remaining(self.left, self._journal, self._processes)
+        number, rest = self._total - len(self.left), estimate_remaining(self.left, self._journal, self._processes)
         line = f"[{number}/{self._total}] {step.name}: {text}  ({seconds:.1f} s; {rest})"
         self._console.print(line, highlight=False, soft_wrap=True, markup=False)
 
@@ -153,7 +153,7 @@ def run_all(steps: list[Step], journal: Journal, console: Console) -> None:
         session.mark(step, *perform(step))
 
 
-def remaining(steps: list[Step], journal: Journal, processes: int = 1) -> str:
+def estimate_remaining(steps: list[Step], journal: Journal, processes: int = 1) -> str:
     """An estimate in words of how long these steps take, from what others of their kinds took."""
     rates = journal.seconds_per_work()
     known = sum(rates[step.kind] * step.work for step in steps if step.kind in rates) / processes

@@ -125,7 +125,7 @@ def _play(seed, trainer, evaluator, model, code, rallies, rng) -> scoring.Rallie
     end = np.where(rng.random(rallies) < ROBOT_SHARE, robot, human)
     dropped = rng.random(rallies) < FILTERED_SHARE
     end = np.where(dropped, rng.choice([End.FIRST_NET, End.SERVICE, End.DUMMY_BY_HAND], rallies), end)
-    return scoring.scored(seed, trainer, evaluator, model, code, np.where(dropped, 1, length), end)
+    return scoring.score_rallies(seed, trainer, evaluator, model, code, np.where(dropped, 1, length), end)
 
 
 def _world(path: Path) -> None:

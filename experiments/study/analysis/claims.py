@@ -21,11 +21,11 @@ from experiments.study.analysis.statistics import (
     Bootstrap,
     Estimate,
     Interval,
-    exponential,
-    normalised_by_model,
-    normalised_by_player,
+    average_over_seeds,
+    exponentiate,
+    normalise_by_model,
+    normalise_by_player,
     t_mean,
-    t_over_seeds,
 )
 from experiments.study.analysis.study_folder import BallLog, StudyFolder, changes_of, paper_models
 from mjx_tt.rally.end_reasons import End
@@ -101,13 +101,13 @@ class Measurements:
     def normalised(self) -> Bootstrap:
         """Own evaluations of the ten models, normalised by player."""
         rallies = self.study.pick(TEN, selected=False)
-        return self._finite(rallies, normalised_by_player(rallies))
+        return self._finite(rallies, normalise_by_player(rallies))
 
     @cached_property
     def cross_normalised(self) -> Bootstrap:
         """Own and cross-evaluations of the final models, normalised by the trainer's own evaluation of the model."""
         rallies = self.study.pick(FINAL, own=None, selected=False)
-        return self._finite(rallies, normalised_by_model(rallies))
+        return self._finite(rallies, normalise_by_model(rallies))
 
     @cached_property
     def changes(self) -> Changes:
@@ -229,8 +229,8 @@ def model_change(changes: Changes) -> Interval | None:
     logs = {key: float(np.log(b / a)) for key, (a, b) in changes.items() if a > 0 and b > 0}
     if len(logs) < 2:
         return None
-    found = t_over_seeds(logs)
-    return exponential(found if found.n > 1 else replace(t_mean([*logs.values()]), over=ONE_SEED))
+    found = average_over_seeds(logs)
+    return exponentiate(found if found.n > 1 else replace(t_mean([*logs.values()]), over=ONE_SEED))
 
 
 def model_change_by_level(changes: Changes) -> Interval | None:
@@ -245,12 +245,12 @@ def model_change_by_level(changes: Changes) -> Interval | None:
                 logs.setdefault(seed, ([], []))[k].append(float(np.log(second)))
     both = {seed: pair for seed, pair in logs.items() if all(pair)}
     if len(both) > 1:
-        return exponential(t_over_seeds({(s, ""): float(np.mean(a) - np.mean(b)) for s, (a, b) in both.items()}))
+        return exponentiate(average_over_seeds({(s, ""): float(np.mean(a) - np.mean(b)) for s, (a, b) in both.items()}))
     beginners, intermediate = next(iter(both.values()), ([], []))
     if min(len(beginners), len(intermediate)) < 2:
         return None
     count = len(beginners) + len(intermediate)
-    return exponential(Interval(*welch_interval(intermediate, beginners), count, ONE_SEED))
+    return exponentiate(Interval(*welch_interval(intermediate, beginners), count, ONE_SEED))
 
 
 def paper_changes(player: str) -> tuple[float, float]:

@@ -23,7 +23,7 @@ SEED = 2  # of the draws; those of balls, joints and hits have others
 Ends = Mapping[str, tuple[float, float]]  # low and high end by dotted path
 
 
-def against_the_arm(ranges: Ends, believed: float) -> dict[str, tuple[float, float]]:
+def shift_to_arm(ranges: Ends, believed: float) -> dict[str, tuple[float, float]]:
     """The prior's ranges with those of ball and axes as late against the arm as the arm's own range lets them be.
 
     believed: [s] of the arm's measurement.
@@ -38,7 +38,7 @@ def against_the_arm(ranges: Ends, believed: float) -> dict[str, tuple[float, flo
     return out
 
 
-def moments(ranges: Ends, believed: float) -> dict[str, tuple[float, float]]:
+def compute_moments(ranges: Ends, believed: float) -> dict[str, tuple[float, float]]:
     """Mean and standard deviation of each parameter, uniform in its range; of ball and axes against the arm."""
     out = {path: (0.5 * (low + high), (high - low) / 12**0.5) for path, (low, high) in ranges.items()}
     if ARM in ranges:
@@ -79,7 +79,7 @@ def _change_command(samples: Samples, change: Callable[[np.ndarray, np.ndarray],
     return replace(samples, values=values)
 
 
-def in_sums(truth: Mapping[str, float], world: Mapping[str, float]) -> dict[str, float]:
+def add_to_sums(truth: Mapping[str, float], world: Mapping[str, float]) -> dict[str, float]:
     """A reality's values, by dotted path, with its delays as logs and play can show them.
 
     world: values of the world that they stand beside: where the arm's measurement fixes the clock, and where the axes'

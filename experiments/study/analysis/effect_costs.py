@@ -14,7 +14,7 @@ from pathlib import Path
 from ballmodel.io.atomic_files import replacing
 from experiments.config.study import EFFECTS
 from experiments.errors import ConfigError
-from experiments.study.analysis.statistics import Interval, exponential, t_over_seeds
+from experiments.study.analysis.statistics import Interval, average_over_seeds, exponentiate
 
 FILE = "effects.csv"
 MODELS = ("is2r-sim1", "is2r-sim3", "oracle-sim", "is2r-ft100", "s2r-ft100", "oracle-ft")
@@ -36,7 +36,7 @@ class Outcome:
     """Mean number of paddle touches; NaN without rallies."""
 
 
-def gain(outcomes: list[Outcome], model: str, without: str) -> Interval | None:
+def estimate_gain(outcomes: list[Outcome], model: str, without: str) -> Interval | None:
     """Rally length without an effect over that with all: geometric mean over the players of each seed, then over seeds.
 
     Student's t on the seeds' logarithms, since the players of a seed share one reality; no interval (NaN) for one seed,
@@ -48,7 +48,7 @@ def gain(outcomes: list[Outcome], model: str, without: str) -> Interval | None:
         for (seed, player, world), length in found.items()
         if world == without and (seed, player, NOTHING) in found
     }
-    return exponential(t_over_seeds(logs)) if logs else None
+    return exponentiate(average_over_seeds(logs)) if logs else None
 
 
 def write(path: Path, outcomes: list[Outcome]) -> None:

@@ -31,7 +31,7 @@ UNKNOWN = -1  # whether the robot ended the rally, where the table has no entry
 COLUMNS = tuple("seed trainer evaluator model blind rally length end robot_ended filtered selected".split())
 
 
-def end_of(text: str) -> End:
+def parse_end(text: str) -> End:
     """The end by its row's number (from 1; the first 15 are the paper's) or by its name.
 
     Raises ValueError listing what is allowed.
@@ -46,25 +46,25 @@ def end_of(text: str) -> End:
         raise ValueError(f"{text!r} is no end of a rally; 1 to {len(ROWS)} are allowed, or {names}") from None
 
 
-def kept(pooled: int) -> int:
+def count_reported(pooled: int) -> int:
     """Number of rallies that are reported of a pool of so many: five sixths, 50 of 60."""
     return round(pooled * KEEP / POOL)
 
 
-def pool(filtered: ArrayLike) -> np.ndarray:
+def choose_pool(filtered: ArrayLike) -> np.ndarray:
     """(n,) bool, the rallies of one evaluation among which the longest are reported: the first 60 that count."""
     counted = ~np.asarray(filtered, bool)
     return counted & (np.cumsum(counted) <= POOL)
 
 
-def select(length: ArrayLike, filtered: ArrayLike) -> np.ndarray:
+def choose_reported(length: ArrayLike, filtered: ArrayLike) -> np.ndarray:
     """(n,) bool, the rallies that are reported, of one evaluation's in the order of play.
 
-    length: (n,) touches; filtered: (n,) bool. Of the ``pool`` the longest five sixths; of equal lengths the earlier.
+    length: (n,) touches; filtered: (n,) bool. Of the pool the longest five sixths; of equal lengths the earlier.
     """
-    length, first = np.asarray(length), np.flatnonzero(pool(filtered))
+    length, first = np.asarray(length), np.flatnonzero(choose_pool(filtered))
     chosen = np.zeros(length.size, bool)
-    chosen[first[np.argsort(-length[first], kind="stable")[: kept(first.size)]]] = True
+    chosen[first[np.argsort(-length[first], kind="stable")[: count_reported(first.size)]]] = True
     return chosen
 
 
@@ -102,7 +102,7 @@ class Rallies:
         return self.trainer == self.evaluator
 
 
-def scored(
+def score_rallies(
     seed: int, trainer: str, evaluator: str, model: str, blind: str, length: ArrayLike, end: ArrayLike
 ) -> Rallies:
     """One evaluation's rallies, in the order of play. length: (n,) touches; end: (n,) End."""
@@ -117,14 +117,14 @@ def scored(
         end=end,
         robot_ended=np.array([UNKNOWN if e is None else int(e) for e in ended], int),
         filtered=filtered,
-        pooled=pool(filtered),
-        selected=select(length, filtered),
+        pooled=choose_pool(filtered),
+        selected=choose_reported(length, filtered),
     )
 
 
 def join(parts: Iterable[Rallies]) -> Rallies:
     """Rallies one after the other; without any, an empty one."""
-    parts = list(parts) or [scored(0, "", "", "", "", [], [])]
+    parts = list(parts) or [score_rallies(0, "", "", "", "", [], [])]
     return Rallies(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Rallies)))
 
 
@@ -163,7 +163,7 @@ def read(path: Path) -> Rallies:
     parts = []
     for group, played in evaluations.items():
         numbers, lengths, ends = zip(*sorted(played, key=lambda p: p[0]), strict=True)
-        parts.append(replace(scored(*group, lengths, ends), rally=np.array(numbers)))
+        parts.append(replace(score_rallies(*group, lengths, ends), rally=np.array(numbers)))
     return join(parts)
 
 

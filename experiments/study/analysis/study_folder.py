@@ -305,7 +305,7 @@ def _missing(study: StudyFolder, models: tuple[str, ...], cross: bool) -> list[s
     counted.update(key for key, filtered in zip(evaluations, r.filtered.tolist(), strict=True) if not filtered)
     short = [
         f"seed {seed}, {trainer} with {evaluator}, {model}: {count} rallies that count of {scoring.POOL}, "
-        f"the longest {scoring.kept(count)} are reported"
+        f"the longest {scoring.count_reported(count)} are reported"
         for (seed, trainer, evaluator, model), count in counted.items()
         if count < scoring.POOL
     ]

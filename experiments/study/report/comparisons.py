@@ -68,7 +68,7 @@ def _return_rates(m: Measurements, seed: int, player: str, keys: Sequence[str]) 
 def draw_effects(m: Measurements) -> Figure | None:
     """Rally length without an effect over that with all, by model."""
     models, worlds = effect_costs.MODELS, effect_costs.WORLDS[1:]
-    gains = [[effect_costs.gain(m.study.effects, model, world) for model in models] for world in worlds]
+    gains = [[effect_costs.estimate_gain(m.study.effects, model, world) for model in models] for world in worlds]
     logs = np.array([[np.nan if gain is None else np.log2(gain.value) for gain in row] for row in gains])
     if not np.isfinite(logs).any():
         return None

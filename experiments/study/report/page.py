@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from experiments.study.analysis.claims import NOT_COMPARABLE, PLAYS, VERDICTS, WIDEST, Measurements, show, show_interval
 from experiments.study.analysis.paper import FINAL, LEVELS, SHORT, of_level
 from experiments.study.analysis.scoring import KEEP
-from experiments.study.analysis.statistics import FEWEST_SEEDS, Estimate, Interval, chance
+from experiments.study.analysis.statistics import FEWEST_SEEDS, Estimate, Interval, name_chance
 from experiments.study.analysis.study_folder import StudyFolder, load
 from experiments.study.paths import REPORT
 from experiments.study.report import figures, tables, tsne
@@ -83,7 +83,7 @@ class Report:
             broken_off=int(np.sum(rallies.selected & (rallies.end == End.NONE))),
             most_missing=MOST_MISSING,
             fewest_seeds=FEWEST_SEEDS,
-            chance=chance(len(self.study.seeds)),
+            chance=name_chance(len(self.study.seeds)),
             rallies_reported=KEEP,
             widest=f"{WIDEST:g}",
             plays=f"{PLAYS:g}",

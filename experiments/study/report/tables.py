@@ -15,9 +15,9 @@ from ballmodel.io.atomic_files import replacing
 from experiments.stats import holm
 from experiments.study.analysis import effect_costs
 from experiments.study.analysis.claims import DIFFERENCE, HITS, Measurements, paper_changes, show, show_interval
-from experiments.study.analysis.identified import PRIOR, estimates, holds
+from experiments.study.analysis.identified import PRIOR, holds, list_estimates
 from experiments.study.analysis.paper import BY_KEY, CROSS, FINAL, GROUPS, LEVELS, SHORT, TEN, level, of_level
-from experiments.study.analysis.statistics import FEWEST_SEEDS, chance, difference, share_of, t_mean
+from experiments.study.analysis.statistics import FEWEST_SEEDS, compare_models, estimate_share, name_chance, t_mean
 from experiments.study.analysis.study_folder import NUMBERS, ROUNDS, StudyFolder, numbers, paper_models, widths
 from experiments.study.report.figures import TUNED
 from experiments.study.report.plots import Measured, interval_of
@@ -131,7 +131,7 @@ def tabulate_effects(m: Measurements) -> Table:
     """Rally length of each model in a reality without an effect over that with all, with 95 % intervals over seeds."""
     rows = []
     for world in effect_costs.WORLDS[1:]:
-        gains = [effect_costs.gain(m.study.effects, model, world) for model in effect_costs.MODELS]
+        gains = [effect_costs.estimate_gain(m.study.effects, model, world) for model in effect_costs.MODELS]
         if any(gains):
             rows.append((world, *map(_with_interval, gains)))
     head = ("left out", *(BY_KEY[model].label for model in effect_costs.MODELS))
@@ -194,7 +194,7 @@ def tabulate_coverage(m: Measurements) -> Table:
             different[seed, row["parameter"], row["low"], row["high"]] = held
     rows = []
     for (name, source), inside in sorted(found.items()):
-        share = share_of((seed, held) for (seed, *_), held in inside.items())
+        share = estimate_share((seed, held) for (seed, *_), held in inside.items())
         width = f"{100 * share.low:.0f} to {100 * share.high:.0f} %"
         if source == PRIOR:
             width = "none: given, not estimated"
@@ -227,7 +227,7 @@ def tabulate_significance(m: Measurements) -> Table:
         for group in GROUPS
         for scale, boot in (("raw", m.raw), ("normalised", m.normalised))
         for a, b in ((is2r, s2r), (is2r, oracle), (oracle, s2r))
-        if (d := difference(boot, a, b, of_level(group))) is not None
+        if (d := compare_models(boot, a, b, of_level(group))) is not None
     ]
     adjusted = holm(d.p_rallies for *_, d in found)
     rows = []
@@ -236,7 +236,7 @@ def tabulate_significance(m: Measurements) -> Table:
         spans = (show_interval(DIFFERENCE, d.bootstrap), show_interval(DIFFERENCE, d.welch))
         label = f"{SHORT[a]} − {SHORT[b]}"
         rows.append((group, scale, label, f"{d.bootstrap.value:+.2f}", *spans, *tests, str(d.pairs)))
-    spans = (f"95 %, {chance(len(m.study.seeds))}", "95 %, Welch")
+    spans = (f"95 %, {name_chance(len(m.study.seeds))}", "95 %, Welch")
     tests = ("p Welch", "p permuted", "p permuted, Holm", "p policies")
     head = ("players", "scale", "difference", "mean", *spans, *tests, "pairs of policies")
     return Table(head, rows, range(3, len(head)))
@@ -327,7 +327,7 @@ def _estimates(study: StudyFolder) -> Iterator[tuple[int, str, str, dict[str, An
     for path in sorted(study.folder.glob("seed*/player*/identified/world*.yaml")):
         seed, player = int(path.parents[2].name[4:]), path.parents[1].name
         opened = study.realities.get(seed)
-        for row in estimates(ModelFile.load(path), None if opened is None else opened["reality"]):
+        for row in list_estimates(ModelFile.load(path), None if opened is None else opened["reality"]):
             yield seed, player, path.stem, row
 
 

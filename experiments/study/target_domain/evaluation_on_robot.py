@@ -29,7 +29,7 @@ SESSIONS = 3  # on the rig at most in one go, until all rallies are played: a bu
 PLAYED = "played.json"  # an evaluation's rallies so far, with the sessions that they are from
 
 
-def seed_of(name: str) -> int:
+def derive_seed(name: str) -> int:
     """Seed of a step of that name."""
     return zlib.crc32(name.encode()) >> 1
 
@@ -95,7 +95,7 @@ def _load(folder: Path, artefact: str) -> Evaluation:
     return found
 
 
-def rally_step(
+def make_rally_step(
     folder: Path,
     who: tuple[int, str, str, str],
     run_of: Callable[[], Path],
@@ -124,7 +124,7 @@ def rally_step(
             if status is not None:
                 left = f"{rallies - found.counted} of {rallies} rallies are left to play"
                 console.print(f"{found.newest_report(folder)}: {left}", highlight=False, soft_wrap=True)
-            chance = seed_of(name) + found.begun
+            chance = derive_seed(name) + found.begun
             found = replace(found, begun=found.begun + 1)
             found.save(folder)
             try:
@@ -140,14 +140,14 @@ def rally_step(
                 "these rallies"
             )
         played = [(one["length"], End[one["end"]]) for one in found.rallies]
-        scored = scoring.scored(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
+        scored = scoring.score_rallies(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
         scoring.write(counted, scored)
         return f"{len(played)} rallies, {scored.length[~scored.filtered].mean():.1f} touches on average"
 
     return Step(name, "rallies", rallies, inputs, (counted,), run)
 
 
-def blind_steps(
+def make_blind_steps(
     folder: Path,
     seed: int,
     trainer: str,

@@ -78,12 +78,12 @@ def record(
         episodes = simulator.episodes(turn_key, model, state)
         watched = jax.tree.map(np.asarray, _watched(policy, episodes, task=task))
         state, _ = simulator.shots(policy, player, model, state, turn_key)
-        seen = hidden_effects.seen(model, watched[0], noise, jax.random.fold_in(camera_key, turn))
+        seen = hidden_effects.observe(model, watched[0], noise, jax.random.fold_in(camera_key, turn))
         late_by = np.asarray(episodes.latency)
         for lane in range(lanes):
             begin = EVERY * (turn * lanes + lane)
             late = float(late_by[0, lane]) - believed
-            count = in_sight(watched[0][..., lane])
+            count = count_visible(watched[0][..., lane])
             time = begin + late + np.arange(count) / CAMERA_RATE
             balls.append(Trajectory(session, str(len(balls)), np.asarray(time), seen[:, :count, lane]))
             commands, encoders = (np.asarray(x)[..., lane] for x in watched[1:])
@@ -101,7 +101,7 @@ class _States:
     encoder: np.ndarray  # (8, T) true positions at the simulator's steps
 
 
-def in_sight(position: np.ndarray) -> int:
+def count_visible(position: np.ndarray) -> int:
     """Frames of a ball's positions (3, T) [m] until it falls low, passes the robot or comes back to where it was hit.
 
     A person behind the table may strike below its height: such a ball rises first.

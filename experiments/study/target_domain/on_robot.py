@@ -29,7 +29,7 @@ from experiments.finetuning import session as tuning
 from experiments.finetuning.robot import SCENE, BallRecorder, LockStepRobot
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
-from experiments.study.target_domain.evaluation_on_robot import export_once, seed_of
+from experiments.study.target_domain.evaluation_on_robot import derive_seed, export_once
 from experiments.study.target_domain.hit_log import HitLog
 from experiments.study.workflow import Waiting
 from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, before_racket, load_logs
@@ -49,14 +49,14 @@ def look_up(study: Study, robot: str) -> None:
         except ConfigError as error:
             raise ConfigError(f"robot: {error}") from None
     for player in study.recordings:
-        recording(study, player)
+        load_recording(study, player)
     if study.identification is not None and study.identification.joints is not None:
         given = Path(study.identification.joints)
         with error_context("identification.joints"):
             load_logs([given / file for file in ROBOT_FILES])
 
 
-def recording(study: Study, player: str) -> Dataset:
+def load_recording(study: Study, player: str) -> Dataset:
     """Balls of a player recorded before the study. Raises ConfigError naming the key and what is wrong."""
     where, path = f"recordings.{player}", study.recording(player)
     with error_context(where):
@@ -74,10 +74,10 @@ class RobotWorld:
 
     def first_balls(self, player: str, name: str) -> Dataset:
         """Balls of the player recorded before the study, on the rig without a recording those that the virtual player
-        serves. Raises ConfigError as ``recording`` does."""
+        serves. Raises ConfigError as ``load_recording`` does."""
         if player not in self._study.recordings:
-            return serve_balls(player, self._study.first_balls, seed_of(name), name.rsplit("/", 1)[-1])
-        measured = recording(self._study, player)
+            return serve_balls(player, self._study.first_balls, derive_seed(name), name.rsplit("/", 1)[-1])
+        measured = load_recording(self._study, player)
         # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
         label = name.rsplit("/", 1)[-1]
         tracks = tuple(replace(t, session=label, name=str(i)) for i, t in enumerate(measured))
@@ -86,7 +86,7 @@ class RobotWorld:
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         """``mjx-tt finetune``; raises Waiting when the operator stopped it."""
         study = self._study
-        settings = study.fine_tuning.model_copy(update={"updates": real_updates, "seed": seed_of(name)})
+        settings = study.fine_tuning.model_copy(update={"updates": real_updates, "seed": derive_seed(name)})
         balls = settings.updates * settings.episodes_per_update
         self._console.print(
             f"{name}: {player} to the table, {balls:,} balls for {settings.updates} updates and twice "
@@ -102,7 +102,7 @@ class RobotWorld:
             None,
             None,
             "numpy",
-            seed_of(name),
+            derive_seed(name),
             self._console,
             player if self._robot == RIG else None,
         )
@@ -136,12 +136,12 @@ class RobotWorld:
         balls, robot = self._study.simulation.selection_episodes, self._robot
         experiment = loop.experiment_of(trained.source)
         if robot == tuning.LOCK_STEP:
-            emulated = loop.lock_step_robot(experiment, seed=seed_of(name))
+            emulated = loop.lock_step_robot(experiment, seed=derive_seed(name))
             return float(np.mean([_lock_step(emulated, trained, n) for n in range(balls)]))
         artefact = export_once(trained, self._console)
         logs = trained.source / "selection"
         self._console.print(f"{name}: {player} plays {balls} balls with {trained.source.name}", highlight=False)
-        session.run(artefact, robot, balls, None, "numpy", logs, None, seed_of(name), None, self._console)
+        session.run(artefact, robot, balls, None, "numpy", logs, None, derive_seed(name), None, self._console)
         found = json.loads(max(logs.glob("*.json")).read_text(encoding="utf-8"))
         if found["episodes"] < balls:
             raise Waiting(

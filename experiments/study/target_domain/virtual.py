@@ -228,7 +228,7 @@ class World(Protocol):
         """Function that scores a policy with the player; None where scores are not needed."""
 
 
-def with_spin(reality: VirtualReality, player: str, key: PRNGKeyArray) -> SimModel:
+def add_spin(reality: VirtualReality, player: str, key: PRNGKeyArray) -> SimModel:
     """The reality's model with mean and spread of the spin of a player's strokes."""
     state = reality.simulator.start(reality.player(player), reality.known, key, STROKES)
     spin = np.asarray(state.ball.spin)
@@ -253,9 +253,9 @@ class VirtualWorld:
             self.reality.player(player), self._study.first_balls, self._key(name), Path(name).name
         )
 
-    def with_spin(self, player: str, name: str) -> SimModel:
+    def add_spin(self, player: str, name: str) -> SimModel:
         """The reality as a training could have it at best: with mean and spread of the spin of the player's strokes."""
-        return with_spin(self.reality, player, self._key(name))
+        return add_spin(self.reality, player, self._key(name))
 
     def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
         """Commands and measured positions of all joints in so many seconds of motion without a ball."""

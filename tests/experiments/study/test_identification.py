@@ -16,7 +16,7 @@ from experiments.config.study import PRIOR
 from experiments.runs import load_policy
 from experiments.study import identification
 from experiments.study.analysis import delays
-from experiments.study.analysis.identified import BELIEVED, LOGS, estimates, holds
+from experiments.study.analysis.identified import BELIEVED, LOGS, holds, list_estimates
 from experiments.study.analysis.identified import PRIOR as DRAWN
 from experiments.study.target_domain import hit_log, joint_log
 from experiments.study.target_domain.virtual import VirtualReality
@@ -93,7 +93,7 @@ def test_a_world_is_what_the_logs_say_and_the_prior_for_the_rest(identified, tmp
     assert values["ball.table.height"] == 0.0 and "ball.table.height" not in drawn
     # What no log of this kind shows is drawn as before; the arm's measurement, which fixes the clock, is as believed.
     hidden = {"ball.paddle.restitution", "sensing.ball_offset_x", "drives.joint_1.joint_offset"}
-    rows = {row["parameter"]: row for row in estimates(world, truth)}
+    rows = {row["parameter"]: row for row in list_estimates(world, truth)}
     for path in hidden:
         assert [rows[path]["low"], rows[path]["high"]] == PRIOR[path] and rows[path]["decided by"] == DRAWN
     assert drawn == set(PRIOR) - {delays.ARM}
@@ -130,7 +130,7 @@ def test_hits_of_real_play_decide_the_rubber_and_the_delay(tmp_path):
     logs, before = [tmp_path / "D0.csv", tmp_path / "joints"], identification.read_prior(PRIOR, "prior")
     found = identification.identify(logs, 400, ModelFile(SimModel()), before, [tmp_path / "hits"])
     assert found.hits > 40 and found.world.provenance["identified"]["hits"] == found.hits
-    rows = {row["parameter"]: row for row in estimates(found.world)}
+    rows = {row["parameter"]: row for row in list_estimates(found.world)}
     truth, middle = models.paths(reality.model), models.paths(found.world.model)
     delay = "latency.ball_observation"  # against the joints' delay, which is left as believed
     truth[delay] += models.paths()["latency.abb_observation"] - truth["latency.abb_observation"]
@@ -149,10 +149,10 @@ def test_rows_of_a_world_name_what_moved_or_is_drawn():
         models.with_values(SimModel(), {"ball.table.friction": 0.2}),
         identification.read_prior({"ball.paddle.restitution": [0.8, 0.9]}, "prior"),
     )
-    rows = {row["parameter"]: (row["low"], row["high"]) for row in estimates(world)}
+    rows = {row["parameter"]: (row["low"], row["high"]) for row in list_estimates(world)}
     assert rows == {"ball.table.friction": (0.2, 0.2), "ball.paddle.restitution": (0.8, 0.9)}
     nothing = replace(world, model=SimModel(), randomise=())
-    assert estimates(nothing) == []
+    assert list_estimates(nothing) == []
 
 
 def test_delays_are_judged_by_the_sums_that_show_and_a_persons_spin_not_at_all():
@@ -164,7 +164,7 @@ def test_delays_are_judged_by_the_sums_that_show_and_a_persons_spin_not_at_all()
     world = models.with_values(SimModel(), {"ball_spin.mean_x": 20.0})
     truth = {"latency.abb_observation": nominal["latency.abb_observation"] - 0.005}
     truth["latency.abb_action"] = nominal["latency.abb_action"] + 0.004
-    rows = {row["parameter"]: row for row in estimates(ModelFile(world, (samples,)), truth)}
+    rows = {row["parameter"]: row for row in list_estimates(ModelFile(world, (samples,)), truth)}
     assert rows["latency.abb_action"]["truth"] == pytest.approx(nominal["latency.abb_action"] - 0.001)
     assert rows["latency.ball_observation"]["truth"] == pytest.approx(nominal["latency.ball_observation"] + 0.005)
     assert [holds(rows[path]) for path in paths] == [True, True]

@@ -37,9 +37,9 @@ from experiments.study.analysis.paper import TEN
 from experiments.study.pipeline import Pipeline
 from experiments.study.schedule import Human, Identified, Real, Simulated
 from experiments.study.target_domain import hidden_effects
-from experiments.study.target_domain.evaluation_on_robot import blind_steps
+from experiments.study.target_domain.evaluation_on_robot import make_blind_steps
 from experiments.study.target_domain.virtual import VirtualReality
-from experiments.study.workflow import Journal, Step, Waiting, remaining, run_all, unfinished
+from experiments.study.workflow import Journal, Step, Waiting, estimate_remaining, list_unfinished, run_all
 from mjx_tt.env import rewards
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.rally import human_player
@@ -261,9 +261,9 @@ def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
 def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
     night = study_config.load(study_config.shipped()["study_night"])
     by_key = {item.key: item for item in (*schedule.LOOP, *schedule.COMPARED) if isinstance(item, Simulated)}
-    first = training.configuration(night, by_key["is2r-sim1"], "player3/M0", None, 5)
-    later = training.configuration(night, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
-    oracle = training.configuration(night, by_key["oracle-sim"], "player3/M2", None, 7)
+    first = training.make_config(night, by_key["is2r-sim1"], "player3/M0", None, 5)
+    later = training.make_config(night, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
+    oracle = training.make_config(night, by_key["oracle-sim"], "player3/M2", None, 7)
     assert first.training.updates + 2 * later.training.updates == oracle.training.updates
     assert (first.initial_policy, later.initial_policy, oracle.initial_policy) == (None, str(tmp_path), None)
     assert (
@@ -286,23 +286,23 @@ def test_the_papers_study_trains_as_the_papers_training():
     ]
     assert study_.simulation.rounds[0].simulated == paper.training.updates
     item = next(i for i in schedule.list_items(study_, "player1") if isinstance(i, Simulated))
-    assert training.configuration(study_, item, "narrow", None, 0).training.later_rewards is None
+    assert training.make_config(study_, item, "narrow", None, 0).training.later_rewards is None
 
 
 # The hidden reality
 
 
 def test_leaving_out_an_effect_changes_no_other_and_seeds_differ():
-    everything = hidden_effects.differences(hidden_effects.draw(3))
+    everything = hidden_effects.list_differences(hidden_effects.draw(3))
     ranges = {path: bounds for group in hidden_effects.RANGES.values() for path, bounds in group.items()}
     assert everything.keys() == ranges.keys()
     assert all(low <= everything[path] <= high for path, (low, high) in ranges.items())
     for effect in hidden_effects.RANGES:
-        left = hidden_effects.differences(hidden_effects.draw(3, (effect,)))
+        left = hidden_effects.list_differences(hidden_effects.draw(3, (effect,)))
         assert left == {path: value for path, value in everything.items() if path not in hidden_effects.RANGES[effect]}
     assert tuple(hidden_effects.RANGES) == study_config.EFFECTS
     assert hidden_effects.draw(3, study_config.EFFECTS) == models.with_values(SimModel(), {})
-    other = hidden_effects.differences(hidden_effects.draw(4))
+    other = hidden_effects.list_differences(hidden_effects.draw(4))
     assert all(other[path] != value for path, value in everything.items())
     with pytest.raises(ValueError, match="no effect is called 'magic'; there are rubber"):
         hidden_effects.draw(3, ("magic",))
@@ -323,18 +323,18 @@ def test_realities_lie_to_both_sides_of_what_training_believes_and_within_the_pr
 
 
 def test_effects_from_outside_come_on_top_and_change_no_other():
-    inside = hidden_effects.differences(hidden_effects.draw(3))
+    inside = hidden_effects.list_differences(hidden_effects.draw(3))
     for effect, ranges in hidden_effects.OUTSIDE.items():
         model = hidden_effects.draw(3, outside=(effect,))
-        found = hidden_effects.differences(model)
+        found = hidden_effects.list_differences(model)
         assert {p: v for p, v in found.items() if p not in ranges} == {
             p: v for p, v in inside.items() if p not in ranges
         }
         assert all(low <= found[path] <= high for path, (low, high) in ranges.items())
         # What no prior has: an identification cannot come upon it by chance.
         assert not set(ranges) <= set(study_config.PRIOR)
-        assert hidden_effects.content(model, 3, (), (effect,))["outside"] == [effect]
-    assert "outside" not in hidden_effects.content(hidden_effects.draw(3), 3, ())
+        assert hidden_effects.describe(model, 3, (), (effect,))["outside"] == [effect]
+    assert "outside" not in hidden_effects.describe(hidden_effects.draw(3), 3, ())
     assert tuple(hidden_effects.OUTSIDE) == get_args(study_config.Outside)
     with pytest.raises(ValueError, match="outside of the model is called 'magic'; there are lift, bounce"):
         hidden_effects.draw(3, outside=("magic",))
@@ -459,10 +459,10 @@ def test_steps_go_on_where_they_were_stopped_and_follow_what_is_made_anew(tmp_pa
     run_all(toy_steps(tmp_path, done), Journal(path), quiet())
     assert len(done) == 4
     (tmp_path / "b").unlink()
-    assert [s.name for s in unfinished(toy_steps(tmp_path, done), Journal(path))] == ["b", "d"]
+    assert [s.name for s in list_unfinished(toy_steps(tmp_path, done), Journal(path))] == ["b", "d"]
     with pytest.raises(KeyboardInterrupt):  # b is made anew, and then it is killed: d is older than b
         run_all(toy_steps(tmp_path, done, fail="d"), Journal(path), quiet())
-    assert [s.name for s in unfinished(toy_steps(tmp_path, done), Journal(path))] == ["d"]
+    assert [s.name for s in list_unfinished(toy_steps(tmp_path, done), Journal(path))] == ["d"]
     path.write_text("nonsense\n" + path.read_text())
     with pytest.raises(RunError, match="line 1 is no step"):
         Journal(path)
@@ -473,11 +473,11 @@ def test_the_remaining_time_follows_from_what_the_same_kind_took(tmp_path):
     steps = [Step(str(i), "fast" if i < 3 else "slow", i + 1.0, (), (), lambda: "") for i in range(5)]
     journal.append(steps[0], 2.0)
     journal.append(steps[1], 4.0)
-    assert remaining(steps[2:], journal) == "at least 0:00:06 left, not yet timed: slow"
+    assert estimate_remaining(steps[2:], journal) == "at least 0:00:06 left, not yet timed: slow"
     journal.append(steps[3], 40.0)
-    assert remaining([steps[2], steps[4]], Journal(journal.path)) == "about 0:00:56 left"
+    assert estimate_remaining([steps[2], steps[4]], Journal(journal.path)) == "about 0:00:56 left"
     journal.append(steps[2], 300.0)  # one that compiled is not what the next ones take
-    assert remaining([steps[2], steps[4]], journal) == "about 0:00:56 left"
+    assert estimate_remaining([steps[2], steps[4]], journal) == "about 0:00:56 left"
 
 
 def test_who_does_the_steps(tmp_path):
@@ -557,7 +557,7 @@ def test_worlds_side_by_side_are_those_that_were_drawn():
         hidden_effects.draw(3, left_out)
         for left_out in ((), ("drives", "encoders"), ("table",), tuple(hidden_effects.RANGES))
     ]
-    together = models.paths(hidden_effects.side_by_side(drawn, 2))
+    together = models.paths(hidden_effects.stack_worlds(drawn, 2))
     for path, value in together.items():
         wanted = [models.paths(world)[path] for world in drawn]
         if isinstance(value, jax.Array):
@@ -612,7 +612,7 @@ def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
     )
     by_key = {item.key: item for item in schedule.LOOP if isinstance(item, Simulated)}
     human = finished / "seed0" / "player3" / "balls" / "human_M2.yaml"
-    text = training.simulate(study(), by_key["is2r-sim1"], tmp_path / "again", human, None, "again", quiet(), None)
+    text = training.train_seeds(study(), by_key["is2r-sim1"], tmp_path / "again", human, None, "again", quiet(), None)
     assert text.startswith("6 updates")
     assert not compiled
     places = tmp_path / "again", finished / "seed0" / "player3" / "is2r-sim1"
@@ -712,7 +712,7 @@ def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
 def test_people_play_under_code_names_and_the_key_opens_when_the_sheet_is_full(finished, tmp_path):
     folder, player = tmp_path / "blind", finished / "seed0" / "player3"
     runs_of = {key: (lambda key=key: player / key) for key in ("is2r-ft35", "is2r-ft65")}
-    make, count = blind_steps(folder, 0, "player3", "player4", runs_of, (), "robot.yaml", quiet())
+    make, count = make_blind_steps(folder, 0, "player3", "player4", runs_of, (), "robot.yaml", quiet())
     journal = Journal(tmp_path / "steps.jsonl")
     with pytest.raises(Waiting, match=r"player4 plays rallies with .*policies/CODE --robot robot.yaml.*A has 0 of 50"):
         run_all([make, count], journal, quiet())
@@ -721,7 +721,7 @@ def test_people_play_under_code_names_and_the_key_opens_when_the_sheet_is_full(f
     length = {"A": 3, "B": 8}
     filled = [f"{line[:-2]},{length[line[0]]},13" if line.endswith(",,") else line for line in lines]
     sheet.write_text("\n".join(filled) + "\n")
-    assert [step.name for step in unfinished([make, count], journal)] == [count.name]
+    assert [step.name for step in list_unfinished([make, count], journal)] == [count.name]
     run_all([make, count], journal, quiet())
     rallies = scoring.read(folder / blind_protocol.EVALUATIONS)
     codes = blind_protocol.unseal(folder / blind_protocol.KEY)["codes"]

@@ -34,7 +34,7 @@ from tests.support import made_up_study
 def rallies(lengths: dict, end=End.ROBOT_MISSED):
     """Rallies from {(seed, trainer, evaluator, model): lengths}."""
     return scoring.join(
-        scoring.scored(s, t, e, m, "A", values, [end] * len(values)) for (s, t, e, m), values in lengths.items()
+        scoring.score_rallies(s, t, e, m, "A", values, [end] * len(values)) for (s, t, e, m), values in lengths.items()
     )
 
 
@@ -94,7 +94,7 @@ def test_fewer_than_five_seeds_are_not_drawn_anew():
     levels = [3, 30, 12, 7]
     data = rallies({(s, "player1", "player1", "m"): np.full(5, level) for s, level in enumerate(levels)})
     assert np.ptp(Bootstrap(data).mean("m", ["player1"]).draws) == 0.0
-    assert [statistics.chance(n) for n in (1, 4, 5)] == ["rallies", "rallies", "seeds and rallies"]
+    assert [statistics.name_chance(n) for n in (1, 4, 5)] == ["rallies", "rallies", "seeds and rallies"]
 
 
 def test_the_interval_covers_as_often_as_it_says():
@@ -129,7 +129,7 @@ def test_tests_of_differences_are_scipys_and_counted_by_hand():
     rng = np.random.default_rng(1)
     x, y = rng.geometric(0.1, 40), rng.geometric(0.14, 40)
     data = rallies({(0, "player1", "player1", "a"): x, (0, "player1", "player1", "b"): y})
-    found = statistics.difference(Bootstrap(data), "a", "b", ["player1"])
+    found = statistics.compare_models(Bootstrap(data), "a", "b", ["player1"])
     welch = stats.ttest_ind(x, y, equal_var=False)
     assert found.p_welch == pytest.approx(welch.pvalue)
     assert (found.welch.low, found.welch.high) == pytest.approx(tuple(welch.confidence_interval()))
@@ -154,10 +154,10 @@ def test_normalisation_both_ways_by_hand():
         }
     )
     own = data.take(data.own)
-    by_player = statistics.normalised_by_player(own)
+    by_player = statistics.normalise_by_player(own)
     spread = np.sqrt(20 / 3)  # of 2, 4, 6, 8 around 5
     assert by_player == pytest.approx([*(np.array([-3, -1, 1, 3]) / spread), -np.sqrt(0.5), np.sqrt(0.5)])
-    by_model = statistics.normalised_by_model(data)
+    by_model = statistics.normalise_by_model(data)
     unit = np.sqrt(2.0)  # of 2, 4
     expected = {
         (0, "a", True): [-1 / unit, 1 / unit],
@@ -297,7 +297,7 @@ def test_claims_are_judged_as_the_made_up_numbers_demand(whole):
 def test_what_an_effect_costs_is_the_geometric_mean_over_players_and_seeds(whole):
     outcomes = study_data.load(whole).effects
     for world, ratio in {"magnus": 1.2, "drives": 0.9, "all": 1.5, "camera": 1.0}.items():
-        found = effect_costs.gain(outcomes, "oracle-ft", world)
+        found = effect_costs.estimate_gain(outcomes, "oracle-ft", world)
         assert (found.value, found.low, found.high) == pytest.approx((ratio, ratio, ratio))
     with open(whole / "report" / "effects.csv", newline="") as file:
         head, *rows = csv.reader(file)

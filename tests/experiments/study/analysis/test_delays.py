@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.study.analysis import delays
-from experiments.study.analysis.identified import LOGS, PRIOR_ALONE, estimates, holds
+from experiments.study.analysis.identified import LOGS, PRIOR_ALONE, holds, list_estimates
 from experiments.study.analysis.identified import PRIOR as DRAWN
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, Samples, SimModel
@@ -30,7 +30,7 @@ def test_a_later_clock_of_all_that_moves_is_no_other_reality():
     """Measurements 7 ms later, commands 7 ms sooner: the same robot for whoever sees and commands it."""
     later = {path: value + (0.007 if "observation" in path else -0.007) for path, value in TRUTH.items()}
     world = models.paths() | {delays.ARM: 0.029, delays.AXES: 0.035}
-    one, other = (delays.in_sums(models.paths() | x, world) for x in (TRUTH, later))
+    one, other = (delays.add_to_sums(models.paths() | x, world) for x in (TRUTH, later))
     assert one == pytest.approx(other, abs=1e-12)
     # By hand: the arm is measured 9 ms sooner than believed, and 25 ms sooner than the axes.
     assert one[delays.ARM] == 0.029 and one[delays.AXES] == pytest.approx(0.029 + 0.025)
@@ -39,11 +39,11 @@ def test_a_later_clock_of_all_that_moves_is_no_other_reality():
 
 
 def test_ball_and_axes_are_as_open_against_the_arm_as_both_ranges_let_them_be():
-    known = delays.moments(RANGES, 0.029)
+    known = delays.compute_moments(RANGES, 0.029)
     assert known[delays.AXES_COMMAND] == pytest.approx((0.05, 0.1 / 12**0.5))
     assert known[delays.BALL] == pytest.approx((0.039, (2 * 0.02**2 / 12) ** 0.5))
     assert known[delays.AXES] == pytest.approx((0.029, ((0.02**2 + 0.04**2) / 12) ** 0.5))
-    ends = delays.against_the_arm(RANGES, 0.029)
+    ends = delays.shift_to_arm(RANGES, 0.029)
     assert ends[delays.BALL] == pytest.approx((0.019, 0.059)) and ends[delays.AXES] == pytest.approx((0.0, 0.059))
     drawn = delays.draw_unseen(RANGES, 0.029, (delays.AXES, delays.BALL), 20_000)
     assert drawn.values.min() >= 0.0
@@ -73,7 +73,7 @@ def test_a_report_judges_the_sum_and_says_what_the_prior_alone_drew():
     made_of = {"identified": {PRIOR_ALONE: [delays.AXES]}}
     samples = Samples((delays.AXES_COMMAND, delays.AXES), values, np.ones(200))
     world = ModelFile(models.with_values(SimModel(), centre), (samples,), made_of)
-    rows = {row["parameter"]: row for row in estimates(world, {delays.AXES: 0.022, delays.AXES_COMMAND: 0.062})}
+    rows = {row["parameter"]: row for row in list_estimates(world, {delays.AXES: 0.022, delays.AXES_COMMAND: 0.062})}
     sums = rows[delays.AXES_COMMAND]
     assert sums["high"] - sums["low"] < 0.0025 and holds(sums) and sums["decided by"] == LOGS
     assert sums["truth"] == pytest.approx(0.022 + 0.062 - centre[delays.AXES])

@@ -14,7 +14,7 @@ from experiments.errors import RunError
 from experiments.finetuning.robot import LockStepRallies
 from experiments.runs import load_policy
 from experiments.study import identification
-from experiments.study.analysis.identified import LOGS, estimates
+from experiments.study.analysis.identified import LOGS, list_estimates
 from experiments.study.target_domain import on_robot
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.sim.model import ModelFile, SimModel
@@ -69,7 +69,7 @@ def identified(folder, served, late: float):
     believed, before = ModelFile(SimModel()), identification.read_prior(PRIOR, "prior")
     made = identification.identify(logs, 400, believed, before, [folder / "hits"])
     assert 0.6 * hit < made.hits <= hit + 1  # of balls that were hit nearly all are used, and no others
-    return {row["parameter"]: row for row in estimates(made.world) if row["decided by"] == LOGS}
+    return {row["parameter"]: row for row in list_estimates(made.world) if row["decided by"] == LOGS}
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_sessions_of_the_emulated_robot_show_by_how_much_it_obeys_later(tmp_path
 def test_without_a_log_of_the_joints_the_drives_are_drawn_from_the_prior(served):
     before = identification.read_prior(PRIOR, "prior")
     made = identification.identify([served], 60, ModelFile(SimModel()), before)
-    rows = {row["parameter"]: row for row in estimates(made.world)}
+    rows = {row["parameter"]: row for row in list_estimates(made.world)}
     assert made.left == {} and rows["drives.joint_2.lag"]["decided by"] == "prior"
     for path in ("drives.joint_2.lag", "latency.abb_action", "latency.abb_observation"):
         assert [rows[path]["low"], rows[path]["high"]] == PRIOR[path]
