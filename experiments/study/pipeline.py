@@ -44,7 +44,7 @@ from experiments.study.schedule import (
 )
 from experiments.study.target_domain import hidden_effects, on_robot
 from experiments.study.target_domain.evaluation_on_robot import make_blind_steps, make_rally_step
-from experiments.study.target_domain.virtual import VirtualReality, VirtualWorld, World
+from experiments.study.target_domain.virtual import VirtualReality, VirtualWorld
 from experiments.study.workflow import Step
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.env.policy import Policy
@@ -57,7 +57,7 @@ class Pipeline:
     def __init__(self, study: Study, folder: Path, console: Console) -> None:
         self.study, self.paths, self.console = study, StudyPaths(folder), console
         self._virtual: dict[int, VirtualWorld] = {}
-        self._world: dict[int, World] = {}
+        self._world: dict[int, VirtualWorld | on_robot.RobotWorld] = {}
         if study.robot is None:
             shared = VirtualReality(study, study.seeds[0])
             self._virtual = {seed: VirtualWorld(study, seed, shared) for seed in study.seeds}

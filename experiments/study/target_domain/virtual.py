@@ -14,7 +14,6 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -211,23 +210,6 @@ class VirtualReality:
         }
 
 
-class World(Protocol):
-    """A seed's reality for the loop. ``name`` is that of the step, from which all chance follows."""
-
-    def first_balls(self, player: str, name: str) -> Dataset:
-        """The player's balls across the table, without a robot."""
-
-    def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
-        """Fine-tunes the policy of the run ``source`` into the run ``folder``; the player's hits and a sentence."""
-
-    def hits(self, player: str, source: Path, folder: Path, name: str) -> HitLog:
-        """Balls of rallies with the run ``source`` or, where it was just fine-tuned, ``folder``: ball and joints by one
-        clock."""
-
-    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
-        """Function that scores a policy with the player; None where scores are not needed."""
-
-
 def add_spin(reality: VirtualReality, player: str, key: PRNGKeyArray) -> SimModel:
     """The reality's model with mean and spread of the spin of a player's strokes."""
     state = reality.simulator.start(reality.player(player), reality.known, key, STROKES)
@@ -240,7 +222,7 @@ def add_spin(reality: VirtualReality, player: str, key: PRNGKeyArray) -> SimMode
 
 
 class VirtualWorld:
-    """The virtual reality of a seed."""
+    """A seed's reality for the loop, as ``RobotWorld``; all chance follows from ``name``, that of a step."""
 
     def __init__(self, study: Study, seed: int, reality: VirtualReality) -> None:
         self._study, self._seed, self.reality = study, seed, reality.at(seed)
@@ -249,6 +231,7 @@ class VirtualWorld:
         return jax.random.fold_in(build.key(self._seed, STUDY), zlib.crc32(name.encode()) >> 1)
 
     def first_balls(self, player: str, name: str) -> Dataset:
+        """The player's balls across the table, without a robot."""
         return self.reality.first_balls(
             self.reality.player(player), self._study.first_balls, self._key(name), Path(name).name
         )
@@ -269,6 +252,7 @@ class VirtualWorld:
         return hit_log.record(reality.simulator, reality.known, person, policy, self._key(name), name, noise, late)
 
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
+        """Fine-tunes the policy of the run ``source`` into the run ``folder``; the player's hits and a sentence."""
         theta, statistics = load_policy.load_statistics(source)
         person = self.reality.player(player)
         cycle = self.reality.fine_tune(person, theta, statistics, real_updates, self._key(name), folder.name)
@@ -287,6 +271,7 @@ class VirtualWorld:
         return Dataset(cycle.balls, name), text
 
     def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
+        """Function that scores a policy with the player; None where scores are not needed."""
         if self._study.simulation.seeds == 1:
             return None
         person, balls, key = self.reality.player(player), self._study.simulation.selection_episodes, self._key(name)
