@@ -119,8 +119,8 @@ class VirtualReality:
         """``updates`` updates from the parameters theta (976,) on, while the player rallies with the robot."""
         ask_key, rally_key, play_key, camera_key = jax.random.split(key, 4)
         config = build.bgs_config(self._settings.optimiser(), updates)
-        lanes = self._settings.episodes_per_update
-        rally = self.simulator.start(player, self.known, rally_key, lanes)
+        sessions = self._settings.episodes_per_update
+        rally = self.simulator.start(player, self.known, rally_key, sessions)
         # Strongly typed as what the updates return, so that the first call and the others are one program.
         state, rally = jax.tree.map(
             lambda x: jax.lax.convert_element_type(x, x.dtype), (strategy.init(jnp.asarray(theta), config), rally)
@@ -162,15 +162,15 @@ class VirtualReality:
         config: BGSConfig,
     ) -> tuple[BGSState, RallyState, tuple[ShotResult, BGSInfo]]:
         """``_chunk`` updates: state and rally after them, and each one's (ShotResult, BGSInfo)."""
-        settings, lanes = self._settings, self._settings.episodes_per_update
-        frozen = [_per_lane(x, lanes) for x in normalizer.normaliser(statistics)]
+        settings, sessions = self._settings, self._settings.episodes_per_update
+        frozen = [_repeat_per_session(x, sessions) for x in normalizer.normaliser(statistics)]
 
         def update(
             carry: tuple[BGSState, RallyState], _: None
         ) -> tuple[tuple[BGSState, RallyState], tuple[ShotResult, BGSInfo]]:
             state, rally = carry
             population = strategy.ask(jax.random.fold_in(key, state.updates), state, config)
-            theta = jnp.repeat(population.members, settings.repeats, axis=1)  # the lanes of a member side by side
+            theta = jnp.repeat(population.members, settings.repeats, axis=1)  # the sessions of a member side by side
             shot_key = jax.random.fold_in(play_key, state.updates)
             rally, shots = self.simulator.shots(Policy(theta, *frozen), player, model, rally, shot_key)
             returns = self._returns(shots).reshape(2 * settings.num_directions, settings.repeats).mean(axis=1)
@@ -189,7 +189,7 @@ class VirtualReality:
         self, policy: Policy, player: Player, model: SimModel, key: PRNGKeyArray, turns: int
     ) -> tuple[Array, Array]:
         """Outcomes and faults (turns, SELECTION_SESSIONS) of one policy."""
-        policy = jax.tree.map(lambda x: _per_lane(x, SELECTION_SESSIONS), policy)
+        policy = jax.tree.map(lambda x: _repeat_per_session(x, SELECTION_SESSIONS), policy)
         start_key, play_key = jax.random.split(key)
 
         def shoot(rally: RallyState, turn: Array) -> tuple[RallyState, tuple[Array, Array]]:
@@ -278,6 +278,6 @@ class VirtualWorld:
         return lambda p: self.reality.score(person, p.policy, balls, key)
 
 
-def _per_lane(x: Array, lanes: int) -> Array:
-    """One column for each of the lanes: (n,) -> (n, L)."""
-    return jnp.broadcast_to(x[:, None], (x.shape[0], lanes))
+def _repeat_per_session(x: Array, sessions: int) -> Array:
+    """One column for each of the sessions: (n,) -> (n, L)."""
+    return jnp.broadcast_to(x[:, None], (x.shape[0], sessions))
