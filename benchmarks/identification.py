@@ -32,10 +32,9 @@ from experiments.runs import load_policy, run_dir
 from experiments.runs.run_dir import Run
 from experiments.stats import wilson
 from experiments.study import identification
-from experiments.study.analysis.identified import LOGS, estimates, holds
+from experiments.study.analysis.identified import LOGS, holds, list_estimates
 from experiments.study.target_domain import hidden_effects, hit_log, joint_log
-from experiments.study.target_domain.finetuning import VirtualReality
-from experiments.study.target_domain.world import with_spin
+from experiments.study.target_domain.virtual import VirtualReality, add_spin
 from experiments.training.loop import train
 from mjx_tt import platform
 from mjx_tt.env.episode import RETURNED
@@ -134,7 +133,7 @@ def of_reality(
     policy = load_policy.load(QUICKSTART).policy
     log = hit_log.record(reality.simulator, reality.known, person, policy, keys[2], "hits", CAMERA_NOISE, BELIEVED)
     identification.write_hits(folder / "hits", log.balls, log.joints)
-    prior = identification.prior(studies.PRIOR, "prior")
+    prior = identification.read_prior(studies.PRIOR, "prior")
     worlds = {"nominal": ModelFile(SimModel()), "prior": ModelFile(SimModel(), prior)}
     seconds: dict[str, float] = {}
     logs = [folder / "D0.csv", folder / "joints"]
@@ -145,11 +144,11 @@ def of_reality(
         seconds[name], worlds[name] = time.monotonic() - began, found.world
         counts[name] = found.hits
         found.world.save(folder / f"{name}.yaml")
-    worlds["truth"] = ModelFile(with_spin(reality, player, keys[6]))
+    worlds["truth"] = ModelFile(add_spin(reality, player, keys[6]))
     base = {
         "seed": seed,
         "outside": list(outside),
-        "reality": hidden_effects.differences(reality.model),
+        "reality": hidden_effects.list_differences(reality.model),
         "hits": counts["hits"],
         "identification_seconds": seconds,
         "intervals": {name: intervals(worlds[name], reality.model) for name in ("identified", "hits")},
@@ -219,7 +218,7 @@ def intervals(world: ModelFile, reality: SimModel) -> dict[str, list[float]]:
 
     Delays as sums or differences, which is all that logs and play show.
     """
-    rows = estimates(world, hidden_effects.differences(reality))
+    rows = list_estimates(world, hidden_effects.list_differences(reality))
     decided = [row for row in rows if row["decided by"] == LOGS and holds(row) is not None]
     return {row["parameter"]: [row["truth"], row["low"], row["high"]] for row in decided}
 

@@ -23,7 +23,7 @@ from experiments.deploy import session_logs
 from experiments.runs import load_policy, run_dir
 from experiments.stats import wilson
 from experiments.study.target_domain import hidden_effects, hit_log, joint_log
-from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.study.target_domain.virtual import VirtualReality
 from mjx_tt import platform
 from mjx_tt.diagnosis.diagnose import diagnose
 from mjx_tt.diagnosis.logs import Logs

@@ -44,7 +44,7 @@ def blind(
     """Raises ConfigError for what cannot be done."""
     options.start_jax(1)
     from experiments.progress import make_console
-    from experiments.study.blind import protocol
+    from experiments.study import blind_protocol
 
     screen, place = make_console(), Path(folder)
     if action == "make":
@@ -52,17 +52,17 @@ def blind(
         return
     if policies:
         raise ConfigError(f"blind {action} takes the folder only, got {' '.join(policies)}")
-    if not (place / protocol.KEY).exists():
+    if not (place / blind_protocol.KEY).exists():
         raise ConfigError(f"{folder}: holds no sealed key; begin with `mjx-tt blind make {folder} MODEL=POLICY ...`")
     if action == "sheet":
         _show_progress(place, screen)
     else:
-        _show_opened(protocol.open_key(place), place, screen)
+        _show_opened(blind_protocol.open_key(place), place, screen)
 
 
 def _make(folder: Path, given: tuple[str, ...], trainer: str, evaluator: str, seed: int, console: Console) -> None:
     """Begins a blind evaluation; ``given`` are MODEL=POLICY."""
-    from experiments.study.blind import protocol
+    from experiments.study import blind_protocol
 
     policies: dict[str, Path] = {}
     for text in given:
@@ -79,21 +79,23 @@ def _make(folder: Path, given: tuple[str, ...], trainer: str, evaluator: str, se
             "blind make needs --trainer, who trained the policies: for a study's report the player in whose place, "
             "such as --trainer player3; --evaluator is the trainer where it is left out"
         )
-    codes = protocol.make(folder, policies, trainer, evaluator, seed)
-    where = f"{len(codes)} policies under {folder / protocol.POLICIES}"
+    codes = blind_protocol.make(folder, policies, trainer, evaluator, seed)
+    where = f"{len(codes)} policies under {folder / blind_protocol.POLICIES}"
     console.print(f"{where}, to be tested in this order: {' '.join(codes)}", soft_wrap=True)
-    console.print(f"sheet: {folder / protocol.SHEET}; the key is sealed in {folder / protocol.KEY}", soft_wrap=True)
+    console.print(
+        f"sheet: {folder / blind_protocol.SHEET}; the key is sealed in {folder / blind_protocol.KEY}", soft_wrap=True
+    )
 
 
 def _show_progress(folder: Path, console: Console) -> None:
     """Number of rallies of each code."""
     from rich.table import Table
 
+    from experiments.study import blind_protocol
     from experiments.study.analysis import scoring
-    from experiments.study.blind import protocol
 
     table = Table("code", "rallies", "that count", f"of {scoring.KEEP}")
-    for p in protocol.progress(folder):
+    for p in blind_protocol.count_progress(folder):
         table.add_row(p.code, str(p.played), str(p.counted), "done" if p.complete else "open")
     console.print(table)
 
@@ -102,8 +104,8 @@ def _show_opened(rallies: Rallies, folder: Path, console: Console) -> None:
     """Which code was which model, with the mean of the reported rallies."""
     from rich.table import Table
 
+    from experiments.study import blind_protocol
     from experiments.study.analysis.statistics import t_mean
-    from experiments.study.blind import protocol
 
     table = Table("code", "model", "reported rallies", "mean length (95 %)")
     for model in dict.fromkeys(rallies.model.tolist()):
@@ -111,4 +113,4 @@ def _show_opened(rallies: Rallies, folder: Path, console: Console) -> None:
         mean = t_mean(mine.length)
         table.add_row(str(mine.blind[0]), model, str(mean.n), f"{mean.value:.1f} ({mean.low:.1f} to {mean.high:.1f})")
     console.print(table)
-    console.print(f"{folder / protocol.EVALUATIONS}, key in {folder / protocol.OPENED}", soft_wrap=True)
+    console.print(f"{folder / blind_protocol.EVALUATIONS}, key in {folder / blind_protocol.OPENED}", soft_wrap=True)

@@ -57,8 +57,10 @@ def is2r(
     from experiments.interrupts import interruptible
     from experiments.jobs.site import Workers
     from experiments.progress import make_console
-    from experiments.study import session, workers
+    from experiments.study import session
 
-    side_by_side = Workers(1 if elsewhere else workers.choose(loaded, processes, devices), elsewhere, str(site))
+    side_by_side = Workers(
+        1 if elsewhere else session.choose_processes(loaded, processes, devices), elsewhere, str(site)
+    )
     with interruptible() if loaded.robot is None else nullcontext():
         return 0 if session.run(loaded, Path(out) / loaded.name, make_console(), side_by_side) else 130

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 
 import jax
 import jax.numpy as jnp
@@ -16,48 +16,44 @@ from ballmodel.io.atomic_files import replacing
 from ballmodel.registry import Balls
 from experiments.config import build
 from experiments.config.study import Study
+from experiments.study import blind_protocol
 from experiments.study.analysis import effect_costs, scoring
-from experiments.study.blind import protocol
-from experiments.study.target_domain import hidden_effects as realities
-from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.study.analysis.study_folder import BallLog
+from experiments.study.paths import StudyPaths
+from experiments.study.target_domain import hidden_effects
+from experiments.study.target_domain.virtual import VirtualReality
 from mjx_tt.env.policy import Policy
 from mjx_tt.rally import human_player
 from mjx_tt.rally.simulator import Box, RallyResult
 
-EVALUATIONS, LOGS = "evaluations.csv", "evaluations"
-LOGGED_TOUCHES = 30  # human hits that are kept, per rally and lane on average
+LOGGED_TOUCHES = 30  # human hits that are kept, per rally and session on average
 EVALUATION, EFFECTS = 7, 8  # purposes of keys, beside those of experiments.config.build
+Pairings = Sequence[tuple[str, str, str]]  # trainer, evaluator, model
 
 
 def play(
     study: Study,
     reality: VirtualReality,
     seed: int,
-    pairings: list[tuple[str, str, str]],
-    policies: list[Policy],
-    boxes: list[Balls],
+    pairings: Pairings,
+    policies: Sequence[Policy],
+    balls: Sequence[Balls],
 ) -> RallyResult:
-    """Rallies of each pairing (trainer, evaluator, model) in ``evaluation.lanes`` sessions side by side.
+    """Rallies of each pairing in ``evaluation.lanes`` parallel sessions. Arrays are NumPy, sessions last.
 
-    boxes: what each policy was trained for. Arrays are NumPy.
+    balls: what each policy was trained for
     """
-    lanes, settings = study.evaluation.lanes, study.evaluation
-
-    def spread(arrays: Iterable[ArrayLike]) -> Array:  # one array (n, ...) per pairing -> (n, pairings x lanes)
-        return jnp.repeat(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1), lanes, axis=-1)
-
-    policy = jax.tree.map(lambda *arrays: spread(arrays), *policies)
+    sessions, settings = study.evaluation.lanes, study.evaluation
     people = human_player.stack([reality.player(evaluator) for _, evaluator, _ in pairings])
-    person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), people)
-    low, high = (spread(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes)), strict=True))
-    rallies = settings.rallies // lanes
+    policy, box = _stack(policies, balls, lambda stacked: jnp.repeat(stacked, sessions, axis=-1))
+    rallies = settings.rallies // sessions
     result = reality.simulator.play(
         policy,
-        person,
+        jax.tree.map(lambda leaf: jnp.repeat(leaf, sessions), people),
         reality.known,
         build.key(seed, EVALUATION),
         rallies,
-        Box(low, high),
+        box,
         settings.max_touches,
         LOGGED_TOUCHES * rallies,
     )
@@ -68,113 +64,97 @@ def play_without(
     study: Study,
     reality: VirtualReality,
     seed: int,
-    models: list[tuple[str, str]],
-    policies: list[Policy],
-    boxes: list[Balls],
+    models: Sequence[tuple[str, str]],
+    policies: Sequence[Policy],
+    balls: Sequence[Balls],
 ) -> list[effect_costs.Outcome]:
     """Rallies of each (player, model) in every world of ``effects.WORLDS``, ``evaluation.rallies`` each, in one call.
 
-    boxes: what each policy was trained for. What the study's own reality
-    lacks is left out of all worlds.
+    balls: what each policy was trained for. What the study's own reality lacks is left out of all worlds.
     """
-    lanes, settings = study.evaluation.lanes, study.evaluation
-    absent, everything = tuple(study.reality.without), tuple(realities.RANGES)
+    sessions, settings = study.evaluation.lanes, study.evaluation
+    absent, everything = tuple(study.reality.without), tuple(hidden_effects.RANGES)
     special = {effect_costs.NOTHING: (), effect_costs.ALL: everything}
     left_out = [absent + special.get(world, (world,)) for world in effect_costs.WORLDS]
     outside = tuple(study.reality.outside)
-    worlds = [realities.draw(seed, names, () if set(names) == set(everything) else outside) for names in left_out]
+    worlds = [hidden_effects.draw(seed, names, () if set(names) == set(everything) else outside) for names in left_out]
     people = [
         human_player.without_spin(person) if "spin" in names else person
         for names in left_out
         for person in (human_player.load(player) for player, _ in models)
     ]
-
-    # Lanes: worlds x models x sessions.
-    def per_model(arrays: Iterable[ArrayLike]) -> Array:
-        each = jnp.stack([jnp.asarray(a) for a in arrays], axis=-1)
-        return jnp.tile(jnp.repeat(each, lanes, axis=-1), len(worlds))
-
-    policy = jax.tree.map(lambda *arrays: per_model(arrays), *policies)
-    low, high = (per_model(ends) for ends in zip(*((box.low, box.high) for box in map(Box.of, boxes)), strict=True))
-    person = jax.tree.map(lambda leaf: jnp.repeat(leaf, lanes), human_player.stack(people))
-    world = realities.side_by_side(worlds, len(models) * lanes)
+    # Batch axis: worlds x models x sessions.
+    policy, box = _stack(policies, balls, lambda stacked: jnp.tile(jnp.repeat(stacked, sessions, axis=-1), len(worlds)))
     result = reality.simulator.play(
         policy,
-        person,
-        world,
+        jax.tree.map(lambda leaf: jnp.repeat(leaf, sessions), human_player.stack(people)),
+        hidden_effects.stack_worlds(worlds, len(models) * sessions),
         build.key(seed, EFFECTS),
-        settings.rallies // lanes,
-        Box(low, high),
+        settings.rallies // sessions,
+        box,
         settings.max_touches,
     )
-    shape = (-1, len(worlds), len(models), lanes)
+    shape = (-1, len(worlds), len(models), sessions)
     length, end = (np.moveaxis(np.asarray(x).reshape(shape), 0, -1) for x in (result.length, result.end))
     counts = ~np.isin(end, [int(e) for e in scoring.FILTERED])
-    return [
-        effect_costs.Outcome(seed, player, model, without, int(counts[w, m].sum()), _mean(length[w, m][counts[w, m]]))
-        for m, (player, model) in enumerate(models)
-        for w, without in enumerate(effect_costs.WORLDS)
-    ]
+    found = []
+    for m, (player, model) in enumerate(models):
+        for w, without in enumerate(effect_costs.WORLDS):
+            lengths = length[w, m][counts[w, m]]
+            mean = float(lengths.mean()) if lengths.size else float("nan")
+            found.append(effect_costs.Outcome(seed, player, model, without, lengths.size, mean))
+    return found
 
 
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if values.size else float("nan")
+def _stack(policies: Sequence[Policy], balls: Sequence[Balls], spread: Callable[[Array], Array]) -> tuple[Policy, Box]:
+    """Policies and the boxes of their balls, one (..., n) array each, spread over the batch axis."""
+
+    def stack(*arrays: ArrayLike) -> Array:
+        return spread(jnp.stack([jnp.asarray(a) for a in arrays], axis=-1))
+
+    boxes = [Box.of(one) for one in balls]
+    return jax.tree.map(stack, *policies), Box(stack(*(b.low for b in boxes)), stack(*(b.high for b in boxes)))
 
 
-def code_names(seed: int, pairings: list[tuple[str, str, str]]) -> list[str]:
+def draw_codes(seed: int, pairings: Pairings) -> list[str]:
     """A code for each pairing, one to one among the models that a player evaluates."""
     codes: dict[tuple[str, str, str], str] = {}
     for evaluator in dict.fromkeys(e for _, e, _ in pairings):
-        mine = [f"{trainer}/{model}" for trainer, e, model in pairings if e == evaluator]
-        drawn = protocol.draw(mine, np.random.default_rng([seed, zlib.crc32(evaluator.encode())]))
-        codes |= {(t, e, m): drawn[f"{t}/{m}"] for t, e, m in pairings if e == evaluator}
+        evaluated = {f"{trainer}/{model}": (trainer, e, model) for trainer, e, model in pairings if e == evaluator}
+        rng = np.random.default_rng([seed, zlib.crc32(evaluator.encode())])
+        codes |= {evaluated[name]: code for name, code in blind_protocol.draw(evaluated, rng).items()}
     return [codes[pairing] for pairing in pairings]
 
 
-def rallies_of(
-    seed: int, pairings: list[tuple[str, str, str]], codes: list[str], result: RallyResult, lanes: int
-) -> scoring.Rallies:
+def score(seed: int, pairings: Pairings, result: RallyResult, sessions: int) -> scoring.Rallies:
     """All rallies as scored lines; the sessions of a pairing count as one, their rallies in turn."""
     parts = []
-    for i, (pairing, code) in enumerate(zip(pairings, codes, strict=True)):
-        mine = slice(i * lanes, (i + 1) * lanes)
-        parts.append(scoring.scored(seed, *pairing, code, result.length[:, mine].ravel(), result.end[:, mine].ravel()))
+    for i, (pairing, code) in enumerate(zip(pairings, draw_codes(seed, pairings), strict=True)):
+        mine = slice(i * sessions, (i + 1) * sessions)
+        parts.append(
+            scoring.score_rallies(seed, *pairing, code, result.length[:, mine].ravel(), result.end[:, mine].ravel())
+        )
     return scoring.join(parts)
 
 
-def save_logs(folder: Path, seed: int, pairings: list[tuple[str, str, str]], result: RallyResult, lanes: int) -> None:
-    """Writes each pairing's balls to ``folder``/SEED_TRAINER_EVALUATOR_MODEL.npz, the balls last in every array."""
-    folder.mkdir(parents=True, exist_ok=True)
+def save_logs(paths: StudyPaths, seed: int, pairings: Pairings, result: RallyResult, sessions: int) -> None:
+    """Writes each pairing's balls as the arrays of a ``BallLog``."""
     log = result.balls
     capacity = log.touch.shape[0]
-    taken = np.arange(capacity)[:, None] < np.minimum(log.count, capacity)  # (capacity, L)
+    taken = np.arange(capacity)[:, None] < np.minimum(log.count, capacity)  # (capacity, sessions of all pairings)
     for i, pairing in enumerate(pairings):
-        mine = slice(i * lanes, (i + 1) * lanes)
+        mine = slice(i * sessions, (i + 1) * sessions)
         keep = taken[:, mine]
-        # Rallies are numbered as ``rallies_of`` does: the first of each session, then the second of each, ...
-        number = log.rally[:, mine] * lanes + np.arange(lanes)
-        arrays = {
-            "rally": number[keep],
-            **{
-                name: getattr(log, name)[..., mine][..., keep]
-                for name in (
-                    "touch",
-                    "first",
-                    "position",
-                    "velocity",
-                    "landing",
-                    "hit",
-                    "returned",
-                    "return_landing",
-                )
-            },
-        }
-        path = folder / f"{seed}_{'_'.join(pairing)}.npz"
+        arrays = {f.name: getattr(log, f.name)[..., mine] for f in fields(BallLog)}
+        # Rallies are numbered as ``score`` does: the first of each session, then the second of each, ...
+        arrays["rally"] = arrays["rally"] * sessions + np.arange(sessions)
+        path = paths.evaluation_log(seed, *pairing)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **{name: values[..., keep] for name, values in arrays.items()})
 
 
-def summary(rallies: scoring.Rallies, trainer: str | None = None) -> dict[str, float]:
+def summarise(rallies: scoring.Rallies) -> dict[str, float]:
     """Mean length of the reported rallies by model, played by their own trainers."""
-    own = rallies.take(rallies.own & rallies.selected & (True if trainer is None else rallies.trainer == trainer))
+    own = rallies.take(rallies.own & rallies.selected)
     return {model: float(own.length[own.model == model].mean()) for model in dict.fromkeys(own.model.tolist())}

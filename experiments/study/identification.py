@@ -47,7 +47,7 @@ class Identified:
     settled: bool  # False: the fit of the balls still moved when its rounds were over
 
 
-def prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
+def read_prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
     """Ranges of the prior by dotted path. Raises ValueError naming ``where`` and the path at fault."""
     found = models.from_dict({"randomise": dict(data)}, where).randomise
     for one in found:
@@ -56,10 +56,10 @@ def prior(data: Mapping[str, Any], where: str) -> tuple[Range, ...]:
     return tuple(one for one in found if isinstance(one, Range))
 
 
-def unknown(model: Mapping[str, Any], ranges: Mapping[str, Any]) -> ModelFile:
+def prior_world(model: Mapping[str, Any], ranges: Mapping[str, Any]) -> ModelFile:
     """The world of a model YAML's content with these ranges in place of what it draws. Raises ValueError."""
     plain = {key: value for key, value in model.items() if key != "randomise"}
-    return ModelFile(models.from_dict(plain, "simulation.model").model, prior(ranges, "identification.prior"))
+    return ModelFile(models.from_dict(plain, "simulation.model").model, read_prior(ranges, "identification.prior"))
 
 
 def identify(
@@ -78,43 +78,43 @@ def identify(
     seconds: of the joints' motion that are looked at, in the middle of a longer log. Raises ValueError naming the log
     at fault.
     """
-    read_ = load_logs([str(path) for path in logs])
-    balls = read_.balls
+    found = load_logs([str(path) for path in logs])
+    balls = found.balls
     if len(balls) > most:
         balls = tuple(balls[i] for i in np.sort(np.random.default_rng(0).permutation(len(balls))[:most]))
     ranges = {one.path: (one.low, one.high) for one in before}
     arm, axes = (models.paths(believed.model)[path] for path in (delays.ARM, delays.AXES))
-    known = delays.moments(ranges, arm)
+    known = delays.compute_moments(ranges, arm)
     seen = {HEIGHT if path == SEEN_HIGH else path: normal for path, normal in known.items()}
-    flown = of_balls.fit(balls, believed.model, seen, say)
+    balls_fit = of_balls.fit(balls, believed.model, seen, say)
     say("fitting the drives")
-    driven = of_joints.fit(middle(read_.joints, seconds), believed.model, known) if read_.joints else None
+    joints_fit = of_joints.fit(cut_middle(found.joints, seconds), believed.model, known) if found.joints else None
     say("fitting the hits")
-    struck = _of_hits(flown, hits, believed.model, known)
-    drawn = [] if driven is None else [driven.samples()]
+    hits_fit = _fit_hits(balls_fit, hits, believed.model, known)
+    parts = [] if joints_fit is None else [joints_fit.samples()]
     lift = np.random.default_rng(1).normal(0.0, of_balls.LIFT_ERROR, of_balls.DRAWS)
-    if struck is not None:
-        shown, lift = struck.samples(delays.against_the_arm(ranges, arm))
-        drawn.append(shown)
-    found = {path for one in drawn for path in one.paths}
+    if hits_fit is not None:
+        shown, lift = hits_fit.samples(delays.shift_to_arm(ranges, arm))
+        parts.append(shown)
+    sampled = {path for one in parts for path in one.paths}
     # Against the arm, whose delay is as believed; which other ranges know nothing of.
-    open_ = [path for path in (delays.AXES, delays.BALL) if drawn and path in ranges and path not in found]
-    if open_:
-        drawn.append(delays.drawn(ranges, arm, open_, of_balls.DRAWS))
-    samples = delays.in_sum(_joined([_in_the_tables_frame(flown.samples(lift)), *drawn]), axes)
-    settled = {*samples.paths, *((delays.ARM,) if drawn else ())}
+    unseen = [path for path in (delays.AXES, delays.BALL) if parts and path in ranges and path not in sampled]
+    if unseen:
+        parts.append(delays.draw_unseen(ranges, arm, unseen, of_balls.DRAWS))
+    samples = delays.shift_command(_join([_in_table_frame(balls_fit.samples(lift)), *parts]), axes)
+    settled = {*samples.paths, *((delays.ARM,) if parts else ())}
     others: list[Randomised] = [one for one in before if one.path not in settled]
-    own = settled | {one.path for one in before}
-    others += [one for one in believed.randomise if not set(one.paths) & own]
+    covered = settled | {one.path for one in before}
+    others += [one for one in believed.randomise if not set(one.paths) & covered]
     centre = dict(zip(samples.paths, samples.values.mean(axis=0).tolist(), strict=True))
-    left = {} if driven is None else driven.left
-    hit = 0 if struck is None else struck.hits
-    made_of = {"flights": flown.problem.grid.n, "hits": hit, "joints": left, PRIOR_ALONE: open_}
-    world = ModelFile(models.with_values(flown.model(), centre), (samples, *others), {"identified": made_of})
-    return Identified(world, flown.problem.grid.n, hit, left, flown.posterior.converged)
+    left = {} if joints_fit is None else joints_fit.left
+    flights, hit = balls_fit.problem.grid.n, 0 if hits_fit is None else hits_fit.hits
+    made_of = {"flights": flights, "hits": hit, "joints": left, PRIOR_ALONE: unseen}
+    world = ModelFile(models.with_values(balls_fit.model(), centre), (samples, *others), {"identified": made_of})
+    return Identified(world, flights, hit, left, balls_fit.posterior.converged)
 
 
-def middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRecord, ...]:
+def cut_middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRecord, ...]:
     """The middle ``seconds`` of records that are longer by more than a second."""
     first = max(r.state_time[0] for r in records)
     last = min(r.state_time[-1] for r in records)
@@ -124,13 +124,13 @@ def middle(records: Sequence[JointRecord], seconds: float) -> tuple[JointRecord,
     return tuple(r.between(begin, begin + seconds) for r in records)
 
 
-def _in_the_tables_frame(drawn: Samples) -> Samples:
+def _in_table_frame(drawn: Samples) -> Samples:
     """The same with the camera's offset in place of the table's height, which no ball before a hit can tell apart."""
     return replace(drawn, paths=tuple(SEEN_HIGH if path == HEIGHT else path for path in drawn.paths))
 
 
-def _of_hits(
-    flown: of_balls.BallsTogether, folders: Sequence[Path], world: SimModel, known: of_hits.Prior
+def _fit_hits(
+    balls_fit: of_balls.BallsTogether, folders: Sequence[Path], world: SimModel, known: of_hits.Prior
 ) -> of_hits.HitsTogether | None:
     """Posterior after the hits in these folders; None where there are none, or too few."""
     if not folders:
@@ -151,10 +151,10 @@ def _of_hits(
         tuple(map(np.concatenate, zip(*(getattr(path, name) for path in paths), strict=True)))
         for name in ("time", "position")
     )
-    return of_hits.fit(flown, balls, JointPath(times, places), known)
+    return of_hits.fit(balls_fit, balls, JointPath(times, places), known)
 
 
-def _joined(parts: Sequence[Samples]) -> Samples:
+def _join(parts: Sequence[Samples]) -> Samples:
     """Samples of equal length and weight side by side, row by row."""
     values = np.concatenate([one.values for one in parts], axis=1)
     return Samples(tuple(path for one in parts for path in one.paths), values, np.ones(len(values)))

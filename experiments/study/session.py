@@ -1,27 +1,37 @@
-"""One session of a study: looks up what it names, checks that the folder is its own, does the remaining steps."""
+"""One session of a study: looks up what it names, checks that the folder is its own, does the remaining steps.
+
+Most steps are independent: players, seeds, methods. Several processes do them side by side, since one training on all
+cores is slower than as many trainings on a core each. The process that was asked decides what is next, marks what is
+done and says so; the workers only do what they are told. What a step makes follows from its name alone, so nothing
+depends on who does it.
+"""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
 from rich.console import Console
 
 from experiments.config import build
 from experiments.config.files import read_yaml
 from experiments.config.study import Study, parse
-from experiments.errors import RunError, checked
+from experiments.errors import ConfigError, RunError, error_context
+from experiments.jobs import engine
+from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import ALONE, Workers
 from experiments.runs import run_dir
 from experiments.runs.run_dir import Run
 from experiments.study import identification, training
-from experiments.study.pipeline import REPORT, Loop
-from experiments.study.schedule import Simulated, items
+from experiments.study.paths import JOURNAL, REPORT, SESSIONS, SETTINGS
+from experiments.study.pipeline import Pipeline
+from experiments.study.schedule import Simulated, list_items
 from experiments.study.target_domain import on_robot
-from experiments.study.workers import run_side_by_side
-from experiments.study.workflow import JOURNAL, Journal, Waiting, run_all
+from experiments.study.workflow import Journal, Session, Step, Waiting, perform, run_all
 
-SETTINGS, SESSIONS = "study.yaml", "study.json"
 CHANGEABLE = ("players", "seeds", "simulation.checkpoint_seconds", "simulation.devices")
 
 
@@ -36,10 +46,10 @@ def run(study: Study, folder: Path, console: Console, workers: Workers = ALONE) 
     with Run(folder).locked():
         if not Journal(folder / JOURNAL).entries:  # later on, what is no longer read may be gone
             look_up(study)
-        loop = Loop(study, folder, console)
+        pipeline = Pipeline(study, folder, console)
         _open(study, folder)
         try:
-            steps, journal = loop.steps(), Journal(folder / JOURNAL)
+            steps, journal = pipeline.steps(), Journal(folder / JOURNAL)
             if workers.alone:
                 run_all(steps, journal, console)
             else:
@@ -64,11 +74,12 @@ def look_up(study: Study) -> None:
     """Raises ConfigError for what a study names and is not there, before hours are spent on its first steps."""
     for balls in study.ablation.balls if study.ablation else ():
         build.distribution(balls, "ablation.balls")
-    for item in items(study, study.players[0]):
+    for item in list_items(study, study.players[0]):
         if isinstance(item, Simulated) and item.source is None:
-            build.experiment(training.configuration(study, item, "narrow", None, 0), "simulation")
+            build.experiment(training.make_config(study, item, "narrow", None, 0), "simulation")
     if study.identification is not None:
-        checked("identification", identification.prior, study.identification.prior, "prior")
+        with error_context("identification"):
+            identification.read_prior(study.identification.prior, "prior")
     if study.robot is not None:
         on_robot.look_up(study, study.robot)
 
@@ -78,19 +89,83 @@ def _open(study: Study, folder: Path) -> None:
 
     Where no step is done yet there is nothing that belongs to another study.
     """
-    path = folder / SETTINGS
+    path, sessions = folder / SETTINGS, folder / SESSIONS
     if path.exists() and Journal(folder / JOURNAL).entries:
-        found = parse(read_yaml(checked(str(path), path.read_text, "utf-8"), str(path)), str(path))
-        changed = run_dir.differences(found.to_dict(), study.to_dict(), CHANGEABLE.__contains__, "study")
+        recorded = parse(_read(path), str(path))
+        changed = run_dir.differences(recorded.to_dict(), study.to_dict(), CHANGEABLE.__contains__, "study")
         if changed:
             raise RunError(f"{folder}: is another study:\n{changed}\nRestore these values or choose another --out")
     run_dir.write_yaml(path, study.to_dict())
-    sessions = folder / SESSIONS
-    before: list[dict[str, Any]] = []
-    if sessions.exists():
-        found = read_yaml(checked(str(sessions), sessions.read_text, "utf-8"), str(sessions))
-        listed = found.get("sessions") if isinstance(found, dict) else None
-        if not isinstance(listed, list):
-            raise RunError(f"{sessions}: holds no list of sessions; restore the file or remove it")
-        before = listed
-    run_dir.write_json(sessions, {"sessions": [*before, run_dir.provenance()]})
+    content = _read(sessions) if sessions.exists() else {"sessions": []}
+    if not isinstance(content, dict) or not isinstance(content.get("sessions"), list):
+        raise RunError(f"{sessions}: holds no list of sessions; restore the file or remove it")
+    run_dir.write_json(sessions, {"sessions": [*content["sessions"], run_dir.provenance()]})
+
+
+def _read(path: Path) -> Any:
+    with error_context(str(path)):
+        text = path.read_text("utf-8")
+    return read_yaml(text, str(path))
+
+
+def choose_processes(study: Study, processes: int | None, devices: int | None) -> int:
+    """Number of processes for a study's steps: ``processes`` where it is given, else one per core.
+
+    On a robot, on an accelerator, or where a number of devices is asked for, one does them all. Call it when JAX is
+    configured. Raises ConfigError for several processes at a robot.
+    """
+    if study.robot is not None:
+        if (processes or 1) > 1:
+            raise ConfigError(
+                f"--processes {processes}: with a robot the steps are done one after the other; allowed: 1"
+            )
+        return 1
+    if processes is not None:
+        return processes
+    if devices is not None or study.simulation.devices != "auto":
+        return 1
+    return len(os.sched_getaffinity(0)) if jax.default_backend() == "cpu" else 1
+
+
+def run_side_by_side(
+    study: Study, folder: Path, steps: list[Step], journal: Journal, console: Console, workers: Workers
+) -> None:
+    """Does what is not done yet of a study's steps, each as soon as its inputs are made and a worker is free.
+
+    Ctrl-C and SIGTERM stop the workers, which save what they train, and then raise KeyboardInterrupt; so does the first
+    error of a step, which is raised when the others have stopped. Raises RunError when a worker was killed.
+    """
+    progress = Session(steps, journal, console, workers.count)
+    if not progress.left:
+        return
+    by_name = {step.name: step for step in progress.left}
+    setup = Setup("experiments.study.session:prepare", (study, folder))
+
+    def ended(job: Job, result: tuple[str, float]) -> None:
+        progress.mark(by_name[job.name], *result)
+
+    engine.run(workers.engine(setup, folder), jobs(progress.left), ended)
+
+
+def jobs(steps: list[Step]) -> list[Job]:
+    """The steps, each after those that make its inputs; a round's trainings share a program."""
+    makers = {path: step.name for step in steps for path in step.outputs}
+    return [
+        Job(
+            step.name,
+            (step.name,),
+            frozenset(makers[path] for path in step.inputs if path in makers),
+            step.program,
+            step.compiled,
+        )
+        for step in steps
+    ]
+
+
+def prepare(study: Study, folder: Path) -> Callable[[str], tuple[str, float]]:
+    """The function that does a step of that name, in a worker."""
+    simulation = study.simulation.model_copy(update={"devices": 1})
+    console = Console(force_terminal=False)  # live bars of several processes would overwrite each other
+    pipeline = Pipeline(study.model_copy(update={"simulation": simulation}), folder, console)
+    steps = {step.name: step for step in pipeline.steps()}
+    return lambda name: perform(steps[name])

@@ -17,13 +17,12 @@ from experiments.runs import load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
-from experiments.study.schedule import Simulated, updates
+from experiments.study.paths import POLICY
+from experiments.study.schedule import Simulated, count_updates
 from experiments.training.loop import train
 
-POLICY = "policy.npz"
 
-
-def configuration(
+def make_config(
     study: Study, item: Simulated, balls: str | dict, source: Path | None, seed: int, world: Path | None = None
 ) -> Config:
     """The training YAML of a model: balls by name or content, initial policy from ``source``, the round's recipe.
@@ -36,7 +35,7 @@ def configuration(
     if recipe.step is not None:
         optimiser = optimiser.model_copy(update={"step": recipe.step})
     training = Training(
-        updates=updates(study, item),
+        updates=count_updates(study, item),
         later_rewards=recipe.later_rewards,
         seed=seed,
         pool=simulation.pool,
@@ -56,7 +55,7 @@ def configuration(
     )
 
 
-def simulate(
+def train_seeds(
     study: Study,
     item: Simulated,
     folder: Path,
@@ -71,13 +70,13 @@ def simulate(
 
     human: YAML of the human model; None: the distribution that the item names. source: run to start from. name: of the
     step, which decides the seeds. score: what a policy is worth in reality, needed to choose among seeds. world: as in
-    ``configuration``.
+    ``make_config``.
     """
     balls = item.balls if human is None else load_distribution(human).to_dict()
     scores: dict[str, float] = {}
     for k in range(study.simulation.seeds):
         seed = zlib.crc32(f"{name}/{k}".encode()) >> 1  # another one for every player, model and study seed
-        config = configuration(study, item, balls, source, seed, world)
+        config = make_config(study, item, balls, source, seed, world)
         experiment, run = build.experiment(config, name), Run(folder / "training" / f"seed{k}")
         run.check(experiment.config)
         if not run.trained(experiment.config):
@@ -90,4 +89,4 @@ def simulate(
     run_dir.write_json(folder / SELECTION, {"best": f"training/{best}", "scores": scores})
     worth = f", worth {scores[best]:.2f} of 2 in reality" if scores else ""
     among = f", best of {len(scores)}" if len(scores) > 1 else ""
-    return f"{updates(study, item)} updates{among}{worth}"
+    return f"{count_updates(study, item)} updates{among}{worth}"

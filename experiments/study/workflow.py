@@ -21,8 +21,6 @@ from rich.console import Console
 from ballmodel.io.atomic_files import sync_folder
 from experiments.errors import ExperimentError, RunError
 
-JOURNAL = "steps.jsonl"
-
 
 class Waiting(ExperimentError):
     """A step that people do is not finished: the message says what is to be done before the same command goes on."""
@@ -84,7 +82,7 @@ class Journal:
         sync_folder(self.path.parent)
         self.entries.append(entry)
 
-    def place(self, step: Step) -> int | None:
+    def index(self, step: Step) -> int | None:
         """Index of the step's last mark; None without one."""
         return max((i for i, entry in enumerate(self.entries) if entry["step"] == step.name), default=None)
 
@@ -98,14 +96,14 @@ class Journal:
         return {kind: statistics.median(each) for kind, each in rates.items()}
 
 
-def unfinished(steps: list[Step], journal: Journal) -> list[Step]:
+def list_unfinished(steps: list[Step], journal: Journal) -> list[Step]:
     """The steps that are still to be done, in their order."""
     makers = {path: step for step in steps for path in step.outputs}
     left: list[Step] = []
     for step in steps:
-        mark = journal.place(step)
+        mark = journal.index(step)
         sources = {makers[path].name: makers[path] for path in step.inputs if path in makers}.values()
-        stale = any(source in left or (journal.place(source) or 0) > (mark or 0) for source in sources)
+        stale = any(source in left or (journal.index(source) or 0) > (mark or 0) for source in sources)
         if mark is None or stale or not all(path.exists() for path in step.outputs):
             left.append(step)
     return left
@@ -119,6 +117,8 @@ def perform(step: Step) -> tuple[str, float]:
     missing = [str(path) for path in step.inputs if not path.exists()]
     if missing:
         raise RunError(f"{step.name}: {', '.join(missing)} is missing, though the step that makes it is done")
+    for path in step.outputs:
+        path.parent.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     text = step.run()
     for path in step.outputs:
@@ -127,37 +127,33 @@ def perform(step: Step) -> tuple[str, float]:
     return text, time.monotonic() - began
 
 
-class Ledger:
-    """Marks the steps of one session as they end, and says so; ``left`` are those still to be done, in their order."""
+class Session:
+    """Steps of one session, marked and announced as they end; ``left`` are those still to be done, in their order."""
 
     def __init__(self, steps: list[Step], journal: Journal, console: Console, processes: int = 1) -> None:
         self._journal, self._console, self._processes = journal, console, processes
-        self.left, self._total = unfinished(steps, journal), len(steps)
+        self.left, self._total = list_unfinished(steps, journal), len(steps)
         done = self._total - len(self.left)
         if done:
             console.print(f"{done} of {self._total} steps were done before, {len(self.left)} are left", highlight=False)
 
-    def ended(self, step: Step, text: str, seconds: float) -> None:
-        """After a step that took ``seconds``. Raises OSError."""
+    def mark(self, step: Step, text: str, seconds: float) -> None:
+        """Marks a step that took ``seconds`` as done. Raises OSError."""
         self._journal.append(step, seconds)
         self.left.remove(step)
-        place, rest = self._total - len(self.left), remaining(self.left, self._journal, self._processes)
-        self._console.print(
-            f"[{place}/{self._total}] {step.name}: {text}  ({seconds:.1f} s; {rest})",
-            highlight=False,
-            soft_wrap=True,
-            markup=False,
-        )
+        number, rest = self._total - len(self.left), estimate_remaining(self.left, self._journal, self._processes)
+        line = f"[{number}/{self._total}] {step.name}: {text}  ({seconds:.1f} s; {rest})"
+        self._console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 def run_all(steps: list[Step], journal: Journal, console: Console) -> None:
     """Does what is not done yet, one step after the other. Raises what a step raises, and what ``perform`` does."""
-    ledger = Ledger(steps, journal, console)
-    for step in list(ledger.left):
-        ledger.ended(step, *perform(step))
+    session = Session(steps, journal, console)
+    for step in list(session.left):
+        session.mark(step, *perform(step))
 
 
-def remaining(steps: list[Step], journal: Journal, processes: int = 1) -> str:
+def estimate_remaining(steps: list[Step], journal: Journal, processes: int = 1) -> str:
     """An estimate in words of how long these steps take, from what others of their kinds took."""
     rates = journal.seconds_per_work()
     known = sum(rates[step.kind] * step.work for step in steps if step.kind in rates) / processes

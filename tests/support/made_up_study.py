@@ -15,9 +15,9 @@ import numpy as np
 from ballmodel import constants as c
 from ballmodel import registry
 from ballmodel.distribution import save_distribution
+from experiments.study import blind_protocol
 from experiments.study.analysis import effect_costs, scoring
 from experiments.study.analysis.paper import ABLATED, BY_SKILL, CROSS, FINAL, MODELS, OTHER_WORLDS, VARIANT
-from experiments.study.blind import protocol
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.sim.model import ModelFile, Range, SimModel
 
@@ -95,7 +95,7 @@ def make(folder: Path, seeds=(0,), names=BY_SKILL, balls: int = 60, rallies: int
             wanted += [(other, key) for other in CROSS[player] for key in FINAL] if cross else []
             wanted += [(player, m.key) for m in ABLATED] if player == ABLATION_PLAYER else []
             _world(folder / f"seed{seed}" / player / "identified" / "world0.yaml")
-            codes = protocol.draw([f"{e}/{m}" for e, m in wanted], rng)
+            codes = blind_protocol.draw([f"{e}/{m}" for e, m in wanted], rng)
             for evaluator, model in wanted:
                 one = _play(seed, player, evaluator, model, codes[f"{evaluator}/{model}"], rallies, rng)
                 parts.append(one)
@@ -125,7 +125,7 @@ def _play(seed, trainer, evaluator, model, code, rallies, rng) -> scoring.Rallie
     end = np.where(rng.random(rallies) < ROBOT_SHARE, robot, human)
     dropped = rng.random(rallies) < FILTERED_SHARE
     end = np.where(dropped, rng.choice([End.FIRST_NET, End.SERVICE, End.DUMMY_BY_HAND], rallies), end)
-    return scoring.scored(seed, trainer, evaluator, model, code, np.where(dropped, 1, length), end)
+    return scoring.score_rallies(seed, trainer, evaluator, model, code, np.where(dropped, 1, length), end)
 
 
 def _world(path: Path) -> None:

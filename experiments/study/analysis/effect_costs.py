@@ -14,7 +14,7 @@ from pathlib import Path
 from ballmodel.io.atomic_files import replacing
 from experiments.config.study import EFFECTS
 from experiments.errors import ConfigError
-from experiments.study.analysis.statistics import Interval, exponential, t_over_seeds
+from experiments.study.analysis.statistics import Interval, average_over_seeds, exponentiate
 
 FILE = "effects.csv"
 MODELS = ("is2r-sim1", "is2r-sim3", "oracle-sim", "is2r-ft100", "s2r-ft100", "oracle-ft")
@@ -36,7 +36,7 @@ class Outcome:
     """Mean number of paddle touches; NaN without rallies."""
 
 
-def gain(outcomes: list[Outcome], model: str, without: str) -> Interval | None:
+def estimate_gain(outcomes: list[Outcome], model: str, without: str) -> Interval | None:
     """Rally length without an effect over that with all: geometric mean over the players of each seed, then over seeds.
 
     Student's t on the seeds' logarithms, since the players of a seed share one reality; no interval (NaN) for one seed,
@@ -48,7 +48,7 @@ def gain(outcomes: list[Outcome], model: str, without: str) -> Interval | None:
         for (seed, player, world), length in found.items()
         if world == without and (seed, player, NOTHING) in found
     }
-    return exponential(t_over_seeds(logs)) if logs else None
+    return exponentiate(average_over_seeds(logs)) if logs else None
 
 
 def write(path: Path, outcomes: list[Outcome]) -> None:
@@ -61,26 +61,16 @@ def write(path: Path, outcomes: list[Outcome]) -> None:
 
 def read(path: Path) -> list[Outcome]:
     """Outcomes from the file of ``write``. Raises ConfigError naming file and line."""
+    out = []
     try:
         with open(path, newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+            for number, row in enumerate(csv.DictReader(file), 2):
+                try:
+                    counts = int(row["rallies"]), float(row["length"])
+                    out.append(Outcome(int(row["seed"]), row["player"], row["model"], row["without"], *counts))
+                except (KeyError, TypeError, ValueError) as error:
+                    wanted = ", ".join(f.name for f in fields(Outcome))
+                    raise ConfigError(f"{path}: line {number}: {row}: {error!r}; wanted are {wanted}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path}: not readable as CSV in UTF-8: {error}") from None
-    out = []
-    for number, row in enumerate(rows, 2):
-        try:
-            out.append(
-                Outcome(
-                    int(row["seed"]),
-                    row["player"],
-                    row["model"],
-                    row["without"],
-                    int(row["rallies"]),
-                    float(row["length"]),
-                )
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(
-                f"{path}: line {number}: {row}: {error!r}; wanted are {', '.join(f.name for f in fields(Outcome))}"
-            ) from None
     return out

@@ -15,18 +15,18 @@ PRIOR_ALONE = "from the prior alone"  # what made the world: those of its sample
 SPIN = "ball_spin."  # of strokes: a person's own, so that a reality has no one number for it
 
 
-def estimates(world: ModelFile, truth: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
+def list_estimates(world: ModelFile, truth: Mapping[str, float] | None = None) -> list[dict[str, Any]]:
     """A row for each parameter that the world moved or draws: its value, 90 % of what is drawn, and the truth if known.
 
     decided by: the logs, the prior, or neither. truth: values that differ from the nominal model, by dotted path;
-    delays as ``delays.in_sums`` has them.
+    delays as ``delays.add_to_sums`` has them.
     """
     nominal, values = models.paths(), models.paths(world.model)
-    shown = [delays.as_shown(x, values[delays.AXES]) if isinstance(x, Samples) else x for x in world.randomise]
+    shown = [delays.restore_command(x, values[delays.AXES]) if isinstance(x, Samples) else x for x in world.randomise]
     drawn = {path: ends for one in shown for path, ends in one.ends().items()}
     alone = (world.provenance or {}).get("identified", {}).get(PRIOR_ALONE, ())
     logged = {path for one in shown if isinstance(one, Samples) for path in one.paths} - set(alone)
-    known = None if truth is None else delays.in_sums(nominal | dict(truth), values)
+    known = None if truth is None else delays.add_to_sums(nominal | dict(truth), values)
     rows = []
     for path, value in values.items():
         low, high = drawn.get(path, (value, value))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballmodel.io.atomic_files import replacing
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, error_context
 from mjx_tt.rally.end_reasons import ROWS, End
 
 POOL = 60
@@ -28,22 +28,10 @@ ROBOT_ENDED = {end: ended for end, _, ended, _ in ROWS}
 NUMBERS = {str(number): end for number, (end, *_) in enumerate(ROWS, 1)}
 """End by its number on a scoring sheet, that of the row in the paper's table."""
 UNKNOWN = -1  # whether the robot ended the rally, where the table has no entry
-COLUMNS = (
-    "seed",
-    "trainer",
-    "evaluator",
-    "model",
-    "blind",
-    "rally",
-    "length",
-    "end",
-    "robot_ended",
-    "filtered",
-    "selected",
-)
+COLUMNS = tuple("seed trainer evaluator model blind rally length end robot_ended filtered selected".split())
 
 
-def end_of(text: str) -> End:
+def parse_end(text: str) -> End:
     """The end by its row's number (from 1; the first 15 are the paper's) or by its name.
 
     Raises ValueError listing what is allowed.
@@ -58,25 +46,25 @@ def end_of(text: str) -> End:
         raise ValueError(f"{text!r} is no end of a rally; 1 to {len(ROWS)} are allowed, or {names}") from None
 
 
-def kept(pooled: int) -> int:
+def count_reported(pooled: int) -> int:
     """Number of rallies that are reported of a pool of so many: five sixths, 50 of 60."""
     return round(pooled * KEEP / POOL)
 
 
-def pool(filtered: ArrayLike) -> np.ndarray:
+def choose_pool(filtered: ArrayLike) -> np.ndarray:
     """(n,) bool, the rallies of one evaluation among which the longest are reported: the first 60 that count."""
     counted = ~np.asarray(filtered, bool)
     return counted & (np.cumsum(counted) <= POOL)
 
 
-def select(length: ArrayLike, filtered: ArrayLike) -> np.ndarray:
+def choose_reported(length: ArrayLike, filtered: ArrayLike) -> np.ndarray:
     """(n,) bool, the rallies that are reported, of one evaluation's in the order of play.
 
-    length: (n,) touches; filtered: (n,) bool. Of the ``pool`` the longest five sixths; of equal lengths the earlier.
+    length: (n,) touches; filtered: (n,) bool. Of the pool the longest five sixths; of equal lengths the earlier.
     """
-    length, first = np.asarray(length), np.flatnonzero(pool(filtered))
+    length, first = np.asarray(length), np.flatnonzero(choose_pool(filtered))
     chosen = np.zeros(length.size, bool)
-    chosen[first[np.argsort(-length[first], kind="stable")[: kept(first.size)]]] = True
+    chosen[first[np.argsort(-length[first], kind="stable")[: count_reported(first.size)]]] = True
     return chosen
 
 
@@ -114,49 +102,43 @@ class Rallies:
         return self.trainer == self.evaluator
 
 
-def scored(
+def score_rallies(
     seed: int, trainer: str, evaluator: str, model: str, blind: str, length: ArrayLike, end: ArrayLike
 ) -> Rallies:
     """One evaluation's rallies, in the order of play. length: (n,) touches; end: (n,) End."""
     length, end = np.asarray(length, int), np.asarray(end, int)
-    count = length.size
+    names = dict(seed=seed, trainer=trainer, evaluator=evaluator, model=model, blind=blind)
     filtered = np.isin(end, [int(e) for e in FILTERED])
     ended = [ROBOT_ENDED.get(End(e)) for e in end.tolist()]
     return Rallies(
-        seed=np.full(count, seed),
-        trainer=np.full(count, trainer),
-        evaluator=np.full(count, evaluator),
-        model=np.full(count, model),
-        blind=np.full(count, blind),
-        rally=np.arange(count),
+        **{name: np.full(length.size, value) for name, value in names.items()},
+        rally=np.arange(length.size),
         length=length,
         end=end,
         robot_ended=np.array([UNKNOWN if e is None else int(e) for e in ended], int),
         filtered=filtered,
-        pooled=pool(filtered),
-        selected=select(length, filtered),
+        pooled=choose_pool(filtered),
+        selected=choose_reported(length, filtered),
     )
 
 
 def join(parts: Iterable[Rallies]) -> Rallies:
     """Rallies one after the other; without any, an empty one."""
-    parts = list(parts) or [scored(0, "", "", "", "", [], [])]
+    parts = list(parts) or [score_rallies(0, "", "", "", "", [], [])]
     return Rallies(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Rallies)))
 
 
 def write(path: Path, rallies: Rallies) -> None:
     """Writes evaluations.csv, one line a rally; the end by its name."""
-    names = [End(e).name.lower() for e in rallies.end.tolist()]
-    columns = [getattr(rallies, name).tolist() for name in COLUMNS]
-    columns[COLUMNS.index("end")] = names
+    columns = {name: getattr(rallies, name).tolist() for name in COLUMNS}
+    columns["end"] = [End(e).name.lower() for e in columns["end"]]
+    columns["robot_ended"] = ["" if e == UNKNOWN else e for e in columns["robot_ended"]]
     for name in ("filtered", "selected"):
-        columns[COLUMNS.index(name)] = getattr(rallies, name).astype(int).tolist()
-    ended = rallies.robot_ended.tolist()
-    columns[COLUMNS.index("robot_ended")] = ["" if e == UNKNOWN else e for e in ended]
+        columns[name] = [int(flag) for flag in columns[name]]
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
-        writer.writerows(zip(*columns, strict=True))
+        writer.writerows(zip(*columns.values(), strict=True))
 
 
 def read(path: Path) -> Rallies:
@@ -172,39 +154,35 @@ def read(path: Path) -> Rallies:
             if missing:
                 raise ConfigError(f"{path}: column {', '.join(missing)} is missing; wanted: {', '.join(COLUMNS)}")
             for row in reader:
-                where = f"{path}: line {reader.line_num}"
-                group = (
-                    _whole(row, "seed", where),
-                    _name(row, "trainer", where),
-                    _name(row, "evaluator", where),
-                    _name(row, "model", where),
-                    row["blind"] or "",
-                )
-                try:
-                    end = End[(row["end"] or "").strip().upper()]
-                except KeyError:
-                    names = ", ".join(e.name.lower() for e in End)
-                    raise ConfigError(f"{where}: column end: {row['end'] or ''!r} is none of {names}") from None
-                rally = (_whole(row, "rally", where), _whole(row, "length", where), end)
-                evaluations.setdefault(group, []).append(rally)
+                with error_context(f"{path}: line {reader.line_num}"):
+                    names = (_name(row, column) for column in ("trainer", "evaluator", "model"))
+                    group = (_whole(row, "seed"), *names, row["blind"] or "")
+                    evaluations.setdefault(group, []).append((_whole(row, "rally"), _whole(row, "length"), _end(row)))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path}: not readable as CSV in UTF-8: {error}") from None
     parts = []
     for group, played in evaluations.items():
-        played.sort(key=lambda p: p[0])
-        one = scored(*group, [length for _, length, _ in played], [end for *_, end in played])
-        parts.append(replace(one, rally=np.array([number for number, *_ in played])))
+        numbers, lengths, ends = zip(*sorted(played, key=lambda p: p[0]), strict=True)
+        parts.append(replace(score_rallies(*group, lengths, ends), rally=np.array(numbers)))
     return join(parts)
 
 
-def _name(row: dict[str, str], column: str, where: str) -> str:
+def _name(row: dict[str, str], column: str) -> str:
     if not row[column]:
-        raise ConfigError(f"{where}: column {column}: a name is wanted, got nothing")
+        raise ValueError(f"column {column}: a name is wanted, got nothing")
     return row[column]
 
 
-def _whole(row: dict[str, str], column: str, where: str) -> int:
+def _whole(row: dict[str, str], column: str) -> int:
     text = (row[column] or "").strip()
     if not re.fullmatch("[0-9]{1,9}", text):
-        raise ConfigError(f"{where}: column {column}: a whole number from 0 to 999999999 is wanted, got {text!r}")
+        raise ValueError(f"column {column}: a whole number from 0 to 999999999 is wanted, got {text!r}")
     return int(text)
+
+
+def _end(row: dict[str, str]) -> End:
+    try:
+        return End[(row["end"] or "").strip().upper()]
+    except KeyError:
+        names = ", ".join(e.name.lower() for e in End)
+        raise ValueError(f"column end: {row['end'] or ''!r} is none of {names}") from None

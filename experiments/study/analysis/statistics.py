@@ -8,7 +8,7 @@ seeds it would draw a handful of points, which are no 95 %: there it is the boot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from experiments.stats import sign_flip, t_interval, welch_interval, welch_p
-from experiments.study.analysis.scoring import Rallies, kept
+from experiments.study.analysis.scoring import Rallies, count_reported
 
 DRAWS = 2000
 FEWEST_SEEDS = 5  # drawn anew: 4 of 5 give 70 different means, 1 of 2 give two
@@ -25,7 +25,7 @@ Cell = tuple[int, str, str, str]  # seed, trainer, evaluator, model
 Models = str | Iterable[str]  # one or several
 
 
-def chance(seeds: int) -> str:
+def name_chance(seeds: int) -> str:
     """Name of what the bootstrap draws anew in a study of so many seeds."""
     return "seeds and rallies" if seeds >= FEWEST_SEEDS else "rallies"
 
@@ -42,7 +42,7 @@ class Interval:
     over: str = ""
 
 
-def exponential(logs: Interval) -> Interval:
+def exponentiate(logs: Interval) -> Interval:
     """A mean of logarithms as a geometric mean."""
     with np.errstate(over="ignore"):
         value, low, high = np.exp([logs.value, logs.low, logs.high]).tolist()
@@ -101,14 +101,14 @@ class Bootstrap:
         values = np.asarray(rallies.length if values is None else values, float)
         rng = np.random.default_rng(key)
         reported = rallies.selected if longest else np.ones(len(rallies), bool)
-        self.cells = cells(rallies.take(reported), values[reported])
+        self.cells = group_by_cell(rallies.take(reported), values[reported])
         self.seeds = tuple(sorted({cell[0] for cell in self.cells}))
         self.point = {cell: float(v.mean()) for cell, v in self.cells.items()}
         pooled = rallies.pooled if longest else reported
         order = np.flatnonzero(pooled)[np.argsort(-rallies.length[pooled], kind="stable")]  # the longest first
         self._draws: dict[Cell, Any] = {
-            cell: _means(v, kept(v.size) if longest else v.size, draws, rng)
-            for cell, v in cells(rallies.take(order), values[order]).items()
+            cell: _means(v, count_reported(v.size) if longest else v.size, draws, rng)
+            for cell, v in group_by_cell(rallies.take(order), values[order]).items()
         }
         # Which seeds each draw takes, by how many there are: the same for all means, so that their differences pair.
         self._chosen = {
@@ -138,6 +138,11 @@ class Bootstrap:
             return None
         first, second = (self._mean([cell for cell in side if cell[:2] in both]) for side in found)
         return first, second
+
+    def pooled(self, model: str, trainers: Iterable[str]) -> np.ndarray:
+        """(n,) the values of a model with its own trainers."""
+        found = [self.cells[cell] for cell in self._find(model, trainers, True)]
+        return np.concatenate(found) if found else np.zeros(0)
 
     def _find(self, models: Models, trainers: Iterable[str], own: bool | None) -> list[Cell]:
         models, trainers = (models,) if isinstance(models, str) else tuple(models), tuple(trainers)
@@ -170,7 +175,7 @@ def _means(values: np.ndarray, first: int, draws: int, rng: np.random.Generator)
     return values[drawn].mean(axis=1)
 
 
-def cells(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
+def group_by_cell(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
     """The values by seed, trainer, evaluator and model."""
     groups: dict[Cell, list[int]] = {}
     columns = (getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model"))
@@ -179,43 +184,36 @@ def cells(rallies: Rallies, values: np.ndarray) -> dict[Cell, np.ndarray]:
     return {cell: values[index] for cell, index in groups.items()}
 
 
-def normalised_by_player(rallies: Rallies) -> np.ndarray:
+def normalise_by_player(rallies: Rallies) -> np.ndarray:
     """(n,) (length - mean) / std, both over the reported own evaluations of the trainer in that seed (Normalization,
     Evaluations).
 
     ``rallies``: own evaluations of the ten models. NaN where all lengths of a player are equal.
     """
-    return _standardised(rallies, lambda cell: (cell[0], cell[1]))
+    return _standardise(rallies, ("seed", "trainer"), rallies.selected)
 
 
-def normalised_by_model(rallies: Rallies) -> np.ndarray:
+def normalise_by_model(rallies: Rallies) -> np.ndarray:
     """(n,) (length - mean) / std, both over what is reported of the trainer's own evaluation of that model
     (Normalization, Cross-Evaluations).
 
     ``rallies``: own and cross-evaluations; NaN where the trainer did not evaluate the model.
     """
-    return _standardised(rallies, lambda cell: (cell[0], cell[1], cell[3]), own_only=True)
+    return _standardise(rallies, ("seed", "trainer", "model"), rallies.selected & rallies.own)
 
 
-def _standardised(
-    rallies: Rallies, group: Callable[[Cell], tuple[int | str, ...]], own_only: bool = False
-) -> np.ndarray:
-    length = rallies.length.astype(float)
-    columns = zip(*(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model")), strict=True)
-    names = [group(cell) for cell in columns]
-    out, based = np.full(length.size, np.nan), rallies.selected & (rallies.own | (not own_only))
-    index: dict[tuple[int | str, ...], list[int]] = {}
-    for i, name in enumerate(names):
-        index.setdefault(name, []).append(i)
-    for numbers in index.values():
-        members = np.array(numbers)
-        base = length[members[based[members]]]
+def _standardise(rallies: Rallies, group: Sequence[str], reference: np.ndarray) -> np.ndarray:
+    """(n,) lengths standardised by the reference rallies, (n,) bool, of their group."""
+    out, columns = np.full(len(rallies), np.nan), [getattr(rallies, name) for name in group]
+    for names in set(zip(*(column.tolist() for column in columns), strict=True)):
+        members = np.all([column == name for column, name in zip(columns, names, strict=True)], axis=0)
+        base = rallies.length[members & reference].astype(float)
         if base.size > 1 and base.std(ddof=1) > 0.0:
-            out[members] = (length[members] - base.mean()) / base.std(ddof=1)
+            out[members] = (rallies.length[members] - base.mean()) / base.std(ddof=1)
     return out
 
 
-def share_of(held: Iterable[tuple[int, bool]]) -> Interval:
+def estimate_share(held: Iterable[tuple[int, bool]]) -> Interval:
     """Share of what holds, (seed, true or false) each, with percentiles of a bootstrap over seeds.
 
     What belongs to one seed shares its reality and its logs, so that seeds alone are drawn anew, S - 1 of S; without an
@@ -235,7 +233,7 @@ def share_of(held: Iterable[tuple[int, bool]]) -> Interval:
     return Interval(value, float(low), float(high), int(count[1].sum()))
 
 
-def t_over_seeds(values: Mapping[tuple[int, str], float]) -> Interval:
+def average_over_seeds(values: Mapping[tuple[int, str], float]) -> Interval:
     """Mean of values by seed and player: over the players of each seed, then over seeds, with Student's t over seeds.
 
     The players of a seed share one hidden reality. Without an interval (NaN) where there is one seed only.
@@ -274,7 +272,7 @@ class Difference:
     pairs: int
 
 
-def difference(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bool = True) -> Difference | None:
+def compare_models(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bool = True) -> Difference | None:
     """Of model ``a`` minus model ``b``, over pairs of cells that differ in the model only."""
     trainers = tuple(trainers)
     pairs = [
@@ -290,13 +288,13 @@ def difference(boot: Bootstrap, a: str, b: str, trainers: Iterable[str], own: bo
         (both[0] - both[1]).interval,
         Interval(*welch_interval(second, first), first.size + second.size),
         welch_p(first, second),
-        permutation(pairs),
+        permute_rallies(pairs),
         sign_flip([x.mean() - y.mean() for x, y in pairs]),
         len(pairs),
     )
 
 
-def permutation(pairs: list[tuple[np.ndarray, np.ndarray]], draws: int = PERMUTATIONS, key: int = 0) -> float:
+def permute_rallies(pairs: list[tuple[np.ndarray, np.ndarray]], draws: int = PERMUTATIONS, key: int = 0) -> float:
     """Two-sided p of the mean difference over pairs of samples, whose members are exchanged within each pair.
 
     The share of permutations at least as extreme, the observed one among them (Phipson and Smyth 2010). SciPy's

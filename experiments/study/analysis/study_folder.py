@@ -6,48 +6,39 @@ import json
 import reprlib
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 
 from ballmodel import registry
 from ballmodel.distribution import AXES, BallDistribution, load_distribution
 from ballmodel.io.yaml import read as read_yaml
 from experiments.errors import ConfigError
-from experiments.runs.run_dir import CONFIG
+from experiments.runs.run_dir import CONFIG, Run
 from experiments.study.analysis import effect_costs, scoring
-from experiments.study.analysis.paper import BY_KEY, BY_SKILL, CROSS, FINAL, IS2R, LEARNED, MODELS, TEN
+from experiments.study.analysis.paper import BY_KEY, BY_SKILL, CROSS, FINAL, IDENTIFIED, IS2R, METHODS, TEN
 from experiments.study.analysis.statistics import Models
+from experiments.study.paths import EVALUATIONS, SESSIONS, SETTINGS, StudyPaths
 from mjx_tt.rally.human_player import FOLDER as VIRTUAL_PLAYERS
-
-T = TypeVar("T")
 
 ROUNDS = ("M0", "M1", "M2")
 DATASETS = ("D0", "D1", "D2")
-SETTINGS, EVALUATIONS = "study.yaml", "evaluations.csv"
-LOG = {
-    "rally": 0,
-    "touch": 0,
-    "first": 0,
-    "position": 3,
-    "velocity": 3,
-    "landing": 2,
-    "hit": 0,
-    "returned": 0,
-    "return_landing": 2,
-}
-"""Arrays of a BallLog with their rows; 0 for a plain list of balls."""
-NUMBERS = tuple(f"{part} {axis} {end}" for part, axes in AXES.items() for axis in axes for end in ("min", "max"))
+QUANTITIES = tuple(f"{part} {axis}" for part, axes in AXES.items() for axis in axes)
+"""Quantities that a human model bounds: position and velocity at the start, landing point."""
+NUMBERS = tuple(f"{quantity} {end}" for quantity in QUANTITIES for end in ("min", "max"))
 """Names of the 16 numbers of a human model."""
 
 
 @dataclass(frozen=True)
 class BallLog:
-    """The human's balls of one evaluation, arrays with the balls last.
+    """The human's balls of one evaluation, arrays with the n balls last.
 
     rally: (n,) its rally; touch: (n,) the touch that hit it; first: (n,) bool, begins a rally;
     position, velocity: (3, n) [m], [m/s] at the human's contact; landing: (2, n) [m] on the robot's side;
@@ -72,9 +63,39 @@ class BallLog:
         return points[:, np.isfinite(points).all(axis=0)]
 
 
+LOG_ROWS = {name: 0 for name in BallLog.__dataclass_fields__} | {
+    "position": 3,
+    "velocity": 3,
+    "landing": 2,
+    "return_landing": 2,
+}
+"""Rows of the arrays of a BallLog; 0 for a plain list of balls."""
+
+
+class _NumberRow(BaseModel, extra="allow"):
+    player: str
+    model: str
+    deviation: float
+
+
+class _RallyRow(BaseModel, extra="allow"):
+    player: str
+    statistic: str
+    target: float
+    reached: float
+
+
+class _Calibration(BaseModel):
+    """calibration.json: deviations of the virtual players' human models, and their rally lengths."""
+
+    medians: dict[str, dict[str, float]] = {}
+    numbers: list[_NumberRow] = []
+    rallies: list[_RallyRow] = []
+
+
 @dataclass
-class Study:
-    """Content of a study's folder.
+class StudyFolder:
+    """Content of a study's folder. Every reader raises ConfigError for a damaged file.
 
     missing: what the study that its settings ask for would have besides, in words
     left_out: what its settings leave out of a whole study, in words
@@ -86,6 +107,10 @@ class Study:
     rallies: scoring.Rallies
     missing: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+
+    @property
+    def paths(self) -> StudyPaths:
+        return StudyPaths(self.folder)
 
     @cached_property
     def seeds(self) -> tuple[int, ...]:
@@ -117,18 +142,22 @@ class Study:
         return r.take(where)
 
     def models_of(self, seed: int, player: str) -> dict[str, BallDistribution]:
-        """The human models that were fitted: of M0, M1, M2 those that are there. Raises ConfigError."""
-        out = {}
+        """The human models that were fitted: of M0, M1, M2 those that are there."""
+        found = {}
         for name in ROUNDS:
-            path = self.folder / f"seed{seed}" / player / "balls" / f"human_{name}.yaml"
+            path = self.paths.human(seed, player, name)
             if path.exists():
-                out[name] = _read(path, load_distribution)
-        return out
+                with _reading(path):
+                    found[name] = load_distribution(path)
+        return found
 
     def log(self, seed: int, trainer: str, evaluator: str, model: str) -> BallLog | None:
-        """The balls of an evaluation. Raises ConfigError for a file that does not hold the arrays of a BallLog."""
-        path = self.folder / "evaluations" / f"{seed}_{trainer}_{evaluator}_{model}.npz"
-        return _read(path, _ball_log) if path.exists() else None
+        """The balls of an evaluation; None where there is no file."""
+        path = self.paths.evaluation_log(seed, trainer, evaluator, model)
+        if not path.exists():
+            return None
+        with _reading(path):
+            return _ball_log(path)
 
     def logs(self, trainer: str, model: str) -> list[BallLog]:
         """The logs of a policy with its own trainer, of all seeds."""
@@ -138,61 +167,58 @@ class Study:
     def metrics(self, seed: int, player: str, model: str) -> list[dict[str, Any]]:
         """The rows of a policy's training or fine-tuning, one per update; none where there is no file.
 
-        An unfinished last line is left out: the run may be under way. Raises ConfigError naming any other bad line.
+        An unfinished last line is left out: the run may be under way.
         """
-        path = self.folder / f"seed{seed}" / player / model / "metrics.jsonl"
-        return _read(path, _metrics) if path.exists() else []
-
-    def trajectories(self, seed: int, player: str, name: str) -> Path | None:
-        """The measured balls D0, D1 or D2, the last two as additions."""
-        path = self.folder / f"seed{seed}" / player / "balls" / f"{name}.csv"
-        return path if path.exists() else None
+        path = Run(self.paths.model(seed, player, model)).metrics
+        if not path.exists():
+            return []
+        with _reading(path):
+            return _metric_rows(path)
 
     @cached_property
     def calibration(self) -> dict[str, Any]:
-        """The calibration of the virtual players: the folder's calibration.json or the shipped one; empty with people.
-
-        Raises ConfigError.
-        """
+        """calibration.json of the folder, or the shipped one of the virtual players; empty with people."""
         path = self.folder / "calibration.json"
-        if path.exists():
-            return _read(path, _calibration)
-        virtual = self.settings and self.settings.get("robot") is None
-        return _read(VIRTUAL_PLAYERS / "calibration.json", _calibration) if virtual else {}
+        if not path.exists():
+            if not self.settings or self.settings.get("robot") is not None:
+                return {}
+            path = VIRTUAL_PLAYERS / "calibration.json"
+        with _reading(path):
+            content = json.loads(path.read_bytes())
+            try:
+                _Calibration.model_validate(content)
+            except ValidationError as error:
+                first = error.errors()[0]
+                place = ".".join(map(str, first["loc"])) or "the file"
+                raise ValueError(f"{place}: {first['msg']}, got {reprlib.repr(first['input'])}") from None
+            return content
 
     @cached_property
     def effects(self) -> list[effect_costs.Outcome]:
-        """Rallies in realities that lack something. Raises ConfigError."""
+        """Rallies in realities that lack something."""
         return [o for path in sorted(self.folder.glob(f"seed*/{effect_costs.FILE}")) for o in effect_costs.read(path)]
 
     @cached_property
     def realities(self) -> dict[int, Any]:
-        """The opened realities by seed. Raises ConfigError."""
-        paths = {seed: self.folder / f"seed{seed}" / "reality.yaml" for seed in self.seeds}
-        return {seed: _read(path, read_yaml) for seed, path in paths.items() if path.exists()}
+        """The opened realities by seed."""
+        found = {}
+        for seed in self.seeds:
+            path = self.paths.seed(seed) / "reality.yaml"
+            if path.exists():
+                with _reading(path):
+                    found[seed] = read_yaml(path)
+        return found
 
 
 def numbers(distribution: BallDistribution) -> np.ndarray:
     """(16,) the numbers of a human model in the order of NUMBERS."""
-    d = distribution
-    return np.array(
-        [
-            value
-            for part, axes in AXES.items()
-            for k in range(len(axes))
-            for value in (getattr(d, f"{part}_min")[k], getattr(d, f"{part}_max")[k])
-        ]
-    )
+    ends = [[v for part in AXES for v in getattr(distribution, f"{part}_{end}")] for end in ("min", "max")]
+    return np.array(ends).T.ravel()
 
 
 def paper_models(player: str) -> dict[str, BallDistribution]:
     """The paper's M0, M1 and M2 of a player."""
     return {name: registry.load(f"{player}/{name}") for name in ROUNDS}
-
-
-def change(a: BallDistribution, b: BallDistribution, scale: np.ndarray) -> float:
-    """Mean over the 16 numbers of |b - a| in units of ``scale`` (16,)."""
-    return float(np.mean(np.abs(numbers(b) - numbers(a)) / scale))
 
 
 def widths(models: dict[str, BallDistribution]) -> np.ndarray:
@@ -201,31 +227,36 @@ def widths(models: dict[str, BallDistribution]) -> np.ndarray:
     return np.repeat(table[:, :, 1].max(0) - table[:, :, 0].min(0), 2)
 
 
-def load(folder: Path) -> Study:
+def changes_of(models: dict[str, BallDistribution]) -> tuple[float, float]:
+    """Changes M0 to M1 and M1 to M2: mean over the 16 numbers, in units of each quantity's width over the models."""
+    scale, (m0, m1, m2) = widths(models), (numbers(models[name]) for name in ROUNDS)
+    return float(np.mean(np.abs(m1 - m0) / scale)), float(np.mean(np.abs(m2 - m1) / scale))
+
+
+def load(folder: Path) -> StudyFolder:
     """Reads a study's folder, whole or partial.
 
     Raises ConfigError where there is nothing to report on, and for a file that is damaged.
     """
     folder = Path(folder)
-    evaluated, asked, sessions = (folder / name for name in (EVALUATIONS, SETTINGS, "study.json"))
+    evaluated, asked, sessions = (folder / name for name in (EVALUATIONS, SETTINGS, SESSIONS))
     if not evaluated.exists() and not asked.exists():
-        raise ConfigError(f"{folder}: is no study: neither {SETTINGS} nor {EVALUATIONS} is there{_instead(folder)}")
+        raise ConfigError(f"{folder}: is no study: neither {SETTINGS} nor {EVALUATIONS} is there{_suggestion(folder)}")
     rallies = scoring.read(evaluated) if evaluated.exists() else scoring.join([])
-    settings = _read(asked, _settings) if asked.exists() else {}
-    info = _read(sessions, _json_mapping) if sessions.exists() else {}
-    known, strange = _known(rallies)
-    study = Study(folder, settings, info, rallies.take(known))
+    settings, info = _mapping_of(asked), _mapping_of(sessions)
+    known, unknown = _known(rallies)
+    study = StudyFolder(folder, settings, info, rallies.take(known))
     if not study.players:
-        if strange:
-            raise ConfigError(f"{evaluated}: the figures have no place for any of its rallies: {'; '.join(strange)}")
+        if unknown:
+            raise ConfigError(f"{evaluated}: the figures have no place for any of its rallies: {'; '.join(unknown)}")
         raise ConfigError(f"{folder}: nothing to report on yet: there is no player's folder and no rally")
     models, cross, study.left_out = _asked_for(settings)
-    study.missing.extend([*(f"a place for rallies with {which}" for which in strange), *_missing(study, models, cross)])
+    study.missing = [*(f"a place for rallies with {which}" for which in unknown), *_missing(study, models, cross)]
     return study
 
 
-def _instead(folder: Path) -> str:
-    """Clause about a folder that is no study but holds a run, with the command for that; empty where it holds none."""
+def _suggestion(folder: Path) -> str:
+    """A clause that says what to do with a folder that is no study."""
     runs = [path.parent for path in sorted([*folder.glob(CONFIG), *folder.glob(f"*/{CONFIG}")])]
     if not runs:
         return "" if folder.is_dir() else "; there is no such folder"
@@ -238,24 +269,25 @@ def _asked_for(settings: dict[str, Any]) -> tuple[tuple[str, ...], bool, list[st
     Without settings, those of the paper.
     """
     baselines = settings.get("baselines", True)
-    models = {True: TEN, False: ()}.get(baselines, tuple(m.key for m in MODELS if m.method == IS2R))
+    models = {True: TEN, False: ()}.get(baselines, tuple(m.key for m in METHODS[IS2R]))
     left_out = list(dict.fromkeys(BY_KEY[key].method for key in TEN if key not in models))
     cross = (settings.get("evaluation") or {}).get("cross", True)
     if not cross:
         left_out.append("rallies with players who did not train the policy")
     if settings.get("identification") is not None:
-        models += tuple(model.key for model in LEARNED["id"])
+        models += tuple(model.key for model in METHODS[IDENTIFIED])
     return models, cross, left_out
 
 
-def _missing(study: Study, models: tuple[str, ...], cross: bool) -> list[str]:
+def _missing(study: StudyFolder, models: tuple[str, ...], cross: bool) -> list[str]:
     """Parts that a study lacks of those models and cross-evaluations, in words."""
     out = []
     absent = [p for p in BY_SKILL if p not in study.players]
     if absent:
         out.append(f"players {', '.join(absent)}")
     r = study.rallies
-    there = set(zip(r.seed.tolist(), r.trainer.tolist(), r.evaluator.tolist(), r.model.tolist(), strict=True))
+    evaluations = list(zip(*(a.tolist() for a in (r.seed, r.trainer, r.evaluator, r.model)), strict=True))
+    there = set(evaluations)
     for seed in study.seeds:
         for player in study.players:
             lacking = [m for m in models if (seed, player, player, m) not in there]
@@ -269,10 +301,12 @@ def _missing(study: Study, models: tuple[str, ...], cross: bool) -> list[str]:
             fitted = study.models_of(seed, player)
             if len(fitted) < len(ROUNDS) and "is2r-sim1" in models:
                 out.append(f"seed {seed}, {player}: human model {', '.join(m for m in ROUNDS if m not in fitted)}")
+    counted = Counter({key: 0 for key in evaluations})
+    counted.update(key for key, filtered in zip(evaluations, r.filtered.tolist(), strict=True) if not filtered)
     short = [
         f"seed {seed}, {trainer} with {evaluator}, {model}: {count} rallies that count of {scoring.POOL}, "
-        f"the longest {scoring.kept(count)} are reported"
-        for (seed, trainer, evaluator, model), count in counted(r).items()
+        f"the longest {scoring.count_reported(count)} are reported"
+        for (seed, trainer, evaluator, model), count in counted.items()
         if count < scoring.POOL
     ]
     return out + short
@@ -284,38 +318,28 @@ def _known(rallies: scoring.Rallies) -> tuple[np.ndarray, list[str]]:
     for column, known in (("trainer", BY_SKILL), ("evaluator", BY_SKILL), ("model", BY_KEY)):
         fits = np.isin(getattr(rallies, column), list(known))
         where &= fits
-        strange = sorted(set(getattr(rallies, column)[~fits].tolist()))
-        if strange:
-            out.append(f"{column} {', '.join(strange)} (known are {', '.join(sorted(known))})")
+        unknown = sorted(set(getattr(rallies, column)[~fits].tolist()))
+        if unknown:
+            out.append(f"{column} {', '.join(unknown)} (known are {', '.join(sorted(known))})")
     return where, out
 
 
-def counted(rallies: scoring.Rallies) -> dict[tuple[int, str, str, str], int]:
-    """Rallies that are not filtered, by seed, trainer, evaluator and model."""
-    out: dict[tuple[int, str, str, str], int] = {}
-    for s, t, e, m, f in zip(
-        *(getattr(rallies, name).tolist() for name in ("seed", "trainer", "evaluator", "model", "filtered")),
-        strict=True,
-    ):
-        out[s, t, e, m] = out.get((s, t, e, m), 0) + (not f)
-    return out
-
-
-def _read(path: Path, parse: Callable[[Path], T]) -> T:
-    """Result of ``parse`` on a file; raises its errors as a ConfigError that names the file."""
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Errors of reading a file become a ConfigError that names it."""
     try:
-        return parse(path)
+        yield
     except (ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        said = str(error).removeprefix(f"{path}: ") or type(error).__name__
-        raise ConfigError(f"{path}: cannot be read: {said}; restore the file") from None
+        text = str(error).removeprefix(f"{path}: ") or type(error).__name__
+        raise ConfigError(f"{path}: cannot be read: {text}; restore the file") from None
 
 
-def _settings(path: Path) -> dict[str, Any]:
-    return _mapping(read_yaml(path))
-
-
-def _json_mapping(path: Path) -> dict[str, Any]:
-    return _mapping(json.loads(path.read_text(encoding="utf-8")))
+def _mapping_of(path: Path) -> dict[str, Any]:
+    """Content of a YAML or JSON file; empty where there is none."""
+    if not path.exists():
+        return {}
+    with _reading(path):
+        return _mapping(json.loads(path.read_bytes()) if path.suffix == ".json" else read_yaml(path))
 
 
 def _mapping(content: Any) -> dict[str, Any]:
@@ -324,17 +348,13 @@ def _mapping(content: Any) -> dict[str, Any]:
     return content
 
 
-def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _metrics(path: Path) -> list[dict[str, Any]]:
+def _metric_rows(path: Path) -> list[dict[str, Any]]:
     rows = []
     lines = path.read_bytes().splitlines(keepends=True)
     for number, line in enumerate(lines, 1):
         try:
             row = _mapping(json.loads(line))
-            if not _number(row.get("return_rate", 0.0)):
+            if not isinstance(row.get("return_rate", 0.0), int | float):
                 raise ValueError(f"return_rate is {row['return_rate']!r}, a number is wanted")
         except ValueError as error:
             if number == len(lines) and not line.endswith(b"\n"):
@@ -344,39 +364,16 @@ def _metrics(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _calibration(path: Path) -> dict[str, Any]:
-    """medians: {player: {model: number}}; numbers, rallies: lists of rows with the same keys."""
-    content = _json_mapping(path)
-    for player, by_model in _mapping(content.get("medians", {})).items():
-        if not all(map(_number, _mapping(by_model).values())):
-            raise ValueError(f"medians.{player}: numbers are wanted, got {by_model!r}")
-    for part, texts, values in (
-        ("numbers", ("player", "model"), ("deviation",)),
-        ("rallies", ("player", "statistic"), ("target", "reached")),
-    ):
-        rows = content.get(part, [])
-        if not isinstance(rows, list):
-            raise ValueError(f"{part}: a list is wanted, got {reprlib.repr(rows)}")
-        for k, row in enumerate(rows):
-            fits = isinstance(row, dict) and row.keys() == rows[0].keys()
-            fits = fits and all(isinstance(row.get(n), str) for n in texts) and all(_number(row.get(n)) for n in values)
-            if not fits:
-                wanted = f"{', '.join(texts)} as text and {', '.join(values)} as numbers"
-                raise ValueError(f"{part}[{k}]: {wanted} are wanted, the same keys in every row, got {row!r}")
-    return content
-
-
 def _ball_log(path: Path) -> BallLog:
-    with open(path, "rb") as file:
-        if not zipfile.is_zipfile(file):
-            raise ValueError("it is no NumPy archive (.npz)")
+    if path.stat().st_size and not zipfile.is_zipfile(path):
+        raise ValueError("it is no NumPy archive (.npz)")
     with np.load(path, allow_pickle=False) as data:
-        lacking = [name for name in LOG if name not in data]
+        lacking = [name for name in LOG_ROWS if name not in data]
         if lacking:
-            raise ValueError(f"has no array {', '.join(lacking)}; wanted: {', '.join(LOG)}")
-        arrays = {name: data[name] for name in LOG}
+            raise ValueError(f"has no array {', '.join(lacking)}; wanted: {', '.join(LOG_ROWS)}")
+        arrays = {name: data[name] for name in LOG_ROWS}
     count = arrays["rally"].size
-    for name, rows in LOG.items():
+    for name, rows in LOG_ROWS.items():
         wanted, array = (rows, count) if rows else (count,), arrays[name]
         if array.shape != wanted or array.dtype.kind not in "biuf":
             raise ValueError(f"array {name} is {array.dtype} {array.shape}; numbers of shape {wanted} are wanted")

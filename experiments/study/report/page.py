@@ -1,31 +1,35 @@
 """The report of a study: the paper's figures and tables with ours beside them, and what agrees.
 
-The prose, in the order of a reader's questions, is the template study.html. A part that a study lacks is named in its
-place.
+All prose is in the templates: ``study.html``, in the order of a reader's questions, and ``findings.txt``, the first
+sentences. A part that a study lacks is named in its place.
 """
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 
+import matplotlib
+import numpy as np
 import yaml
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
-from experiments.study.analysis.claims import NOT_COMPARABLE, VERDICTS, Measurements, findings, show, span
-from experiments.study.analysis.claims import __doc__ as RULES
-from experiments.study.analysis.paper import LEVELS, RALLIES, WITHOUT
-from experiments.study.analysis.statistics import FEWEST_SEEDS, Estimate, chance
-from experiments.study.analysis.study_folder import Study, load
-from experiments.study.report import figures, further_figures, heatmaps, human_model_figures, tables, tsne
-from experiments.study.report import text as words
+from experiments.study.analysis.claims import NOT_COMPARABLE, PLAYS, VERDICTS, WIDEST, Measurements, show, show_interval
+from experiments.study.analysis.paper import FINAL, LEVELS, SHORT, of_level
+from experiments.study.analysis.scoring import KEEP
+from experiments.study.analysis.statistics import FEWEST_SEEDS, Estimate, Interval, name_chance
+from experiments.study.analysis.study_folder import StudyFolder, load
+from experiments.study.paths import REPORT
+from experiments.study.report import figures, tables, tsne
+from experiments.study.report.plots import STYLE
+from mjx_tt.rally.end_reasons import End
 from mjx_tt.viz.html import Page, details, environment, table
 
-REPORT = "report"
-ABSENT = "This study holds nothing of it."
+ABSENT = "this study holds nothing of it."
 MOST_MISSING = 12  # that are listed at once
 
 
@@ -34,22 +38,21 @@ def write(folder: Path) -> Path:
 
     Raises ConfigError where there is no study or a file of it cannot be read.
     """
-    study = load(folder)
-    report = Report(study)
+    report = Report(load(folder))
     report.compose()
-    target = study.folder / REPORT
-    path, *_ = report.page.write(target / "index.html", target)
+    target = folder / REPORT
+    report.page.write(target, target.parent)
     for name, content in report.tables.items():
-        content.write(target / f"{name}.csv")
-    return path
+        content.write(target.parent / f"{name}.csv")
+    return target
 
 
 class Report:
     """Pictures, tables and claims of one study, each by the name that the template calls."""
 
-    def __init__(self, study: Study) -> None:
+    def __init__(self, study: StudyFolder) -> None:
         self.study, self.measured = study, Measurements(study)
-        self.findings = {f.claim.key: f for f in findings(self.measured)}
+        self.findings = self.measured.findings
         self.tables: dict[str, tables.Table] = {}
         self._templates = environment("experiments.study.report")
         name = study.settings.get("name", study.folder.name)
@@ -62,35 +65,65 @@ class Report:
 
     def compose(self) -> None:
         """Fills the page's sections from the template."""
+        rallies = self.study.rallies
         self._templates.get_template("study.html").render(
             study=self.study,
             section=self._section,
             picture=self._picture,
             table=self._table,
             claims=self._claims,
-            all_claims=self._all_claims,
             note=lambda caller: Markup('<p class="note">{}</p>').format(_line(caller())),
             not_drawn=lambda caller: self._not_drawn(_line(caller())),
             details=lambda title, caller: Markup(details(title, caller())),
             badge=_badge,
             yaml=lambda data: yaml.safe_dump(data, sort_keys=False),
             json=lambda data: json.dumps(data, indent=2),
-            sentences=words.sentences(self.measured, self.findings),
-            counts={v: sum(f.verdict == v for f in self.findings.values()) for v in VERDICTS},
-            broken_off=tables.broken_off(self.study),
+            sentences=self.sentences(),
+            counts=self._counts(),
+            broken_off=int(np.sum(rallies.selected & (rallies.end == End.NONE))),
             most_missing=MOST_MISSING,
             fewest_seeds=FEWEST_SEEDS,
-            chance=chance(len(self.study.seeds)),
-            rallies_reported=RALLIES,
+            chance=name_chance(len(self.study.seeds)),
+            rallies_reported=KEEP,
+            widest=f"{WIDEST:g}",
+            plays=f"{PLAYS:g}",
             seed=f"Seed {self.study.seeds[0]}. " if self.study.seeds else "",
-            rules=RULES,
         )
+
+    def sentences(self) -> list[str]:
+        """The findings in plain words, only of what was measured."""
+        m = self.measured
+        means = {SHORT[key]: mean.value for key in FINAL if (mean := m.raw.mean(key, of_level("all")))}
+        unselected = m.length_ratio("is2r-ft100", "s2r-ft100", boot=m.unselected)
+        text = self._templates.get_template("findings.txt").render(
+            ratio=lambda a, b: _times(m.length_ratio(a, b)),
+            found={key: f.interval for key, f in self.findings.items() if f.interval is not None},
+            compared=compare,
+            means=means,
+            levels=LEVELS,
+            changes=np.mean(list(m.changes.values()), axis=0).tolist() if m.changes else None,
+            unselected=unselected and unselected.interval,
+            counts=self._counts(),
+            differing=[f.claim.text for f in self.findings.values() if f.verdict == "differs"],
+        )
+        return [Markup(line).unescape() for line in text.splitlines() if line.strip()]
 
     @cached_property
     def planes(self) -> list[tsne.Plane]:
         """The first seed's balls of each player."""
         found = (tsne.embed(self.study, player, seed) for seed in self.study.seeds[:1] for player in self.study.players)
         return [plane for plane in found if plane is not None]
+
+    def draw(self, name: str) -> Figure | None:
+        """The figure of that name; None where the study holds nothing of it."""
+        with matplotlib.rc_context(STYLE):
+            if name in tsne.PANELS:
+                return tsne.draw(self.planes, tsne.PANELS[name])
+            return figures.FIGURES[name](self.measured)
+
+    def _counts(self) -> dict[str, int]:
+        counted = Counter(f.verdict for f in self.findings.values())
+        return {verdict: counted[verdict] for verdict in VERDICTS}
 
     # What the template calls
 
@@ -100,122 +133,55 @@ class Report:
         return ""
 
     def _picture(self, name: str, caller: Callable[[], Markup]) -> Markup:
-        caption, figure = _line(caller()), FIGURES[name](self)
+        caption, figure = _line(caller()), self.draw(name)
         if figure is None:
-            return self._not_drawn(f"{caption.split('.')[0].split(':')[0]}: {ABSENT[0].lower() + ABSENT[1:]}")
+            return self._not_drawn(f"{caption.split('.')[0].split(':')[0]}: {ABSENT}")
         return Markup(self.page.picture(name, figure, escape(caption), caption.split(". ")[0]))
 
     def _table(self, name: str, title: str, opened: bool = False) -> Markup:
-        content = self.tables[name] = TABLES[name](self)
+        content = self.tables[name] = tables.TABLES[name](self.measured)
         if not content.rows:
-            return self._not_drawn(f"{title}: {ABSENT[0].lower() + ABSENT[1:]}")
-        html = Markup(table(content.head, [tuple(map(escape, row)) for row in content.rows], content.right))
+            return self._not_drawn(f"{title}: {ABSENT}")
+        cells = [[_badge(cell) if cell in VERDICTS else escape(cell) for cell in row] for row in content.rows]
+        html = Markup(table(content.head, cells, tuple(content.right)))
         return Markup("<h3>{}</h3>{}").format(title, html) if opened else Markup(details(title, html))
 
     def _claims(self, *keys: str) -> Markup:
         rows = []
         for f in (self.findings[key] for key in keys):
-            ours = escape(ABSENT)
+            ours = escape(ABSENT.capitalize())
             if f.interval is not None:
-                ours = Markup("<b>{}</b> ({})").format(show(f.unit, f.interval.value), span(f.unit, f.interval))
+                ours = Markup("<b>{}</b> ({})").format(
+                    show(f.unit, f.interval.value), show_interval(f.unit, f.interval)
+                )
             said = Markup("{}<br><span class=note>{}</span>").format(f.claim.text, f.claim.source)
             paper = "" if f.paper is None else show(f.unit, f.paper)
             rows.append((_badge(f.verdict), said, escape(f.claim.quantity), paper, ours, escape(f.why)))
         return Markup(table(("", "the paper says", "measured", "paper", "here (95 %)", "why"), rows, (3,)))
 
-    def _all_claims(self) -> Markup:
-        content = self.tables["claims"] = tables.claims(list(self.findings.values()))
-        rows = [(*map(escape, row[:6]), _badge(row[6]), escape(row[7])) for row in content.rows]
-        return Markup(table(content.head, rows, content.right))
-
     def _not_drawn(self, text: str) -> Markup:
         return Markup("<p>{} {}</p>").format(_badge(NOT_COMPARABLE), text)
 
 
-def _zero_shot(report: Report) -> tables.Table:
-    rows = [
-        (name, *(_ratio_text(report.measured.ratio(b, a, name)) for a, b in further_figures.PAIRS)) for name in LEVELS
-    ]
-    head = ("players", "35 % / sim 1", "65 % / sim 2", "100 % / sim 3", "Oracle fine-tuned / sim")
-    return tables.Table(head, rows, (1, 2, 3, 4))
+def compare(ratio: Interval) -> str:
+    """A ratio of rally lengths as what stands before "than": how much longer or shorter, with its interval."""
+    value, low, high = (100.0 * (x - 1.0) for x in (ratio.value, ratio.low, ratio.high))
+    if low <= 0.0 <= high:
+        return f"not clearly longer or shorter ({value:+.0f} %, {low:+.0f} to {high:+.0f} %) than"
+    return f"{abs(value):.0f} % {'longer' if value > 0 else 'shorter'} ({low:+.0f} to {high:+.0f} %) than"
 
 
-def _calibration_medians(report: Report) -> tables.Table:
-    rows = [
-        (player, *(f"{100 * by[m]:.0f} %" if m in by else "" for m in ("M0", "M1", "M2")))
-        for player, by in report.study.calibration.get("medians", {}).items()
-    ]
-    return tables.Table(("player", "M0", "M1", "M2"), rows, (1, 2, 3))
-
-
-def _calibration(name: str) -> Callable[[Report], tables.Table]:
-    def made(report: Report) -> tables.Table:
-        lines = report.study.calibration[name]
-        head = tuple(lines[0])
-        return tables.Table(head, [tuple(str(line[key]) for key in head) for line in lines])
-
-    return made
-
-
-FIGURES: dict[str, Callable[[Report], Figure | None]] = {
-    "summary": lambda r: further_figures.summary(list(r.findings.values())),
-    "aggregated": lambda r: figures.aggregated(r.study, r.measured),
-    "aggregated_means": lambda r: figures.means(r.study, r.measured),
-    "by_skill": lambda r: figures.by_skill(r.study, r.measured),
-    "without_advanced": lambda r: figures.means(r.study, r.measured, WITHOUT),
-    "checkpoints": lambda r: figures.checkpoints(r.study, r.measured),
-    "zero_shot": lambda r: further_figures.zero_shot(r.study, r.measured),
-    "fine_tuning": lambda r: further_figures.fine_tuning(r.study, r.measured),
-    "evolution": lambda r: human_model_figures.evolution(r.study, r.measured),
-    "changes": lambda r: human_model_figures.changes(r.study, r.measured),
-    "effects": lambda r: further_figures.effects_left_out(r.study),
-    "cross": lambda r: figures.cross(r.study, r.measured),
-    "cross_players": lambda r: figures.cross_by_player(r.study, r.measured),
-    "players": lambda r: figures.by_player(r.study, r.measured),
-    "tsne_training": lambda r: tsne.training(r.planes),
-    "tsne_evaluation": lambda r: tsne.evaluation(r.planes),
-    "tsne_methods": lambda r: tsne.methods(r.planes),
-    "heatmap_incoming": lambda r: heatmaps.heatmaps(r.study, heatmaps.incoming),
-    "heatmap_outgoing": lambda r: heatmaps.heatmaps(r.study, heatmaps.outgoing),
-    "ablation": lambda r: figures.ablation(r.study, r.measured),
-    "variant": lambda r: further_figures.variant(r.study, r.measured),
-    "identification": lambda r: further_figures.identification(r.study, r.measured),
-    "ends": lambda r: further_figures.ends(r.study, r.measured),
-    "unselected": lambda r: further_figures.unselected(r.study, r.measured),
-    "calibration": lambda r: human_model_figures.calibration(r.study.calibration),
-}
-TABLES: dict[str, Callable[[Report], tables.Table]] = {
-    "normalised": lambda r: tables.quartiles(r.study, r.measured),
-    "player_skill": lambda r: tables.skill(r.study),
-    "zero_shot": _zero_shot,
-    "distances": lambda r: tables.change(r.study, r.measured),
-    "deviations": lambda r: tables.deviations(r.study),
-    "ball_distributions": lambda r: tables.distributions(r.study),
-    "effects": lambda r: tables.effects_left_out(r.study),
-    "cross": lambda r: tables.cross(r.study, r.measured),
-    "inside": lambda r: tables.inside(r.study),
-    "identified": lambda r: tables.identified(r.study),
-    "coverage": lambda r: tables.coverage(r.study),
-    "ends": lambda r: tables.ends(r.study),
-    "significance": lambda r: tables.significance(r.measured),
-    "models": lambda r: tables.models(r.study, r.measured),
-    "rallies": lambda r: tables.ball_counts(r.study),
-    "calibration_medians": _calibration_medians,
-    "calibration_numbers": _calibration("numbers"),
-    "calibration_rallies": _calibration("rallies"),
-}
+def _times(ratio: Estimate | None) -> str | None:
+    """A ratio of rally lengths in words, with its interval."""
+    if ratio is None:
+        return None
+    i = ratio.interval
+    return f"{i.value:.2f} times ({i.low:.2f} to {i.high:.2f})"
 
 
 def _line(text: Markup) -> str:
     """The template's prose as plain text on one line."""
     return " ".join(text.unescape().split())
-
-
-def _ratio_text(estimate: Estimate | None) -> str:
-    if estimate is None:
-        return ""
-    i = estimate.interval
-    return f"{i.value:.2f} ({i.low:.2f} to {i.high:.2f})"
 
 
 def _badge(verdict: str) -> Markup:

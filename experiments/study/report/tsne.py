@@ -15,19 +15,26 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.errors import checked
-from experiments.study.analysis.paper import IS2R, S2R
-from experiments.study.analysis.study_folder import DATASETS, Study
-from experiments.study.report.style import COLOUR, player_label, styled
-from mjx_tt.viz.html import FAINT
+from experiments.errors import error_context
+from experiments.study.analysis.paper import BY_KEY, COLOURS, IS2R, S2R
+from experiments.study.analysis.study_folder import DATASETS, StudyFolder
+from experiments.study.report.plots import add_legend, line, note_empty, player_label
 
 MOST = 500  # balls of a data set, as in the paper
 FEWEST = 10
 ITERATIONS = 500
 PERPLEXITY = 30
 EVALUATIONS = ("is2r-ft35", "is2r-ft65", "is2r-ft100", "s2r-ft100")
-SHADES = {"D0": "#e69f00", "D1": "#56b4e9", "D2": "#7b4fa3"}
-NAMES = {"D0": "D0", "D1": "ΔD1", "D2": "ΔD2"}
+DATASET_COLOURS = {"D0": "#e69f00", "D1": "#56b4e9", "D2": "#7b4fa3"}
+Panel = tuple[str, Sequence[str], str | None]  # title, data sets, model whose evaluation is drawn on top
+PANELS: dict[str, tuple[Panel, ...]] = {
+    # Evolution of the training balls: D0, D1 = D0 + ΔD1, D2 = D1 + ΔD2 (app:ball-dist-evo-train).
+    "tsne_training": tuple((name, DATASETS[: k + 1], None) for k, name in enumerate(DATASETS)),
+    # On top the evaluation after each round of i-S2R (app:ball-dist-evo-train-eval).
+    "tsne_evaluation": tuple((key, DATASETS[: k + 1], key) for k, key in enumerate(EVALUATIONS[:3])),
+    # The final evaluation, i-S2R left, S2R+FT right (app:ball-dist-is2r-s2r).
+    "tsne_methods": (("i-S2R", DATASETS, "is2r-ft100"), ("S2R+FT", DATASETS[:2], "s2r-ft100")),
+}
 
 
 @dataclass(frozen=True)
@@ -38,16 +45,17 @@ class Plane:
     points: dict[str, np.ndarray]
 
 
-def embed(study: Study, player: str, seed: int) -> Plane | None:
+def embed(study: StudyFolder, player: str, seed: int) -> Plane | None:
     """The plane of a player in one seed; None without balls."""
-    sets = {name: features for name in DATASETS if (features := trained(study, seed, player, name)) is not None}
+    sets = {name: balls for name in DATASETS if (balls := training_balls(study, seed, player, name)) is not None}
     for key in EVALUATIONS:
         log = study.log(seed, player, player, key)
         if log is not None and log.features.shape[1]:
             sets[key] = log.features
     rng = np.random.default_rng(0)
-    sets = {name: _some(features, rng, MOST if name in DATASETS else MOST // 2) for name, features in sets.items()}
-    total = sum(features.shape[1] for features in sets.values())
+    for name, balls in sets.items():
+        sets[name] = balls[:, rng.permutation(balls.shape[1])[: MOST if name in DATASETS else MOST // 2]]
+    total = sum(balls.shape[1] for balls in sets.values())
     if total < FEWEST:
         return None
     from sklearn.manifold import TSNE  # a second to import, which only this picture needs
@@ -60,11 +68,11 @@ def embed(study: Study, player: str, seed: int) -> Plane | None:
     with threadpool_limits(1):  # threads that wait for each other on busy cores take ten times as long
         tsne = TSNE(perplexity=perplexity, init="pca", max_iter=ITERATIONS, angle=0.7, random_state=0)
         placed = tsne.fit_transform(standard)
-    edges = np.cumsum([features.shape[1] for features in sets.values()])[:-1]
+    edges = np.cumsum([balls.shape[1] for balls in sets.values()])[:-1]
     return Plane(player, {name: part.T for name, part in zip(sets, np.split(placed, edges), strict=True)})
 
 
-def trained(study: Study, seed: int, player: str, name: str) -> np.ndarray | None:
+def training_balls(study: StudyFolder, seed: int, player: str, name: str) -> np.ndarray | None:
     """(8, n) of the measured balls of D0, or of what D1 and D2 add, fitted as the human model is; None without any.
 
     Raises ConfigError for a file that cannot be read.
@@ -73,100 +81,49 @@ def trained(study: Study, seed: int, player: str, name: str) -> np.ndarray | Non
     from ballmodel.flight import ball_params
     from ballmodel.io.tables import read_csv
 
-    path = study.trajectories(seed, player, name)
-    if path is None:
+    path = study.paths.balls(seed, player, name)
+    if not path.exists():
         return None
-    data = checked("", read_csv, path)
-    keep = np.random.default_rng(0).permutation(len(data.trajectories))[:MOST]
+    with error_context():
+        data = read_csv(path)
+    keep = sorted(np.random.default_rng(0).permutation(len(data.trajectories))[:MOST])
     try:
-        _, report = fit_human(
-            replace(data, trajectories=tuple(data.trajectories[k] for k in sorted(keep))), ball_params()
-        )
+        _, report = fit_human(replace(data, trajectories=tuple(data.trajectories[k] for k in keep)), ball_params())
     except ValueError:  # too few balls for a model are too few for a picture
         return None
     return np.concatenate([report.landed.position, report.landed.velocity, report.landing])
 
 
-@styled
-def training(planes: list[Plane]) -> Figure | None:
-    """Evolution of the training balls: D0, D1 = D0 + ΔD1, D2 = D1 + ΔD2 (app:ball-dist-evo-train)."""
+def draw(planes: Sequence[Plane], panels: Sequence[Panel]) -> Figure | None:
+    """A row of panels for each player."""
     if not planes:
         return None
-    figure, grid = _figure(planes, 3)
-    for row, plane in zip(grid, planes, strict=True):
-        for k, (axes, name) in enumerate(zip(row, DATASETS, strict=True)):
-            _scatter(axes, plane, DATASETS[: k + 1])
-            axes.set_title(f"{player_label(plane.player)}: {name}" if not k else name)
-    _legend(figure, DATASETS)
-    return figure
-
-
-@styled
-def evaluation(planes: list[Plane]) -> Figure | None:
-    """The balls of training and, on top, of the evaluation after each round of i-S2R (app:ball-dist-evo-train-eval)."""
-    if not planes:
-        return None
-    figure, grid = _figure(planes, 3)
-    for row, plane in zip(grid, planes, strict=True):
-        for k, (axes, key) in enumerate(zip(row, EVALUATIONS[:3], strict=True)):
-            _scatter(axes, plane, DATASETS[: k + 1], key)
-            axes.set_title(f"{player_label(plane.player)}: {key}" if not k else key)
-    _legend(figure, DATASETS, (IS2R,))
-    return figure
-
-
-@styled
-def methods(planes: list[Plane]) -> Figure | None:
-    """The balls of training and those of the final evaluation, i-S2R left, S2R+FT right (app:ball-dist-is2r-s2r)."""
-    if not planes:
-        return None
-    figure, grid = _figure(planes, 2)
-    for row, plane in zip(grid, planes, strict=True):
-        for axes, key, sets in zip(row, ("is2r-ft100", "s2r-ft100"), (DATASETS, DATASETS[:2]), strict=True):
+    figure = Figure(figsize=(3.5 * len(panels), 3.1 * len(planes)))
+    for row, plane in zip(figure.subplots(len(planes), len(panels), squeeze=False), planes, strict=True):
+        for axes, (title, sets, key) in zip(row, panels, strict=True):
             _scatter(axes, plane, sets, key)
-        row[0].set_title(f"{player_label(plane.player)}: i-S2R")
-        row[1].set_title("S2R+FT")
-    _legend(figure, DATASETS, (IS2R, S2R))
+            axes.set_title(f"{player_label(plane.player)}: {title}" if axes is row[0] else title)
+    dot = {"linestyle": "", "marker": "o"}
+    names = {"D0": "D0", "D1": "ΔD1", "D2": "ΔD2"}
+    handles = [line(f"training {names[n]}", DATASET_COLOURS[n], markersize=4, **dot) for n in DATASETS]
+    evaluated = {BY_KEY[key].method for *_, key in panels if key}
+    for method, name in ((IS2R, "i-S2R"), (S2R, "S2R+FT")):
+        if method in evaluated:
+            handles.append(line(f"evaluation of {name}", COLOURS[method], markerfacecolor="none", **dot))
+    add_legend(figure, handles, ncols=min(len(handles), 4))
     return figure
 
 
-def _figure(planes: list[Plane], columns: int) -> tuple[Figure, np.ndarray]:
-    figure = Figure(figsize=(3.5 * columns, 3.1 * len(planes)))
-    return figure, figure.subplots(len(planes), columns, squeeze=False)
-
-
-def _scatter(axes: Axes, plane: Plane, sets: Sequence[str], key: str | None = None) -> None:
+def _scatter(axes: Axes, plane: Plane, sets: Sequence[str], key: str | None) -> None:
+    if key is not None and key not in plane.points:
+        note_empty(axes)
     x, y = np.concatenate(list(plane.points.values()), axis=1)
     axes.scatter(x, y, s=2, color="#e9ebee", linewidth=0)  # where balls of this player can be at all
     for name in sets:
         if name in plane.points:
-            x, y = plane.points[name]
-            axes.scatter(x, y, s=5, color=SHADES[name], alpha=0.75, linewidth=0)
-    if key is not None:
-        method = S2R if key.startswith("s2r") else IS2R
-        if key in plane.points:
-            x, y = plane.points[key]
-            axes.scatter(x, y, s=12, facecolor="none", edgecolor=COLOUR[method], linewidth=0.6)
-        else:
-            axes.text(0.5, 0.5, "not in this study", transform=axes.transAxes, ha="center", color=FAINT)
+            axes.scatter(*plane.points[name], s=5, color=DATASET_COLOURS[name], alpha=0.75, linewidth=0)
+    if key in plane.points:
+        shade = COLOURS[BY_KEY[key].method]
+        axes.scatter(*plane.points[key], s=12, facecolor="none", edgecolor=shade, linewidth=0.6)
     axes.set_xticks([])
     axes.set_yticks([])
-
-
-def _legend(figure: Figure, sets: Sequence[str], evaluated: Sequence[str] = ()) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], linestyle="", marker="o", markersize=4, color=SHADES[n], label=f"training {NAMES[n]}")
-        for n in sets
-    ]
-    names = {IS2R: "evaluation of i-S2R", S2R: "evaluation of S2R+FT"}
-    handles += [
-        Line2D([], [], linestyle="", marker="o", markerfacecolor="none", color=COLOUR[k], label=names[k])
-        for k in evaluated
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))
-
-
-def _some(features: np.ndarray, rng: np.random.Generator, most: int) -> np.ndarray:
-    return features[:, rng.permutation(features.shape[1])[:most]]

@@ -18,8 +18,8 @@ from experiments.finetuning import loop
 from experiments.runs import load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
+from experiments.study import blind_protocol
 from experiments.study.analysis import scoring
-from experiments.study.blind import protocol
 from experiments.study.workflow import Step, Waiting
 from experiments.training import finalize
 from mjx_tt.rally.end_reasons import End
@@ -29,12 +29,12 @@ SESSIONS = 3  # on the rig at most in one go, until all rallies are played: a bu
 PLAYED = "played.json"  # an evaluation's rallies so far, with the sessions that they are from
 
 
-def seed_of(name: str) -> int:
+def derive_seed(name: str) -> int:
     """Seed of a step of that name."""
     return zlib.crc32(name.encode()) >> 1
 
 
-def exported(trained: TrainedPolicy, console: Console) -> Path:
+def export_once(trained: TrainedPolicy, console: Console) -> Path:
     """The artefact of a run, exported if it has none. Raises ConfigError for a policy that the robot cannot run."""
     folder = Run(trained.source).artefact
     if not (folder / "manifest.json").exists():
@@ -61,7 +61,7 @@ class Evaluation:
     def counted(self) -> int:
         return sum(not one["filtered"] for one in self.rallies)
 
-    def last(self, folder: Path) -> Path:
+    def newest_report(self, folder: Path) -> Path:
         """The newest session's report; the folder where no session has one."""
         return folder / self.reports[-1] if self.reports else folder
 
@@ -71,7 +71,7 @@ class Evaluation:
         run_dir.write_json(folder / PLAYED, asdict(self))
 
 
-def _played(folder: Path, artefact: str) -> Evaluation:
+def _load(folder: Path, artefact: str) -> Evaluation:
     """The evaluation of a policy so far, with reports that are new in the folder, saved; an empty one at first.
 
     Raises ConfigError for a file that cannot be read.
@@ -82,21 +82,20 @@ def _played(folder: Path, artefact: str) -> Evaluation:
             kept = json.loads(path.read_text(encoding="utf-8"))
             if kept["artefact"] == artefact:  # else of the policy before it was trained anew
                 found = Evaluation(artefact, kept["begun"], tuple(kept["reports"]), tuple(kept["rallies"]))
-        for report in sorted(
-            p for p in folder.glob("[0-9]*.json") if "." not in p.stem and p.name not in found.reports
-        ):
-            path, told = report, json.loads(report.read_text(encoding="utf-8"))
-            if told["artefact_sha256"] == artefact:
-                more = (told.get("rallies") or {"list": []})["list"]
-                reports = (*found.reports, report.name)
-                found = Evaluation(artefact, max(found.begun, len(reports)), reports, (*found.rallies, *more))
+        reports = sorted(p for p in folder.glob("[0-9]*.json") if "." not in p.stem and p.name not in found.reports)
+        for path in reports:
+            report = json.loads(path.read_text(encoding="utf-8"))
+            if report["artefact_sha256"] == artefact:
+                names = (*found.reports, path.name)
+                rallies = (*found.rallies, *(report.get("rallies") or {"list": []})["list"])
+                found = Evaluation(artefact, max(found.begun, len(names)), names, rallies)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error!r}; restore the file") from None
     found.save(folder)
     return found
 
 
-def rally_step(
+def make_rally_step(
     folder: Path,
     who: tuple[int, str, str, str],
     run_of: Callable[[], Path],
@@ -110,46 +109,44 @@ def rally_step(
     would choose among a policy's sessions.
     """
     seed, trainer, evaluator, model = who
-    name, counted = f"seed{seed}/rallies/{trainer}-{evaluator}-{model}", folder / protocol.EVALUATIONS
+    name, counted = f"seed{seed}/rallies/{trainer}-{evaluator}-{model}", folder / blind_protocol.EVALUATIONS
 
     def run() -> str:
-        artefact = exported(load_policy.load(run_of()), console)
+        artefact = export_once(load_policy.load(run_of()), console)
         digest = artefacts.load(artefact).digest
-        found = _played(folder, digest)
+        found, status = _load(folder, digest), None
         for _ in range(SESSIONS):
-            left = rallies - found.counted
-            if left <= 0:
+            if found.counted >= rallies or status == 0:  # all are played, or somebody ended it by a key
                 break
-            chance = seed_of(name) + found.begun
+            if status is not None:
+                left = f"{rallies - found.counted} of {rallies} rallies are left to play"
+                console.print(f"{found.newest_report(folder)}: {left}", highlight=False, soft_wrap=True)
+            chance = derive_seed(name) + found.begun
             found = replace(found, begun=found.begun + 1)
             found.save(folder)
             try:
                 setup = RobotOptions(backend="numpy", seed=chance, player=evaluator)
+                left = rallies - found.counted
                 status = play.run(artefact, RIG, folder, console, setup, rallies=left)
             finally:
-                found = _played(folder, digest)
+                found = _load(folder, digest)
             if status == play.INTERRUPTED:
                 raise KeyboardInterrupt(f"{name}: stopped")
-            left = rallies - found.counted
-            if left <= 0 or status == 0:  # all are played, or somebody ended it by a key
-                break
-            console.print(
-                f"{found.last(folder)}: {left} of {rallies} rallies are left to play", highlight=False, soft_wrap=True
-            )
         if found.counted < rallies:
             raise RunError(
                 f"{name}: {rallies} rallies that count are needed, {rallies - found.counted} are missing; the last "
-                f"session is {found.last(folder)}. Make the machine quiet; the same command goes on with these rallies"
+                f"session is {found.newest_report(folder)}. Make the machine quiet; the same command goes on with "
+                "these rallies"
             )
         played = [(one["length"], End[one["end"]]) for one in found.rallies]
-        scored = scoring.scored(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
+        scored = scoring.score_rallies(seed, trainer, evaluator, model, "", *zip(*played, strict=True))
         scoring.write(counted, scored)
         return f"{len(played)} rallies, {scored.length[~scored.filtered].mean():.1f} touches on average"
 
     return Step(name, "rallies", rallies, inputs, (counted,), run)
 
 
-def blind_steps(
+def make_blind_steps(
     folder: Path,
     seed: int,
     trainer: str,
@@ -163,33 +160,30 @@ def blind_steps(
 
     folder: of this evaluation; runs_of: each model's run. What is played is ``mjx-tt run FOLDER/policies/CODE``.
     """
-    name, sheet, counted = (
-        f"seed{seed}/blind/{trainer}-{evaluator}",
-        folder / protocol.SHEET,
-        folder / protocol.EVALUATIONS,
-    )
+    name = f"seed{seed}/blind/{trainer}-{evaluator}"
+    key, sheet, counted = (folder / x for x in (blind_protocol.KEY, blind_protocol.SHEET, blind_protocol.EVALUATIONS))
 
     def make() -> str:
-        if (folder / protocol.KEY).exists() and not sheet.exists():  # killed in between
-            protocol.progress(folder)
-        elif not (folder / protocol.KEY).exists():
-            policies = {model: exported(load_policy.load(run()), console) for model, run in runs_of.items()}
+        if not key.exists():
+            policies = {model: export_once(load_policy.load(run()), console) for model, run in runs_of.items()}
             # The ablation's oracle is a model of the loop under a second name.
-            codes = protocol.make(folder, policies, trainer, evaluator, seed, twice=True)
+            codes = blind_protocol.make(folder, policies, trainer, evaluator, seed, twice=True)
             return f"{len(codes)} policies as {', '.join(codes)}"
+        blind_protocol.count_progress(folder)  # writes the sheet where it was killed in between
         return "policies under code names"
 
     def count() -> str:
-        left = [f"{p.code} has {p.counted} of {scoring.KEEP}" for p in protocol.progress(folder) if not p.complete]
+        progress = blind_protocol.count_progress(folder)
+        left = [f"{p.code} has {p.counted} of {scoring.KEEP}" for p in progress if not p.complete]
         if left:
             raise Waiting(
                 f"{name}: {evaluator} plays rallies with "
-                f"`mjx-tt run {folder / protocol.POLICIES}/CODE --robot {robot}` and "
+                f"`mjx-tt run {folder / blind_protocol.POLICIES}/CODE --robot {robot}` and "
                 f"writes each down in {sheet}; rallies that count: {', '.join(left)}. Then the same command continues"
             )
-        return f"{len(protocol.open_key(folder)):,} rallies"
+        return f"{len(blind_protocol.open_key(folder)):,} rallies"
 
     return [
-        Step(name, "blind", 1, inputs, (folder / protocol.KEY, sheet), make),
-        Step(f"{name} counted", "blind", 1, (folder / protocol.KEY,), (counted,), count),
+        Step(name, "blind", 1, inputs, (key, sheet), make),
+        Step(f"{name} counted", "blind", 1, (key,), (counted,), count),
     ]

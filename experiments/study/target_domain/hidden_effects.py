@@ -5,7 +5,7 @@ left out keeps what training believes. The draw depends on the seed and on the p
 effect changes no other. Balls spin as the player hits them; training believes that none does. Effects from outside of
 the model's class are added only where a study names them.
 
-What was drawn is sealed (``study.blind.protocol``) when a study begins and opened when it is over. The learner gets
+What was drawn is sealed (``study.blind_protocol``) when a study begins and opened when it is over. The learner gets
 measured balls and rewards.
 """
 
@@ -120,24 +120,24 @@ def _uniform(seed: int, path: str, low: float, high: float) -> float:
     return float(np.random.default_rng([seed, zlib.crc32(path.encode())]).uniform(low, high))
 
 
-def side_by_side(worlds: list[SimModel], lanes: int) -> SimModel:
-    """All worlds in one model, each in as many neighbouring lanes: what differs among them is (worlds * lanes,)."""
+def stack_worlds(worlds: list[SimModel], sessions: int) -> SimModel:
+    """All worlds in one model, each for as many neighbouring sessions: what differs is (worlds * sessions,)."""
     values = [models.paths(world) for world in worlds]  # also of drives that a world does not have
     differ = [path for path in values[0] if len({v[path] for v in values}) > 1]
     return models.with_values(
-        worlds[0], {path: jnp.repeat(jnp.array([v[path] for v in values], jnp.float32), lanes) for path in differ}
+        worlds[0], {path: jnp.repeat(jnp.array([v[path] for v in values], jnp.float32), sessions) for path in differ}
     )
 
 
-def differences(model: SimModel) -> dict[str, float]:
+def list_differences(model: SimModel) -> dict[str, float]:
     """Values of a reality that differ from what training believes, by dotted path."""
     nominal = models.paths()
     return {path: float(value) for path, value in models.paths(model).items() if value != nominal[path]}
 
 
-def content(model: SimModel, seed: int, without: tuple[str, ...], outside: tuple[str, ...] = ()) -> dict[str, Any]:
+def describe(model: SimModel, seed: int, without: tuple[str, ...], outside: tuple[str, ...] = ()) -> dict[str, Any]:
     """Content to be sealed: plain data."""
-    found: dict[str, Any] = {"seed": seed, "without": list(without), "reality": differences(model)}
+    found: dict[str, Any] = {"seed": seed, "without": list(without), "reality": list_differences(model)}
     return found | ({"outside": list(outside)} if outside else {})
 
 
@@ -187,11 +187,11 @@ def measure(model: SimModel, balls: BallState, noise: float, key: PRNGKeyArray) 
     n = balls.position.shape[1]
     padded = jax.tree.map(lambda x: jnp.pad(jnp.asarray(x, jnp.float32), ((0, 0), (0, -n % 256)), mode="edge"), balls)
     positions, length = _fly(without_nominal(model.ball), padded, round(_LONGEST * CAMERA_RATE))
-    tracked = seen(model, jnp.moveaxis(positions, 1, 0), noise, key)
+    tracked = observe(model, jnp.moveaxis(positions, 1, 0), noise, key)
     return Measured(np.moveaxis(tracked, 0, 1)[..., :n], np.asarray(length)[:n])
 
 
-def seen(model: SimModel, position: Array | np.ndarray, noise: float, key: PRNGKeyArray) -> np.ndarray:
+def observe(model: SimModel, position: Array | np.ndarray, noise: float, key: PRNGKeyArray) -> np.ndarray:
     """Positions (3, ...) [m] as the reality's cameras give them: calibration and noise [m]."""
     camera = sensors.make_camera(model.sensing)
     place = jnp.asarray(position) if camera is None else camera.project(jnp.asarray(position))

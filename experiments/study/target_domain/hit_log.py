@@ -59,17 +59,17 @@ def record(
     session: str,
     noise: float,
     believed: float,
-    lanes: int = 12,
+    rallies: int = 12,
     turns: int = 10,
 ) -> HitLog:
-    """``lanes`` x ``turns`` balls of rallies of a player with a policy, one after the other on the log's clock.
+    """``rallies`` x ``turns`` balls of rallies of a player with a policy, one after the other on the log's clock.
 
     model: the reality, without what is nominal; noise: [m] of the camera; believed: [s] by which the camera is late as
     far as one knows, which its stamps are put right by.
     """
     start_key, play_key, camera_key = jax.random.split(key, 3)
-    policy = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[..., None], lanes, axis=-1), policy)
-    state, task = simulator.start(player, model, start_key, lanes), simulator.task
+    policy = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[..., None], rallies, axis=-1), policy)
+    state, task = simulator.start(player, model, start_key, rallies), simulator.task
     balls: list[Trajectory] = []
     states: list[_States] = []
     for turn in range(turns):
@@ -77,16 +77,16 @@ def record(
         episodes = simulator.episodes(turn_key, model, state)
         watched = jax.tree.map(np.asarray, _watched(policy, episodes, task=task))
         state, _ = simulator.shots(policy, player, model, state, turn_key)
-        seen = hidden_effects.seen(model, watched[0], noise, jax.random.fold_in(camera_key, turn))
+        seen = hidden_effects.observe(model, watched[0], noise, jax.random.fold_in(camera_key, turn))
         late_by = np.asarray(episodes.latency)
-        for lane in range(lanes):
-            begin = EVERY * (turn * lanes + lane)
-            late = float(late_by[0, lane]) - believed
-            count = in_sight(watched[0][..., lane])
+        for rally in range(rallies):
+            begin = EVERY * (turn * rallies + rally)
+            late = float(late_by[0, rally]) - believed
+            count = count_visible(watched[0][..., rally])
             time = begin + late + np.arange(count) / CAMERA_RATE
-            balls.append(Trajectory(session, str(len(balls)), np.asarray(time), seen[:, :count, lane]))
-            commands, encoders = (np.asarray(x)[..., lane] for x in watched[1:])
-            states.append(_States(begin, late_by[:, lane], commands, encoders))
+            balls.append(Trajectory(session, str(len(balls)), np.asarray(time), seen[:, :count, rally]))
+            commands, encoders = (np.asarray(x)[..., rally] for x in watched[1:])
+            states.append(_States(begin, late_by[:, rally], commands, encoders))
     return HitLog(Dataset(tuple(balls), session), _records(task, model, states))
 
 
@@ -100,7 +100,7 @@ class _States:
     encoder: np.ndarray  # (8, T) true positions at the simulator's steps
 
 
-def in_sight(position: np.ndarray) -> int:
+def count_visible(position: np.ndarray) -> int:
     """Frames of a ball's positions (3, T) [m] until it falls low, passes the robot or comes back to where it was hit.
 
     A person behind the table may strike below its height: such a ball rises first.

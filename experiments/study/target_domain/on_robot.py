@@ -22,19 +22,23 @@ from experiments.commands.options import LOCK_STEP, RIG, RobotOptions
 from experiments.config import robot as robots
 from experiments.config.study import Study
 from experiments.deploy import play, session_logs
-from experiments.errors import ConfigError, RunError, checked
+from experiments.deploy.virtual_player import VirtualPlayer
+from experiments.errors import ConfigError, RunError, error_context
 from experiments.finetuning import loop
 from experiments.finetuning import on_robot as tuning
-from experiments.finetuning.robot import LockStepRobot
+from experiments.finetuning.robot import SCENE, BallRecorder, LockStepRobot
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
-from experiments.study.target_domain.evaluation_on_robot import exported, seed_of
+from experiments.study.target_domain.evaluation_on_robot import derive_seed, export_once
 from experiments.study.target_domain.hit_log import HitLog
-from experiments.study.target_domain.served_balls import LEAST_SAMPLES, served
 from experiments.study.workflow import Waiting
-from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, load_logs
+from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, before_racket, load_logs
+from robot_io.emulator.config import RigParams
+from robot_io.emulator.lockstep import LockStep
 
 BALLS, AROUND = 120, 1.0  # of a fine-tuning of which everything is kept; [s] of the joints before and after them
+LEAST_SAMPLES = 20  # of a ball that is looked at
+LONGEST_SERVICE, FEWEST_SERVICES = 2.0, 5  # [s] from ball to ball; one in five at least can be used
 
 
 def look_up(study: Study, robot: str) -> None:
@@ -45,16 +49,18 @@ def look_up(study: Study, robot: str) -> None:
         except ConfigError as error:
             raise ConfigError(f"robot: {error}") from None
     for player in study.recordings:
-        recording(study, player)
+        load_recording(study, player)
     if study.identification is not None and study.identification.joints is not None:
         given = Path(study.identification.joints)
-        checked("identification.joints", load_logs, [given / file for file in ROBOT_FILES])
+        with error_context("identification.joints"):
+            load_logs([given / file for file in ROBOT_FILES])
 
 
-def recording(study: Study, player: str) -> Dataset:
+def load_recording(study: Study, player: str) -> Dataset:
     """Balls of a player recorded before the study. Raises ConfigError naming the key and what is wrong."""
     where, path = f"recordings.{player}", study.recording(player)
-    measured = checked(where, read, path)
+    with error_context(where):
+        measured = read(path)
     if not isinstance(measured, Dataset):
         raise ConfigError(f"{where}: {path} holds start states; measured trajectories are needed")
     return measured
@@ -68,10 +74,10 @@ class RobotWorld:
 
     def first_balls(self, player: str, name: str) -> Dataset:
         """Balls of the player recorded before the study, on the rig without a recording those that the virtual player
-        serves. Raises ConfigError as ``recording`` does."""
+        serves. Raises ConfigError as ``load_recording`` does."""
         if player not in self._study.recordings:
-            return served(player, self._study.first_balls, seed_of(name), name.rsplit("/", 1)[-1])
-        measured = recording(self._study, player)
+            return serve_balls(player, self._study.first_balls, derive_seed(name), name.rsplit("/", 1)[-1])
+        measured = load_recording(self._study, player)
         # Numbered anew: data sets of several rounds are read together, and one name stands for one ball.
         label = name.rsplit("/", 1)[-1]
         tracks = tuple(replace(t, session=label, name=str(i)) for i, t in enumerate(measured))
@@ -80,7 +86,7 @@ class RobotWorld:
     def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
         """``mjx-tt finetune``; raises Waiting when the operator stopped it."""
         study = self._study
-        settings = study.fine_tuning.model_copy(update={"updates": real_updates, "seed": seed_of(name)})
+        settings = study.fine_tuning.model_copy(update={"updates": real_updates, "seed": derive_seed(name)})
         balls = settings.updates * settings.episodes_per_update
         self._console.print(
             f"{name}: {player} to the table, {balls:,} balls for {settings.updates} updates and twice "
@@ -89,7 +95,7 @@ class RobotWorld:
             soft_wrap=True,
         )
         opponent = player if self._robot == RIG else None
-        setup = RobotOptions(backend="numpy", seed=seed_of(name), player=opponent)
+        setup = RobotOptions(backend="numpy", seed=derive_seed(name), player=opponent)
         found = tuning.finetune(str(source), settings, Run(folder), self._robot, self._console, setup)
         if found is None:
             raise Waiting(f"{name}: fine-tuning with {player} is not finished; the same command goes on with it")
@@ -103,7 +109,7 @@ class RobotWorld:
         if not logs:
             raise RunError(f"{folder}: holds no session's log (.mcap), of which the simulation is identified")
         flights, joints = session_logs.load(logs[-1])
-        strokes = (stroke for t in flights for stroke in by_stroke(t))
+        strokes = (stroke for t in flights for stroke in split_by_stroke(t))
         kept = sorted((t for t in strokes if len(t) >= LEAST_SAMPLES), key=lambda t: t.time[0])[-BALLS:]
         if not kept or not joints:
             raise RunError(f"{logs[-1]}: holds {len(kept)} balls and {len(joints)} joints; both are needed")
@@ -121,12 +127,12 @@ class RobotWorld:
         balls, robot = self._study.simulation.selection_episodes, self._robot
         experiment = loop.experiment_of(trained.source)
         if robot == LOCK_STEP:
-            emulated = loop.lock_step_robot(experiment, seed=seed_of(name))
+            emulated = loop.lock_step_robot(experiment, seed=derive_seed(name))
             return float(np.mean([_lock_step(emulated, trained, n) for n in range(balls)]))
-        artefact = exported(trained, self._console)
+        artefact = export_once(trained, self._console)
         logs = trained.source / "selection"
         self._console.print(f"{name}: {player} plays {balls} balls with {trained.source.name}", highlight=False)
-        setup = RobotOptions(backend="numpy", seed=seed_of(name))
+        setup = RobotOptions(backend="numpy", seed=derive_seed(name))
         play.run(artefact, robot, logs, self._console, setup, balls)
         found = json.loads(max(logs.glob("*.json")).read_text(encoding="utf-8"))
         if found["episodes"] < balls:
@@ -136,12 +142,39 @@ class RobotWorld:
         return (found["hit"] + found["returned"] - 2.0 * len(found["faults"])) / found["episodes"]
 
 
+class StandStill:
+    """A policy that does not move."""
+
+    def reset(self) -> None:
+        pass
+
+    def step(self, observation: np.ndarray) -> np.ndarray:
+        return np.zeros(len(observation) - 3)
+
+
+def serve_balls(player: str, count: int, seed: int, session: str) -> Dataset:
+    """Balls that a virtual player serves, as the emulated trackers measured them; the robot stands still."""
+    recorder = BallRecorder()
+    rig = LockStep(SCENE, VirtualPlayer(player, seed), StandStill(), RigParams(seed=seed % 2**31), recorder=recorder)
+    rig.throwing = True
+    found: tuple[Trajectory, ...] = ()
+    while len(found) < count:
+        before = len(found)
+        rig.run(LONGEST_SERVICE * max(count - before, FEWEST_SERVICES))
+        tracks = (recorder.trajectory(ball) for ball in recorder.balls)
+        whole = [track for track in tracks if len(track) >= LEAST_SAMPLES]
+        found = tuple(Trajectory(session, str(i), t[:, 0], t[:, 1:].T) for i, t in enumerate(whole[:count]))
+        if len(found) == before:
+            raise RunError(f"{player} serves no ball on the rig")
+    return Dataset(tuple(before_racket(t) for t in found), f"{player} on the rig")
+
+
 def _lock_step(robot: LockStepRobot, trained: TrainedPolicy, number: int) -> float:
     summary = robot.play(trained.policy.astype(np.float32), number).summary
     return -2.0 if summary.fault else float(summary.outcome != "missed") + float(summary.outcome == "returned")
 
 
-def by_stroke(track: Trajectory) -> tuple[Trajectory, ...]:
+def split_by_stroke(track: Trajectory) -> tuple[Trajectory, ...]:
     """A rally's track from each stroke of the person to the next one, the robot's hit between them."""
     cuts, away, farthest = [0], False, 0  # away from the robot; sample at which the ball was farthest that way
     y = track.position[1]

@@ -16,10 +16,10 @@ from experiments.config.study import PRIOR
 from experiments.runs import load_policy
 from experiments.study import identification
 from experiments.study.analysis import delays
-from experiments.study.analysis.identified import BELIEVED, LOGS, estimates, holds
+from experiments.study.analysis.identified import BELIEVED, LOGS, holds, list_estimates
 from experiments.study.analysis.identified import PRIOR as DRAWN
 from experiments.study.target_domain import hit_log, joint_log
-from experiments.study.target_domain.finetuning import VirtualReality
+from experiments.study.target_domain.virtual import VirtualReality
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.together.hits import SEEN_HIGH
 from mjx_tt.env.task import Task, TaskConfig
@@ -76,7 +76,7 @@ def identified(task, tmp_path_factory):
     folder, slow = tmp_path_factory.mktemp("logs"), {"drives.joint_2.lag": 0.018, "drives.gantry_x.velocity_gain": 0.95}
     identification.write_joints(folder / "joints", swept(task, models.with_values(SimModel(), slow)))
     measurements.write_csv(folder / "D0.csv", balls(World(friction=0.19, height=0.006)))
-    logs, before = [folder / "D0.csv", folder / "joints"], identification.prior(PRIOR, "prior")
+    logs, before = [folder / "D0.csv", folder / "joints"], identification.read_prior(PRIOR, "prior")
     found = identification.identify(logs, 100, ModelFile(SimModel()), before)
     truth = {**slow, "ball.table.friction": 0.19, SEEN_HIGH: 0.006}
     return folder, found, truth
@@ -93,7 +93,7 @@ def test_a_world_is_what_the_logs_say_and_the_prior_for_the_rest(identified, tmp
     assert values["ball.table.height"] == 0.0 and "ball.table.height" not in drawn
     # What no log of this kind shows is drawn as before; the arm's measurement, which fixes the clock, is as believed.
     hidden = {"ball.paddle.restitution", "sensing.ball_offset_x", "drives.joint_1.joint_offset"}
-    rows = {row["parameter"]: row for row in estimates(world, truth)}
+    rows = {row["parameter"]: row for row in list_estimates(world, truth)}
     for path in hidden:
         assert [rows[path]["low"], rows[path]["high"]] == PRIOR[path] and rows[path]["decided by"] == DRAWN
     assert drawn == set(PRIOR) - {delays.ARM}
@@ -103,7 +103,7 @@ def test_a_world_is_what_the_logs_say_and_the_prior_for_the_rest(identified, tmp
         wanted = np.percentile(np.random.default_rng(6).uniform(*PRIOR[path], 100_000) - arm, [5, 95])
         assert [rows[path]["low"], rows[path]["high"]] == pytest.approx(list(wanted), abs=0.004)
         assert rows[path]["decided by"] == DRAWN
-    for path in ("drives.joint_1.lag", "latency.abb_action", delays.TOLD):
+    for path in ("drives.joint_1.lag", "latency.abb_action", delays.AXES_COMMAND):
         assert rows[path]["high"] - rows[path]["low"] < 0.002
     friction = rows["ball.table.friction"]
     assert friction["low"] < 0.19 < friction["high"] < friction["low"] + 0.02 and friction["truth"] == 0.19
@@ -127,10 +127,10 @@ def test_hits_of_real_play_decide_the_rubber_and_the_delay(tmp_path):
     # The clock is one: a ball's track and its joints cover the same time.
     assert all(log.joints[0].state_time[0] < t.time[-1] < log.joints[0].state_time[-1] for t in log.balls)
     identification.write_hits(tmp_path / "hits", log.balls, log.joints)
-    logs, before = [tmp_path / "D0.csv", tmp_path / "joints"], identification.prior(PRIOR, "prior")
+    logs, before = [tmp_path / "D0.csv", tmp_path / "joints"], identification.read_prior(PRIOR, "prior")
     found = identification.identify(logs, 400, ModelFile(SimModel()), before, [tmp_path / "hits"])
     assert found.hits > 40 and found.world.provenance["identified"]["hits"] == found.hits
-    rows = {row["parameter"]: row for row in estimates(found.world)}
+    rows = {row["parameter"]: row for row in list_estimates(found.world)}
     truth, middle = models.paths(reality.model), models.paths(found.world.model)
     delay = "latency.ball_observation"  # against the joints' delay, which is left as believed
     truth[delay] += models.paths()["latency.abb_observation"] - truth["latency.abb_observation"]
@@ -141,18 +141,18 @@ def test_hits_of_real_play_decide_the_rubber_and_the_delay(tmp_path):
 
 def test_a_prior_with_an_unknown_path_is_refused():
     with pytest.raises(ValueError, match="identification.prior.*did you mean 'ball.table.friction'"):
-        identification.prior({"ball.table.fricton": [0.1, 0.2]}, "identification.prior")
+        identification.read_prior({"ball.table.fricton": [0.1, 0.2]}, "identification.prior")
 
 
 def test_rows_of_a_world_name_what_moved_or_is_drawn():
     world = ModelFile(
         models.with_values(SimModel(), {"ball.table.friction": 0.2}),
-        identification.prior({"ball.paddle.restitution": [0.8, 0.9]}, "prior"),
+        identification.read_prior({"ball.paddle.restitution": [0.8, 0.9]}, "prior"),
     )
-    rows = {row["parameter"]: (row["low"], row["high"]) for row in estimates(world)}
+    rows = {row["parameter"]: (row["low"], row["high"]) for row in list_estimates(world)}
     assert rows == {"ball.table.friction": (0.2, 0.2), "ball.paddle.restitution": (0.8, 0.9)}
     nothing = replace(world, model=SimModel(), randomise=())
-    assert estimates(nothing) == []
+    assert list_estimates(nothing) == []
 
 
 def test_delays_are_judged_by_the_sums_that_show_and_a_persons_spin_not_at_all():
@@ -164,7 +164,7 @@ def test_delays_are_judged_by_the_sums_that_show_and_a_persons_spin_not_at_all()
     world = models.with_values(SimModel(), {"ball_spin.mean_x": 20.0})
     truth = {"latency.abb_observation": nominal["latency.abb_observation"] - 0.005}
     truth["latency.abb_action"] = nominal["latency.abb_action"] + 0.004
-    rows = {row["parameter"]: row for row in estimates(ModelFile(world, (samples,)), truth)}
+    rows = {row["parameter"]: row for row in list_estimates(ModelFile(world, (samples,)), truth)}
     assert rows["latency.abb_action"]["truth"] == pytest.approx(nominal["latency.abb_action"] - 0.001)
     assert rows["latency.ball_observation"]["truth"] == pytest.approx(nominal["latency.ball_observation"] + 0.005)
     assert [holds(rows[path]) for path in paths] == [True, True]

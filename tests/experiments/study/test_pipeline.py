@@ -31,15 +31,15 @@ from experiments.config import build, experiment
 from experiments.config import study as study_config
 from experiments.errors import ConfigError, RunError
 from experiments.runs import load_policy
-from experiments.study import evaluation, schedule, session, training, workers
-from experiments.study import pipeline as is2r
+from experiments.study import blind_protocol, evaluation, paths, schedule, session, training
 from experiments.study.analysis import effect_costs, scoring
-from experiments.study.blind import protocol
+from experiments.study.analysis.paper import TEN
+from experiments.study.pipeline import Pipeline
 from experiments.study.schedule import Human, Identified, Real, Simulated
 from experiments.study.target_domain import hidden_effects
-from experiments.study.target_domain.evaluation_on_robot import blind_steps
-from experiments.study.target_domain.finetuning import VirtualReality
-from experiments.study.workflow import Journal, Step, Waiting, remaining, run_all, unfinished
+from experiments.study.target_domain.evaluation_on_robot import make_blind_steps
+from experiments.study.target_domain.virtual import VirtualReality
+from experiments.study.workflow import Journal, Step, Waiting, estimate_remaining, list_unfinished, run_all
 from mjx_tt.env import reward_weights
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.rally import human_player
@@ -118,8 +118,6 @@ def test_shipped_studies_have_the_papers_numbers_and_no_training_is_mistaken_for
         ({"players": ["player3", "player3"]}, "different entries"),
         ({"players": ["anna"]}, "got 'anna'"),
         ({"reality": {"without": ["magic"]}}, "got 'magic'"),
-        ({"ablation": {"player": "player4"}}, "ablation.player 'player4'"),
-        ({"evaluation": {"rallies": 50, "lanes": 7}}, "multiple of its lanes 7"),
         ({"robot": "lockstep"}, "recordings of the first balls of player3"),
         ({"robot": "lockstep", "identification": {}}, "logs no session; take robot: rig"),
         ({"evaluation": {"rallies": 40, "lanes": 8}}, "evaluation.rallies 40 is less than 50"),
@@ -195,12 +193,12 @@ def test_what_a_study_names_is_looked_up_before_it_begins(tmp_path, changes, mes
 def test_a_start_that_came_to_no_step_does_not_block_another(tmp_path):
     session._open(study(), tmp_path)
     session._open(study(first_balls=61), tmp_path)
-    assert "first_balls: 61" in (tmp_path / session.SETTINGS).read_text()
+    assert "first_balls: 61" in (tmp_path / paths.SETTINGS).read_text()
     Journal(tmp_path / "steps.jsonl").append(Step("seed0/player3/D0", "first balls", 1, (), (), lambda: ""), 1.0)
     with pytest.raises(RunError, match="first_balls: the study has 61, now 62"):
         session._open(study(first_balls=62), tmp_path)
     for content in (b"[1]", b"\x80", b"{"):
-        (tmp_path / session.SESSIONS).write_bytes(content)
+        (tmp_path / paths.SESSIONS).write_bytes(content)
         with pytest.raises((RunError, ConfigError), match="study.json"):
             session._open(study(first_balls=61), tmp_path)
 
@@ -217,7 +215,7 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
     }
     for player in whole.players:
         made: set[str] = {"D0", "large", "medium", "narrow", "prior", "reality"}
-        for item in schedule.items(whole, player):
+        for item in schedule.list_items(whole, player):
             assert {n for n in needs[type(item)](item) if n is not None} <= made, item
             made |= (
                 {item.name}
@@ -225,20 +223,20 @@ def test_everything_is_made_after_what_it_needs_and_the_papers_ten_models_are_th
                 else {item.key} | ({item.data} if isinstance(item, Real) else set())
             )
         assert {"world2", "id-ft100", "prior-ft100", "bound-ft100"} <= made
-        assert set(schedule.MODELS) <= made
+        assert set(TEN) <= made
     # "fine-tuned for 70 updates per cycle for the last two cycles and 60 for the first": 200, oracle 35 %.
     by_key = {item.key: item for item in (*schedule.LOOP, *schedule.COMPARED) if not isinstance(item, Human)}
     spent = {}
     for key, item in by_key.items():
         before = spent.get(item.source, 0) if item.source else 0
-        spent[key] = before + (schedule.updates(whole, item) if isinstance(item, Real) else 0)
+        spent[key] = before + (schedule.count_updates(whole, item) if isinstance(item, Real) else 0)
     assert spent["is2r-ft100"] == spent["s2r-ft100"] == 200 and spent["oracle-ft"] == 0.35 * 200
-    assert schedule.updates(whole, by_key["oracle-sim"]) == 40000
+    assert schedule.count_updates(whole, by_key["oracle-sim"]) == 40000
 
 
 def test_the_loop_alone_is_compared_with_its_variants():
     changes = ("baselines=is2r", "identification={}", "ablation=null", "evaluation={cross: false, effects: false}")
-    found = schedule.pairings(study_config.load(study_config.shipped()["study_night"], changes))
+    found = schedule.list_pairings(study_config.load(study_config.shipped()["study_night"], changes))
     of_one = {model for trainer, player, model in found if trainer == player == "player4"}
     rounds = ("sim1", "ft35", "sim2", "ft65", "sim3", "ft100")
     loops = {f"{loop}-{step}" for loop in ("is2r", "id") for step in rounds}
@@ -248,24 +246,24 @@ def test_the_loop_alone_is_compared_with_its_variants():
 
 def test_every_player_evaluates_ten_own_models_and_three_of_two_others():
     whole = study_config.load(study_config.shipped()["study_full"], ("fresh=false", "ablation=null"))
-    pairs = schedule.pairings(whole)
+    pairs = schedule.list_pairings(whole)
     for player in whole.players:
         assert sum(t == e == player for t, e, _ in pairs) == 10
         others = [(t, m) for t, e, m in pairs if e == player != t]
         assert len(others) == len(set(others)) == 6 and len({t for t, _ in others}) == 2
-    codes = evaluation.code_names(0, pairs)
+    codes = evaluation.draw_codes(0, pairs)
     for player in whole.players:
         mine = [code for code, (_, e, _) in zip(codes, pairs, strict=True) if e == player]
         assert len(set(mine)) == 16
-    assert codes != evaluation.code_names(1, pairs)
+    assert codes != evaluation.draw_codes(1, pairs)
 
 
 def test_a_rounds_training_has_its_recipe_and_starts_where_it_says(tmp_path):
     night = study_config.load(study_config.shipped()["study_night"])
     by_key = {item.key: item for item in (*schedule.LOOP, *schedule.COMPARED) if isinstance(item, Simulated)}
-    first = training.configuration(night, by_key["is2r-sim1"], "player3/M0", None, 5)
-    later = training.configuration(night, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
-    oracle = training.configuration(night, by_key["oracle-sim"], "player3/M2", None, 7)
+    first = training.make_config(night, by_key["is2r-sim1"], "player3/M0", None, 5)
+    later = training.make_config(night, by_key["is2r-sim2"], "player3/M1", tmp_path, 6)
+    oracle = training.make_config(night, by_key["oracle-sim"], "player3/M2", None, 7)
     assert first.training.updates + 2 * later.training.updates == oracle.training.updates
     assert (first.initial_policy, later.initial_policy, oracle.initial_policy) == (None, str(tmp_path), None)
     assert (
@@ -287,24 +285,24 @@ def test_the_papers_study_trains_as_the_papers_training():
         (5000, 70, None, None),
     ]
     assert study_.simulation.rounds[0].simulated == paper.training.updates
-    item = next(i for i in schedule.items(study_, "player1") if isinstance(i, Simulated))
-    assert training.configuration(study_, item, "narrow", None, 0).training.later_rewards is None
+    item = next(i for i in schedule.list_items(study_, "player1") if isinstance(i, Simulated))
+    assert training.make_config(study_, item, "narrow", None, 0).training.later_rewards is None
 
 
 # The hidden reality
 
 
 def test_leaving_out_an_effect_changes_no_other_and_seeds_differ():
-    everything = hidden_effects.differences(hidden_effects.draw(3))
+    everything = hidden_effects.list_differences(hidden_effects.draw(3))
     ranges = {path: bounds for group in hidden_effects.RANGES.values() for path, bounds in group.items()}
     assert everything.keys() == ranges.keys()
     assert all(low <= everything[path] <= high for path, (low, high) in ranges.items())
     for effect in hidden_effects.RANGES:
-        left = hidden_effects.differences(hidden_effects.draw(3, (effect,)))
+        left = hidden_effects.list_differences(hidden_effects.draw(3, (effect,)))
         assert left == {path: value for path, value in everything.items() if path not in hidden_effects.RANGES[effect]}
     assert tuple(hidden_effects.RANGES) == study_config.EFFECTS
     assert hidden_effects.draw(3, study_config.EFFECTS) == models.with_values(SimModel(), {})
-    other = hidden_effects.differences(hidden_effects.draw(4))
+    other = hidden_effects.list_differences(hidden_effects.draw(4))
     assert all(other[path] != value for path, value in everything.items())
     with pytest.raises(ValueError, match="no effect is called 'magic'; there are rubber"):
         hidden_effects.draw(3, ("magic",))
@@ -325,18 +323,18 @@ def test_realities_lie_to_both_sides_of_what_training_believes_and_within_the_pr
 
 
 def test_effects_from_outside_come_on_top_and_change_no_other():
-    inside = hidden_effects.differences(hidden_effects.draw(3))
+    inside = hidden_effects.list_differences(hidden_effects.draw(3))
     for effect, ranges in hidden_effects.OUTSIDE.items():
         model = hidden_effects.draw(3, outside=(effect,))
-        found = hidden_effects.differences(model)
+        found = hidden_effects.list_differences(model)
         assert {p: v for p, v in found.items() if p not in ranges} == {
             p: v for p, v in inside.items() if p not in ranges
         }
         assert all(low <= found[path] <= high for path, (low, high) in ranges.items())
         # What no prior has: an identification cannot come upon it by chance.
         assert not set(ranges) <= set(study_config.PRIOR)
-        assert hidden_effects.content(model, 3, (), (effect,))["outside"] == [effect]
-    assert "outside" not in hidden_effects.content(hidden_effects.draw(3), 3, ())
+        assert hidden_effects.describe(model, 3, (), (effect,))["outside"] == [effect]
+    assert "outside" not in hidden_effects.describe(hidden_effects.draw(3), 3, ())
     assert tuple(hidden_effects.OUTSIDE) == get_args(study_config.Outside)
     with pytest.raises(ValueError, match="outside of the model is called 'magic'; there are lift, bounce"):
         hidden_effects.draw(3, outside=("magic",))
@@ -461,10 +459,10 @@ def test_steps_go_on_where_they_were_stopped_and_follow_what_is_made_anew(tmp_pa
     run_all(toy_steps(tmp_path, done), Journal(path), quiet())
     assert len(done) == 4
     (tmp_path / "b").unlink()
-    assert [s.name for s in unfinished(toy_steps(tmp_path, done), Journal(path))] == ["b", "d"]
+    assert [s.name for s in list_unfinished(toy_steps(tmp_path, done), Journal(path))] == ["b", "d"]
     with pytest.raises(KeyboardInterrupt):  # b is made anew, and then it is killed: d is older than b
         run_all(toy_steps(tmp_path, done, fail="d"), Journal(path), quiet())
-    assert [s.name for s in unfinished(toy_steps(tmp_path, done), Journal(path))] == ["d"]
+    assert [s.name for s in list_unfinished(toy_steps(tmp_path, done), Journal(path))] == ["d"]
     path.write_text("nonsense\n" + path.read_text())
     with pytest.raises(RunError, match="line 1 is no step"):
         Journal(path)
@@ -475,23 +473,23 @@ def test_the_remaining_time_follows_from_what_the_same_kind_took(tmp_path):
     steps = [Step(str(i), "fast" if i < 3 else "slow", i + 1.0, (), (), lambda: "") for i in range(5)]
     journal.append(steps[0], 2.0)
     journal.append(steps[1], 4.0)
-    assert remaining(steps[2:], journal) == "at least 0:00:06 left, not yet timed: slow"
+    assert estimate_remaining(steps[2:], journal) == "at least 0:00:06 left, not yet timed: slow"
     journal.append(steps[3], 40.0)
-    assert remaining([steps[2], steps[4]], Journal(journal.path)) == "about 0:00:56 left"
+    assert estimate_remaining([steps[2], steps[4]], Journal(journal.path)) == "about 0:00:56 left"
     journal.append(steps[2], 300.0)  # one that compiled is not what the next ones take
-    assert remaining([steps[2], steps[4]], journal) == "about 0:00:56 left"
+    assert estimate_remaining([steps[2], steps[4]], journal) == "about 0:00:56 left"
 
 
 def test_who_does_the_steps(tmp_path):
     many = study_config.parse(TINY | {"simulation": {**TINY["simulation"], "devices": "auto"}}, "test")
     if jax.default_backend() == "cpu":
-        assert workers.choose(many, None, None) == len(os.sched_getaffinity(0))
-    assert workers.choose(many, 3, None) == 3
-    assert workers.choose(many, None, 2) == workers.choose(study(), None, None) == 1
+        assert session.choose_processes(many, None, None) == len(os.sched_getaffinity(0))
+    assert session.choose_processes(many, 3, None) == 3
+    assert session.choose_processes(many, None, 2) == session.choose_processes(study(), None, None) == 1
     with_robot = study(robot="lockstep", recordings={"player3": str(tmp_path / "balls.csv")})
-    assert workers.choose(with_robot, None, None) == 1
+    assert session.choose_processes(with_robot, None, None) == 1
     with pytest.raises(ConfigError, match="--processes 2: with a robot .* allowed: 1"):
-        workers.choose(with_robot, 2, None)
+        session.choose_processes(with_robot, 2, None)
 
 
 # The whole loop
@@ -508,25 +506,25 @@ def loop(what: study_config.Study, folder: Path) -> None:
     """The study without its report, which has tests of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     session._open(what, folder)
-    run_all(is2r.Loop(what, folder, quiet()).steps_of_play(), Journal(folder / "steps.jsonl"), quiet())
+    run_all(Pipeline(what, folder, quiet()).steps_of_play(), Journal(folder / "steps.jsonl"), quiet())
 
 
 @pytest.mark.slow
 def test_a_study_leaves_what_it_says(finished):
     player = finished / "seed0" / "player3"
-    for key in schedule.MODELS:
-        kept = Policy.load(player / key / training.POLICY)
+    for key in TEN:
+        kept = Policy.load(player / key / paths.POLICY)
         assert kept.theta.shape == (976,) and kept.mean.shape == kept.inv_std.shape == (N_OBSERVATION,)
         assert np.isfinite(kept.theta).all()
     # Weights are carried on: from simulation to reality and back.
     tuned, trained, other = (
-        Policy.load(player / key / training.POLICY).theta for key in ("is2r-ft35", "is2r-sim1", "oracle-sim")
+        Policy.load(player / key / paths.POLICY).theta for key in ("is2r-ft35", "is2r-sim1", "oracle-sim")
     )
     assert cosine(tuned, trained) > 0.9 and abs(cosine(other, trained)) < 0.3
     started = load_policy.load(player / "is2r-sim2" / "training" / "seed0").config.initial_policy
     assert started == str((player / "is2r-ft35").resolve())
     rallies = scoring.read(finished / "evaluations.csv")
-    assert set(rallies.model.tolist()) == set(schedule.MODELS) and len(rallies) == 50 * 10
+    assert set(rallies.model.tolist()) == set(TEN) and len(rallies) == 50 * 10
     with open(finished / "evaluations.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     with np.load(finished / "evaluations" / "0_player3_player3_is2r-ft100.npz") as log:
@@ -550,7 +548,7 @@ def test_a_study_leaves_what_it_says(finished):
     drawn = hidden_effects.draw(0, ("drives", "encoders"))
     assert f"ball.paddle.restitution: {drawn.ball.paddle.restitution}" in opened
     assert str(drawn.ball.paddle.restitution) not in (finished / "seed0" / "reality.sealed").read_text()
-    assert protocol.unseal(finished / "seed0" / "reality.sealed")["seed"] == 0
+    assert blind_protocol.unseal(finished / "seed0" / "reality.sealed")["seed"] == 0
 
 
 def test_worlds_side_by_side_are_those_that_were_drawn():
@@ -559,7 +557,7 @@ def test_worlds_side_by_side_are_those_that_were_drawn():
         hidden_effects.draw(3, left_out)
         for left_out in ((), ("drives", "encoders"), ("table",), tuple(hidden_effects.RANGES))
     ]
-    together = models.paths(hidden_effects.side_by_side(drawn, 2))
+    together = models.paths(hidden_effects.stack_worlds(drawn, 2))
     for path, value in together.items():
         wanted = [models.paths(world)[path] for world in drawn]
         if isinstance(value, jax.Array):
@@ -578,7 +576,7 @@ def test_an_effect_is_left_out_for_the_policy_it_says(finished):
     rows = effect_costs.read(finished / "seed0" / effect_costs.FILE)
     assert [(r.model, r.without) for r in rows] == [(m, w) for m in effect_costs.MODELS for w in effect_costs.WORLDS]
     player = finished / "seed0" / "player3"
-    policies = [Policy.load(player / model / training.POLICY) for model in effect_costs.MODELS]
+    policies = [Policy.load(player / model / paths.POLICY) for model in effect_costs.MODELS]
     human = {"is2r-sim1": "M0", "s2r-ft100": "M0"}
     boxes = [load_distribution(player / "balls" / f"human_{human.get(m, 'M2')}.yaml") for m in effect_costs.MODELS]
     layout = np.array([(w, m) for w in range(len(effect_costs.WORLDS)) for m in range(6) for _ in range(lanes)]).T
@@ -614,28 +612,33 @@ def test_a_second_training_uses_the_first_ones_program(finished, tmp_path):
     )
     by_key = {item.key: item for item in schedule.LOOP if isinstance(item, Simulated)}
     human = finished / "seed0" / "player3" / "balls" / "human_M2.yaml"
-    text = training.simulate(study(), by_key["is2r-sim1"], tmp_path / "again", human, None, "again", quiet(), None)
+    text = training.train_seeds(study(), by_key["is2r-sim1"], tmp_path / "again", human, None, "again", quiet(), None)
     assert text.startswith("6 updates")
     assert not compiled
     places = tmp_path / "again", finished / "seed0" / "player3" / "is2r-sim1"
-    one, two = (Policy.load(place / training.POLICY).theta for place in places)
+    one, two = (Policy.load(place / paths.POLICY).theta for place in places)
     assert np.abs(one - two).max() > 1e-3  # another seed and other balls
 
 
 @pytest.mark.slow
 def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tmp_path):
-    """Its steps done by two processes, stopped as a batch system does, gone on with, killed, and ended by this one."""
-    folder = tmp_path / "tiny"
+    """Two processes are stopped as a batch system does, then killed; Parsl goes on, is killed, and ends the study."""
+    folder, site = tmp_path / "tiny", tmp_path / "here.yaml"
     player = folder / "seed0" / "player3"
+    site.write_text(yaml.safe_dump({"provider": {"kind": "local"}, "workers_per_node": 1, "memory_per_worker": 1.0}))
+    command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder)]
 
-    def start_and_end(sign: Path, number: int) -> tuple[int, str]:
+    def steps_done() -> list[str]:
+        return [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
+
+    def start_and_end(sign: Path, number: int, *more: str) -> tuple[int, str]:
         """Exit status and message of a session that gets a signal when ``sign`` is there."""
-        command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder)]
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL if more else subprocess.PIPE}
+        process = subprocess.Popen([*command, *more], cwd=ROOT, text=True, **streams)
         while not sign.exists() and process.poll() is None:
             time.sleep(0.005)
         time.sleep(0.1)
-        assert process.poll() is None, process.stderr.read()
+        assert process.poll() is None, more or process.stderr.read()
         os.kill(process.pid, number)
         _, message = process.communicate(timeout=120)  # its end means that no worker lives: each holds the pipe
         return process.returncode, message
@@ -643,14 +646,17 @@ def test_a_study_stopped_and_killed_ends_as_one_that_nobody_touched(finished, tm
     status, message = start_and_end(player / "is2r-sim1" / "training" / "seed0" / "metrics.jsonl", signal.SIGTERM)
     assert status != 0 and re.search(r"is2r-sim1.*: stopped after update \d", message), message
     assert f"{folder}: stopped; the same command continues the study" in message
-    assert [e["step"] for e in Journal(folder / "steps.jsonl").entries][-1] == "seed0/player3/M0"
+    assert steps_done()[-1] == "seed0/player3/M0"
     status, message = start_and_end(player / "is2r-ft35" / "checkpoints", signal.SIGKILL)
     assert status == -signal.SIGKILL, message
-    before = Journal(folder / "steps.jsonl").entries
-    assert before and len(before) < 10  # of 20
-    loop(study(), folder)
-    entries = [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
-    assert len(entries) == len(set(entries))  # nothing was done twice
+    training_ = player / "is2r-sim2" / "training" / "seed0" / "metrics.jsonl"
+    assert start_and_end(training_, signal.SIGKILL, str(site))[0] == -signal.SIGKILL
+    before = steps_done()
+    assert "seed0/player3/M1" in before and len(before) < 14  # of 20
+    done = subprocess.run([*command, str(site)], cwd=ROOT, capture_output=True, text=True, timeout=1200)
+    assert done.returncode == 0, done.stdout + done.stderr
+    entries = steps_done()
+    assert entries[: len(before)] == before and len(entries) == len(set(entries))  # nothing was done twice
     assert_same_bits(folder, finished)
 
 
@@ -666,29 +672,6 @@ def assert_same_bits(folder: Path, finished: Path) -> None:
                         np.testing.assert_array_equal(a[name], b[name], err_msg=f"{path}: {name}")
             else:
                 assert path.read_bytes() == mine.read_bytes(), path
-
-
-@pytest.mark.slow
-def test_a_study_by_parsl_killed_and_resumed_ends_as_one_by_this_process(finished, tmp_path):
-    """The process that was asked is killed while a worker trains; the same command ends the study."""
-    folder = tmp_path / "tiny"
-    here = {"provider": {"kind": "local"}, "workers_per_node": 1, "memory_per_worker": 1.0}
-    (tmp_path / "here.yaml").write_text(yaml.safe_dump(here))
-    command = [sys.executable, "-c", DRIVER, json.dumps(TINY), str(folder), str(tmp_path / "here.yaml")]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
-    measured = folder / "seed0" / "player3" / "is2r-sim1" / "training" / "seed0" / "metrics.jsonl"
-    while not measured.exists():
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.kill()
-    process.wait()
-    before = len(Journal(folder / "steps.jsonl").entries)
-    assert 0 < before < 10  # of 20
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=1200)
-    assert done.returncode == 0, done.stdout + done.stderr
-    entries = [entry["step"] for entry in Journal(folder / "steps.jsonl").entries]
-    assert len(entries) == len(set(entries)) > before
-    assert_same_bits(folder, finished)
 
 
 @pytest.mark.slow
@@ -712,7 +695,7 @@ def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
         recordings={"player3": str(finished / "seed0" / "player3" / "balls" / "D0.csv")},
     )
     console, folder = quiet(), tmp_path / "robot"
-    steps = is2r.Loop(what, folder, console).steps_of_play()
+    steps = Pipeline(what, folder, console).steps_of_play()
     names = [step.name for step in steps]
     assert "seed0/reality" not in names and names[-1] == "evaluations"
     first = names.index("seed0/player3/is2r-ft35") + 1
@@ -721,7 +704,7 @@ def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
     measured = (folder / "seed0" / "player3" / "balls" / "D1.csv").read_text().splitlines()
     assert measured[0] == "session,trajectory,t,x,y,z" and len(measured) > 20
     assert (folder / "seed0" / "player3" / "is2r-ft35" / "journal.jsonl").read_text().count("\n") == 2 + 2 + 2
-    theta = Policy.load(folder / "seed0" / "player3" / "is2r-ft35" / training.POLICY).theta
+    theta = Policy.load(folder / "seed0" / "player3" / "is2r-ft35" / paths.POLICY).theta
     assert np.isfinite(theta).all()
 
 
@@ -729,20 +712,20 @@ def test_on_a_robot_the_study_waits_for_its_people(finished, tmp_path):
 def test_people_play_under_code_names_and_the_key_opens_when_the_sheet_is_full(finished, tmp_path):
     folder, player = tmp_path / "blind", finished / "seed0" / "player3"
     runs_of = {key: (lambda key=key: player / key) for key in ("is2r-ft35", "is2r-ft65")}
-    make, count = blind_steps(folder, 0, "player3", "player4", runs_of, (), "robot.yaml", quiet())
+    make, count = make_blind_steps(folder, 0, "player3", "player4", runs_of, (), "robot.yaml", quiet())
     journal = Journal(tmp_path / "steps.jsonl")
     with pytest.raises(Waiting, match=r"player4 plays rallies with .*policies/CODE --robot robot.yaml.*A has 0 of 50"):
         run_all([make, count], journal, quiet())
-    sheet = folder / protocol.SHEET
+    sheet = folder / blind_protocol.SHEET
     lines = sheet.read_text().splitlines()
     length = {"A": 3, "B": 8}
     filled = [f"{line[:-2]},{length[line[0]]},13" if line.endswith(",,") else line for line in lines]
     sheet.write_text("\n".join(filled) + "\n")
-    assert [step.name for step in unfinished([make, count], journal)] == [count.name]
+    assert [step.name for step in list_unfinished([make, count], journal)] == [count.name]
     run_all([make, count], journal, quiet())
-    rallies = scoring.read(folder / protocol.EVALUATIONS)
-    codes = protocol.unseal(folder / protocol.KEY)["codes"]
+    rallies = scoring.read(folder / blind_protocol.EVALUATIONS)
+    codes = blind_protocol.unseal(folder / blind_protocol.KEY)["codes"]
     for model, code in codes.items():
         assert set(rallies.length[rallies.model == model].tolist()) == {length[code]}
-    played = load_policy.load(folder / protocol.POLICIES / codes["is2r-ft65"])
-    np.testing.assert_array_equal(played.policy.theta, Policy.load(player / "is2r-ft65" / training.POLICY).theta)
+    played = load_policy.load(folder / blind_protocol.POLICIES / codes["is2r-ft65"])
+    np.testing.assert_array_equal(played.policy.theta, Policy.load(player / "is2r-ft65" / paths.POLICY).theta)

@@ -26,7 +26,7 @@ from experiments.study.analysis import paper as study_paper
 from experiments.study.analysis import study_folder as study_data
 from experiments.study.analysis.claims import DIFFERENCE, HITS, RATIO, SHARE, judge
 from experiments.study.analysis.statistics import Bootstrap, Interval
-from experiments.study.report import figures, heatmaps, page, text, tsne
+from experiments.study.report import figures, heatmaps, page, tsne
 from mjx_tt.rally.end_reasons import End
 from tests.support import made_up_study
 
@@ -34,7 +34,7 @@ from tests.support import made_up_study
 def rallies(lengths: dict, end=End.ROBOT_MISSED):
     """Rallies from {(seed, trainer, evaluator, model): lengths}."""
     return scoring.join(
-        scoring.scored(s, t, e, m, "A", values, [end] * len(values)) for (s, t, e, m), values in lengths.items()
+        scoring.score_rallies(s, t, e, m, "A", values, [end] * len(values)) for (s, t, e, m), values in lengths.items()
     )
 
 
@@ -94,7 +94,7 @@ def test_fewer_than_five_seeds_are_not_drawn_anew():
     levels = [3, 30, 12, 7]
     data = rallies({(s, "player1", "player1", "m"): np.full(5, level) for s, level in enumerate(levels)})
     assert np.ptp(Bootstrap(data).mean("m", ["player1"]).draws) == 0.0
-    assert [statistics.chance(n) for n in (1, 4, 5)] == ["rallies", "rallies", "seeds and rallies"]
+    assert [statistics.name_chance(n) for n in (1, 4, 5)] == ["rallies", "rallies", "seeds and rallies"]
 
 
 def test_the_interval_covers_as_often_as_it_says():
@@ -129,7 +129,7 @@ def test_tests_of_differences_are_scipys_and_counted_by_hand():
     rng = np.random.default_rng(1)
     x, y = rng.geometric(0.1, 40), rng.geometric(0.14, 40)
     data = rallies({(0, "player1", "player1", "a"): x, (0, "player1", "player1", "b"): y})
-    found = statistics.difference(Bootstrap(data), "a", "b", ["player1"])
+    found = statistics.compare_models(Bootstrap(data), "a", "b", ["player1"])
     welch = stats.ttest_ind(x, y, equal_var=False)
     assert found.p_welch == pytest.approx(welch.pvalue)
     assert (found.welch.low, found.welch.high) == pytest.approx(tuple(welch.confidence_interval()))
@@ -154,10 +154,10 @@ def test_normalisation_both_ways_by_hand():
         }
     )
     own = data.take(data.own)
-    by_player = statistics.normalised_by_player(own)
+    by_player = statistics.normalise_by_player(own)
     spread = np.sqrt(20 / 3)  # of 2, 4, 6, 8 around 5
     assert by_player == pytest.approx([*(np.array([-3, -1, 1, 3]) / spread), -np.sqrt(0.5), np.sqrt(0.5)])
-    by_model = statistics.normalised_by_model(data)
+    by_model = statistics.normalise_by_model(data)
     unit = np.sqrt(2.0)  # of 2, 4
     expected = {
         (0, "a", True): [-1 / unit, 1 / unit],
@@ -215,7 +215,7 @@ def test_a_ball_falls_into_the_square_that_the_table_says():
     """Robot's right-hand far corner hit from the human's left near the net, seen from the robot's end."""
     landing = np.array([[0.7, -0.7, 0.0], [-1.3, -0.05, np.nan]])
     place = np.array([[-0.7, 0.0, 0.0], [0.1, 2.2, 0.5]])
-    count, back = heatmaps.grid(landing, place, np.array([True, False, True]))
+    count, back = heatmaps.count_balls(landing, place, np.array([True, False, True]))
     assert count.sum() == 2 and back.sum() == 1
     assert count[2, 0, 0, 0] == 1 and back[2, 0, 0, 0] == 1
     assert count[0, 2, 1, 2] == 1  # behind the human's end line: the square nearest to it
@@ -225,7 +225,7 @@ def test_grids_add_up_to_numpys_histogram():
     rng = np.random.default_rng(0)
     landing = rng.uniform([[-c.TABLE_WIDTH / 2], [-c.TABLE_LENGTH / 2]], [[c.TABLE_WIDTH / 2], [0.0]], (2, 500))
     place = rng.uniform([[-c.TABLE_WIDTH / 2], [0.0]], [[c.TABLE_WIDTH / 2], [c.TABLE_LENGTH / 2]], (2, 500))
-    count, _ = heatmaps.grid(landing, place, np.ones(500, bool))
+    count, _ = heatmaps.count_balls(landing, place, np.ones(500, bool))
     theirs, _ = np.histogramdd(
         np.concatenate([landing, place]).T,
         bins=3,
@@ -266,10 +266,10 @@ def test_measured_means_are_the_known_ones(whole):
             known, found = made_up_study.mean_length(player, model), m.unselected.mean(model, [player])
             # Of some 145 rallies of a geometric distribution, under policies that scatter by 5 %.
             assert found.value == pytest.approx(known, abs=4 * (known / np.sqrt(145) + 0.05 * known / np.sqrt(2)))
-    kept = m.ratio("is2r-ft100", "is2r-ft100", "all", False, True, boot=m.unselected).interval
+    kept = m.kept_ratio(["is2r-ft100"], boot=m.unselected).interval
     assert kept.low - 0.1 <= 0.7 <= kept.high + 0.1
     robot = made_up_study.ROBOT_SHARE  # and of the human's, a third are returns to the corner
-    assert m.robot_ends().value == pytest.approx(robot + (1.0 - robot) / 3, abs=0.03)
+    assert m.robot_ended_share().value == pytest.approx(robot + (1.0 - robot) / 3, abs=0.03)
     made = [study_data.load(whole).log(seed, "player1", "player1", "is2r-ft100") for seed in (0, 1)]
     far = sum(
         int(h and y > 1.37)
@@ -277,11 +277,13 @@ def test_measured_means_are_the_known_ones(whole):
         for h, r, y in zip(log.hit, log.returned, log.return_landing[1], strict=True)
         if not r
     )
-    assert m.over().value == pytest.approx(far / sum(int(np.sum(~log.returned)) for log in made))
+    assert m.over_share("is2r-ft100", "advanced").value == pytest.approx(
+        far / sum(int(np.sum(~log.returned)) for log in made)
+    )
 
 
 def test_claims_are_judged_as_the_made_up_numbers_demand(whole):
-    found = {f.claim.key: f for f in claims.findings(claims.Measurements(study_data.load(whole)))}
+    found = claims.Measurements(study_data.load(whole)).findings
     assert set(found) == {claim.key for claim in study_paper.CLAIMS}
     for key in ("beginner", "advanced", "fine-tuning", "cross", "keeps-less", "robot-ends"):
         assert found[key].verdict.startswith("agrees"), (key, found[key])
@@ -295,7 +297,7 @@ def test_claims_are_judged_as_the_made_up_numbers_demand(whole):
 def test_what_an_effect_costs_is_the_geometric_mean_over_players_and_seeds(whole):
     outcomes = study_data.load(whole).effects
     for world, ratio in {"magnus": 1.2, "drives": 0.9, "all": 1.5, "camera": 1.0}.items():
-        found = effect_costs.gain(outcomes, "oracle-ft", world)
+        found = effect_costs.estimate_gain(outcomes, "oracle-ft", world)
         assert (found.value, found.low, found.high) == pytest.approx((ratio, ratio, ratio))
     with open(whole / "report" / "effects.csv", newline="") as file:
         head, *rows = csv.reader(file)
@@ -363,7 +365,7 @@ def test_identified_worlds_stand_beside_the_opened_reality(whole):
     assert counted["decided by"] == "prior" and counted["95 % over seeds"] == "none: given, not estimated"
     assert len(rows) == 2 * 2 * 2 and {row["round"] for row in rows} == {"world0"}  # seeds, players, parameters
     m = claims.Measurements(study_data.load(whole))
-    ratio, known = m.ratio("id-sim1", "is2r-sim1", "all").interval, made_up_study.MEANS["id-sim1"] / 3.0
+    ratio, known = m.length_ratio("id-sim1", "is2r-sim1").interval, made_up_study.MEANS["id-sim1"] / 3.0
     assert ratio.low < known < ratio.high
     assert (whole / "report" / "identification.png").stat().st_size > 10_000
 
@@ -398,12 +400,12 @@ def test_a_study_of_chosen_methods_is_whole_and_says_first_what_identification_b
     assert study.left_out == ["S2R", "S2R-Oracle", "rallies with players who did not train the policy"]
     assert [line for line in study.missing if "human model" not in line] == []
     report = page.Report(study)
-    said = text.sentences(report.measured, report.findings)
+    said = report.sentences()
     assert "2.00 times (2.00 to 2.00) as long as those of the first." in said[0]
     assert "4.50 times (4.50 to 4.50) as long as where it is not, and 9.00 times" in said[1]
     assert "2.50 times" in said[2] and "fine-tuning" in said[2]
-    assert figures.cross(study, report.measured) is None  # not bars of the own players alone
-    for axes in figures.by_skill(study, report.measured).axes:  # no empty place for a method that was left out
+    assert figures.draw_cross(report.measured) is None  # not bars of the own players alone
+    for axes in figures.draw_by_skill(report.measured).axes:  # no empty place for a method that was left out
         assert [label.get_text() for label in axes.get_xticklabels()] == ["i-S2R", "identified"]
 
     (tmp_path / "study.yaml").write_text("name: whole\n")  # where all was asked for, it is missing
@@ -473,7 +475,7 @@ DAMAGED = {  # file of a study: contents, what reads it
     ),
     "seed0/player5/balls/D1.csv": (
         [b"\x80", b"t,x\n1,2\n"],
-        lambda folder: tsne.trained(study_data.load(folder), 0, "player5", "D1"),
+        lambda folder: tsne.training_balls(study_data.load(folder), 0, "player5", "D1"),
     ),
 }
 
@@ -514,33 +516,25 @@ def test_a_damaged_file_ends_the_command_with_one_line(small, tmp_path, capsys):
 
 
 def test_a_line_that_is_being_written_is_left_out(small, tmp_path):
-    study = study_data.Study(tmp_path, {}, {}, scoring.join([]))
+    study = study_data.StudyFolder(tmp_path, {}, {}, scoring.join([]))
     path = tmp_path / "seed0" / "player5" / "is2r-ft35" / "metrics.jsonl"
     path.parent.mkdir(parents=True)
     path.write_text('{"update": 1, "return_rate": 0.5}\n{"update": 2, "ret')
     assert study.metrics(0, "player5", "is2r-ft35") == [{"update": 1, "return_rate": 0.5}]
 
 
-def test_a_log_with_arrays_of_other_shapes_is_named(small, tmp_path):
+def test_a_log_with_other_arrays_is_named(small, tmp_path):
     name = "0_player5_player5_is2r-ft100.npz"
     with np.load(small / "evaluations" / name) as data:
         arrays = dict(data)
     (tmp_path / "evaluations").mkdir()
-    study = study_data.Study(tmp_path, {}, {}, scoring.join([]))
+    study = study_data.StudyFolder(tmp_path, {}, {}, scoring.join([]))
     text = np.full(arrays["hit"].size, "a")
     for array, wrong in (("touch", arrays["touch"][1:]), ("position", arrays["position"][:2]), ("hit", text)):
         np.savez(tmp_path / "evaluations" / name, **arrays | {array: wrong})
         with pytest.raises(ConfigError, match=f"array {array} is .* are wanted"):
             study.log(0, "player5", "player5", "is2r-ft100")
-
-
-def test_a_log_without_an_array_is_named(whole, tmp_path):
-    source = whole / "evaluations" / "0_player3_player3_is2r-ft100.npz"
-    with np.load(source) as data:
-        kept = {name: data[name] for name in data if name != "returned"}
-    folder = tmp_path / "evaluations"
-    folder.mkdir()
-    np.savez(folder / source.name, **kept)
-    study = study_data.Study(tmp_path, {}, {}, scoring.join([]))
+    del arrays["returned"]
+    np.savez(tmp_path / "evaluations" / name, **arrays)
     with pytest.raises(ConfigError, match="has no array returned"):
-        study.log(0, "player3", "player3", "is2r-ft100")
+        study.log(0, "player5", "player5", "is2r-ft100")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments.study.analysis.effect_costs import NOTHING, Outcome, gain
+from experiments.study.analysis.effect_costs import NOTHING, Outcome, estimate_gain
 
 
 def outcomes(ratios: dict[tuple[int, str], float]) -> list[Outcome]:
@@ -23,7 +23,7 @@ def outcomes(ratios: dict[tuple[int, str], float]) -> list[Outcome]:
 def test_the_interval_is_students_t_over_seeds():
     """Five players of a seed that all gain alike are one piece of evidence."""
     by_seed = {0: 1.1, 1: 1.9, 2: 1.3}
-    found = gain(
+    found = estimate_gain(
         outcomes({(s, f"player{k}"): ratio for s, ratio in by_seed.items() for k in range(5)}), "is2r-sim1", "spin"
     )
     logs = np.log([*by_seed.values()])
@@ -34,11 +34,11 @@ def test_the_interval_is_students_t_over_seeds():
 
 
 def test_players_of_a_seed_are_averaged_first():
-    found = gain(outcomes({(0, "a"): 1.0, (0, "b"): 4.0, (1, "a"): 2.0}), "is2r-sim1", "spin")
+    found = estimate_gain(outcomes({(0, "a"): 1.0, (0, "b"): 4.0, (1, "a"): 2.0}), "is2r-sim1", "spin")
     assert (found.value, found.low, found.high) == pytest.approx((2.0, 2.0, 2.0))
 
 
 def test_one_seed_has_no_interval():
-    found = gain(outcomes({(0, "a"): 2.0, (0, "b"): 8.0}), "is2r-sim1", "spin")
+    found = estimate_gain(outcomes({(0, "a"): 2.0, (0, "b"): 8.0}), "is2r-sim1", "spin")
     assert found.value == pytest.approx(4.0) and math.isnan(found.low) and math.isnan(found.high)
-    assert gain(outcomes({(0, "a"): 2.0}), "is2r-sim1", "magnus") is None
+    assert estimate_gain(outcomes({(0, "a"): 2.0}), "is2r-sim1", "magnus") is None

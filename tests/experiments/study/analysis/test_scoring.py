@@ -30,14 +30,14 @@ PRINTED = [
 
 
 def test_ends_are_attributed_as_in_the_papers_table():
-    one = scoring.scored(0, "p", "p", "m", "A", np.ones(15, int), [row[0] for row in ROWS[:15]])
+    one = scoring.score_rallies(0, "p", "p", "m", "A", np.ones(15, int), [row[0] for row in ROWS[:15]])
     printed = {"Yes": 1, "No": 0, "": scoring.UNKNOWN}
     assert one.robot_ended.tolist() == [printed[who] for who, _ in PRINTED]
     assert one.filtered.tolist() == [what == "Filter" for _, what in PRINTED]
 
 
 def test_a_return_beside_the_table_is_the_robots():
-    one = scoring.scored(0, "p", "p", "m", "A", [4], [End.ROBOT_OUT])
+    one = scoring.score_rallies(0, "p", "p", "m", "A", [4], [End.ROBOT_OUT])
     assert one.robot_ended.tolist() == [1] and not one.filtered[0] and one.selected[0]
 
 
@@ -45,7 +45,7 @@ def test_selection_is_the_longest_five_sixths_of_the_first_sixty():
     rng = np.random.default_rng(1)
     for count in (10, 55, 64, 90):
         length, filtered = rng.integers(1, 30, count), rng.random(count) < 0.15
-        chosen = scoring.select(length, filtered)
+        chosen = scoring.choose_reported(length, filtered)
         pool = [i for i in range(count) if not filtered[i]][:60]
         wanted = {60: 50}.get(len(pool), round(len(pool) * 5 / 6))
         while len(pool) > wanted:  # take away the shortest, one by one; of equal ones the last played
@@ -58,21 +58,21 @@ def test_fewer_rallies_that_count_do_not_shift_the_mean():
     rng, means = np.random.default_rng(4), []
     for dropped in (8, 0):
         end = np.where(np.arange(60) < dropped, End.SERVICE, End.ROBOT_MISSED)
-        drawn = (scoring.scored(0, "p", "p", "m", "A", rng.geometric(0.05, 60), end) for _ in range(2000))
+        drawn = (scoring.score_rallies(0, "p", "p", "m", "A", rng.geometric(0.05, 60), end) for _ in range(2000))
         means.append([one.length[one.selected].mean() for one in drawn])
     few, many = np.mean(means, axis=1)
     assert few == pytest.approx(many, rel=0.02)  # each is known to 0.4 %
     assert many == pytest.approx(1.18 * 20.0, rel=0.02)
-    assert [scoring.kept(n) for n in (0, 1, 52, 60)] == [0, 1, 43, 50]
+    assert [scoring.count_reported(n) for n in (0, 1, 52, 60)] == [0, 1, 43, 50]
 
 
 def test_a_rally_after_the_sixtieth_is_not_reported_however_long():
     length = np.full(61, 3)
     length[60] = 300
-    assert not scoring.select(length, np.zeros(61, bool))[60]
+    assert not scoring.choose_reported(length, np.zeros(61, bool))[60]
     filtered = np.zeros(61, bool)
     filtered[7] = True  # now it is the sixtieth that counts
-    assert scoring.select(length, filtered)[60]
+    assert scoring.choose_reported(length, filtered)[60]
 
 
 def test_the_file_keeps_every_rally(tmp_path):
@@ -80,7 +80,7 @@ def test_the_file_keeps_every_rally(tmp_path):
     ends = rng.integers(0, len(End), 70)
     evaluations = ((0, "player1", "player1"), (0, "player1", "player4"), (3, "player2", "player2"))
     written = scoring.join(
-        scoring.scored(seed, trainer, evaluator, "is2r-ft100", "Q", rng.integers(1, 40, 70), ends)
+        scoring.score_rallies(seed, trainer, evaluator, "is2r-ft100", "Q", rng.integers(1, 40, 70), ends)
         for seed, trainer, evaluator in evaluations
     )
     scoring.write(tmp_path / "evaluations.csv", written)

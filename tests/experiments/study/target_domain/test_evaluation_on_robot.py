@@ -20,7 +20,7 @@ from experiments.deploy import play
 from experiments.errors import RunError
 from experiments.study.analysis import scoring
 from experiments.study.target_domain import evaluation_on_robot
-from experiments.study.target_domain.evaluation_on_robot import PLAYED, rally_step, seed_of
+from experiments.study.target_domain.evaluation_on_robot import PLAYED, derive_seed, make_rally_step
 from robot_io.errors import RefusedError
 from robot_io.policy import artefact as artefacts
 from tests.support.paths import ROOT
@@ -51,7 +51,7 @@ def test_rallies_that_faults_cut_short_go_on_in_another_session_and_all_count(tm
     run, folder, said, over = tmp_path / "run", tmp_path / "rallies", io.StringIO(), threading.Event()
     shutil.copytree(POLICY, run)
     folder.mkdir()
-    step = rally_step(
+    step = make_rally_step(
         folder, (0, "player3", "player3", "zero_shot"), lambda: run, (), RALLIES, Console(file=said, width=200)
     )
     disturbing = threading.Thread(target=late_until_a_session_has_ended, args=(folder, said, over))
@@ -112,9 +112,9 @@ def step_of(run, monkeypatch, plan, rallies=10):
     """The step of a zero-shot policy, and the sessions that it will have."""
     rig, folder = Sessions(plan), run.parent / "rallies"
     monkeypatch.setattr(play, "run", rig.run)
-    monkeypatch.setattr(evaluation_on_robot, "exported", lambda trained, console: run)
+    monkeypatch.setattr(evaluation_on_robot, "export_once", lambda trained, console: run)
     who = (0, "player3", "player3", "zero_shot")
-    return rally_step(folder, who, lambda: run, (), rallies, Console(file=io.StringIO())), rig
+    return make_rally_step(folder, who, lambda: run, (), rallies, Console(file=io.StringIO())), rig
 
 
 def test_a_failed_evaluation_goes_on_with_what_it_played(run, monkeypatch):
@@ -124,7 +124,7 @@ def test_a_failed_evaluation_goes_on_with_what_it_played(run, monkeypatch):
     assert rig.asked == [10, 7, 5]
     step.run()
     assert rig.asked[3:] == [3] and not rig.plan
-    assert rig.chances == [seed_of(step.name) + k for k in range(4)]
+    assert rig.chances == [derive_seed(step.name) + k for k in range(4)]
     counted = scoring.read(step.outputs[0])
     np.testing.assert_array_equal(counted.length, np.arange(1, 15))  # every rally once, in the order of play
     assert (~counted.filtered).sum() == 10
@@ -139,7 +139,7 @@ def test_a_session_that_is_stopped_or_raises_counts_if_it_has_a_report(run, monk
         rig.plan = [(10, 0)]
     step.run()
     assert rig.asked == [10, 10 if end is None else 6]
-    assert rig.chances == [seed_of(step.name), seed_of(step.name) + 1]
+    assert rig.chances == [derive_seed(step.name), derive_seed(step.name) + 1]
     assert (~scoring.read(step.outputs[0]).filtered).sum() == 10
 
 

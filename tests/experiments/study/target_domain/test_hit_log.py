@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments.study.target_domain.hit_log import AWAY, in_sight
+from experiments.study.target_domain.hit_log import AWAY, count_visible
 
 RATE = 125.0  # [Hz]
 
@@ -20,12 +20,12 @@ def thrown(height: float, up: float, seconds: float = 1.4) -> np.ndarray:
 def test_a_ball_is_seen_until_it_falls_below_the_table_however_low_it_was_struck(height, up):
     low = -0.03  # under the table's plane
     falls_below = (up + (up**2 + 4.0 * 4.905 * (height - low)) ** 0.5) / 9.81  # [s]
-    assert in_sight(thrown(height, up)) / RATE == pytest.approx(falls_below, abs=1.01 / RATE)
+    assert count_visible(thrown(height, up)) / RATE == pytest.approx(falls_below, abs=1.01 / RATE)
 
 
 def test_a_ball_is_seen_until_it_passes_the_robot_or_comes_back_past_the_player():
     passing = thrown(0.3, 7.0)
-    assert in_sight(passing) / RATE == pytest.approx(4.0 / 3.0, abs=1.01 / RATE)
+    assert count_visible(passing) / RATE == pytest.approx(4.0 / 3.0, abs=1.01 / RATE)
     back, t = passing.copy(), np.arange(passing.shape[1]) / RATE
     back[1] = np.where(t < 0.3, 1.7 - 3.0 * t, 0.8 + 3.0 * (t - 0.3))  # where it was struck again after 0.6 s
-    assert in_sight(back) / RATE == pytest.approx(0.6 + AWAY / 3.0, abs=1.01 / RATE)
+    assert count_visible(back) / RATE == pytest.approx(0.6 + AWAY / 3.0, abs=1.01 / RATE)

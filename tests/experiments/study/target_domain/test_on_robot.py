@@ -14,8 +14,8 @@ from experiments.errors import RunError
 from experiments.finetuning.robot import LockStepRallies
 from experiments.runs import load_policy
 from experiments.study import identification
-from experiments.study.analysis.identified import LOGS, estimates
-from experiments.study.target_domain import on_robot, served_balls
+from experiments.study.analysis.identified import LOGS, list_estimates
+from experiments.study.target_domain import on_robot
 from mjx_tt.diagnosis.logs import ROBOT_FILES
 from mjx_tt.sim.model import ModelFile, SimModel
 from robot_io import log
@@ -37,7 +37,7 @@ def test_a_rallys_track_is_parted_at_the_persons_strokes():
     time = np.arange(0.0, 2.2, 0.008)
     y = np.interp(time, *zip(*places, strict=True)) + np.random.default_rng(0).normal(0.0, 0.003, time.size)
     track = Trajectory("s", "1", time, np.stack([0.0 * y, y, 0.2 + 0.0 * y]))
-    parts = on_robot.by_stroke(track)
+    parts = on_robot.split_by_stroke(track)
     assert [round(float(p.time[0]), 1) for p in parts] == [0.0, 1.0] and sum(map(len, parts)) == time.size
     assert all(p.position[1].min() < -1.1 < 1.1 < p.position[1, 0] for p in parts)
 
@@ -50,7 +50,7 @@ def test_a_fine_tuning_without_a_log_is_told_so(tmp_path):
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     path = tmp_path_factory.mktemp("served") / "D0.csv"
-    balls = served_balls.served("player3", 40, 3, "D0")
+    balls = on_robot.serve_balls("player3", 40, 3, "D0")
     assert len(balls) == 40 and all(t.position[1, 0] > 0.5 and t.position[1].min() < 0.0 for t in balls)
     measurements.write_csv(path, balls)
     return path
@@ -66,10 +66,10 @@ def identified(folder, served, late: float):
     found = world().hits("player3", folder, folder, "x")
     identification.write_hits(folder / "hits", found.balls, found.joints)
     logs = [served, *(folder / "hits" / file for file in ROBOT_FILES)]
-    believed, before = ModelFile(SimModel()), identification.prior(PRIOR, "prior")
+    believed, before = ModelFile(SimModel()), identification.read_prior(PRIOR, "prior")
     made = identification.identify(logs, 400, believed, before, [folder / "hits"])
     assert 0.6 * hit < made.hits <= hit + 1  # of balls that were hit nearly all are used, and no others
-    return {row["parameter"]: row for row in estimates(made.world) if row["decided by"] == LOGS}
+    return {row["parameter"]: row for row in list_estimates(made.world) if row["decided by"] == LOGS}
 
 
 @pytest.mark.slow
@@ -93,9 +93,9 @@ def test_sessions_of_the_emulated_robot_show_by_how_much_it_obeys_later(tmp_path
 @pytest.mark.slow
 @pytest.mark.optimised
 def test_without_a_log_of_the_joints_the_drives_are_drawn_from_the_prior(served):
-    before = identification.prior(PRIOR, "prior")
+    before = identification.read_prior(PRIOR, "prior")
     made = identification.identify([served], 60, ModelFile(SimModel()), before)
-    rows = {row["parameter"]: row for row in estimates(made.world)}
+    rows = {row["parameter"]: row for row in list_estimates(made.world)}
     assert made.left == {} and rows["drives.joint_2.lag"]["decided by"] == "prior"
     for path in ("drives.joint_2.lag", "latency.abb_action", "latency.abb_observation"):
         assert [rows[path]["low"], rows[path]["high"]] == PRIOR[path]

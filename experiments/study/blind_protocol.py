@@ -10,7 +10,6 @@ the key from being read by chance, and from being changed after the rallies are 
 from __future__ import annotations
 
 import base64
-import binascii
 import codecs
 import csv
 import hashlib
@@ -29,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ballmodel.io.atomic_files import replacing
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, error_context
 from experiments.study.analysis import scoring
 from mjx_tt.rally.end_reasons import ROWS, End
 
@@ -47,7 +46,7 @@ _WHOLE = re.compile("[0-9]{1,9}")
 # The bijection and its seal
 
 
-def codes(count: int) -> tuple[str, ...]:
+def list_codes(count: int) -> tuple[str, ...]:
     """A, B, ... Z, AA, AB, ... in the order of testing."""
     lengths = (map("".join, itertools.product(string.ascii_uppercase, repeat=n)) for n in itertools.count(1))
     return tuple(itertools.islice(itertools.chain.from_iterable(lengths), count))
@@ -62,7 +61,9 @@ def draw(models: Iterable[str], rng: np.random.Generator) -> dict[str, str]:
     models = list(models)
     if len(set(models)) < len(models):
         raise ValueError(f"each model once, got {', '.join(models)}")
-    return {models[k]: code for code, k in zip(codes(len(models)), rng.permutation(len(models)).tolist(), strict=True)}
+    return {
+        models[k]: code for code, k in zip(list_codes(len(models)), rng.permutation(len(models)).tolist(), strict=True)
+    }
 
 
 def seal(path: Path, content: Any) -> str:
@@ -84,11 +85,13 @@ def unseal(path: Path) -> Any:
     try:
         sealed = json.loads(Path(path).read_text(encoding="utf-8"))
         plain = zlib.decompress(base64.b64decode(sealed["sealed"], validate=True))
-        if hashlib.sha256(plain).hexdigest() != sealed["sha256"]:
-            raise ConfigError(f"{path}: its content is not what its hash commits to: it was changed after sealing")
-        return json.loads(plain)["content"]
-    except (ValueError, KeyError, TypeError, zlib.error, binascii.Error) as error:
+        genuine = hashlib.sha256(plain).hexdigest() == sealed["sha256"]
+        content = json.loads(plain)["content"] if genuine else None
+    except (ValueError, KeyError, TypeError, zlib.error) as error:
         raise ConfigError(f"{path}: no sealed file: {error}") from None
+    if not genuine:
+        raise ConfigError(f"{path}: its content is not what its hash commits to: it was changed after sealing")
+    return content
 
 
 # The protocol for people
@@ -157,7 +160,7 @@ def make(
         "evaluator": evaluator,
         "seed": seed,
     }
-    blank_sheet(folder / SHEET, tuple(key.values()))
+    write_blank_sheet(folder / SHEET, tuple(key.values()))
     seal(folder / KEY, content)
     begun.unlink()
     return tuple(key.values())
@@ -193,31 +196,24 @@ def _copy(policy: Artefact, folder: Path) -> str:
     return artefact.load(folder).digest
 
 
-def blank_sheet(path: Path, tested: tuple[str, ...], rallies: int = scoring.POOL + SPARE) -> None:
-    """A scoring sheet: the table of ends as comments, then a line for every rally."""
+INSTRUCTIONS = (
+    "One line a rally, in the order of play. length: paddle touches of human and robot together, the human's first",
+    "hit is 1; 0 only where a rally is not counted. end: number of the row that says how the rally ended.",
+    "Lines with neither length nor end are left out.",
+)
+
+
+def write_blank_sheet(path: Path, tested: tuple[str, ...], rallies: int = scoring.POOL + SPARE) -> None:
+    """A scoring sheet: as comments the instructions and the paper's table of ends (Rally score evaluation and
+    end-of-rally attribution), then a line for every rally."""
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        for line in instructions():
-            file.write(f"# {line}\n")
+        file.writelines(f"# {line}\n" for line in INSTRUCTIONS)
+        for number, (_, description, ended, filtered) in enumerate(ROWS, 1):
+            who = {True: "the robot ended it", False: "the human ended it", None: "open"}[ended]
+            file.write(f"# {number:>2}  {description} [{'not counted' if filtered else who}]\n")
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(SHEET_COLUMNS)
         writer.writerows((code, rally, "", "") for code in tested for rally in range(1, rallies + 1))
-
-
-def instructions() -> list[str]:
-    """Instructions on a sheet, with the paper's table (Rally score evaluation and end-of-rally attribution)."""
-    lines = [
-        "One line a rally, in the order of play. length: paddle touches of human and robot together, the human's first",
-        "hit is 1; 0 only where a rally is not counted. end: number of the row that says how the rally ended.",
-        "Lines with neither length nor end are left out.",
-    ]
-    for number, (_, description, ended, filtered) in enumerate(ROWS, 1):
-        who = (
-            "not counted"
-            if filtered
-            else {True: "the robot ended it", False: "the human ended it", None: "open"}[ended]
-        )
-        lines.append(f"{number:>2}  {description} [{who}]")
-    return lines
 
 
 def read_sheet(path: Path) -> dict[str, list[Played]]:
@@ -225,61 +221,62 @@ def read_sheet(path: Path) -> dict[str, list[Played]]:
 
     Cells may be separated by commas, semicolons or tabs: what a spreadsheet writes depends on its country.
     """
-    played: dict[str, list[Played]] = {}
     content = Path(path).read_bytes()
     encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     try:
         lines = content.decode(encoding).splitlines()
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not readable as UTF-8: {error}") from None
-    filled = [
-        (n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith(("#", '"#'))
-    ]
+    filled = [(n, x) for n, x in enumerate(lines, 1) if x.strip() and not x.lstrip().startswith(("#", '"#'))]
     head = filled[0][1] if filled else ""
     separator = next((s for s in SEPARATORS if tuple(_cells(head, s)[:4]) == SHEET_COLUMNS), None)
     if separator is None:
         raise ConfigError(f"{path}: the first line must be {','.join(SHEET_COLUMNS)}, got {head.strip()}")
+    played: dict[str, list[Played]] = {}
     for number, line in filled[1:]:
-        cells = _cells(line, separator)
-        code, rally, length, end = (cells + [""] * 4)[:4]
-        where = f"{path}: line {number}"
-        if not any(cells):
+        code, rally, length, end = (_cells(line, separator) + [""] * 4)[:4]
+        if not any((code, rally, length, end)):
             continue
         rallies = played.setdefault(code, [])
         if not length and not end:
             continue
-        if not _WHOLE.fullmatch(rally) or not _WHOLE.fullmatch(length):
-            raise ConfigError(f"{where}: rally and length are whole numbers, got {rally!r} and {length!r}")
-        if any(p.rally == int(rally) for p in rallies):
-            raise ConfigError(f"{where}: rally {rally} of {code} is there twice")
-        try:
-            rallies.append(Played(int(rally), int(length), scoring.end_of(end)))
-        except ValueError as error:
-            raise ConfigError(f"{where}: end: {error}") from None
-        if not rallies[-1].length and rallies[-1].end not in scoring.FILTERED:
-            raise ConfigError(f"{where}: length 0: the human's first hit is 1, and a rally with end {end} counts")
+        with error_context(f"{path}: line {number}"):
+            one = _parse_rally(rally, length, end)
+            if any(p.rally == one.rally for p in rallies):
+                raise ValueError(f"rally {rally} of {code} is there twice")
+            rallies.append(one)
     return {code: sorted(rallies, key=lambda p: p.rally) for code, rallies in played.items()}
+
+
+def _parse_rally(rally: str, length: str, end: str) -> Played:
+    """A line of the sheet. Raises ValueError."""
+    if not _WHOLE.fullmatch(rally) or not _WHOLE.fullmatch(length):
+        raise ValueError(f"rally and length are whole numbers, got {rally!r} and {length!r}")
+    try:
+        played = Played(int(rally), int(length), scoring.parse_end(end))
+    except ValueError as error:
+        raise ValueError(f"end: {error}") from None
+    if not played.length and played.end not in scoring.FILTERED:
+        raise ValueError(f"length 0: the human's first hit is 1, and a rally with end {end} counts")
+    return played
 
 
 def _cells(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
 
 
-def progress(folder: Path) -> list[Progress]:
+def count_progress(folder: Path) -> list[Progress]:
     """Progress of the sheet, code by code; writes a blank one where there is none."""
     folder = Path(folder)
     tested = tuple(unseal(folder / KEY)["codes"].values())
     if not (folder / SHEET).exists():
-        blank_sheet(folder / SHEET, tested)
+        write_blank_sheet(folder / SHEET, tested)
     sheet = read_sheet(folder / SHEET)
     unknown = sorted(set(sheet) - set(tested))
     if unknown:
         raise ConfigError(f"{folder / SHEET}: code {', '.join(unknown)} is unknown; there are {', '.join(tested)}")
-    out = []
-    for code in tested:
-        played = sheet.get(code, [])
-        out.append(Progress(code, len(played), sum(p.end not in scoring.FILTERED for p in played)))
-    return out
+    rallies = {code: sheet.get(code, []) for code in tested}
+    return [Progress(code, len(p), sum(x.end not in scoring.FILTERED for x in p)) for code, p in rallies.items()]
 
 
 def open_key(folder: Path) -> scoring.Rallies:
@@ -292,7 +289,7 @@ def open_key(folder: Path) -> scoring.Rallies:
 
     folder = Path(folder)
     key = unseal(folder / KEY)
-    open_ones = [p for p in progress(folder) if not p.complete]
+    open_ones = [p for p in count_progress(folder) if not p.complete]
     if open_ones:
         missing = ", ".join(f"{p.code} has {p.counted}" for p in open_ones)
         raise ConfigError(
@@ -303,7 +300,7 @@ def open_key(folder: Path) -> scoring.Rallies:
         if artefact.load(folder / POLICIES / code).digest != key["digests"][model]:
             raise ConfigError(f"{folder / POLICIES / code}: is not the policy that was sealed under this code")
         rally, length, end = (np.array(column, int) for column in zip(*map(astuple, sheet[code]), strict=True))
-        one = scoring.scored(key["seed"], key["trainer"], key["evaluator"], model, code, length, end)
+        one = scoring.score_rallies(key["seed"], key["trainer"], key["evaluator"], model, code, length, end)
         parts.append(replace(one, rally=rally))
     rallies = scoring.join(parts)
     scoring.write(folder / EVALUATIONS, rallies)

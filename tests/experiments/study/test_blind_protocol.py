@@ -13,8 +13,8 @@ from scipy.stats import chisquare
 
 from experiments import cli
 from experiments.errors import ConfigError
+from experiments.study import blind_protocol
 from experiments.study.analysis import scoring
-from experiments.study.blind import protocol
 from robot_io.policy import artefact, export
 from robot_io.policy.policy import Policy
 
@@ -25,32 +25,34 @@ def test_codes_are_one_to_one_and_the_order_is_random():
     rng = np.random.default_rng(0)
     places = np.zeros((4, 4), int)
     for _ in range(2000):
-        key = protocol.draw("abcd", rng)
+        key = blind_protocol.draw("abcd", rng)
         assert list(key.values()) == ["A", "B", "C", "D"] and set(key) == set("abcd")
         for place, model in enumerate(key):
             places["abcd".index(model), place] += 1
     assert chisquare(places.ravel()).pvalue > 1e-3
-    assert protocol.codes(28)[-3:] == ("Z", "AA", "AB")
+    assert blind_protocol.list_codes(28)[-3:] == ("Z", "AA", "AB")
     with pytest.raises(ValueError, match="each model once"):
-        protocol.draw(["a", "a"], rng)
+        blind_protocol.draw(["a", "a"], rng)
 
 
 def test_a_sealed_file_does_not_show_and_cannot_be_changed(tmp_path):
     path = tmp_path / "key.sealed"
     content = {"codes": {"is2r-ft100": "A"}, "number": 0.1}
-    digest = protocol.seal(path, content)
+    digest = blind_protocol.seal(path, content)
     text = path.read_text()
     assert "is2r" not in text and "codes" not in text and digest in text
-    assert protocol.unseal(path) == content
-    assert protocol.seal(tmp_path / "again", content) != digest  # the hash alone does not tell the content by trying
+    assert blind_protocol.unseal(path) == content
+    assert (
+        blind_protocol.seal(tmp_path / "again", content) != digest
+    )  # the hash alone does not tell the content by trying
     sealed = json.loads(text)
     plain = zlib.decompress(base64.b64decode(sealed["sealed"])).replace(b"ft100", b"ft065")
     path.write_text(json.dumps(sealed | {"sealed": base64.b64encode(zlib.compress(plain)).decode()}))
     with pytest.raises(ConfigError, match="changed after sealing"):
-        protocol.unseal(path)
+        blind_protocol.unseal(path)
     path.write_text("{}")
     with pytest.raises(ConfigError, match="no sealed file"):
-        protocol.unseal(path)
+        blind_protocol.unseal(path)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +97,7 @@ def test_people_evaluate_without_knowing_what(tmp_path, artefacts, capsys):
     lengths = {code: rng.integers(2, 40, 70) for code in "ABC"}
     late = {("B", rally) for rally in range(40, 71)}
     fill(folder / "sheet.csv", lengths, late)
-    assert [(p.code, p.counted, p.complete) for p in protocol.progress(folder)] == [
+    assert [(p.code, p.counted, p.complete) for p in blind_protocol.count_progress(folder)] == [
         ("A", 70, True),
         ("B", 39, False),
         ("C", 70, True),
@@ -130,23 +132,23 @@ def test_a_start_that_was_cut_off_begins_anew(tmp_path, artefacts, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(protocol, "seal", killed)  # the policies are copied, the key is not yet there
-        protocol.make(folder, policies, "anna", "anna")
+        patch.setattr(blind_protocol, "seal", killed)  # the policies are copied, the key is not yet there
+        blind_protocol.make(folder, policies, "anna", "anna")
     assert (folder / "policies" / "A").exists() and not (folder / "key.sealed").exists()
-    assert protocol.make(folder, policies, "anna", "anna") == ("A", "B")
+    assert blind_protocol.make(folder, policies, "anna", "anna") == ("A", "B")
     assert sorted(path.name for path in folder.iterdir()) == ["key.sealed", "policies", "sheet.csv"]
 
 
 def test_a_swapped_policy_is_found(tmp_path, artefacts):
     folder = tmp_path / "blind"
     folder.mkdir()
-    protocol.make(folder, {model: artefacts / model for model in MODELS[:2]}, "anna", "anna")
+    blind_protocol.make(folder, {model: artefacts / model for model in MODELS[:2]}, "anna", "anna")
     fill(folder / "sheet.csv", {code: np.full(70, 4) for code in "AB"})
     (folder / "policies" / "A").rename(folder / "policies" / "swap")
     (folder / "policies" / "B").rename(folder / "policies" / "A")
     (folder / "policies" / "swap").rename(folder / "policies" / "B")
     with pytest.raises(ConfigError, match="not the policy that was sealed"):
-        protocol.open_key(folder)
+        blind_protocol.open_key(folder)
 
 
 @pytest.mark.parametrize(
@@ -160,19 +162,19 @@ def test_a_swapped_policy_is_found(tmp_path, artefacts):
 def test_a_bad_line_of_a_sheet_is_named(tmp_path, line, says):
     (tmp_path / "sheet.csv").write_text("code,rally,length,end\n" + line + "\n")
     with pytest.raises(ConfigError, match=f"sheet.csv: line .*{says}"):
-        protocol.read_sheet(tmp_path / "sheet.csv")
+        blind_protocol.read_sheet(tmp_path / "sheet.csv")
 
 
 def test_a_folder_without_a_policy_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="mjx-tt export"):
-        protocol.make(tmp_path / "b", {"m": tmp_path, "n": tmp_path}, "a", "a")
+        blind_protocol.make(tmp_path / "b", {"m": tmp_path, "n": tmp_path}, "a", "a")
     assert not (tmp_path / "b").exists()
 
 
 def test_a_copy_does_not_say_which_model_it_is(tmp_path, artefacts):
     folder = tmp_path / "blind"
-    protocol.make(folder, {model: artefacts / model for model in MODELS}, "anna", "anna")
-    key = protocol.unseal(folder / "key.sealed")
+    blind_protocol.make(folder, {model: artefacts / model for model in MODELS}, "anna", "anna")
+    key = blind_protocol.unseal(folder / "key.sealed")
     for model, code in key["codes"].items():
         copy = folder / "policies" / code
         for path in copy.iterdir():
@@ -194,7 +196,7 @@ def test_one_policy_under_two_names_is_refused(tmp_path, artefacts, capsys):
         assert cli.main(["blind", "make", str(tmp_path / "b"), f"a={first}", f"b={other}", "--trainer", "player3"]) == 1
         assert "a and b: are the same policy" in capsys.readouterr().err
     assert not (tmp_path / "b" / "policies").exists()
-    assert protocol.make(tmp_path / "b", {"a": first, "b": first}, "player3", "player3", twice=True) == ("A", "B")
+    assert blind_protocol.make(tmp_path / "b", {"a": first, "b": first}, "player3", "player3", twice=True) == ("A", "B")
 
 
 def test_a_blind_evaluation_needs_a_trainer(tmp_path, artefacts, capsys):
@@ -206,18 +208,18 @@ def test_a_blind_evaluation_needs_a_trainer(tmp_path, artefacts, capsys):
 @pytest.mark.parametrize("separator, encoding", [(";", "utf-8-sig"), ("\t", "utf-16"), (",", "utf-8"), (";", "cp1252")])
 def test_a_sheet_is_read_as_spreadsheets_save_it(tmp_path, separator, encoding):
     path = tmp_path / "sheet.csv"
-    protocol.blank_sheet(path, ("A", "B"), 3)
+    blind_protocol.write_blank_sheet(path, ("A", "B"), 3)
     lines = [line if line.startswith("#") else line.replace(",", separator) for line in path.read_text().splitlines()]
     lines = [line.replace(f"A{separator}2{separator * 2}", f"A{separator}2{separator}5{separator}13") for line in lines]
     lines = [f'"{line}"{separator * 3}' if line.startswith("#") else line for line in lines] + [separator * 3]
     path.write_bytes("\r\n".join(lines).encode(encoding))
-    assert protocol.read_sheet(path) == {"A": [protocol.Played(2, 5, scoring.End.ROBOT_MISSED)], "B": []}
+    assert blind_protocol.read_sheet(path) == {"A": [blind_protocol.Played(2, 5, scoring.End.ROBOT_MISSED)], "B": []}
 
 
 def test_a_rally_that_counts_has_a_touch(tmp_path):
     path = tmp_path / "sheet.csv"
     path.write_text("code,rally,length,end\nA,1,0,14\nA,2,0,1\n")  # a dummy ball by hand; not counted
-    assert [p.length for p in protocol.read_sheet(path)["A"]] == [0, 0]
+    assert [p.length for p in blind_protocol.read_sheet(path)["A"]] == [0, 0]
     path.write_text("code,rally,length,end\nA,1,0,13\n")
     with pytest.raises(ConfigError, match="line 2: length 0: the human's first hit is 1"):
-        protocol.read_sheet(path)
+        blind_protocol.read_sheet(path)

@@ -1,15 +1,19 @@
-"""Fine-tuning, seed selection and rallies in a virtual reality, with a virtual player on the other side of the net.
+"""A virtual reality: fine-tuning, choice among seeds, rallies and logs with a virtual player across the net.
 
-The settings are those of fine-tuning on a robot (``experiments.config.finetuning``): an update's balls are the lanes of
+The settings are those of fine-tuning on a robot (``experiments.config.finetuning``): an update's balls are parallel
 rallies that go on across updates, as a person keeps playing while the robot tries its perturbations. What comes back is
 what a robot and its cameras would tell: rewards, faults, measured balls.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import zlib
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +22,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import PRNGKeyArray
 
+from ballmodel.io.atomic_files import replacing
 from ballmodel.partial_params import without_nominal
 from ballmodel.trajectory import Dataset, Trajectory
 from bgs import normalizer, strategy
@@ -26,17 +31,27 @@ from bgs.strategy import BGSConfig, BGSInfo, BGSState
 from experiments.config import build
 from experiments.config.study import Study
 from experiments.evaluation import evaluate
-from experiments.study.target_domain import hidden_effects
+from experiments.runs import checkpoint, load_policy, run_dir
+from experiments.runs.load_policy import TrainedPolicy
+from experiments.runs.run_dir import CONFIG, Run
+from experiments.study.analysis import delays
+from experiments.study.target_domain import hidden_effects, hit_log, joint_log
+from experiments.study.target_domain.hit_log import HitLog
 from experiments.training.update import TrainState
+from mjx_tt.diagnosis.joint import JointRecord
 from mjx_tt.env.episode import MISSED, RETURNED
 from mjx_tt.env.policy import Policy
 from mjx_tt.env.task import TaskConfig
 from mjx_tt.rally import human_player
 from mjx_tt.rally.human_player import Player
 from mjx_tt.rally.simulator import RallySimulator, RallyState, ShotResult
+from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 
-SELECTION_LANES = 10  # sessions side by side in which policies are compared
+FAULT = -2.0  # paper: a fault of the robot
+SELECTION_SESSIONS = 10  # side by side in which policies are compared
+STROKES = 512  # from which the spin of a player's strokes is known
+STUDY = 6  # purpose of a key, beside those of experiments.config.build
 
 
 @dataclass(frozen=True)
@@ -104,8 +119,8 @@ class VirtualReality:
         """``updates`` updates from the parameters theta (976,) on, while the player rallies with the robot."""
         ask_key, rally_key, play_key, camera_key = jax.random.split(key, 4)
         config = build.bgs_config(self._settings.optimiser(), updates)
-        lanes = self._settings.episodes_per_update
-        rally = self.simulator.start(player, self.known, rally_key, lanes)
+        sessions = self._settings.episodes_per_update
+        rally = self.simulator.start(player, self.known, rally_key, sessions)
         # Strongly typed as what the updates return, so that the first call and the others are one program.
         state, rally = jax.tree.map(
             lambda x: jax.lax.convert_element_type(x, x.dtype), (strategy.init(jnp.asarray(theta), config), rally)
@@ -131,7 +146,7 @@ class VirtualReality:
 
     def score(self, player: Player, policy: Policy, balls: int, key: PRNGKeyArray) -> float:
         """The paper's sparse reward by which a seed is chosen, over at least ``balls`` balls with the player."""
-        turns = -(-balls // SELECTION_LANES)
+        turns = -(-balls // SELECTION_SESSIONS)
         outcome, fault = self._compared(policy, player, self.known, key, turns=turns)
         return evaluate.sparse_reward(np.asarray(outcome), np.asarray(fault))
 
@@ -147,15 +162,15 @@ class VirtualReality:
         config: BGSConfig,
     ) -> tuple[BGSState, RallyState, tuple[ShotResult, BGSInfo]]:
         """``_chunk`` updates: state and rally after them, and each one's (ShotResult, BGSInfo)."""
-        settings, lanes = self._settings, self._settings.episodes_per_update
-        frozen = [_per_lane(x, lanes) for x in normalizer.normaliser(statistics)]
+        settings, sessions = self._settings, self._settings.episodes_per_update
+        frozen = [_repeat_per_session(x, sessions) for x in normalizer.normaliser(statistics)]
 
         def update(
             carry: tuple[BGSState, RallyState], _: None
         ) -> tuple[tuple[BGSState, RallyState], tuple[ShotResult, BGSInfo]]:
             state, rally = carry
             population = strategy.ask(jax.random.fold_in(key, state.updates), state, config)
-            theta = jnp.repeat(population.members, settings.repeats, axis=1)  # the lanes of a member side by side
+            theta = jnp.repeat(population.members, settings.repeats, axis=1)  # the sessions of a member side by side
             shot_key = jax.random.fold_in(play_key, state.updates)
             rally, shots = self.simulator.shots(Policy(theta, *frozen), player, model, rally, shot_key)
             returns = self._returns(shots).reshape(2 * settings.num_directions, settings.repeats).mean(axis=1)
@@ -173,15 +188,15 @@ class VirtualReality:
     def _shots_of(
         self, policy: Policy, player: Player, model: SimModel, key: PRNGKeyArray, turns: int
     ) -> tuple[Array, Array]:
-        """Outcomes and faults (turns, SELECTION_LANES) of one policy."""
-        policy = jax.tree.map(lambda x: _per_lane(x, SELECTION_LANES), policy)
+        """Outcomes and faults (turns, SELECTION_SESSIONS) of one policy."""
+        policy = jax.tree.map(lambda x: _repeat_per_session(x, SELECTION_SESSIONS), policy)
         start_key, play_key = jax.random.split(key)
 
         def shoot(rally: RallyState, turn: Array) -> tuple[RallyState, tuple[Array, Array]]:
             rally, shots = self.simulator.shots(policy, player, model, rally, jax.random.fold_in(play_key, turn))
             return rally, (shots.outcome, shots.fault | ~shots.finite)
 
-        rally = self.simulator.start(player, model, start_key, SELECTION_LANES)
+        rally = self.simulator.start(player, model, start_key, SELECTION_SESSIONS)
         return jax.lax.scan(shoot, rally, jnp.arange(turns))[1]
 
     def _row(self, shots: ShotResult) -> dict[str, float]:
@@ -195,6 +210,74 @@ class VirtualReality:
         }
 
 
-def _per_lane(x: Array, lanes: int) -> Array:
-    """One column for each of the lanes: (n,) -> (n, L)."""
-    return jnp.broadcast_to(x[:, None], (x.shape[0], lanes))
+def add_spin(reality: VirtualReality, player: str, key: PRNGKeyArray) -> SimModel:
+    """The reality's model with mean and spread of the spin of a player's strokes."""
+    state = reality.simulator.start(reality.player(player), reality.known, key, STROKES)
+    spin = np.asarray(state.ball.spin)
+    mean, std = (
+        {f"ball_spin.{kind}_{axis}": float(x) for axis, x in zip("xyz", values, strict=True)}
+        for kind, values in (("mean", spin.mean(axis=1)), ("std", spin.std(axis=1)))
+    )
+    return models.with_values(reality.model, mean | std)
+
+
+class VirtualWorld:
+    """A seed's reality for the loop, as ``RobotWorld``; all chance follows from ``name``, that of a step."""
+
+    def __init__(self, study: Study, seed: int, reality: VirtualReality) -> None:
+        self._study, self._seed, self.reality = study, seed, reality.at(seed)
+
+    def _key(self, name: str) -> PRNGKeyArray:
+        return jax.random.fold_in(build.key(self._seed, STUDY), zlib.crc32(name.encode()) >> 1)
+
+    def first_balls(self, player: str, name: str) -> Dataset:
+        """The player's balls across the table, without a robot."""
+        return self.reality.first_balls(
+            self.reality.player(player), self._study.first_balls, self._key(name), Path(name).name
+        )
+
+    def add_spin(self, player: str, name: str) -> SimModel:
+        """The reality as a training could have it at best: with mean and spread of the spin of the player's strokes."""
+        return add_spin(self.reality, player, self._key(name))
+
+    def joint_log(self, seconds: float, name: str) -> tuple[JointRecord, ...]:
+        """Commands and measured positions of all joints in so many seconds of motion without a ball."""
+        return joint_log.record(self.reality.simulator.task, self.reality.known, self._key(name), seconds)
+
+    def hits(self, player: str, source: Path, folder: Path, name: str) -> HitLog:
+        """Balls of rallies with the policy of the run ``source``."""
+        reality, policy = self.reality, load_policy.load(source).policy
+        person, noise = reality.player(player), self._study.reality.camera_noise
+        late = models.paths(build.believed(self._study.simulation.model).model)[delays.BALL]
+        return hit_log.record(reality.simulator, reality.known, person, policy, self._key(name), name, noise, late)
+
+    def fine_tune(self, player: str, source: Path, real_updates: int, folder: Path, name: str) -> tuple[Dataset, str]:
+        """Fine-tunes the policy of the run ``source`` into the run ``folder``; the player's hits and a sentence."""
+        theta, statistics = load_policy.load_statistics(source)
+        person = self.reality.player(player)
+        cycle = self.reality.fine_tune(person, theta, statistics, real_updates, self._key(name), folder.name)
+        run = Run(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        config = Run(source).config().model_copy(update={"name": folder.name, "initial_policy": str(source.resolve())})
+        run_dir.write_yaml(folder / CONFIG, config.to_dict())
+        with replacing(run.metrics) as temporary:
+            temporary.write_text("".join(f"{json.dumps(row)}\n" for row in cycle.rows), encoding="utf-8")
+        checkpoint.save(run.checkpoints, real_updates, cycle.state, {"seconds": 0.0})
+        tenth = max(1, real_updates // 10)
+        first, last = (
+            sum(r["return_rate"] for r in part) / tenth for part in (cycle.rows[:tenth], cycle.rows[-tenth:])
+        )
+        text = f"{real_updates} updates, {len(cycle.balls):,} balls, returned {first:.0%} at first, {last:.0%} at last"
+        return Dataset(cycle.balls, name), text
+
+    def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
+        """Function that scores a policy with the player; None where scores are not needed."""
+        if self._study.simulation.seeds == 1:
+            return None
+        person, balls, key = self.reality.player(player), self._study.simulation.selection_episodes, self._key(name)
+        return lambda p: self.reality.score(person, p.policy, balls, key)
+
+
+def _repeat_per_session(x: Array, sessions: int) -> Array:
+    """One column for each of the sessions: (n,) -> (n, L)."""
+    return jnp.broadcast_to(x[:, None], (x.shape[0], sessions))
