@@ -75,7 +75,7 @@ class AxisEmulator:
         """Moves on to ``now`` [s], the plant being at ``position`` [m] with ``velocity`` [m/s]; its new one [m/s]."""
         with self._lock:
             drive = self.drive
-            drive.measure(position)
+            drive.measure(position, velocity)
             while self._arrived:  # since the last step: later than in truth by less than a step, never earlier
                 self._queue.append((now + self._dead_time, self._arrived.popleft()))
                 self._written = now

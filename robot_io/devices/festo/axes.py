@@ -2,8 +2,11 @@
 
 The drives position: each cycle they get a target and a highest speed (``robot_io.devices.festo.following``). When the
 computer dies in mid-motion they stop by themselves: at the last target, at most ``lead`` seconds and a braking
-distance away, or
-when their node guards fire.
+distance away, or when their node guards fire.
+
+Without commands to follow, each axis brakes until it is measured to stand, and is then held at that very place. A drive
+whose task is only dropped may keep a set-point far ahead of an axis that is blocked: it goes on pushing, and the axis
+jumps there as soon as it is free.
 """
 
 from __future__ import annotations
@@ -21,6 +24,12 @@ from robot_io.devices.festo.modbus_link import AxisLost
 from robot_io.devices.festo.profile import AxisCommand, AxisStatus
 
 DEFAULTS = AxesConfig()
+STANDING_TIME, STANDING_WAY = 0.06, 1e-3  # [s], [m]: an axis that moved less than that in this time stands
+# [m/s] at which a drive takes its set-point back to an axis that stands: 0.4 m in less than a second.
+BACK = 0.5
+SETTLING, AT_REST = 0.3, 0.1  # [s] after which an axis that was told to rest must be within this share of max_error
+FASTEST = 1.5  # times the highest speed: a position that came faster is not believed
+JITTER = 0.035  # [s] by which the time between two measurements may differ from that between two cycles
 
 
 class _Channel:
@@ -38,10 +47,28 @@ class _Channel:
         self.on = False  # shall be enabled
         self.was_enabled = False
         self.homing = False  # shall be homed
+        self.jumped = False  # its position, as no axis can; until somebody switches it on again
+        self.held: float | None = None  # where it is held; None while it moves, brakes or is not known
+        self._past: deque[tuple[float, float]] = deque()  # times and positions of the last STANDING_TIME
 
-    def answered(self, status: AxisStatus, now: float) -> None:
-        self.status, self.received = status, now
-        self.position = self.axis.zero + self.axis.direction * status.position
+    def answered(self, status: AxisStatus, now: float, speed: float) -> None:
+        """Take an answer of an axis whose highest speed is ``speed`` [m/s]."""
+        position, homed = self.axis.zero + self.axis.direction * status.position, self.status and self.status.homed
+        reach = FASTEST * speed * (now - self.received + JITTER)
+        self.jumped |= bool(homed and status.homed) and abs(position - self.position) > reach
+        self.status, self.received, self.position = status, now, position
+        self._past.append((now, position))
+        while len(self._past) > 1 and self._past[1][0] <= now - STANDING_TIME:
+            self._past.popleft()
+
+    def hold(self, now: float) -> None:
+        """Note where to hold an axis that follows no commands: where it is measured, once it stands."""
+        positions = [position for _, position in self._past]
+        stands = bool(positions) and self._past[0][0] <= now - STANDING_TIME and np.ptp(positions) <= STANDING_WAY
+        if self.status is None or not self.status.homed or self.homing or self.jumped:
+            self.held = None
+        elif stands and (self.held is None or abs(self.position - self.held) > STANDING_WAY):
+            self.held = self.position
 
 
 class FestoAxes:
@@ -69,6 +96,7 @@ class FestoAxes:
         self._requests: deque[str] = deque()
         self._moving = False
         self._reference = Reference(self.config.latency)
+        self._resting_since = math.inf  # [s] of the commands
         self._deadlines = dict.fromkeys(("acknowledge", "enable", "home"), math.inf)
         self._acknowledging = False
         self._sequence = 0
@@ -209,7 +237,7 @@ class FestoAxes:
                 elif request == "stop":
                     channel.homing = False
                 elif request == "enable":
-                    channel.on = True
+                    channel.on, channel.jumped = True, False
                 elif request == "home":
                     channel.homing = channel.status is None or not channel.status.homed
             if request in ("enable", "home"):
@@ -258,17 +286,21 @@ class FestoAxes:
             return False
         if not self._moving:
             self._reference.restart()
+            self._resting_since = math.inf
         return True
 
     def _commands(self, now: float) -> list[AxisCommand]:
         target = self._target
         moves = self._moves(target, now) if self._moving and target is not None else []
-        if not moves:
-            moves = [Move(c.position if c.status else 0.0, 0.0, 0.0) for c in self._channels]
-        self.commanded = np.array([m.velocity for m in moves])
+        self.commanded = np.array([m.velocity for m in moves]) if moves else np.zeros(len(self._channels))
         commands = []
-        for channel, wanted in zip(self._channels, moves, strict=True):
+        for i, channel in enumerate(self._channels):
             status, axis, healthy = channel.status, channel.axis, self.fault is None
+            if moves:
+                channel.held, wanted = None, moves[i]
+            else:
+                channel.hold(now)
+                wanted = Move(channel.position if channel.held is None else channel.held, BACK, 0.0)
             # Only what would stop by itself when the computer dies gets power, and none while a fault is latched.
             may_be_on = channel.on and channel.configured and status and not status.fault
             commands.append(
@@ -277,7 +309,7 @@ class FestoAxes:
                     # Pulsed: a drive that is still braking takes no notice of the edge.
                     acknowledge=bool(self._acknowledging and status and status.fault and self._sequence // 8 % 2),
                     home=bool(channel.homing and may_be_on and status and status.enabled and healthy),
-                    move=self._moving,
+                    move=bool(moves or (channel.held is not None and may_be_on and status and status.enabled)),
                     position=(wanted.position - axis.zero) * axis.direction,
                     speed=wanted.speed,
                     acceleration=self.config.acceleration,
@@ -290,15 +322,17 @@ class FestoAxes:
         """Each axis's move; none, and a fault, when one is too far off its reference."""
         cfg, reference = self.config, target.at(now)
         self._reference.add(now, reference)
+        self._resting_since = math.inf if any(target.velocity) else min(self._resting_since, now)
+        allowed = cfg.max_error * (AT_REST if now - self._resting_since > cfg.latency + SETTLING else 1.0)
         moves = []
         for i, channel in enumerate(self._channels):
             axis = channel.axis
             error = self._reference.at(channel.received)[i] - channel.position
-            if abs(error) > cfg.max_error:
+            if abs(error) > allowed:
                 self._moving = False
                 self._latch(
                     "following_error",
-                    f"{axis.name} is {abs(error):.3f} m from where it was commanded, allowed are {cfg.max_error} m: "
+                    f"{axis.name} is {abs(error):.3f} m from where it was commanded, allowed are {allowed:g} m: "
                     "is it blocked, or did the commands not start from its position?",
                 )
                 return []
@@ -326,7 +360,7 @@ class FestoAxes:
         except ValueError as error:
             self._latch("bad_answer", f"{axis.name}: {error}.")
             return
-        channel.answered(status, now)
+        channel.answered(status, now, self.config.speed)
         if status.fault and not self._acknowledging:
             self._latch(
                 "drive_fault",

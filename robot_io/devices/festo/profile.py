@@ -18,7 +18,8 @@ class AxisCommand:
     enable        power the drive; without, the drive ramps to a stop and switches off
     acknowledge   a rising edge clears a fault
     home          a rising edge starts homing, held until the axis is homed
-    move          go to ``position`` at up to ``speed``; without, the drive brakes, drops the task and holds
+    move          go to ``position`` at up to ``speed``; without, the drive brakes, drops the task and holds: its own
+                  set-point or the place where it is measured, as the make has it
     position      target [m]
     speed         highest speed on the way [m/s], not negative
     acceleration  of speeding up and braking [m/s^2]

@@ -25,7 +25,7 @@ from robot_io.devices.festo import (
     ModbusLink,
 )
 from robot_io.emulator.axes import AxisEmulator, DriveParams, serve
-from tests.support.axes_lockstep import CYCLE, PROFILES, LockStep, Stream
+from tests.support.axes_lockstep import CYCLE, PROFILES, STEP, LockStep, Stream
 from tests.support.paths import ROOT
 
 A = 15.0  # [m/s^2]
@@ -345,7 +345,9 @@ def test_a_lost_axis_stops_both(profile):
 
 @pytest.mark.parametrize("lost", [0, 1])
 def test_losing_either_axis_stops_the_other_in_the_same_cycle(lost):
-    rig, stream = moving()
+    rig = LockStep(start=(-0.6, -0.4)).start()
+    stream = Stream(rig, lambda t: np.full(2, min(15.0 * t, 0.5)))
+    rig.run(0.4, stream)
     other = rig.emulators[1 - lost]
     rig.emulators[lost].disconnect()
     stream(rig.now)
@@ -439,13 +441,68 @@ def test_commands_that_do_not_start_where_the_axis_is():
     np.testing.assert_allclose(rig.position, before, atol=1e-5)
 
 
-def test_a_blocked_axis():
-    rig, stream = moving()
-    held = rig.position[0]
-    for _ in range(300):
-        rig.position[0] = held
-        rig.run(0.001, stream)
-    assert rig.axes.fault is not None and rig.axes.fault.cause in ("following_error", "drive_fault")
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("holds_measured", [False, True])
+@pytest.mark.parametrize("end", ["fault", "stop", "silence"])
+def test_a_blocked_axis_is_neither_pushed_nor_jumps_when_it_is_free(profile, holds_measured, end):
+    """Whatever ended the commands and wherever its drive leaves the set-point of a dropped task."""
+    rig, stream = moving(profile, params=DriveParams(following_error=1.0, holds_measured=holds_measured))
+    wall = rig.position[0]
+
+    def against_the_wall(seconds, each=None):
+        for _ in range(round(seconds / STEP)):
+            rig.run(STEP, each)
+            if rig.position[0] > wall:
+                rig.position[0], rig.velocity[0] = wall, 0.0
+
+    against_the_wall(1.0 if end == "fault" else 0.15, stream)
+    assert (rig.axes.fault is not None) == (end == "fault")
+    assert end != "fault" or rig.axes.fault.cause == "following_error"
+    if end == "stop":
+        rig.axes.stop()
+    against_the_wall(1.0)
+    assert rig.emulators[0].drive.operating and rig.emulators[0].drive.x - wall < 0.002
+    assert abs(rig.emulators[0].drive.set_point()) < 0.04
+    free = len(rig.log)
+    rig.run(1.0)
+    assert np.abs(rig.trace[free:, 1] - wall).max() < 0.002
+    rig.position[0] -= 0.05  # somebody moves it
+    rig.run(1.5)
+    assert np.abs(rig.velocity[0]) < 1e-3
+
+
+def test_an_axis_that_is_kept_from_its_place_at_rest_is_a_fault():
+    """A stiff drive would push there for as long as the robot rests, by less than ``max_error``."""
+    rig, _ = moving(params=DriveParams(following_error=1.0))
+    stream = Stream(rig, lambda t: (0.5 * (t < 0.1), 0.0))
+    wall = rig.position[0] + 0.02
+    for _ in range(1000):
+        rig.run(STEP, stream)
+        if rig.position[0] > wall:
+            rig.position[0], rig.velocity[0] = wall, 0.0
+    assert rig.axes.fault.cause == "following_error" and "allowed are 0.01 m" in rig.axes.fault.sentence
+    free = len(rig.log)
+    rig.run(1.0)
+    assert np.abs(rig.trace[free:, 1] - wall).max() < 0.002
+
+
+def test_an_axis_whose_position_jumped_is_not_led_there():
+    """By 0.3 m between two answers: what is measured then is not where it is."""
+    rig, stream = moving(params=DriveParams(following_error=1.0))
+    link = rig.axes._channels[0].axis.link
+    exchange = link.exchange
+
+    def false(*arguments):
+        registers = exchange(*arguments)
+        count = (registers[5] + (registers[6] << 16) + 300_000) % 2**32
+        return [*registers[:5], count & 0xFFFF, count >> 16, *registers[7:]]
+
+    link.exchange = false
+    rig.run(1.0, stream)
+    assert rig.axes.fault.cause == "following_error" and abs(rig.velocity[0]) < 1e-3
+    stopped = rig.position[0]
+    rig.run(1.0)
+    assert rig.position[0] == pytest.approx(stopped, abs=1e-4)
 
 
 def test_a_drive_that_something_else_switches_off():
