@@ -88,7 +88,8 @@ class Bridge:
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
         self._axes_received = self._last_tick = -math.inf
-        self._motion = Coasting(gate.period, np.array(contract.limits.acceleration))  # as the devices are told it
+        acceleration = np.array(contract.limits.acceleration)
+        self._motion = Coasting(gate.period, gate.config.late, acceleration)  # as the devices are told it
         self._zeros = np.zeros(contract.n_joints)
         self._policy_limit = np.array(contract.limits.policy_velocity)
         speed = (jog.SPEED if config.jog else config.home_speed) * self._policy_limit

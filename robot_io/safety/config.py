@@ -38,7 +38,8 @@ class SafetyConfig:
     following_error  distance (8,) of a measured position from where the reference was between ``delay`` before
     delay            shortest and longest time from a command to the measurement of its effect
     following_ticks  commands in a row after which a following error is a fault
-    late             longest time between two commands
+    late             longest time between two commands: so long the robot may go on with the last one, and that way and
+                     braking after it are proven clear as well; more is a fault
     stale_*          longest age of what was last heard of a device, and of the policy's request; the tracker's is over
                      four frames: more would leave no time to stop within 0.15 s behind the arm's dead time
     """
@@ -56,7 +57,7 @@ class SafetyConfig:
     following_error: tuple[float, ...] = _each(*_FOLLOWING_ERROR)
     delay: tuple[float, float] = (0.0, 0.2)
     following_ticks: int = 3
-    late: float = 0.05
+    late: float = 0.03
     stale_arm: float = 0.05
     stale_axes: float = 0.05
     stale_tracker: float = 0.035
