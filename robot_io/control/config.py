@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import ipaddress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 from robot_io.calibrated import RANGES as CALIBRATION_RANGES
 from robot_io.calibrated import Calibration
 from robot_io.contract import CONTROL_RATE, LIMITS, PAPER, Contract, JointLimits
 from robot_io.control.observation import LONGEST_DELAY, ObservationDelays
 from robot_io.devices.egm.messages import N_ARM_JOINTS
-from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
+from robot_io.devices.festo import AxesConfig, Axis, AxisProfile, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.ranges import check_ranges
 from robot_io.safety.config import SafetyConfig
@@ -19,6 +19,7 @@ PROFILES = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
 ANSWER_TIME = 0.035  # [s] for an axis to answer: less than the age at which its state counts as stale
 SAME_ZERO = 1e-4  # [m] by which the zeros of a linear axis may differ from those of the robot's calibration
 
+UNITS = ("position_unit", "velocity_unit", "base_velocity", "base_acceleration")
 PORT = (1, 65535)
 # Allowed in a robot.yaml: watchdogs, margins and time-outs end where they would no longer protect
 # (docs/concepts/safety.md).
@@ -31,6 +32,10 @@ RANGES = {
     "axes.device_id": (0, 255),
     "axes.zero": (-5.0, 5.0),
     "axes.direction": (-1, 1),
+    "axes.position_unit": (1e-9, 1e-3),
+    "axes.velocity_unit": (1e-7, 0.1),
+    "axes.base_velocity": (0.01, 100.0),
+    "axes.base_acceleration": (0.1, 1000.0),
     "axes_motion.speed": (0.01, 2.0),
     "axes_motion.acceleration": (0.1, 15.0),
     "axes_motion.latency": (0.001, 0.3),
@@ -96,13 +101,32 @@ class ArmConfig:
 
 @dataclass(frozen=True)
 class AxisConfig:
-    """One linear axis. zero [m]: robot's coordinate where the drive reads 0; direction 1 or -1."""
+    """One linear axis.
+
+    zero           [m] robot's coordinate where the drive reads 0; direction 1 or -1
+    combined       write and read by one request, function code 0x17; false: by 0x10 and then 0x03
+    position_unit  [m] of a count in the drive's set-up, and velocity_unit [m/s]; base_velocity [m/s] and
+                   base_acceleration [m/s^2] that its 100 % stand for; None: the profile's. A CMMT's are compared
+    """
 
     host: str = "127.0.0.1"
     port: int = 502
     device_id: int = 1
     zero: float = 0.0
     direction: int = 1
+    combined: bool = True
+    position_unit: float | None = None
+    velocity_unit: float | None = None
+    base_velocity: float | None = None
+    base_acceleration: float | None = None
+
+    def profile(self, name: str) -> AxisProfile:
+        """The profile of a drive with these units. Raises ValueError for a unit that it does not have."""
+        kind = PROFILES[name]
+        given = {key: value for key in UNITS if (value := getattr(self, key)) is not None}
+        for key in given.keys() - {each.name for each in fields(kind)}:
+            raise ValueError(f"axes.{key} is {given[key]}, allowed is no such key: {name} carries no such number")
+        return kind(**given)
 
 
 @dataclass(frozen=True)
@@ -140,6 +164,7 @@ class RobotConfig:
             raise ValueError(f"axis_profile is {self.axis_profile!r}, allowed: {', '.join(PROFILES)}")
         check_ranges(self, RANGES)
         for i, axis in enumerate(self.axes):
+            axis.profile(self.axis_profile)
             if axis.direction not in (-1, 1):
                 raise ValueError(f"axes[{i}].direction is {axis.direction}, allowed are 1 and -1")
         measured, zeros = self.calibration.robot, tuple(axis.zero for axis in self.axes)
@@ -189,6 +214,12 @@ class RobotConfig:
                     f"axes_motion.speed is {speed} m/s, {contract.joints[i]} of {contract.robot} may be asked for "
                     f"{most} m/s: allowed is at least that, up to {RANGES['axes_motion.speed'][1]} m/s"
                 )
+            needed = contract.limits.acceleration[i]
+            if self.axes_motion.acceleration < needed:
+                raise ValueError(
+                    f"axes_motion.acceleration is {self.axes_motion.acceleration} m/s^2, allowed is at least {needed}, "
+                    f"by which the gate brakes {contract.joints[i]}: with less it runs farther than is proven clear"
+                )
             if self.safety.following_error[i] > 0.1:
                 raise ValueError(
                     f"safety.following_error[{i}] is {self.safety.following_error[i]} m, allowed is 0.005 to 0.1"
@@ -213,8 +244,10 @@ def linear_axes(config: RobotConfig, contract: Contract = PAPER) -> FestoAxes:
     """The axes behind their Modbus connections, which the first exchange opens."""
     axes = []
     for i, axis in zip(contract.carrying, config.axes, strict=True):
-        link = ModbusLink(axis.host, axis.port, ANSWER_TIME, axis.device_id)
-        profile = PROFILES[config.axis_profile]()
+        link = ModbusLink(axis.host, axis.port, ANSWER_TIME, axis.device_id, axis.combined)
+        profile = axis.profile(config.axis_profile)
         low, high = axis_range(i, config.safety, contract.limits)
         axes.append(Axis(contract.joints[i], link, profile, low, high, zero=axis.zero, direction=axis.direction))
-    return FestoAxes(axes, config.axes_motion)
+    # The gate proves the way of a command that no other one follows for no longer than that.
+    timeout = min(config.axes_motion.command_timeout, config.safety.late)
+    return FestoAxes(axes, replace(config.axes_motion, command_timeout=timeout))

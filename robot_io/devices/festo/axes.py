@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from robot_io.devices.festo.config import AxesConfig, AxesFault, AxesState, Axis
 from robot_io.devices.festo.following import Move, Reference, Target, move
 from robot_io.devices.festo.modbus_link import AxisLost
-from robot_io.devices.festo.profile import AxisCommand, AxisStatus
+from robot_io.devices.festo.profile import AxisCommand, AxisStatus, SetUpError
 
 DEFAULTS = AxesConfig()
 STANDING_TIME, STANDING_WAY = 0.06, 1e-3  # [s], [m]: an axis that moved less than that in this time stands
@@ -41,6 +41,7 @@ class _Channel:
     def __init__(self, axis: Axis) -> None:
         self.axis = axis
         self.configured = False
+        self.set_up: Iterator[None] | None = None  # while it is compared with what robot.yaml says of it
         self.status: AxisStatus | None = None
         self.received = -math.inf
         self.position = 0.0
@@ -345,12 +346,18 @@ class FestoAxes:
         axis, profile = channel.axis, channel.axis.profile
         try:
             if not channel.configured:
-                self._configure(channel)
+                channel.set_up = channel.set_up or profile.set_up(axis.link, self.config.node_guard)
+                channel.configured = next(channel.set_up, True) is True
             registers = axis.link.exchange(
                 profile.write_address, profile.encode(command), profile.read_address, profile.read_count
             )
             status = profile.decode(registers)
+        except SetUpError as error:
+            channel.set_up = None
+            self._latch(error.cause, f"{axis.name}: {error}.")
+            return
         except AxisLost as error:
+            channel.set_up = None
             channel.configured = channel.on = channel.was_enabled = channel.homing = False
             channel.status = None
             self._latch(
@@ -371,20 +378,6 @@ class FestoAxes:
             channel.on = False
             self._latch("switched_off", f"{axis.name} has switched off by itself: acknowledge, then enable the axes.")
         channel.was_enabled = status.enabled and channel.on
-
-    def _configure(self, channel: _Channel) -> None:
-        guard = channel.axis.profile.node_guard(self.config.node_guard)
-        if guard is not None:
-            address, values = guard
-            answer = channel.axis.link.exchange(address, values, address, len(values))
-            if answer != values:
-                self._latch(
-                    "node_guard",
-                    f"{channel.axis.name} took the time-out {values} as {answer}: without it, it would not stop when "
-                    "the computer dies.",
-                )
-                return
-        channel.configured = True
 
     def _latch(self, cause: str, sentence: str) -> None:
         """The first fault counts: the others mostly follow from it. No axis goes on searching its reference."""

@@ -46,7 +46,7 @@ class AxesConfig:
     hold_speed           for reaching a target whose velocity is 0
     max_error            deviation from the commanded position that is a fault [m]
     node_guard           silence after which a drive stops by itself [s]; set at start-up where the profile can
-    command_timeout      age of a command at which the axes stop and hold [s]
+    command_timeout      age of a command at which the axes stop and hold [s]; never more than the gate's ``late``
     state_timeout        age of the state at which it counts as unknown [s]
     acknowledge_timeout, enable_timeout, homing_timeout [s]
     overtravel           how far beyond either end of the range a search for the reference may take an axis [m]: to
@@ -62,7 +62,7 @@ class AxesConfig:
     hold_speed: float = 0.1
     max_error: float = 0.1
     node_guard: float = 0.1
-    command_timeout: float = 0.05
+    command_timeout: float = 0.03
     state_timeout: float = 0.05
     acknowledge_timeout: float = 1.0
     enable_timeout: float = 5.0
@@ -101,7 +101,7 @@ class AxesFault:
     """Reason why the axes were stopped: a short name and a sentence.
 
     Names: axis_lost, drive_fault, switched_off, acknowledge_timeout, enable_timeout, homing_timeout, node_guard,
-    bad_answer, following_error.
+    units, bad_answer, following_error.
     """
 
     cause: str

@@ -24,7 +24,7 @@ from robot_io.devices.festo import (
     FhppProfile,
     ModbusLink,
 )
-from robot_io.emulator.axes import AxisEmulator, DriveParams, serve
+from robot_io.emulator.axes import AxisEmulator, AxisUnits, DriveParams, serve
 from tests.support.axes_lockstep import CYCLE, PROFILES, STEP, LockStep, Stream
 from tests.support.paths import ROOT
 
@@ -73,12 +73,6 @@ def test_input_registers_of_telegram_111():
     )
     assert status.fault_code == 126 and "following error" in CmmtProfile().fault_text(126)
     assert CmmtProfile().fault_text(999).startswith("999: look")
-
-
-def test_node_guard_registers():
-    assert CmmtProfile().node_guard(0.1) == (400, [100, 0])
-    assert CmmtProfile().node_guard(100.0) == (400, [0x86A0, 1])
-    assert FhppProfile().node_guard(0.1) is None
 
 
 @pytest.mark.parametrize(
@@ -551,24 +545,67 @@ def test_problems_before_the_first_motion():
 
 
 def test_a_drive_that_does_not_take_the_node_guard():
-    rig = LockStep(wrap=NoGuard)
+    rig = LockStep(wrap=NoGuard, node_guard=1.0)
     rig.run(0.05)
-    assert rig.axes.fault.cause == "node_guard" and "[1000, 0]" in rig.axes.problem(rig.now)
+    assert rig.axes.fault.cause == "node_guard" and "[100, 0] as [1000, 0]" in rig.axes.problem(rig.now)
     assert LockStep(node_guard=5.0).start().emulators[0].node_guard == 0.1  # one that does
 
 
 class NoGuard(DirectLink):
-    """A drive that does not take the node guard."""
+    """A drive that answers the node guard with what was written, and does not take it."""
 
     def exchange(self, write_address, values, read_address, count):
-        if write_address == 400:
-            return [1000, 0]
-        return super().exchange(write_address, values, read_address, count)
+        return values if write_address == 400 else super().exchange(write_address, values, read_address, count)
+
+
+class SwappedGuard(DirectLink):
+    """The words of a drive's node guard come high word first."""
+
+    def exchange(self, write_address, values, read_address, count):
+        values = values[::-1] if write_address == 400 else values
+        answer = super().exchange(write_address, values, read_address, count)
+        return answer[::-1] if read_address == 400 else answer
+
+
+def test_a_node_guard_whose_words_are_swapped_is_refused():
+    rig = LockStep(wrap=SwappedGuard, node_guard=1.0)
+    rig.run(0.05)
+    assert rig.axes.fault.cause == "node_guard" and "are its words swapped" in rig.axes.problem(rig.now)
+    assert rig.emulators[0].node_guard == 1.0
+
+
+@pytest.mark.parametrize(
+    ("units", "says"),
+    [
+        (dict(base_acceleration=7.5), "base_acceleration is 7.5 (parameter 12346), robot.yaml has 15"),
+        (dict(base_velocity=1.0), "base_velocity is 1 (parameter 12345), robot.yaml has 2"),
+        (dict(position=1e-5), "position_unit is 1e-05 (parameter 11724), robot.yaml has 1e-06"),
+        (dict(velocity=1e-4), "velocity_unit is 0.0001 (parameter 11725), robot.yaml has 0.001"),
+    ],
+)
+def test_a_drive_that_counts_otherwise_gets_no_power(units, says):
+    rig = LockStep(units=AxisUnits(**{"position": 1e-6, **units}))
+    rig.run(0.2)
+    for request in (rig.axes.acknowledge, rig.axes.enable):
+        request()
+    rig.run(0.5)
+    assert rig.axes.fault.cause == "units" and says in rig.axes.problem(rig.now)
+    assert not any(emulator.drive.operating for emulator in rig.emulators)
+
+
+def test_a_drive_that_tells_no_units_gets_no_power():
+    rig = LockStep()
+    for emulator in rig.emulators:
+        emulator._parameters.pop((12346, 0))
+    rig.axes.enable()
+    rig.run(0.5)
+    assert rig.axes.fault.cause == "units" and "12346" in rig.axes.problem(rig.now)
+    assert not any(emulator.drive.operating for emulator in rig.emulators)
 
 
 def test_a_drive_that_would_not_stop_by_itself_gets_no_power():
     """The operator's whole request at once: acknowledge, enable, home."""
-    rig = LockStep(wrap=NoGuard)
+    rig = LockStep(wrap=NoGuard, node_guard=1.0)
     rig.run(0.05)
     for _ in range(3):
         for request in (rig.axes.acknowledge, rig.axes.enable, rig.axes.home):
@@ -786,6 +823,7 @@ def test_festos_own_client_runs_the_emulator():
             for k in ("acknowledged", "enabled", "homed", "moved", "back", "stopped", "updated", "disabled")
         )
         assert told["device"] == "RIG-AXIS"
+        assert told["units"] == [-6, -3, 2.0, 15.0, 15.0]  # powers of ten of m and m/s; m/s, m/s^2
         assert told["start"] == pytest.approx(50_000, abs=100)  # [um]
         assert told["position"] == pytest.approx(150_000, abs=100)
         assert told["velocity"] == pytest.approx(-1.0, abs=0.6)  # [m/s], somewhere on its ramp
