@@ -229,7 +229,7 @@ class FestoAxes:
                 self._acknowledging = True
                 self._deadlines["acknowledge"] = now + self.config.acknowledge_timeout
             elif request in ("stop", "disable"):
-                self._ignore_before = now
+                self._ignore_before, self._reference = now, Reference(self.config.latency)
             elif self.fault is not None:
                 continue
             for channel in self._channels:
@@ -286,7 +286,7 @@ class FestoAxes:
             self.stale_commands += self._moving
             return False
         if not self._moving:
-            self._reference.restart()
+            self._reference.restart(now)
             self._resting_since = math.inf
         return True
 

@@ -411,6 +411,16 @@ def test_a_stream_that_breaks_off_stops_both_and_may_go_on(profile):
     assert rig.velocity[0] == pytest.approx(0.5, abs=0.02) and rig.axes.problem(rig.now) is None
 
 
+def test_a_stream_that_breaks_off_for_a_moment_at_full_speed_goes_on():
+    """The axes brake meanwhile; what was commanded before is still on its way and no following error."""
+    rig = LockStep(start=(-0.9, 0.0)).start()
+    stream = Stream(rig, lambda t: (min(15.0 * t, 1.8), 0.0))
+    silent = rig.now + 0.3
+    rig.run(0.6, lambda now: None if silent < now < silent + 0.045 else stream(now))
+    assert rig.axes.stale_commands == 1 and rig.axes.problem(rig.now) is None
+    assert rig.velocity[0] > 1.5
+
+
 @pytest.mark.parametrize("profile", PROFILES)
 def test_when_the_computer_dies_the_drives_stop_by_themselves(profile):
     rig, stream = moving(profile)
