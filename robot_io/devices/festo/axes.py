@@ -25,6 +25,8 @@ from robot_io.devices.festo.profile import AxisCommand, AxisStatus, SetUpError
 
 DEFAULTS = AxesConfig()
 STANDING_TIME, STANDING_WAY = 0.06, 1e-3  # [s], [m]: an axis that moved less than that in this time stands
+# One that shakes is held as well: [s] after the last command, when it is [m] away from its place, once in [s].
+LONGEST_BRAKING, SHAKING_WAY, SHAKING = 0.5, 5e-3, 1.0
 # [m/s] at which a drive takes its set-point back to an axis that stands: 0.4 m in less than a second.
 BACK = 0.5
 SETTLING, AT_REST = 0.3, 0.1  # [s] after which an axis that was told to rest must be within this share of max_error
@@ -51,6 +53,7 @@ class _Channel:
         self.jumped = False  # its position, as no axis can; until somebody switches it on again
         self.held: float | None = None  # where it is held; None while it moves, brakes or is not known
         self._past: deque[tuple[float, float]] = deque()  # times and positions of the last STANDING_TIME
+        self._idle_since, self._held_since = math.inf, -math.inf  # [s] without commands; held at this place
 
     def answered(self, status: AxisStatus, now: float, speed: float) -> None:
         """Take an answer of an axis whose highest speed is ``speed`` [m/s]."""
@@ -62,14 +65,21 @@ class _Channel:
         while len(self._past) > 1 and self._past[1][0] <= now - STANDING_TIME:
             self._past.popleft()
 
+    def follow(self) -> None:
+        """It follows commands, and is held nowhere."""
+        self.held, self._idle_since, self._held_since = None, math.inf, -math.inf
+
     def hold(self, now: float) -> None:
         """Note where to hold an axis that follows no commands: where it is measured, once it stands."""
+        self._idle_since = min(self._idle_since, now)
         positions = [position for _, position in self._past]
         stands = bool(positions) and self._past[0][0] <= now - STANDING_TIME and np.ptp(positions) <= STANDING_WAY
+        shakes = min(now - self._idle_since - LONGEST_BRAKING, now - self._held_since - SHAKING) > 0.0
+        away = math.inf if self.held is None else abs(self.position - self.held)
         if self.status is None or not self.status.homed or self.homing or self.jumped:
             self.held = None
-        elif stands and (self.held is None or abs(self.position - self.held) > STANDING_WAY):
-            self.held = self.position
+        elif (stands and away > STANDING_WAY) or (shakes and away > SHAKING_WAY):
+            self.held, self._held_since = self.position, now
 
 
 class FestoAxes:
@@ -298,7 +308,8 @@ class FestoAxes:
         for i, channel in enumerate(self._channels):
             status, axis, healthy = channel.status, channel.axis, self.fault is None
             if moves:
-                channel.held, wanted = None, moves[i]
+                channel.follow()
+                wanted = moves[i]
             else:
                 channel.hold(now)
                 wanted = Move(channel.position if channel.held is None else channel.held, BACK, 0.0)

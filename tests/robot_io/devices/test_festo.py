@@ -475,6 +475,29 @@ def test_a_blocked_axis_is_neither_pushed_nor_jumps_when_it_is_free(profile, hol
     assert np.abs(rig.velocity[0]) < 1e-3
 
 
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_blocked_axis_that_shakes_is_not_pushed_either(profile):
+    """Somebody holds it: it never stands."""
+    rig, stream = moving(profile, params=DriveParams(following_error=1.0))
+    wall = rig.position[0]
+
+    def held(seconds, each=None):
+        for _ in range(round(seconds / STEP)):
+            rig.run(STEP, each)
+            place = wall - 0.003 * (1.0 + np.sin(30.0 * rig.now))
+            if rig.position[0] > place:
+                rig.position[0], rig.velocity[0] = place, 0.0
+
+    held(0.6, stream)
+    assert rig.axes.fault.cause == "following_error"
+    held(1.5)
+    ahead = []
+    for _ in range(50):
+        held(0.01)
+        ahead.append(rig.emulators[0].drive.x - rig.position[0])
+    assert rig.emulators[0].drive.operating and max(ahead) < 0.012
+
+
 def test_an_axis_that_is_kept_from_its_place_at_rest_is_a_fault():
     """A stiff drive would push there for as long as the robot rests, by less than ``max_error``."""
     rig, _ = moving(params=DriveParams(following_error=1.0))
