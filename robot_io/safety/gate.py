@@ -126,7 +126,7 @@ class SafetyGate:
         self._offset = np.zeros(n)  # the same, remembered while the reference moves
         self._measured_velocity: np.ndarray | None = None
         self._last: float | None = None  # time of the command before
-        self._coasting = Coasting(period, config.late, self._a)  # as the devices are told it
+        self.motion = Coasting(period, config.late, self._a)  # as the devices are told it, between ticks and without
         self._lead = 0.0  # [s] that commands are ahead of the clock
         self._armed_at = 0.0
         # The linear axes do not know where they are. Set by whoever sees them; while nothing moves, what they say then
@@ -230,7 +230,7 @@ class SafetyGate:
         self._deviation, self._offset = np.zeros_like(self._velocity), np.zeros_like(self._velocity)
         self._lead, self._last = 0.0, None
         self._monitor.restart(position, now)
-        self._coasting.ticked(position, self._velocity, now)
+        self.motion.ticked(position, self._velocity, now)
 
     def brake(self, now: float) -> None:
         """Slows down to rest from the next command on and holds; no fault. Armed again by ``arm``."""
@@ -327,7 +327,7 @@ class SafetyGate:
         self._velocity = velocity
         self._start = self._reference
         self._reference = self._reference + velocity * self.period
-        self._coasting.ticked(self._start, velocity, now)
+        self.motion.ticked(self._start, velocity, now)
         self._monitor.sent(self._reference, now + self.period)
         return Sent(velocity.copy(), self._reference.copy(), changed, self.state)
 
@@ -335,9 +335,9 @@ class SafetyGate:
         """Takes over the motion that the devices were told while ticks were missing: it has slowed down by itself, and
         whoever brakes on from the last tick's velocity would make them faster again. True: they hold the measured place
         by now, wherever that is."""
-        if not self._engaged or not self._coasting.missed(now):
+        if not self._engaged or not self.motion.missed(now):
             return False
-        moved = self._coasting.at(now)
+        moved = self.motion.at(now)
         if moved is None:
             self._velocity = np.zeros_like(self._velocity)
             return True

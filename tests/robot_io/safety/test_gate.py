@@ -17,7 +17,6 @@ from robot_io.contract import JOINT_NAMES, LIMITS
 from robot_io.errors import RefusedError
 from robot_io.limits import limit_velocity
 from robot_io.safety.clearance import BLADE, RobotGeometry
-from robot_io.safety.coasting import Coasting
 from robot_io.safety.config import SLACK
 from robot_io.safety.faults import Cause, FaultLatch
 from robot_io.safety.gate import GateState, SafetyConfig, SafetyGate
@@ -672,10 +671,8 @@ def check_late_tick(gate, now, gap, answered, distances):
 
     answered: its packets are answered meanwhile, as when the tick alone is late; else it goes on as it was told last.
     """
-    told = Coasting(T, gate.config.late, A_MAX)
-    told.ticked(gate.start, gate.velocity, now)
-    moments = np.linspace(0.0, gap, 10)
-    places = [told.at(now + moment)[0] if answered else gate.start + gate.velocity * moment for moment in moments]
+    times = np.linspace(0.0, gap, 10)
+    places = [gate.motion.at(now + t)[0] if answered else gate.start + gate.velocity * t for t in times]
     robot, real = places[-1], [places[-1]]
     now += gap
     for _ in range(REST + 1):
