@@ -18,6 +18,7 @@ FEWEST = 5
 MOST_TRIPLES = 2000
 OUTLIER = 3.5  # robust deviations beyond which a point is not used
 FINEST = 5e-4  # [m] least deviation that is taken for one
+HANDED = 5.0  # times the residual that the mirror image's must be, to be sure which of them the frame is
 SPREAD = 0.1  # [m] root mean square extent that points need in two directions
 
 
@@ -39,7 +40,8 @@ class TrackerFit:
 def fit(table: np.ndarray, seen: np.ndarray, date: str) -> TrackerFit:
     """The tracker's frame from points (n, 3) [m] of the table frame and what the tracker gave for them.
 
-    Raises ValueError for too few points, on one line, or of which no majority agrees.
+    Raises ValueError for too few points, on one line or in one plane, of which no majority agrees, and where the frame
+    is mirrored.
     """
     n = len(table)
     if n < FEWEST:
@@ -52,16 +54,23 @@ def fit(table: np.ndarray, seen: np.ndarray, date: str) -> TrackerFit:
     triples = triples[np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) > SPREAD**2]
     if len(triples) > MOST_TRIPLES:
         triples = triples[np.random.default_rng(0).choice(len(triples), MOST_TRIPLES, replace=False)]
-    best = _of_triples(table, seen, triples)
-    if np.median(best) > LARGEST_TRACKER_RESIDUAL:
-        raise ValueError(f"no rigid motion fits: half of the points are {np.median(best):.3f} m off or more")
-    used = best <= OUTLIER * max(1.4826 * float(np.median(best)), FINEST)
-    for _ in range(5):
-        motion = _motion(table, seen, np.flatnonzero(used))
-        residuals = _distances(table, seen, motion)
-        used = residuals <= OUTLIER * max(1.4826 * float(np.median(residuals)), FINEST)
+    motion, residuals, used = _agreeing(table, seen, triples)
+    _, mirrored, others = _agreeing(table, -seen, triples)
+    if others.sum() > used.sum():
+        raise ValueError(
+            f"the tracker's frame is a mirror image of the table's: so {others.sum()} of {n} points agree, without it "
+            f"{used.sum()}; one of its axes points the other way, or two are exchanged"
+        )
+    if np.median(residuals) > LARGEST_TRACKER_RESIDUAL:
+        raise ValueError(f"no rigid motion fits: half of the points are {np.median(residuals):.3f} m off or more")
     if used.sum() < max(FEWEST, n / 2):
         raise ValueError(f"only {used.sum()} of {n} points agree with each other; measure them again")
+    told, doubt = (max(float(np.sqrt((r[used] ** 2).mean())), FINEST) for r in (residuals, mirrored))
+    if doubt < HANDED * told:
+        raise ValueError(
+            "the points that agree lie in one plane, so nothing tells the tracker's frame from its mirror image; put "
+            "the ball on a stand of 0.1 m or more at some of the places"
+        )
     rotation, position = motion
     variance = float((residuals[used] ** 2).sum()) / max(3 * int(used.sum()) - 6, 1)
     lever = table[used] - table[used].mean(0)
@@ -75,6 +84,18 @@ def fit(table: np.ndarray, seen: np.ndarray, date: str) -> TrackerFit:
         date,
     )
     return TrackerFit(found, residuals, used, np.array([*[np.sqrt(variance / used.sum())] * 3, *turns]))
+
+
+def _agreeing(
+    table: np.ndarray, seen: np.ndarray, triples: np.ndarray
+) -> tuple[tuple[Rotation, np.ndarray], np.ndarray, np.ndarray]:
+    """The motion that most points agree with, every point's distance (n,) under it, and which agree (n,)."""
+    residuals = _of_triples(table, seen, triples)
+    for _ in range(5):
+        used = residuals <= OUTLIER * max(1.4826 * float(np.median(residuals)), FINEST)
+        motion = _motion(table, seen, np.flatnonzero(used))
+        residuals = _distances(table, seen, motion)
+    return motion, residuals, residuals <= OUTLIER * max(1.4826 * float(np.median(residuals)), FINEST)
 
 
 def _motion(table: np.ndarray, seen: np.ndarray, rows: np.ndarray) -> tuple[Rotation, np.ndarray]:

@@ -41,7 +41,6 @@ from robot_io.history import History
 from robot_io.log.messages import Action, Ball, Command, Event, Joints, Level, Observation, Record, Tick, json_text
 from robot_io.log.recorder import NullRecorder, SessionRecorder
 from robot_io.safety.clearance import RobotGeometry
-from robot_io.safety.coasting import Coasting
 from robot_io.safety.faults import Cause
 from robot_io.safety.gate import GateState, SafetyGate, Sent
 
@@ -88,7 +87,6 @@ class Bridge:
         # Session and packet of the arm's controller; True when it was started anew since it was armed.
         self._arm_session_id, self._arm_sequence, self._arm_restarted = 0, -1, False
         self._axes_received = self._last_tick = -math.inf
-        self._motion = Coasting(gate.period, np.array(contract.limits.acceleration))  # as the devices are told it
         self._zeros = np.zeros(contract.n_joints)
         self._policy_limit = np.array(contract.limits.policy_velocity)
         speed = (jog.SPEED if config.jog else config.home_speed) * self._policy_limit
@@ -144,7 +142,6 @@ class Bridge:
         self.gate.arm(measured, now, velocity)
         self._arm_session_id = self.arm_session.session_id
         self._arm_restarted = self._been_home = False
-        self._motion.ticked(measured, self._zeros, now)
         self.stopped_because = ""
         self._way_home.restart()
         self._home = measured if self.config.jog else self._home
@@ -226,7 +223,7 @@ class Bridge:
         # Where the old reference would lead a controller that was started anew, nobody has asked for.
         self._arm_restarted |= feedback.sequence < self._arm_sequence
         self._arm_sequence = feedback.sequence
-        moved = None if self.gate.state is GateState.DISARMED or self._arm_restarted else self._motion.at(now)
+        moved = self.gate.motion.at(now) if self.gate.engaged and not self._arm_restarted else None
         return None if moved is None else (moved[0][self._arm_rows], moved[1][self._arm_rows])
 
     def tracker_received(self, datagram: bytes, source: str, now: float, port: int | None = None) -> None:
@@ -262,12 +259,11 @@ class Bridge:
             request = self._decide(now)
         with self._guarded(now):
             sent = self.gate.command(request, measured, measured_velocity, now)
-            self._motion.ticked(self.gate.start if self.gate.engaged else measured, sent.velocity, now)
         if sent is None:  # arm and axes, which get no new command, slow down by themselves
             with self._guarded(now):
                 self._after(now)
             return self._zeros.copy()
-        start = self._motion.start
+        start = self.gate.start
         with self._guarded(now):
             if self.gate.engaged:
                 self.axes.command(start[self._axes_rows], sent.velocity[self._axes_rows], now)

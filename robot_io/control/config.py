@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Literal
 
 from ballmodel.io.ranges import Within, check_fields
@@ -11,7 +11,7 @@ from robot_io.calibrated import Calibration
 from robot_io.contract import CONTROL_RATE, LIMITS, PAPER, Contract, JointLimits
 from robot_io.control.observation import ObservationDelays
 from robot_io.devices.egm.messages import N_ARM_JOINTS
-from robot_io.devices.festo import AxesConfig, Axis, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
+from robot_io.devices.festo import AxesConfig, Axis, AxisProfile, CmmtProfile, FestoAxes, FhppProfile, ModbusLink
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.safety.config import SafetyConfig
 
@@ -19,6 +19,7 @@ PROFILES = {"cmmt": CmmtProfile, "fhpp": FhppProfile}
 ANSWER_TIME = 0.035  # [s] for an axis to answer: less than the age at which its state counts as stale
 SAME_ZERO = 1e-4  # [m] by which the zeros of a linear axis may differ from those of the robot's calibration
 
+UNITS = ("position_unit", "velocity_unit", "base_velocity", "base_acceleration")
 Port = Annotated[int, Within(1, 65535)]
 
 
@@ -38,13 +39,32 @@ class ArmConfig:
 
 @dataclass(frozen=True)
 class AxisConfig:
-    """One linear axis. zero [m]: robot's coordinate where the drive reads 0; direction 1 or -1."""
+    """One linear axis.
+
+    zero           [m] robot's coordinate where the drive reads 0; direction 1 or -1
+    combined       write and read by one request, function code 0x17; false: by 0x10 and then 0x03
+    position_unit  [m] of a count in the drive's set-up, and velocity_unit [m/s]; base_velocity [m/s] and
+                   base_acceleration [m/s^2] that its 100 % stand for; None: the profile's. A CMMT's are compared
+    """
 
     host: str = "127.0.0.1"
     port: Port = 502
     device_id: Annotated[int, Within(0, 255)] = 1
     zero: Annotated[float, Within(-5.0, 5.0, "m")] = 0.0
     direction: Literal[-1, 1] = 1
+    combined: bool = True
+    position_unit: Annotated[float, Within(1e-9, 1e-3, "m")] | None = None
+    velocity_unit: Annotated[float, Within(1e-7, 0.1, "m/s")] | None = None
+    base_velocity: Annotated[float, Within(0.01, 100.0, "m/s")] | None = None
+    base_acceleration: Annotated[float, Within(0.1, 1000.0, "m/s^2")] | None = None
+
+    def profile(self, name: str) -> AxisProfile:
+        """The profile of a drive with these units. Raises ValueError for a unit that it does not have."""
+        kind = PROFILES[name]
+        given = {key: value for key in UNITS if (value := getattr(self, key)) is not None}
+        for key in given.keys() - {each.name for each in fields(kind)}:
+            raise ValueError(f"axes.{key}: expected no such key, since {name} carries no such number, got {given[key]}")
+        return kind(**given)
 
 
 @dataclass(frozen=True)
@@ -79,6 +99,8 @@ class RobotConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        for axis in self.axes:
+            axis.profile(self.axis_profile)
         measured, zeros = self.calibration.robot, tuple(axis.zero for axis in self.axes)
         if measured.date and any(abs(a - b) > SAME_ZERO for a, b in zip(measured.axes_zero, zeros, strict=False)):
             raise ValueError(
@@ -125,6 +147,13 @@ class RobotConfig:
                     f"axes_motion.speed: expected at least {most} m/s, which {contract.joints[i]} of {contract.robot} "
                     f"may be asked for, got {speed} m/s"
                 )
+            needed = contract.limits.acceleration[i]
+            if self.axes_motion.acceleration < needed:
+                raise ValueError(
+                    f"axes_motion.acceleration: expected at least {needed} m/s^2, by which the gate brakes "
+                    f"{contract.joints[i]}, got {self.axes_motion.acceleration}: with less it runs farther than is "
+                    "proven clear"
+                )
             if (error := self.safety.following_error[i]) > 0.1:
                 raise ValueError(f"safety.following_error[{i}]: expected 0.005 to 0.1 m, got {error}")
 
@@ -139,8 +168,10 @@ def linear_axes(config: RobotConfig, contract: Contract = PAPER) -> FestoAxes:
     """The axes behind their Modbus connections, which the first exchange opens."""
     axes = []
     for i, axis in zip(contract.carrying, config.axes, strict=True):
-        link = ModbusLink(axis.host, axis.port, ANSWER_TIME, axis.device_id)
-        profile = PROFILES[config.axis_profile]()
+        link = ModbusLink(axis.host, axis.port, ANSWER_TIME, axis.device_id, axis.combined)
+        profile = axis.profile(config.axis_profile)
         low, high = axis_range(i, config.safety, contract.limits)
         axes.append(Axis(contract.joints[i], link, profile, low, high, zero=axis.zero, direction=axis.direction))
-    return FestoAxes(axes, config.axes_motion)
+    # The gate proves the way of a command that no other one follows for no longer than that.
+    timeout = min(config.axes_motion.command_timeout, config.safety.late)
+    return FestoAxes(axes, replace(config.axes_motion, command_timeout=timeout))

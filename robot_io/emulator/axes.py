@@ -69,13 +69,13 @@ class AxisEmulator:
         self._past = Past(feedback_delay + 0.02)
         self._reported = (0.0, 0.0)
         self._mailbox = [0] * 74
-        self._parameters: dict[tuple[int, int], list[int]] = {}
+        self._parameters = self._bank.parameters()
 
     def step(self, now: float, position: float, velocity: float) -> float:
         """Moves on to ``now`` [s], the plant being at ``position`` [m] with ``velocity`` [m/s]; its new one [m/s]."""
         with self._lock:
             drive = self.drive
-            drive.measure(position)
+            drive.measure(position, velocity)
             while self._arrived:  # since the last step: later than in truth by less than a step, never earlier
                 self._queue.append((now + self._dead_time, self._arrived.popleft()))
                 self._written = now
@@ -193,12 +193,13 @@ class AxisEmulator:
         return [milliseconds & 0xFFFF, milliseconds >> 16]
 
     def _mailbox_answer(self, request: int) -> int:
-        """Parameters are only stored: number, subindex, elements, request, length, then from 510 on the data."""
+        """Parameters have no effect: number, subindex, elements, request, length, then from 510 on the data."""
         key = (self._mailbox[0], self._mailbox[1])
         if request == MAILBOX_WRITE:
             self._parameters[key] = [self._mailbox[4], *self._mailbox[10:]]
             return MAILBOX_DONE
         if request == MAILBOX_READ and key in self._parameters:
-            self._mailbox[4], *self._mailbox[10:] = self._parameters[key]
+            self._mailbox[4], *data = self._parameters[key]
+            self._mailbox[10:] = [*data, *[0] * 64][:64]
             return MAILBOX_DONE
         return MAILBOX_ERROR

@@ -27,6 +27,8 @@ class DriveParams:
     speed, acceleration   highest [m/s], [m/s^2]
     smoothing             window of the jerk-limiting mean over the generated velocity [s]; 0 for none
     position_gain         of the position controller [1/s]
+    holds_measured        a dropped task's set-point begins anew where the axis is measured; else it brakes as planned,
+                          however far it is ahead of an axis that is blocked
     following_error       deviation from the generated position that is a fault [m]
     switch_on_time        from ON to operating [s]
     homing_time           [s]; the search itself is not modelled, the axis stands
@@ -36,6 +38,7 @@ class DriveParams:
     acceleration: Annotated[float, Within(0.1, 100.0, "m/s^2")] = 15.0
     smoothing: Annotated[float, Within(0.0, 1.0, "s")] = 0.008
     position_gain: Annotated[float, Within(0.1, 1000.0, "1/s")] = 20.0
+    holds_measured: bool = False
     following_error: Annotated[float, Within(0.001, 10.0, "m")] = 0.1
     switch_on_time: Annotated[float, Within(0.0, 60.0, "s")] = 0.05
     homing_time: Annotated[float, Within(0.0, 60.0, "s")] = 1.0
@@ -63,7 +66,7 @@ class Drive:
         self._started = False  # by the first step, which begins the drive's time
         self._area = 0.0  # time integral of x
         self._past = Past(2.0 * params.smoothing + 0.01)
-        self._position = 0.0
+        self._position = self._velocity = 0.0  # measured
 
     @property
     def operating(self) -> bool:
@@ -120,6 +123,8 @@ class Drive:
 
     def halt(self) -> None:
         """Brakes and drops the task."""
+        if self.task and self.params.holds_measured:
+            self._restart(self._position, self._velocity)
         self.task = False
 
     def pause(self) -> None:
@@ -129,9 +134,9 @@ class Drive:
     def resume(self) -> None:
         self.paused = False
 
-    def measure(self, position: float) -> None:
-        """The plant's position, of which the generator starts when the drive gets power."""
-        self._position = position
+    def measure(self, position: float, velocity: float) -> None:
+        """Position and velocity of the plant, at which the generator starts when the drive gets power."""
+        self._position, self._velocity = position, velocity
         if self.origin is None:
             self.origin = position
         if self.power not in (Power.OPERATING, Power.SWITCHING_OFF):
@@ -174,6 +179,13 @@ class Drive:
             self.fault(FOLLOWING_ERROR)
         highest = 1.1 * self.params.speed
         return min(max(v + self.params.position_gain * error, -highest), highest)
+
+    def _restart(self, x: float, v: float) -> None:
+        """The generator goes on from here, as if it had come at this velocity."""
+        window = self.params.smoothing
+        self.x, self.v, self._past = x, v, Past(2.0 * window + 0.01)
+        self._past.add(self._now - window, x - v * window, self._area - (x - 0.5 * v * window) * window)
+        self._past.add(self._now, x, self._area)
 
     def _switch_off(self) -> None:
         self.task = self.homing = False

@@ -5,6 +5,8 @@ Written from the registers' side without the computer's codecs (``robot_io.devic
 
 from __future__ import annotations
 
+import math
+import struct
 from dataclasses import dataclass
 
 from robot_io.devices.festo.cmmt import STW1, ZSW1, PosSTW1, PosZSW1
@@ -50,6 +52,14 @@ class CmmtRegisters:
     def __init__(self, units: AxisUnits | None = None) -> None:
         self.units = units or self.units
         self._last = [0] * self.shortest
+
+    def parameters(self) -> dict[tuple[int, int], list[int]]:
+        """Its units by number and subindex: bytes of data, then words. Resolutions are powers of ten, bytes long."""
+        units = self.units
+        resolutions = {11724: units.position, 11725: units.velocity}
+        reals = {12345: units.base_velocity, 12346: units.base_acceleration, 12347: units.base_acceleration}
+        found = {(n, 0): [1, round(math.log10(value)) & 0xFF] for n, value in resolutions.items()}
+        return found | {(n, 0): [4, *struct.unpack("<HH", struct.pack("<f", value))] for n, value in reals.items()}
 
     def apply(self, words: list[int], drive: Drive) -> None:
         """Takes one image of the output registers."""
@@ -124,6 +134,10 @@ class FhppRegisters:
     def __init__(self, units: AxisUnits | None = None) -> None:
         self.units = units or self.units
         self._last = (0, 0, 0)
+
+    def parameters(self) -> dict[tuple[int, int], list[int]]:
+        """It has no mailbox."""
+        return {}
 
     def apply(self, words: list[int], drive: Drive) -> None:
         """Takes one image of the output registers."""

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 from ballmodel.io.ranges import Within, check_fields
 from robot_io.contract import Contract
-from robot_io.devices.festo import AxesConfig
 from robot_io.emulator import arm as arms
 from robot_io.emulator.arm import ArmParams
 from robot_io.emulator.axis_drive import DriveParams
@@ -16,8 +15,6 @@ from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
 from robot_io.emulator.world import WorldParams
 
-# The latency that training knows and the lag of the carriage's servo behind it.
-AXES_CONFIG = AxesConfig(latency=0.0645 + 0.033 + 0.035, gain=2.0)
 AXIS_FEEDBACK_DELAY = 0.033  # [s], paper: latency of the linear axes' observation
 # Training knows the time from a command to its effect; of the paper's 0.071 and 0.0645 s so much is no dead time.
 ARM_RESPONSE, AXIS_RESPONSE = 0.016, 0.0145  # [s]
@@ -31,8 +28,7 @@ class RigParams:
     arm: ArmParams = field(default_factory=lambda: ArmParams(comm_timeout=0.06))
     axis_profile: Literal["cmmt", "fhpp"] = "cmmt"
     axis_dead_time: Annotated[float, Within(0.0, 1.0, "s")] = 0.050
-    # A position controller as stiff as the carriage, a velocity servo with a lag of 35 ms, bears without overshoot.
-    drive: DriveParams = DriveParams(switch_on_time=0.02, homing_time=0.1, position_gain=2.0, following_error=0.15)
+    drive: DriveParams = DriveParams(switch_on_time=0.02, homing_time=0.1)
     node_guard: Annotated[float, Within(0.01, 10.0, "s")] = 0.1
     tracker: TrackerParams = TrackerParams()
     action_delay: Annotated[float, Within(0.0, 1.0, "s")] = 0.0

@@ -26,7 +26,7 @@ from robot_io.devices.fixed_base import FixedBase
 from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.arm import ArmController, ArmStateError
 from robot_io.emulator.axes import AxisEmulator
-from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams, for_robot
+from robot_io.emulator.config import AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
 from robot_io.emulator.tracker import TrackerEmulator
@@ -88,7 +88,7 @@ class LockStep:
             )
             for i, emulator in zip(contract.carrying, self.emulators, strict=True)
         ]
-        self.axes: FestoAxes | FixedBase = FestoAxes(axes, AXES_CONFIG) if axes else FixedBase()
+        self.axes: FestoAxes | FixedBase = FestoAxes(axes) if axes else FixedBase()
         seed = np.random.SeedSequence([params.seed, first]).generate_state(4)
         self.cameras = TrackerEmulator(params.tracker, int(seed[0]), params.hidden)
         self._to_bridge = Network(params.arm_network, int(seed[1]))

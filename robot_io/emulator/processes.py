@@ -21,7 +21,7 @@ from robot_io.devices.tracker import TrackerConfig
 from robot_io.emulator.arm import ArmController, ArmStateError
 from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_server import serve
-from robot_io.emulator.config import AXES_CONFIG, AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams, for_robot
+from robot_io.emulator.config import AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
 from robot_io.emulator.shared_state import ASLEEP, START_TIME, Motion, Shared
@@ -120,7 +120,6 @@ class Rig:
             arm=ArmConfig(HOST, self.ports.arm, HOST),
             axis_profile=self.params.axis_profile,
             axes=tuple(AxisConfig(HOST, port) for port in self.ports.axes),
-            axes_motion=AXES_CONFIG,
             tracker=TrackerConfig(HOST, self.ports.tracker, HOST),
         )
 

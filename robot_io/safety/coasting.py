@@ -6,19 +6,19 @@ import math
 
 import numpy as np
 
-PATIENCE = 2.0  # control periods that a tick may take before it counts as missing
 HOLD_AFTER = 0.2  # [s] after which an arm that was told to stand is told to stay where it is measured
 
 
 class Coasting:
     """The last tick's reference and velocity. Times are seconds of one monotonic clock, passed in.
 
-    A motion that no tick renews slows down at the acceleration limits by itself: whatever has broken the ticks is not
-    asked, neither gate nor devices.
+    A motion that no tick renews for ``patience`` seconds slows down at the acceleration limits by itself, one step a
+    period, along the very way that the gate has proven clear: whatever has broken the ticks is not asked, neither gate
+    nor devices.
     """
 
-    def __init__(self, period: float, acceleration: np.ndarray) -> None:
-        self._period, self._a = period, acceleration
+    def __init__(self, period: float, patience: float, acceleration: np.ndarray) -> None:
+        self._period, self._patience, self._step = period, patience, acceleration * period
         self.time = -math.inf  # of the tick
         self.start = np.full_like(acceleration, np.nan)  # reference (n,) at the tick
         self._velocity = np.zeros_like(acceleration)
@@ -27,16 +27,24 @@ class Coasting:
         """The motion from ``now`` on: from ``start`` (n,) at ``velocity`` (n,)."""
         self.start, self._velocity, self.time = start, velocity, now
 
+    def missed(self, now: float) -> bool:
+        """The next tick is so late that the motion has begun to slow down."""
+        return now - self.time > self._patience
+
     def at(self, now: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Reference (n,) and velocity (n,); None: hold the measured place."""
         if not np.isfinite(self.start).all():
             return None
-        since, on_time = max(now - self.time, 0.0), PATIENCE * self._period
-        if since <= on_time:
+        since = max(now - self.time, 0.0)
+        if since <= self._patience:
             return self.start + self._velocity * since, self._velocity
-        speed = np.abs(self._velocity)
-        left = np.maximum(speed - self._a * (since - on_time), 0.0)
-        if since - on_time > float((speed / self._a).max()) + HOLD_AFTER:
+        speed, braking = np.abs(self._velocity), since - self._patience
+        longest = math.ceil(float((speed / self._step).max()))  # periods until rest
+        if braking > longest * self._period + HOLD_AFTER:
             return None
-        way = speed * on_time + (speed**2 - left**2) / (2.0 * self._a)
-        return self.start + np.sign(self._velocity) * way, np.sign(self._velocity) * left
+        periods = np.arange(1, longest + 1)
+        left = np.maximum(speed[:, None] - self._step[:, None] * periods, 0.0)  # (n, periods)
+        spent = np.clip(braking - (periods - 1) * self._period, 0.0, self._period)
+        now_in = min(int(braking / self._period), longest)
+        velocity = np.sign(self._velocity) * (left[:, now_in] if now_in < longest else 0.0)
+        return self.start + self._velocity * self._patience + np.sign(self._velocity) * (left @ spent), velocity

@@ -40,7 +40,8 @@ class SafetyConfig:
     following_error  distance (8,) of a measured position from where the reference was between ``delay`` before
     delay            shortest and longest time from a command to the measurement of its effect
     following_ticks  commands in a row after which a following error is a fault
-    late             longest time between two commands
+    late             longest time between two commands: so long the robot may go on with the last one, and that way and
+                     braking after it are proven clear as well; more is a fault
     stale_*          longest age of what was last heard of a device, and of the policy's request; the tracker's is over
                      four frames: more would leave no time to stop within 0.15 s behind the arm's dead time
     """
@@ -58,7 +59,7 @@ class SafetyConfig:
     following_error: tuple[Annotated[float, Within(0.005, 0.4)], ...] = _each(*_FOLLOWING_ERROR)
     delay: tuple[Annotated[float, Within(0.0, 0.3, "s")], Annotated[float, Within(0.0, 0.3, "s")]] = (0.0, 0.2)
     following_ticks: Annotated[int, Within(1, 6)] = 3
-    late: Annotated[float, Within(0.02, 0.1, "s")] = 0.05
+    late: Annotated[float, Within(0.02, 0.1, "s")] = 0.03
     stale_arm: Annotated[float, Within(0.01, 0.1, "s")] = 0.05
     stale_axes: Annotated[float, Within(0.01, 0.1, "s")] = 0.05
     stale_tracker: Annotated[float, Within(0.01, 0.05, "s")] = 0.035

@@ -22,6 +22,7 @@ def main(address: str, port: int) -> None:
     com_modbus.ModbusClient = functools.partial(com_modbus.ModbusClient, port=port)  # festo-edcon only knows port 502
     com = com_modbus.ComModbus(address, cycle_time=5, timeout_ms=500)
     told = {"device": com.device_info["product_code"]}
+    told["units"] = [com.read_pnu(number) for number in (11724, 11725, 12345, 12346, 12347)]
     with MotionHandler(com, config_mode="write") as motion:
         motion.base_velocity = 2.0
         told["acknowledged"] = motion.acknowledge_faults()

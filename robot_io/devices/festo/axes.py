@@ -2,15 +2,18 @@
 
 The drives position: each cycle they get a target and a highest speed (``robot_io.devices.festo.following``). When the
 computer dies in mid-motion they stop by themselves: at the last target, at most ``lead`` seconds and a braking
-distance away, or
-when their node guards fire.
+distance away, or when their node guards fire.
+
+Without commands to follow, each axis brakes until it is measured to stand, and is then held at that very place. A drive
+whose task is only dropped may keep a set-point far ahead of an axis that is blocked: it goes on pushing, and the axis
+jumps there as soon as it is free.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,9 +21,17 @@ from numpy.typing import ArrayLike
 from robot_io.devices.festo.config import AxesConfig, AxesFault, AxesState, Axis
 from robot_io.devices.festo.following import Move, Reference, Target, move
 from robot_io.devices.festo.modbus_link import AxisLost
-from robot_io.devices.festo.profile import AxisCommand, AxisStatus
+from robot_io.devices.festo.profile import AxisCommand, AxisStatus, SetUpError
 
 DEFAULTS = AxesConfig()
+STANDING_TIME, STANDING_WAY = 0.06, 1e-3  # [s], [m]: an axis that moved less than that in this time stands
+# One that shakes is held as well: [s] after the last command, when it is [m] away from its place, once in [s].
+LONGEST_BRAKING, SHAKING_WAY, SHAKING = 0.5, 5e-3, 1.0
+# [m/s] at which a drive takes its set-point back to an axis that stands: 0.4 m in less than a second.
+BACK = 0.5
+SETTLING, AT_REST = 0.3, 0.1  # [s] after which an axis that was told to rest must be within this share of max_error
+FASTEST = 1.5  # times the highest speed: a position that came faster is not believed
+JITTER = 0.035  # [s] by which the time between two measurements may differ from that between two cycles
 
 
 class _Channel:
@@ -32,16 +43,43 @@ class _Channel:
     def __init__(self, axis: Axis) -> None:
         self.axis = axis
         self.configured = False
+        self.set_up: Iterator[None] | None = None  # while it is compared with what robot.yaml says of it
         self.status: AxisStatus | None = None
         self.received = -math.inf
         self.position = 0.0
         self.on = False  # shall be enabled
         self.was_enabled = False
         self.homing = False  # shall be homed
+        self.jumped = False  # its position, as no axis can; until somebody switches it on again
+        self.held: float | None = None  # where it is held; None while it moves, brakes or is not known
+        self._past: deque[tuple[float, float]] = deque()  # times and positions of the last STANDING_TIME
+        self._idle_since, self._held_since = math.inf, -math.inf  # [s] without commands; held at this place
 
-    def answered(self, status: AxisStatus, now: float) -> None:
-        self.status, self.received = status, now
-        self.position = self.axis.zero + self.axis.direction * status.position
+    def answered(self, status: AxisStatus, now: float, speed: float) -> None:
+        """Take an answer of an axis whose highest speed is ``speed`` [m/s]."""
+        position, homed = self.axis.zero + self.axis.direction * status.position, self.status and self.status.homed
+        reach = FASTEST * speed * (now - self.received + JITTER)
+        self.jumped |= bool(homed and status.homed) and abs(position - self.position) > reach
+        self.status, self.received, self.position = status, now, position
+        self._past.append((now, position))
+        while len(self._past) > 1 and self._past[1][0] <= now - STANDING_TIME:
+            self._past.popleft()
+
+    def follow(self) -> None:
+        """It follows commands, and is held nowhere."""
+        self.held, self._idle_since, self._held_since = None, math.inf, -math.inf
+
+    def hold(self, now: float) -> None:
+        """Note where to hold an axis that follows no commands: where it is measured, once it stands."""
+        self._idle_since = min(self._idle_since, now)
+        positions = [position for _, position in self._past]
+        stands = bool(positions) and self._past[0][0] <= now - STANDING_TIME and np.ptp(positions) <= STANDING_WAY
+        shakes = min(now - self._idle_since - LONGEST_BRAKING, now - self._held_since - SHAKING) > 0.0
+        away = math.inf if self.held is None else abs(self.position - self.held)
+        if self.status is None or not self.status.homed or self.homing or self.jumped:
+            self.held = None
+        elif (stands and away > STANDING_WAY) or (shakes and away > SHAKING_WAY):
+            self.held, self._held_since = self.position, now
 
 
 class FestoAxes:
@@ -69,6 +107,7 @@ class FestoAxes:
         self._requests: deque[str] = deque()
         self._moving = False
         self._reference = Reference(self.config.latency)
+        self._resting_since = math.inf  # [s] of the commands
         self._deadlines = dict.fromkeys(("acknowledge", "enable", "home"), math.inf)
         self._acknowledging = False
         self._sequence = 0
@@ -200,7 +239,7 @@ class FestoAxes:
                 self._acknowledging = True
                 self._deadlines["acknowledge"] = now + self.config.acknowledge_timeout
             elif request in ("stop", "disable"):
-                self._ignore_before = now
+                self._ignore_before, self._reference = now, Reference(self.config.latency)
             elif self.fault is not None:
                 continue
             for channel in self._channels:
@@ -209,7 +248,7 @@ class FestoAxes:
                 elif request == "stop":
                     channel.homing = False
                 elif request == "enable":
-                    channel.on = True
+                    channel.on, channel.jumped = True, False
                 elif request == "home":
                     channel.homing = channel.status is None or not channel.status.homed
             if request in ("enable", "home"):
@@ -257,18 +296,23 @@ class FestoAxes:
             self.stale_commands += self._moving
             return False
         if not self._moving:
-            self._reference.restart()
+            self._reference.restart(now)
+            self._resting_since = math.inf
         return True
 
     def _commands(self, now: float) -> list[AxisCommand]:
         target = self._target
         moves = self._moves(target, now) if self._moving and target is not None else []
-        if not moves:
-            moves = [Move(c.position if c.status else 0.0, 0.0, 0.0) for c in self._channels]
-        self.commanded = np.array([m.velocity for m in moves])
+        self.commanded = np.array([m.velocity for m in moves]) if moves else np.zeros(len(self._channels))
         commands = []
-        for channel, wanted in zip(self._channels, moves, strict=True):
+        for i, channel in enumerate(self._channels):
             status, axis, healthy = channel.status, channel.axis, self.fault is None
+            if moves:
+                channel.follow()
+                wanted = moves[i]
+            else:
+                channel.hold(now)
+                wanted = Move(channel.position if channel.held is None else channel.held, BACK, 0.0)
             # Only what would stop by itself when the computer dies gets power, and none while a fault is latched.
             may_be_on = channel.on and channel.configured and status and not status.fault
             commands.append(
@@ -277,7 +321,7 @@ class FestoAxes:
                     # Pulsed: a drive that is still braking takes no notice of the edge.
                     acknowledge=bool(self._acknowledging and status and status.fault and self._sequence // 8 % 2),
                     home=bool(channel.homing and may_be_on and status and status.enabled and healthy),
-                    move=self._moving,
+                    move=bool(moves or (channel.held is not None and may_be_on and status and status.enabled)),
                     position=(wanted.position - axis.zero) * axis.direction,
                     speed=wanted.speed,
                     acceleration=self.config.acceleration,
@@ -290,15 +334,17 @@ class FestoAxes:
         """Each axis's move; none, and a fault, when one is too far off its reference."""
         cfg, reference = self.config, target.at(now)
         self._reference.add(now, reference)
+        self._resting_since = math.inf if any(target.velocity) else min(self._resting_since, now)
+        allowed = cfg.max_error * (AT_REST if now - self._resting_since > cfg.latency + SETTLING else 1.0)
         moves = []
         for i, channel in enumerate(self._channels):
             axis = channel.axis
             error = self._reference.at(channel.received)[i] - channel.position
-            if abs(error) > cfg.max_error:
+            if abs(error) > allowed:
                 self._moving = False
                 self._latch(
                     "following_error",
-                    f"{axis.name} is {abs(error):.3f} m from where it was commanded, allowed are {cfg.max_error} m: "
+                    f"{axis.name} is {abs(error):.3f} m from where it was commanded, allowed are {allowed:g} m: "
                     "is it blocked, or did the commands not start from its position?",
                 )
                 return []
@@ -311,12 +357,18 @@ class FestoAxes:
         axis, profile = channel.axis, channel.axis.profile
         try:
             if not channel.configured:
-                self._configure(channel)
+                channel.set_up = channel.set_up or profile.set_up(axis.link, self.config.node_guard)
+                channel.configured = next(channel.set_up, True) is True
             registers = axis.link.exchange(
                 profile.write_address, profile.encode(command), profile.read_address, profile.read_count
             )
             status = profile.decode(registers)
+        except SetUpError as error:
+            channel.set_up = None
+            self._latch(error.cause, f"{axis.name}: {error}.")
+            return
         except AxisLost as error:
+            channel.set_up = None
             channel.configured = channel.on = channel.was_enabled = channel.homing = False
             channel.status = None
             self._latch(
@@ -326,7 +378,7 @@ class FestoAxes:
         except ValueError as error:
             self._latch("bad_answer", f"{axis.name}: {error}.")
             return
-        channel.answered(status, now)
+        channel.answered(status, now, self.config.speed)
         if status.fault and not self._acknowledging:
             self._latch(
                 "drive_fault",
@@ -337,20 +389,6 @@ class FestoAxes:
             channel.on = False
             self._latch("switched_off", f"{axis.name} has switched off by itself: acknowledge, then enable the axes.")
         channel.was_enabled = status.enabled and channel.on
-
-    def _configure(self, channel: _Channel) -> None:
-        guard = channel.axis.profile.node_guard(self.config.node_guard)
-        if guard is not None:
-            address, values = guard
-            answer = channel.axis.link.exchange(address, values, address, len(values))
-            if answer != values:
-                self._latch(
-                    "node_guard",
-                    f"{channel.axis.name} took the time-out {values} as {answer}: without it, it would not stop when "
-                    "the computer dies.",
-                )
-                return
-        channel.configured = True
 
     def _latch(self, cause: str, sentence: str) -> None:
         """The first fault counts: the others mostly follow from it. No axis goes on searching its reference."""

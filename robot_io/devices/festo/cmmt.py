@@ -11,14 +11,37 @@ base value), NIST_B is N4 (0x40000000 is 100 %). festo-edcon moves the whole 28-
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntFlag
 
 from robot_io.devices.festo.faults import CMMT_FAULTS, fault_text
-from robot_io.devices.festo.profile import INT32, AxisCommand, AxisStatus, count_of, expect_count, signed
+from robot_io.devices.festo.modbus_link import RegisterLink
+from robot_io.devices.festo.profile import (
+    INT32,
+    AxisCommand,
+    AxisStatus,
+    SetUpError,
+    count_of,
+    expect_count,
+    signed,
+)
 
 OUTPUT_ADDRESS, INPUT_ADDRESS, BLOCK = 0, 100, 28
 TIMEOUT_ADDRESS = 400  # 32 bits, low word first [ms]
+# Parameter number, subindex, elements, request or answer, bytes of data, which begins at 510.
+MAILBOX_ADDRESS, MAILBOX_DATA = 500, 510
+READ, DONE, FAILED = 0x01, 0x10, 0x03
+PATIENCE = 20  # cycles to wait for a parameter
+# Number, format and what of CmmtProfile it must agree with, as in festo-edcon's pnu_map.csv; units as powers of ten.
+PARAMETERS = (
+    (11724, "<b", "position_unit"),
+    (11725, "<b", "velocity_unit"),
+    (12345, "<f", "base_velocity"),
+    (12346, "<f", "base_acceleration"),
+    (12347, "<f", "base_acceleration"),  # of braking
+)
+SAME = 1e-3  # share by which the drive's number may differ: it is a float32
 WORDS = 11  # of the 28 that telegram 111 uses, each way
 N2, N4 = 0x4000, 0x40000000  # 100 %
 ALL_N2 = (0, 0x7FFF)
@@ -159,9 +182,35 @@ class CmmtProfile:
             velocity=signed(registers[7] | registers[8] << 16, 32) * self.base_velocity / N4,
         )
 
-    def node_guard(self, seconds: float) -> tuple[int, list[int]]:
-        milliseconds = count_of(seconds, 1e-3, (1, INT32[1]), "node guard [s]")
-        return TIMEOUT_ADDRESS, [milliseconds & 0xFFFF, milliseconds >> 16]
+    def set_up(self, link: RegisterLink, node_guard: float) -> Iterator[None]:
+        """As ``AxisProfile.set_up``. What is read goes with an image that asks for nothing, so it is no echo."""
+        image = self.encode(AxisCommand())
+        milliseconds = count_of(node_guard, 1e-3, (1, INT32[1]), "node guard [s]")
+        wanted = [milliseconds & 0xFFFF, milliseconds >> 16]
+        before = link.exchange(OUTPUT_ADDRESS, image, TIMEOUT_ADDRESS, 2)
+        if before[1]:
+            raise SetUpError("node_guard", f"its time-out reads as {before}, over a minute: are its words swapped?")
+        link.exchange(TIMEOUT_ADDRESS, wanted, TIMEOUT_ADDRESS, 2)
+        answer = link.exchange(OUTPUT_ADDRESS, image, TIMEOUT_ADDRESS, 2)
+        if answer != wanted:
+            words = f"it took the time-out {wanted} as {answer}: without it, it would not stop when the computer dies"
+            raise SetUpError("node_guard", words)
+        for number, form, key in PARAMETERS:
+            link.exchange(MAILBOX_ADDRESS, [number, 0, 1, READ], MAILBOX_ADDRESS, 4)
+            for _ in range(PATIENCE):
+                yield
+                status, length, *_, low, high = link.exchange(
+                    OUTPUT_ADDRESS, image, MAILBOX_ADDRESS + 3, MAILBOX_DATA - MAILBOX_ADDRESS - 1
+                )
+                if status in (DONE, FAILED):
+                    break
+            size = struct.calcsize(form)
+            if status != DONE or length != size:
+                raise SetUpError("units", f"it does not tell parameter {number}, its {key}: is it a CMMT?")
+            value = struct.unpack(form, struct.pack("<HH", low, high)[:size])[0]
+            found, given = 10.0**value if key.endswith("unit") else value, getattr(self, key)
+            if not abs(found - given) <= SAME * given:
+                raise SetUpError("units", f"its {key} is {found:g} (parameter {number}), robot.yaml has {given:g}")
 
     def fault_text(self, code: int) -> str:
         return fault_text(code, CMMT_FAULTS)

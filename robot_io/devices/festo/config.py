@@ -48,7 +48,7 @@ class AxesConfig:
     hold_speed           for reaching a target whose velocity is 0
     max_error            deviation from the commanded position that is a fault [m]
     node_guard           silence after which a drive stops by itself [s]; set at start-up where the profile can
-    command_timeout      age of a command at which the axes stop and hold [s]
+    command_timeout      age of a command at which the axes stop and hold [s]; never more than the gate's ``late``
     state_timeout        age of the state at which it counts as unknown [s]
     acknowledge_timeout, enable_timeout, homing_timeout [s]
     overtravel           how far beyond either end of the range a search for the reference may take an axis [m]: to
@@ -64,7 +64,7 @@ class AxesConfig:
     hold_speed: Annotated[float, Within(0.001, 0.5, "m/s")] = 0.1
     max_error: Annotated[float, Within(0.005, 0.15, "m")] = 0.1
     node_guard: Annotated[float, Within(0.02, 0.2, "s")] = 0.1
-    command_timeout: Annotated[float, Within(0.02, 0.1, "s")] = 0.05
+    command_timeout: Annotated[float, Within(0.02, 0.1, "s")] = 0.03
     state_timeout: Annotated[float, Within(0.02, 0.1, "s")] = 0.05
     acknowledge_timeout: Annotated[float, Within(0.1, 10.0, "s")] = 1.0
     enable_timeout: Annotated[float, Within(0.1, 30.0, "s")] = 5.0
@@ -103,7 +103,7 @@ class AxesFault:
     """Reason why the axes were stopped: a short name and a sentence.
 
     Names: axis_lost, drive_fault, switched_off, acknowledge_timeout, enable_timeout, homing_timeout, node_guard,
-    bad_answer, following_error.
+    units, bad_answer, following_error.
     """
 
     cause: str

@@ -10,10 +10,12 @@ registers and function code 0x17: GDCP-CMMO-ST-LK-C-HP-EN, 4.3. One per cent of 
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntFlag
 
 from robot_io.devices.festo.faults import FHPP_FAULTS, fault_text
+from robot_io.devices.festo.modbus_link import RegisterLink
 from robot_io.devices.festo.profile import INT32, AxisCommand, AxisStatus, count_of, expect_count
 
 ADDRESS, REGISTERS = 0, 4
@@ -134,8 +136,8 @@ class FhppProfile:
             velocity=percent * self.base_velocity / 100.0,
         )
 
-    def node_guard(self, seconds: float) -> None:
-        return None
+    def set_up(self, link: RegisterLink, node_guard: float) -> Iterator[None]:
+        yield from ()
 
     def fault_text(self, code: int) -> str:
         return fault_text(code, FHPP_FAULTS)

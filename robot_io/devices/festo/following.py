@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from robot_io.devices.festo.config import AxesConfig
 
-MEMORY = 0.1  # [s] kept beyond the latency
+MEMORY = 0.1  # [s] kept beyond the latency; of a silence after which a stream is another one
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,10 @@ class Reference:
         self._latency = latency
         self._past: deque[tuple[float, tuple[float, ...]]] = deque()
 
-    def restart(self) -> None:
-        self._past.clear()
+    def restart(self, now: float) -> None:
+        """A stream begins; one that broke off for a moment goes on, since what it asked for is still to come."""
+        if self._past and now - self._past[-1][0] > MEMORY:
+            self._past.clear()
 
     def add(self, time: float, position: tuple[float, ...]) -> None:
         past = self._past

@@ -13,7 +13,7 @@ from pymodbus.pdu import ExceptionResponse
 DEFAULT_PORT = 502
 RETRY = 0.5  # [s] between attempts to connect: a dead axis must not slow down the exchange with the living one
 EXCEPTIONS = {
-    1: "illegal function: the drive does not know function code 0x17; try combined=False",
+    1: "illegal function: the drive does not know function code 0x17; set combined: false of this axis",
     2: "illegal data address: is this the right profile for the drive?",
     3: "illegal data value",
     4: "device failure",

@@ -5,10 +5,21 @@ Positions are in the drive's own coordinate, in metres; only the codecs (``cmmt`
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
+from robot_io.devices.festo.modbus_link import RegisterLink
+
 INT32 = (-(2**31), 2**31 - 1)
+
+
+class SetUpError(ValueError):
+    """A drive is not set up as robot.yaml says; ``cause`` is the name of the fault."""
+
+    def __init__(self, cause: str, sentence: str) -> None:
+        super().__init__(sentence)
+        self.cause = cause
 
 
 @dataclass(frozen=True)
@@ -18,7 +29,8 @@ class AxisCommand:
     enable        power the drive; without, the drive ramps to a stop and switches off
     acknowledge   a rising edge clears a fault
     home          a rising edge starts homing, held until the axis is homed
-    move          go to ``position`` at up to ``speed``; without, the drive brakes, drops the task and holds
+    move          go to ``position`` at up to ``speed``; without, the drive brakes, drops the task and holds: its own
+                  set-point or the place where it is measured, as the make has it
     position      target [m]
     speed         highest speed on the way [m/s], not negative
     acceleration  of speeding up and braking [m/s^2]
@@ -77,8 +89,12 @@ class AxisProfile(Protocol):
     def decode(self, registers: list[int]) -> AxisStatus:
         """Status from ``read_count`` registers; ValueError on another length."""
 
-    def node_guard(self, seconds: float) -> tuple[int, list[int]] | None:
-        """Address and registers that set the drive's own time-out; None when its set-up tool sets it."""
+    def set_up(self, link: RegisterLink, node_guard: float) -> Iterator[None]:
+        """Set the drive's own time-out [s] and compare its units with the profile's, a few exchanges at a time.
+
+        Raises SetUpError where the drive would not stop by itself or counts otherwise. Nothing where its set-up tool
+        alone sets and shows these.
+        """
 
     def fault_text(self, code: int) -> str:
         """The drive's fault number in words."""

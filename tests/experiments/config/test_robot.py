@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 
 import pytest
 import yaml
@@ -10,7 +11,8 @@ import yaml
 from ballmodel.io import validation
 from experiments.config import robot
 from experiments.errors import ConfigError
-from robot_io.control.config import AxisConfig, RobotConfig
+from robot_io.control.config import AxisConfig, RobotConfig, linear_axes
+from robot_io.devices.festo import CmmtProfile
 from robot_io.emulator.config import RigParams
 from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.tracker.cameras import CameraParams
@@ -160,6 +162,30 @@ def test_every_number_of_a_robot_has_a_lower_and_an_upper_end():
     found = list(numbers_of(validation.json_schema(RobotConfig)))
     assert len(found) > 60
     assert all(node["minimum"] <= node["maximum"] for node in found)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("axes_motion: {acceleration: 10.0}", "axes_motion.acceleration: expected at least 15.0 m/s^2"),
+        ("axis_profile: fhpp\naxes: [{}, {velocity_unit: 0.001}]", "axes.velocity_unit: expected no such key"),
+    ],
+)
+def test_what_voids_a_proof_or_reaches_no_drive_is_refused(tmp_path, text, says):
+    path = tmp_path / "robot.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        robot.load_robot(path)
+
+
+def test_units_of_a_drive_reach_its_profile_and_no_axis_outlasts_the_gate(tmp_path):
+    path = tmp_path / "robot.yaml"
+    path.write_text("safety: {late: 0.02}\naxes: [{}, {combined: false, base_velocity: 3.0, position_unit: 1.0e-5}]")
+    axes = linear_axes(robot.load_robot(path))
+    first, second = (channel.axis for channel in axes._channels)
+    assert (first.profile, second.profile) == (CmmtProfile(), CmmtProfile(position_unit=1e-5, base_velocity=3.0))
+    assert (first.link._combined, second.link._combined) == (True, False)
+    assert axes.config.command_timeout == 0.02
 
 
 def test_a_robot_yaml_without_speed_scale_is_slow(tmp_path):

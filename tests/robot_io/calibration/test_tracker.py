@@ -52,6 +52,28 @@ def test_points_that_cannot_tell_are_refused():
         tracker.fit(table, np.random.default_rng(0).uniform(-1, 1, seen.shape), "2026-11-22")
 
 
+@pytest.mark.parametrize("mirror", [(-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, -1)])
+def test_a_mirrored_frame_is_refused(mirror):
+    """With points on a stand it is told; without them nothing can tell, whichever the frame is."""
+    table, seen = grid()
+    with pytest.raises(ValueError, match="mirror image of the table's: so 15 of 15 points"):
+        tracker.fit(table, seen * mirror, "2026-11-22")
+    flat = table[:, 2] < 0.1
+    for frame in (seen, seen * mirror):
+        with pytest.raises(ValueError, match="in one plane, .* on a stand"):
+            tracker.fit(table[flat], frame[flat], "2026-11-22")
+
+
+def test_one_point_on_a_low_stand_tells():
+    few = [*range(12), 13]
+    low, there = (points[few] for points in grid())
+    low[-1, 2] -= 0.2
+    there[-1, 2] -= 0.2  # the hidden frame is turned by less than 10 mrad
+    assert tracker.fit(low, there, "2026-11-22").used.all()
+    with pytest.raises(ValueError, match="mirror"):
+        tracker.fit(low, there * [1, 1, -1], "2026-11-22")
+
+
 def test_csv_errors_name_file_line_and_column(tmp_path):
     path = tmp_path / "ball.csv"
     path.write_text("table_x,table_y,table_z,ball_x,ball_y,ball_z\n0,0,0.02,1,2,x\n")

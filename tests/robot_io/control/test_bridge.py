@@ -171,8 +171,8 @@ def test_every_fault_stops_the_robot_is_latched_and_can_be_mended(name):
     told = noticed + arm.cycle + braking
     if by == "bridge":  # at its tick; and the low-pass needs four time constants
         told += 1 / 75 + arm.dead_time + arm.cycle + 4 / (2 * np.pi * arm.low_pass)
-    # The arm still moves a little as long as the carriage under it brakes.
-    assert times[0] < told and times[1] < told + 0.12
+    # The arm still moves a little as long as the carriage under it brakes, and swings at its stiff drive.
+    assert times[0] < told and times[1] < told + 0.13
     if cause is None:  # the arm's own communication timeout and the drives' node guard
         assert "no message" in rig.arm.cause
         return

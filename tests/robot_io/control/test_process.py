@@ -10,7 +10,7 @@ from robot_io.control import messages, process
 from robot_io.control.interfaces import BridgeState
 from robot_io.policy import export
 from robot_io.policy.policy import Policy
-from robot_io.safety.coasting import PATIENCE
+from robot_io.safety.config import SafetyConfig
 from robot_io.safety.owner_watch import LONGEST_SILENCE
 from tests.support.simulated_clock import DEAD_TIME
 from tests.support.simulated_control import Simulated
@@ -112,7 +112,7 @@ def test_an_exception_that_lasts_leaves_the_arm_at_rest_within_its_braking_dista
     assert all(not speed.any() for now, _, speed in simulation.replies if now > 11.3)
     for _ in range(300):
         simulation.advance()
-    late = DEAD_TIME + (PATIENCE + 2) / 75
+    late = DEAD_TIME + SafetyConfig().late + 2 / 75
     braking = np.abs(velocity) * late + velocity**2 / (2 * np.array(contract.LIMITS.acceleration[2:]))
     assert (np.abs(simulation.arm - place) <= braking + 0.02).all()
     rest = simulation.arm.copy()

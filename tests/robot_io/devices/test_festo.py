@@ -24,8 +24,8 @@ from robot_io.devices.festo import (
     FhppProfile,
     ModbusLink,
 )
-from robot_io.emulator.axes import AxisEmulator, DriveParams, serve
-from tests.support.axes_lockstep import CYCLE, PROFILES, LockStep, Stream
+from robot_io.emulator.axes import AxisEmulator, AxisUnits, DriveParams, serve
+from tests.support.axes_lockstep import CYCLE, PROFILES, STEP, LockStep, Stream
 from tests.support.paths import ROOT
 
 A = 15.0  # [m/s^2]
@@ -73,12 +73,6 @@ def test_input_registers_of_telegram_111():
     )
     assert status.fault_code == 126 and "following error" in CmmtProfile().fault_text(126)
     assert CmmtProfile().fault_text(999).startswith("999: look")
-
-
-def test_node_guard_registers():
-    assert CmmtProfile().node_guard(0.1) == (400, [100, 0])
-    assert CmmtProfile().node_guard(100.0) == (400, [0x86A0, 1])
-    assert FhppProfile().node_guard(0.1) is None
 
 
 @pytest.mark.parametrize(
@@ -345,7 +339,9 @@ def test_a_lost_axis_stops_both(profile):
 
 @pytest.mark.parametrize("lost", [0, 1])
 def test_losing_either_axis_stops_the_other_in_the_same_cycle(lost):
-    rig, stream = moving()
+    rig = LockStep(start=(-0.6, -0.4)).start()
+    stream = Stream(rig, lambda t: np.full(2, min(15.0 * t, 0.5)))
+    rig.run(0.4, stream)
     other = rig.emulators[1 - lost]
     rig.emulators[lost].disconnect()
     stream(rig.now)
@@ -415,6 +411,16 @@ def test_a_stream_that_breaks_off_stops_both_and_may_go_on(profile):
     assert rig.velocity[0] == pytest.approx(0.5, abs=0.02) and rig.axes.problem(rig.now) is None
 
 
+def test_a_stream_that_breaks_off_for_a_moment_at_full_speed_goes_on():
+    """The axes brake meanwhile; what was commanded before is still on its way and no following error."""
+    rig = LockStep(start=(-0.9, 0.0)).start()
+    stream = Stream(rig, lambda t: (min(15.0 * t, 1.8), 0.0))
+    silent = rig.now + 0.3
+    rig.run(0.6, lambda now: None if silent < now < silent + 0.045 else stream(now))
+    assert rig.axes.stale_commands == 1 and rig.axes.problem(rig.now) is None
+    assert rig.velocity[0] > 1.5
+
+
 @pytest.mark.parametrize("profile", PROFILES)
 def test_when_the_computer_dies_the_drives_stop_by_themselves(profile):
     rig, stream = moving(profile)
@@ -439,13 +445,91 @@ def test_commands_that_do_not_start_where_the_axis_is():
     np.testing.assert_allclose(rig.position, before, atol=1e-5)
 
 
-def test_a_blocked_axis():
-    rig, stream = moving()
-    held = rig.position[0]
-    for _ in range(300):
-        rig.position[0] = held
-        rig.run(0.001, stream)
-    assert rig.axes.fault is not None and rig.axes.fault.cause in ("following_error", "drive_fault")
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("holds_measured", [False, True])
+@pytest.mark.parametrize("end", ["fault", "stop", "silence"])
+def test_a_blocked_axis_is_neither_pushed_nor_jumps_when_it_is_free(profile, holds_measured, end):
+    """Whatever ended the commands and wherever its drive leaves the set-point of a dropped task."""
+    rig, stream = moving(profile, params=DriveParams(following_error=1.0, holds_measured=holds_measured))
+    wall = rig.position[0]
+
+    def against_the_wall(seconds, each=None):
+        for _ in range(round(seconds / STEP)):
+            rig.run(STEP, each)
+            if rig.position[0] > wall:
+                rig.position[0], rig.velocity[0] = wall, 0.0
+
+    against_the_wall(1.0 if end == "fault" else 0.15, stream)
+    assert (rig.axes.fault is not None) == (end == "fault")
+    assert end != "fault" or rig.axes.fault.cause == "following_error"
+    if end == "stop":
+        rig.axes.stop()
+    against_the_wall(1.0)
+    assert rig.emulators[0].drive.operating and rig.emulators[0].drive.x - wall < 0.002
+    assert abs(rig.emulators[0].drive.set_point()) < 0.04
+    free = len(rig.log)
+    rig.run(1.0)
+    assert np.abs(rig.trace[free:, 1] - wall).max() < 0.002
+    rig.position[0] -= 0.05  # somebody moves it
+    rig.run(1.5)
+    assert np.abs(rig.velocity[0]) < 1e-3
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_blocked_axis_that_shakes_is_not_pushed_either(profile):
+    """Somebody holds it: it never stands."""
+    rig, stream = moving(profile, params=DriveParams(following_error=1.0))
+    wall = rig.position[0]
+
+    def held(seconds, each=None):
+        for _ in range(round(seconds / STEP)):
+            rig.run(STEP, each)
+            place = wall - 0.003 * (1.0 + np.sin(30.0 * rig.now))
+            if rig.position[0] > place:
+                rig.position[0], rig.velocity[0] = place, 0.0
+
+    held(0.6, stream)
+    assert rig.axes.fault.cause == "following_error"
+    held(1.5)
+    ahead = []
+    for _ in range(50):
+        held(0.01)
+        ahead.append(rig.emulators[0].drive.x - rig.position[0])
+    assert rig.emulators[0].drive.operating and max(ahead) < 0.012
+
+
+def test_an_axis_that_is_kept_from_its_place_at_rest_is_a_fault():
+    """A stiff drive would push there for as long as the robot rests, by less than ``max_error``."""
+    rig, _ = moving(params=DriveParams(following_error=1.0))
+    stream = Stream(rig, lambda t: (0.5 * (t < 0.1), 0.0))
+    wall = rig.position[0] + 0.02
+    for _ in range(1000):
+        rig.run(STEP, stream)
+        if rig.position[0] > wall:
+            rig.position[0], rig.velocity[0] = wall, 0.0
+    assert rig.axes.fault.cause == "following_error" and "allowed are 0.01 m" in rig.axes.fault.sentence
+    free = len(rig.log)
+    rig.run(1.0)
+    assert np.abs(rig.trace[free:, 1] - wall).max() < 0.002
+
+
+def test_an_axis_whose_position_jumped_is_not_led_there():
+    """By 0.3 m between two answers: what is measured then is not where it is."""
+    rig, stream = moving(params=DriveParams(following_error=1.0))
+    link = rig.axes._channels[0].axis.link
+    exchange = link.exchange
+
+    def false(*arguments):
+        registers = exchange(*arguments)
+        count = (registers[5] + (registers[6] << 16) + 300_000) % 2**32
+        return [*registers[:5], count & 0xFFFF, count >> 16, *registers[7:]]
+
+    link.exchange = false
+    rig.run(1.0, stream)
+    assert rig.axes.fault.cause == "following_error" and abs(rig.velocity[0]) < 1e-3
+    stopped = rig.position[0]
+    rig.run(1.0)
+    assert rig.position[0] == pytest.approx(stopped, abs=1e-4)
 
 
 def test_a_drive_that_something_else_switches_off():
@@ -494,24 +578,67 @@ def test_problems_before_the_first_motion():
 
 
 def test_a_drive_that_does_not_take_the_node_guard():
-    rig = LockStep(wrap=NoGuard)
+    rig = LockStep(wrap=NoGuard, node_guard=1.0)
     rig.run(0.05)
-    assert rig.axes.fault.cause == "node_guard" and "[1000, 0]" in rig.axes.problem(rig.now)
+    assert rig.axes.fault.cause == "node_guard" and "[100, 0] as [1000, 0]" in rig.axes.problem(rig.now)
     assert LockStep(node_guard=5.0).start().emulators[0].node_guard == 0.1  # one that does
 
 
 class NoGuard(DirectLink):
-    """A drive that does not take the node guard."""
+    """A drive that answers the node guard with what was written, and does not take it."""
 
     def exchange(self, write_address, values, read_address, count):
-        if write_address == 400:
-            return [1000, 0]
-        return super().exchange(write_address, values, read_address, count)
+        return values if write_address == 400 else super().exchange(write_address, values, read_address, count)
+
+
+class SwappedGuard(DirectLink):
+    """The words of a drive's node guard come high word first."""
+
+    def exchange(self, write_address, values, read_address, count):
+        values = values[::-1] if write_address == 400 else values
+        answer = super().exchange(write_address, values, read_address, count)
+        return answer[::-1] if read_address == 400 else answer
+
+
+def test_a_node_guard_whose_words_are_swapped_is_refused():
+    rig = LockStep(wrap=SwappedGuard, node_guard=1.0)
+    rig.run(0.05)
+    assert rig.axes.fault.cause == "node_guard" and "are its words swapped" in rig.axes.problem(rig.now)
+    assert rig.emulators[0].node_guard == 1.0
+
+
+@pytest.mark.parametrize(
+    ("units", "says"),
+    [
+        (dict(base_acceleration=7.5), "base_acceleration is 7.5 (parameter 12346), robot.yaml has 15"),
+        (dict(base_velocity=1.0), "base_velocity is 1 (parameter 12345), robot.yaml has 2"),
+        (dict(position=1e-5), "position_unit is 1e-05 (parameter 11724), robot.yaml has 1e-06"),
+        (dict(velocity=1e-4), "velocity_unit is 0.0001 (parameter 11725), robot.yaml has 0.001"),
+    ],
+)
+def test_a_drive_that_counts_otherwise_gets_no_power(units, says):
+    rig = LockStep(units=AxisUnits(**{"position": 1e-6, **units}))
+    rig.run(0.2)
+    for request in (rig.axes.acknowledge, rig.axes.enable):
+        request()
+    rig.run(0.5)
+    assert rig.axes.fault.cause == "units" and says in rig.axes.problem(rig.now)
+    assert not any(emulator.drive.operating for emulator in rig.emulators)
+
+
+def test_a_drive_that_tells_no_units_gets_no_power():
+    rig = LockStep()
+    for emulator in rig.emulators:
+        emulator._parameters.pop((12346, 0))
+    rig.axes.enable()
+    rig.run(0.5)
+    assert rig.axes.fault.cause == "units" and "12346" in rig.axes.problem(rig.now)
+    assert not any(emulator.drive.operating for emulator in rig.emulators)
 
 
 def test_a_drive_that_would_not_stop_by_itself_gets_no_power():
     """The operator's whole request at once: acknowledge, enable, home."""
-    rig = LockStep(wrap=NoGuard)
+    rig = LockStep(wrap=NoGuard, node_guard=1.0)
     rig.run(0.05)
     for _ in range(3):
         for request in (rig.axes.acknowledge, rig.axes.enable, rig.axes.home):
@@ -729,6 +856,7 @@ def test_festos_own_client_runs_the_emulator():
             for k in ("acknowledged", "enabled", "homed", "moved", "back", "stopped", "updated", "disabled")
         )
         assert told["device"] == "RIG-AXIS"
+        assert told["units"] == [-6, -3, 2.0, 15.0, 15.0]  # powers of ten of m and m/s; m/s, m/s^2
         assert told["start"] == pytest.approx(50_000, abs=100)  # [um]
         assert told["position"] == pytest.approx(150_000, abs=100)
         assert told["velocity"] == pytest.approx(-1.0, abs=0.6)  # [m/s], somewhere on its ramp
