@@ -39,9 +39,7 @@ JAX = ("jax", "jaxlib", "flax", "optax", "brax", "equinox", "mujoco")
 # Of robot_io, whose other modules run on the robot: what some may import besides.
 JAX_ALLOWED = {
     "robot_io/policy/export.py": JAX,
-    "robot_io/policy/pytree.py": ("jax",),
     "robot_io/policy/jax_policy.py": ("jax", "jaxlib"),
-    "robot_io/policy/jax_network.py": ("jax",),
     "robot_io/emulator/world.py": ("mujoco",),
 }
 

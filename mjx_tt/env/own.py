@@ -32,7 +32,7 @@ from jaxtyping import Bool, Float
 
 from ballmodel.flight import PaddlePose
 from mjx_tt.env import rewards
-from robot_io.contract import PAPER, Contract
+from robot_io.contract import PAPER, Contract, unflatten
 from robot_io.policy.policy import Policy
 
 F = TypeVar("F", bound=Callable)
@@ -107,14 +107,7 @@ class Network:
 
     def unflatten(self, theta: Any) -> dict[str, Any]:
         """Parameters by name from theta (size, ...)."""
-        if theta.shape[0] != self.size:
-            raise ValueError(f"theta has {theta.shape[0]} parameters, the network {self.name!r} has {self.size}")
-        parameters, place = {}, 0
-        for name, shape in self.shapes.items():
-            count = int(np.prod(shape))
-            parameters[name] = theta[place : place + count].reshape(shape + theta.shape[1:])
-            place += count
-        return parameters
+        return unflatten(theta, self.shapes)
 
 
 @dataclass(frozen=True)
