@@ -20,6 +20,7 @@ eight and 3 + n observations in place of eleven; everything else is the same.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -197,18 +198,17 @@ def n_parameters(n_joints: int = N_JOINTS) -> int:
     return sum(int(np.prod(shape)) for shape in parameter_shapes(n_joints).values())
 
 
-def unflatten(theta: Any, n_joints: int = N_JOINTS) -> dict[str, Any]:
-    """Splits theta (976, ...batch) into a dict of arrays shaped as ``parameter_shapes`` with batch axes last.
+def unflatten(theta: Any, shapes: Mapping[str, tuple[int, ...]] | None = None) -> dict[str, Any]:
+    """Splits theta (size, ...batch) into arrays by name of these shapes, in this order, with the batch axes last.
 
-    Works on NumPy and JAX arrays. Raises ValueError when the first axis has another length.
+    Works on NumPy and JAX arrays. Without ``shapes``: ``parameter_shapes()``. Raises ValueError for another size.
     """
-    if theta.shape[0] != n_parameters(n_joints):
-        raise ValueError(
-            f"theta has {theta.shape[0]} parameters, the policy of {n_joints} joints has {n_parameters(n_joints)}"
-        )
+    shapes = parameter_shapes() if shapes is None else shapes
+    sizes = [int(np.prod(shape)) for shape in shapes.values()]
+    if theta.shape[0] != sum(sizes):
+        raise ValueError(f"theta has {theta.shape[0]} parameters, expected {sum(sizes)}")
     parts, start = {}, 0
-    for name, shape in parameter_shapes(n_joints).items():
-        size = int(np.prod(shape))
+    for (name, shape), size in zip(shapes.items(), sizes, strict=True):
         parts[name] = theta[start : start + size].reshape(shape + theta.shape[1:])
         start += size
     return parts

@@ -9,7 +9,7 @@ from importlinter.cli import lint_imports
 
 from tests.support.paths import ROOT
 
-USES_JAX = {f"robot_io/policy/{name}.py" for name in ("export", "jax_network", "jax_policy", "pytree")}
+USES_JAX = {f"robot_io/policy/{name}.py" for name in ("export", "jax_policy")}
 
 
 def test_the_contracts_hold(monkeypatch):

@@ -1,12 +1,17 @@
 """The journal of fine-tuning: one JSON line per episode, on the disk before the next ball is played.
 
-Everything but their order is in the lines: parameters, curves and the human's balls can be made from them again.
+Everything but their order is in the lines: parameters, curves and the human's balls can be made from them again. Each
+line ends in a checksum of everything before it in the file, so that a line that was changed, doubled or taken out is
+noticed. Lines without one, of journals that were begun before there were checksums, are covered by the next that has
+one.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +24,7 @@ from robot_io.control.episode import EpisodeSummary
 
 BEFORE, TRAINING, AFTER = "before", "training", "after"
 PHASES = (BEFORE, TRAINING, AFTER)
+_CHECKSUM = re.compile(rb', "checksum": "([0-9a-f]{16})"}\n$')
 
 
 @dataclass(frozen=True)
@@ -58,12 +64,13 @@ class Journal:
     """Appends entries to a file and reads back what an earlier session left there.
 
     A last line that was not finished when the power went is dropped. Raises RunError for any other line that is no
-    entry: the file was changed by someone.
+    entry or does not follow the lines before it: the file was changed by someone.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.entries: list[Entry] = []
+        self._digest = hashlib.sha256()  # of all lines
         whole = self._read() if path.exists() else 0
         self._file = open(path, "ab", buffering=0)
         os.ftruncate(self._file.fileno(), whole)
@@ -72,7 +79,7 @@ class Journal:
 
     def append(self, entry: Entry) -> None:
         """Adds an entry; it is on the disk when this returns. Raises OSError when the disk refuses."""
-        line = (json.dumps(_to_json(entry), allow_nan=False) + "\n").encode()
+        line = content = self._checked(json.dumps(_to_json(entry), allow_nan=False).encode())
         handle = self._file.fileno()
         start = os.fstat(handle).st_size
         try:
@@ -82,19 +89,32 @@ class Journal:
         except OSError:
             os.ftruncate(handle, start)  # no half a line in the middle, should there be room again
             raise
+        self._digest.update(content)
         self.entries.append(entry)
 
     def close(self) -> None:
         self._file.close()
 
+    def _checked(self, content: bytes) -> bytes:
+        """The line of a JSON object: with the checksum of the lines before it and of itself."""
+        digest = self._digest.copy()
+        digest.update(content)
+        return content[:-1] + f', "checksum": "{digest.hexdigest()[:16]}"}}\n'.encode()
+
     def _read(self) -> int:
         """Reads the entries; length [bytes] of the whole lines."""
         content, whole = self.path.read_bytes(), 0
-        lines = content.splitlines(keepends=True)
+        lines, checked = content.splitlines(keepends=True), False
         for i, line in enumerate(lines):
             try:
                 if not line.endswith(b"\n"):
                     raise ValueError("the line has no end")
+                checked |= _CHECKSUM.search(line) is not None
+                if checked and line != self._checked(_CHECKSUM.sub(b"}", line)):
+                    raise RunError(
+                        f"{self.path}: line {i + 1} was changed, or lines before it were changed, doubled or taken "
+                        "out; restore the file or start a new run"
+                    )
                 self.entries.append(_from_json(json.loads(line)))
             except (ValueError, TypeError, KeyError) as error:
                 if i == len(lines) - 1:
@@ -102,6 +122,7 @@ class Journal:
                 raise RunError(
                     f"{self.path}: line {i + 1} is no episode ({error}); restore the file or start a new run"
                 ) from None
+            self._digest.update(line)
             whole += len(line)
         return whole
 
@@ -121,4 +142,5 @@ def _from_json(data: dict[str, Any]) -> Entry:
     summary = dict(data.pop("summary"))
     summary |= {name: tuple(value) for name, value in summary.items() if isinstance(value, list)}
     trajectory = np.array(data.pop("trajectory"), float).reshape(-1, 4)
+    data.pop("checksum", None)
     return Entry(summary=EpisodeSummary(**summary), returns=data.pop("return"), trajectory=trajectory, **data)

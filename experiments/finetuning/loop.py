@@ -44,7 +44,7 @@ from mjx_tt.env.terms import PlayedBall as RewardedBall
 from robot_io.contract import JOINT_NAMES
 from robot_io.control.episode import HIT, RETURNED, EpisodeSummary
 from robot_io.emulator.config import RigParams
-from robot_io.policy import jax_network
+from robot_io.policy import jax_policy
 from robot_io.policy.policy import Policy
 
 SETTINGS = "finetuning.yaml"
@@ -150,7 +150,7 @@ class FineTuningRun:
         first: TrainState,
         network: Network | None = None,
     ) -> None:
-        self._network = None if network is None else jax_network.exported(network)
+        self._network = None if network is None else jax_policy.exported(network)
         self._settings, self._run, self._robot, self._operator = settings, run, robot, operator
         self._bgs = build.bgs_config(settings.optimiser(), settings.updates)
         self._weights = {term.name: term.weight for term in build.reward_terms(settings.rewards)}

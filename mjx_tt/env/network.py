@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from robot_io.contract import unflatten
+
 State: TypeAlias = Any  # a pytree of arrays, whatever a network remembers
 Parameters: TypeAlias = Mapping[str, Array]
 
@@ -41,14 +43,7 @@ class Network:
 
     def unflatten(self, theta: Any) -> dict[str, Any]:
         """Parameters by name from theta (size, ...)."""
-        if theta.shape[0] != self.size:
-            raise ValueError(f"theta has {theta.shape[0]} parameters, the network {self.name!r} has {self.size}")
-        parameters, place = {}, 0
-        for name, shape in self.shapes.items():
-            count = int(np.prod(shape))
-            parameters[name] = theta[place : place + count].reshape(shape + theta.shape[1:])
-            place += count
-        return parameters
+        return unflatten(theta, self.shapes)
 
 
 def network(name: str, shapes: Mapping[str, tuple[int, ...]]) -> Callable[[type], Network]:

@@ -1,18 +1,18 @@
-"""The gated dilated CNN of 976 parameters in JAX, in streaming form (in full: ``robot_io.policy.policy.forward``).
+"""The gated dilated CNN of 976 parameters in JAX, and a user's network, as controllers of simulated episodes.
 
-Architecture and parameter order: ``robot_io.contract``. Streaming keeps one past input, two past outputs of layer 1 and
-four of layer 2, which is all that the dilations 1, 2, 4 reach back to: 928 multiply-adds a control step instead of
-4,576.
+Architecture and parameter order: ``robot_io.contract``; the network tick by tick: ``robot_io.policy.policy.step``.
 
 Parameters may differ along a last axis of P perturbations: kernels are (2, in, out, P) and the batch of activations
 (channels, B) is R repeats of them, B = R x P with P the faster index. Sums over channels are written out so that each
-layer is one vector loop over the batch.
+layer is one vector loop over the batch. ``mjx_tt.gradient.network`` has matrix products for loops that are
+differentiated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeAlias
 
 import jax
@@ -23,21 +23,11 @@ from jaxtyping import Float, PRNGKeyArray
 from mjx_tt.env.episode import Tick
 from mjx_tt.env.network import Network
 from mjx_tt.robot.scalar_algebra import optimization_barrier
-from robot_io.contract import DILATIONS, GATED, n_parameters
-from robot_io.policy.pytree import Policy as Policy
+from robot_io.contract import GATED, n_parameters
+from robot_io.policy.jax_policy import Policy as Policy
+from robot_io.policy.policy import Past, start, step
 
 Parameters: TypeAlias = Mapping[str, Array]  # of ``Policy.parameters``
-Layer: TypeAlias = tuple[Array, Array, bool]  # kernel, bias, gated
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class PolicyState:
-    """State of the streaming form, newest last."""
-
-    inputs: Float[Array, "1 observed *batch"]  # normalised observation of the tick before
-    layer1: Float[Array, "2 8 *batch"]
-    layer2: Float[Array, "4 12 *batch"]
 
 
 def initial_theta(key: PRNGKeyArray, scale: float = 0.1, size: int = n_parameters()) -> Float[Array, " size"]:
@@ -45,9 +35,9 @@ def initial_theta(key: PRNGKeyArray, scale: float = 0.1, size: int = n_parameter
     return scale * jax.random.normal(key, (size,))
 
 
-def _layer(layer: Layer, older: Float[Array, "inputs *batch"], newer: Float[Array, "inputs *batch"]) -> Array:
-    """One tap pair of a layer: older, newer (in, B) -> (out, B), with B = R x P for kernels of P perturbations."""
-    kernel, bias, gated = layer
+def _layer(parameters: Parameters, i: int, older: Array, newer: Array) -> Array:
+    """Layer i from 0: older, newer (in, B) -> (out, B), with B = R x P for kernels of P perturbations."""
+    kernel, bias = parameters[f"conv{i + 1}/kernel"], parameters[f"conv{i + 1}/bias"]
     columns = kernel.shape[3] if kernel.ndim == 4 else 1
     shape = (-1, columns) if kernel.ndim == 4 else newer.shape[1:]
 
@@ -61,36 +51,17 @@ def _layer(layer: Layer, older: Float[Array, "inputs *batch"], newer: Float[Arra
             + spread(kernel[0, c]) * older[c].reshape(shape)[None]
             + spread(kernel[1, c]) * newer[c].reshape(shape)[None]
         )
-    z = optimization_barrier(z).reshape(-1, *newer.shape[1:])
-    if not gated:
+    x = activate(optimization_barrier(z).reshape(-1, *newer.shape[1:]), i)
+    return x if i == len(GATED) - 1 else optimization_barrier(x)
+
+
+def activate(z: Array, i: int, axis: int = 0) -> Array:
+    """Outputs of layer i from 0; ``axis`` has the channels."""
+    if not GATED[i]:
         return jnp.tanh(z)
-    half = z.shape[0] // 2
-    return jnp.tanh(z[:half]) * jax.nn.sigmoid(z[half:])
-
-
-def _layers(parameters: Parameters) -> list[Layer]:
-    return [(parameters[f"conv{i}/kernel"], parameters[f"conv{i}/bias"], gated) for i, gated in enumerate(GATED, 1)]
-
-
-def start(parameters: Parameters, x: Float[Array, "observed *batch"]) -> PolicyState:
-    """State whose whole history is the first normalised observation ``x`` (11, ...)."""
-    one, two, _ = _layers(parameters)
-    h1 = _layer(one, x, x)
-    h2 = _layer(two, h1, h1)
-    return PolicyState(x[None], jnp.stack([h1] * DILATIONS[1]), jnp.stack([h2] * DILATIONS[2]))
-
-
-def stream(
-    parameters: Parameters, state: PolicyState, x: Float[Array, "observed *batch"]
-) -> tuple[Float[Array, "joints *batch"], PolicyState]:
-    """One control step: normalised observation ``x`` (11, ...) -> action (8, ...) in [-1, 1] and the next state."""
-    one, two, three = _layers(parameters)
-    h1 = optimization_barrier(_layer(one, state.inputs[0], x))
-    h2 = optimization_barrier(_layer(two, state.layer1[0], h1))
-    action = _layer(three, state.layer2[0], h2)
-    return action, PolicyState(
-        x[None], jnp.concatenate([state.layer1[1:], h1[None]]), jnp.concatenate([state.layer2[1:], h2[None]])
-    )
+    half = z.shape[axis] // 2
+    signal, opening = (jax.lax.slice_in_dim(z, k * half, (k + 1) * half, axis=axis) for k in (0, 1))
+    return jnp.tanh(signal) * jax.nn.sigmoid(opening)
 
 
 @jax.tree_util.register_dataclass
@@ -112,13 +83,13 @@ class PolicyController:
             raise ValueError(f"the policy's network is {policy.network.name!r}; here only the paper's is computed")
         return cls(policy.parameters, policy.mean, policy.inv_std)
 
-    def start(self, observation: Float[Array, "observed *batch"]) -> PolicyState:
-        return start(self.parameters, normalised(observation, self.mean, self.inv_std))
+    def start(self, observation: Float[Array, "observed *batch"]) -> Past:
+        return start(partial(_layer, self.parameters), normalised(observation, self.mean, self.inv_std))
 
     def act(
-        self, tick: Tick, state: PolicyState, observation: Float[Array, "observed *batch"]
-    ) -> tuple[Float[Array, "joints *batch"], PolicyState]:
-        return stream(self.parameters, state, normalised(observation, self.mean, self.inv_std))
+        self, tick: Tick, state: Past, observation: Float[Array, "observed *batch"]
+    ) -> tuple[Float[Array, "joints *batch"], Past]:
+        return step(partial(_layer, self.parameters), state, normalised(observation, self.mean, self.inv_std))
 
 
 def normalised(x: Float[Array, "observed *batch"], mean: Array, inv_std: Array) -> Float[Array, "observed *batch"]:

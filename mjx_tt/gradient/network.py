@@ -7,7 +7,6 @@ all episodes in every control step, one by one: twenty times the time forwards, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +14,9 @@ from jax import Array
 from jaxtyping import Float
 
 from mjx_tt.env.episode import Controller, Tick
-from mjx_tt.env.policy import controller, normalised
-from robot_io.contract import DILATIONS, GATED
-from robot_io.policy.policy import Policy
-
-Past: TypeAlias = tuple[
-    tuple[Array, ...], ...
-]  # by layer: its inputs (P, in, R) of the last control steps, oldest first
+from mjx_tt.env.policy import activate, controller, normalised
+from robot_io.contract import GATED
+from robot_io.policy.policy import Past, Policy, start, step
 
 
 @jax.tree_util.register_dataclass
@@ -48,21 +43,13 @@ class Matrices:
         return cls(tuple(weights), tuple(biases), policy.mean, policy.inv_std)
 
     def start(self, observation: Float[Array, "observed L"]) -> Past:
-        """As if the first observation had always been there."""
-        x, past = self._by_policy(observation), []
-        for i, dilation in enumerate(DILATIONS):
-            past.append((x,) * dilation)
-            x = self._layer(i, x, x)
-        return tuple(past)
+        return start(self._layer, self._by_policy(observation))
 
     def act(
         self, tick: Tick, state: Past, observation: Float[Array, "observed L"]
     ) -> tuple[Float[Array, "joints L"], Past]:
-        x, later = self._by_policy(observation), []
-        for i, past in enumerate(state):
-            later.append((*past[1:], x))
-            x = self._layer(i, past[0], x)
-        return x.transpose(1, 2, 0).reshape(x.shape[1], -1), tuple(later)
+        action, later = step(self._layer, state, self._by_policy(observation))
+        return action.transpose(1, 2, 0).reshape(action.shape[1], -1), later
 
     def _by_policy(self, observation: Array) -> Array:
         """Normalised observations (P, 11, R) of (11, R x P)."""
@@ -72,10 +59,7 @@ class Matrices:
     def _layer(self, i: int, older: Array, newer: Array) -> Array:
         inputs = jnp.concatenate([older, newer], 1)
         z = jnp.matmul(self.weights[i], inputs, precision=jax.lax.Precision.HIGHEST) + self.biases[i]
-        if not GATED[i]:
-            return jnp.tanh(z)
-        half = z.shape[1] // 2
-        return jnp.tanh(z[:, :half]) * jax.nn.sigmoid(z[:, half:])
+        return activate(z, i, axis=1)
 
 
 def differentiable(policy: Policy) -> Controller:

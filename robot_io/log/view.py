@@ -14,10 +14,15 @@ from importlib import resources
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from scipy.spatial.transform import Rotation
 
 from ballmodel.constants import (
     BALL_DIAMETER,
@@ -45,6 +50,7 @@ BLADE_THICKNESS = 0.012  # [m] as drawn
 BLUE, WHITE, GREY, STEEL = (0.05, 0.27, 0.52, 1.0), (1.0, 1.0, 1.0, 1.0), (0.3, 0.3, 0.3, 0.5), (0.7, 0.72, 0.75, 1.0)
 ORANGE, RED = (1.0, 0.5, 0.0, 1.0), (0.75, 0.1, 0.1, 1.0)
 
+UNTURNED = Rotation.identity()
 NOTHING = '{"joints": [], "capsules": [], "blade_capsules": []}'  # geometry of a robot that is not drawn
 
 TF = Topic("/tf", FrameTransforms)
@@ -61,36 +67,37 @@ class View:
     """
 
     def __init__(self, base: Frame = HERE, robot: Contract = PAPER) -> None:
-        self._base, self._turned = base, _quaternion(base.matrix)
+        self._base, self._turned = base, Rotation.from_matrix(base.matrix)
         shipped = (resources.files("robot_io.safety") / SHIPPED).read_text(encoding="utf-8")
         geometry = json.loads(shipped if robot == PAPER else robot.geometry or NOTHING)
         self._joints, self._blade = geometry["joints"], geometry["blade_capsules"]
-        self._fixed = [_quaternion(np.array(joint["rot"], float)) for joint in self._joints]
+        self._fixed = [Rotation.from_matrix(joint["rot"]) for joint in self._joints]
         self._capsules = geometry["capsules"]
         self._due = {Joints: -math.inf, Ball: -math.inf}
 
     def scene(self, time: float) -> Encoded:
         """Table, robot and ball, each in its frame; for the session's start."""
         update = SceneUpdate()
-        _table(update.entities.add(id="table", frame_id=FRAME))
+        _draw_table(update.entities.add(id="table", frame_id=FRAME))
         ball = update.entities.add(id=BALL_FRAME, frame_id=BALL_FRAME)
-        _sphere(ball, (0.0, 0.0, 0.0), BALL_DIAMETER, ORANGE)
+        _add(ball.spheres, (0.0, 0.0, 0.0), (BALL_DIAMETER,) * 3, ORANGE)
         links = {j["name"]: update.entities.add(id=j["name"], frame_id=j["name"]) for j in self._joints}
         for capsule in self._capsules:
             if capsule["name"] in self._blade:
                 continue
-            p, q = capsule["p0"], capsule["p1"]
+            p, q = np.array(capsule["p0"], float), np.array(capsule["p1"], float)
             if capsule["joint"] == FIXED:
-                p, q = (self._base.outward(np.array(end)).tolist() for end in (p, q))
+                p, q = self._base.outward(p), self._base.outward(q)
                 links.setdefault(FIXED, update.entities.add(id=FIXED, frame_id=FRAME))
             link, width = links[capsule["joint"]], 2.0 * capsule["radius"]
-            _cylinder(link, *_stretch(p, q), width, math.dist(p, q), STEEL)
-            _sphere(link, p, width, STEEL)
-            _sphere(link, q, width, STEEL)
+            _add_cylinder(link, 0.5 * (p + q), q - p, width, math.dist(p, q), STEEL)
+            for end in (p, q):
+                _add(link.spheres, end, (width,) * 3, STEEL)
         blade = [capsule for name in self._blade for capsule in self._capsules if capsule["name"] == name]
         if blade:
-            middle, _ = _stretch(blade[0]["p0"], blade[0]["p1"])
-            _cylinder(links[blade[0]["joint"]], middle, _normal(blade), 2.0 * PADDLE_RADIUS, BLADE_THICKNESS, RED)
+            middle = 0.5 * (np.array(blade[0]["p0"]) + np.array(blade[0]["p1"]))
+            link = links[blade[0]["joint"]]
+            _add_cylinder(link, middle, _normal(blade), 2.0 * PADDLE_RADIUS, BLADE_THICKNESS, RED)
         for entity in update.entities:
             entity.frame_locked = True
         return Encoded(SCENE, time, time, 0, update)
@@ -104,7 +111,7 @@ class View:
         elif isinstance(record, Ball):
             if self._is_due(record, record.capture_time, BALL_RATE) and np.isfinite(record.position).all():
                 message = FrameTransforms()
-                _frame(message, FRAME, BALL_FRAME, record.position.tolist(), (0.0, 0.0, 0.0, 1.0))
+                _add_frame(message, FRAME, BALL_FRAME, record.position)
                 yield Encoded(TF, record.received, record.capture_time, record.id, message)
         elif isinstance(record, Event) and (value := _state(record)):
             yield Encoded(STATE, record.time, record.time, 0, KeyValuePair(key="state", value=value))
@@ -118,16 +125,15 @@ class View:
 
     def _frames(self, position: Sequence[float]) -> FrameTransforms:
         message, parent = FrameTransforms(), FRAME
-        for joint, fixed, q in zip(self._joints, self._fixed, position, strict=True):
-            place, turned = joint["pos"], fixed
+        for joint, turned, q in zip(self._joints, self._fixed, position, strict=True):
+            place, axis = np.array(joint["pos"], float), np.array(joint["axis"], float)
             if joint["type"] == "slide":
-                place = (np.array(place) + q * np.array(joint["rot"]) @ np.array(joint["axis"])).tolist()
+                place = place + turned.apply(q * axis)
             else:
-                s = math.sin(0.5 * q)
-                turned = _product(fixed, (*(s * a for a in joint["axis"]), math.cos(0.5 * q)))
+                turned = turned * Rotation.from_rotvec(q * axis)
             if parent == FRAME:
-                place, turned = self._base.outward(np.array(place)).tolist(), _product(self._turned, turned)
-            _frame(message, parent, joint["name"], place, turned)
+                place, turned = self._base.outward(place), self._turned * turned
+            _add_frame(message, parent, joint["name"], place, turned)
             parent = joint["name"]
         return message
 
@@ -157,101 +163,50 @@ def _state(event: Event) -> str | None:
         return None
 
 
-def _frame(message: Any, parent: str, child: str, place: Sequence[float], turned: Sequence[float]) -> None:
-    frame = message.transforms.add(parent_frame_id=parent, child_frame_id=child)
-    frame.translation.x, frame.translation.y, frame.translation.z = place
-    frame.rotation.x, frame.rotation.y, frame.rotation.z, frame.rotation.w = turned
-
-
-def _table(table: SceneEntity) -> None:
-    half_x, half_y = 0.5 * (TABLE_WIDTH - LINE), 0.5 * (TABLE_LENGTH - LINE)
-    _cube(table, (0.0, 0.0, -0.5 * TABLE_THICKNESS), (TABLE_WIDTH, TABLE_LENGTH, TABLE_THICKNESS), BLUE)
-    for x, width in ((-half_x, LINE), (0.0, 0.003), (half_x, LINE)):
-        _cube(table, (x, 0.0, 0.0), (width, TABLE_LENGTH, 0.002), WHITE)
-    for y in (-half_y, half_y):
-        _cube(table, (0.0, y, 0.0), (TABLE_WIDTH, LINE, 0.002), WHITE)
-    _cube(table, (0.0, 0.0, 0.5 * NET_HEIGHT), (TABLE_WIDTH + 2 * NET_OVERHANG, NET_THICKNESS, NET_HEIGHT), GREY)
-    for x, y in ((x, y) for x in (-0.6, 0.6) for y in (-1.05, 1.05)):
-        _cube(
-            table, (x, y, -0.5 * (TABLE_HEIGHT + TABLE_THICKNESS)), (0.05, 0.05, TABLE_HEIGHT - TABLE_THICKNESS), GREY
-        )
-
-
-def _cube(entity: SceneEntity, place: Sequence[float], size: Sequence[float], colour: Sequence[float]) -> None:
-    cube = entity.cubes.add()
-    _pose(cube, place, (0.0, 0.0, 0.0, 1.0), colour)
-    cube.size.x, cube.size.y, cube.size.z = size
-
-
-def _sphere(entity: SceneEntity, place: Sequence[float], diameter: float, colour: Sequence[float]) -> None:
-    sphere = entity.spheres.add()
-    _pose(sphere, place, (0.0, 0.0, 0.0, 1.0), colour)
-    sphere.size.x = sphere.size.y = sphere.size.z = diameter
-
-
-def _cylinder(
-    entity: SceneEntity,
-    place: Sequence[float],
-    axis: Sequence[float],
-    diameter: float,
-    length: float,
-    colour: Sequence[float],
-) -> None:
-    cylinder = entity.cylinders.add(bottom_scale=1.0, top_scale=1.0)
-    _pose(cylinder, place, _towards(axis), colour)
-    cylinder.size.x = cylinder.size.y = diameter
-    cylinder.size.z = length
-
-
-def _pose(shape: Any, place: Sequence[float], turned: Sequence[float], colour: Sequence[float]) -> None:
-    pose = shape.pose
-    pose.position.x, pose.position.y, pose.position.z = place
-    pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w = turned
-    shape.color.r, shape.color.g, shape.color.b, shape.color.a = colour
-
-
-def _normal(blade: Sequence[dict[str, Any]]) -> list[float]:
-    """Direction across the blade: across its first two capsules, or whatever lies across the only one."""
-    (_, first), (_, second) = (_stretch(c["p0"], c["p1"]) for c in (blade[0], blade[-1]))
-    normal = np.cross(first, second)
-    if not normal.any():
-        normal = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
-    normal = normal / np.linalg.norm(normal)
-    return (normal * np.sign(normal[np.argmax(np.abs(normal))]) + 0.0).tolist()  # without a negative zero
-
-
-def _stretch(p: Sequence[float], q: Sequence[float]) -> tuple[list[float], list[float]]:
-    """Middle of the stretch from p to q, and its direction."""
-    return [0.5 * (a + b) for a, b in zip(p, q, strict=True)], [b - a for a, b in zip(p, q, strict=True)]
-
-
-def _towards(axis: Sequence[float]) -> tuple[float, ...]:
-    """Quaternion x, y, z, w of the shortest turn from the z axis to ``axis``."""
-    x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
-    if z < 0.0:  # a cylinder has no direction, and so the opposite turn is never half a one
-        x, y, z = -x, -y, -z
-    quaternion = np.array([-y, x, 0.0, 1.0 + z])
-    return tuple((quaternion / np.linalg.norm(quaternion)).tolist())
-
-
-def _quaternion(turn: np.ndarray) -> tuple[float, ...]:
-    """Quaternion x, y, z, w of a rotation matrix: the longest row of 4 q q^T is the least rounded."""
-    trace = np.trace(turn)
-    outer = np.empty((4, 4))
-    outer[:3, :3] = turn + turn.T + (1.0 - trace) * np.eye(3)
-    outer[3, :3] = outer[:3, 3] = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
-    outer[3, 3] = 1.0 + trace
-    row = outer[np.argmax(np.diag(outer))]
-    return tuple((row / np.linalg.norm(row)).tolist())
-
-
-def _product(a: Sequence[float], b: Sequence[float]) -> tuple[float, ...]:
-    """Quaternion product a b: the turn b, then the turn a."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
+def _add_frame(message: Any, parent: str, child: str, place: Any, turned: Rotation = UNTURNED) -> None:
+    message.transforms.add(
+        parent_frame_id=parent, child_frame_id=child, translation=_vector(place), rotation=_quaternion(turned)
     )
+
+
+def _draw_table(table: SceneEntity) -> None:
+    half_x, half_y = 0.5 * (TABLE_WIDTH - LINE), 0.5 * (TABLE_LENGTH - LINE)
+    lines = [(-half_x, 0.0, LINE, TABLE_LENGTH), (0.0, 0.0, 0.003, TABLE_LENGTH), (half_x, 0.0, LINE, TABLE_LENGTH)]
+    lines += [(0.0, -half_y, TABLE_WIDTH, LINE), (0.0, half_y, TABLE_WIDTH, LINE)]
+    leg, middle = TABLE_HEIGHT - TABLE_THICKNESS, -0.5 * (TABLE_HEIGHT + TABLE_THICKNESS)
+    shapes = (
+        ((0.0, 0.0, -0.5 * TABLE_THICKNESS), (TABLE_WIDTH, TABLE_LENGTH, TABLE_THICKNESS), BLUE),
+        *(((x, y, 0.0), (width, length, 0.002), WHITE) for x, y, width, length in lines),
+        ((0.0, 0.0, 0.5 * NET_HEIGHT), (TABLE_WIDTH + 2 * NET_OVERHANG, NET_THICKNESS, NET_HEIGHT), GREY),
+        *(((x, y, middle), (0.05, 0.05, leg), GREY) for x in (-0.6, 0.6) for y in (-1.05, 1.05)),
+    )
+    for shape in shapes:
+        _add(table.cubes, *shape)
+
+
+def _add(shapes: Any, place: Any, size: Any, colour: Sequence[float], turned: Rotation = UNTURNED) -> Any:
+    pose = Pose(position=_vector(place), orientation=_quaternion(turned))
+    return shapes.add(pose=pose, size=_vector(size), color=Color(**dict(zip("rgba", colour, strict=True))))
+
+
+def _add_cylinder(
+    entity: SceneEntity, place: Any, axis: np.ndarray, diameter: float, length: float, colour: Sequence[float]
+) -> None:
+    turned, _ = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])
+    cylinder = _add(entity.cylinders, place, (diameter, diameter, length), colour, turned)
+    cylinder.bottom_scale = cylinder.top_scale = 1.0
+
+
+def _vector(values: Any) -> Vector3:
+    return Vector3(**dict(zip("xyz", values, strict=True)))
+
+
+def _quaternion(turned: Rotation) -> Quaternion:
+    return Quaternion(**dict(zip("xyzw", turned.as_quat(), strict=True)))
+
+
+def _normal(blade: Sequence[dict[str, Any]]) -> np.ndarray:
+    """Direction across the blade: across its first two capsules, or whatever lies across the only one."""
+    first, second = (np.subtract(capsule["p1"], capsule["p0"]) for capsule in (blade[0], blade[-1]))
+    normal = np.cross(first, second)
+    return normal if normal.any() else np.cross(first, np.eye(3)[np.argmin(np.abs(first))])

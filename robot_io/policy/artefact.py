@@ -11,19 +11,15 @@ import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from robot_io import contract
 from robot_io.contract import Contract
 from robot_io.errors import ContractError
-from robot_io.policy.numpy_policy import StreamingPolicy
-from robot_io.policy.own_network import ExportedNetwork
-from robot_io.policy.policy import Policy
-
-if TYPE_CHECKING:
-    from robot_io.policy.jax_network import ExportedPolicy
+from robot_io.policy.backends import LoopPolicy, make_policy
+from robot_io.policy.policy import ExportedNetwork, Policy
 
 SCHEMA_VERSION = 1
 NORMALISER_FORMULA = "(observation - mean) * inverse_scale"
@@ -35,14 +31,14 @@ PARAMETERS = "params.npz"
 GOLDEN = "golden.npz"
 ONNX = "policy.onnx"
 JAX_EXPORT = "policy.jaxexport"
-NETWORK = "network.py"  # of a user's own network: the file that defines it, which the robot does not run
+NETWORK = "network.py"  # of a user-defined network: the file that defines it, which the robot does not run
 HASHED_FILES = (PARAMETERS, GOLDEN, ONNX, JAX_EXPORT)  # by the manifest, which has a digest of its own
 FILES = (MANIFEST, MANIFEST_DIGEST, *HASHED_FILES)
-OWN_HASHED_FILES = (PARAMETERS, GOLDEN, NETWORK, JAX_EXPORT)  # where the network is a user's own
-OWN_FILES = (MANIFEST, MANIFEST_DIGEST, *OWN_HASHED_FILES)
-OWN_TOLERANCE = 1e-5  # of the exported step in float32 on another machine
+USER_DEFINED_HASHED_FILES = (PARAMETERS, GOLDEN, NETWORK, JAX_EXPORT)  # where the network is user-defined
+USER_DEFINED_FILES = (MANIFEST, MANIFEST_DIGEST, *USER_DEFINED_HASHED_FILES)
+USER_DEFINED_TOLERANCE = 1e-5  # of the exported step in float32 on another machine
 
-OWN_ARCHITECTURE = ("network", "parameters", "n_parameters", "step")  # keys that describe a user's own network
+USER_DEFINED_ARCHITECTURE = ("network", "parameters", "n_parameters", "step")  # of a user-defined network
 MANIFEST_KEYS = (
     "schema_version",
     "contract",
@@ -70,8 +66,8 @@ class Artefact:
     digest          SHA-256 of manifest.json: identifies the policy and everything about it
     manifest        the manifest as plain data
     policy          theta float32, normaliser float64; its ``network`` is None for the paper's
-    golden_history  (8, 11, G) float32; of a user's own network one episode's observations (G, 11)
-    golden_action   (8, G) float64: the reference's answer to ``golden_history``; (G, 8) of a user's own network
+    golden_history  (8, 11, G) float32; of a user-defined network one episode's observations (G, 11)
+    golden_action   (8, G) float64: the reference's answer to ``golden_history``; (G, 8) of a user-defined network
     """
 
     folder: Path
@@ -86,13 +82,9 @@ class Artefact:
         """Of the robot that the policy was trained for."""
         return contract.from_description(self.manifest["contract"])
 
-    def streaming(self) -> StreamingPolicy | ExportedPolicy:
+    def streaming(self) -> LoopPolicy:
         """The policy for the control loop, at the start of an episode."""
-        if self.policy.network is None:
-            return StreamingPolicy(self.policy, self.contract)
-        from robot_io.policy.jax_network import ExportedPolicy  # imports JAX
-
-        return ExportedPolicy(self.policy)
+        return make_policy("numpy" if self.policy.network is None else "jit", self.policy, self.contract)
 
 
 def load(folder: str | Path, standing: contract.Contract | None = None) -> Artefact:
@@ -113,77 +105,51 @@ def load(folder: str | Path, standing: contract.Contract | None = None) -> Artef
             raise ArtefactError(f"{folder / name}: SHA-256 is {found}, the manifest says {expected}; {_RECOPY}")
     robot = contract.from_description(manifest["contract"])
     check_robot(folder, robot, standing or robot)
+    network, shapes = None, contract.parameter_shapes(robot.n_joints)
+    count, seen, answered = manifest["golden"].get("count"), robot.n_observation, robot.n_joints
+    wanted = {"history": ((contract.HISTORY, seen, count), "float32"), "action": ((answered, count), "float64")}
     if NETWORK in contents:
-        return _own(folder, contents, manifest, robot)
-    parameters = _parameters(folder, contents, contract.parameter_shapes(robot.n_joints))
-    golden_count = manifest["golden"].get("count")
-    golden = _arrays(
-        folder / GOLDEN,
-        contents[GOLDEN],
-        {
-            "history": ((contract.HISTORY, robot.n_observation, golden_count), "float32"),
-            "action": ((robot.n_joints, golden_count), "float64"),
-        },
+        described = manifest["architecture"]
+        shapes = {name: tuple(shape) for name, shape in described["parameters"].items()}
+        source = contents[NETWORK].decode()
+        network = ExportedNetwork(described["network"], tuple(shapes.items()), contents[JAX_EXPORT], source)
+        wanted = {"observation": ((count, seen), "float32"), "action": ((count, answered), "float64")}
+    parameters = _arrays(
+        folder / PARAMETERS, contents[PARAMETERS], {name: (shape, "float32") for name, shape in shapes.items()}
     )
-    mean, inv_std = _normaliser(folder / MANIFEST, manifest["normaliser"], robot.n_observation)
-    artefact = Artefact(
-        folder=folder,
-        digest=sha256(contents[MANIFEST]),
-        manifest=manifest,
-        policy=Policy(parameters, mean, inv_std),
-        golden_history=golden["history"],
-        golden_action=golden["action"],
-    )
-    difference = float(np.max(np.abs(artefact.policy.apply(artefact.golden_history) - artefact.golden_action)))
-    if not difference <= GOLDEN_TOLERANCE:
+    golden_input, golden_action = _arrays(folder / GOLDEN, contents[GOLDEN], wanted).values()
+    theta = np.concatenate([parameter.ravel() for parameter in parameters.values()])
+    policy = Policy(theta, *_normaliser(folder / MANIFEST, manifest["normaliser"], seen), network)
+    try:
+        action = policy.apply(golden_input) if network is None else _play(policy, golden_input)
+    except Exception as error:  # JAX absent, or of a version that reads the export no more
+        if network is None:
+            raise
+        raise ArtefactError(
+            f"{folder / JAX_EXPORT}: the network {network.name!r} cannot be run here ({type(error).__name__}: "
+            f"{error}); it takes a JAX at most six months from {manifest['written_with']}; {_REEXPORT}"
+        ) from error
+    difference, allowed = float(np.max(np.abs(action - golden_action))), tolerance(network)
+    if not difference <= allowed:
         raise ArtefactError(
             f"{folder / GOLDEN}: this machine's policy differs from the golden outputs by {difference:.3g}, allowed is "
-            f"{GOLDEN_TOLERANCE:g}; do not run it: the forward pass or NumPy changed since the export, so {_REEXPORT}"
+            f"{allowed:g}; do not run it: the forward pass, NumPy or JAX changed since the export, so {_REEXPORT}"
         )
-    return artefact
+    return Artefact(folder, sha256(contents[MANIFEST]), manifest, policy, golden_input, golden_action)
 
 
 load_artefact = load  # its name in ``robot_io``
 
 
-def _own(folder: Path, contents: dict[str, bytes], manifest: dict[str, Any], robot: Contract) -> Artefact:
-    """The artefact of a user's own network. Raises ArtefactError."""
-    described = manifest["architecture"]
-    shapes = {name: tuple(shape) for name, shape in described["parameters"].items()}
-    network = ExportedNetwork(
-        described["network"], tuple(shapes.items()), contents[JAX_EXPORT], contents[NETWORK].decode()
-    )
-    count = manifest["golden"].get("count")
-    wanted: dict[str, tuple[tuple[int, ...], str]] = {
-        "observation": ((count, robot.n_observation), "float32"),
-        "action": ((count, robot.n_joints), "float64"),
-    }
-    golden = _arrays(folder / GOLDEN, contents[GOLDEN], wanted)
-    mean, inv_std = _normaliser(folder / MANIFEST, manifest["normaliser"], robot.n_observation)
-    policy = Policy(_parameters(folder, contents, shapes), mean, inv_std, network)
-    try:
-        from robot_io.policy.jax_network import ExportedPolicy
-
-        action = ExportedPolicy(policy).episode(golden["observation"])
-    except Exception as error:  # JAX absent, or of a version that reads the export no more
-        raise ArtefactError(
-            f"{folder / JAX_EXPORT}: the network {network.name!r} cannot be run here ({type(error).__name__}: "
-            f"{error}); it takes a JAX at most six months from {manifest['written_with']}; {_REEXPORT}"
-        ) from error
-    difference = float(np.max(np.abs(action - golden["action"])))
-    if not difference <= OWN_TOLERANCE:
-        raise ArtefactError(
-            f"{folder / GOLDEN}: this machine's policy differs from the golden outputs by {difference:.3g}, allowed is "
-            f"{OWN_TOLERANCE:g}; do not run it: JAX changed since the export, so {_REEXPORT}"
-        )
-    return Artefact(folder, sha256(contents[MANIFEST]), manifest, policy, golden["observation"], golden["action"])
+def tolerance(network: ExportedNetwork | None) -> float:
+    """Largest difference allowed between a policy's answers and its golden outputs."""
+    return GOLDEN_TOLERANCE if network is None else USER_DEFINED_TOLERANCE
 
 
-def _parameters(folder: Path, contents: dict[str, bytes], shapes: dict[str, tuple[int, ...]]) -> np.ndarray:
-    """theta from params.npz. Raises ArtefactError."""
-    wanted = {name: (shape, "float32") for name, shape in shapes.items()}
-    arrays = _arrays(folder / PARAMETERS, contents[PARAMETERS], wanted)
-    return np.concatenate([arrays[name].ravel() for name in shapes])
+def _play(policy: Policy, observations: np.ndarray) -> np.ndarray:
+    from robot_io.policy.jax_policy import ExportedPolicy  # imports JAX
+
+    return ExportedPolicy(policy).episode(observations)
 
 
 def sha256(content: bytes) -> str:
@@ -246,7 +212,7 @@ def _read_files(folder: Path) -> dict[str, bytes]:
     if not folder.is_dir():
         raise ArtefactError(f"{folder}: no such folder; an artefact is a folder holding {', '.join(FILES)}")
     present = {entry.name for entry in folder.iterdir()}
-    files = OWN_FILES if NETWORK in present else FILES
+    files = USER_DEFINED_FILES if NETWORK in present else FILES
     missing, extra = sorted(set(files) - present), sorted(present - set(files))
     if missing:
         raise ArtefactError(f"{folder}: {', '.join(missing)} missing, an artefact holds {', '.join(files)}; {_RECOPY}")
@@ -283,8 +249,10 @@ def _verified_manifest(folder: Path, contents: dict[str, bytes]) -> dict[str, An
     expectations = [("contract", contract.describe(robot)), ("architecture", architecture(robot))]
     if NETWORK in contents:
         described = manifest["architecture"]
-        if not isinstance(described, dict) or set(described) != set(OWN_ARCHITECTURE):
-            raise ArtefactError(f"{path}: architecture: found {described!r}, expected {OWN_ARCHITECTURE}; {_REEXPORT}")
+        if not isinstance(described, dict) or set(described) != set(USER_DEFINED_ARCHITECTURE):
+            raise ArtefactError(
+                f"{path}: architecture: found {described!r}, expected {USER_DEFINED_ARCHITECTURE}; {_REEXPORT}"
+            )
         expectations.pop()
     for key, expected in expectations:
         lines = differences(manifest[key], json.loads(json.dumps(expected)), key)
@@ -307,7 +275,7 @@ def _arrays(path: Path, content: bytes, expected: dict[str, tuple[tuple[int, ...
             raise ArtefactError(f"{path}: {name} is {array.dtype} {array.shape}, expected {dtype} {shape}; {_REEXPORT}")
         if not np.all(np.isfinite(array)):
             raise ArtefactError(f"{path}: {name} has a non-finite number; export an earlier checkpoint")
-    return arrays
+    return {name: arrays[name] for name in expected}
 
 
 def _normaliser(path: Path, normaliser: dict[str, Any], size: int) -> tuple[np.ndarray, np.ndarray]:

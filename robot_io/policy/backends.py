@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -11,30 +11,30 @@ from robot_io import contract
 from robot_io.policy.numpy_policy import StreamingPolicy
 from robot_io.policy.policy import Policy
 
-if TYPE_CHECKING:
-    from robot_io.policy.jax_network import ExportedPolicy
-    from robot_io.policy.jax_policy import JitPolicy
-
 TRIALS = 300  # steps of each that are timed, after as many that are not
 SLOWER = 0.2e-3  # [s] by which nine of ten of JAX's steps may take longer than NumPy's: 1.5 % of a control period
 
 
-def make_policy(
-    backend: str, policy: Policy, robot: contract.Contract = contract.PAPER
-) -> StreamingPolicy | JitPolicy | ExportedPolicy:
-    """A policy for the loop, by "numpy" or "jit". Raises ValueError for another backend."""
-    if policy.network is not None:
-        if backend != "jit":
-            raise ValueError(f"policy backend {backend!r}: the network {policy.network.name!r} is computed by jit only")
-        from robot_io.policy.jax_network import ExportedPolicy  # imports JAX
+class LoopPolicy(Protocol):
+    """A policy in the control loop."""
 
-        return ExportedPolicy(policy)
+    def reset(self) -> None:
+        """Forgets everything: the next observation begins an episode."""
+
+    def step(self, observation: np.ndarray) -> np.ndarray:
+        """Action (joints,) in [-1, 1] for an observation (n,)."""
+
+
+def make_policy(backend: str, policy: Policy, robot: contract.Contract = contract.PAPER) -> LoopPolicy:
+    """A policy for the loop, by "numpy" or "jit". Raises ValueError for another backend."""
+    if policy.network is not None and backend != "jit":
+        raise ValueError(f"policy backend {backend!r}: the network {policy.network.name!r} is computed by jit only")
     if backend == "numpy":
         return StreamingPolicy(policy, robot)
     if backend == "jit":
-        from robot_io.policy.jax_policy import JitPolicy  # imports JAX
+        from robot_io.policy import jax_policy  # imports JAX
 
-        return JitPolicy(policy)
+        return (jax_policy.JitPolicy if policy.network is None else jax_policy.ExportedPolicy)(policy)
     raise ValueError(f"policy backend {backend!r}, allowed: numpy, jit")
 
 
@@ -58,7 +58,7 @@ def choose(backend: str, policy: Policy, robot: contract.Contract = contract.PAP
     return "jit", f"policy compiled by JAX ({times})"
 
 
-def _slow_step(policy: StreamingPolicy | JitPolicy | ExportedPolicy, robot: contract.Contract) -> float:
+def _slow_step(policy: LoopPolicy, robot: contract.Contract) -> float:
     """Time [s] within which 90 % of the steps are done; what is slower is the machine's load."""
     observations = np.random.default_rng(0).normal(0.0, 0.5, (2 * TRIALS, robot.n_observation))
     seconds = []

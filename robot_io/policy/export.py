@@ -1,6 +1,6 @@
 """Makes an artefact from trained parameters and proves that its four forms of the policy agree.
 
-The only module of this package that imports JAX, ONNX and ONNX Runtime; the robot needs none of them.
+Imports JAX, ONNX and ONNX Runtime; the robot needs none of them for the paper's network.
 All forms take a batch-last history (8, 11, B), oldest observation first, and give actions (8, B).
 """
 
@@ -9,12 +9,11 @@ from __future__ import annotations
 import io
 import json
 import os
-import secrets
-import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jax
@@ -27,11 +26,10 @@ from onnx import TensorProto, helper, numpy_helper
 
 from robot_io import contract
 from robot_io.policy import artefact as artefacts
-from robot_io.policy import jax_network
+from robot_io.policy import jax_policy
 from robot_io.policy.artefact import ArtefactError
-from robot_io.policy.jax_network import ExportedPolicy
+from robot_io.policy.jax_policy import Policy
 from robot_io.policy.policy import forward
-from robot_io.policy.pytree import Policy
 
 AGREEMENT = 1e-5  # largest difference allowed between any two forms of the policy, of an action in [-1, 1]
 GOLDEN_COUNT = 64
@@ -60,7 +58,7 @@ def write(
     folder = Path(folder).resolve()
     _check_target(folder, overwrite)
     given, size = policy.network, robot.n_observation
-    network = None if given is None else jax_network.exported(given, size)
+    network = None if given is None else jax_policy.exported(given, size)
     parameters = contract.n_parameters(robot.n_joints) if network is None else network.size
     policy = Policy(
         _finite(policy.theta, "theta", (parameters,)),
@@ -71,18 +69,24 @@ def write(
     contents = _contents(policy, provenance, given, robot)
 
     folder.parent.mkdir(parents=True, exist_ok=True)
-    staging = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}")
-    staging.mkdir()
-    try:
+    with TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as hidden:
+        made, replaced = Path(hidden) / "made", Path(hidden) / "replaced"
+        made.mkdir()
         for name, content in contents.items():
-            with open(staging / name, "wb") as file:
+            with open(made / name, "wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-        report = verify(staging)
-        _move_into_place(staging, folder, overwrite)
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
+        report = verify(made)
+        _check_target(folder, overwrite)  # again: the target may have appeared meanwhile
+        if folder.exists():  # a folder cannot be renamed over a full one
+            os.rename(folder, replaced)
+        try:
+            os.rename(made, folder)
+        except OSError:
+            if replaced.exists():
+                os.rename(replaced, folder)
+            raise
     return report
 
 
@@ -93,59 +97,41 @@ def verify(folder: str | Path, histories: int = 1000, seed: int = 0) -> dict[str
     form against the NumPy reference)}. Raises ArtefactError when the artefact does not load or its forms disagree.
     """
     artefact = artefacts.load(folder)
-    if artefact.policy.network is not None:
-        return _verify_own(artefact, histories, seed)
-    history = random_histories(artefact.policy, histories, seed)
-    session = onnxruntime.InferenceSession(
-        (artefact.folder / artefacts.ONNX).read_bytes(), providers=["CPUExecutionProvider"]
-    )
-    exported = jax.export.deserialize(bytearray((artefact.folder / artefacts.JAX_EXPORT).read_bytes()))
-    with jax.default_device(jax.devices("cpu")[0]):
-        actions = {
-            "numpy": artefact.policy.apply(history),
-            "jit": np.asarray(_jitted_forward(artefact.policy.astype(np.float32), history)),
-            "onnxruntime": session.run(["action"], {"history": history})[0],
-            "jax_export": np.asarray(exported.call(history)),
-        }
-    stacked = np.stack(list(actions.values()))
-    reference = actions.pop("numpy")
+    policy = artefact.policy
+    history = random_histories(policy, histories, seed)
+    if policy.network is None:
+        session = onnxruntime.InferenceSession(
+            (artefact.folder / artefacts.ONNX).read_bytes(), providers=["CPUExecutionProvider"]
+        )
+        exported = jax.export.deserialize(bytearray((artefact.folder / artefacts.JAX_EXPORT).read_bytes()))
+        reference, allowed = policy.apply(history), AGREEMENT
+        with jax.default_device(jax.devices("cpu")[0]):
+            actions = {
+                "jit": np.asarray(_jitted_forward(policy.astype(np.float32), history)),
+                "onnxruntime": session.run(["action"], {"history": history})[0],
+                "jax_export": np.asarray(exported.call(history)),
+            }
+    else:
+        # Its other form, the user's Python, is not run here: golden.npz is what that wrote. The exported step must
+        # remember nothing of an episode before.
+        runner, episode = jax_policy.ExportedPolicy(policy), history[0].T
+        reference, allowed = runner.episode(episode), 0.0
+        actions = {"jax_export": runner.episode(episode)}
+    stacked = np.stack([reference, *actions.values()])
     from_reference = {name: float(np.max(np.abs(action - reference))) for name, action in actions.items()}
     largest = float(np.max(stacked.max(axis=0) - stacked.min(axis=0)))
-    report = {
-        "digest": artefact.digest,
-        "histories": histories,
-        "tolerance": AGREEMENT,
-        "largest_difference": largest,
-        "from_reference": from_reference,
-    }
-    if not largest <= AGREEMENT:
+    if not largest <= allowed:
         raise ArtefactError(
-            f"{folder}: its forms of the policy differ by {largest:.3g} (from the NumPy "
-            f"reference: {from_reference}), allowed is {AGREEMENT:g}; do not run it, export the policy again"
-        )
-    return report
-
-
-def _verify_own(artefact: artefacts.Artefact, ticks: int, seed: int) -> dict[str, Any]:
-    """The exported step of a user's network against itself from another start: it must remember nothing of before.
-
-    Its other form, the user's Python, is not run here; ``golden.npz`` is what this wrote.
-    """
-    runner = ExportedPolicy(artefact.policy)
-    episode = random_histories(artefact.policy, ticks, seed)[0].T
-    first, again = runner.episode(episode), runner.episode(episode)
-    difference = float(np.max(np.abs(first - again)))
-    if difference > 0.0 or not np.isfinite(first).all():
-        raise ArtefactError(
-            f"{artefact.folder}: the network {artefact.policy.network.name!r} answers the same episode differently the "
-            f"second time, by {difference:.3g}, or with numbers that are not finite; do not run it"
+            f"{folder}: its forms of the policy, or its answers to the same episode played twice, differ by "
+            f"{largest:.3g} (from the reference: {from_reference}), allowed is {allowed:g}; do not run it, export the "
+            "policy again"
         )
     return {
         "digest": artefact.digest,
-        "histories": ticks,
-        "tolerance": artefacts.OWN_TOLERANCE,
-        "largest_difference": difference,
-        "from_reference": {"jax_export": difference},
+        "histories": histories,
+        "tolerance": AGREEMENT if policy.network is None else artefacts.USER_DEFINED_TOLERANCE,
+        "largest_difference": largest,
+        "from_reference": from_reference,
     }
 
 
@@ -217,11 +203,11 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
 def jax_export(policy: Policy) -> bytes:
     """The policy with its numbers inside, serialised by ``jax.export`` for the CPU, any batch size."""
     shape = jax.export.symbolic_shape(f"{contract.HISTORY}, {policy.n_observation}, batch")
-    return jax_network.serialised(partial(_forward, policy), jax.ShapeDtypeStruct(shape, jnp.float32))
+    return jax_policy.serialised(partial(_forward, policy), jax.ShapeDtypeStruct(shape, jnp.float32))
 
 
 def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: contract.Contract) -> dict[str, bytes]:
-    """Files of the artefact by name. given: the user's own network as it was before its export, or None."""
+    """Files of the artefact by name. given: the user-defined network as it was before its export, or None."""
     history = random_histories(policy, GOLDEN_COUNT, seed=1)
     if policy.network is None:
         action = policy.apply(history)
@@ -231,10 +217,10 @@ def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: con
             artefacts.ONNX: onnx_model(policy).SerializeToString(),
             artefacts.JAX_EXPORT: jax_export(policy),
         }
-        architecture, tolerance = artefacts.architecture(robot), artefacts.GOLDEN_TOLERANCE
+        architecture = artefacts.architecture(robot)
     else:
         network, episode = policy.network, np.ascontiguousarray(history[0].T)
-        action = jax_network.reference(given, policy, episode).astype(np.float64)
+        action = jax_policy.reference(given, policy, episode).astype(np.float64)
         contents = {
             artefacts.PARAMETERS: _npz(network.unflatten(policy.theta)),
             artefacts.GOLDEN: _npz({"observation": episode, "action": action}),
@@ -247,7 +233,6 @@ def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: con
             "n_parameters": network.size,
             "step": f"{artefacts.JAX_EXPORT}: theta, mean, inverse_scale, first, state, observation -> action, state",
         }
-        tolerance = artefacts.OWN_TOLERANCE
     manifest = {
         "schema_version": artefacts.SCHEMA_VERSION,
         "contract": contract.describe(robot),
@@ -257,7 +242,7 @@ def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: con
             "mean": [float(v) for v in policy.mean],
             "inverse_scale": [float(v) for v in policy.inv_std],
         },
-        "golden": {"file": artefacts.GOLDEN, "count": GOLDEN_COUNT, "tolerance": tolerance},
+        "golden": {"file": artefacts.GOLDEN, "count": GOLDEN_COUNT, "tolerance": artefacts.tolerance(policy.network)},
         "files": {name: artefacts.sha256(content) for name, content in contents.items()},
         "provenance": provenance,
         "written_with": {
@@ -302,24 +287,8 @@ def _check_target(folder: Path, overwrite: bool) -> None:
         raise ArtefactError(f"{folder}: already exists; choose another name or overwrite it explicitly")
     if not folder.is_dir():
         raise ArtefactError(f"{folder}: is a file, an artefact is a folder; choose another name")
-    foreign = sorted({entry.name for entry in folder.iterdir()} - {*artefacts.FILES, *artefacts.OWN_FILES})
+    foreign = sorted({entry.name for entry in folder.iterdir()} - {*artefacts.FILES, *artefacts.USER_DEFINED_FILES})
     if foreign:
         raise ArtefactError(
             f"{folder}: holds {', '.join(foreign)}, which no artefact does; not overwritten, choose another name"
         )
-
-
-def _move_into_place(staging: Path, folder: Path, overwrite: bool) -> None:
-    _check_target(folder, overwrite)  # again: the target may have appeared meanwhile
-    if not folder.exists():
-        os.rename(staging, folder)
-        return
-    # A folder cannot be renamed over a full one. A crash between the two renames leaves the old artefact whole, here:
-    replaced = folder.with_name(f".{folder.name}.replaced-{secrets.token_hex(4)}")
-    os.rename(folder, replaced)
-    try:
-        os.rename(staging, folder)
-    except OSError:
-        os.rename(replaced, folder)
-        raise
-    shutil.rmtree(replaced)

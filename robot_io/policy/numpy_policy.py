@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 
 from robot_io import contract
-from robot_io.policy.policy import Policy, gate
+from robot_io.policy.policy import Past, Policy, gate, start, step
 
 
 class StreamingPolicy:
     """A policy fed one observation per control tick, remembering what it already computed.
 
-    Each layer keeps as many of its past inputs as its dilation: one observation, two outputs of layer 1, four of
-    layer 2. Equal to ``Policy.apply`` over the last eight observations, the first since ``reset`` filling the history.
+    Equal to ``Policy.apply`` over the last eight observations, the first since ``reset`` filling the history.
     """
 
     def __init__(self, policy: Policy, robot: contract.Contract = contract.PAPER) -> None:
@@ -34,12 +31,11 @@ class StreamingPolicy:
             for i, _ in enumerate(contract.DILATIONS, start=1)
         ]
         self._biases = [parameters[f"conv{i}/bias"] for i, _ in enumerate(contract.DILATIONS, start=1)]
-        self._past: list[deque[np.ndarray]] = []
-        self.reset()
+        self._past: Past | None = None
 
     def reset(self) -> None:
         """Forgets everything: the next observation begins an episode."""
-        self._past = [deque(maxlen=dilation) for dilation in contract.DILATIONS]
+        self._past = None
 
     def step(self, observation: np.ndarray) -> np.ndarray:
         """Action (8,) for the newest observation (11,).
@@ -53,11 +49,10 @@ class StreamingPolicy:
             bad = [n for n, v in zip(self._names, observation, strict=True) if not np.isfinite(v)]
             raise ValueError(f"observation has a non-finite {', '.join(bad)}")
         x = (observation - self._mean) * self._inv_std
-        layers = zip(contract.DILATIONS, self._past, self._weights, self._biases, contract.GATED, strict=True)
-        for dilation, past, weights, bias, gated in layers:
-            if not past:  # a constant history gives every layer a constant input
-                past.extend([x] * dilation)
-            pre_activation = weights @ np.concatenate((past[0], x)) + bias
-            past.append(x)
-            x = gate(pre_activation, axis=0) if gated else np.tanh(pre_activation)
-        return x
+        past = start(self._layer, x) if self._past is None else self._past
+        action, self._past = step(self._layer, past, x)
+        return action
+
+    def _layer(self, i: int, older: np.ndarray, newer: np.ndarray) -> np.ndarray:
+        z = self._weights[i] @ np.concatenate((older, newer)) + self._biases[i]
+        return gate(z, axis=0) if contract.GATED[i] else np.tanh(z)

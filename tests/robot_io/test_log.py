@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import signal
 import struct
 import subprocess
 import sys
 import time
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,7 @@ from experiments.errors import ConfigError
 from robot_io import log
 from robot_io.contract import JOINT_NAMES
 from robot_io.log import messages as records
+from robot_io.log import scan
 from robot_io.log.__main__ import Frames
 from robot_io.log.messages import LogError
 from robot_io.log.writer import sample_clock_offset
@@ -215,6 +218,60 @@ def test_standard_readers_open_the_file(recording):
     assert json.loads(event.message) == {"episode": 1}
 
 
+def test_messages_in_which_zeros_are_left_out_or_that_are_longer_keep_their_numbers(tmp_path):
+    """proto3 omits a field that is 0, and numbers of ticks have other lengths: read as the library does."""
+    random = np.random.default_rng(0)
+    position = random.choice([0.0, -0.0, 1.5, np.inf], (3, 300))
+    timings = random.choice([0.0, 1e-3, np.inf], (5, 300))
+    ticks = np.array([*range(100), *range(126, 226), *range((1 << 32) - 100, 1 << 32)])
+    with log.FileRecorder.start(tmp_path, "zeros", {}, start_time=START, clock_offset_ns=EPOCH) as recorder:
+        for k, tick in enumerate(ticks):
+            now = START + k * 1e-7  # nanoseconds of one to nine digits
+            recorder.put(log.Ball(now, now, position[:, k], 1), log.Tick(int(tick), now, *timings[:, k]))
+            recorder.put(log.Observation(int(tick), now, np.zeros(11)))
+    path = recorder.close()
+    session = log.read(path)
+    np.testing.assert_array_equal(session.ball.position, position)
+    np.testing.assert_array_equal(session.ticks.tick, ticks)
+    for name, values in zip(("lateness", "policy_seconds", "ball_age", "gantry_age", "arm_age"), timings, strict=True):
+        np.testing.assert_array_equal(getattr(session.ticks, name), values)
+    np.testing.assert_array_equal(session.observations.values, np.zeros((11, 300)))
+    with open(path, "rb") as file:
+        decoded = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages("/tick"))
+    assert [message.decoded_message.lateness for message in decoded] == list(timings[0])
+
+
+def test_the_pieces_of_a_stream_are_the_whole(recording):
+    whole = log.read(recording)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scan, "BATCH", 1)
+        pieces = list(log.stream(recording, most=500))
+    assert len(pieces) > 3 and [len(piece.attachments) for piece in pieces] == [1] * len(pieces)
+    for series in ("ball", "joints", "commands", "observations", "actions", "ticks"):
+        for name in (field.name for field in fields(getattr(whole, series))):
+            parts = [getattr(getattr(piece, series), name) for piece in pieces]
+            np.testing.assert_array_equal(np.concatenate(parts, axis=-1), getattr(getattr(whole, series), name))
+    assert sum((piece.events for piece in pieces), ()) == whole.events
+    assert "end" not in pieces[0].metadata and pieces[-1].metadata == whole.metadata
+
+
+def test_a_stream_ends_where_the_file_is_damaged(recording, tmp_path):
+    with open(recording, "rb") as file:
+        lost = make_reader(file).get_summary().chunk_indexes[3]
+    flipped = bytearray(recording.read_bytes())
+    flipped[lost.chunk_start_offset + 9 + 100] ^= 4
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(flipped)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scan, "BATCH", 1)
+        pieces = log.stream(damaged, most=1)
+        ticks = next(pieces).ticks.tick.size
+        with pytest.raises(LogError, match="chunk 4 cannot be used"):
+            for piece in pieces:
+                ticks += piece.ticks.tick.size
+    assert 100 < ticks < 250
+
+
 def test_equal_sessions_give_equal_files(tmp_path, recording):
     assert make(tmp_path).read_bytes() == recording.read_bytes()
 
@@ -359,6 +416,24 @@ def test_a_dead_recorder_is_noticed_and_does_not_disturb(tmp_path):
     recorder.put(*tick(2, time.monotonic()))
     assert recorder.dropped == 12
     with pytest.raises(LogError, match="mjx-tt log salvage"):
+        recorder.close()
+
+
+@pytest.mark.parametrize("removed", ["folder", "file"])
+def test_a_log_that_was_removed_is_noticed(tmp_path, removed):
+    folder = tmp_path / "logs"
+    recorder = log.Recorder.start(folder, "a", {})
+    recorder.put(*tick(0, time.monotonic()))
+    if removed == "folder":
+        shutil.rmtree(folder)
+    else:
+        os.rename(folder / "a.mcap.part", folder / "b.mcap.part")
+    deadline = time.monotonic() + 20.0
+    while recorder.failure is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+        recorder.put(*tick(1, time.monotonic()))
+    assert "a.mcap.part: removed or moved while it was written" in recorder.failure
+    with pytest.raises(LogError, match="not finished"):
         recorder.close()
 
 

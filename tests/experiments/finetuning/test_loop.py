@@ -7,6 +7,7 @@ import json
 import math
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -358,9 +359,33 @@ def test_a_journal_that_was_changed_is_refused(source, tmp_path):
         tune(source, tmp_path / "run", Failing(8))
     path = tmp_path / "run" / loop.JOURNAL
     lines = path.read_bytes().splitlines(keepends=True)
-    path.write_bytes(b"".join([*lines[:2], b"nonsense\n", *lines[3:]]))
-    with pytest.raises(RunError, match="line 3"):
-        tune(source, tmp_path / "run", Toy())
+    assert b'"discarded": false' in lines[2]
+    changes = {
+        "nonsense": [*lines[:2], b"nonsense\n", *lines[3:]],
+        "changed": [*lines[:2], lines[2].replace(b'"discarded": false', b'"discarded": true'), *lines[3:]],
+        "doubled": [*lines[:2], lines[1], *lines[2:]],
+        "taken out": [*lines[:2], *lines[3:]],
+        "exchanged": [*lines[:2], lines[3], lines[2], *lines[4:]],
+        "the last one changed": [*lines[:-1], lines[-1].replace(b'"discarded": false', b'"discarded": true')],
+    }
+    for change, content in changes.items():
+        path.write_bytes(b"".join(content))
+        with pytest.raises(RunError, match=f"line {len(lines) if 'last' in change else 3} was changed"):
+            Journal(path)
+
+
+def test_a_journal_from_before_there_were_checksums_goes_on(source, tmp_path):
+    with pytest.raises(Interrupted):
+        tune(source, tmp_path / "run", Failing(8))
+    path = tmp_path / "run" / loop.JOURNAL
+    old = re.sub(rb', "checksum": "[0-9a-f]+"', b"", path.read_bytes())
+    path.write_bytes(old)
+    tune(source, tmp_path / "run", Toy())
+    tune(source, tmp_path / "whole", Toy())
+    assert len(entries(tmp_path / "run")) == len(entries(tmp_path / "whole"))
+    path.write_bytes(path.read_bytes().replace(b'"discarded": false', b'"discarded": true', 1))
+    with pytest.raises(RunError, match=f"line {len(old.splitlines()) + 1} was changed, or lines before it"):
+        Journal(path)
 
 
 def test_another_fine_tuning_in_the_same_folder_is_refused(source, tmp_path):

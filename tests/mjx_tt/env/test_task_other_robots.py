@@ -22,7 +22,7 @@ from robot_io import contract
 from robot_io.contract import PAPER
 from robot_io.policy import artefact, export
 from robot_io.policy.artefact import ArtefactError
-from robot_io.policy.pytree import Policy
+from robot_io.policy.jax_policy import Policy
 
 OTHERS = [name for name in robots.names() if name != robots.DEFAULT]
 TICKS = 60

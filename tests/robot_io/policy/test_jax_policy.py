@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from robot_io.policy import jax_network
+from robot_io.policy import jax_policy
 
 FRAMES = "jax_traceback_in_locations_limit"
 
@@ -23,7 +23,7 @@ def test_a_serialised_function_names_no_source_file():
     place, shape = __file__.encode(), jax.ShapeDtypeStruct((3,), jnp.float32)
     before = getattr(jax.config, FRAMES)
     plain = bytes(jax.export.export(jax.jit(_twice), platforms=["cpu"])(shape).serialize())
-    content = jax_network.serialised(_twice, shape)
+    content = jax_policy.serialised(_twice, shape)
     assert place in plain and place not in content and b".py" not in content
     assert getattr(jax.config, FRAMES) == before
     x = np.array([-1.0, 0.1, 3.0], np.float32)
