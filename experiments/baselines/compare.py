@@ -52,6 +52,7 @@ from mjx_tt.env.task import Controller
 from mjx_tt.sim.model import ModelFile
 
 STARTED = "started.json"
+BRAX = "brax's training functions"  # trainings by loops that came before them are other ones
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,8 @@ class Common:
         shared = {key: config[key] for key in ("robot", *OWN, "task")} | {"pool": config["training"]["pool"]}
         given = self.comparison.to_dict()
         algorithm = {key: value for key, value in given["algorithms"][name].items() if key not in OWN}
+        if algorithm["kind"] != "bgs":
+            shared["learner"] = BRAX
         return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
 
     def evaluation_conditions(self) -> dict[str, Any]:
