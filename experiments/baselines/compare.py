@@ -2,7 +2,7 @@
 
 Folder of a comparison:
   comparison.yaml                     the request, defaults written out
-  <algorithm>/seed<K>/started.json    versions, once its program is compiled
+  <algorithm>/seed<K>/started.json    versions, once the first piece is learned, so its program is compiled
   <algorithm>/seed<K>/training.json   the curve, and under which conditions it came about
   <algorithm>/seed<K>/policy/         the controller's arrays
   <algorithm>/seed<K>/evaluation.json
@@ -17,7 +17,7 @@ import json
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,13 +45,14 @@ from experiments.jobs import engine
 from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import ALONE, Workers
 from experiments.runs import checkpoint, run_dir
-from experiments.training.trainers import KINDS
+from experiments.training.trainers import trainer
 from mjx_tt.env.brax import TableTennis
 from mjx_tt.env.episode import Controller
 from mjx_tt.env.rollout import Simulator
 from mjx_tt.sim.model import ModelFile
 
 STARTED = "started.json"
+BRAX = "brax's training functions"  # trainings by loops that came before them are other ones
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,8 @@ class Common:
         shared = {key: config[key] for key in ("robot", *OWN, "task")} | {"pool": config["training"]["pool"]}
         given = self.comparison.to_dict()
         algorithm = {key: value for key, value in given["algorithms"][name].items() if key not in OWN}
+        if algorithm["kind"] != "bgs":
+            shared["learner"] = BRAX
         return shared | {"budget": given["budget"], "curve": given["curve"], "algorithm": algorithm}
 
     def evaluation_conditions(self) -> dict[str, Any]:
@@ -166,23 +169,13 @@ def unfinished(common: Common) -> dict[str, list[int]]:
 def learner(settings: Algorithm, experiment: Experiment) -> Learner:
     """The algorithm on the experiment's task. Raises ConfigError."""
     config, model = experiment.config, experiment.model
+    if isinstance(settings, Bgs):
+        bgs = checked("optimiser", build.bgs_config, settings.optimiser, settings.schedule_updates)
+        training = config.training.model_copy(update={"devices": 1})
+        config = config.model_copy(update={"optimiser": settings.optimiser, "training": training})
+        return EvolutionLearner(trainer(replace(experiment, config=config, bgs=bgs)))
     pool = build.pool(experiment, build.key(config.training.seed, build.TRAINING_BALLS), config.training.pool)
     simulator = Simulator(experiment.task, 1)
-    if isinstance(settings, Bgs):
-        optimiser = settings.optimiser
-        bgs = checked("optimiser", build.bgs_config, optimiser, settings.schedule_updates)
-        return EvolutionLearner(
-            KINDS[optimiser.gradient](
-                simulator,
-                bgs,
-                pool,
-                model.model,
-                model.randomise,
-                optimiser.repeats,
-                optimiser.common_random_numbers,
-                optimiser.initial_scale,
-            )
-        )
     env = TableTennis(simulator, pool, model.model, model.randomise)
     if isinstance(settings, QtOpt):
         return QtOptLearner(settings, env)

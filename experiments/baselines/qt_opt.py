@@ -77,7 +77,7 @@ class QtOptLearner:
     """Random actions first, then ``gradient_steps`` after every step of the environments."""
 
     def __init__(self, settings: QtOpt, env: Env) -> None:
-        self._settings, self._env = settings, EpisodeCounter(env)
+        self._settings, self.env = settings, EpisodeCounter(env)
         size, joints = env.observation_size, env.action_size
         self._critics = networks.make_q_network(
             size, joints, running_statistics.normalize, hidden_layer_sizes=tuple(settings.layers)
@@ -94,20 +94,20 @@ class QtOptLearner:
 
     def train(self, seed: int, observe: Observer) -> None:
         """As ``Learner``."""
-        self._env = EpisodeCounter(self._env.env)
+        self.env = EpisodeCounter(self.env.env)
         fill, piece = (jax.jit(function, donate_argnums=0) for function in (self._fill, self._piece))
         state = jax.jit(self.init)(jax.random.PRNGKey(seed))
         with suppress(BudgetSpent):
-            observe(self.controller(state.normaliser, state.critic), self._env.counts())
+            observe(self.controller(state.normaliser, state.critic), self.env.counts())
             state = fill(state)
             while True:
                 state = piece(state)
-                observe(self.controller(state.normaliser, state.critic), self._env.counts())
+                observe(self.controller(state.normaliser, state.critic), self.env.counts())
 
     def template(self) -> NetworkController:
         """As ``Learner``."""
         critic = self._critics.init(jax.random.PRNGKey(0))
-        return jax.eval_shape(lambda: self.controller(empty_normaliser(self._env.observation_size), critic))
+        return jax.eval_shape(lambda: self.controller(empty_normaliser(self.env.observation_size), critic))
 
     def controller(self, normaliser: RunningStatisticsState, critic: Params) -> NetworkController:
         """The search without exploration."""
@@ -118,8 +118,8 @@ class QtOptLearner:
         critic_key, env_key, buffer_key, key = jax.random.split(key, 4)
         critic = self._critics.init(critic_key)
         target = jax.tree.map(jnp.copy, critic)  # a state that is given away whole must not hold an array twice
-        env = self._env.reset(jax.random.split(env_key, self._settings.replay.environments))
-        normaliser, buffer = empty_normaliser(self._env.observation_size), self._queue.init(buffer_key)
+        env = self.env.reset(jax.random.split(env_key, self._settings.replay.environments))
+        normaliser, buffer = empty_normaliser(self.env.observation_size), self._queue.init(buffer_key)
         return QtOptState(critic, target, self._optimiser.init(critic), normaliser, buffer, env, key)
 
     def update(self, state: QtOptState, batch: Transition) -> QtOptState:
@@ -151,7 +151,7 @@ class QtOptLearner:
 
     def _play(self, state: QtOptState, policy: Exploration) -> QtOptState:
         action_key, key = jax.random.split(state.key)
-        env, transition = acting.actor_step(self._env, state.env, policy, action_key)
+        env, transition = acting.actor_step(self.env, state.env, policy, action_key)
         normaliser = running_statistics.update(state.normaliser, transition.observation)
         buffer = self._queue.insert_internal(state.buffer, transition)
         return state.replace(env=env, normaliser=normaliser, buffer=buffer, key=key)
@@ -162,7 +162,7 @@ class QtOptLearner:
         return jax.lax.scan(lambda s, batch: (self.update(s, batch), None), state.replace(buffer=buffer), batches)[0]
 
     def _random(self, observation: jax.Array, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
-        return jax.random.uniform(key, (observation.shape[0], self._env.action_size), minval=-1.0), {}
+        return jax.random.uniform(key, (observation.shape[0], self.env.action_size), minval=-1.0), {}
 
     def _explore(self, state: QtOptState, observation: jax.Array, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
         search_key, noise_key, random_key, which_key = jax.random.split(key, 4)
@@ -185,4 +185,4 @@ class QtOptLearner:
         return best_action(value, normals, self._settings.elites)
 
     def _draw(self, key: jax.Array) -> jax.Array:
-        return jax.random.normal(key, (self._settings.rounds, self._settings.candidates, self._env.action_size))
+        return jax.random.normal(key, (self._settings.rounds, self._settings.candidates, self.env.action_size))

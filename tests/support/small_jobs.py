@@ -16,6 +16,10 @@ def prepare(folder: Path) -> Callable[..., str]:
     def do(name: str, deed: str) -> str:
         note(folder, f"begin {name} {os.getpid()}")
         if deed == "fail":
+            until = time.monotonic() + 60.0
+            while {line.split()[1] for line in lines(folder) if line.startswith("begin")} == {name}:
+                assert time.monotonic() < until, "no other job has begun"
+                time.sleep(0.02)
             raise ValueError(f"{name} cannot be done")
         if deed == "die once" and sum(line.startswith(f"begin {name} ") for line in lines(folder)) == 1:
             os.kill(os.getpid(), signal.SIGKILL)

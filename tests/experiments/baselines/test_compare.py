@@ -230,6 +230,19 @@ def test_every_algorithm_has_the_joints_of_the_robot(tmp_path, settings):
     assert action.shape == (7, 5) and controller.mean.shape == (10,)
 
 
+def test_learning_keeps_its_shapes_on_another_robot(tmp_path):
+    """Traced, not compiled: play as all learners from steps do it, and QT-Opt's learning."""
+    path = write(tmp_path, SMALL | {"robot": "fr3_pedestal"})
+    comparison, config = baselines.load(path, ("algorithms.X={kind: qt_opt}",))
+    common = compare.prepare(comparison, config, str(path), tmp_path, Console())
+    learner = compare.learner(common.comparison.algorithms["X"], common.experiment)
+    state = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
+    assert state.env.obs.shape == (64, 8 * 10)
+    after = jax.eval_shape(learner._piece, jax.eval_shape(learner._fill, state))
+    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, state)
+    assert after.env.metrics.keys() == {"hit", "returned", "episode_return"}
+
+
 @pytest.mark.slow
 def test_a_comparison_on_another_robot_runs(tmp_path):
     path = write(tmp_path, SMALL | {"robot": "fr3_pedestal"})
