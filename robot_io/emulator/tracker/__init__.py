@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
 if TYPE_CHECKING:
     from robot_io.emulator.world import World
 
+Identity: TypeAlias = Literal["ball", "stroke", "lost"]
+IDENTITIES = get_args(Identity)
 Offset = Annotated[float, Within(-1.0, 1.0, "m")]
 
 
@@ -37,7 +39,7 @@ class TrackerParams:
     latency: Annotated[float, Within(0.0, 1.0, "s")] = 0.015
     noise: Annotated[float, Within(0.0, 1.0, "m")] = 0.003
     offset: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
-    identity: Literal["ball", "stroke", "lost"] = "ball"
+    identity: Identity = "ball"
     cameras: CameraParams = CameraParams()
 
     def __post_init__(self) -> None:
