@@ -77,7 +77,7 @@ class PlayedBall:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Sensed:
-    """What the policy's side knows at a control step. SI units, the batch last."""
+    """Measurements that the policy may see at a control step. SI units, the batch last."""
 
     ball: Float[Array, "3 *batch"]  # [m] as the tracker reports it, late and with noise
     joints: Float[Array, "joints *batch"]  # [m, rad] as the encoders report them, late
