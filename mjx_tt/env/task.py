@@ -23,15 +23,7 @@ from jaxtyping import Bool, Float
 from ballmodel.flight import Events
 from ballmodel.state import BallState
 from mjx_tt.env import observation
-from mjx_tt.env.episode import (
-    Accumulators,
-    Controller,
-    EpisodeConstants,
-    Episodes,
-    EpisodeState,
-    Return,
-    Tick,
-)
+from mjx_tt.env.episode import Accumulators, Controller, EpisodeConstants, Episodes, EpisodeState, Return, Tick
 from mjx_tt.env.physics import ENGINES, Physics
 from mjx_tt.env.reward_weights import SIM_WEIGHTS, TERMS
 from mjx_tt.env.terms import (
