@@ -19,6 +19,19 @@ from experiments.config.optimiser import Optimiser
 from mjx_tt.env.reward_weights import REAL_WEIGHTS, SIM_WEIGHTS
 
 
+def _describe_weights(schema: dict[str, Any]) -> None:
+    """Adds the built-in terms' weights to the JSON schema, for editors and the reference."""
+    schema["properties"] |= {
+        name: {
+            "anyOf": [{"type": "number"}, {"type": "null"}],
+            "default": None,
+            "title": name,
+            "description": f"Weight of the term; {SIM_WEIGHTS[name]:g} in sim, {REAL_WEIGHTS[name]:g} in real.",
+        }
+        for name in SIM_WEIGHTS
+    }
+
+
 class Rewards(Section):
     """Weights of reward terms by name; a term that is left out, or null, keeps the weight of ``base``.
 
@@ -26,36 +39,26 @@ class Rewards(Section):
     they are left out.
     """
 
-    model_config = ConfigDict(extra="allow", json_schema_extra=lambda schema: schema["properties"].update(_weights()))
-    __pydantic_extra__: dict[str, Finite | None]
+    model_config = ConfigDict(extra="allow", json_schema_extra=_describe_weights)
+    __pydantic_extra__: dict[str, Finite]
 
     base: Literal["sim", "real"] = "sim"
     """The paper's weights for simulation or for the real robot."""
 
     @model_validator(mode="before")
     @classmethod
-    def _flat(cls, data: Any) -> Any:
-        """Artefacts from before version 1 hold the weights of user-defined terms under ``own``."""
-        if isinstance(data, dict) and isinstance(data.get("own"), dict):
-            return {key: value for key, value in data.items() if key != "own"} | data["own"]
-        return data
+    def _flatten(cls, data: Any) -> Any:
+        """Leaves out nulls. Artefacts of earlier versions hold the weights of user-defined terms under ``own``."""
+        if not isinstance(data, dict):
+            return data
+        user = data.get("own")
+        flat = {k: v for k, v in data.items() if k != "own"} | user if isinstance(user, dict) else data
+        return {name: weight for name, weight in flat.items() if weight is not None or name == "base"}
 
     @property
     def changed(self) -> dict[str, float]:
         """The weights that differ from the base's."""
-        return {name: float(weight) for name, weight in self.__pydantic_extra__.items() if weight is not None}
-
-
-def _weights() -> dict[str, Any]:
-    """JSON schema of the built-in terms' weights, for editors and the reference."""
-    return {
-        name: {
-            "type": "number",
-            "title": name,
-            "description": f"Weight of the term; {SIM_WEIGHTS[name]:g} in sim, {REAL_WEIGHTS[name]:g} in real.",
-        }
-        for name in SIM_WEIGHTS
-    }
+        return {name: float(weight) for name, weight in self.__pydantic_extra__.items()}
 
 
 class Task(Section):

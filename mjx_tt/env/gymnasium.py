@@ -15,13 +15,9 @@ from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mjx_tt.env.brax import OBSERVATION_SIZE
 from mjx_tt.env.make import make
-from robot_io.contract import N_JOINTS
 
 ID = "mjx_tt/TableTennis-v0"
-OBSERVATION = Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
-ACTION = Box(-1.0, 1.0, (N_JOINTS,), np.float32)
 
 
 class TableTennisVectorEnv(VectorEnv):
@@ -35,9 +31,11 @@ class TableTennisVectorEnv(VectorEnv):
     def __init__(self, num_envs: int = 1, **options: Any) -> None:
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self.num_envs = num_envs
-        self.single_observation_space, self.single_action_space = OBSERVATION, ACTION
-        self.observation_space, self.action_space = (batch_space(s, num_envs) for s in (OBSERVATION, ACTION))
         env = make(**options)
+        self.single_observation_space = Box(-np.inf, np.inf, (env.observation_size,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (env.action_size,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
         self._reset, self._step = jax.jit(env.reset), jax.jit(env.step)
         self._state: Any = None
 
@@ -72,10 +70,10 @@ class TableTennisVectorEnv(VectorEnv):
 class TableTennisEnv(gymnasium.Env):
     """One ball at a time."""
 
-    observation_space, action_space = OBSERVATION, ACTION
-
     def __init__(self, **options: Any) -> None:
         self._balls = TableTennisVectorEnv(1, **options)
+        self.observation_space = self._balls.single_observation_space
+        self.action_space = self._balls.single_action_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

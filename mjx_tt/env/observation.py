@@ -1,4 +1,4 @@
-"""What the sensors report: delayed, filtered, distorted, noisy positions of ball and joints."""
+"""Sensor model: delayed, filtered, distorted, noisy positions of ball and joints."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def measure(
 
 
 def sense(tick: Tick, s: EpisodeState, episodes: Episodes, constants: EpisodeConstants) -> Sensed:
-    """What arrives at control step ``tick``."""
+    """Measurements that arrive at control step ``tick``."""
     joints = slice(3, 3 + count_joints(constants))
     captured = [
         latency.read_ring(s.observations[:, :3], tick - constants.ball.periods),

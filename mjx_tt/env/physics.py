@@ -43,7 +43,7 @@ class Engine(Protocol):
 
 
 class Physics(ABC):
-    """What happens between two control steps; when the ball is over, the task says."""
+    """Motion of robot and ball between two control steps; the task says when a ball is over."""
 
     def __init__(
         self, robot: Robot, engine: str, control_rate: float, sim_rate: float, longest: tuple[float, float]

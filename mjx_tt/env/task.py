@@ -23,15 +23,7 @@ from jaxtyping import Bool, Float
 from ballmodel.flight import Events
 from ballmodel.state import BallState
 from mjx_tt.env import observation
-from mjx_tt.env.episode import (
-    Accumulators,
-    Controller,
-    EpisodeConstants,
-    Episodes,
-    EpisodeState,
-    Return,
-    Tick,
-)
+from mjx_tt.env.episode import Accumulators, Controller, EpisodeConstants, Episodes, EpisodeState, Return, Tick
 from mjx_tt.env.physics import ENGINES, Physics
 from mjx_tt.env.reward_weights import SIM_WEIGHTS, TERMS
 from mjx_tt.env.terms import (
@@ -56,13 +48,13 @@ from robot_io.limits import limit_velocity
 # ---- Observation -----------------------------------------------------------------------------------------------------
 
 
-@observation_term("ball")
+@observation_term()
 def ball(sensed: Sensed) -> Array:
     """Position of the ball [m]: rows 0 to 2."""
     return sensed.ball
 
 
-@observation_term("joints")
+@observation_term()
 def joints(sensed: Sensed) -> Array:
     """Positions of the joints [m], [rad]."""
     return sensed.joints
@@ -89,7 +81,7 @@ FACING = 0.3  # smallest y component of the blade's normal in good style (72 deg
 SOFT_RANGE = 0.05  # share of a joint's range at each end that the joint-angle term counts as unsafe
 
 
-@reward_term("state_transition", per="ball")
+@reward_term(per="ball")
 def state_transition(ball: PlayedBall) -> Array:
     """In [0, 5]: nearing the ball up to 3, hit 3, over the net 3.5, on the human's half 4, plus up to 1 more.
 
@@ -102,44 +94,44 @@ def state_transition(ball: PlayedBall) -> Array:
     return jnp.where(ball.hit, after_hit, 3.0 * jnp.exp(-ball.closest / APPROACH_RANGE))
 
 
-@reward_term("net_clearance", per="ball")
+@reward_term(per="ball")
 def net_clearance(ball: PlayedBall) -> Array:
     """In [0, 1]: the outgoing ball's height over the net plane against a target height."""
     bonus = jnp.exp(-(((ball.net_height - NET_TARGET) / NET_RANGE) ** 2))
     return jnp.where(jnp.asarray(ball.hit) & ball.crossed, bonus, 0.0)
 
 
-@reward_term("hit_and_land", per="ball")
+@reward_term(per="ball")
 def hit_and_land(ball: PlayedBall) -> Array:
     """1 for a ball that was returned."""
     return jnp.where(ball.returned, 1.0, 0.0)
 
 
-@reward_term("fault", per="ball")
+@reward_term(per="ball")
 def fault(ball: PlayedBall) -> Array:
     """-2 for a fault of the robot."""
     return jnp.where(ball.fault, FAULT, 0.0)
 
 
-@reward_term("jerk", reduce="one_minus_mean")
+@reward_term(reduce="one_minus_mean")
 def jerk(step: ControlStep) -> Array:
     """Share of the jerk that full acceleration against full acceleration takes."""
-    return share_of_limit(step.jerk, 2.0 * np.asarray(step.limits.acceleration) / step.period)
+    return measure_share(step.jerk, 2.0 * np.asarray(step.limits.acceleration) / step.period)
 
 
-@reward_term("acceleration", reduce="one_minus_mean")
+@reward_term(reduce="one_minus_mean")
 def acceleration(step: ControlStep) -> Array:
     """Share of the accelerations' limits."""
-    return share_of_limit(step.acceleration, step.limits.acceleration)
+    return measure_share(step.acceleration, step.limits.acceleration)
 
 
-@reward_term("velocity", reduce="one_minus_mean")
+@reward_term(reduce="one_minus_mean")
 def velocity(step: ControlStep) -> Array:
     """Share of the velocities' limits."""
-    return share_of_limit(step.command, step.limits.velocity)
+    return measure_share(step.command, step.limits.velocity)
 
 
-@reward_term("joint_angle")
+@reward_term()
 def joint_angle(step: ControlStep) -> Array:
     """Control steps with every joint well inside its range."""
     lower, upper = np.asarray(step.limits.lower), np.asarray(step.limits.upper)
@@ -151,25 +143,25 @@ def joint_angle(step: ControlStep) -> Array:
     return safe
 
 
-@reward_term("collision", reduce="minus_sum")
+@reward_term(reduce="minus_sum")
 def collision(step: ControlStep) -> Array:
     """Control steps in contact with table or robot."""
     return (step.table_gap <= 0.0) | (step.own_gap <= 0.0)
 
 
-@reward_term("paddle_height", reduce="minus_sum")
+@reward_term(reduce="minus_sum")
 def paddle_height(step: ControlStep) -> Array:
     """Control steps with a low paddle."""
     return step.blade_gap < BLADE_CLEARANCE
 
 
-@reward_term("style", reduce="minus_sum")
+@reward_term(reduce="minus_sum")
 def style(step: ControlStep) -> Array:
     """Control steps with a paddle that faces backwards."""
     return jnp.asarray(step.blade.normal[1] < FACING)
 
 
-def share_of_limit(values: Float[Array, "joints *batch"], limit: np.ndarray | tuple[float, ...]) -> Array:
+def measure_share(values: Float[Array, "joints *batch"], limit: np.ndarray | tuple[float, ...]) -> Array:
     """Mean over the joints of |value| / limit, at most 1 each."""
     parts = [jnp.minimum(jnp.abs(values[i]) / limit[i], 1.0) for i in range(len(limit))]
     return jnp.asarray(sum(parts)) / len(limit)

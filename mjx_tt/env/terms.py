@@ -1,14 +1,14 @@
 """Reward and observation terms: a term is one function, marked by a decorator.
 
-    @reward_term("calm_wrist")  # of a ControlStep: the term is the mean over the control steps under the policy
+    @reward_term()  # of a ControlStep: the term is the mean over the control steps under the policy
     def calm_wrist(step):
         return -abs(step.command[7])
 
-    @reward_term("deep", per="ball")  # of a PlayedBall: the term is this number
+    @reward_term(per="ball")  # of a PlayedBall: the term is this number
     def deep(ball):
         return ball.returned * ball.landing[1]
 
-    @observation_term("last_command")  # of what is Sensed: further rows of the observation
+    @observation_term()  # of what is Sensed: further rows of the observation
     def last_command(sensed):
         return sensed.command
 
@@ -77,7 +77,7 @@ class PlayedBall:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Sensed:
-    """What the policy's side knows at a control step. SI units, the batch last."""
+    """Measurements that the policy may see at a control step. SI units, the batch last."""
 
     ball: Float[Array, "3 *batch"]  # [m] as the tracker reports it, late and with noise
     joints: Float[Array, "joints *batch"]  # [m, rad] as the encoders report them, late
@@ -132,15 +132,15 @@ class ObservationTerm:
 
 
 def reward_term(
-    name: str, per: Literal["step", "ball"] = "step", reduce: str = "mean"
+    name: str = "", per: Literal["step", "ball"] = "step", reduce: str = "mean"
 ) -> Callable[[Callable[[Any], Any]], RewardTerm]:
-    """Makes a function a reward term of that name; an experiment gives its weight: ``rewards: {NAME: 0.5}``."""
-    return lambda function: RewardTerm(name, function, per, reduce)
+    """Makes a function a reward term, by default of its own name; an experiment gives its weight: ``{NAME: 0.5}``."""
+    return lambda function: RewardTerm(name or function.__name__, function, per, reduce)
 
 
-def observation_term(name: str) -> Callable[[Callable[[Sensed], Any]], ObservationTerm]:
-    """Makes a function an observation term of that name; an experiment asks for it: ``observations: {NAME: 1.0}``."""
-    return lambda function: ObservationTerm(name, function)
+def observation_term(name: str = "") -> Callable[[Callable[[Sensed], Any]], ObservationTerm]:
+    """Makes a function an observation term, by default of its own name; an experiment asks for it: ``{NAME: 1.0}``."""
+    return lambda function: ObservationTerm(name or function.__name__, function)
 
 
 def _check_name(what: str, name: Any) -> None:

@@ -236,7 +236,8 @@ def test_defaults_are_those_of_the_task_and_weights_follow_the_terms():
 
 
 def test_an_older_artefacts_user_defined_weights_are_read():
-    assert config.Rewards(style=1.0, own={"calm": 0.5}).changed == {"style": 1.0, "calm": 0.5}
+    older = config.Rewards(base="sim", style=1.0, jerk=None, own={"calm": 0.5})
+    assert older.to_dict() == {"base": "sim", "style": 1.0, "calm": 0.5}
 
 
 def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_current_folder(tmp_path, monkeypatch):

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
-from mjx_tt.env import make, user_defined
+from mjx_tt.env import make, task, user_defined
 from mjx_tt.env.policy import Policy, initial_theta
 from mjx_tt.env.reward_weights import SIM_WEIGHTS, TERMS
 from mjx_tt.env.task import APPROACH_RANGE, TaskConfig, weigh_rewards
 from robot_io import contract
+from tests.support.paths import ROOT
 
 MINE = """
 import jax.numpy as jnp
@@ -116,6 +119,17 @@ def test_the_papers_network_as_a_users_plays_as_the_packages(policy):
     same = np.isclose(found.returns, wanted.returns, rtol=1e-3, atol=1e-3)
     assert same.mean() > 0.98  # a contact turns rounding into another bounce
     np.testing.assert_allclose(found.peak_velocity[same], wanted.peak_velocity[same], rtol=1e-3, atol=1e-3)
+
+
+def test_the_pages_built_in_term_is_one_function_and_one_weight():
+    """The diff of docs/how-to/define-a-task.md."""
+    page = (ROOT / "docs" / "how-to" / "define-a-task.md").read_text(encoding="utf-8")
+    code, weights = re.search(r"```diff\n(.*?)--- mjx_tt/env/reward_weights.py\n(.*?)```", page, re.S).groups()
+    names = dict(vars(task))
+    exec("\n".join(line[1:] for line in code.splitlines() if line.startswith("+")), names)
+    term, command = names["wrist"], np.array([0.0] * 7 + [-2.5])
+    assert float(term(SimpleNamespace(command=command, limits=contract.LIMITS))) == pytest.approx(2.5 / np.deg2rad(600))
+    assert term.reduce == "one_minus_mean" and f'+    "{term.name}": ' in weights
 
 
 def test_the_same_text_gives_the_same_objects():
