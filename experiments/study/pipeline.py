@@ -7,7 +7,7 @@ a virtual one (``target_domain.virtual``) or a robot with its operator (``target
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -373,7 +373,7 @@ class Pipeline:
             item = made[item.source]
         return item.balls
 
-    def _policies_and_balls(self, seed: int, models: list[tuple[str, str]]) -> tuple[list[Policy], list[Balls]]:
+    def _policies_and_balls(self, seed: int, models: Sequence[tuple[str, str]]) -> tuple[list[Policy], list[Balls]]:
         """The policies of (trainer, model), and the balls that each was last trained on in simulation."""
         policies, balls = [], []
         for trainer, model in models:

@@ -77,7 +77,8 @@ def loop_in(prefix: str, suffix: str, world: str | None = None, identify: bool =
     simulations; identify: each round first identifies its world
     """
     items: list[Item] = []
-    data, hits, source = ["D0"], [], None
+    data, hits = ["D0"], list[str]()
+    source: str | None = None
     for number, (sim, real) in enumerate(POLICY_SUFFIXES):
         human = Human("M0" if number == 0 else f"M{number}{suffix}", tuple(data))
         items += [human] if number else []

@@ -155,8 +155,8 @@ def read(path: Path) -> Rallies:
                 raise ConfigError(f"{path}: column {', '.join(missing)} is missing; wanted: {', '.join(COLUMNS)}")
             for row in reader:
                 with error_context(f"{path}: line {reader.line_num}"):
-                    names = (_name(row, column) for column in ("trainer", "evaluator", "model"))
-                    group = (_whole(row, "seed"), *names, row["blind"] or "")
+                    trainer, evaluator, model = (_name(row, column) for column in ("trainer", "evaluator", "model"))
+                    group = (_whole(row, "seed"), trainer, evaluator, model, row["blind"] or "")
                     evaluations.setdefault(group, []).append((_whole(row, "rally"), _whole(row, "length"), _end(row)))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path}: not readable as CSV in UTF-8: {error}") from None

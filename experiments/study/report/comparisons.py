@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from experiments.finetuning.report import smooth
 from experiments.study.analysis import effect_costs, paper
-from experiments.study.analysis.claims import RATIO, Measurements
+from experiments.study.analysis.claims import Measurements
 from experiments.study.analysis.scoring import UNKNOWN
 from experiments.study.report import plots
 from mjx_tt.viz.html import FAINT, INK
@@ -80,8 +80,9 @@ def draw_effects(m: Measurements) -> Figure | None:
         gain = gains[row][column]
         if gain is not None and np.isfinite(log):
             sure = gain.low > 1.0 or gain.high < 1.0
-            style = {"color": "white" if abs(log) > 0.6 * limit else INK, "fontweight": "bold" if sure else "normal"}
-            axes.text(column, row, f"{gain.value:.2f}", ha="center", va="center", fontsize=9, **style)
+            ink, weight = "white" if abs(log) > 0.6 * limit else INK, "bold" if sure else "normal"
+            text = f"{gain.value:.2f}"
+            axes.text(column, row, text, ha="center", va="center", fontsize=9, color=ink, fontweight=weight)
     names = [paper.BY_KEY[key].label.replace(" fine", "\nfine") for key in models]
     axes.set_xticks(range(len(models)), names, fontsize=8)
     axes.set_yticks(range(len(worlds)), worlds)
@@ -180,15 +181,16 @@ def draw_unselected(m: Measurements) -> Figure | None:
 
 def draw_summary(m: Measurements) -> Figure | None:
     """The claims about ratios: ours with its interval, the paper's where it states a number."""
-    shown = [f for f in m.findings.values() if f.unit == RATIO and f.interval is not None and f.claim.summary]
+    shown = [(f, s) for f in m.findings.values() if f.interval is not None and (s := f.claim.summary) is not None]
     if not shown:
         return None
     figure = Figure(figsize=(10.5, 0.36 * len(shown) + 1.4))
     axes = figure.subplots()
-    labels, methods = ([f.claim.summary[key] for f in shown] for key in ("label", "method"))
+    ratios, labels = [f.interval for f, _ in shown], [s["label"] for _, s in shown]
+    shades = [paper.COLOURS[s["method"]] for _, s in shown]
     xlabel = "ratio of mean rally lengths (log scale), 95 % intervals; diamonds: the paper's numbers"
-    plots.draw_ratios(axes, [f.interval for f in shown], labels, [paper.COLOURS[method] for method in methods], xlabel)
-    for row, f in enumerate(shown):
+    plots.draw_ratios(axes, ratios, labels, shades, xlabel)
+    for row, (f, _) in enumerate(shown):
         if f.paper is not None:
             plots.mark_paper(axes, f.paper, row, 7)
         axes.annotate(f.verdict, (1.01, row), xycoords=("axes fraction", "data"), va="center", fontsize=8.5, color=INK)

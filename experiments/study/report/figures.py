@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from ballmodel import registry
 from experiments.study.analysis import paper
 from experiments.study.analysis.claims import Measurements
-from experiments.study.analysis.statistics import Bootstrap
+from experiments.study.analysis.statistics import Bootstrap, Interval
 from experiments.study.report import comparisons, heatmaps, human_model_figures, plots
 from mjx_tt.viz.html import FAINT, INK
 
@@ -114,8 +114,10 @@ def draw_checkpoints(m: Measurements) -> Figure | None:
             shade = paper.COLOURS[method]
             for i, key, mean in found:
                 face = shade if paper.BY_KEY[key].fine_tuned else "white"
-                style = {"fmt": "o", "color": shade, "markerfacecolor": face, "linewidth": 1.6, "capsize": 2.5}
-                axes.errorbar(i + shifts[method], mean.value, plots.error_lengths(mean), **style)
+                at, lengths = i + shifts[method], plots.error_lengths(mean)
+                axes.errorbar(
+                    at, mean.value, lengths, fmt="o", color=shade, markerfacecolor=face, linewidth=1.6, capsize=2.5
+                )
             x, y = [i + shifts[method] for i, *_ in found], [mean.value for *_, mean in found]
             axes.plot(x, y, dashes[method], color=shade, linewidth=1.6, zorder=1)
         axes.set_xticks(range(len(plots.STAGES)), plots.STAGE_LABELS, fontsize=7.5)
@@ -158,8 +160,9 @@ def draw_cross(m: Measurements) -> Figure | None:
     centre.set_title("Normalised by the trainer's own")
     kept = [[m.kept_ratio([key])] for key in paper.FINAL]
     plots.draw_bars(right, kept, [[key] for key in paper.FINAL], names, fontsize=8.5)
-    for k, claim in enumerate(("keeps-is2r", "keeps-s2r")):
-        plots.mark_paper(right, k + 0.38, m.findings[claim].paper)
+    for k, key in enumerate(("keeps-is2r", "keeps-s2r")):
+        if (share := m.findings[key].paper) is not None:
+            plots.mark_paper(right, k + 0.38, share)
     right.axhline(1.0, color=FAINT, linewidth=0.8)
     plots.show_percent(right.yaxis)
     right.set_title("Kept with other players")
@@ -225,7 +228,7 @@ def draw_ablation(m: Measurements) -> Figure | None:
     return figure
 
 
-def _mean(boot: Bootstrap, key: str, group: str) -> plots.Measured:
+def _mean(boot: Bootstrap, key: str, group: str) -> Interval | None:
     return plots.interval_of(boot.mean(key, paper.of_level(group)))
 
 

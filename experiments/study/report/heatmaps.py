@@ -100,8 +100,16 @@ def _draw_grids(axes: Axes, count: np.ndarray, back: np.ndarray) -> None:
             face = PALETTE(rate) if n else "white"
             axes.add_patch(Rectangle((x0 + k, y0 + m), 1, 1, facecolor=face, edgecolor="#d0d4d9", linewidth=0.5))
             if n:
-                style = {"ha": "center", "va": "center", "fontsize": 7.5, "color": "white" if rate > 0.6 else INK}
-                axes.text(x0 + k + 0.5, y0 + m + 0.5, f"{100 * n / total:.1f}", **style)
+                ink = "white" if rate > 0.6 else INK
+                axes.text(
+                    x0 + k + 0.5,
+                    y0 + m + 0.5,
+                    f"{100 * n / total:.1f}",
+                    ha="center",
+                    va="center",
+                    fontsize=7.5,
+                    color=ink,
+                )
         axes.add_patch(Rectangle((x0, y0), CELLS, CELLS, facecolor="none", edgecolor=INK, linewidth=1.2))
         share = f"{100 * count[i, j].sum() / total:.1f} %"
         axes.text(x0, y0 + CELLS + 0.06, share, fontsize=8.5, fontweight="bold", va="bottom")

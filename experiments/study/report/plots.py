@@ -7,10 +7,12 @@ are the paper's. Boxes are the paper's: white circle the mean, line the median, 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -24,21 +26,22 @@ from mjx_tt.viz.html import STYLE as PAGE_STYLE
 
 STYLE = PAGE_STYLE | {"figure.constrained_layout.use": True, "axes.titleweight": "bold", "font.size": 9.5}
 HUMAN_MODEL_COLOURS = {"M0": "#9ecae1", "M1": "#4292c6", "M2": "#08519c"}
-HOLLOW = {"facecolor": "white", "edgecolor": INK, "linewidth": 0.9}
-DIAMOND = {"marker": "D", "color": INK, "markerfacecolor": "white", "linestyle": ""}
+HOLLOW: dict[str, Any] = {"facecolor": "white", "edgecolor": INK, "linewidth": 0.9}
+DIAMOND: dict[str, Any] = {"marker": "D", "color": INK, "markerfacecolor": "white", "linestyle": ""}
 LENGTH, MEAN, NORMALISED = "rally length", "mean rally length, 95 %", "normalised rally length"
 STAGES = ("sim1", "ft35", "sim2", "ft65", "sim3", "ft100")
 STAGE_LABELS = ("sim 1", "fine-tuned\n35 %", "sim 2", "fine-tuned\n65 %", "sim 3", "fine-tuned\n100 %")
-Colour = str | tuple[float, ...]
+Colour = str | tuple[float, float, float]
 Measured = Estimate | Interval | None  # with a value and an interval, or missing
 
 
-def colour(key: str) -> tuple[float, ...]:
+def colour(key: str) -> tuple[float, float, float]:
     """Colour of a model: its method's, paler where it is not fine-tuned."""
     model = BY_KEY[key]
     rgb = to_rgb(COLOURS[model.method])
     pale = not model.fine_tuned and model.method != ABLATION
-    return tuple(share + 0.55 * (1.0 - share) for share in rgb) if pale else rgb
+    red, green, blue = (share + 0.55 * (1.0 - share) if pale else share for share in rgb)
+    return red, green, blue
 
 
 def held(boot: Bootstrap, keys: Sequence[str]) -> list[str]:
@@ -75,7 +78,7 @@ def draw_bars(
     labels: Sequence[str],
     ylabel: str = "",
     hatches: Sequence[str | None] | None = None,
-    **label_style: object,
+    **label_style: Any,
 ) -> None:
     """Groups of bars with their intervals, a group at each of 0, 1, 2 ... on the x axis.
 
@@ -89,7 +92,7 @@ def draw_bars(
             if interval is None:
                 continue
             at, hatch = x + (k - 0.5 * (len(group) - 1)) * width, hatches and hatches[k]
-            edge = {"hatch": hatch, "edgecolor": "white"} if hatch else {}
+            edge: dict[str, Any] = {"hatch": hatch, "edgecolor": "white"} if hatch else {}
             axes.bar(at, interval.value, 0.95 * width, color=colour(key), linewidth=0, **edge)
             axes.errorbar(at, interval.value, error_lengths(interval), color=INK, linewidth=1.1, capsize=2.5)
     axes.set_xticks(range(len(labels)), labels, **label_style)
@@ -112,7 +115,7 @@ def draw_grouped_means(
     groups: Sequence[Sequence[str]],
     players: Sequence[str],
     labels: Sequence[str],
-    **label_style: object,
+    **label_style: Any,
 ) -> None:
     """Bars of the mean length of groups of models."""
     draw_bars(axes, [[boot.mean(key, players) for key in group] for group in groups], groups, labels, **label_style)
@@ -127,7 +130,7 @@ def draw_boxes(
     labelled: bool = True,
 ) -> None:
     """A box plot for every model. samples: (n,) rally lengths of each key, empty where there are none."""
-    thin = {"color": INK, "linewidth": 0.8}
+    thin: dict[str, Any] = {"color": INK, "linewidth": 0.8}
     for k, (values, key) in enumerate(zip(samples, keys, strict=True)):
         if not values.size:
             continue
@@ -166,7 +169,7 @@ def draw_ratios(
         if interval is None:
             axes.text(1.0, row, "not in this study", ha="center", va="center", fontsize=8, color=FAINT)
             continue
-        style = {"fmt": "o", "color": shade, "markersize": 6, "linewidth": 2, "capsize": 3}
+        style: dict[str, Any] = {"fmt": "o", "color": shade, "markersize": 6, "linewidth": 2, "capsize": 3}
         axes.errorbar(interval.value, row, xerr=error_lengths(interval), **style)
     axes.axvline(1.0, color=INK, linewidth=0.8, linestyle=":")
     axes.set_yticks(range(len(labels)), labels)
@@ -193,31 +196,33 @@ def note_empty(axes: Axes) -> None:
         axes.text(0.5, 0.5, "not in this study", transform=axes.transAxes, ha="center", color=FAINT)
 
 
-def show_percent(axis: object) -> None:
+def show_percent(axis: Axis) -> None:
     """Labels of an axis of shares in percent."""
     axis.set_major_formatter(lambda value, _: f"{value:.0%}")
 
 
-def add_legend(figure: Figure, handles: Iterable[Artist], place: str = "center", **options: object) -> None:
+def add_legend(figure: Figure, handles: Iterable[Artist], place: str = "center", **options: Any) -> None:
     """A legend below the axes."""
     handles = list(handles)
-    figure.legend(handles=handles, loc=f"outside lower {place}", **{"ncols": len(handles) or 1} | options)
+    options = {"ncols": len(handles) or 1, "loc": f"outside lower {place}"} | options
+    figure.legend(handles=handles, **options)
 
 
-def patch(label: str, shade: Colour, **options: object) -> Patch:
+def patch(label: str, shade: Colour, **options: Any) -> Patch:
     """An entry of a legend for an area."""
     return Patch(facecolor=shade, label=label, **options)
 
 
-def line(label: str, shade: Colour = INK, **options: object) -> Line2D:
+def line(label: str, shade: Colour = INK, **options: Any) -> Line2D:
     """An entry of a legend for a line or, with a marker, for points."""
-    return Line2D([], [], **{"color": shade, "label": label} | options)
+    options = {"color": shade, "label": label} | options
+    return Line2D([], [], **options)
 
 
 def _label_models(axes: Axes, keys: Sequence[str], labelled: bool) -> None:
     """A tick for every model at 0, 1, 2 ...; slanted where there are many."""
     many = len(keys) > 4
     names = [key if many else SHORT.get(key, key) for key in keys] if labelled else [""] * len(keys)
-    style = {"rotation": 45, "ha": "right", "fontsize": 8} if many else {"fontsize": 8.5}
+    style: dict[str, Any] = {"rotation": 45, "ha": "right", "fontsize": 8} if many else {"fontsize": 8.5}
     axes.set_xticks(range(len(keys)), names, **style)
     axes.set_xlim(-0.6, len(keys) - 0.4)

@@ -236,9 +236,9 @@ def tabulate_significance(m: Measurements) -> Table:
         spans = (show_interval(DIFFERENCE, d.bootstrap), show_interval(DIFFERENCE, d.welch))
         label = f"{SHORT[a]} − {SHORT[b]}"
         rows.append((group, scale, label, f"{d.bootstrap.value:+.2f}", *spans, *tests, str(d.pairs)))
-    spans = (f"95 %, {name_chance(len(m.study.seeds))}", "95 %, Welch")
-    tests = ("p Welch", "p permuted", "p permuted, Holm", "p policies")
-    head = ("players", "scale", "difference", "mean", *spans, *tests, "pairs of policies")
+    columns = (f"95 %, {name_chance(len(m.study.seeds))}", "95 %, Welch")
+    p_columns = ("p Welch", "p permuted", "p permuted, Holm", "p policies")
+    head = ("players", "scale", "difference", "mean", *columns, *p_columns, "pairs of policies")
     return Table(head, rows, range(3, len(head)))
 
 
@@ -260,9 +260,9 @@ def tabulate_models(m: Measurements) -> Table:
                 spans[2] = f"fewer than {FEWEST_SEEDS} seeds"
             rest = (f"{length.max()}", f"{every.mean():.1f}", str(len(every)))
             rows.append((group, model, str(t.n), f"{seeds.value:.1f}", *spans, *quartiles, *rest))
-    spans = ("t over rallies", "bootstrap over rallies", "bootstrap over seeds and rallies")
-    rest = ("25 %", "median", "75 %", "max", "mean, unselected", "rallies, unselected")
-    head = ("players", "model", "rallies", "mean", *spans, *rest)
+    columns = ("t over rallies", "bootstrap over rallies", "bootstrap over seeds and rallies")
+    statistics = ("25 %", "median", "75 %", "max", "mean, unselected", "rallies, unselected")
+    head = ("players", "model", "rallies", "mean", *columns, *statistics)
     return Table(head, rows, range(2, len(head)))
 
 

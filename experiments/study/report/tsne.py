@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -103,7 +104,7 @@ def draw(planes: Sequence[Plane], panels: Sequence[Panel]) -> Figure | None:
         for axes, (title, sets, key) in zip(row, panels, strict=True):
             _scatter(axes, plane, sets, key)
             axes.set_title(f"{player_label(plane.player)}: {title}" if axes is row[0] else title)
-    dot = {"linestyle": "", "marker": "o"}
+    dot: dict[str, Any] = {"linestyle": "", "marker": "o"}
     names = {"D0": "D0", "D1": "ΔD1", "D2": "ΔD2"}
     handles = [line(f"training {names[n]}", DATASET_COLOURS[n], markersize=4, **dot) for n in DATASETS]
     evaluated = {BY_KEY[key].method for *_, key in panels if key}
@@ -121,9 +122,11 @@ def _scatter(axes: Axes, plane: Plane, sets: Sequence[str], key: str | None) -> 
     axes.scatter(x, y, s=2, color="#e9ebee", linewidth=0)  # where balls of this player can be at all
     for name in sets:
         if name in plane.points:
-            axes.scatter(*plane.points[name], s=5, color=DATASET_COLOURS[name], alpha=0.75, linewidth=0)
-    if key in plane.points:
+            x, y = plane.points[name]
+            axes.scatter(x, y, s=5, color=DATASET_COLOURS[name], alpha=0.75, linewidth=0)
+    if key is not None and key in plane.points:
         shade = COLOURS[BY_KEY[key].method]
-        axes.scatter(*plane.points[key], s=12, facecolor="none", edgecolor=shade, linewidth=0.6)
+        x, y = plane.points[key]
+        axes.scatter(x, y, s=12, facecolor="none", edgecolor=shade, linewidth=0.6)
     axes.set_xticks([])
     axes.set_yticks([])
