@@ -14,8 +14,8 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 
 from benchmarks.harness import run
-from experiments.commands.options import RIG, RobotOptions
 from experiments.deploy import play
+from experiments.options import RIG, RobotOptions
 
 
 def main(

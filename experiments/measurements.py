@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ballmodel.io import MeasuredStates, read
+from ballmodel.io import MeasuredStates, TrackOptions, read
 from ballmodel.io.atomic_files import replacing
+from ballmodel.io.formats import GUESS
 from ballmodel.io.tables import COLUMNS
 from ballmodel.trajectory import Dataset
 from experiments.errors import ConfigError, error_context
 from mjx_tt.diagnosis.tracks import clean
+from mjx_tt.diagnosis.tracks.frame import align
 from mjx_tt.prediction import SpinPrior, fit_states
 from mjx_tt.prediction.state_fit import lift_known
 from mjx_tt.sim.model import SimModel
@@ -21,14 +23,32 @@ from mjx_tt.sim.model import SimModel
 LEAST_SAMPLES = 8  # of a stroke whose start and spin are fitted
 
 
-def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
-    """The balls of several files together. Raises ConfigError for files that hold different kinds of measurements."""
+def read_all(
+    paths: list[str], format: str | None, options: TrackOptions = GUESS, frame: str | None = None
+) -> Dataset | MeasuredStates:
+    """The balls of several files together.
+
+    Args:
+        paths: the files.
+        format: of all of them; None: as suffix and content say.
+        options: what is known of tables and logs.
+        frame: of tracks, which are then brought into the table frame; "auto": found out; None: they stay as they are.
+
+    Raises:
+        ConfigError: a file is not as it should be, or the files hold different kinds of measurements.
+    """
     with error_context():
-        parts = [read(path, format) for path in paths]
+        parts = [read(path, format, options) for path in paths]
     source = ", ".join(part.source for part in parts)
     datasets = [part for part in parts if isinstance(part, Dataset)]
     if len(datasets) == len(parts):
-        return Dataset(tuple(trajectory for part in datasets for trajectory in part), source)
+        notes = tuple(f"{part.source}: {note}" for part in datasets for note in part.notes)
+        tracks = tuple(trajectory for part in datasets for trajectory in part)
+        if frame is not None and max(map(len, tracks)) >= LEAST_SAMPLES:
+            with error_context():
+                tracks, moved = align(tracks, source, None if frame == "auto" else frame)
+            notes += moved
+        return Dataset(tracks, source, notes)
     if len(parts) == 1:
         return parts[0]
     kinds = ", ".join(
@@ -38,9 +58,11 @@ def read_all(paths: list[str], format: str | None) -> Dataset | MeasuredStates:
     raise ConfigError(f"several files must all hold trajectories ({kinds}); fit the others one by one")
 
 
-def read_trajectories(paths: Iterable[str | Path], format: str | None = None) -> Dataset:
+def read_trajectories(
+    paths: Iterable[str | Path], format: str | None = None, options: TrackOptions = GUESS, frame: str | None = None
+) -> Dataset:
     """Trajectories of several files together. Raises ConfigError as ``read_all`` does, and for start states."""
-    measured = read_all([str(path) for path in paths], format)
+    measured = read_all([str(path) for path in paths], format, options, frame)
     if not isinstance(measured, Dataset):
         raise ConfigError(f"{measured.source}: holds start states; measured trajectories are needed")
     return measured

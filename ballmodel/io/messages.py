@@ -199,16 +199,17 @@ def _collect(
                 raise ValueError(f"{path}: message {topics[topic] - 1} on {topic}: expected a point with x, y and z")
             continue
         try:
-            place = [float(_get(point, axis)) for axis in "xyz"]
+            x, y, z = (float(_get(point, axis)) for axis in "xyz")
         except (TypeError, ValueError):
             raise ValueError(f"{path}: message {topics[topic] - 1} on {topic}: x, y, z are no numbers") from None
-        labels = [str(_get(message, name) or "") for name in ("session", "trajectory")]
-        balls.setdefault(topic, []).append((logged if stamp is None else stamp, *place, labels[0], labels[1]))
+        session, name = (str(_get(message, key) or "") for key in ("session", "trajectory"))
+        balls.setdefault(topic, []).append((logged if stamp is None else stamp, x, y, z, session, name))
     chosen = options.topic or (TOPIC if TOPIC in balls else next(iter(balls), None))
     if chosen not in balls:
         listed = ", ".join(topics) or "none"
         raise ValueError(f"{path}: no point on the topic {chosen or TOPIC}; topics that can be read: {listed}")
     if options.topic is None and chosen != TOPIC and len(balls) > 1:
         raise ValueError(f"{path}: points are on {', '.join(balls)}; name the ball's: --topic {chosen}")
-    time, *position, session, track = map(list, zip(*balls[chosen], strict=True))
-    return Samples(np.array(time), np.array(position), session, track, tuple(notes))
+    time, *position = np.array([row[:4] for row in balls[chosen]]).T
+    sessions, tracks = [row[4] for row in balls[chosen]], [row[5] for row in balls[chosen]]
+    return Samples(time, np.array(position), sessions, tracks, tuple(notes))

@@ -43,7 +43,8 @@ def read_spindoe(path: str | os.PathLike) -> SpinDataset:
     if missing:
         raise ValueError(f"{index}: column {', '.join(missing)} is missing; wanted: traj_file, {', '.join(SPINS)}")
     trajectories: list[Trajectory] = []
-    spins, notes = [], {}
+    spins: list[list[float]] = []
+    notes: dict[str, None] = {}
     for number, row in enumerate(rows, start=2):
         try:
             spins.append([float(row[name]) for name in SPINS])
@@ -51,11 +52,11 @@ def read_spindoe(path: str | os.PathLike) -> SpinDataset:
             raise ValueError(
                 f"{index}: row {number}: three numbers of rad/s are wanted as {', '.join(SPINS)}"
             ) from None
-        file = _find_file(index.parent, row["traj_file"].strip())
-        flight = make_dataset(read_table(file, UNITS), str(file), UNITS)
+        flown = _find_file(index.parent, row["traj_file"].strip())
+        flight = make_dataset(read_table(flown, UNITS), str(flown), UNITS)
         longest = max(flight, key=len)
-        trajectories.append(Trajectory(index.parent.name, file.stem, longest.time, longest.position))
-        notes |= {f"{file.name}: {note}": None for note in flight.notes}
+        trajectories.append(Trajectory(index.parent.name, flown.stem, longest.time, longest.position))
+        notes |= {f"{flown.name}: {note}": None for note in flight.notes}
     return SpinDataset(tuple(trajectories), str(index.parent), tuple(notes), np.array(spins).T)
 
 

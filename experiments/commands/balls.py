@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from experiments.commands import options
+from experiments import options
 
 if TYPE_CHECKING:
     from rich.console import Console

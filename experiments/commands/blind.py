@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
 from experiments.errors import ConfigError
+from experiments.options import option
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import count
+from experiments import options
+from experiments.options import count
 
 app = options.command(
     "compare",

@@ -7,9 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
 from experiments.errors import checked
+from experiments.options import option
 from experiments.runs.run_dir import Run
 
 app = options.command(

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
 from experiments.errors import ConfigError, checked
+from experiments.options import option
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -62,6 +62,7 @@ class Request:
         int, option("UPDATES", "with --policy: retrain for so many updates under the extended model")
     ] = 0
     episodes: Annotated[int, Parameter(help="balls of each evaluation (default: 2000)")] = 2000
+    tracks: options.TrackFileOptions = options.TRACKS
 
     def load_robot(self) -> Robot:
         """The robot whose joints were logged. Raises ConfigError."""
@@ -130,7 +131,9 @@ def resting_pose(text: str, robot: Robot | None = None) -> dict[str, float]:
     return pose
 
 
-def read_logs(paths: Sequence[str], robot: Robot | None = None) -> diagnosis.Logs:
+def read_logs(
+    paths: Sequence[str], robot: Robot | None = None, tracks: options.TrackFileOptions = options.TRACKS
+) -> diagnosis.Logs:
     """Logs of balls and joints, sessions at the robot among them. robot: whose joints; None: the paper's.
 
     Raises ValueError or FileNotFoundError naming the file.
@@ -142,12 +145,13 @@ def read_logs(paths: Sequence[str], robot: Robot | None = None) -> diagnosis.Log
     sessions = [f for f in files if session_logs.is_session(f)]
     others = [f for f in files if f not in sessions]
     if not sessions:
-        return diagnosis.load_logs(paths, robot)
-    rest = diagnosis.load_logs(others, robot) if others else diagnosis.Logs((), (), {})
+        return diagnosis.load_logs(paths, robot, tracks.load(), tracks.frame)
+    rest = diagnosis.load_logs(others, robot, tracks.load(), tracks.frame) if others else diagnosis.Logs((), (), {})
     balls, records = list(rest.balls), [("the CSV files", rest.joints)] if rest.joints else []
     for file in sessions:
         flights, joints = session_logs.load(file, robot)
-        diagnosis.check(flights, str(file))
+        if diagnosis.align(flights, str(file))[1]:  # its frame is the robot's, which no log may change
+            raise ValueError(f"{file}: the balls do not bounce on the robot's table; calibrate the tracker")
         balls += flights
         if joints:
             records.append((str(file), joints))
@@ -167,7 +171,7 @@ def run(logs: Sequence[str], request: Request, console: Console) -> diagnosis.Di
     nominal = ModelFile(build.nominal_model(robot))
     if request.model:
         nominal = checked("--model", ModelFile.load, request.model, nominal.model)
-    found = checked("", read_logs, logs, robot)
+    found = checked("", read_logs, logs, robot, request.tracks)
     home = resting_pose(request.home, robot)
     if home and not found.joints:
         raise ConfigError(f"--home {request.home}: the logs hold no joints")

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
+from experiments.options import option
 from experiments.runs.locate import find_policy
 
 app = options.command(

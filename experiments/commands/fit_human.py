@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import count, option
+from experiments import options
 from experiments.errors import ConfigError, checked
+from experiments.options import count, option
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -64,6 +64,7 @@ def fit_human(
     mixture: Annotated[
         str | None, option("YAML", "also fit a mixture over start states with spin; a picture is drawn beside it")
     ] = None,
+    tracks: options.TrackFileOptions = options.TRACKS,
 ) -> None:
     """Fits a distribution, writes its YAML and prints its 16 numbers beside those of the paper's players.
 
@@ -89,17 +90,18 @@ def fit_human(
     from experiments.commands.balls import print_numbers
     from experiments.measurements import read_all, start_states
     from experiments.progress import make_console
-    from mjx_tt import diagnosis
 
     screen, path = make_console(), Path(out)
-    measured = read_all(list(data), format)
+    measured = read_all(list(data), format, tracks.load(), tracks.frame or "auto")
+    if isinstance(measured, Dataset):
+        for note in measured.notes:
+            screen.print(note)
     if fit == "nelder-mead" and not isinstance(measured, Dataset):
         raise ConfigError(
             f"{', '.join(data)}: holds start states, which need no fit; --fit {fit} is for trajectories, leave it out"
         )
     world = options.load_model(model) if model else None
     if world is not None and isinstance(measured, Dataset):
-        checked("", diagnosis.check, measured.trajectories, measured.source)
         measured, lines = start_states(measured, world)
         screen.print(*lines, sep="\n")
     try:
@@ -109,8 +111,6 @@ def fit_human(
                 measured, ball, eps, min_samples, name or path.stem, serves, fit, progress, short_balls
             )
     except ValueError as error:
-        if isinstance(measured, Dataset):
-            checked("", diagnosis.check, measured.trajectories, measured.source)
         raise ConfigError(f"{', '.join(data)}: {error}") from None
     path.parent.mkdir(parents=True, exist_ok=True)
     save_distribution(path, distribution)

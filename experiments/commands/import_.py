@@ -7,9 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
 from experiments.errors import ConfigError
+from experiments.options import option
 
 app = options.command(
     "import",
@@ -28,6 +28,7 @@ def import_measurements(
     *,
     out: Annotated[str, option("FILE", ".csv or .mcap")],
     format: options.Format = None,
+    tracks: options.TrackFileOptions = options.TRACKS,
 ) -> None:
     """Raises ConfigError for another suffix or without trajectories."""
     options.check_exists(data)
@@ -38,10 +39,13 @@ def import_measurements(
     from experiments.progress import make_console
 
     path = Path(out)
-    measured = read_trajectories([data], format)
+    measured = read_trajectories([data], format, tracks.load(), tracks.frame)
     if path.exists() and path.samefile(data):
         raise ConfigError(f"--out {path}: is the file to be converted")
     path.parent.mkdir(parents=True, exist_ok=True)
     (write_csv if path.suffix == ".csv" else write_mcap)(path, measured)
     samples = sum(len(trajectory) for trajectory in measured)
-    make_console().print(f"{path}: {len(measured):,} trajectories, {samples:,} samples")
+    console = make_console()
+    for note in measured.notes:
+        console.print(note)
+    console.print(f"{path}: {len(measured):,} trajectories, {samples:,} samples")

@@ -8,9 +8,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import count
+from experiments import options
 from experiments.errors import ConfigError
+from experiments.options import count
 
 app = options.command(
     "is2r",

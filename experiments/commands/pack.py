@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
+from experiments.options import option
 from experiments.runs.locate import run_of
 
 app = options.command(

@@ -7,9 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
 from experiments.errors import ConfigError
+from experiments.options import option
 
 app = options.command(
     "predict",
@@ -33,6 +33,7 @@ def predict(
     ] = (0.3,),
     seen: Annotated[float | None, option("S", "use only the first S seconds of each stroke")] = None,
     format: options.Format = None,
+    tracks: options.TrackFileOptions = options.TRACKS,
 ) -> None:
     """Raises ConfigError for data that hold no strokes."""
     options.check_suffix(out, ".csv")
@@ -44,6 +45,6 @@ def predict(
     from experiments.measurements import read_trajectories
     from experiments.progress import make_console
 
-    measured = read_trajectories(data, format)
+    measured = read_trajectories(data, format, tracks.load(), tracks.frame or "auto")
     lines = ball_predictions.write(Path(out), measured, options.load_model(model), tuple(sorted(horizon)), seen)
-    make_console().print(*lines, sep="\n")
+    make_console().print(*measured.notes, *lines, sep="\n")

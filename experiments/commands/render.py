@@ -7,9 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import count, option
+from experiments import options
 from experiments.errors import checked
+from experiments.options import count, option
 from experiments.runs.locate import find_policy
 
 app = options.command(

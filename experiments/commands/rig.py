@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from cyclopts import Token
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
+from experiments.options import option
 
 app = options.command(
     "rig",

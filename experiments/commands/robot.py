@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
 from experiments.errors import ConfigError
+from experiments.options import option
 from experiments.runs.locate import artefact_of
 
 app = options.command(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from experiments.commands import options
+from experiments import options
 
 app = options.command(
     "schema",

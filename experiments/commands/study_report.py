@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands import options
+from experiments import options
 
 app = options.command(
     "study-report",

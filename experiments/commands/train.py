@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter, Token
 
-from experiments.commands import options
-from experiments.commands.options import option
+from experiments import options
 from experiments.errors import ConfigError
+from experiments.options import option
 
 app = options.command(
     "train",

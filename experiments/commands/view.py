@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands import options
-from experiments.commands.options import SHIPPED_POLICY, count, option
+from experiments import options
 from experiments.errors import ConfigError
+from experiments.options import SHIPPED_POLICY, count, option
 from experiments.runs.locate import find_policy, is_exported
 
 if TYPE_CHECKING:

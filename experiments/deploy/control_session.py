@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from experiments.commands.options import RobotOptions
 from experiments.config import robot as robots
 from experiments.deploy import calibration_check, robot_attachment
 from experiments.deploy.rig import box_of, rig_for
+from experiments.options import RobotOptions
 from experiments.runs import run_dir
 from robot_io.contract import Contract
 from robot_io.control import messages, process

@@ -11,7 +11,6 @@ from typing import Any
 
 from rich.console import Console
 
-from experiments.commands.options import RIG, RobotOptions
 from experiments.config import robot as robots
 from experiments.deploy import calibration_check, session_report
 from experiments.deploy.control_session import RECOVERIES, ControlSession, load_installed, open_session
@@ -19,6 +18,7 @@ from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, RECOVER, Keyb
 from experiments.deploy.recovery import Recovery
 from experiments.deploy.session_report import PlayedSession
 from experiments.interrupts import stop_requested
+from experiments.options import RIG, RobotOptions
 from experiments.runs import run_dir
 from robot_io.contract import PAPER
 from robot_io.control.config import RobotConfig

@@ -12,12 +12,12 @@ import numpy as np
 from rich.console import Console
 
 from ballmodel import registry
-from experiments.commands.options import RobotOptions
 from experiments.config import build
 from experiments.config import robot as robots
 from experiments.deploy.operator_console import QUIT, Keyboard
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.errors import ConfigError, checked
+from experiments.options import RobotOptions
 from mjx_tt.robot import robots as simulated
 from mjx_tt.robot.robots import Robot
 from mjx_tt.sim.model import SimModel

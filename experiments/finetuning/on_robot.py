@@ -7,7 +7,6 @@ from typing import Any
 
 from rich.console import Console
 
-from experiments.commands.options import LOCK_STEP, RIG, RobotOptions
 from experiments.config import robot as robots
 from experiments.config.build import Experiment
 from experiments.config.finetuning import FineTuning
@@ -18,6 +17,7 @@ from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.finetuning import loop
 from experiments.finetuning.bridge_robot import COMPUTING, BridgeRobot
 from experiments.finetuning.robot import LockStepRallies, Robot
+from experiments.options import LOCK_STEP, RIG, RobotOptions
 from experiments.runs import load_policy
 from experiments.runs.run_dir import Run
 from experiments.training import finalize

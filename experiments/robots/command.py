@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from experiments.commands.options import check_exists, check_suffix, command, count, option, start_jax
 from experiments.errors import ConfigError
+from experiments.options import check_exists, check_suffix, command, count, option, start_jax
 from experiments.progress import make_console
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ballmodel.trajectory import Trajectory
-from experiments.commands import options
+from experiments import options
 from experiments.deploy import robot_attachment, session_logs
 from experiments.errors import ConfigError
 from experiments.view.playlist import FixedPlaylist

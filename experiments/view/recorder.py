@@ -185,7 +185,7 @@ class Recorder:
     def _play(self, policy: Policy, episodes: Episodes) -> dict[str, Array]:
         """The episodes tick by tick (max_steps, ..., L), then balls that are over flying on alone, and the result."""
         task, config = self.simulator.task, self.simulator.config
-        controller = RecordingController(controller_of(policy))
+        controller = RecordingController(controller_of(policy), len(self.joints))
         constants, start = task.prepare(episodes), task.reset(episodes, controller)
         alone = replace(episodes.model.ball, flight=replace(episodes.model.ball.flight, integrator="midpoint"))
 

@@ -94,7 +94,7 @@ def load_logs(
             raise ValueError(
                 f"{file}: holds single ball states, no trajectories: a diagnosis needs positions over time"
             )
-        notes += tuple(f"{file.name}: {note}" for note in data.notes)
+        notes += tuple(f"{file.name}: {note}" for note in getattr(data, "notes", ()))
         single = len(data) == 1 and not data.trajectories[0].name
         tracks.setdefault(file.parent, []).extend(
             replace(t, name=file.stem) if single else t for t in data.trajectories

@@ -13,7 +13,7 @@ import sys
 from importlib import resources
 from pathlib import Path
 
-from mjx_tt.robot import geometry
+from mjx_tt.robot import geometry, robots
 from mjx_tt.robot.robots import Robot
 
 
@@ -40,6 +40,8 @@ def main(arguments: list[str]) -> int:
             f"unknown arguments {arguments}; usage: python -m mjx_tt.robot.geometry_export [--check]", file=sys.stderr
         )
         return 2
+    from mjx_tt.robot import robots
+
     wanted, file = text(robots.paper()), path()
     if arguments:
         current = file.exists() and file.read_text(encoding="utf-8") == wanted

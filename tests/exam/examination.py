@@ -31,12 +31,12 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from experiments.commands.options import load_site
 from experiments.errors import ConfigError
 from experiments.jobs import engine
 from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import ALONE as ONE_BY_ONE
 from experiments.jobs.site import Workers
+from experiments.options import load_site
 from tests.exam.generator import cases as drawing
 from tests.exam.generator import held_out, human_strokes, scoring
 from tests.exam.generator.cases import BallCase, Case

@@ -80,13 +80,13 @@ def training_balls(study: StudyFolder, seed: int, player: str, name: str) -> np.
     """
     from ballmodel.fit_distribution import fit_human
     from ballmodel.flight import ball_params
-    from ballmodel.io.tables import read_csv
+    from ballmodel.io import read
 
     path = study.paths.balls(seed, player, name)
     if not path.exists():
         return None
     with error_context():
-        data = read_csv(path)
+        data = read(path)
     keep = sorted(np.random.default_rng(0).permutation(len(data.trajectories))[:MOST])
     try:
         _, report = fit_human(replace(data, trajectories=tuple(data.trajectories[k] for k in keep)), ball_params())

@@ -11,10 +11,10 @@ from typing import Any
 
 from rich.console import Console
 
-from experiments.commands.options import RIG, RobotOptions
 from experiments.deploy import play
 from experiments.errors import ConfigError, RunError
 from experiments.finetuning import loop
+from experiments.options import RIG, RobotOptions
 from experiments.runs import load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
@@ -126,8 +126,8 @@ def make_rally_step(
             found.save(folder)
             try:
                 setup = RobotOptions(backend="numpy", seed=chance, player=evaluator)
-                left = rallies - found.counted
-                status = play.run(artefact, RIG, folder, console, setup, rallies=left)
+                missing = rallies - found.counted
+                status = play.run(artefact, RIG, folder, console, setup, rallies=missing)
             finally:
                 found = _load(folder, digest)
             if status == play.INTERRUPTED:

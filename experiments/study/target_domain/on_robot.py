@@ -18,7 +18,6 @@ from rich.console import Console
 from ballmodel.io import read
 from ballmodel.trajectory import Dataset, Trajectory
 from experiments import measurements
-from experiments.commands.options import LOCK_STEP, RIG, RobotOptions
 from experiments.config import robot as robots
 from experiments.config.study import Study
 from experiments.deploy import play, session_logs
@@ -27,6 +26,7 @@ from experiments.errors import ConfigError, RunError, error_context
 from experiments.finetuning import loop
 from experiments.finetuning import on_robot as tuning
 from experiments.finetuning.robot import SCENE, BallRecorder, LockStepRobot
+from experiments.options import LOCK_STEP, RIG, RobotOptions
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
 from experiments.study.target_domain.evaluation_on_robot import derive_seed, export_once

@@ -156,7 +156,7 @@ def align(
 
 def _choose(signs: _Signs, across: bool, words: set[str] | None) -> Frame | None:
     """The frame in which bounces and passages over the net are where table and net are."""
-    found = []
+    found: list[tuple[float, tuple[float, float], int, Frame]] = []
     for frame in _frames():
         if (words is not None and set(frame.words) != words) or (words is None and across == (frame.quarters % 2 == 0)):
             continue

@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from experiments.commands.options import ROBOT
 from experiments.config import robot as robots
 from experiments.config.finetuning import FineTuning
 from experiments.deploy import calibration_check, play
 from experiments.errors import ConfigError
 from experiments.finetuning import on_robot as tuning
+from experiments.options import ROBOT
 from experiments.runs import run_dir
 from mjx_tt.robot.robots import paper
 from robot_io.calibration import contacts

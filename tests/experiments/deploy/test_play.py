@@ -19,13 +19,13 @@ import pytest
 from mcap.reader import make_reader
 from rich.console import Console
 
-from experiments.commands.options import RIG, RobotOptions
 from experiments.config import build, robot
 from experiments.deploy import control_session as sessions
 from experiments.deploy import play
 from experiments.deploy.control_session import ControlSession
 from experiments.deploy.rig import rig_for
 from experiments.errors import ConfigError, explained
+from experiments.options import RIG, RobotOptions
 from mjx_tt.robot import robots as simulated
 from mjx_tt.sim.model import SimModel
 from robot_io import contract, log

@@ -14,7 +14,6 @@ import yaml
 from rich.console import Console
 
 from experiments.commands import diagnose
-from experiments.commands.options import RIG, RobotOptions
 from experiments.config import build
 from experiments.config import robot as robots
 from experiments.deploy import play
@@ -22,6 +21,7 @@ from experiments.deploy import rig as deploy_rig
 from experiments.deploy.control_session import ControlSession
 from experiments.errors import ConfigError
 from experiments.finetuning.robot import LockStepRobot
+from experiments.options import RIG, RobotOptions
 from experiments.sharing import recordings
 from experiments.view import measured
 from experiments.view.viewer import robot_of

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.commands.options import RIG, RobotOptions
 from experiments.deploy import play, robot_attachment
 from experiments.errors import ConfigError
+from experiments.options import RIG, RobotOptions
 from experiments.view import measured, scene
 from experiments.view.viewer import robot_of
 from mjx_tt.robot import robots

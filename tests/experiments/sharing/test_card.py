@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from experiments.commands.options import SHIPPED_POLICY
 from experiments.errors import RunError
+from experiments.options import SHIPPED_POLICY
 from experiments.sharing import card
 from robot_io.policy import artefact as artefacts
 

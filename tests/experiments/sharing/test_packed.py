@@ -18,9 +18,9 @@ import yaml
 
 from experiments import cli
 from experiments.commands.evaluate import default_folder
-from experiments.commands.options import SHIPPED_POLICY
 from experiments.config.experiment import parse
 from experiments.errors import RunError
+from experiments.options import SHIPPED_POLICY
 from experiments.runs import load_policy
 from experiments.runs.locate import artefact_of
 from experiments.sharing import packed

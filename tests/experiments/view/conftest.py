@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ballmodel import registry
-from experiments.commands.options import SHIPPED_POLICY
+from experiments.options import SHIPPED_POLICY
 from experiments.runs import load_policy
 from experiments.view.playlist import PolicyPlaylist
 from experiments.view.recorder import Recorder

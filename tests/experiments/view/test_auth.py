@@ -13,8 +13,8 @@ from websockets.sync.client import connect
 
 from experiments import cli
 from experiments.commands import view
-from experiments.commands.options import SHIPPED_POLICY
 from experiments.errors import ConfigError
+from experiments.options import SHIPPED_POLICY
 from experiments.view import auth
 
 TOKEN = "a-token-of-its-own"

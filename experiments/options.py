@@ -19,12 +19,13 @@ from cyclopts import App, Parameter, Token
 from experiments.errors import ConfigError, checked
 
 if TYPE_CHECKING:
+    from ballmodel.io.samples import TrackOptions
     from experiments.config.build import Experiment
     from experiments.config.site import Site as SiteFile
     from experiments.runs.load_policy import TrainedPolicy
     from mjx_tt.sim.model import SimModel
 
-SHIPPED_POLICY = Path(__file__).parents[1] / "shipped" / "policies" / "quickstart"
+SHIPPED_POLICY = Path(__file__).parent / "shipped" / "policies" / "quickstart"
 RIG, LOCK_STEP = "rig", "lockstep"  # values of --robot that are no file
 
 
@@ -150,7 +151,39 @@ class RobotOptions:
             raise ConfigError(f"{given}: unknown; allowed: {', '.join(names)}")
 
 
-PLAY, ALONE, ROBOT = PlayOptions(), DistributedOptions(), RobotOptions()  # where nothing is given
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class TrackFileOptions:
+    """What a person knows about files of tracks; the rest is found out."""
+
+    columns: Annotated[str, option("OURS=THEIRS,...", "columns of t, x, y, z, trajectory, such as t=Timestamp,x=X")] = ""
+    units: Annotated[str, option("UNITS", "units of the tracks, such as mm,ms, or frames with --fps")] = ""
+    fps: Annotated[float | None, option("HZ", "frames a second, where times are numbers of frames")] = None
+    frame: Annotated[
+        str | None,
+        option("FRAME", "frame of the tracks: table, or words of corner, end, side, floor, x-along joined by +"),
+    ] = None
+    topic: Annotated[str | None, option("TOPIC", "topic of the ball in a bag or MCAP file")] = None
+    salvage: Annotated[bool, Parameter(help="read a log that is damaged up to there")] = False
+
+    def load(self) -> TrackOptions:
+        """The options of ``ballmodel.io.read``. Raises ConfigError."""
+        from ballmodel.io.samples import LENGTHS, TrackOptions
+        from experiments.errors import error_context
+
+        pairs = [pair.partition("=")[::2] for pair in self.columns.split(",") if pair]
+        given = [unit for unit in self.units.split(",") if unit]
+        length = [unit for unit in given if unit in LENGTHS]
+        time = [unit for unit in given if unit not in LENGTHS] or (["frames"] if self.fps else [])
+        if len(length) > 1 or len(time) > 1:
+            raise ConfigError(f"--units {self.units}: expected one unit of length and one of time, such as mm,ms")
+        with error_context("--units"):
+            return TrackOptions(
+                dict(pairs), *(length or [None]), *(time or [None]), self.fps, self.topic, self.salvage
+            )
+
+
+PLAY, ALONE, ROBOT, TRACKS = PlayOptions(), DistributedOptions(), RobotOptions(), TrackFileOptions()  # where nothing is given
 
 
 # -- before the work ---------------------------------------------------------------------------------------------------
