@@ -152,7 +152,8 @@ def _figure(rows: list[dict[str, Any]], balls: int, result: dict[str, Any], titl
     figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=(2, 1))
     column = {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
     if rows:
-        updates, mean, style = column["update"], column["mean_return"], {"color": CURVE_COLOUR}
+        updates, mean = column["update"], column["mean_return"]
+        style: Any = {"color": CURVE_COLOUR}
         upper.fill_between(updates, column["low"], column["high"], alpha=0.18, linewidth=0, **style)
         label = f"perturbed policies, {balls} balls an update, 95 %"
         upper.plot(updates, mean, "o", markersize=3, alpha=0.7, label=label, **style)

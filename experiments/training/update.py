@@ -71,11 +71,8 @@ class Trainer:
         self.simulator, self.bgs_config, self.pool = simulator, bgs_config, simulator.replicate(pool)
         self._model = model
         self.inputs: Inputs = self.pool, simulator.replicate(arguments(model, randomise))
-        self._episodes_per_direction, self._crn, self._initial_scale = (
-            episodes_per_direction,
-            common_random_numbers,
-            initial_scale,
-        )
+        self._episodes_per_direction, self._initial_scale = episodes_per_direction, initial_scale
+        self._crn = common_random_numbers
         self._reward_schedule = reward_schedule
         self.network = network
         self._update = jax.jit(simulator.on_devices(self._update_local, out_specs=PartitionSpec()))
