@@ -26,9 +26,9 @@ def seen(params, ball, frames=4000, number=1):
 @pytest.mark.parametrize(
     "wrong, named",
     [
-        ({"first": [0, 0, 2.2]}, "tracker.cameras.first is (0.0, 0.0, 2.2)"),
-        ({"second": [0.05, 0, 3]}, "tracker.cameras.second is (0.05, 0.0, 3.0)"),
-        ({"first": [2.6, -1.6, 2.15]}, "tracker.cameras.second is (2.6, -1.6, 2.2), allowed .* away from first"),
+        ({"first": [0, 0, 2.2]}, "tracker.cameras.first: expected .* beside .*, got (0.0, 0.0, 2.2)"),
+        ({"second": [0.05, 0, 3]}, "tracker.cameras.second: expected .* beside .*, got (0.05, 0.0, 3.0)"),
+        ({"first": [2.6, -1.6, 2.15]}, "tracker.cameras.second: expected .* away from first, got"),
     ],
 )
 def test_cameras_that_cannot_triangulate_are_refused(wrong, named):
