@@ -156,7 +156,9 @@ class RobotOptions:
 class TrackFileOptions:
     """What a person knows about files of tracks; the rest is found out."""
 
-    columns: Annotated[str, option("OURS=THEIRS,...", "columns of t, x, y, z, trajectory, such as t=Timestamp,x=X")] = ""
+    columns: Annotated[str, option("OURS=THEIRS,...", "columns of t, x, y, z, trajectory, such as t=Timestamp,x=X")] = (
+        ""
+    )
     units: Annotated[str, option("UNITS", "units of the tracks, such as mm,ms, or frames with --fps")] = ""
     fps: Annotated[float | None, option("HZ", "frames a second, where times are numbers of frames")] = None
     frame: Annotated[
@@ -178,12 +180,15 @@ class TrackFileOptions:
         if len(length) > 1 or len(time) > 1:
             raise ConfigError(f"--units {self.units}: expected one unit of length and one of time, such as mm,ms")
         with error_context("--units"):
-            return TrackOptions(
-                dict(pairs), *(length or [None]), *(time or [None]), self.fps, self.topic, self.salvage
-            )
+            return TrackOptions(dict(pairs), *(length or [None]), *(time or [None]), self.fps, self.topic, self.salvage)
 
 
-PLAY, ALONE, ROBOT, TRACKS = PlayOptions(), DistributedOptions(), RobotOptions(), TrackFileOptions()  # where nothing is given
+PLAY, ALONE, ROBOT, TRACKS = (
+    PlayOptions(),
+    DistributedOptions(),
+    RobotOptions(),
+    TrackFileOptions(),
+)  # where nothing is given
 
 
 # -- before the work ---------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from experiments import options
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError
 from experiments.options import count, option
 
 if TYPE_CHECKING:

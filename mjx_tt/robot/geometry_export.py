@@ -40,7 +40,6 @@ def main(arguments: list[str]) -> int:
             f"unknown arguments {arguments}; usage: python -m mjx_tt.robot.geometry_export [--check]", file=sys.stderr
         )
         return 2
-    from mjx_tt.robot import robots
 
     wanted, file = text(robots.paper()), path()
     if arguments:

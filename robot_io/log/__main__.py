@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import signal
 import sys
 import time
@@ -16,7 +17,7 @@ import traceback
 
 from robot_io.log.messages import Event, Level, LogError
 from robot_io.log.recorder import FRAME, SETUP
-from robot_io.log.writer import Session, SessionWriter
+from robot_io.log.writer import SessionWriter
 
 FLUSH_SECONDS = 0.2
 LOOK_SECONDS = 0.05  # between looks into the pipe, which holds more than five seconds
@@ -86,7 +87,7 @@ def main() -> int:
     stream = sys.stdin.fileno()
     try:
         setup = _exactly(stream, SETUP.unpack(_exactly(stream, SETUP.size))[0])
-        writer = SessionWriter(Session.from_json(setup))
+        writer = SessionWriter(pickle.loads(setup))
         _say({"ready": True})
         malformed = record(stream, writer)
         _say({"path": str(writer.finish(malformed))})

@@ -64,12 +64,12 @@ class Numbers:
     LOGGED: ClassVar[str] = "time"
 
     @property
-    def log_time(self) -> float | None:
+    def log_time(self) -> Any:
         return getattr(self, self.LOGGED)
 
     def pack(self) -> bytes:
         """Raises LogError for arrays of other shapes than the fields have."""
-        layout = _layout(type(self))
+        layout = _layout(self.KIND)
         packed, alike = layout.head.pack(self.KIND, *layout.scalars(self)), None
         for name, length in layout.arrays:
             values = np.asarray(getattr(self, name), "<f8")
@@ -82,7 +82,7 @@ class Numbers:
 
     @classmethod
     def unpack(cls, data: bytes) -> Self:
-        layout = _layout(cls)
+        layout = _layout(cls.KIND)
         _, *scalars = layout.head.unpack_from(data)
         fields: dict[str, Any] = dict(zip(layout.names, scalars, strict=True))
         size, parts = len(data) - layout.head.size, len(layout.arrays)
@@ -104,8 +104,8 @@ class _Layout:
 
 
 @cache
-def _layout(cls: type[Numbers]) -> _Layout:
-    hints = get_type_hints(cls, include_extras=True)
+def _layout(kind: int) -> _Layout:
+    hints = get_type_hints(_KINDS[kind], include_extras=True)
     fields = {name: hint.__metadata__[0] for name, hint in hints.items() if hasattr(hint, "__metadata__")}
     names = tuple(name for name, form in fields.items() if isinstance(form, str))
     arrays = tuple((name, form) for name, form in fields.items() if not isinstance(form, str))

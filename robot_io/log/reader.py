@@ -174,7 +174,7 @@ class _Columns:
             mine = np.flatnonzero(batch.channel == channel)
             try:
                 if topic is EVENT:
-                    self._events += [self._event(batch, i) for i in mine]
+                    self._events += [self._event(batch, i) for i in mine.tolist()]
                 elif isinstance(topic, NumbersTopic):
                     numbers = topic.decode(batch, mine)
                     heads = (batch.log_time[mine], batch.publish_time[mine], batch.sequence[mine].astype(np.int64))
@@ -192,9 +192,14 @@ class _Columns:
             self._robot,
             dict(metadata),
             dict(attachments),
-            *map(self._series, (Ball, Joints, Command, Observation, Action, Tick)),
-            events,
-            tuple(self._scan.faults),
+            ball=self._series(Ball),
+            joints=self._series(Joints),
+            commands=self._series(Command),
+            observations=self._series(Observation),
+            actions=self._series(Action),
+            ticks=self._series(Tick),
+            events=events,
+            faults=tuple(self._scan.faults),
         )
 
     def _series(self, record: Any) -> Any:

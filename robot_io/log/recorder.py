@@ -11,6 +11,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import pickle
 import select
 import struct
 import subprocess
@@ -18,7 +19,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any, Protocol, Self
 
 from robot_io.contract import PAPER, Contract
 from robot_io.log.messages import LARGEST, End, Event, Level, LogError, Record
@@ -32,9 +33,9 @@ _ATOMIC = LARGEST + FRAME.size
 
 
 class SessionRecorder(Protocol):
-    """Recorder as the bridge uses it."""
+    """Recorder as the bridge uses it. In a ``with`` block it is closed at its end."""
 
-    dropped: int  # records lost so far
+    dropped: int = 0  # records lost so far
 
     @property
     def failure(self) -> str | None:
@@ -46,6 +47,12 @@ class SessionRecorder(Protocol):
     def close(self) -> Path | None:
         """Finishes the log and returns its path."""
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
 
 class _Process(subprocess.Popen[bytes]):
     """A process with pipes to its input and from its output."""
@@ -54,11 +61,10 @@ class _Process(subprocess.Popen[bytes]):
     stdout: IO[bytes]
 
 
-class Recorder:
+class Recorder(SessionRecorder):
     """Records a session through a process of its own. Used by one thread, the control thread."""
 
     def __init__(self, session: Session, process: _Process) -> None:
-        self.dropped = 0
         self.malformed = 0
         self._session = session
         self._process = process
@@ -102,7 +108,7 @@ class Recorder:
         )
         try:
             pipe = process.stdin.fileno()
-            setup = made.to_json()
+            setup = pickle.dumps(made)
             process.stdin.write(SETUP.pack(len(setup)))
             for start in range(0, len(setup), 1 << 16):
                 process.stdin.write(setup[start : start + (1 << 16)])
@@ -191,12 +197,6 @@ class Recorder:
         self._result = Path(answer["path"])
         return self._result
 
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _send(self, frames: list[bytes]) -> bool:
         try:
             os.write(self._pipe, b"".join(frames))
@@ -247,11 +247,10 @@ class Recorder:
                 return
 
 
-class FileRecorder:
+class FileRecorder(SessionRecorder):
     """The same log written in the calling process: for lock-step runs, where time stands still while it writes."""
 
     def __init__(self, session: Session) -> None:
-        self.dropped = 0
         self._writer = SessionWriter(session)
         self._result: Path | None = None
 
@@ -289,17 +288,10 @@ class FileRecorder:
             self._result = self._writer.finish()
         return self._result
 
-    def __enter__(self) -> FileRecorder:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class NullRecorder:
+class NullRecorder(SessionRecorder):
     """Keeps nothing."""
 
-    dropped = 0
     failure = None
 
     def put(self, *records: Record) -> None:
@@ -307,12 +299,6 @@ class NullRecorder:
 
     def close(self) -> None:
         return None
-
-    def __enter__(self) -> NullRecorder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
 
 def _line(process: _Process, timeout: float) -> dict[str, Any] | None:

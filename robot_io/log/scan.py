@@ -11,11 +11,11 @@ import struct
 import zlib
 from array import array
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -38,7 +38,7 @@ _HEAD = struct.Struct("<BQ")  # opcode and length of a record
 _FOOTER = struct.Struct("<BQQQI")  # with its head: starts of summary and its offsets, CRC
 _MESSAGE = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<i8"), ("publish_time", "<i8")])
 _MALFORMED = (McapError, ZstdError, ValueError, OverflowError, struct.error)
-_READERS = {
+_READERS: dict[int, Callable[[ReadDataStream], Any]] = {
     Opcode.HEADER: Header.read,
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,

@@ -212,9 +212,19 @@ def topics(robot: Contract = PAPER) -> dict[str, Topic]:
     acted = {"names": " ".join(joints), "units": "1"}
 
     def of_joints(name: str, record: type[Numbers], sequence: str = "tick", **fields: str) -> Topic:
-        keys, known = tuple(fields), {"record": record, "fields": tuple(fields.values()), "sequence": sequence}
+        keys = tuple(fields)
         write, read = partial(_write_joints, joints, keys), partial(_read_joints, joints, keys)
-        return NumbersTopic(name, JointStates, moved, width=n, write=write, read=read, **known)
+        return NumbersTopic(
+            name,
+            JointStates,
+            moved,
+            record=record,
+            fields=tuple(fields.values()),
+            width=n,
+            write=write,
+            read=read,
+            sequence=sequence,
+        )
 
     def of_values(name: str, record: type[Numbers], width: int, metadata: dict[str, str]) -> Topic:
         write, read = lambda parts: Values(values=parts[0]), partial(_read_values, width)
@@ -277,8 +287,9 @@ def encode(record: Record, topics: dict[str, Topic]) -> list[Encoded]:
     found = []
     for topic in topics.values():
         if isinstance(topic, NumbersTopic) and type(record) is topic.record:
-            stamp, sequence = getattr(record, topic.stamp), getattr(record, topic.sequence) if topic.sequence else 0
-            found.append(Encoded(topic, record.log_time, stamp, sequence, topic.encode(record)))
+            logged, stamp = getattr(record, topic.record.LOGGED), getattr(record, topic.stamp)
+            sequence = getattr(record, topic.sequence) if topic.sequence else 0
+            found.append(Encoded(topic, logged, stamp, sequence, topic.encode(record)))
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import json
 import math
@@ -58,16 +57,6 @@ class Session:
     @property
     def unfinished(self) -> Path:
         return self.folder / f"{self.name}{UNFINISHED}"
-
-    def to_json(self) -> bytes:
-        attachments = {name: base64.b64encode(content).decode() for name, content in self.attachments.items()}
-        return json.dumps([str(self.folder), self.name, self.metadata, attachments, self.clock_offset_ns]).encode()
-
-    @classmethod
-    def from_json(cls, data: bytes) -> Session:
-        folder, name, metadata, attachments, clock_offset_ns = json.loads(data)
-        contents = {name: base64.b64decode(content) for name, content in attachments.items()}
-        return cls(Path(folder), name, metadata, contents, clock_offset_ns)
 
 
 def session(
