@@ -175,12 +175,13 @@ class TrackFileOptions:
 
         pairs = [pair.partition("=")[::2] for pair in self.columns.split(",") if pair]
         given = [unit for unit in self.units.split(",") if unit]
-        length = [unit for unit in given if unit in LENGTHS]
-        time = [unit for unit in given if unit not in LENGTHS] or (["frames"] if self.fps else [])
-        if len(length) > 1 or len(time) > 1:
+        lengths = [unit for unit in given if unit in LENGTHS]
+        times = [unit for unit in given if unit not in LENGTHS] or (["frames"] if self.fps else [])
+        if len(lengths) > 1 or len(times) > 1:
             raise ConfigError(f"--units {self.units}: expected one unit of length and one of time, such as mm,ms")
+        length, time = (found[0] if found else None for found in (lengths, times))
         with error_context("--units"):
-            return TrackOptions(dict(pairs), *(length or [None]), *(time or [None]), self.fps, self.topic, self.salvage)
+            return TrackOptions(dict(pairs), length, time, self.fps, self.topic, self.salvage)
 
 
 PLAY, ALONE, ROBOT, TRACKS = (

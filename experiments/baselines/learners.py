@@ -34,8 +34,8 @@ from experiments.config import build
 from experiments.config.baselines import Ppo, Sac
 from experiments.training.update import Trainer
 from mjx_tt.env.brax import flatten
+from mjx_tt.env.episode import Controller, Tick
 from mjx_tt.env.policy import Policy, PolicyController
-from mjx_tt.env.task import Controller, Tick
 from robot_io.contract import HISTORY
 
 PIECE = 512  # control steps of each environment between two looks at a learner with a replay buffer

@@ -16,7 +16,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.errors import error_context
 from experiments.study.analysis.paper import BY_KEY, COLOURS, IS2R, S2R
 from experiments.study.analysis.study_folder import DATASETS, StudyFolder
 from experiments.study.report.plots import add_legend, line, note_empty, player_label
@@ -80,13 +79,12 @@ def training_balls(study: StudyFolder, seed: int, player: str, name: str) -> np.
     """
     from ballmodel.fit_distribution import fit_human
     from ballmodel.flight import ball_params
-    from ballmodel.io import read
+    from experiments.measurements import read_trajectories
 
     path = study.paths.balls(seed, player, name)
     if not path.exists():
         return None
-    with error_context():
-        data = read(path)
+    data = read_trajectories([path])
     keep = sorted(np.random.default_rng(0).permutation(len(data.trajectories))[:MOST])
     try:
         _, report = fit_human(replace(data, trajectories=tuple(data.trajectories[k] for k in keep)), ball_params())
