@@ -204,8 +204,8 @@ def show_percent(axis: Axis) -> None:
 def add_legend(figure: Figure, handles: Iterable[Artist], place: str = "center", **options: Any) -> None:
     """A legend below the axes."""
     handles = list(handles)
-    options = {"handles": handles, "ncols": len(handles) or 1, "loc": f"outside lower {place}"} | options
-    figure.legend(**options)
+    settings: dict[str, Any] = {"ncols": len(handles) or 1, "loc": f"outside lower {place}"} | options
+    figure.legend(handles=handles, **settings)
 
 
 def patch(label: str, shade: Colour, **options: Any) -> Patch:
