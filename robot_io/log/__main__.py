@@ -83,25 +83,25 @@ def record(stream: int, writer: SessionWriter) -> int:
 
 def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _leave_real_time()
+    _lower_priority()
     stream = sys.stdin.fileno()
     try:
-        setup = _exactly(stream, SETUP.unpack(_exactly(stream, SETUP.size))[0])
+        setup = _read_exactly(stream, SETUP.unpack(_read_exactly(stream, SETUP.size))[0])
         writer = SessionWriter(pickle.loads(setup))
-        _say({"ready": True})
+        _send_line({"ready": True})
         malformed = record(stream, writer)
-        _say({"path": str(writer.finish(malformed))})
+        _send_line({"path": str(writer.finish(malformed))})
     except OSError as error:
-        _say({"error": str(error)})
+        _send_line({"error": str(error)})
         return 1
     except Exception as error:
         traceback.print_exc()
-        _say({"error": f"{type(error).__name__}: {error}"})
+        _send_line({"error": f"{type(error).__name__}: {error}"})
         return 1
     return 0
 
 
-def _leave_real_time() -> None:
+def _lower_priority() -> None:
     """The control process's priority is not for this one, which shall not preempt it either."""
     try:
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
@@ -110,7 +110,7 @@ def _leave_real_time() -> None:
         pass
 
 
-def _exactly(stream: int, count: int) -> bytes:
+def _read_exactly(stream: int, count: int) -> bytes:
     data = b""
     while len(data) < count:
         part = os.read(stream, count - len(data))
@@ -120,7 +120,7 @@ def _exactly(stream: int, count: int) -> bytes:
     return data
 
 
-def _say(line: dict) -> None:
+def _send_line(line: dict) -> None:
     try:
         print(json.dumps(line), flush=True)
     except BrokenPipeError:

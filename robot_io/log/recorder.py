@@ -73,7 +73,7 @@ class Recorder(SessionRecorder):
         self._reason = ""  # why the first malformed record was refused
         self._malformed_reported = 0
         self._broken = False
-        self._last_words: dict[str, Any] | None = None
+        self._answer: dict[str, Any] | None = None
         self._result: Path | None = None
 
     @classmethod
@@ -141,8 +141,8 @@ class Recorder(SessionRecorder):
     def failure(self) -> str | None:
         if not self._broken:
             return None
-        words = self._hear(0.0) or {}
-        reason = "it was asked to" if "path" in words else words.get("error", "without a word")
+        answer = self._read_answer(0.0) or {}
+        reason = "it was asked to" if "path" in answer else answer.get("error", "without a word")
         return f"{self._session.unfinished}: the recorder process has ended ({reason}), nothing is recorded any more"
 
     def put(self, *records: Record) -> None:
@@ -181,9 +181,9 @@ class Recorder(SessionRecorder):
             return self._result
         if self._process.stdout.closed:
             raise LogError(f"{self._session.unfinished}: not finished, and closed before")
-        self._send_last(End(self.dropped, self.malformed), timeout)
+        self._send_end(End(self.dropped, self.malformed), timeout)
         self._process.stdin.close()
-        answer = self._hear(timeout) or {"error": f"the recorder process did not answer in {timeout:g} s"}
+        answer = self._read_answer(timeout) or {"error": f"the recorder process did not answer in {timeout:g} s"}
         try:
             self._process.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -222,17 +222,17 @@ class Recorder(SessionRecorder):
             return  # next time
         self._unreported, self._malformed_reported = 0, self.malformed
 
-    def _hear(self, timeout: float) -> dict[str, Any] | None:
+    def _read_answer(self, timeout: float) -> dict[str, Any] | None:
         """The recorder process's last words, None before it said any."""
-        if self._last_words is None:
-            self._last_words = _line(self._process, timeout)
-        return self._last_words
+        if self._answer is None:
+            self._answer = _line(self._process, timeout)
+        return self._answer
 
     def _count_malformed(self, error: Exception) -> None:
         self.malformed += 1
         self._reason = self._reason or f"{type(error).__name__}: {error}"
 
-    def _send_last(self, end: End, timeout: float) -> None:
+    def _send_end(self, end: End, timeout: float) -> None:
         packed = end.pack()
         poll = select.poll()
         poll.register(self._pipe, select.POLLOUT)

@@ -103,7 +103,7 @@ def _compiled(network: ExportedNetwork) -> tuple[Any, tuple[np.ndarray, ...]]:
 
 
 def exported(network: Any, n_observation: int = contract.N_OBSERVATION) -> ExportedNetwork:
-    """The robot's form of a network as ``mjx_tt.env.own`` defines it; one that has this form already as it is."""
+    """The robot's form of a network as the simulator has it; one that has this form already as it is."""
     if isinstance(network, ExportedNetwork):
         return network
 
