@@ -196,7 +196,7 @@ def test_a_robot_yaml_for_other_joints_is_refused_by_key(tmp_path):
     path.write_text(yaml.safe_dump({"axes": [{}], "safety": {"still": [0.05] * 8, "overshoot": [0.05] * 8}}))
     with pytest.raises(ConfigError, match="safety.*8 positive numbers"):
         robots.load_robot(path, contract=ur10e)
-    with pytest.raises(ValueError, match="axes: got 2 entries"):
+    with pytest.raises(ValueError, match="axes: expected 1 entries"):
         RobotConfig().check_joints(ur10e)
 
 
