@@ -294,8 +294,8 @@ def brax_on_new_jax() -> Iterator[None]:
     if hasattr(jax, "device_put_replicated"):
         yield
         return
-    jax.device_put_replicated = device_put_replicated  # type: ignore[attr-defined]
+    setattr(jax, "device_put_replicated", device_put_replicated)  # noqa: B010 - no name that mypy knows
     try:
         yield
     finally:
-        del jax.device_put_replicated  # type: ignore[attr-defined]
+        delattr(jax, "device_put_replicated")  # noqa: B043

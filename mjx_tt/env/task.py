@@ -337,7 +337,7 @@ class Task(Physics):
         by_lane = (episodes, self.prepare(episodes))
         return while_any(
             lambda s: s.live,
-            lambda tick, s, by_lane, controller: self.step(tick, s, *by_lane, controller),
+            lambda tick, s, by_lane, controller: self.step(tick, s, by_lane[0], by_lane[1], controller),
             self.reset(episodes, controller),
             by_lane,
             controller,

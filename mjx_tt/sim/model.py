@@ -168,7 +168,7 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
         if dataclasses.is_dataclass(value):
             yield from _leaves(value, f"{prefix}{f.name}.")
         else:
-            yield prefix + f.name, value, find_note(type_hints(type(node))[f.name])
+            yield prefix + f.name, value, find_note(type_hints(type(node))[f.name])  # type: ignore[arg-type]
 
 
 def with_values(model: SimModel, values: Mapping[str, Any]) -> SimModel:
@@ -262,7 +262,7 @@ def file_type(joints: tuple[str, ...] = JOINT_NAMES) -> Any:
 
 def _mapping_type(name: str, tree: dict[str, Any]) -> Any:
     keys = {key: _mapping_type(key, below) if isinstance(below, dict) else below for key, below in tree.items()}
-    return TypedDict(name, keys, total=False)  # type: ignore[misc, operator]
+    return TypedDict(name, keys, total=False)  # type: ignore[operator]
 
 
 @cache
