@@ -9,7 +9,8 @@ import pytest
 
 import mjx_tt
 from experiments.view.recorder import Recorder, slider_groups
-from mjx_tt.env.task import MISSED, RETURNED, TaskConfig
+from mjx_tt.env.episode import MISSED, RETURNED
+from mjx_tt.env.task import TaskConfig
 from mjx_tt.rally.end_reasons import End
 from mjx_tt.sim.model import ModelFile, Range, Samples, SimModel, with_values
 from robot_io.contract import JOINT_NAMES
