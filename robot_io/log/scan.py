@@ -211,6 +211,8 @@ class Scan:
                 elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                     self._declare(_READERS[opcode](ReadDataStream(BytesIO(content[at : at + length]))))
                 at += length
+            if at != size:
+                raise ValueError("its last record ends beyond it")
         except _MALFORMED as error:
             return str(error)
         self._contents.append(content)

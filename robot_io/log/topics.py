@@ -152,7 +152,8 @@ class NumbersTopic(Topic):
         template, places = self._template
         start, end, data = batch.start[mine], batch.end[mine], batch.data
         rows = sliding_window_view(data, template.size)[end - template.size]
-        size = 2 + data[start + 1].astype(np.int64) + template.size  # a timestamp stands before
+        # Before it stand the timestamp, whose second byte is its length, and the tick.
+        size = 2 + data[np.minimum(start + 1, data.size - 1)].astype(np.int64) + template.size
         if self._has_tick:
             tick = batch.sequence[mine].astype(np.int64)
             size += np.where(tick > 0, 2, 0) + sum((tick >= 1 << bits).astype(int) for bits in range(7, 32, 7))

@@ -113,7 +113,7 @@ def test_trackers_play_the_same_rallies(noise):
     same = [(r.length, r.end, r.started) for r in found["ball"].rallies]
     assert same == [(r.length, r.end, r.started) for r in found["stroke"].rallies]
     actions = [
-        [r.action.tolist() for r in rig.bridge.recorder.records if isinstance(r, Action)] for rig in found.values()
+        [r.values.tolist() for r in rig.bridge.recorder.records if isinstance(r, Action)] for rig in found.values()
     ]
     assert actions[0] == actions[1]
     assert [(r.length, r.end) for r in found["lost"].rallies[:2]] == [r[:2] for r in same[:2]]
