@@ -126,7 +126,7 @@ class BoxFile(BallFile):
 
     def box(self, name: str, source: str) -> BallDistribution:
         """The box; ``name`` and ``source`` stand in for missing ones."""
-        ends = {
+        ends: dict[str, Any] = {
             f"{part}_{end}": tuple(getattr(getattr(self, part), axis)[i] for axis in axes)
             for part, axes in AXES.items()
             for i, end in enumerate(("min", "max"))

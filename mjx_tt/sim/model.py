@@ -163,12 +163,13 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Dotted path, value and annotation of every leaf."""
     if isinstance(node, SimModel) and node.drives is None:
         node = dataclasses.replace(node, drives=drive_params(node.joints)())
+    owner: Any = type(node)
     for f in _parameters(node):
         value = getattr(node, f.name)
         if dataclasses.is_dataclass(value):
             yield from _leaves(value, f"{prefix}{f.name}.")
         else:
-            yield prefix + f.name, value, find_note(type_hints(type(node))[f.name])
+            yield prefix + f.name, value, find_note(type_hints(owner)[f.name])
 
 
 def with_values(model: SimModel, values: Mapping[str, Any]) -> SimModel:
@@ -262,7 +263,7 @@ def file_type(joints: tuple[str, ...] = JOINT_NAMES) -> Any:
 
 def _mapping_type(name: str, tree: dict[str, Any]) -> Any:
     keys = {key: _mapping_type(key, below) if isinstance(below, dict) else below for key, below in tree.items()}
-    return TypedDict(name, keys, total=False)  # type: ignore[misc, operator]
+    return TypedDict(name, keys, total=False)  # type: ignore[operator]
 
 
 @cache

@@ -162,10 +162,10 @@ def file_type(numbers: Mapping[str, Within]) -> Any:
     """Type of ``randomise`` in a YAML, by what is allowed for each number of the model; samples stand as content."""
     ends = {path: Annotated[float, note] for path, note in numbers.items()}
     columns = {path: list[end] for path, end in ends.items()} | {WEIGHT: list[Annotated[float, Within(0.0)]]}  # type: ignore[valid-type]
-    samples = TypedDict("samples", columns, total=False)  # type: ignore[misc, operator]
+    samples = TypedDict("samples", columns, total=False)  # type: ignore[misc]
     ranges = {path: Annotated[tuple[end, end], Increasing] for path, end in ends.items()}  # type: ignore[valid-type]
     keys = ranges | {SAMPLES: Annotated[samples, AfterValidator(_check_samples)]}
-    return Annotated[TypedDict("randomise", keys, total=False), AfterValidator(_check_once)]  # type: ignore[misc, operator]
+    return Annotated[TypedDict("randomise", keys, total=False), AfterValidator(_check_once)]  # type: ignore[operator]
 
 
 def _check_samples(columns: dict[str, list[float]]) -> dict[str, list[float]]:
