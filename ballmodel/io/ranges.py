@@ -87,8 +87,9 @@ def check_fields(config: Any) -> None:
 
 def _fields(config: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
     """Path, value and what is allowed of every annotated field, and of every entry of a tuple."""
+    owner: Any = type(config)
     for field in fields(config):
-        allowed = find_note(type_hints(type(config))[field.name])  # type: ignore[arg-type]
+        allowed = find_note(type_hints(owner)[field.name])
         waiting = [(prefix + field.name, getattr(config, field.name))]
         while waiting:
             path, value = waiting.pop(0)

@@ -63,8 +63,9 @@ def validate(kind: type[T], data: Any, where: str) -> T:
     """
     # As JSON, whose lists may be tuples and whose keys are text; nothing else is converted.
     content = to_json({"content": data}, inf_nan_mode="constants", fallback=str)
+    make_file: Any = _file
     try:
-        return _file(kind).model_validate_json(content).content  # type: ignore[arg-type, attr-defined]
+        return make_file(kind).model_validate_json(content).content
     except ValidationError as error:
         lines = dict.fromkeys(format_errors(error, kind, from_json(content)["content"]))
         raise ValueError("\n".join(f"{where}: {line}" for text in lines for line in text.splitlines())) from None
@@ -113,8 +114,7 @@ def _schema(kind: Any) -> dict[str, Any]:
 
 def format_errors(error: ValidationError, kind: Any, data: Any) -> list[str]:
     """One line per mistake: "dotted.path: expected what is allowed, got what was given; what to do"."""
-    schema = _schema(kind)
-    found: dict[str, str] = {}
+    schema, found = _schema(kind), dict[str, str]()
     for mistake in error.errors(include_url=False):
         path, line = _Place(schema, data, mistake["loc"][1:]).line(mistake)
         found.setdefault(path, line)

@@ -163,12 +163,13 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Dotted path, value and annotation of every leaf."""
     if isinstance(node, SimModel) and node.drives is None:
         node = dataclasses.replace(node, drives=drive_params(node.joints)())
+    owner: Any = type(node)
     for f in _parameters(node):
         value = getattr(node, f.name)
         if dataclasses.is_dataclass(value):
             yield from _leaves(value, f"{prefix}{f.name}.")
         else:
-            yield prefix + f.name, value, find_note(type_hints(type(node))[f.name])  # type: ignore[arg-type]
+            yield prefix + f.name, value, find_note(type_hints(owner)[f.name])
 
 
 def with_values(model: SimModel, values: Mapping[str, Any]) -> SimModel:
