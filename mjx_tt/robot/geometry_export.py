@@ -13,7 +13,7 @@ import sys
 from importlib import resources
 from pathlib import Path
 
-from mjx_tt.robot import geometry
+from mjx_tt.robot import geometry, robots
 from mjx_tt.robot.robots import Robot
 
 
