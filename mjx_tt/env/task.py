@@ -334,12 +334,11 @@ class Task(Physics):
 
         Of an episode that ended before others the robot may have moved on; ball, outcome and sums are those of its end.
         """
-        by_lane = (episodes, self.prepare(episodes))
         return while_any(
             lambda s: s.live,
-            lambda tick, s, by_lane, controller: self.step(tick, s, by_lane[0], by_lane[1], controller),
+            lambda tick, s, given, plays: self.step(tick, s, given[0], given[1], plays),
             self.reset(episodes, controller),
-            by_lane,
+            (episodes, self.prepare(episodes)),
             controller,
             limit=self.config.max_steps,
             lanes=self.config.lanes and self.config.engine == "fused",
