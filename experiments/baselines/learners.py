@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -286,7 +286,7 @@ def empty_normaliser(size: int) -> running_statistics.RunningStatisticsState:
 def brax_on_new_jax() -> Iterator[None]:
     """Gives brax 0.14 the function ``jax.device_put_replicated``, which JAX 0.10 removed (google/brax, issue 671)."""
 
-    def device_put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
+    def device_put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
         # By brax's own kind of map: from another layout brax would compile its first call apart from the others.
         stacked = jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
         return jax.pmap(lambda x: x, axis_name="i", devices=devices)(stacked)
@@ -294,8 +294,8 @@ def brax_on_new_jax() -> Iterator[None]:
     if hasattr(jax, "device_put_replicated"):
         yield
         return
-    jax.device_put_replicated = device_put_replicated  # type: ignore[attr-defined]
+    jax.device_put_replicated = device_put_replicated
     try:
         yield
     finally:
-        del jax.device_put_replicated  # type: ignore[attr-defined]
+        del jax.device_put_replicated

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -130,7 +131,7 @@ class QtOptLearner:
             state.critic, state.normaliser, batch, wanted, optimizer_state=state.optimiser
         )
         target = optax.incremental_update(critic, state.target, self._settings.target_rate)
-        return state.replace(critic=critic, target=target, optimiser=optimiser, key=key)
+        return replace(state, critic=critic, target=target, optimiser=optimiser, key=key)
 
     def wanted(self, state: QtOptState, batch: Transition, normals: jax.Array) -> jax.Array:
         """Values (B,) that the critics are to have."""
@@ -154,12 +155,12 @@ class QtOptLearner:
         env, transition = acting.actor_step(self.env, state.env, policy, action_key)
         normaliser = running_statistics.update(state.normaliser, transition.observation)
         buffer = self._queue.insert_internal(state.buffer, transition)
-        return state.replace(env=env, normaliser=normaliser, buffer=buffer, key=key)
+        return replace(state, env=env, normaliser=normaliser, buffer=buffer, key=key)
 
     def _learn(self, state: QtOptState) -> QtOptState:
         buffer, drawn = self._queue.sample_internal(state.buffer)
         batches = jax.tree.map(lambda x: x.reshape(self._settings.replay.gradient_steps, -1, *x.shape[1:]), drawn)
-        return jax.lax.scan(lambda s, batch: (self.update(s, batch), None), state.replace(buffer=buffer), batches)[0]
+        return jax.lax.scan(lambda s, batch: (self.update(s, batch), None), replace(state, buffer=buffer), batches)[0]
 
     def _random(self, observation: jax.Array, key: jax.Array) -> tuple[jax.Array, dict[str, Any]]:
         return jax.random.uniform(key, (observation.shape[0], self.env.action_size), minval=-1.0), {}
