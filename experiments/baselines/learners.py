@@ -286,10 +286,10 @@ def empty_normaliser(size: int) -> running_statistics.RunningStatisticsState:
 def brax_on_new_jax() -> Iterator[None]:
     """Gives brax 0.14 the function ``jax.device_put_replicated``, which JAX 0.10 removed (google/brax, issue 671)."""
 
-    def device_put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
+    def device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
         # By brax's own kind of map: from another layout brax would compile its first call apart from the others.
-        stacked = jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
-        return jax.pmap(lambda x: x, axis_name="i", devices=devices)(stacked)
+        stacked = jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), x)
+        return jax.pmap(lambda leaf: leaf, axis_name="i", devices=devices)(stacked)
 
     if hasattr(jax, "device_put_replicated"):
         yield
