@@ -52,7 +52,8 @@ def main(
         except Exception as error:  # such as memory that does not suffice; the other sizes are wanted all the same
             print(f"{name}: {type(error).__name__}: {str(error)[:200]}", flush=True)
             return
-        compiling, spent = time.perf_counter() - began, []
+        compiling = time.perf_counter() - began
+        spent: list[float] = []
         while len(spent) < 3 or sum(spent) < seconds:
             before = time.perf_counter()
             work()

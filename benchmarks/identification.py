@@ -157,7 +157,7 @@ def of_reality(
         return base
     human, _ = fit_human(measurements.read_trajectories([folder / "D0.csv"]), ball_params(), short_balls=True)
     save_distribution(folder / "M0.yaml", human)
-    policies = {
+    policies: dict[str, Policy] = {
         name: trained(out / "runs" / f"{name}_{seed}", worlds[name], updates, folder / "M0.yaml") for name in trained_in
     }
     policies["quickstart"] = policy
@@ -225,7 +225,7 @@ def intervals(world: ModelFile, reality: SimModel) -> dict[str, list[float]]:
 
 def summary(found: list[dict[str, Any]]) -> str:
     """The bars of the issue in words and numbers."""
-    worlds = [w for w in WORLDS if all(w in one["returned"] for one in found)]
+    worlds: list[str] = [w for w in WORLDS if all(w in one["returned"] for one in found)]
     lines = ["seed class " + " ".join(f"{w:>16s}" for w in worlds) + "   rally of the same"]
     for one in found:
         rates = [one["returned"][world] for world in worlds]
