@@ -88,7 +88,7 @@ def start_states(measured: Dataset, model: SimModel) -> tuple[MeasuredStates, li
 
 
 def write_csv(path: Path, dataset: Dataset) -> None:
-    """Writes ``session,trajectory,t,x,y,z``, which ``ballmodel.io.read_csv`` reads back exactly."""
+    """Writes ``session,trajectory,t,x,y,z``, which ``ballmodel.io.read`` reads back exactly."""
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
