@@ -34,8 +34,6 @@ PAGE = re.compile(r"\bdocs/[\w./-]+\.(?:md|json|svg|png)\b")
 LINK = re.compile(r"\]\(((?!https?:)[^)#]+)")
 COMMAND = re.compile(r"^mjx-tt (.+?)(?: >.*| &)?$", re.MULTILINE)
 KEY = re.compile(r"(?:^|[{,]) *-? *([a-z]\w+): ", re.MULTILINE)
-# Names that docstrings still mention and that are gone.
-OUTDATED = {"study_statistics", "study_claims", "hand_ball"}
 # Words of other programs and standards, and names that a reader fills in.
 FOREIGN = set(
     "Args EGMStreamStart EGM_STOP_RAMP_DOWN JobSet RESULTS Raises Returns SEED_TRAINER_EVALUATOR_MODEL SESSION TRobEGM "
@@ -45,8 +43,8 @@ FOREIGN = set(
 
 @cache
 def vocabulary() -> frozenset[str]:
-    """Words of the source outside of docstrings and comments, of data files, of file names, and the sets above."""
-    words = FOREIGN | OUTDATED
+    """Words of the source outside of docstrings and comments, of data files, of file names, and FOREIGN."""
+    words = set(FOREIGN)
     for path in MODULES:
         tree = ast.parse(path.read_text("utf-8"))
         ignored = {id(constant) for constant, _ in docstrings(tree)}

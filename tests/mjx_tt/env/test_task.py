@@ -1,5 +1,5 @@
 """Episodes made by hand: what they come to, when they end and what they are worth, against an independent calculation
-of the ball (``hand_ball``) and MuJoCo's own poses and distances of the robot."""
+of the ball (``ball_flight``) and MuJoCo's own poses and distances of the robot."""
 
 from __future__ import annotations
 

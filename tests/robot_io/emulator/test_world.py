@@ -1,4 +1,4 @@
-"""The rig's world against closed forms, the independent calculation in ``hand_ball`` and MuJoCo's own model."""
+"""The rig's world against closed forms, the independent calculation in ``ball_flight`` and MuJoCo's own model."""
 
 from __future__ import annotations
 
