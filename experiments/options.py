@@ -55,7 +55,7 @@ def count(text: str) -> Parameter:
 
 BallSeed = Annotated[int | None, option("K", "seed of the balls")]
 Devices = Annotated[int | None, count("host devices (default: one per processor core)")]
-Format = Annotated[str | None, option("NAME", "csv, mcap, deepmind or aimy (default: from the suffix)")]
+Format = Annotated[str | None, option("NAME", "csv, mcap, bag, deepmind, aimy or spindoe (default: from the suffix)")]
 Model = Annotated[str | None, option("YAML", "another simulation model")]
 Overrides = Annotated[tuple[str, ...], option("KEY=VALUE", "change one key of the file; may be repeated", "--set")]
 PolicyFolder = Annotated[str, Parameter("RUN_OR_ARTEFACT", help="folder of a run or of an exported policy")]

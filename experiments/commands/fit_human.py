@@ -41,7 +41,7 @@ what belongs together.
 @app.default
 def fit_human(
     *data: Annotated[
-        str, Parameter("DATA", help=".csv, .mcap, .json (DeepMind) or .hdf5 (AIMY launcher)", required=True)
+        str, Parameter("DATA", help="tracks of any form, .json (DeepMind) or .hdf5 (AIMY launcher)", required=True)
     ],
     out: Annotated[str, option("YAML", "the file to write")],
     name: Annotated[str, option("NAME", "name of the distribution (default: the output file's)")] = "",

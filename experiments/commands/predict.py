@@ -25,7 +25,7 @@ Writes session,trajectory,t,x,y,z and the deviations sd_x,sd_y,sd_z [m] and cova
 
 @app.default
 def predict(
-    *data: Annotated[str, Parameter("DATA", help=".csv, .mcap or .hdf5", required=True)],
+    *data: Annotated[str, Parameter("DATA", help="tracks of any form", required=True)],
     out: Annotated[str, option("CSV", "the file to write")],
     model: options.Model = None,
     horizon: Annotated[
