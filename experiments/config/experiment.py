@@ -172,8 +172,9 @@ def refuse_unknown_terms(key: str, rewards: str | Rewards) -> None:
     """Raises ValueError for weights of other terms than the built-in ones. key: of the weights, for the message."""
     for name in () if isinstance(rewards, str) else rewards.changed:
         if name not in SIM_WEIGHTS:
+            hint = validation.nearest(name, SIM_WEIGHTS)
             raise ValueError(
-                f"{key}.{name}: unknown reward term; {validation.nearest(name, SIM_WEIGHTS)} allowed: "
+                f"{key}.{name}: unknown reward term; {hint}{hint and ' '}allowed: "
                 f"{', '.join(SIM_WEIGHTS)}, and terms of a file that the key definitions names"
             )
 

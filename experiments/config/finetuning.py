@@ -85,7 +85,8 @@ def _check_rewards(rewards: str | Rewards, where: str) -> None:
         )
     for name, weight in rewards.changed.items():
         if name not in SIM_WEIGHTS:
-            allowed = f"{validation.nearest(name, SIM_WEIGHTS)} allowed: {', '.join(MEASURED_WEIGHTS)}"
+            hint = validation.nearest(name, SIM_WEIGHTS)
+            allowed = f"{hint}{hint and ' '}allowed: {', '.join(MEASURED_WEIGHTS)}"
             raise ConfigError(f"{where}: rewards.{name}: unknown reward term; {allowed}")
         if weight and name not in MEASURED_WEIGHTS:
             raise ConfigError(

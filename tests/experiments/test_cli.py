@@ -292,22 +292,30 @@ def test_what_nelder_mead_cannot_fit_is_refused(tmp_path, capsys):
 @pytest.mark.parametrize(
     "command, given, says",
     [
-        ("train", "study_quick.yaml", "the shipped study_quick.yaml is a study: `mjx-tt is2r study_quick.yaml`"),
-        ("is2r", "quickstart.yaml", "the shipped quickstart.yaml is an experiment: `mjx-tt train quickstart.yaml`"),
-        ("compare", "quickstart.yaml", "is an experiment: `mjx-tt train quickstart.yaml`; a comparison is wanted"),
+        ("train", "study_quick.yaml", "the shipped study_quick.yaml is a study: use `mjx-tt is2r study_quick.yaml`"),
+        ("is2r", "quickstart.yaml", "the shipped quickstart.yaml is an experiment: use `mjx-tt train quickstart.yaml`"),
+        (
+            "compare",
+            "quickstart.yaml",
+            "expected a comparison, the shipped quickstart.yaml is an experiment: use `mjx-tt train",
+        ),
         (
             "train",
             "{shipped}/study/study_quick.yaml",
-            "is a study, it has the key simulation: `mjx-tt is2r {shipped}/study/stu",
+            "got a study with the key simulation; use `mjx-tt is2r {shipped}/study/stu",
         ),
         (
             "train",
             "{shipped}/compare/compare_quick.yaml",
-            "is a comparison, it has the key algorithms: `mjx-tt compare",
+            "got a comparison with the key algorithms; use `mjx-tt compare",
         ),
-        ("is2r", "{shipped}/compare/compare_quick.yaml", "is a comparison, it has the key algorithms: `mjx-tt compare"),
-        ("is2r", "{shipped}/train/narrow.yaml", "is an experiment, it has the key balls: `mjx-tt train"),
-        ("compare", "{shipped}/study/study_full.yaml", "is a study, it has the key simulation: `mjx-tt is2r"),
+        (
+            "is2r",
+            "{shipped}/compare/compare_quick.yaml",
+            "got a comparison with the key algorithms; use `mjx-tt compare",
+        ),
+        ("is2r", "{shipped}/train/narrow.yaml", "got an experiment with the key balls; use `mjx-tt train"),
+        ("compare", "{shipped}/study/study_full.yaml", "got a study with the key simulation; use `mjx-tt is2r"),
     ],
 )
 def test_a_file_of_another_command_is_told_from_a_wrong_one(command, given, says, capsys, monkeypatch, tmp_path):

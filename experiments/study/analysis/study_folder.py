@@ -330,7 +330,8 @@ def _reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        text = str(error).removeprefix(f"{path}: ") or type(error).__name__
+        lines = [line.removeprefix(f"{path}: ") for line in str(error).splitlines()]
+        text = "; ".join(lines) or type(error).__name__
         raise ConfigError(f"{path}: cannot be read: {text}; restore the file") from None
 
 
