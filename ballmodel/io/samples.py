@@ -90,7 +90,7 @@ def make_dataset(samples: Samples, source: str, options: TrackOptions) -> Datase
         raise ValueError(f"{source}: expected rows with time and position of a ball, got none among {known.size}")
     time, position = time[kept], position[:, kept]
     keys = [(samples.session[i], samples.track[i]) for i in kept]
-    scale = _find_length(position, samples.length or options.length, notes)
+    scale = _find_length(position, options.length or samples.length, notes)
     tracks = {}
     for key, rows in _group(keys).items():
         order = rows[np.argsort(time[rows], kind="stable")]

@@ -35,8 +35,9 @@ app = options.command(
   mjx-tt diagnose session1.csv --policy runs/quickstart --out diagnosis          what the defect costs in play
   mjx-tt train my.yaml --set model=diagnosis/extended.yaml                       train with what was found
 
-Writes report.html (look at it first), verdict.json, extended.yaml and plots. Ball logs: session,trajectory,t,x,y,z as
-CSV, MCAP, or the launcher's HDF5; robot logs: command.csv (t,joint,velocity) and state.csv (t,joint,position).
+Writes report.html (look at it first), verdict.json, extended.yaml and plots. Ball logs: tracks as
+CSV, JSON, NumPy, Parquet, MCAP, ROS bag or the launcher's HDF5; robot logs: command.csv (t,joint,velocity) and
+state.csv (t,joint,position).
 """,
 )
 

@@ -139,6 +139,8 @@ def test_what_a_person_says_counts(tmp_path):
     path.write_text(text([(n, f, x, y, -z) for n, f, x, y, z in frame_numbers(ROWS)]))
     with pytest.raises(ValueError, match="numbers of frames; say how many a second there are"):
         read(path)
+    path.write_text(text(ROWS, "id,time,x_mm,y_mm,z_mm"))
+    assert_same(read(path, options=TrackOptions(length="m")))
     with pytest.raises(ValueError, match="unit of length: expected one of m, cm, mm, got 'inch'"):
         TrackOptions(length="inch")
 
