@@ -21,7 +21,7 @@ JUMP = 0.005  # [m]
 
 
 def blocked(axis, holds_measured, stop, policy=None, share=0.7, gain=20.0, limit=1.0):
-    """The state after 2 s against the obstacle, the drive's set-point beyond it [m], and the way on when it is gone [m].
+    """The state after 2 s against the obstacle, the drive's set-point beyond it [m], and how far it then goes on [m].
 
     stop: None waits for the fault, else the operator stops [s] later; limit: of the drive's own following error [m].
     share: of the fastest swing of that axis. None: it was never that fast, its drive had switched off, or it came
