@@ -208,7 +208,7 @@ def test_the_pages_observation_term_is_seen_by_a_network_of_its_size(folder, tmp
     (tmp_path / "my_task.py").write_text(text)
     with pytest.raises(ConfigError, match=r"(?s)network 'gru': line \d+.*dot_general"):
         build.experiment(config.load(folder / "my_task.yaml", overrides), "my_task.yaml")
-    smaller, larger = re.search(r"`w` is `(.*?)` in place of `(.*?)`", PAGE).groups()[::-1]
+    smaller, larger = re.search(r"`w` is `(.*?)` instead of `(.*?)`", PAGE).groups()[::-1]
     (tmp_path / "my_task.py").write_text(text.replace(smaller, larger))
     experiment = build.experiment(config.load(folder / "my_task.yaml", overrides), "my_task.yaml")
     last = experiment.task.observations[-1]
