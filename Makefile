@@ -6,7 +6,7 @@
 #             cores; resumable)
 # make test   set up and run the tests but for the slow ones (docs/how-to/run-the-tests.md)
 # make test-changed  those that a change since the last commit (BASE=...) can affect
-# make test-slow  a quarter of the slow tests, another one at each commit
+# make test-slow  a quarter of the slow tests, another quarter at each commit
 # make test-all  all tests
 # make check  set up and check style, types and imports
 # make exam   hide causes in logs and let the diagnosis find them: the large examination (hours; resumable)
@@ -18,7 +18,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: view demo rig-demo study-quick test test-changed test-slow test-all check exam docs bench setup clean
+.PHONY: view demo rig-demo study-quick test test-changed test-slow durations test-all check exam docs bench setup clean
 
 view: $(READY)
 	$(BIN)/mjx-tt view
@@ -38,7 +38,7 @@ study-quick: $(READY)
 WORKERS  ?= 2
 PYTEST   := $(BIN)/python -m pytest
 PARALLEL := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
-FAST     := -m "not slow and not realtime"
+FAST     := -m "not slow and not deferred and not realtime"
 
 # Where arrays are computed: every annotation is checked, types and ranks of arrays change only where the code says so.
 # The longest come first, so that neither process waits for the other at the end.
@@ -49,25 +49,36 @@ REALTIME  = $(shell grep -rl --include="test_*.py" "mark.realtime" tests)
 test: $(READY)
 	STRICT_ARRAYS=1 $(PYTEST) $(PARALLEL) $(STRICT) $(FAST)
 	$(PYTEST) $(PARALLEL) $(ALL_ELSE) $(FAST)
-	$(PYTEST) $(REALTIME) -m "not slow and realtime"
+	$(PYTEST) $(REALTIME) -m "not slow and not deferred and realtime"
 
 # What differs from the commit BASE, and all that imports it.
 BASE     ?= HEAD
 test-changed: $(READY)
-	$(BIN)/python -m tests.support.changed $(BASE) | xargs -r $(PYTEST) $(PARALLEL) $(FAST)
+	$(BIN)/python -m tests.support.changed $(BASE) | xargs -r $(PYTEST) $(PARALLEL) -m "not slow and not realtime"
 
-# The slow tests in SHARDS parts of equal time, by the times in tests/durations.json; each commit's turn is another
-# part, so that they all run within as many landings. SHARDS=1 runs all.
+# The slow and the deferred tests in SHARDS parts of equal time, by the times in tests/durations.json; each commit's turn
+# is another part, so that they all run within as many landings. SHARDS=1 runs all.
 SHARDS   ?= 4
 TURN     ?= $(shell git rev-list --count HEAD 2>/dev/null || echo 0)
 PART      = --splits $(SHARDS) --group $(shell echo $$(($(TURN) % $(SHARDS) + 1))) --durations-path tests/durations.json
+STUDY    := tests/experiments/study
 test-slow: $(READY)
-	$(PYTEST) $(PARALLEL) tests --ignore=tests/experiments/study -m "slow and not realtime" $(PART)
-	USERS_FUSION=1 $(PYTEST) $(PARALLEL) tests/experiments/study -m "slow and not realtime" $(PART)
-	$(PYTEST) $(REALTIME) -m "slow and realtime" $(PART)
+	STRICT_ARRAYS=1 $(PYTEST) $(PARALLEL) $(STRICT) -m "deferred and not realtime" $(PART)
+	$(PYTEST) $(PARALLEL) $(ALL_ELSE) -m "deferred and not realtime" $(PART)
+	$(PYTEST) $(PARALLEL) tests --ignore=$(STUDY) -m "slow and not realtime" $(PART)
+	USERS_FUSION=1 $(PYTEST) $(PARALLEL) $(STUDY) -m "slow and not realtime" $(PART)
+	$(PYTEST) $(REALTIME) -m "(slow or deferred) and realtime" $(PART)
 
 test-all: test
 	$(MAKE) test-slow SHARDS=1
+
+# Times every test anew, one by one; the record says which are deferred and how the parts are cut. Some 50 minutes.
+durations: $(READY)
+	rm -f .cache/durations.json
+	-STRICT_ARRAYS=1 $(PYTEST) $(STRICT) -m "not slow" --store-durations --durations-path .cache/durations.json
+	-$(PYTEST) $(ALL_ELSE) -m "not slow" --store-durations --durations-path .cache/durations.json
+	-$(PYTEST) tests -m slow --store-durations --durations-path .cache/durations.json
+	$(BIN)/python -m tests.support.durations .cache/durations.json
 
 check: $(READY)
 	$(BIN)/ruff check .

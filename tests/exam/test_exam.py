@@ -502,7 +502,7 @@ def test_bounces_far_off_stay_in_their_ranges():
 
 
 SLOW = pytest.mark.slow
-MORE = (SLOW, pytest.mark.exhaustive)  # others of their kind stay in continuous integration
+MORE = (SLOW,)
 PEOPLE = pytest.mark.skipif(
     not human_strokes.DATA.exists(), reason=f"measured strokes are absent: {human_strokes.DATA}"
 )

@@ -101,6 +101,7 @@ def test_seeds_that_are_none(seeds, capsys):
     assert "different whole numbers separated by commas" in capsys.readouterr().err
 
 
+@pytest.mark.smoke
 def test_train_leaves_evaluation_artefact_pictures_and_measurements(trained):
     _, runs, output = trained
     run = runs / "tiny"

@@ -64,6 +64,7 @@ def run(policy, log_folder, balls=None) -> tuple[int, str]:
 
 
 @pytest.mark.realtime
+@pytest.mark.smoke
 def test_plays_on_the_rig_and_leaves_a_log_and_a_summary(policy, tmp_path):
     status, text = run(policy, tmp_path, balls=2)
     assert status == 0, text

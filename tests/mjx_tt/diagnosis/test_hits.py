@@ -25,7 +25,7 @@ MODEL = with_values(SimModel(), {"ball.table.height": -3.0})
 HITS, RATE, RADIUS, THICKNESS = 48, 125.0, 0.020, 0.012
 EVERY = 1.5  # [s] from ball to ball
 BEFORE, AFTER = 0.45, 0.3  # [s] of each ball
-MORE = (pytest.mark.slow, pytest.mark.exhaustive)
+MORE = (pytest.mark.slow,)
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,7 @@ def by_lanes(caplog):
     assert "left to XLA" not in caplog.text
 
 
+@pytest.mark.smoke
 def test_the_nominal_model(by_lanes):
     assert_alike(*both(CONFIG, n_parameters()))
 
