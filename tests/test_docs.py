@@ -115,6 +115,24 @@ def test_names_of_a_page_exist(page):
     assert not missing, "\n".join(missing)
 
 
+def test_every_statement_of_the_paper_has_a_place_and_a_class():
+    rows = re.findall(
+        r"^\| (\d+) \| (.+?) \| (.+?) \| (.+?) \|$", text_of(ROOT / "docs/reference/paper.md"), re.MULTILINE
+    )
+    assert [int(number) for number, *_ in rows] == list(range(1, len(rows) + 1))
+    classes = ("exact", "equivalent, because", "differs", "not done, because")
+    found = dict.fromkeys(classes, 0)
+    for number, _, where, text in rows:
+        assert CODE.search(where), f"statement {number}: no place"
+        kind = next((kind for kind in classes if re.match(rf"{kind}\b", text)), None)
+        assert kind, f"statement {number}: expected one of {', '.join(classes)}, got {text!r}"
+        found[kind] += 1
+    counted = dict(
+        re.findall(r"^\| ([a-z, ]+) \| [^|]+ \| (\d+) \|$", text_of(ROOT / "docs/reference/paper.md"), re.MULTILINE)
+    )
+    assert {kind: int(count) for kind, count in counted.items()} == found
+
+
 def test_names_in_docstrings_exist():
     missing = [
         f"{path.relative_to(ROOT)}:{line}: `{code}`: {word}"

@@ -18,7 +18,7 @@ app = options.command(
     """\
   mjx-tt train quickstart.yaml
   mjx-tt train narrow.yaml medium.yaml --seeds 0,1,2        six runs: runs/narrow/seed0/ ... runs/medium/seed2/
-  mjx-tt train player3_m2.yaml --seeds 0,1,2 --select       and name the best seed, as the paper does
+  mjx-tt train player3_m2.yaml --seeds 0,1,2 --select       and name the best seed, in simulation
   mjx-tt train my.yaml --set training.updates=500 --set balls=player1/M0
   mjx-tt train my.yaml --seeds 0,1,2,3 --site cluster.yaml   on a cluster's nodes: docs/how-to/use-a-cluster.md
   srun mjx-tt train my.yaml --distributed auto               one training by all processes of a SLURM job

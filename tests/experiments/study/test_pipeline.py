@@ -277,6 +277,7 @@ def test_the_papers_study_trains_as_the_papers_training():
     study_ = study_config.load(study_config.shipped()["study_paper"])
     paper = experiment.load(experiment.shipped()["paper"])
     assert study_.simulation.optimiser == paper.optimiser
+    assert study_.simulation.task == paper.task
     step = paper.optimiser.step
     assert (step.kind, step.learning_rate, step.schedule.kind) == ("sgd", 0.00375, "constant")
     assert [(r.simulated, r.real, r.step, r.later_rewards) for r in study_.simulation.rounds] == [
