@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -18,13 +19,17 @@ LONGEST = 1.5  # [s]
 HALF = 0.5  # [s] from which a test is recorded
 
 
-def defer_long_tests(items: list[pytest.Item]) -> None:
-    """Marks the tests that took longer than LONGEST."""
-    seconds = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
-    for item in items:
-        marked = any(item.get_closest_marker(name) for name in ("slow", "smoke"))
-        if seconds.get(item.nodeid, 0.0) > LONGEST and not marked:
-            item.add_marker(pytest.mark.deferred)
+@cache
+def read_seconds() -> dict[str, float]:
+    """Seconds by test."""
+    return json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Marks a test that took longer than LONGEST."""
+    marked = any(item.get_closest_marker(name) for name in ("slow", "smoke"))
+    if read_seconds().get(item.nodeid, 0.0) > LONGEST and not marked:
+        item.add_marker(pytest.mark.deferred)
 
 
 def main(recorded: str) -> None:

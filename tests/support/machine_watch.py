@@ -80,8 +80,7 @@ def watched_machine(request: pytest.FixtureRequest) -> Iterator[None]:
     yield
 
 
-def rerun_where_the_machine_stood(items: list[pytest.Item]) -> None:
-    """Marks tests in real time to be run again."""
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.get_closest_marker("realtime") is not None:
             item.add_marker(pytest.mark.flaky(reruns=2, condition=_stood))
