@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
-
-T = TypeVar("T")
 
 
 class ExperimentError(Exception):
@@ -48,9 +45,3 @@ def error_context(where: str = "") -> Iterator[None]:
     except (ValueError, OSError, RuntimeError) as error:
         lines = str(error).splitlines() or [""]
         raise ConfigError("\n".join(f"{where}: {line}" for line in lines) if where else str(error)) from None
-
-
-def checked(where: str, function: Callable[..., T], *arguments: Any) -> T:
-    """Result of a function within ``error_context``."""
-    with error_context(where):
-        return function(*arguments)

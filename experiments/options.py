@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter, Token
 
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 
 if TYPE_CHECKING:
     from ballmodel.io.samples import TrackOptions
@@ -233,7 +233,8 @@ def load_model(path: str | None) -> SimModel:
     """The simulation model of a file, None: the nominal one. Raises ConfigError."""
     from mjx_tt.sim.model import ModelFile, SimModel
 
-    return SimModel() if path is None else checked("--model", ModelFile.load, path).model
+    with error_context("--model"):
+        return SimModel() if path is None else ModelFile.load(path).model
 
 
 def find_shipped(name: str, shipped: dict[str, Path]) -> Path:

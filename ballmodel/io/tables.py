@@ -66,7 +66,7 @@ def read_table(path: str | os.PathLike, options: TrackOptions) -> Samples:
         elif suffix in (".npy", ".npz"):
             table = _read_arrays(path)
         elif suffix == ".parquet":
-            table = pd.read_parquet(path)
+            table = _read_parquet(path)
         else:
             table, first = _read_text(path)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError, json.JSONDecodeError) as error:
@@ -123,6 +123,13 @@ def _is_number(text: str, decimal: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _read_parquet(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_parquet(path)
+    except ImportError:
+        raise ValueError(f"{path}: Parquet needs pyarrow: pip install 'mjx-tt[lerobot]'") from None
 
 
 def _read_json(path: Path) -> pd.DataFrame:

@@ -40,7 +40,7 @@ from experiments.config import build
 from experiments.config.baselines import OWN, Algorithm, Bgs, Budget, Comparison, Ppo, QtOpt
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
-from experiments.errors import RunError, checked
+from experiments.errors import RunError, error_context
 from experiments.jobs import engine
 from experiments.jobs.engine import Job, Setup
 from experiments.jobs.site import ALONE, Workers
@@ -170,7 +170,8 @@ def learner(settings: Algorithm, experiment: Experiment) -> Learner:
     """The algorithm on the experiment's task. Raises ConfigError."""
     config, model = experiment.config, experiment.model
     if isinstance(settings, Bgs):
-        bgs = checked("optimiser", build.bgs_config, settings.optimiser, settings.schedule_updates)
+        with error_context("optimiser"):
+            bgs = build.bgs_config(settings.optimiser, settings.schedule_updates)
         training = config.training.model_copy(update={"devices": 1})
         config = config.model_copy(update={"optimiser": settings.optimiser, "training": training})
         return EvolutionLearner(trainer(replace(experiment, config=config, bgs=bgs)))

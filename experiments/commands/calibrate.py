@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from experiments import options
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 from experiments.options import option
 
 if TYPE_CHECKING:
@@ -84,8 +84,10 @@ def calibrate(
 def _tracker(path: Path, today: str, screen: Console) -> TrackerCalibration:
     from robot_io.calibration import points, tracker
 
-    lines, (table, seen) = checked("", points.read, path, points.TABLE, points.BALL)
-    fit = checked(str(path), tracker.fit, table, seen, today)
+    with error_context():
+        lines, (table, seen) = points.read(path, points.TABLE, points.BALL)
+    with error_context(str(path)):
+        fit = tracker.fit(table, seen, today)
     _show_points(screen, path, lines, fit.residuals, fit.used)
     position, turn = 1e3 * fit.deviation[:3], 1e3 * fit.deviation[3:]
     screen.print(
@@ -104,7 +106,8 @@ def _load_standing(name: str) -> tuple[Contract, np.ndarray | None]:
     from mjx_tt.robot import robots
     from robot_io.contract import PAPER
 
-    robot = checked("", robots.load, name)
+    with error_context():
+        robot = robots.load(name)
     if robot.contract == PAPER:
         return PAPER, None
     frame = robot.paddle()
@@ -116,8 +119,10 @@ def _robot(
 ) -> RobotCalibration:
     from robot_io.calibration import points, robot
 
-    lines, table, joints, paddle = checked("", points.touched, path, contract, end)
-    fit = checked(str(path), robot.fit, table, joints, paddle, zeros, today, contract)
+    with error_context():
+        lines, table, joints, paddle = points.touched(path, contract, end)
+    with error_context(str(path)):
+        fit = robot.fit(table, joints, paddle, zeros, today, contract)
     _show_points(screen, path, lines, fit.residuals, fit.used)
     found = fit.calibration
     values = (*found.joint_zeros, *found.base_position, *found.base_rotation, *found.tip)
@@ -137,12 +142,14 @@ def _clock(path: Path, known: Calibration, today: str, screen: Console) -> Clock
     from robot_io.calibrated import Calibration
     from robot_io.calibration import clock
 
-    session = checked("", log.read, path)
+    with error_context():
+        session = log.read(path)
     then = session.attachments.get("calibration.yaml")  # what joints and ball were logged with
     if then is not None:
         where = f"{path}: calibration.yaml"
         known = robots.fill(Calibration, read_yaml(then.decode(), where) or {}, where)
-    found, told = checked(str(path), clock.fit, session, known, today)
+    with error_context(str(path)):
+        found, told = clock.fit(session, known, today)
     for line in told:
         screen.print(line)
     return found

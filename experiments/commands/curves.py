@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from experiments import options
-from experiments.errors import checked
+from experiments.errors import error_context
 from experiments.options import option
 from experiments.runs.run_dir import Run
 
@@ -31,4 +31,5 @@ def draw_curves(
     from experiments.progress import make_console
 
     found = [learning_curves.read_curve(folder) for folder in runs]
-    make_console().print(str(checked("", learning_curves.draw_curves, Path(out), found)), soft_wrap=True)
+    with error_context():
+        make_console().print(str(learning_curves.draw_curves(Path(out), found)), soft_wrap=True)

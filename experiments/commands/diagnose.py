@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from experiments import options
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 from experiments.options import option
 
 if TYPE_CHECKING:
@@ -69,7 +69,8 @@ class Request:
         """The robot whose joints were logged. Raises ConfigError."""
         from mjx_tt.robot import robots
 
-        return robots.paper() if self.robot is None else checked("--robot", robots.load, self.robot)
+        with error_context("--robot"):
+            return robots.paper() if self.robot is None else robots.load(self.robot)
 
     def check(self) -> None:
         """Refuses at once a request that would fail after the work. Raises ConfigError."""
@@ -171,8 +172,10 @@ def run(logs: Sequence[str], request: Request, console: Console) -> diagnosis.Di
     robot = request.load_robot()
     nominal = ModelFile(build.nominal_model(robot))
     if request.model:
-        nominal = checked("--model", ModelFile.load, request.model, nominal.model)
-    found = checked("", read_logs, logs, robot, request.tracks)
+        with error_context("--model"):
+            nominal = ModelFile.load(request.model, nominal.model)
+    with error_context():
+        found = read_logs(logs, robot, request.tracks)
     home = resting_pose(request.home, robot)
     if home and not found.joints:
         raise ConfigError(f"--home {request.home}: the logs hold no joints")
@@ -190,19 +193,18 @@ def run(logs: Sequence[str], request: Request, console: Console) -> diagnosis.Di
     } | ({} if request.robot is None else {"robot": robot.name})
     if request.model:
         provenance["model_sha256"] = hashlib.sha256(Path(request.model).read_bytes()).hexdigest()
-    return checked(
-        ", ".join(logs),
-        diagnosis.diagnose,
-        found,
-        nominal.model,
-        request.spin,
-        tuple(name for part in request.without for name in part.split(",") if name),
-        request.seed,
-        say,
-        provenance,
-        request.randomise,
-        home,
-    )
+    with error_context(", ".join(logs)):
+        return diagnosis.diagnose(
+            found,
+            nominal.model,
+            request.spin,
+            tuple(name for part in request.without for name in part.split(",") if name),
+            request.seed,
+            say,
+            provenance,
+            request.randomise,
+            home,
+        )
 
 
 def play(extended: Path, request: Request, console: Console) -> Play:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from experiments import options
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 from experiments.options import option
 
 if TYPE_CHECKING:
@@ -69,7 +69,8 @@ def list_logs(folder: Path, console: Console) -> None:
     paths = _logs_in(folder)
     table = Table("log", "started (UTC)", "duration", "messages", "lost", "state", title_justify="left")
     for path in sorted(paths, key=lambda path: path.stat().st_mtime):
-        overview = checked("", glance, path)
+        with error_context():
+            overview = glance(path)
         session, end = overview.metadata.get("session", {}), overview.metadata.get("end", {})
         table.add_row(
             path.name,
@@ -88,7 +89,8 @@ def check(paths: list[Path], console: Console) -> int:
 
     faulty = 0
     for path in paths:
-        overview = checked("", log.check, path)
+        with error_context():
+            overview = log.check(path)
         faulty += overview.state != "sound"
         console.print(
             f"{path}: {overview.state}, {overview.messages:,} messages in {overview.duration:.1f} s", soft_wrap=True
@@ -104,7 +106,8 @@ def salvage(path: Path, out: Path | None, console: Console) -> Path:
     """Writes what is sound of a damaged or unfinished log as a proper file, and returns its path."""
     from robot_io import log
 
-    overview = checked("", log.salvage, path, out)
+    with error_context():
+        overview = log.salvage(path, out)
     console.print(f"{overview.path}: {overview.messages:,} messages, {overview.duration:.1f} s", soft_wrap=True)
     for line in overview.metadata["salvage"]["faults"].splitlines():
         console.print(f"  lost: {line}", soft_wrap=True)
@@ -116,8 +119,10 @@ def export(path: Path, out: Path | None, console: Console) -> list[Path]:
     from robot_io import log
     from robot_io.log.writer import SUFFIX
 
-    session = checked("", log.read, path)
-    written = checked("", log.export, session, out or path.with_name(path.name.removesuffix(SUFFIX)))
+    with error_context():
+        session = log.read(path)
+    with error_context():
+        written = log.export(session, out or path.with_name(path.name.removesuffix(SUFFIX)))
     for table in written:
         console.print(table, soft_wrap=True)
     balls = len(log.trajectories(session.ball))

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from experiments import options
-from experiments.errors import checked
+from experiments.errors import error_context
 from experiments.options import count, option
 from experiments.runs.locate import find_policy
 
@@ -47,5 +47,6 @@ def render(
     experiment = play.experiment(trained)
     played = video.record(experiment, trained, episodes, play.seed_of(experiment))
     for path in out:
-        checked("", video.draw, Path(path), played, camera, experiment.task.robot)
+        with error_context():
+            video.draw(Path(path), played, camera, experiment.task.robot)
         make_console().print(path)

@@ -13,7 +13,7 @@ from experiments.config import robot as robots
 from experiments.deploy import robot_attachment
 from experiments.deploy.control_session import ControlSession
 from experiments.deploy.operator_console import KEYS, QUIT, Key, Keyboard, View
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 from mjx_tt.robot import robots as simulated
 from robot_io.calibrated import Calibration
 from robot_io.calibration import points
@@ -202,7 +202,8 @@ class Commissioning:
         loaded, name = None if policy is None else artefacts.load(policy), self.name or robots.named(self.robot)
         if name is None:
             return (PAPER, ()) if loaded is None else (loaded.contract, robot_attachment.of_policy(loaded, console))
-        contract = checked("", simulated.load, name).contract
+        with error_context():
+            contract = simulated.load(name).contract
         if loaded is not None and loaded.contract != contract:
             raise ConfigError(
                 f"--artefact {policy}: a policy for another robot than {name} as it is now; allowed: one of "

@@ -16,7 +16,7 @@ from experiments.config import build
 from experiments.config import robot as robots
 from experiments.deploy.operator_console import QUIT, Keyboard
 from experiments.deploy.virtual_player import VirtualPlayer
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 from experiments.options import RobotOptions
 from mjx_tt.robot import robots as simulated
 from mjx_tt.robot.robots import Robot
@@ -59,7 +59,8 @@ def robot_of(artefact: artefacts.Artefact) -> Robot:
     if artefact.contract == PAPER:
         return simulated.paper()
     where = f"{artefact.folder}: {RECORDED}"
-    robot = checked("", simulated.from_content, content_of(artefact), where)
+    with error_context():
+        robot = simulated.from_content(content_of(artefact), where)
     if robot.contract != artefact.contract:
         name = artefact.contract.robot
         raise ConfigError(f"{where}: no more the {name} of the policy's contract; export the policy again")
@@ -107,7 +108,8 @@ def serve(
 
     robot: name or folder of the robot that stands there, None: the paper's. Raises ConfigError.
     """
-    standing = simulated.paper() if robot is None else checked("--robot", simulated.load, robot)
+    with error_context("--robot"):
+        standing = simulated.paper() if robot is None else simulated.load(robot)
     axes = len(standing.contract.carrying)
     if len(ports) < 2 + axes:
         raise ConfigError(f"--ports: got {len(ports)}; allowed: {2 + axes}, of arm, tracker and {axes} linear axes")

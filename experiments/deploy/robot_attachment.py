@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 from rich.console import Console
 
 from experiments.deploy.rig import RECORDED, content_of
-from experiments.errors import ConfigError, checked
+from experiments.errors import ConfigError, error_context
 from mjx_tt.robot import robots
 from mjx_tt.robot.robots import Robot
 from robot_io.contract import PAPER
@@ -59,7 +59,8 @@ def pack(content: dict[str, Any], where: str) -> bytes:
 
     Raises ConfigError for no robot, one that cannot be made anew from that alone, and one too large.
     """
-    robot = checked("", robots.from_content, content, where)
+    with error_context():
+        robot = robots.from_content(content, where)
     kept = {key: value for key, value in content.items() if key != robots.ELSEWHERE}
     files: dict[str, Path] = {}
     if robot.path is not None:
@@ -90,7 +91,8 @@ def _gathered(robot: Robot, where: str) -> tuple[str, dict[str, Path]]:
 
     robots.rename_files(spec, absolute)
     with robots.quiet():
-        checked(where, spec.compile)
+        with error_context(where):
+            spec.compile()
         root = ElementTree.fromstring(spec.to_xml())
     for element in root.iter():
         for key, value in element.attrib.items():
@@ -116,4 +118,5 @@ def unpack(data: bytes, where: str) -> Robot:
                 content[robots.ELSEWHERE] = str(folder / MJCF)
     except (zipfile.BadZipFile, KeyError, TypeError, ValueError, OSError, RuntimeError) as error:
         raise ConfigError(f"{where}: {NAME}: no robot in it: {error}") from None
-    return checked("", robots.from_content, content, f"{where}: {NAME}")
+    with error_context():
+        return robots.from_content(content, f"{where}: {NAME}")

@@ -20,7 +20,7 @@ from bgs import normalizer
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.config.experiment import Config
-from experiments.errors import CheckpointError, ConfigError, RunError, checked
+from experiments.errors import CheckpointError, ConfigError, RunError, error_context
 from experiments.evaluation.evaluate import draw_balls, return_rate
 from experiments.interrupts import stop_requested
 from experiments.runs import checkpoint, load_policy, run_dir
@@ -236,7 +236,8 @@ def _start(config: Config, run: Run, trainer: Trainer, ranks: Ranks) -> tuple[Tr
         _check_network(config, trainer, str(run.folder))
         theta, statistics = load_policy.load_statistics(config.initial_policy)
     key = build.key(config.training.seed, build.INITIAL_STATE)
-    state = checked(f"initial_policy: {config.initial_policy}", trainer.init, key, theta, statistics)
+    with error_context(f"initial_policy: {config.initial_policy}"):
+        state = trainer.init(key, theta, statistics)
     notes: dict[str, Any] = {"update": 0, "seconds": 0.0, "return_rate": None}
     if ranks.is_first:
         state, notes = checkpoint.load_latest(run.checkpoints, state) or (state, notes)

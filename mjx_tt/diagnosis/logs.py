@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ballmodel.io.formats import SUFFIXES, read
+from ballmodel.io.formats import GUESS, SUFFIXES, read
 from ballmodel.io.samples import TrackOptions
 from ballmodel.io.spindoe import INDEX
 from ballmodel.trajectory import Trajectory
@@ -22,7 +22,6 @@ from mjx_tt.diagnosis.joint import JointRecord, read_robot_csv
 from mjx_tt.diagnosis.tracks.frame import align
 from mjx_tt.robot.robots import Robot
 
-GUESS = TrackOptions()
 TURN = 0.15  # [m] that a ball comes back before it counts as hit
 ROBOT_FILES = ("command.csv", "state.csv")
 
