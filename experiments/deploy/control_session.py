@@ -136,7 +136,8 @@ class ControlSession:
     def prepare(self, rig: Rig | None) -> None:
         """Switch the axes on and home them, on the rig the arm too, until nothing is missing. Raises RefusedError.
 
-        In a fault they are not homed: nothing else is missing then.
+        In a fault they are not homed: nothing else is missing then. On the rig balls are thrown until they have shown
+        the tracker's frame.
         """
         if rig is not None:
             rig.switch_on()
@@ -151,13 +152,30 @@ class ControlSession:
                     unhomed = (
                         message.state == "fault" and message.preparable and not message.arm and not message.tracker
                     )
-                    if unhomed or not message.missing:
+                    if unhomed:
+                        return
+                    if not message.missing:
+                        if rig is not None and message.unproven:
+                            self._show_frame(rig)
                         return
                 if isinstance(message, Refused):  # until the arm has sent its position, or an axis has answered
                     refusal, again = message.error, True
         missing = "no status" if self.status is None else self.status.missing
         text = f"the robot does not get ready within {PREPARE_TIME:g} s: {missing}"
         raise RefusedError(text) if refusal is None else type(refusal)(f"{text}; {refusal}")
+
+    def _show_frame(self, rig: Rig) -> None:
+        """Throw balls until they have shown the tracker's frame. Raises RefusedError."""
+        before = rig.throwing
+        rig.throw(True)
+        try:
+            for status in self._statuses(PREPARE_TIME):
+                if not status.unproven or status.state == "fault":
+                    return
+        finally:
+            rig.throw(before)
+        unproven = "no status" if self.status is None else self.status.unproven
+        raise RefusedError(f"the robot does not get ready within {PREPARE_TIME:g} s: {unproven}")
 
     def reset(self) -> None:
         """Reset a fault and wait until it is gone; without a fault there is nothing to do. Raises RefusedError."""

@@ -160,7 +160,8 @@ class View:
         lines += [Text(f"FAULT {f.cause}: {f.text}", "red") for f in s.faults]
         lines += [Text(f"STOPPED: {s.stopped}", "yellow")] if s.stopped else []
         if not s.faults:
-            lines += [Text(f"waiting: {text}", "yellow") for text in s.present.values()]
+            waiting = [*s.present.values(), *([s.unproven] if s.unproven and s.state == "disarmed" else [])]
+            lines += [Text(f"waiting: {text}", "yellow") for text in dict.fromkeys(waiting)]
         outcomes = ", ".join(f"{n} {name}" for name, n in s.outcomes.items()) or "none yet"
         lines.append(Text(f"balls {s.balls}: {outcomes}"))
         rallies = (

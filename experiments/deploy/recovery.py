@@ -38,7 +38,8 @@ class Recovery:
     def step(self, status: Status, now: float) -> Request | None:
         """Request that is due in this state; None: wait. Raises TimeoutError with what is missing."""
         self._by_itself = self._emulated or (self._by_itself and only_unprepared(status))
-        reasons = "; ".join(filter(None, [status.missing, *status.present.values()]))
+        waits = [status.missing, *status.present.values(), status.unproven]
+        reasons = "; ".join(dict.fromkeys(filter(None, waits)))
         if status.homing:  # which has a time limit of its own
             self._end = now + LONGEST
         if now > self._end:

@@ -35,6 +35,7 @@ from robot_io.control.play import Play
 from robot_io.control.rally import RallySummary
 from robot_io.devices.egm.arm_history import ArmHistory
 from robot_io.devices.egm.session import ArmFeedback, EgmSession
+from robot_io.devices.frame_check import FrameCheck
 from robot_io.devices.tracker import Tracker
 from robot_io.errors import RefusedError, format_error
 from robot_io.history import History
@@ -76,6 +77,7 @@ class Bridge:
         self.recorder = recorder or NullRecorder()
         self.play = Play(self._log, on_episode, on_rally, config.box, config.contract.limits)
         self.counts = self.play.counts
+        self.frame_check = FrameCheck(0 if config.jog else config.balls_needed)
         self._policy, self.policy_version = policy, 0
         self._geometry: RobotGeometry = gate.geometry
         self._home = np.array(self._geometry.home if config.home is None else config.home, float)
@@ -136,8 +138,9 @@ class Bridge:
         for what, problem in (("arm", self.arm_session.problem(now)), ("axes", self.axes.problem(now))):
             if problem:
                 raise RefusedError(f"not armed: {what}: {problem}")
-        if self.tracker.received is None or now - self.tracker.received > 0.5:
-            raise RefusedError("not armed: the ball tracker is silent: start it, and check its address and clock")
+        for what, problem in (("tracker: ", self.tracker.problem(now)), ("", self.unproven)):
+            if problem:
+                raise RefusedError(f"not armed: {what}{problem}")
         measured, velocity = joints(self.feedback, self.config.contract)
         self.gate.arm(measured, now, velocity)
         self._arm_session_id = self.arm_session.session_id
@@ -146,6 +149,14 @@ class Bridge:
         self._way_home.restart()
         self._home = measured if self.config.jog else self._home
         self._change(BridgeState.READY, now, "armed by the operator")
+
+    @property
+    def unproven(self) -> str | None:
+        """What must be seen of the tracker's frame and clock before the robot is armed; None: nothing."""
+        check = self.frame_check
+        if check.problem or not check.needed:
+            return check.problem
+        return self.tracker.refused or self.tracker.clock.unready or check.wanted
 
     def jog(self, step: np.ndarray) -> None:
         """Move on by a step, (n,) or (3,) of the blade, from where it is commanded to be. Raises RefusedError."""
@@ -171,6 +182,9 @@ class Bridge:
         """FAULT to DISARMED. Raises RefusedError without a fault, while a cause is present or the robot still moves."""
         if self.state is not BridgeState.FAULT:
             raise RefusedError(f"nothing to reset: the state is {self.state.value}, without a fault")
+        if self.frame_check.problem:  # other balls show whether what was done about it has helped
+            self.frame_check.restart()
+            self.gate.condition(Cause.TRACKER_FRAME, False, "", now)
         self.gate.reset(now)
         self._logged_faults = 0
         self._change(BridgeState.DISARMED, now, "fault reset by the operator")
@@ -236,7 +250,10 @@ class Bridge:
         if clock.windows >= self._clock_windows + CLOCK_EVERY or clock.windows < self._clock_windows:
             self._clock_windows = clock.windows
             self.event(now, Level.INFO, "clock", json_text(clock.report()))
-        if sample is None or sample.position is None:
+        if sample is None:
+            return
+        self.frame_check.add(sample)
+        if sample.position is None:
             return
         self._log(Ball(sample.captured, now, sample.position, sample.ball))
         self.play.follow(sample, self._blade, now, armed=self.gate.engaged, at_start=self._been_home)
@@ -319,6 +336,8 @@ class Bridge:
             self.event(now, Level.WARNING, "homing", f"stopped: {stopped}")
         clock = self.tracker.clock.problem
         self.gate.condition(Cause.CLOCK, clock is not None, clock or "", now)
+        frame = None if self.config.jog else self.frame_check.problem
+        self.gate.condition(Cause.TRACKER_FRAME, frame is not None, frame or "", now)
         armed = self._state in (BridgeState.READY, BridgeState.ACTIVE)
         if armed and self.arm_session.session_id != self._arm_session_id:
             self._arm_session_id = self.arm_session.session_id

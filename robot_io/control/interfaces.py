@@ -12,6 +12,7 @@ from robot_io.calibrated import Frame
 from robot_io.contract import PAPER, Contract
 from robot_io.control.observation import HERE, ObservationDelays
 from robot_io.control.rally import Box
+from robot_io.devices.frame_check import NEEDED
 
 
 class BridgeState(Enum):
@@ -70,6 +71,7 @@ class BridgeConfig:
     jog              once armed it stays where it is, takes no balls and moves as ``jog`` asks
     overtravel       [m] beyond their range that the linear axes may go while they search their references
     contract         of the robot
+    balls_needed     balls that must have shown the tracker's frame before the robot is armed; jogged, it plays none
     """
 
     delays: ObservationDelays = ObservationDelays()
@@ -81,6 +83,7 @@ class BridgeConfig:
     jog: bool = False
     overtravel: float = 0.0
     contract: Contract = PAPER
+    balls_needed: int = NEEDED
 
 
 STANDARD_PLAY = BridgeConfig()
@@ -93,6 +96,7 @@ class ControlOptions:
     backend: of ``robot_io.policy.backends``; log_folder and log_name of the MCAP, None: no log.
     box: balls that the policy was trained for; None: nothing is out of distribution
     dry: nothing is sent to arm and axes, which move in thought; jog: no balls are taken, the operator moves the robot
+    balls_needed: as of BridgeConfig
     """
 
     artefact: str | None
@@ -105,3 +109,4 @@ class ControlOptions:
     dry: bool = False
     jog: bool = False
     contract: Contract = PAPER
+    balls_needed: int = NEEDED

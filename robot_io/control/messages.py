@@ -170,6 +170,7 @@ class Status:
 
     time            [s] of the control process's clock
     state           value of the ``BridgeState``
+    unproven        what must be seen of the tracker's frame and clock before it is armed; None: nothing
     present         sentences of conditions that keep the robot from being armed, by cause
     arm, axes, tracker  the reason why each cannot be used, or None
     homing          the axes search their references
@@ -216,6 +217,7 @@ class Status:
     log_dropped: int = 0
     timings: dict[str, Any] = field(default_factory=dict)
     stopped: str = ""
+    unproven: str | None = None
 
     @classmethod
     def of(
@@ -230,7 +232,7 @@ class Status:
         """The state at ``now``; ``dropped``: records that the log lost."""
         counts, tracker, session = bridge.counts, bridge.tracker, bridge.arm_session
         contract = bridge.config.contract
-        seen, heard = tracker.newest, tracker.received
+        seen = tracker.newest
         positions, velocities = bridge.measured.tolist(), bridge.gate.velocity.tolist()
         return cls(
             time=now,
@@ -241,7 +243,7 @@ class Status:
             present={cause.value: text for cause, text in bridge.gate.present.items()},
             arm=session.problem(now),
             axes=axes.problem(now),
-            tracker="silent" if heard is None or now - heard >= 0.5 else None,
+            tracker=tracker.problem(now),
             joints=list(zip(contract.joints, contract.units, positions, velocities, strict=True)),
             ball=None if seen is None or seen.position is None else tuple(seen.position.tolist()),
             clock=tracker.clock.report(),
@@ -263,6 +265,7 @@ class Status:
             log_dropped=dropped,
             timings=timings.summary(),
             stopped=bridge.stopped_because,
+            unproven=bridge.unproven,
         )
 
     @property

@@ -137,7 +137,13 @@ class Control:
             self._tracker = Tracker(config.tracker, config.calibration)
             beyond = config.axes_motion.overtravel
             play = BridgeConfig(
-                config.delays, box=options.box, base=found.base, jog=options.jog, overtravel=beyond, contract=contract
+                config.delays,
+                box=options.box,
+                base=found.base,
+                jog=options.jog,
+                overtravel=beyond,
+                contract=contract,
+                balls_needed=0 if options.dry else options.balls_needed,
             )
             self.bridge = Bridge(
                 self._session,

@@ -18,6 +18,7 @@ SETTLED = 10  # windows from which on a drift is told, and judged
 STEP = 0.5  # share of ``bound`` by which a second may miss the line of those before it
 RHYTHM = 0.5  # of the time between two captures that must lie between the arrivals, or the frames waited together
 MOST_DRIFT = 5e-4  # of any clock that works
+EARLY = 3  # windows from which on an offset or a rate that is far off shows
 ONE_OFF = 3  # seconds that miss it, and frames from before it, in a row before that counts
 
 
@@ -31,7 +32,7 @@ class Clock:
     """
 
     def __init__(self, offset: float | None, latency: float, bound: float, drift: float | None = None) -> None:
-        self._given, self._bound, self._nominal = offset, bound, drift
+        self._given, self._latency, self._bound, self._nominal = offset, latency, bound, drift
         self._corrects = offset is None or drift is not None
         self._last: tuple[float, float] | None = None  # capture and arrival of the newest frame
         # Shortest delay of a frame: by the first second, where the offset is given, and kept, or a later second could
@@ -112,6 +113,25 @@ class Clock:
         return found | {"seconds": self.windows}
 
     @property
+    def unready(self) -> str | None:
+        """Reason why capture times cannot be trusted yet, as a sentence; None: nothing speaks against them."""
+        late = 0.0 if self._given is None or self._floor is None else self._floor - self._latency
+        if abs(late) > self._bound:
+            return (
+                f"the tracker's clock is off by {-1e3 * late:+.1f} ms, or tracker.latency is: by tracker.clock_offset "
+                f"its frames come {1e3 * (late + self._latency):.1f} ms after their captures"
+            )
+        if self.problem or self.windows >= SETTLED:
+            return self.problem
+        if self.windows < EARLY:
+            return f"the tracker's clock was heard for {self.windows} s, {EARLY} s are needed"
+        times, delays = np.array(self._windows).T
+        if np.ptp(delays) > STEP * self._bound:
+            rate = 1e6 * float(delays[0] - delays[-1]) / float(times[-1] - times[0])
+            return f"the tracker's clock does not keep the bridge's pace: {rate:+.0f} ppm over {self.windows} s"
+        return self._off
+
+    @property
     def problem(self) -> str | None:
         """Reason why capture times cannot be trusted, as a sentence; None when they can."""
         if self._jumped:
@@ -120,6 +140,11 @@ class Clock:
             return None
         if abs(self.drift) > MOST_DRIFT:
             return f"the tracker's clock drifts by {-1e6 * self.drift:+.0f} ppm, allowed are {1e6 * MOST_DRIFT:.0f}"
+        return self._off
+
+    @property
+    def _off(self) -> str | None:
+        """How far a fixed offset is off, where that is more than the bound."""
         if self._given is not None and not self._corrects and abs(self.measured - self._given) > self._bound:
             return (
                 f"the tracker's clock is off by {1e3 * (self._given - self.measured):+.1f} ms (tracker.clock_bound: "

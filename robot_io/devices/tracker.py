@@ -17,7 +17,7 @@ from __future__ import annotations
 import socket
 import struct
 import zlib
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
@@ -45,6 +45,8 @@ JUMP = 0.1  # [m] of noise on the distance of two positions
 AGREEING = 3  # frames in a row that the track is taken up again from after what looked like outliers
 LONGEST_GAP = 0.5  # [s] of lost frames between two sequence numbers; one further ahead waits for a neighbour
 FASTEST_RATE = 1000.0  # [Hz] of any tracker
+SILENT = 0.5  # [s] without a frame
+MANY, REFUSED = 10, 250  # frames refused for one reason, among so many accepted ones, are no accident
 SILENCE = 1.0  # [s] after which the tracker may have been started anew
 
 
@@ -129,6 +131,8 @@ class Tracker:
         self.seen: float | None = None  # [s] capture time of the last frame that showed a ball
         self.newest: BallSample | None = None
         self.counts: Counter[str] = Counter()
+        self._refusal = ""  # of the newest frame that was refused for its unit or clock
+        self._refusals: deque[int] = deque(maxlen=MANY)  # frames that had been accepted before each
         self._heard: float | None = None  # [s] when the last frame came, accepted or not
         self._sequence: int | None = None
         self._port = config.source_port  # that frames are taken from
@@ -145,6 +149,8 @@ class Tracker:
             sample = decode(datagram)
         except ValueError as error:
             self.counts[str(error).split(":")[0]] += 1
+            if str(error).startswith("position"):
+                self._refuse(f"its {error} is no place within {REACH:g} m [m]: are these millimetres?")
             return None
         if silent and self._heard is not None and now - self._heard > SILENCE:
             self.clock.restart()
@@ -158,6 +164,7 @@ class Tracker:
         age = now - captured
         if age < -self.config.ahead or age > self.config.oldest:
             self.counts["future" if age < 0 else "stale"] += 1
+            self._refuse(f"its frames are {age:+.3f} s old by its clock: tracker.clock_offset is not theirs")
             return None
         if self.newest is not None and not silent and not self._follows(sample.sequence, captured):
             return None
@@ -186,8 +193,25 @@ class Tracker:
             self.seen = captured
         return sample
 
+    def problem(self, now: float) -> str | None:
+        """Reason why nothing is known of the ball, as a sentence; None: frames come."""
+        if self.received is not None and now - self.received <= SILENT:
+            return None
+        why = f"; {self.refused}" if self.refused else ""
+        return f"silent: start the ball tracker, and check its address and clock{why}"
+
+    @property
+    def refused(self) -> str | None:
+        """The newest frames were refused for their unit or clock, as a sentence; None: they were not."""
+        many = len(self._refusals) == MANY and self.counts["accepted"] <= self._refusals[0] + REFUSED
+        return self._refusal if many else None
+
     def _unpinned(self, silent: bool) -> bool:
         return self.config.source_port is None and silent
+
+    def _refuse(self, reason: str) -> None:
+        self._refusal = reason
+        self._refusals.append(self.counts["accepted"])
 
     def _follows(self, sequence: int, captured: float) -> bool:
         """True when a frame comes after the newest by number and time; counts what was lost, or why it does not."""

@@ -50,6 +50,8 @@ class LockStep:
     world   one to use again, which is reset: making it takes a while
     tracker, calibration  what the bridge knows of the installation
     config  of the bridge; its contract says which joints arm and axes have
+    balls_needed  as of BridgeConfig; with the default the tracker, which nobody can move, counts as shown, and only
+            balls that contradict it are heeded
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class LockStep:
         world: World | None = None,
         tracker: TrackerConfig = SAME_CLOCK,
         calibration: Calibration = UNCALIBRATED,
+        balls_needed: int = 0,
     ) -> None:
         contract = config.contract
         self.params = params = for_robot(params, contract)
@@ -106,7 +109,7 @@ class LockStep:
             Tracker(tracker, calibration),
             SafetyGate(contract.limits, geometry=RobotGeometry.of(contract).moved(found.base), config=safety),
             policy,
-            replace(config, base=found.base),
+            replace(config, base=found.base, balls_needed=balls_needed),
             recorder,
             self._played,
             self.rallies.append,
@@ -194,6 +197,11 @@ class LockStep:
         self.axes.home()
         self.run(5.0, lambda: self.axes.problem(self.now) is None)
         self.run(0.1)
+        if self.bridge.frame_check.needed:
+            self.throwing = True
+            bridge = self.bridge
+            self.run(12.0, lambda: not bridge.unproven or bool(bridge.frame_check.problem or bridge.tracker.refused))
+            self.throwing = False
         self.bridge.arm(self.now)
         if not self.run(5.0, lambda: self.bridge.at_home):
             raise RefusedError(f"the rig does not reach its home pose: {self.bridge.gate.faults}")

@@ -161,6 +161,11 @@ class Rig:
         self._shared["throwing"][0] = on
 
     @property
+    def throwing(self) -> bool:
+        """True while balls are thrown."""
+        return bool(self._shared.value("throwing"))
+
+    @property
     def thrown(self) -> int:
         return int(self._shared.value("thrown"))
 

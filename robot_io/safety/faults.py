@@ -20,6 +20,7 @@ class Cause(Enum):
     STALE_AXES = "stale_axes"  # no feedback from the linear axes in time
     STALE_TRACKER = "stale_tracker"  # a ball in play and no word from the tracker in time
     CLOCK = "clock"  # the tracker's clock jumped, drifts or is off by more than is allowed
+    TRACKER_FRAME = "tracker_frame"  # balls do not fall, bounce or pass the net where the tracker's frame has it
     AXIS_LOST = "axis_lost"  # the linear axes report an error or the connection is gone
     ARM_NOT_READY = "arm_not_ready"  # motors, RAPID or EGM are not running
     FOLLOWING_ERROR = "following_error"  # the robot is not where it was sent

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from robot_io.contract import N_JOINTS
-from robot_io.control.bridge import Bridge
+from robot_io.control.bridge import Bridge, BridgeConfig
 from robot_io.devices.egm.messages import decode_sensor, encode_robot
 from robot_io.devices.egm.session import EgmConfig, EgmSession
 from robot_io.devices.tracker import BallSample, Tracker, TrackerConfig, encode
@@ -90,6 +90,7 @@ class Simulation:
         self.summaries: list = []
         self.replies: list[tuple[float, np.ndarray, np.ndarray]] = []  # time, position, velocity
         options.setdefault("on_episode", self.summaries.append)
+        options.setdefault("config", BridgeConfig(balls_needed=0))
         self.bridge = Bridge(
             EgmSession(EgmConfig(CONTROLLER[0])),
             self.axes,

@@ -62,7 +62,7 @@ class Simulated:
         monkeypatch.setattr(process, "time", clock)
         monkeypatch.setattr(process, "select", SimpleNamespace(select=self._select))
         config = RobotConfig(realtime=RealTimeConfig(spin=0.0))
-        options = {"artefact": artefact and str(artefact), "backend": "numpy"} | options
+        options = {"artefact": artefact and str(artefact), "backend": "numpy", "balls_needed": 0} | options
         self.control = Control(config, ControlOptions(**options), theirs)
         self.simulation.bridge = self.control.bridge
 

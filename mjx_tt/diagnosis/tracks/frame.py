@@ -13,52 +13,31 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
-from ballmodel.constants import BALL_RADIUS, NET_HEIGHT, TABLE_HEIGHT, TABLE_LENGTH, TABLE_WIDTH
+from ballmodel.constants import BALL_RADIUS, TABLE_HEIGHT, TABLE_LENGTH, TABLE_WIDTH
+from ballmodel.table_frame import MARGIN, Signs, acceleration, describe_fall
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.tracks.chains import Track, take_apart
 
-GRAVITY_RANGE = (5.0, 15.0)  # [m/s^2] that a fall in metres and seconds may show
 FEWEST = 8  # samples of a trajectory that tells anything
-SPAN = 0.06  # [s] between the three samples that give an acceleration
-DRAG = 0.12  # [1/m] of a ball, low rather than high
-MARGIN = 0.08  # [m] beside the table within which a bounce is one on it
-LEVEL = 0.10  # [m] of height within which a bounce is at the table's, or the floor's
-LOW = NET_HEIGHT - 0.03  # [m] below which no ball passes the net's place
 WRONG = 0.25  # share of bounces and passages over the net that do not fit, from which the frame is another
 FITS = 0.15  # share up to which another frame explains a log
 MOST = 200  # trajectories looked at, spread over the log
 
 
-@dataclass(frozen=True)
-class _Signs:
+class _Signs(Signs):
     """Bounces and paths of a log in some frame."""
 
-    bounces: Float[np.ndarray, "3 b"]  # [m]
-    paths: tuple[Float[np.ndarray, "3 k"], ...]  # [m] of the arcs
-
     def moved(self, frame: Frame) -> _Signs:
+        """The same in the table frame, if they are in ``frame``."""
         return _Signs(frame.to_table(self.bounces), tuple(map(frame.to_table, self.paths)))
 
     def misfit(self) -> tuple[int, int]:
         """Bounces that lie neither on the table nor on the floor, and balls that pass below the net's edge."""
-        x, y, z = self.bounces
-        over_table = (np.abs(x) < TABLE_WIDTH / 2 + MARGIN) & (np.abs(y) < TABLE_LENGTH / 2 + MARGIN)
-        inside = (np.abs(x) < TABLE_WIDTH / 2 - MARGIN) & (np.abs(y) < TABLE_LENGTH / 2 - MARGIN)
-        on_table = over_table & (np.abs(z - BALL_RADIUS) < LEVEL)
-        played = on_table.sum() >= 0.3 * x.size  # without bounces on the table there is no floor beside it
-        on_floor = played & ~inside & (np.abs(z - BALL_RADIUS + TABLE_HEIGHT) < LEVEL)
-        return int(np.sum(~(on_table | on_floor))), sum(int(np.sum(np.maximum(*h) < LOW)) for h in self._heights())
+        return int(self.off().sum()), self.low()
 
     def share(self) -> float:
         """``misfit`` as a share of all bounces and passages."""
-        return sum(self.misfit()) / max(self.bounces.shape[1] + sum(h[0].size for h in self._heights()), 1)
-
-    def _heights(self) -> Iterator[tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]]:
-        """Heights before and after each path's passages of the net's place."""
-        for p in self.paths:
-            k = np.flatnonzero(p[1, :-1] * p[1, 1:] < 0.0)
-            here = k[np.abs(p[0, k]) < TABLE_WIDTH / 2]
-            yield p[2, here], p[2, here + 1]
+        return sum(self.misfit()) / max(self.bounces.shape[1] + self.passages(), 1)
 
     def oddness(self) -> tuple[float, float]:
         """Distance [m] of the middle of play from the net, in halves, and share of balls that do not fly towards -y."""
@@ -131,12 +110,12 @@ def align(
     if not long:
         raise ValueError(f"{source}: no trajectory has {FEWEST} samples, the longest has {max(map(len, trajectories))}")
     long = long[:: -(-len(long) // MOST)]
-    bend, fall = (np.median(a, axis=0) for a in zip(*map(_acceleration, long), strict=True))
+    bend, fall = (np.median(a, axis=0) for a in zip(*(acceleration(t.time, t.position) for t in long), strict=True))
     signs = _signs([take_apart(t) for t in long])
     bounces = signs.bounces.shape[1]
     many = bounces >= max(3, 0.2 * len(long))
-    if not (many and signs.misfit()[0] < 0.1 * bounces):
-        _check_fall(bend, fall, source)
+    if not (many and signs.misfit()[0] < 0.1 * bounces) and (wrong := describe_fall(bend, fall)):
+        raise ValueError(f"{source}: {wrong}")
     travel = np.median([np.ptp(np.percentile(t.position, [5, 95], axis=1), axis=0) for t in long], axis=0)
     across = bool(travel[0] > 2.0 * travel[1])
     chosen = _choose(signs, across, words) if many or words is not None else Frame((), 0, (0.0, 0.0, 0.0))
@@ -186,35 +165,6 @@ def _describe(signs: _Signs, travel: Float[np.ndarray, "3"], source: str) -> str
         f"and {travel[1]:.2f} m along y. Expected the table frame: its origin at the table's centre, y along the "
         f"table, bounces at z = {BALL_RADIUS} m. Convert the coordinates, or name the frame: --frame {'+'.join(FRAMES)}"
     )
-
-
-def _check_fall(bend: Float[np.ndarray, "3"], fall: Float[np.ndarray, "3"], source: str) -> None:
-    """Raises ValueError unless balls fall along -z, their drag taken off."""
-    down = int(np.argmax(np.abs(fall)))
-    if not GRAVITY_RANGE[0] < np.abs(fall[down]) < GRAVITY_RANGE[1]:
-        raise ValueError(
-            f"{source}: balls accelerate by ({', '.join(f'{a:.3g}' for a in bend)}) in x, y, z; a fall of 9.8 m/s^2 "
-            "along -z is wanted (wrong unit of length or time, or no free flights?)"
-        )
-    if down != 2:
-        raise ValueError(f"{source}: balls fall along {'xyz'[down]}, z must point up (swapped axes?)")
-    if fall[2] > 0.0:
-        raise ValueError(f"{source}: balls fall towards +z, z must point up")
-
-
-def _acceleration(t: Trajectory) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Median second derivative [m/s^2] of a trajectory, as it is and with the drag of its speed taken off."""
-    n = len(t)
-    step = float(np.median(np.diff(t.time)))
-    w = int(np.clip(round(SPAN / step), 2, (n - 1) // 2))
-    a, b, c = slice(0, n - 2 * w), slice(w, n - w), slice(2 * w, n)
-    p, time = t.position, t.time
-    first = (p[:, b] - p[:, a]) / (time[b] - time[a])
-    second = (p[:, c] - p[:, b]) / (time[c] - time[b])
-    bend = 2.0 * (second - first) / (time[c] - time[a])
-    velocity = 0.5 * (first + second)
-    fall = bend + DRAG * np.linalg.norm(velocity, axis=0) * velocity
-    return np.median(bend, axis=1), np.median(fall, axis=1)
 
 
 def _signs(tracks: Sequence[Track]) -> _Signs:

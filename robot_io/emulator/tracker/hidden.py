@@ -13,7 +13,9 @@ import numpy as np
 from ballmodel.io.ranges import Within
 
 Metres = Annotated[float, Within(-5.0, 5.0, "m")]
-Radians = Annotated[float, Within(-1.5, 1.5, "rad")]
+Radians = Annotated[float, Within(-3.1416, 3.1416, "rad")]
+
+Scale = Annotated[float, Within(-1000.0, 1000.0)]
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,7 @@ class HiddenErrors:
 
     camera_position  [m] of the tracker's origin in the table frame
     camera_angles    [rad] by which its axes are turned about the table's x, then y, then z axis
+    camera_scale     that it gives of each metre along its axes: -1 mirrors one, 1000 are millimetres
     joint_zeros      [rad] of the arm's joints, six of the paper's robot: true angle where its controller reports 0
     clock_offset     [s] that the tracker's clock shows when the bridge's shows 0
     clock_drift      seconds per second that the tracker's clock gains
@@ -29,9 +32,10 @@ class HiddenErrors:
 
     camera_position: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     camera_angles: tuple[Radians, Radians, Radians] = (0.0, 0.0, 0.0)
+    camera_scale: tuple[Scale, Scale, Scale] = (1.0, 1.0, 1.0)
     joint_zeros: tuple[Annotated[float, Within(-0.05, 0.05, "rad")], ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     clock_offset: Annotated[float, Within(-1e6, 1e6, "s")] = 0.0
-    clock_drift: Annotated[float, Within(-1e-3, 1e-3)] = 0.0
+    clock_drift: Annotated[float, Within(-0.02, 0.02)] = 0.0
 
     def seen(self, point: np.ndarray) -> np.ndarray:
         """Coordinates (3,) that the tracker gives to a point (3,) of the table frame [m]."""
@@ -40,7 +44,7 @@ class HiddenErrors:
         x, y = x * np.cos(c) - y * np.sin(c), x * np.sin(c) + y * np.cos(c)
         x, z = x * np.cos(b) + z * np.sin(b), z * np.cos(b) - x * np.sin(b)
         y, z = y * np.cos(a) - z * np.sin(a), y * np.sin(a) + z * np.cos(a)
-        return np.array([x, y, z])
+        return np.array([x, y, z]) * self.camera_scale
 
     def stamped(self, now: float) -> float:
         """Time [s] on the tracker's clock at ``now`` on the bridge's."""

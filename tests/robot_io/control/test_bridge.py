@@ -67,7 +67,7 @@ def test_arming_is_refused_with_the_reason():
     rig = lockstep()
     rig.cameras.drop_out(1e9)
     power_on(rig)
-    refused(rig, "the ball tracker is silent")
+    refused(rig, "tracker: silent")
     rig.cameras.drop_out(0.0)
     rig.run(0.1)
     policy, rig.bridge._policy = rig.bridge._policy, None

@@ -91,7 +91,7 @@ def to_bridge(motion, delays, unit=FINEST):
     session = EgmSession(EgmConfig(controller_address=HOME))
     loose = SafetyConfig(following_error=(9.0,) * N_JOINTS)  # the robot moves as it was recorded, not as it is told
     policy = Recording()
-    config = BridgeConfig(delays=ObservationDelays(**delays))
+    config = BridgeConfig(delays=ObservationDelays(**delays), balls_needed=0)
     bridge = Bridge(session, axes, Tracker(TrackerConfig()), SafetyGate(config=loose), policy, config)
     first, warm_up = None, -200
     axes.enable()
