@@ -135,7 +135,8 @@ class Bridge:
             raise RefusedError(f"not armed: the state is {self.state.value}, only a disarmed robot can be armed")
         if self._policy is None:
             raise RefusedError("not armed: no policy is loaded")
-        for what, problem in (("arm", self.arm_session.problem(now)), ("axes", self.axes.problem(now))):
+        arm = self.arm_session.problem(now) or self.arm_session.ramping(now)
+        for what, problem in (("arm", arm), ("axes", self.axes.problem(now))):
             if problem:
                 raise RefusedError(f"not armed: {what}: {problem}")
         for what, problem in (("tracker: ", self.tracker.problem(now)), ("", self.unproven)):

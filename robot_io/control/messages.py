@@ -241,7 +241,7 @@ class Status:
             at_home=bridge.state.value in ("ready", "active") and bridge.at_home,
             faults=tuple(FaultReport(f.cause.value, f.sentence) for f in bridge.gate.faults),
             present={cause.value: text for cause, text in bridge.gate.present.items()},
-            arm=session.problem(now),
+            arm=session.problem(now) or session.ramping(now),
             axes=axes.problem(now),
             tracker=tracker.problem(now),
             joints=list(zip(contract.joints, contract.units, positions, velocities, strict=True)),

@@ -45,6 +45,8 @@ class ArmParams:
     stop_deceleration  of each joint in any stop; estimates, what the arm is taken to accelerate at (joint 5 as joint 6)
     lower, upper       position range; a position outside it by more than ``position_tolerance`` switches the motors off
     max_speed          joint speeds of the drives (120T); above ``overspeed`` times that the motors are switched off
+    ramp_in            [s] from EGM's start on in which its commands grow to their full effect, RAPID's RampInTime
+    max_speed_deviation  [rad/s] that no commanded speed exceeds, RAPID's MaxSpeedDeviation
     queue_length       messages that wait at most; later ones are dropped
     stream_always      feedback also while EGM is not running (RAPID's EGMStreamStart)
     """
@@ -61,6 +63,8 @@ class ArmParams:
     max_speed: tuple[Annotated[float, Within(0.01, 100.0, "rad/s")], ...] = _arm(LIMITS.velocity)
     position_tolerance: Annotated[float, Within(0.0, 1.0, "rad")] = math.radians(0.5)
     overspeed: Annotated[float, Within(1.0, 10.0)] = 1.1
+    ramp_in: Annotated[float, Within(0.0, 10.0, "s")] = 1.0
+    max_speed_deviation: Annotated[float, Within(0.001, 100.0, "rad/s")] = math.radians(600.0)
     queue_length: Annotated[int, Within(1, 10000)] = 64
     stream_always: bool = True
 
@@ -161,6 +165,7 @@ class ArmController:
         self._last_message = 0.0
         self._deceleration = np.array(params.stop_deceleration)
         self._max_speed = np.array(params.max_speed)
+        self._egm_began: float | None = None
         self._lower = np.array(params.lower) - params.position_tolerance
         self._upper = np.array(params.upper) + params.position_tolerance
 
@@ -256,14 +261,17 @@ class ArmController:
         self._supervise(position, velocity)
         if self.egm_is_running and self._reference is None:
             self._reference = _Reference(now, position, self.params)
-            self._last_message = now
+            self._last_message = self._egm_began = now
         datagram = self._feedback(now, position)
         if self._reference is not None:
             self._take_message(now, self._reference)
         if self._reference is not None:
             speed, target = self._reference.at(now)
             wanted = speed + self.params.pos_corr_gain * (target - position)
-            self._velocity = np.minimum(np.maximum(wanted, -self._max_speed), self._max_speed)
+            if self._egm_began is not None and now < self._egm_began + self.params.ramp_in:
+                wanted = wanted * ((now - self._egm_began) / self.params.ramp_in)
+            allowed = np.minimum(self._max_speed, self.params.max_speed_deviation)
+            self._velocity = np.minimum(np.maximum(wanted, -allowed), allowed)
         else:
             step = self._deceleration * elapsed
             self._velocity = self._velocity - np.minimum(np.maximum(self._velocity, -step), step)

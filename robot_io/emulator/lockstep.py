@@ -196,7 +196,7 @@ class LockStep:
         self.run(1.0, lambda: self.axes.state is not None and self.axes.state.enabled)
         self.axes.home()
         self.run(5.0, lambda: self.axes.problem(self.now) is None)
-        self.run(0.1)
+        self._ramp_in()
         if self.bridge.frame_check.needed:
             self.throwing = True
             bridge = self.bridge
@@ -205,6 +205,11 @@ class LockStep:
         self.bridge.arm(self.now)
         if not self.run(5.0, lambda: self.bridge.at_home):
             raise RefusedError(f"the rig does not reach its home pose: {self.bridge.gate.faults}")
+
+    def _ramp_in(self) -> None:
+        """Until the arm follows commands fully."""
+        self.run(0.1)
+        self.run(2.0, lambda: self.bridge.arm_session.ramping(self.now) is None)
 
     def recover(self) -> None:
         """Reset a fault and arm again, as an operator does, who jogs the arm where needed; home is reached later.
@@ -227,7 +232,7 @@ class LockStep:
         if not self.axes.homed:
             self.axes.home()
         self.run(3.0, lambda: self.axes.problem(self.now) is None)
-        self.run(0.1)
+        self._ramp_in()
         try:
             self.bridge.arm(self.now)
         except JogFirstError:

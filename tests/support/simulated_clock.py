@@ -92,7 +92,7 @@ class Simulation:
         options.setdefault("on_episode", self.summaries.append)
         options.setdefault("config", BridgeConfig(balls_needed=0))
         self.bridge = Bridge(
-            EgmSession(EgmConfig(CONTROLLER[0])),
+            EgmSession(EgmConfig(CONTROLLER[0], ramp_in=0.0)),  # as this arm, which ramps nothing in
             self.axes,
             Tracker(TrackerConfig()),
             gate,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+from functools import partial
 from types import SimpleNamespace
 
 from robot_io.control import messages, process, realtime
 from robot_io.control.config import RealTimeConfig, RobotConfig
 from robot_io.control.process import Control, ControlOptions
+from robot_io.devices.egm.session import EgmConfig
 from robot_io.safety.owner_watch import BEAT_PERIOD
 from tests.support.simulated_clock import CONTROLLER, Simulation
 
@@ -57,6 +59,7 @@ class Simulated:
         monkeypatch.setattr(process, "TrackerSocket", lambda *_: FrameSocket(self.simulation))
         monkeypatch.setattr(process, "linear_axes", lambda *_: None)
         monkeypatch.setattr(process, "AxesThread", lambda _: self.simulation.axes)
+        monkeypatch.setattr(process, "EgmConfig", partial(EgmConfig, ramp_in=0.0))  # as the simulation's arm
         monkeypatch.setattr(realtime, "prepare", lambda *_: [])
         clock = SimpleNamespace(monotonic=lambda: self.simulation.now, sleep=self._sleep)
         monkeypatch.setattr(process, "time", clock)

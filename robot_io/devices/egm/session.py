@@ -35,6 +35,8 @@ class EgmConfig:
     controller_port     port that packets are taken from; None learns it. Two senders at once are then a problem
     period              the controller's cycle [s]
     timeout             age [s] at which feedback is stale: ``problem`` says so, and the next packet opens a new session
+    ramp_in             [s] after a session has begun in which the arm is not to be armed: the controller's RampInTime, in
+                        which commands do not have their full effect yet, and half a second more
     zeros               (6,) [rad] added to every position that comes, and taken from every one that goes; as many as
                         the arm has joints
     """
@@ -43,6 +45,7 @@ class EgmConfig:
     controller_port: int | None = None
     period: float = 0.004
     timeout: float = 0.05
+    ramp_in: float = 1.5
     zeros: tuple[float, ...] = (0.0,) * len(ABB_JOINTS)
 
     def __post_init__(self) -> None:
@@ -113,6 +116,7 @@ class EgmSession:
         self.endpoint: tuple[str, int] | None = None
         self.statistics = EgmStatistics()
         self._zeros = np.array(config.zeros)
+        self._began = -np.inf  # [s] of the newest session
         self._time_ms = 0
         self._pending = False
         self._reply_sequence = 0
@@ -143,6 +147,7 @@ class EgmSession:
             if order == "next":
                 self.statistics.lost += steps % UINT32 - 1
         self.session_id += new_session
+        self._began = now if new_session else self._began
         self.endpoint = (source[0], source[1])
         self._time_ms = message.time_ms
         self.feedback = ArmFeedback(
@@ -203,6 +208,11 @@ class EgmSession:
         if not feedback.egm_running:
             return "EGM is not running on the arm's controller: let its RAPID program reach EGMRunJoint."
         return None
+
+    def ramping(self, now: float) -> str | None:
+        """Reason why the arm does not follow commands fully yet, as a sentence; None: it does."""
+        left = self._began + self.config.ramp_in - now
+        return f"EGM has just begun, and ramps commands in: wait {left:.1f} s." if left > 0.0 else None
 
     def _note_rival(self, datagram: bytes, source: tuple[str, int], now: float) -> None:
         """Remember a second sender at the controller's address: which of the two is the arm cannot be known."""

@@ -28,6 +28,7 @@ def power_on(rig, arm=True, axes=True):
         rig.run(1.0, lambda: rig.axes.state is not None and rig.axes.state.enabled)
         rig.axes.home()
         rig.run(1.0, lambda: rig.axes.problem(rig.now) is None)
+        rig.run(2.0, lambda: rig.bridge.arm_session.ramping(rig.now) is None)
     rig.run(0.1)
 
 
@@ -60,6 +61,8 @@ def test_arming_is_refused_with_the_reason():
     rig = lockstep()
     refused(rig, "arm: No EGM packet has arrived")
     power_on(rig, axes=False)
+    refused(rig, "arm: EGM has just begun, and ramps commands in: wait 1.[0-5] s")
+    rig.run(1.5)
     refused(rig, "axes: .*switched off: enable the axes")
     rig.axes.enable()
     rig.run(0.2)
@@ -191,6 +194,10 @@ def test_every_fault_stops_the_robot_is_latched_and_can_be_mended(name):
     assert np.abs(rig.world.qpos - place)[2:].max() < 0.02  # also when the arm's controller is started again
     bridge.reset(rig.now)
     assert bridge.state is BridgeState.DISARMED
+    if name == "arm's emergency stop":
+        with pytest.raises(RefusedError, match="EGM has just begun"):
+            bridge.arm(rig.now)
+        rig.run(1.5)
     bridge.arm(rig.now)
     assert rig.run(5.0, lambda: bridge.at_home)
     faulty = rig.summaries.popleft()

@@ -88,7 +88,7 @@ def to_bridge(motion, delays, unit=FINEST):
         ],
         AxesConfig(max_error=9.0),
     )
-    session = EgmSession(EgmConfig(controller_address=HOME))
+    session = EgmSession(EgmConfig(controller_address=HOME, ramp_in=0.0))
     loose = SafetyConfig(following_error=(9.0,) * N_JOINTS)  # the robot moves as it was recorded, not as it is told
     policy = Recording()
     config = BridgeConfig(delays=ObservationDelays(**delays), balls_needed=0)

@@ -25,7 +25,7 @@ class Rig:
     """A controller with ideal drives: joints move exactly at the velocity that it returns."""
 
     def __init__(self, position=ZERO, start=True, client=CLIENT, **params):
-        self.arm = ArmController(client, ArmParams(**params))
+        self.arm = ArmController(client, ArmParams(**{"ramp_in": 0.0} | params))
         self.position, self.velocity = np.array(position, float), np.zeros(6)
         self.cycles, self.messages = 0, 0
         self.datagram: bytes | None = None
@@ -60,6 +60,22 @@ class Rig:
 
 
 # Feedback
+
+
+def test_commands_grow_to_their_full_effect_while_egm_ramps_in():
+    rig, seen = Rig(ramp_in=1.0, **BARE), []
+    for _ in range(300):
+        rig.command(0.5)
+        seen.append(rig.step()[0])
+    times = CYCLE * np.arange(1, 301)
+    np.testing.assert_allclose(seen, 0.5 * np.clip(times - CYCLE, 0.0, 1.0), atol=0.003)
+
+
+def test_no_commanded_speed_exceeds_the_deviation_that_rapid_allows():
+    rig = Rig(max_speed_deviation=0.3, **BARE)
+    rig.command(np.array([0.2, 0.3, 0.4, -0.2, -0.3, -1.0]))
+    rig.step(2)
+    np.testing.assert_allclose(rig.velocity, [0.2, 0.3, 0.3, -0.2, -0.3, -0.3], atol=1e-9)
 
 
 def test_feedback_is_delayed_and_interpolated():
