@@ -45,8 +45,24 @@ def main(address: str, port: int) -> None:
         told["updated"] = motion.position_task(TARGET, SPEED, absolute=True)
         time.sleep(0.2)
         told["final"] = motion.current_position()
+        told["fault"] = _after_a_fault(motion)
         told["disabled"] = motion.disable_powerstage()
     print(json.dumps(told))
+
+
+def _after_a_fault(motion: MotionHandler) -> dict[str, object]:
+    """What the client sees of a fault, made once the word is read, and of its acknowledgement."""
+    print("fault", flush=True)
+    end = time.monotonic() + 5.0
+    while not motion.fault_present() and time.monotonic() < end:
+        time.sleep(0.02)
+        motion.update_inputs()
+    told: dict[str, object] = {"present": motion.fault_present(), "code": int(motion.current_fault_code())}
+    told["refused"] = not motion.position_task(0, SPEED, absolute=True)
+    told["acknowledged"] = motion.acknowledge_faults() and not motion.fault_present()
+    told["enabled"] = motion.enable_powerstage()
+    told["moved"] = motion.position_task(0, SPEED, absolute=True)
+    return told
 
 
 if __name__ == "__main__":

@@ -846,11 +846,14 @@ def test_festos_own_client_runs_the_emulator():
     with RealTime() as rig:
         rig.position[0] = 0.05
         script = ROOT / "tests" / "support" / "festo_client.py"
-        done = subprocess.run(
-            [python, str(script), "127.0.0.1", str(rig.servers[0].port)], capture_output=True, text=True, timeout=60
-        )
-        assert done.returncode == 0, done.stderr
-        told = loads(done.stdout.splitlines()[-1])
+        command = [python, str(script), "127.0.0.1", str(rig.servers[0].port)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as client:
+            for line in client.stdout:
+                if line == "fault\n":
+                    rig.emulators[0].inject_fault(20)
+                else:
+                    told = loads(line)
+            assert client.wait(60) == 0, client.stderr.read()
         assert all(
             told[k] is True
             for k in ("acknowledged", "enabled", "homed", "moved", "back", "stopped", "updated", "disabled")
@@ -861,5 +864,7 @@ def test_festos_own_client_runs_the_emulator():
         assert told["position"] == pytest.approx(150_000, abs=100)
         assert told["velocity"] == pytest.approx(-1.0, abs=0.6)  # [m/s], somewhere on its ramp
         assert -250_000 < told["between"] < 150_000
+        wanted = {"present": True, "code": 20, "refused": True, "acknowledged": True, "enabled": True, "moved": True}
+        assert told["fault"] == wanted
         assert told["final"] == pytest.approx(150_000, abs=100)
         assert not rig.emulators[0].drive.operating and rig.emulators[0].drive.fault_code == 0
