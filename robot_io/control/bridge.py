@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -47,6 +48,8 @@ from robot_io.safety.gate import GateState, SafetyGate, Sent
 
 CLOCK_EVERY = 10  # seconds of frames between two reports of the tracker's clock
 AT_HOME = 0.02  # [m], [rad] of every joint
+TRACED = 300  # ticks
+LONGEST_MUTE = 2.0  # [s]
 LONGEST_STOP = 2.0  # [s] after which a stop ends although the measurement does not come to rest
 
 
@@ -93,12 +96,16 @@ class Bridge:
         self._policy_limit = np.array(contract.limits.policy_velocity)
         speed = (jog.SPEED if config.jog else config.home_speed) * self._policy_limit
         braking = config.home_braking * np.array(contract.limits.acceleration)
-        self._way_home = WayHome(gate, contract.limits, speed, braking)
+        scale = gate.config.speed_scale if config.jog else 1.0
+        self._way_home = WayHome(gate, contract.limits, speed, braking, scale)
         self._logged_faults = self._clock_windows = 0
         self.unlogged = self._reported_unlogged = 0  # records that could not be logged
         self._log_failure = ""  # why the log's file cannot be written
         self._errors: set[str] = set()  # of the program, each logged once
         self._stopping_since, self.stopped_because = -math.inf, ""  # the reason of a stop that no operator asked for
+        self._pulled, self._mute_began, self._mute_end = False, math.inf, -math.inf
+        self.muted: float | None = None  # [s] without answers after which EGM had ended, when it was tried last
+        self.trace: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=TRACED)
         self._been_home, self.paused = False, config.jog  # at the home pose since it was armed
         self.policy_seconds = 0.0  # of the last tick; 0 when the policy was not asked
 
@@ -149,6 +156,8 @@ class Bridge:
         self.stopped_because = ""
         self._way_home.restart()
         self._home = measured if self.config.jog else self._home
+        self._pulled = False
+        self.trace.clear()
         self._change(BridgeState.READY, now, "armed by the operator")
 
     @property
@@ -159,11 +168,32 @@ class Bridge:
             return check.problem
         return self.tracker.refused or self.tracker.clock.unready or check.wanted
 
-    def jog(self, step: np.ndarray) -> None:
-        """Move on by a step, (n,) or (3,) of the blade, from where it is commanded to be. Raises RefusedError."""
+    def jog(self, step: np.ndarray, share: float = jog.SPEED, pulled: bool = False) -> None:
+        """Move on by a step, (n,) or (3,) of the blade, from where it is commanded to be. Raises RefusedError.
+
+        share, pulled: as of ``messages.Jog``.
+        """
         if not self.config.jog or self.state is not BridgeState.READY:
             raise RefusedError(f"not jogged: the state is {self.state.value}; arm it first, in mjx-tt robot jog")
+        if not 0.0 < share <= 1.0:
+            raise RefusedError(f"not jogged: at {share} of the policy's speed; more than 0, at most 1")
+        self._way_home.speed, self._pulled = share * self._policy_limit, pulled
         self._home = self.gate.reference + jog.joints_of(step, self._geometry, self.gate.reference)
+
+    def mute(self, now: float, seconds: float) -> None:
+        """Leave the arm's controller without answers until its EGM has ended. Raises RefusedError unless disarmed."""
+        if not self.config.jog or self.state is not BridgeState.DISARMED or self.arm_session.problem(now):
+            raise RefusedError("not muted: only at rest, disarmed and with EGM running, in mjx-tt robot commission")
+        self.muted, self._mute_began, self._mute_end = None, now, now + min(seconds, LONGEST_MUTE)
+
+    def muting(self, now: float) -> bool:
+        """True while the arm's controller gets no answers."""
+        feedback = self.arm_session.feedback
+        if self.muted is None and now >= self._mute_began and feedback is not None:
+            gone = now - feedback.received > self.arm_session.config.timeout
+            if gone or not feedback.egm_running:
+                self.muted = feedback.received - self._mute_began
+        return self.muted is None and self._mute_began <= now < self._mute_end
 
     def stop(self, now: float, because: str = "") -> None:
         """The operator's stop, or one for a reason: slows down, holds, ends DISARMED. Axes that search a zero stop."""
@@ -220,7 +250,7 @@ class Bridge:
     def arm_received(self, now: float) -> bytes | None:
         """Answer the packet that the EGM session has just taken; None when there is nothing to answer."""
         feedback = self.arm_session.feedback
-        if feedback is None:
+        if feedback is None or self.muting(now):
             return None
         hold = feedback.position, np.zeros_like(feedback.position)
         with self._guarded(now):
@@ -239,7 +269,9 @@ class Bridge:
         self._arm_restarted |= feedback.sequence < self._arm_sequence
         self._arm_sequence = feedback.sequence
         moved = self.gate.motion.at(now) if self.gate.engaged and not self._arm_restarted else None
-        return None if moved is None else (moved[0][self._arm_rows], moved[1][self._arm_rows])
+        if moved is None:
+            return None
+        return moved[0][self._arm_rows], moved[1][self._arm_rows] * (not self._pulled)
 
     def tracker_received(self, datagram: bytes, source: str, now: float, port: int | None = None) -> None:
         """Take one datagram from an IP address and port; without a port none is checked."""
@@ -274,6 +306,7 @@ class Bridge:
         with self._guarded(now):
             measured, measured_velocity = joints(self.feedback, self.config.contract)
             self.play.moved(measured_velocity)
+            self.trace.append((now, self.gate.reference, measured))
             request = self._decide(now)
         with self._guarded(now):
             sent = self.gate.command(request, measured, measured_velocity, now)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from robot_io.control.commissioning import jog
 from robot_io.control.commissioning.mark import Stay
 from robot_io.control.episode import EpisodeSummary
 from robot_io.control.rally import RallySummary
@@ -55,14 +56,32 @@ class Pause:
 
 @dataclass(frozen=True)
 class Jog:
-    """Move the joints by a step (n,) [m], [rad], or the blade by (3,) [m] in the table frame, without turning it."""
+    """Move the joints by a step (n,) [m], [rad], or the blade by (3,) [m] in the table frame, without turning it.
+
+    share   of the policy's speed limits, which the gate scales once more
+    pulled  the arm is told where to be and no speed to go on with: only its position correction moves it
+    """
 
     step: tuple[float, ...]
+    share: float = jog.SPEED
+    pulled: bool = False
 
 
 @dataclass(frozen=True)
 class Mark:
     """Tell where ball and joints were during the last second. Answered by Marked."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Tell how the joints followed during the last seconds. Answered by Traced."""
+
+
+@dataclass(frozen=True)
+class Mute:
+    """Do not answer the arm's controller until its EGM ends, for at most so many seconds. Answered by Muted."""
+
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -89,7 +108,7 @@ class Beat:
     absence: float = 0.0
 
 
-Request = Prepare | Arm | Stop | Reset | Discard | Pause | Jog | Mark | SetPolicy | Quit | Beat
+Request = Prepare | Arm | Stop | Reset | Discard | Pause | Jog | Mark | Trace | Mute | SetPolicy | Quit | Beat
 
 
 @dataclass(frozen=True)
@@ -143,6 +162,22 @@ class Marked:
 
 
 @dataclass(frozen=True)
+class Traced:
+    """Ticks (t,) [s], the gate's reference and the measured position (t, n) [m], [rad] at each."""
+
+    time: np.ndarray
+    reference: np.ndarray
+    measured: np.ndarray
+
+
+@dataclass(frozen=True)
+class Muted:
+    """Time [s] without answers after which EGM had ended; None: it had not."""
+
+    seconds: float | None
+
+
+@dataclass(frozen=True)
 class Failed:
     """The process ends; the robot stands."""
 
@@ -171,6 +206,8 @@ class Status:
     time            [s] of the control process's clock
     state           value of the ``BridgeState``
     unproven        what must be seen of the tracker's frame and clock before it is armed; None: nothing
+    tracker_trouble, clock_trouble  the reasons why its frames were refused, and its clock is not to be trusted
+    shown           balls so far that bounced where they must
     present         sentences of conditions that keep the robot from being armed, by cause
     arm, axes, tracker  the reason why each cannot be used, or None
     homing          the axes search their references
@@ -218,6 +255,9 @@ class Status:
     timings: dict[str, Any] = field(default_factory=dict)
     stopped: str = ""
     unproven: str | None = None
+    shown: int = 0
+    tracker_trouble: str | None = None
+    clock_trouble: str | None = None
 
     @classmethod
     def of(
@@ -266,6 +306,9 @@ class Status:
             timings=timings.summary(),
             stopped=bridge.stopped_because,
             unproven=bridge.unproven,
+            shown=bridge.frame_check.shown,
+            tracker_trouble=tracker.refused,
+            clock_trouble=tracker.refused or tracker.clock.unready,
         )
 
     @property
@@ -280,4 +323,4 @@ class Status:
         return "; ".join(f"{name}: {reason}" for name, reason in found.items() if reason)
 
 
-Message = Ready | Refused | PolicySet | Played | RallyOver | Marked | Failed | Ended | Status
+Message = Ready | Refused | PolicySet | Played | RallyOver | Marked | Traced | Muted | Failed | Ended | Status

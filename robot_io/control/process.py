@@ -162,6 +162,7 @@ class Control:
             raise
         self._quit, self._owner = False, OwnerWatch()
         self._status_at = 0.0
+        self._muting = False
         self._period = 1.0 / config.rate
 
     def _open(self, thing: Closing) -> Closing:
@@ -309,6 +310,9 @@ class Control:
             self.bridge.stop(now, silent)
         self._take_axes()
         self.bridge.tick(deadline, now)
+        if self._muting and not self.bridge.muting(now):
+            self._muting = False
+            self._send(messages.Muted(self.bridge.muted))
         self.timings.lateness.add(now - deadline)
         if self.bridge.policy_seconds:
             self.timings.policy.add(self.bridge.policy_seconds)
@@ -348,8 +352,13 @@ class Control:
                     self.bridge.reset(now)
                 case messages.Discard():
                     self.bridge.discard(now)
-                case messages.Jog(step):
-                    self.bridge.jog(np.array(step))
+                case messages.Jog(step, share, pulled):
+                    self.bridge.jog(np.array(step), share, pulled)
+                case messages.Trace():
+                    self._send(messages.Traced(*map(np.array, zip(*self.bridge.trace, strict=True))))
+                case messages.Mute(seconds):
+                    self.bridge.mute(now, seconds)
+                    self._muting = True
                 case messages.Mark():
                     seen = self._tracker.track, self.bridge.feedback.axes, self.bridge.feedback.arm
                     self._send(messages.Marked(*(Stay.of(history, now) for history in seen)))

@@ -22,6 +22,7 @@ from robot_io.emulator.axis_registers import REGISTERS, AxisUnits, CmmtRegisters
 from robot_io.emulator.axis_server import AxisServer as AxisServer
 from robot_io.emulator.axis_server import serve as serve
 
+SAFE_TORQUE_OFF = 0x33  # our number
 MAILBOX_READ, MAILBOX_WRITE, MAILBOX_ERROR, MAILBOX_DONE = 0x01, 0x02, 0x03, 0x10  # as in festo-edcon
 
 
@@ -141,6 +142,11 @@ class AxisEmulator:
         """A fault of the drive; it brakes, and stays off until the fault is acknowledged."""
         with self._lock:
             self.drive.fault(code)
+
+    def cut_power(self) -> None:
+        """Its STO inputs are open: no power stage, until they close and it is switched on again."""
+        with self._lock:
+            self.drive.fault(SAFE_TORQUE_OFF)
 
     def power_cycle(self, reading: float) -> None:
         """The drive's supply is switched off and on: it has no reference, and reads ``reading`` [m] where it stands."""

@@ -9,7 +9,9 @@ from ballmodel.io.ranges import Within, check_fields
 from robot_io.contract import Contract
 from robot_io.emulator import arm as arms
 from robot_io.emulator.arm import ArmParams
+from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_drive import DriveParams
+from robot_io.emulator.axis_registers import AxisUnits
 from robot_io.emulator.network import NetworkFaults
 from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.tracker.hidden import NOTHING_HIDDEN, HiddenErrors
@@ -45,6 +47,15 @@ class RigParams:
 
 
 STANDARD_RIG = RigParams()
+
+
+def drives_of(params: RigParams, contract: Contract) -> list[AxisEmulator]:
+    """The drives of the linear axes."""
+    dead_time = params.axis_dead_time + params.action_delay
+    base = params.hidden.base_velocity
+    units = None if base == NOTHING_HIDDEN.base_velocity else AxisUnits(1e-6, base_velocity=base)
+    made = params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive, units
+    return [AxisEmulator(*made) for _ in contract.carrying]
 
 
 def for_robot(params: RigParams, contract: Contract) -> RigParams:

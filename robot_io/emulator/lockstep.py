@@ -25,8 +25,7 @@ from robot_io.devices.festo import Axis, DirectLink, FestoAxes
 from robot_io.devices.fixed_base import FixedBase
 from robot_io.devices.tracker import Tracker, TrackerConfig
 from robot_io.emulator.arm import ArmController, ArmStateError
-from robot_io.emulator.axes import AxisEmulator
-from robot_io.emulator.config import AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams, for_robot
+from robot_io.emulator.config import STANDARD_RIG, RigParams, drives_of, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
 from robot_io.emulator.tracker import TrackerEmulator
@@ -77,11 +76,7 @@ class LockStep:
         self.world.reset()
         arm_params = replace(params.arm, dead_time=params.arm.dead_time + params.action_delay)
         self.arm = ArmController(BRIDGE, arm_params)
-        dead_time = params.axis_dead_time + params.action_delay
-        self.emulators = [
-            AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)
-            for _ in contract.carrying
-        ]
+        self.emulators = drives_of(params, contract)
         axes = [
             Axis(
                 contract.joints[i],
@@ -152,10 +147,11 @@ class LockStep:
     def _devices(self, now: float) -> None:
         qpos, qvel = self.world.qpos, self.world.qvel
         abb = list(self._contract.arm)
-        speed, datagram = self.arm.step(now, self.params.hidden.counted(qpos[abb]), qvel[abb])
-        self._setpoint[abb] = speed
-        for i, emulator in zip(self._contract.carrying, self.emulators, strict=True):
-            self._setpoint[i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
+        hidden = self.params.hidden
+        speed, datagram = self.arm.step(now, hidden.counted(qpos[abb]), hidden.ordered(qvel[abb]))
+        self._setpoint[abb] = hidden.to_joints(speed)
+        for k, (i, emulator) in enumerate(zip(self._contract.carrying, self.emulators, strict=True)):
+            self._setpoint[i] = hidden.drive(k, emulator, now, float(qpos[i]), float(qvel[i]))
         if datagram is not None and self.arm_connected:
             self._to_bridge.send(datagram, now)
 

@@ -19,14 +19,13 @@ from robot_io.control import realtime
 from robot_io.control.config import ArmConfig, AxisConfig, RobotConfig
 from robot_io.devices.tracker import TrackerConfig
 from robot_io.emulator.arm import ArmController, ArmStateError
-from robot_io.emulator.axes import AxisEmulator
 from robot_io.emulator.axis_server import serve
-from robot_io.emulator.config import AXIS_FEEDBACK_DELAY, STANDARD_RIG, RigParams, for_robot
+from robot_io.emulator.config import STANDARD_RIG, RigParams, drives_of, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
 from robot_io.emulator.shared_state import ASLEEP, START_TIME, Motion, Shared
 from robot_io.emulator.tracker import TrackerEmulator
-from robot_io.emulator.world import World
+from robot_io.emulator.world import Vector, World
 from robot_io.errors import DeviceError
 
 HOST = "127.0.0.1"
@@ -130,6 +129,21 @@ class Rig:
     def motors_off(self) -> None:
         """The emergency stop of the arm."""
         self._pipes["arm"].send(("motors_off",))
+
+    def press_stop(self) -> None:
+        """The installation's emergency stop: takes the power from arm and axes, where it is wired to them."""
+        if self.params.hidden.stop_wired:
+            self.motors_off()
+            for axis in range(len(self.ports.axes)):
+                self._to_axis("stop", axis)
+
+    def hold(self, place: Vector | None) -> None:
+        """A hand holds the ball at a place (3,) [m], or nowhere any more."""
+        self._shared["held"][:] = 0.0 if place is None else [1.0, *place]
+
+    def clip(self, on: bool) -> None:
+        """Clip the ball to the blade, or take it off."""
+        self._shared["held"][0] = 2.0 if on else 0.0
 
     def drive_fault(self, axis: int, code: int) -> None:
         """A fault of one linear axis's drive. Raises DeviceError for a robot without such an axis."""
@@ -266,6 +280,8 @@ def _world(
         if shared.value("jog"):
             world.jog()
             shared["jog"][0] = 0.0
+        mode, *place = shared["held"].tolist()
+        world.held, world.on_blade = np.array(place) if mode == 1.0 else None, mode == 2.0
         if shared.value("throwing"):
             source.update(world, now)
         publish(now)
@@ -289,8 +305,9 @@ def _arm(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pi
                     _operate(controller, request)
             shared["driven"][0] = now - params.arm.cycle  # the last set-point's time, also if this process was asleep
             qpos, qvel = motion.at(now)
-            setpoint, datagram = controller.step(now, params.hidden.counted(qpos[rows]), qvel[rows])
-            shared["setpoint"][rows] = setpoint
+            hidden = params.hidden
+            setpoint, datagram = controller.step(now, hidden.counted(qpos[rows]), hidden.ordered(qvel[rows]))
+            shared["setpoint"][rows] = hidden.to_joints(setpoint)
             shared["driven"][0] = now
             if datagram is not None and connected:
                 out.send(datagram, now)
@@ -324,11 +341,7 @@ def _operate(controller: ArmController, request: str) -> None:
 
 
 def _axes(shared: Shared, params: RigParams, ports: Ports, contract: Contract, pipe: Connection) -> None:
-    dead_time = params.axis_dead_time + params.action_delay
-    emulators = [
-        AxisEmulator(params.axis_profile, dead_time, AXIS_FEEDBACK_DELAY, params.node_guard, params.drive)
-        for _ in contract.carrying
-    ]
+    emulators = drives_of(params, contract)
     servers = [serve(emulator, HOST, port) for emulator, port in zip(emulators, ports.axes, strict=True)]
     try:
         motion = Motion(shared)
@@ -340,11 +353,12 @@ def _axes(shared: Shared, params: RigParams, ports: Ports, contract: Contract, p
                     "disconnect": emulators[axis].disconnect,
                     "reconnect": emulators[axis].reconnect,
                     "fault": emulators[axis].inject_fault,
+                    "stop": emulators[axis].cut_power,
                 }[kind](*rest)
             shared["driven"][1] = now - AXIS_CYCLE
             qpos, qvel = motion.at(now)
-            for i, emulator in zip(contract.carrying, emulators, strict=True):
-                shared["setpoint"][i] = emulator.step(now, float(qpos[i]), float(qvel[i]))
+            for k, (i, emulator) in enumerate(zip(contract.carrying, emulators, strict=True)):
+                shared["setpoint"][i] = params.hidden.drive(k, emulator, now, float(qpos[i]), float(qvel[i]))
             shared["driven"][1] = now
     finally:
         for server in servers:

@@ -30,6 +30,7 @@ _FIELDS = {
     "finish": 1,
     "estop": 1,
     "jog": 1,
+    "held": 4,  # 1: the ball is at the place that follows; 2: it is clipped to the blade
     "silent_until": 1,
     "driven": 2,  # time [s] up to which arm and axes have given their set-points
 }

@@ -42,6 +42,7 @@ STICKING = 2.0 / 5.0  # share of the slip that brings the contact point of a thi
 NET = (0.1, 0.3)  # restitution and friction
 PHASES = 6  # of a contact's beginning within a step, for the calibration
 RESTING = 0.1  # [m/s]
+CLIP = (0.0, PADDLE_RADIUS + BALL_RADIUS + 0.003, 0.0)  # [m] of a ball at the blade's edge, in the site's frame
 FINE = 4  # steps instead of one near a surface
 NEAR = 0.06  # [m] from the ball's centre: a ball at 20 m/s moves 0.02 m in a step
 
@@ -96,6 +97,8 @@ class World:
             self.model.geom("col_table").id: (self.params.table_restitution, self.params.table_friction),
             self.model.geom("net").id: NET,
         }
+        self.held: np.ndarray | None = None  # [m] where a hand holds the ball
+        self.on_blade = False  # the ball is clipped to the blade
         self.collisions = 0  # steps in which robot and table touched
         self.reset()
 
@@ -104,6 +107,7 @@ class World:
         mujoco.mj_resetData(self.model, self.data)
         self.number = self.strokes = 0
         self.collisions, self.touches, self._touching = 0, [], set()
+        self.held, self.on_blade = None, False
         self.data.qpos[self._q] = self.home
         self.park()
         mujoco.mj_forward(self.model, self.data)
@@ -156,6 +160,17 @@ class World:
         self._touching, self.touches = set(), []
         self.strokes += 1
 
+    @property
+    def visible(self) -> bool:
+        """True while there is a ball to be seen."""
+        return self.in_play or self.on_blade or self.held is not None
+
+    @property
+    def clipped(self) -> np.ndarray:
+        """Where a ball is (3,) [m] that is clipped to the blade, at its edge and beside its axis."""
+        site = self.data.site_xpos[self._site], self.data.site_xmat[self._site].reshape(3, 3)
+        return site[0] + site[1] @ np.array(CLIP)
+
     def jog(self) -> None:
         """Puts the arm to its home pose, as somebody does with the controller's own pendant."""
         arm = self._arm
@@ -181,6 +196,11 @@ class World:
             self._step(duration / steps)
 
     def _step(self, duration: float) -> None:
+        if self.visible and not self.in_play:
+            self._integrate(1, duration)
+            place = self.clipped if self.on_blade else self.held
+            self._place(PARKED if place is None else place, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            return
         if not self.in_play:
             self._place(PARKED, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
             self._integrate(1, duration)

@@ -37,14 +37,17 @@ class WayHome:
     """From wherever the robot is to a target, in steps of one control period.
 
     gate     its geometry and margins are kept; nothing is asked of it
+    scale    by which the gate multiplies what is asked for here, where the last bit of a way is to be gone as fast
     limits   of the joints; speed, braking: (n,) on the way [m/s], [m/s^2], [rad/s], [rad/s^2]
     problem  the reason why there is no way, empty otherwise
     """
 
-    def __init__(self, gate: SafetyGate, limits: JointLimits, speed: np.ndarray, braking: np.ndarray) -> None:
+    def __init__(
+        self, gate: SafetyGate, limits: JointLimits, speed: np.ndarray, braking: np.ndarray, scale: float = 1.0
+    ) -> None:
         self.problem = ""
         self._gate, self._geometry, self._margin = gate, gate.geometry, gate.margins
-        self._speed, self._braking = speed, braking
+        self.speed, self._braking, self._scale = speed, braking, scale
         self._step = RAMP * np.array(limits.acceleration) * gate.period
         room = np.maximum(limits.margin, gate.config.overshoot)
         self._low, self._high = np.array(limits.lower) + room, np.array(limits.upper) - room
@@ -74,7 +77,8 @@ class WayHome:
                 self._way.pop(0)
             else:
                 return self._straight(place - at)
-        return towards(target, at, self._speed, self._braking, self._gate.period)
+        scale = self._scale
+        return towards(target, at, scale * self.speed, self._braking, self._gate.period) / scale
 
     def sent(self, request: np.ndarray, sent: Sent, target: np.ndarray, homeward: bool) -> bool:
         """Take what became of a request; ``homeward``: it was one of ours. True where another way is looked for now."""
@@ -134,7 +138,7 @@ class WayHome:
     def _straight(self, way: np.ndarray) -> np.ndarray:
         """Velocity (n,) along a straight way (n,) in joint space, such that the braking suffices to stop at its end."""
         distance, period = np.abs(way), self._gate.period
-        wanted = np.minimum(self._pace * self._speed, np.sqrt(2.0 * self._braking * distance))
+        wanted = np.minimum(self._pace * self.speed, np.sqrt(2.0 * self._braking * distance))
         wanted = np.minimum(wanted, distance / (3.0 * period))
         wanted = np.minimum(wanted, np.abs(self._gate.velocity) + self._step)
         moved = distance > 0.0

@@ -35,8 +35,8 @@ class EgmConfig:
     controller_port     port that packets are taken from; None learns it. Two senders at once are then a problem
     period              the controller's cycle [s]
     timeout             age [s] at which feedback is stale: ``problem`` says so, and the next packet opens a new session
-    ramp_in             [s] after a session has begun in which the arm is not to be armed: the controller's RampInTime, in
-                        which commands do not have their full effect yet, and half a second more
+    ramp_in             [s] of a new session in which the arm is not armed: the controller's RampInTime, in which it
+                        does not follow fully yet, and half a second more
     zeros               (6,) [rad] added to every position that comes, and taken from every one that goes; as many as
                         the arm has joints
     """

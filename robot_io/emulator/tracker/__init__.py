@@ -48,7 +48,7 @@ class TrackerParams:
     def sees(self, world: World) -> tuple[int, bool]:
         """Number of the ball, and True when it is seen."""
         hidden = self.identity == "lost" and not world.answered
-        return world.strokes if self.identity == "stroke" else world.number, world.in_play and not hidden
+        return world.strokes if self.identity == "stroke" else world.number, world.visible and not hidden
 
 
 class TrackerEmulator:

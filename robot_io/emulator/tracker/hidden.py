@@ -6,11 +6,14 @@ Written without ``robot_io.calibrated`` on purpose: angles about fixed axes here
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from ballmodel.io.ranges import Within
+
+if TYPE_CHECKING:
+    from robot_io.emulator.axes import AxisEmulator
 
 Metres = Annotated[float, Within(-5.0, 5.0, "m")]
 Radians = Annotated[float, Within(-3.1416, 3.1416, "rad")]
@@ -28,6 +31,11 @@ class HiddenErrors:
     joint_zeros      [rad] of the arm's joints, six of the paper's robot: true angle where its controller reports 0
     clock_offset     [s] that the tracker's clock shows when the bridge's shows 0
     clock_drift      seconds per second that the tracker's clock gains
+    joint_order      of the arm's joints, as the controller counts them; empty: as they are
+    axis_factor      [m] that each linear axis's drive counts for a metre of its carriage: -1 runs the other way
+    axis_zero        [m] that its drive reads too much once it is homed
+    base_velocity    [m/s] that the drives' 100 % stand for
+    stop_wired       the emergency stop takes the power from arm and axes
     """
 
     camera_position: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
@@ -36,6 +44,11 @@ class HiddenErrors:
     joint_zeros: tuple[Annotated[float, Within(-0.05, 0.05, "rad")], ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     clock_offset: Annotated[float, Within(-1e6, 1e6, "s")] = 0.0
     clock_drift: Annotated[float, Within(-0.02, 0.02)] = 0.0
+    joint_order: tuple[Annotated[int, Within(0, 11)], ...] = ()
+    axis_factor: tuple[Annotated[float, Within(-10.0, 10.0)], ...] = (1.0, 1.0)
+    axis_zero: tuple[Annotated[float, Within(-1.0, 1.0, "m")], ...] = (0.0, 0.0)
+    base_velocity: Annotated[float, Within(0.01, 100.0, "m/s")] = 2.0
+    stop_wired: bool = True
 
     def seen(self, point: np.ndarray) -> np.ndarray:
         """Coordinates (3,) that the tracker gives to a point (3,) of the table frame [m]."""
@@ -52,7 +65,25 @@ class HiddenErrors:
 
     def counted(self, angles: np.ndarray) -> np.ndarray:
         """Angles (n,) [rad] of which the arm's controller knows where the joints are at ``angles``."""
-        return angles - np.array(self.joint_zeros) if any(self.joint_zeros) else angles
+        angles = angles - np.array(self.joint_zeros) if any(self.joint_zeros) else angles
+        return self.ordered(angles)
+
+    def ordered(self, values: np.ndarray) -> np.ndarray:
+        """Values (n,) of the arm's joints in the controller's order."""
+        return values[list(self.joint_order)] if self.joint_order else values
+
+    def to_joints(self, values: np.ndarray) -> np.ndarray:
+        """Values (n,) in the controller's order, in that of the arm's joints."""
+        return values[np.argsort(self.joint_order)] if self.joint_order else values
+
+    def drive(self, axis: int, emulator: AxisEmulator, now: float, position: float, velocity: float) -> float:
+        """One step of a linear axis's drive at its carriage's position [m] and velocity [m/s]; its new velocity."""
+        factor, zero = self._of(self.axis_factor, axis, 1.0), self._of(self.axis_zero, axis, 0.0)
+        return emulator.step(now, factor * position + zero, factor * velocity) / factor
+
+    @staticmethod
+    def _of(values: tuple[float, ...], i: int, standard: float) -> float:
+        return values[i] if i < len(values) else standard
 
 
 NOTHING_HIDDEN = HiddenErrors()

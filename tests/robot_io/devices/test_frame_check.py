@@ -41,7 +41,7 @@ def rig(hidden, **options):
         ({"clock_offset": 0.1}, "clock_offset is not theirs"),
         ({"clock_offset": -100.0}, "clock_offset is not theirs"),
         ({"clock_offset": -0.03}, "clock is off by"),
-        ({"clock_drift": -0.01}, r"-\d+ ppm"),
+        ({"clock_drift": -0.006}, r"-\d+ ppm"),
     ],
 )
 def test_a_wrong_frame_or_clock_is_not_armed_and_named(hidden, named):
