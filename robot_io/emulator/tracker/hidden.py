@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 Metres = Annotated[float, Within(-5.0, 5.0, "m")]
 Radians = Annotated[float, Within(-3.1416, 3.1416, "rad")]
 
+Factor = Annotated[float, Within(-10.0, 10.0)]
+Zero = Annotated[float, Within(-1.0, 1.0, "m")]
 Scale = Annotated[float, Within(-1000.0, 1000.0)]
 
 
@@ -32,7 +34,7 @@ class HiddenErrors:
     clock_offset     [s] that the tracker's clock shows when the bridge's shows 0
     clock_drift      seconds per second that the tracker's clock gains
     joint_order      of the arm's joints, as the controller counts them; empty: as they are
-    axis_factor      [m] that each linear axis's drive counts for a metre of its carriage: -1 runs the other way
+    axis_factor      metres that each linear axis's drive counts for one of its carriage, not 0: -1 runs the other way
     axis_zero        [m] that its drive reads too much once it is homed
     base_velocity    [m/s] that the drives' 100 % stand for
     stop_wired       the emergency stop takes the power from arm and axes
@@ -45,8 +47,8 @@ class HiddenErrors:
     clock_offset: Annotated[float, Within(-1e6, 1e6, "s")] = 0.0
     clock_drift: Annotated[float, Within(-0.02, 0.02)] = 0.0
     joint_order: tuple[Annotated[int, Within(0, 11)], ...] = ()
-    axis_factor: tuple[Annotated[float, Within(-10.0, 10.0)], ...] = (1.0, 1.0)
-    axis_zero: tuple[Annotated[float, Within(-1.0, 1.0, "m")], ...] = (0.0, 0.0)
+    axis_factor: tuple[Factor, Factor] = (1.0, 1.0)
+    axis_zero: tuple[Zero, Zero] = (0.0, 0.0)
     base_velocity: Annotated[float, Within(0.01, 100.0, "m/s")] = 2.0
     stop_wired: bool = True
 
@@ -78,12 +80,8 @@ class HiddenErrors:
 
     def drive(self, axis: int, emulator: AxisEmulator, now: float, position: float, velocity: float) -> float:
         """One step of a linear axis's drive at its carriage's position [m] and velocity [m/s]; its new velocity."""
-        factor, zero = self._of(self.axis_factor, axis, 1.0), self._of(self.axis_zero, axis, 0.0)
+        factor, zero = (values[min(axis, 1)] for values in (self.axis_factor, self.axis_zero))
         return emulator.step(now, factor * position + zero, factor * velocity) / factor
-
-    @staticmethod
-    def _of(values: tuple[float, ...], i: int, standard: float) -> float:
-        return values[i] if i < len(values) else standard
 
 
 NOTHING_HIDDEN = HiddenErrors()

@@ -32,7 +32,7 @@ class Nowhere(RobotGeometry):
 def swung(joint, config):
     """From end to end at full speed, twice: the farthest outside the range [rad], and the gate."""
     gate = SafetyGate(config=config, geometry=Nowhere.load())
-    arm = ArmController(CLIENT, ArmParams(comm_timeout=0.06))
+    arm = ArmController(CLIENT, ArmParams(comm_timeout=0.06, ramp_in=0.0))
     arm.motors_on()
     arm.start_rapid()
     arm.start_egm()
