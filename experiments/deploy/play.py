@@ -70,10 +70,11 @@ def run(
             if stop.is_set():
                 raise KeyboardInterrupt
             status = 1 if problem else 0
-        except KeyboardInterrupt:
-            status, problem = INTERRUPTED, "stopped by Ctrl-C or another signal"
-        except Exception as error:  # whatever ends the session, what was played is not to be lost
-            status, problem, failure = 1, "", error
+        except (Exception, KeyboardInterrupt) as error:  # whatever ends the session, what was played is not to be lost
+            if isinstance(error, KeyboardInterrupt) or stop.is_set():  # the rig ends with the same signal
+                status, problem = INTERRUPTED, "stopped by Ctrl-C or another signal"
+            else:
+                status, problem, failure = 1, "", error
         session.close()
     summary = session_report.summary(policy, session.robot, played, session.status, session.timings, session.log_file)
     summary |= {"faults": [asdict(fault) for fault in played.faults], "player": setup.player}
