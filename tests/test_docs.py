@@ -166,3 +166,12 @@ def test_commands_of_a_page_are_accepted(page):
         except CycloptsError as error:
             refused.append(f"mjx-tt {command}: {error}")
     assert not refused, "\n".join(refused)
+
+
+def test_the_path_from_datagram_to_command_is_as_long_as_its_page_says():
+    rows = re.findall(
+        r"^\| `(robot_io/[\w/]+\.py)` \| (\d+) \|", (ROOT / "docs/concepts/bridge.md").read_text("utf-8"), re.MULTILINE
+    )
+    found = {path: len((ROOT / path).read_text("utf-8").splitlines()) for path, _ in rows}
+    assert len(found) == 11 and sum(found.values()) <= 2700, found
+    assert all(abs(found[path] - int(lines)) <= 20 for path, lines in rows), found

@@ -120,12 +120,9 @@ def export(path: Path, out: Path | None, console: Console) -> list[Path]:
     from robot_io.log.writer import SUFFIX
 
     with error_context():
-        session = log.read(path)
-    with error_context():
-        written = log.export(session, out or path.with_name(path.name.removesuffix(SUFFIX)))
+        written, balls = log.export(log.stream(path), out or path.with_name(path.name.removesuffix(SUFFIX)))
     for table in written:
         console.print(table, soft_wrap=True)
-    balls = len(log.trajectories(session.ball))
     console.print(f"{balls:,} balls; mjx-tt fit-human {written[0]} makes a distribution of them")
     return written
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import threading
 import time
 from dataclasses import asdict, dataclass
@@ -22,14 +23,14 @@ from experiments.options import RIG, RobotOptions
 from experiments.runs import run_dir
 from robot_io.contract import PAPER
 from robot_io.control.config import RobotConfig
-from robot_io.control.messages import Message, Pause, Played, RallyOver, Refused, Status
+from robot_io.control.messages import Discarded, Message, Pause, Played, RallyOver, Refused, Status
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
 from robot_io.log import view as log_view
 from robot_io.policy import artefact as artefacts
 
 QUIET = 30.0  # [s] without a ball on the rig, after which something is wrong
-INTERRUPTED = 130  # exit status after Ctrl-C, as a shell gives it
+INTERRUPTED = 130  # exit status after a signal, as a shell gives it for Ctrl-C
 
 
 def run(
@@ -45,7 +46,8 @@ def run(
     """Plays a policy; returns the exit status.
 
     Ends when ``balls`` outcomes are known, ``rallies`` that count are over, ``seconds`` have passed, or the operator
-    quits. 0: all went well, 1: it ended early, 130: ended by Ctrl-C; the summary is written in any case.
+    quits. 0: all went well, 1: it ended early, 130: ended by Ctrl-C, SIGTERM or a closed terminal. The summary is
+    written in any case, also where control process, rig or this program fail: then it raises what failed.
     """
     policy = artefacts.load(artefact)
     installed = None if robot == RIG else load_installed(robot, artefact, policy.contract, log_folder)
@@ -57,9 +59,10 @@ def run(
             rig.throw(True)
         else:
             console.print("press p to prepare the axes, a to arm; space stops")
+        failure: Exception | None = None
         try:
             with (
-                stop_requested() as stop,
+                stop_requested(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop,
                 Keyboard() as keyboard,
                 View(console, f"{artefact} on {session.robot.name}") as view,
             ):
@@ -67,8 +70,11 @@ def run(
             if stop.is_set():
                 raise KeyboardInterrupt
             status = 1 if problem else 0
-        except KeyboardInterrupt:
-            status, problem = INTERRUPTED, "stopped by Ctrl-C"
+        except (Exception, KeyboardInterrupt) as error:  # whatever ends the session, what was played is not to be lost
+            if isinstance(error, KeyboardInterrupt) or stop.is_set():  # the rig ends with the same signal
+                status, problem = INTERRUPTED, "stopped by Ctrl-C or another signal"
+            else:
+                status, problem, failure = 1, "", error
         session.close()
     summary = session_report.summary(policy, session.robot, played, session.status, session.timings, session.log_file)
     summary |= {"faults": [asdict(fault) for fault in played.faults], "player": setup.player}
@@ -77,6 +83,8 @@ def run(
         summary["layout"] = str(path.with_suffix(".layout.json"))
         run_dir.write_json(path.with_suffix(".layout.json"), log_view.layout(policy.contract))
     _finish(summary, session.robot, session.log_file, path, console)
+    if failure is not None:
+        raise failure
     if problem:
         console.print(problem, style="red")
     return status
@@ -142,6 +150,8 @@ class _Play:
             self.faults_in_a_row = self.faults_in_a_row if message.summary.fault else 0
             if not console.is_terminal:
                 console.print(f"ball {len(self.played.episodes)}: {message.summary.outcome}")
+        elif isinstance(message, Discarded):
+            self.played.discard(message.number)
         elif isinstance(message, RallyOver):
             rally = message.summary
             self.played.rallies.append(rally)

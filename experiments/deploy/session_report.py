@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,10 @@ class PlayedSession:
     rallies: list[RallySummary] = field(default_factory=list)
     faults: list[FaultReport] = field(default_factory=list)
 
+    def discard(self, number: int) -> None:
+        """Mark the episode of that number as discarded; one whose outcome is open says so itself."""
+        self.episodes = [replace(e, discarded=True) if e.number == number else e for e in self.episodes]
+
     @property
     def counted(self) -> list[RallySummary]:
         """Rallies that are not filtered out."""
@@ -44,7 +48,7 @@ def summary(
     log_file: Path | None,
 ) -> dict[str, Any]:
     """Everything that a session's JSON holds."""
-    episodes = played.episodes
+    episodes = [episode for episode in played.episodes if not episode.discarded]
     returned = sum(e.outcome == "returned" for e in episodes)
     hit = sum(e.outcome != "missed" for e in episodes)
     report: dict[str, Any] = {
@@ -52,6 +56,7 @@ def summary(
         "artefact_sha256": loaded.digest,
         "robot": config.name,
         "episodes": len(episodes),
+        "discarded": len(played.episodes) - len(episodes),
         "returned": returned,
         "hit": hit,
     }

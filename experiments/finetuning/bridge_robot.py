@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from experiments.deploy.control_session import RECOVERIES, ControlSession
 from experiments.deploy.operator_console import KEYS, PAUSE, QUIT, Keyboard, View
 from experiments.finetuning.robot import Operator, PlayedBall
-from robot_io.control.messages import Beat, Discard, Pause, Played, PolicySet, Refused, SetPolicy, Stop
+from robot_io.control.messages import Beat, Discarded, Message, Pause, Played, PolicySet, Refused, SetPolicy, Stop
 from robot_io.emulator.processes import Rig
 from robot_io.errors import RefusedError
 from robot_io.policy.policy import Policy
 from robot_io.safety.owner_watch import LONGEST_ABSENCE
 
+GLANCE = 0.1  # [s] between two looks at the keys
 COMPUTING = LONGEST_ABSENCE  # for an update between two balls, the compilation of the first one included
 
 
@@ -27,8 +29,8 @@ class BridgeRobot(Operator):
 
     def __init__(self, session: ControlSession, rig: Rig | None, keyboard: Keyboard, view: View) -> None:
         self._session, self._rig, self._keyboard, self._view = session, rig, keyboard, view
-        self._paused = self._stopped = self._discarded = False
-        self._version = 0
+        self._paused = self._stopped = self._retracts = False
+        self._version = self._credited = 0  # of the policy, of the ball that was returned last
         session.send(Pause(True))
 
     def describe(self) -> dict[str, Any]:
@@ -40,15 +42,14 @@ class BridgeRobot(Operator):
         The policy is exchanged while no new ball is taken; refused, because the ball before is still played, it is
         handed over again. A ball that another version played does not count.
         """
-        self._discarded = False
         self._version += 1
         exchange = SetPolicy(policy, self._version)
         session, failures = self._session, 0
         session.send(exchange)
         while True:
             refused = False
-            for message in session.messages(0.1):
-                self._view.take(message)
+            for message in session.messages(GLANCE):
+                self._take(message)
                 if isinstance(message, PolicySet) and message.version == self._version:
                     session.send(Pause(False))
                 elif isinstance(message, Refused) and isinstance(message.request, SetPolicy):
@@ -61,6 +62,7 @@ class BridgeRobot(Operator):
                     if message.summary.fault and self._rig is not None:
                         session.recover(self._rig)
                     session.send(Beat(COMPUTING))
+                    self._credited = message.summary.number
                     return PlayedBall(message.summary, message.ball)
             if refused:
                 session.send(exchange)
@@ -74,6 +76,18 @@ class BridgeRobot(Operator):
                     session.recover(self._rig)
                     session.send(exchange)
 
+    def _take(self, message: Message) -> None:
+        self._view.take(message)
+        if isinstance(message, Discarded):
+            self._retracts |= message.number == self._credited != 0
+
+    def _wait(self, seconds: float) -> None:
+        """Reads keys and messages for so long."""
+        for _ in range(max(1, math.ceil(seconds / GLANCE))):
+            for message in self._session.messages(min(seconds, GLANCE)):
+                self._take(message)
+            self._keys()
+
     def _keys(self) -> None:
         key = self._keyboard.pressed()
         if key not in KEYS:
@@ -85,21 +99,20 @@ class BridgeRobot(Operator):
             self._session.send(Stop())  # ends the episode in play, which is then played again
         elif key == PAUSE:
             self._paused = not self._paused
-        elif isinstance(request, Discard):
-            self._discarded = True
         elif request is not None:
             self._session.send(request)
 
     # The operator, asked between episodes
 
-    def discarded(self) -> bool:
-        return self._discarded
+    def retracts(self, seconds: float = 0.0) -> bool:
+        if seconds:
+            self._wait(seconds)
+        retracts, self._retracts = self._retracts, False
+        return retracts
 
     def paused(self) -> bool:
         """Also keep the view alive while it waits."""
-        for message in self._session.messages(0.0):
-            self._view.take(message)
-        self._keys()
+        self._wait(0.0)
         return self._paused and not self._stopped
 
     def stopped(self) -> bool:

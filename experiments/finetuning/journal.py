@@ -1,9 +1,9 @@
 """The journal of fine-tuning: one JSON line per episode, on the disk before the next ball is played.
 
-Everything but their order is in the lines: parameters, curves and the human's balls can be made from them again. Each
-line ends in a checksum of everything before it in the file, so that a line that was changed, doubled or taken out is
-noticed. Lines without one, of journals that were begun before there were checksums, are covered by the next that has
-one.
+Everything but their order is in the lines: parameters, curves and the human's balls can be made from them again. A ball
+that is discarded after its line was written has a second one. Each line ends in a checksum of everything before it in
+the file, so that a line that was changed, doubled or taken out is noticed. Lines without one, of journals that were
+begun before there were checksums, are covered by the next that has one.
 """
 
 from __future__ import annotations
@@ -90,10 +90,16 @@ class Journal:
             os.ftruncate(handle, start)  # no half a line in the middle, should there be room again
             raise
         self._digest.update(content)
-        self.entries.append(entry)
+        self._take(entry)
 
     def close(self) -> None:
         self._file.close()
+
+    def _take(self, entry: Entry) -> None:
+        """A line about the episode before, which was discarded late, stands in its place."""
+        if self.entries and (self.entries[-1].phase, self.entries[-1].episode) == (entry.phase, entry.episode):
+            self.entries.pop()
+        self.entries.append(entry)
 
     def _checked(self, content: bytes) -> bytes:
         """The line of a JSON object: with the checksum of the lines before it and of itself."""
@@ -115,7 +121,7 @@ class Journal:
                         f"{self.path}: line {i + 1} was changed, or lines before it were changed, doubled or taken "
                         "out; restore the file or start a new run"
                     )
-                self.entries.append(_from_json(json.loads(line)))
+                self._take(_from_json(json.loads(line)))
             except (ValueError, TypeError, KeyError) as error:
                 if i == len(lines) - 1:
                     break

@@ -11,6 +11,7 @@ import hashlib
 import math
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +52,11 @@ SETTINGS = "finetuning.yaml"
 JOURNAL = "journal.jsonl"
 HUMAN_BALLS = "human_balls.csv"
 CURVE = "finetuning.png"
-STOPPED = "stopped"  # the bridge's word for an episode that the operator ended
 EVALUATION_EPISODES = 1_000_000  # number of the first evaluation's first episode: other balls than in fine-tuning
 LOCK_STEP_BALLS = 65536
 PAUSE_POLL = 0.05  # [s]
+LATE = 1.0  # [s] after a round in which its last ball can still be discarded
+Slot = tuple[str, int, int, int]
 
 
 def finetune(
@@ -190,13 +192,10 @@ class FineTuningRun:
         played_before = phase == BEFORE and self.update > 0  # before the first update: only read
         theta = None if played_before else np.asarray(self.state.bgs.average)
         update = 0 if phase == BEFORE else self.update
-        entries = []
-        for ball in range(self._settings.evaluation_balls):
-            entry = self._episode((phase, update, 0, ball), theta)
-            if entry is None:
-                return None
-            entries.append(entry)
-        self._progress.note(f"{phase} fine-tuning: {report.sentence(report.evaluated(entries))}")
+        slots = [(phase, update, 0, ball) for ball in range(self._settings.evaluation_balls)]
+        entries = self._play_all(dict.fromkeys(slots, theta))
+        if entries is not None:
+            self._progress.note(f"{phase} fine-tuning: {report.sentence(report.evaluated(entries))}")
         return entries
 
     def _advance(self) -> bool:
@@ -204,14 +203,16 @@ class FineTuningRun:
         settings, number = self._settings, self.update + 1
         population = strategy.ask(jax.random.fold_in(self.state.key, self.update), self.state.bgs, self._bgs)
         members = np.asarray(population.members)
-        entries = []
         # The members take turns, so that a person who tires or warms up is the same to both of a pair.
-        for repeat in range(settings.repeats):
-            for member in _order(settings.num_directions):
-                entry = self._episode((TRAINING, number, member, repeat), members[:, member])
-                if entry is None:
-                    return False
-                entries.append(entry)
+        entries = self._play_all(
+            {
+                (TRAINING, number, member, repeat): members[:, member]
+                for repeat in range(settings.repeats)
+                for member in _order(settings.num_directions)
+            }
+        )
+        if entries is None:
+            return False
         returns = np.zeros(2 * settings.num_directions)
         for entry in entries:
             returns[entry.member] += entry.returns / settings.repeats
@@ -227,14 +228,36 @@ class FineTuningRun:
         self._progress.updated(number, row)
         return True
 
-    def _episode(self, slot: tuple[str, int, int, int], theta: np.ndarray | None) -> Entry | None:
-        """The episode of that slot: from the journal or played now; None when the operator stopped before it."""
+    def _play_all(self, members: dict[Slot, np.ndarray | None]) -> list[Entry] | None:
+        """The episodes of a round, by slot and parameters: from the journal or played now; None: the operator stopped.
+
+        A ball that the operator discards after it was credited is played again before the round is used.
+        """
+        while missing := [slot for slot in members if slot not in self._played]:
+            for slot in missing:
+                if not self._episode(slot, members[slot]):
+                    return None
+            if self._operator.retracts(LATE):
+                self._retract(missing[-1])
+        return [self._played[slot] for slot in members]
+
+    def _retract(self, slot: Slot) -> None:
+        """Marks the newest ball in the journal as discarded, where it belongs to the same round as ``slot``."""
+        entry = self.journal.entries[-1]
+        if entry.slot[:2] != slot[:2]:
+            self._progress.note("the ball before belongs to a round that is over: it counts")
+        elif self._played.pop(entry.slot, None):
+            self.journal.append(replace(entry, discarded=True))
+            self._progress.retracted()
+
+    def _episode(self, slot: Slot, theta: np.ndarray | None) -> bool:
+        """Plays the episode of that slot until it counts; False when the operator stopped before it."""
         while slot not in self._played:
             while self._operator.paused() and not self._operator.stopped():
                 self._progress.paused()
                 time.sleep(PAUSE_POLL)
             if self._operator.stopped():
-                return None
+                return False
             if theta is None:
                 raise RunError(
                     f"{self.journal.path}: an episode of the evaluation before fine-tuning is missing, though updates "
@@ -243,12 +266,14 @@ class FineTuningRun:
             number = self._next_number(*slot[:2])
             mean, inv_std = self._normaliser
             played = self._robot.play(Policy(np.ascontiguousarray(theta), mean, inv_std, self._network), number)
+            if self._operator.retracts():
+                self._retract(slot)
             entry = self._entry(slot, number, played)
             self.journal.append(entry)
             if not entry.discarded:
                 self._played[slot] = entry
             self._progress.played(entry)
-        return self._played[slot]
+        return True
 
     def _next_number(self, phase: str, update: int) -> int:
         """A ball that is played again is another one: every attempt counts."""
@@ -261,10 +286,7 @@ class FineTuningRun:
         summary = played.summary
         terms = reward_terms(summary)
         returns = sum(self._weights[name] * value for name, value in terms.items())
-        # Asked whatever the bridge says, since the question is about this ball only. The human's own faults say nothing
-        # about the policy.
-        discarded = self._operator.discarded() or summary.discarded or summary.fault == STOPPED
-        discarded |= summary.human_fault is not None
+        discarded = self._operator.discarded() or summary.unfit  # asked in any case: the question is about this ball
         return Entry(*slot, number, summary, terms, returns, discarded, played.trajectory)
 
 

@@ -51,6 +51,11 @@ class FineTuningProgress(ProgressBar):
         outcome = "discarded" if entry.discarded else outcome
         self.show(self._counted, f"{where}  {outcome}{self._update_text}  {self._left()} left", plain=False)
 
+    def retracted(self) -> None:
+        """After a ball that counted was discarded."""
+        self._counted -= 1
+        self.note("the ball before was discarded: it is played again")
+
     def updated(self, update: int, row: dict[str, Any]) -> None:
         """After every update with its row of measurements."""
         self._update_text = f"  mean return {row['mean_return']:.2f}, returned {row['return_rate']:.0%}"

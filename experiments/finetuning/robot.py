@@ -69,6 +69,10 @@ class Operator:
         """True for a ball that is to be played again; called once after every ball."""
         return False
 
+    def retracts(self, seconds: float = 0.0) -> bool:
+        """True when the ball before the newest was discarded after it had been played; waits for it so long."""
+        return False
+
     def paused(self) -> bool:
         """True while the fine-tuning is to wait; polled."""
         return False

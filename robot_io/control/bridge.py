@@ -26,7 +26,7 @@ import numpy as np
 from robot_io.control.commissioning import jog
 from robot_io.control.commissioning.homing import HomingGuard
 from robot_io.control.commissioning.way_home import WayHome
-from robot_io.control.episode import Episode, EpisodeSummary
+from robot_io.control.episode import STOPPED, Episode, EpisodeSummary
 from robot_io.control.interfaces import STANDARD_PLAY, Axes, action_of
 from robot_io.control.interfaces import BridgeConfig as BridgeConfig
 from robot_io.control.interfaces import BridgeState as BridgeState
@@ -203,7 +203,7 @@ class Bridge:
             self._stopping_since = now
             self._change(BridgeState.STOPPING, now, because or "stopped by the operator")
             with self._guarded(now):
-                self.play.abort("stopped", now)
+                self.play.abort(STOPPED, now)
         elif self.gate.at_rest:  # otherwise the gate brakes them
             self.axes.stop()
         if not because or self._state is BridgeState.DISARMED:
@@ -224,10 +224,11 @@ class Bridge:
         """Raise RefusedError unless the linear axes may search their references, as of ``HomingGuard.check``."""
         self._homing.check(self.state.value, now)
 
-    def discard(self, now: float) -> None:
-        """Marks the ball in play, or the one before, as not to be used."""
-        self.event(now, Level.INFO, "operator", "discard")
-        self.play.discard()
+    def discard(self, now: float) -> int:
+        """Mark the ball that the operator has seen last as not to be used; returns its number, 0 for none."""
+        number = self.play.discard(now)
+        self.event(now, Level.INFO, "discard", json_text({"episode": number}))
+        return number
 
     def failed(self, error: BaseException, now: float) -> None:
         """Brake for an error of the program, wherever it was raised, and latch it as INTERNAL."""

@@ -27,6 +27,7 @@ from robot_io.control.kinks import (
 )
 from robot_io.control.strokes import COMING, GAP, LEAVING
 from robot_io.devices.tracker import BallSample
+from robot_io.safety.faults import NOT_THE_POLICYS
 
 REACH = 0.35  # [m] between ball and blade when the ball turns round, else it did not touch the blade
 BEHIND, BELOW = -2.9, -0.6  # [m] y and z beyond which an incoming ball is out of reach, as in the simulation
@@ -41,6 +42,8 @@ LAUNCH = 8  # samples from which the human's stroke is estimated
 
 NET, OWN_SIDE, LONG, LOST = "net", "own side", "long", "lost"  # faults of the human
 MISSED, HIT, RETURNED = "missed", "hit", "returned"
+STOPPED = "stopped"  # the operator's stop, in place of a fault's cause
+_REPEATED = {STOPPED, *(cause.value for cause in NOT_THE_POLICYS)}
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class EpisodeSummary:
     closest     [m] least distance of ball and blade centre after the bounce
     crossed     over the net; net_height [m] of its centre there
     landing     (2,) [m] where the outgoing ball came down to the table's height
-    fault       cause of the fault that ended it, or None
+    fault       cause of the fault that ended it, STOPPED, or None
     discarded   thrown away by the operator
     policy_version  of the policy that played it, as its owner counts
     human_fault NET, OWN_SIDE, LONG or LOST (out of sight before it came down): no valid ball; None: a valid one
@@ -85,6 +88,12 @@ class EpisodeSummary:
     net: bool = False
     grazed: bool = False
     idle: bool = False
+
+    @property
+    def unfit(self) -> bool:
+        """It says nothing about the policy, and is to be played again: discarded, stopped, no valid ball of the human,
+        or ended by a fault of tracker, network, computer or operator."""
+        return self.discarded or self.human_fault is not None or self.fault in _REPEATED
 
 
 @dataclass

@@ -44,7 +44,7 @@ class Reset:
 
 @dataclass(frozen=True)
 class Discard:
-    """Mark the ball in play, or the one before, as not to be used."""
+    """Mark the ball that the operator has seen last as not to be used. Answered by Discarded."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +135,13 @@ class PolicySet:
     """Balls that begin from now on are played by this version."""
 
     version: int
+
+
+@dataclass(frozen=True)
+class Discarded:
+    """The ball that the operator has discarded, by ``EpisodeSummary.number``; 0: there was none yet."""
+
+    number: int
 
 
 @dataclass(frozen=True)
@@ -323,4 +330,6 @@ class Status:
         return "; ".join(f"{name}: {reason}" for name, reason in found.items() if reason)
 
 
-Message = Ready | Refused | PolicySet | Played | RallyOver | Marked | Traced | Muted | Failed | Ended | Status
+Message = (
+    Ready | Refused | PolicySet | Discarded | Played | RallyOver | Marked | Traced | Muted | Failed | Ended | Status
+)

@@ -16,6 +16,7 @@ from robot_io.devices.tracker import BallSample
 from robot_io.log.messages import Event, Level, Record, episode_end, episode_start, json_text
 
 MAX_STEPS = 200  # control ticks of an episode, as in training
+REACTION = 0.4  # [s] in which nobody has seen a new ball and pressed a key
 IDLE = 0.05  # share of the policy's velocity limits that a robot which "did not react" stays under
 
 
@@ -146,10 +147,16 @@ class Play:
         self._rallies.abort(now)
         self._taken = self.strokes.number
 
-    def discard(self) -> None:
-        """Mark the ball in play, or the one before, as not to be used."""
-        for episode in self.following:
+    def discard(self, now: float) -> int:
+        """Mark the ball in play as not to be used, or, until it has been in play for REACTION, the one before.
+
+        Returns its number, 0 for none.
+        """
+        seen = [episode for episode in self.following if now - episode.started >= REACTION]
+        for episode in seen:
             episode.discarded = True
+        unseen = len(self.following) - len(seen)
+        return seen[0].number if seen else self.counts.balls - unseen
 
     def track(self, number: int) -> np.ndarray:
         """(n, 4) t [s], x, y, z [m] of an episode's incoming ball until it was played; in ``on_episode`` only."""

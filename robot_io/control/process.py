@@ -351,7 +351,7 @@ class Control:
                 case messages.Reset():
                     self.bridge.reset(now)
                 case messages.Discard():
-                    self.bridge.discard(now)
+                    self._send(messages.Discarded(self.bridge.discard(now)))
                 case messages.Jog(step, share, pulled):
                     self.bridge.jog(np.array(step), share, pulled)
                 case messages.Trace():

@@ -212,9 +212,12 @@ class LockStep:
 
         Raises RefusedError.
         """
-        for action in (self.arm.motors_on, self.arm.start_rapid, self.arm.start_egm):
+        for action in (self.arm.motors_on, self.arm.start_rapid):
             with suppress(ArmStateError):  # it is so already
                 action()
+        self.run(0.2)  # an arm that still brakes cannot start EGM
+        if not self.arm.egm_is_running:
+            self.arm.start_egm()
         self.run(2.5, lambda: self.bridge.gate.settled)
         self.run(1.0)
         if self.axes.fault:

@@ -177,6 +177,11 @@ class World:
         self.data.qpos[self._q[arm]], self.data.qvel[self._v[arm]] = self.home[arm], 0.0
         mujoco.mj_forward(self.model, self.data)
 
+    def hold(self, joint: int, place: float) -> None:
+        """Puts a joint to a place, at rest: an obstacle is there."""
+        self.data.qpos[self._q[joint]], self.data.qvel[self._v[joint]] = place, 0.0
+        mujoco.mj_forward(self.model, self.data)
+
     def park(self) -> None:
         """Takes the ball out of play."""
         self._place(PARKED, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

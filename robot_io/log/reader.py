@@ -18,9 +18,9 @@ from robot_io.contract import Contract
 from robot_io.log.messages import Action, Ball, Command, Event, Joints, Level, LogError, Observation, Tick
 from robot_io.log.scan import Fault, Scan
 from robot_io.log.topics import EVENT, NANO, Messages, NumbersTopic, Topic, topics
-from robot_io.log.writer import FORMAT, FORMAT_VERSION, robot_of
+from robot_io.log.writer import FORMAT, FORMAT_VERSION, parts, robot_of
 
-PIECE = 2_000_000  # messages of one piece of ``stream``: some forty minutes
+PIECE = 200_000  # messages of one piece of ``stream``: some five minutes
 
 
 @dataclass(frozen=True)
@@ -98,11 +98,13 @@ class SessionLog:
                 found[number] = Episode(
                     number, start, event.time, details["outcome"], details["reward"], before | details
                 )
+            elif event.name == "discard" and (number := json.loads(event.text)["episode"]) in found:
+                found[number].details["discarded"] = True
         return tuple(found.values())
 
 
 def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
-    """Reads a whole log; every checksum is checked.
+    """Reads one file of a log into memory; every checksum is checked.
 
     With ``salvage`` a damaged or unfinished file gives what is sound of it, and ``faults`` says what is not. Without,
     it is an error that says where the file is damaged and how much can be had.
@@ -117,11 +119,14 @@ def read(path: str | os.PathLike, salvage: bool = False) -> SessionLog:
 def stream(path: str | os.PathLike, salvage: bool = False, most: int = PIECE) -> Iterator[SessionLog]:
     """Reads a log piece by piece, for sessions that do not fit into memory: each has about ``most`` messages.
 
+    Files that follow ``path`` in a long session (``writer.parts``) are read as well.
+
     Pieces follow each other without gaps or overlap, and there is at least one. An episode may begin in one piece and
     end in another. The last piece has all metadata, attachments and faults. Raises as ``read``: damage is found where
     it is, after the pieces before it, or, where only the whole file's checksum shows it, before the last piece.
     """
-    return _pieces(path, salvage, most)
+    for part in parts(path):
+        yield from _pieces(part, salvage, most)
 
 
 def _pieces(path: str | os.PathLike, salvage: bool, most: int | None) -> Iterator[SessionLog]:

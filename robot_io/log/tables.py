@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import csv
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import fields
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +20,17 @@ GAP = 0.25  # [s] without a sample, after which a ball of the same number is ano
 SHORTEST = 2  # samples of a trajectory that is worth a row
 
 
-def export(log: SessionLog, folder: str | Path) -> list[Path]:
-    """Writes the tables of a log into ``folder``, each complete or not at all, and returns their paths.
+TABLES = {
+    "ball.csv": "session,trajectory,t,x,y,z",
+    "command.csv": "t,joint,velocity",
+    "state.csv": "t,joint,position",
+    "events.csv": "t,level,name,text",
+    "ticks.csv": "tick,t,lateness,policy_seconds,ball_age,gantry_age,arm_age",
+}
+
+
+def export(log: Iterable[SessionLog], folder: str | Path) -> tuple[list[Path], int]:
+    """Writes the tables of a log's pieces into ``folder``, each complete or not at all; their paths, and balls in them.
 
     ball.csv     session,trajectory,t,x,y,z                what ``mjx-tt fit-human`` reads
     command.csv  t,joint,velocity                          as sent to the robot
@@ -26,34 +38,41 @@ def export(log: SessionLog, folder: str | Path) -> list[Path]:
     events.csv   t,level,name,text
     ticks.csv    tick,t,lateness,policy_seconds,ball_age,gantry_age,arm_age
     """
-    folder = Path(folder)
+    folder, pieces = Path(folder), iter(log)
+    first = next(pieces)  # of a log that cannot be read no folder is made
     folder.mkdir(parents=True, exist_ok=True)
+    balls: list[Ball] = []  # kept: a trajectory may go on in the next piece
+    with ExitStack() as stack:
+        writers = {}
+        for name, header in TABLES.items():
+            temporary = stack.enter_context(replacing(folder / name))
+            writers[name] = csv.writer(stack.enter_context(open(temporary, "w", newline="", encoding="utf-8")))
+            writers[name].writerow(header.split(","))
+        for piece in chain([first], pieces):
+            for name, rows in _rows(piece):
+                writers[name].writerows(rows)
+            balls.append(piece.ball)
+        names = [field.name for field in fields(Ball)]
+        ball = Ball(**{name: np.concatenate([getattr(b, name) for b in balls], axis=-1) for name in names})
+        found = trajectories(ball)
+        for name, indices in found:
+            times = ball.capture_time[indices] - first.start_time
+            writers["ball.csv"].writerows(
+                (first.name, name, _seconds(t), *map(_number, position))
+                for t, position in zip(times, ball.position[:, indices].T, strict=True)
+            )
+    return [folder / name for name in TABLES], len(found)
+
+
+def _rows(log: SessionLog) -> Iterator[tuple[str, Iterator[tuple]]]:
     start, commands, joints, ticks = log.start_time, log.commands, log.joints, log.ticks
-    names = log.robot.joints
     ages = (ticks.ball_age, ticks.gantry_age, ticks.arm_age)
     seconds = (ticks.time - start, ticks.lateness, ticks.policy_seconds, *ages)
-    tables = {
-        "ball.csv": ("session,trajectory,t,x,y,z", _balls(log)),
-        "command.csv": ("t,joint,velocity", _by_joint(names, commands.time - start, commands.sent)),
-        "state.csv": ("t,joint,position", _by_joint(names, joints.time - start, joints.position)),
-        "events.csv": (
-            "t,level,name,text",
-            ((_seconds(event.time - start), event.level.name.lower(), event.name, event.text) for event in log.events),
-        ),
-        "ticks.csv": (
-            "tick,t,lateness,policy_seconds,ball_age,gantry_age,arm_age",
-            ((int(tick), *map(_seconds, row)) for tick, *row in zip(ticks.tick, *seconds, strict=True)),
-        ),
-    }
-    paths = []
-    for name, (header, rows) in tables.items():
-        path = folder / name
-        with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(header.split(","))
-            writer.writerows(rows)
-        paths.append(path)
-    return paths
+    yield "command.csv", _by_joint(log.robot.joints, commands.time - start, commands.sent)
+    yield "state.csv", _by_joint(log.robot.joints, joints.time - start, joints.position)
+    events = ((_seconds(e.time - start), e.level.name.lower(), e.name, e.text) for e in log.events)
+    yield "events.csv", events
+    yield "ticks.csv", ((int(tick), *map(_seconds, row)) for tick, *row in zip(ticks.tick, *seconds, strict=True))
 
 
 def trajectories(ball: Ball) -> list[tuple[str, np.ndarray]]:
@@ -78,13 +97,6 @@ def trajectories(ball: Ball) -> list[tuple[str, np.ndarray]]:
         seen[id] += 1
         found.append((str(id) if seen[id] == 1 else f"{id}.{seen[id]}", indices))
     return found
-
-
-def _balls(log: SessionLog) -> Iterator[tuple]:
-    for name, indices in trajectories(log.ball):
-        times = log.ball.capture_time[indices] - log.start_time
-        for t, position in zip(times, log.ball.position[:, indices].T, strict=True):
-            yield (log.name, name, _seconds(t), *map(_number, position))
 
 
 def _by_joint(names: tuple[str, ...], times: np.ndarray, values: np.ndarray) -> Iterator[tuple]:

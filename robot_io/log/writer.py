@@ -9,7 +9,7 @@ import os
 import platform
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ FORMAT = "mjx-tt session log"
 FORMAT_VERSION = 1
 SUFFIX = ".mcap"
 UNFINISHED = ".mcap.part"
+LARGEST_FILE = 128 * 1024 * 1024  # bytes after which a session goes on in another file: some half an hour
 CHUNK_SIZE = 64 * 1024  # bytes; a recorder's flushes usually end a chunk earlier
 CONTRACT = "contract"  # key of the session's metadata: another robot's contract as JSON; the paper's has none
 FORBIDDEN = frozenset('/\\:*?"<>|\0')  # in a file's name, somewhere
@@ -39,6 +40,7 @@ class Session:
     """Start data of a recorder, all of it ready to be written.
 
     folder, name     the file is folder/name.mcap, and folder/name.mcap.part until it is finished
+    part             of the session; from the second on the file is folder/name.002.mcap and so on
     metadata         entries of the MCAP metadata record "session"
     attachments      files kept whole, by name
     clock_offset_ns  added to times of the control process's clock gives nanoseconds since 1970
@@ -49,14 +51,33 @@ class Session:
     metadata: dict[str, str]
     attachments: dict[str, bytes]
     clock_offset_ns: int
+    part: int = 1
 
     @property
     def path(self) -> Path:
-        return self.folder / f"{self.name}{SUFFIX}"
+        return part_of(self.folder / f"{self.name}{SUFFIX}", self.part)
 
     @property
     def unfinished(self) -> Path:
-        return self.folder / f"{self.name}{UNFINISHED}"
+        return self.path.with_suffix(UNFINISHED)
+
+    def following(self) -> Session:
+        """The session's next file."""
+        return replace(self, part=self.part + 1, metadata=self.metadata | {"part": str(self.part + 1)})
+
+
+def part_of(path: Path, part: int) -> Path:
+    """File of a session's part, whose first is ``path``."""
+    return path if part == 1 else path.with_suffix(f".{part:03d}{SUFFIX}")
+
+
+def parts(path: str | os.PathLike) -> list[Path]:
+    """The finished files of a session whose first is ``path``, in order; of a single file itself."""
+    first = Path(path)
+    found = [first]
+    while (following := part_of(first, len(found) + 1)).exists():
+        found.append(following)
+    return found
 
 
 def session(
@@ -142,10 +163,18 @@ def checksum(name: str, entries: Mapping[str, str]) -> str:
 class SessionWriter:
     """Writes one session. Not for the control thread: it encodes, compresses and waits for the disk.
 
-    Raises OSError when the file cannot be made or the disk is full.
+    A file that has grown to ``largest`` bytes is finished, and the session goes on in the next one. Each is a sound log
+    by itself. Raises OSError when a file cannot be made or the disk is full.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, largest: int = LARGEST_FILE) -> None:
+        self._first, self._largest = session.path, largest
+        robot = robot_of(session.metadata, session.name)
+        self._topics = topics(robot)
+        self._view = view.View(Frame(*map(tuple, json.loads(session.metadata.get("robot_base", "[]")))), robot)
+        self._open(session)
+
+    def _open(self, session: Session) -> None:
         self._session = session
         self._end: End | None = None
         self._unflushed = False
@@ -162,9 +191,7 @@ class SessionWriter:
             media_type = "application/octet-stream" if b"\0" in content else "text/plain"
             self._writer.add_attachment(start, start, name, media_type, content)
         schemas: dict[str, int] = {}
-        self._channels = {}
-        robot = robot_of(session.metadata, session.name)
-        self._topics = topics(robot)
+        self._channels: dict[str, int] = {}
         for topic in (*self._topics.values(), *view.TOPICS.values()):
             schema_name = topic.message.DESCRIPTOR.full_name
             if schema_name not in schemas:
@@ -172,7 +199,6 @@ class SessionWriter:
             self._channels[topic.name] = self._writer.register_channel(
                 topic.name, "protobuf", schemas[schema_name], topic.metadata
             )
-        self._view = view.View(Frame(*map(tuple, json.loads(session.metadata.get("robot_base", "[]")))), robot)
         self._add_message(self._view.scene(float(session.metadata["start_time"])))
         self._file.flush()
 
@@ -187,6 +213,10 @@ class SessionWriter:
             for encoded in (*encode(record, self._topics), *self._view.encode(record)):
                 self._add_message(encoded)
         self._unflushed = True
+        if self._file.tell() >= self._largest and not self._end:
+            self._end = End(0, 0)
+            self.finish()
+            self._open(self._session.following())
 
     def flush(self) -> None:
         """Ends the chunk and brings everything so far to the disk. Raises OSError, also for a file that is gone."""
@@ -199,7 +229,10 @@ class SessionWriter:
             self._unflushed = False
 
     def finish(self, malformed: int = 0) -> Path:
-        """Completes the file and gives it its name; ``malformed`` records were refused by ``write``."""
+        """Completes the file and gives it its name; ``malformed`` records were refused by ``write``.
+
+        Returns the session's first file.
+        """
         end = self._end or End(0, 0)
         self._add_metadata(
             "end",
@@ -221,7 +254,7 @@ class SessionWriter:
             raise FileExistsError(f"{path} appeared meanwhile; the log is complete as {self._session.unfinished}")
         os.rename(self._session.unfinished, path)
         sync_folder(path.parent)
-        return path
+        return self._first
 
     def _add_message(self, encoded: Encoded) -> None:
         published, logged = self._nanoseconds(encoded.publish_time), self._nanoseconds(encoded.log_time)

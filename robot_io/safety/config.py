@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 from ballmodel.io.ranges import Within
 from robot_io.contract import JOINT_UNITS, N_JOINTS, Contract
@@ -17,7 +17,8 @@ def _each(slide: float, hinge: float, units: tuple[str, ...] = JOINT_UNITS) -> t
 
 
 # Of a slide [m] and of a hinge [rad].
-_OVERSHOOT, _STILL, _FOLLOWING_ERROR = (0.03, 0.06), (0.02, 0.05), (0.06, 0.2)
+_OVERSHOOT, _STILL, _FOLLOWING_ERROR = (0.03, 0.09), (0.02, 0.05), (0.06, 0.2)
+_DRIVE_DELAY = (0.0645, 0.071)  # [s], the paper's
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class SafetyConfig:
     The defaults are the paper's robot's; ``of`` has those of another one.
 
     speed_scale      (0, 1], share of every requested velocity and of every velocity limit
+    head_room        (0, 1], share of the drives' highest speeds that is commanded: the rest is for their corrections
     table_margin     smallest gap of arm and paddle to the table and to everything under it
     self_margin      smallest gap of the watched pairs of the robot's own parts
     floor_margin     smallest gap of arm and paddle to the floor; the rails of the gantry end 0.15 m above it
@@ -39,6 +41,8 @@ class SafetyConfig:
     overspeed        measured speed over its limit that is a fault; ``monitor.UNSCALED`` is added to a scaled limit
     following_error  distance (8,) of a measured position from where the reference was between ``delay`` before
     delay            shortest and longest time from a command to the measurement of its effect
+    drive_delay      (8,) time from a command to the motion that it makes, lag included
+    drive_delay_error  by which the delay of the arm and that of the linear axes may be wrong, each
     following_ticks  commands in a row after which a following error is a fault
     late             longest time between two commands: so long the robot may go on with the last one, and that way and
                      braking after it are proven clear as well; more is a fault
@@ -47,6 +51,7 @@ class SafetyConfig:
     """
 
     speed_scale: Annotated[float, Within(0.001, 1.0)] = 1.0
+    head_room: Annotated[float, Within(0.5, 1.0)] = 0.9
     table_margin: Annotated[float, Within(0.01, 0.5, "m")] = 0.02
     self_margin: Annotated[float, Within(0.01, 0.5, "m")] = 0.02
     floor_margin: Annotated[float, Within(0.15, 0.7, "m")] = 0.17
@@ -58,6 +63,8 @@ class SafetyConfig:
     overspeed: Annotated[float, Within(1.05, 2.0)] = 1.5
     following_error: tuple[Annotated[float, Within(0.005, 0.4)], ...] = _each(*_FOLLOWING_ERROR)
     delay: tuple[Annotated[float, Within(0.0, 0.3, "s")], Annotated[float, Within(0.0, 0.3, "s")]] = (0.0, 0.2)
+    drive_delay: tuple[Annotated[float, Within(0.0, 0.3, "s")], ...] = _each(*_DRIVE_DELAY)
+    drive_delay_error: Annotated[float, Within(0.0, 0.05, "s")] = 0.017
     following_ticks: Annotated[int, Within(1, 6)] = 3
     late: Annotated[float, Within(0.02, 0.1, "s")] = 0.03
     stale_arm: Annotated[float, Within(0.01, 0.1, "s")] = 0.05
@@ -68,11 +75,15 @@ class SafetyConfig:
     @classmethod
     def of(cls, contract: Contract) -> SafetyConfig:
         """The defaults for a contract's robot."""
-        overshoot, still, following = (_each(*pair, contract.units) for pair in (_OVERSHOOT, _STILL, _FOLLOWING_ERROR))
-        return cls(overshoot=overshoot, still=still, following_error=following)
+        names, pairs = (
+            ("overshoot", "still", "following_error", "drive_delay"),
+            (_OVERSHOOT, _STILL, _FOLLOWING_ERROR, _DRIVE_DELAY),
+        )
+        values: dict[str, Any] = {n: _each(*pair, contract.units) for n, pair in zip(names, pairs, strict=True)}
+        return cls(**values)
 
     def __post_init__(self) -> None:
-        for name in ("speed_scale", "escape_speed"):
+        for name in ("speed_scale", "head_room", "escape_speed"):
             if not 0.0 < getattr(self, name) <= 1.0:
                 raise ValueError(f"{name}: expected more than 0 and at most 1, got {getattr(self, name)}")
         for name in ("table_margin", "self_margin", "floor_margin"):
@@ -82,11 +93,13 @@ class SafetyConfig:
         for name in ("blade_speed", "blade_acceleration", "overspeed", "late", "following_ticks", *ages):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a positive, finite number, got {getattr(self, name)}")
-        each = {name: getattr(self, name) for name in ("still", "overshoot", "following_error")}
+        each = {name: getattr(self, name) for name in ("still", "overshoot", "following_error", "drive_delay")}
         lengths = {len(values) for values in each.values()}
         count = N_JOINTS if N_JOINTS in lengths else min(lengths)
         for name, values in each.items():
             if len(values) != count or not all(0.0 < v < math.inf for v in values):
                 raise ValueError(f"{name}: expected {count} positive numbers, got {values}")
+        if not 0.0 <= self.drive_delay_error < math.inf:
+            raise ValueError(f"drive_delay_error: expected 0 s or more, got {self.drive_delay_error}")
         if not 0.0 <= self.delay[0] < self.delay[1] < math.inf:
             raise ValueError(f"delay: expected a shortest and a longer time [s], got {self.delay}")

@@ -32,6 +32,21 @@ class Cause(Enum):
     INTERNAL = "internal"  # a check of our own results failed
 
 
+# Of the tracker, the network, the computer and the operator: they say nothing about the policy that played.
+NOT_THE_POLICYS = frozenset(
+    {
+        Cause.ESTOP,
+        Cause.OPERATOR,
+        Cause.STALE_ARM,
+        Cause.STALE_AXES,
+        Cause.STALE_TRACKER,
+        Cause.CLOCK,
+        Cause.STALE_POLICY,
+        Cause.TIMING,
+    }
+)
+
+
 @dataclass(frozen=True)
 class Fault:
     """One cause with the time at which it was first seen [s] and a sentence for the operator."""

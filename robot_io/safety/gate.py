@@ -90,16 +90,9 @@ class SafetyGate:
                 f"{len(config.still)} joints: they must be one robot's"
             )
         self.period = period
-        scale = config.speed_scale
-        self.limits = (
-            limits
-            if scale == 1.0
-            else replace(
-                limits,
-                velocity=tuple(scale * v for v in limits.velocity),
-                policy_velocity=tuple(scale * v for v in limits.policy_velocity),
-            )
-        )
+        velocity = tuple(config.speed_scale * config.head_room * v for v in limits.velocity)
+        asked = (min(config.speed_scale * p, v) for p, v in zip(limits.policy_velocity, velocity, strict=True))
+        self.limits = replace(limits, velocity=velocity, policy_velocity=tuple(asked))
         self._v_max, self._a = np.array(self.limits.velocity), np.array(limits.acceleration)
         self._step = self._a * period
         # Beyond the limiter's own margin by this the limiter still leads back within a period or two.
@@ -112,6 +105,7 @@ class SafetyGate:
         self._touch = np.minimum(self._margin, TOUCH)
         self._inside = np.zeros(self._margin.shape, bool)  # gaps that have been below their margin since arming
         self._still = np.array(config.still)
+        self._leads = leads(config, self.geometry.units)
         self._monitor = FeedbackMonitor(limits, self.geometry, config)
         self._stop = StopReference(limits, config, self.geometry.units)
         self._latch = FaultLatch()
@@ -446,6 +440,8 @@ class SafetyGate:
         ways = between(way, late)
         if self.geometry.first_too_close(ways, self._margin, SLACK) is not None:
             return False
+        if self.geometry.first_too_close(self._true_ways(way, late), self._touch, SLACK) is not None:
+            return False
         if self._deviation.any():  # the robot goes beside its reference: it must not touch anything there
             if self.geometry.first_too_close(ways + self._deviation[:, None], self._touch, SLACK) is not None:
                 return False
@@ -456,6 +452,21 @@ class SafetyGate:
             gaps = self.geometry.gaps(way)[self._inside]
             return bool((gaps[:, -1] > gaps[:, 0]).all())
         return True
+
+    def _true_ways(self, way: np.ndarray, late: np.ndarray) -> np.ndarray:
+        """Where the robot itself goes, (8, M), while its drives follow two ways (8, N) of references with their delays:
+        along the first way and back along the second, with the delays as far apart as they may be, either way."""
+        now, period = self._last or 0.0, self.period
+        before, passed = self._monitor.past(now, float(self._leads.max()) + period)
+        braking = period * np.arange(way.shape[1] - 1)
+        ways = []
+        for lead in self._leads:
+            for gap, references in ((period, way), (self.config.late, late)):
+                times = np.concatenate([before, [now], now + gap + braking])
+                values = np.concatenate([passed, references], axis=1)
+                there = np.array([np.interp(times + a, times, row) for a, row in zip(lead, values, strict=True)])
+                ways.append(there if references is way else there[:, ::-1])
+        return np.concatenate(ways, axis=1)
 
     def braking_way(self, velocity: np.ndarray) -> np.ndarray:
         """References (8, N) now and after each period until rest: one period at ``velocity``, then braking."""
@@ -541,6 +552,14 @@ class SafetyGate:
             sentence = self._monitor.following_error(self._unexplained)
             if sentence:
                 self.fault(Cause.FOLLOWING_ERROR, sentence, now)
+
+
+def leads(config: SafetyConfig, units: tuple[str, ...]) -> np.ndarray:
+    """Times (2, n) [s] by which joints may be ahead of the slowest one: linear axes late and the arm early, and the
+    other way round."""
+    apart = np.where([unit == "m" for unit in units], config.drive_delay_error, -config.drive_delay_error)
+    delays = np.maximum(np.array(config.drive_delay) + np.stack([apart, -apart]), 0.0)
+    return delays.max(axis=1, keepdims=True) - delays
 
 
 def between(way: np.ndarray, late: np.ndarray) -> np.ndarray:

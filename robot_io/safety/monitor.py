@@ -50,6 +50,13 @@ class FeedbackMonitor:
         self._past.append((time, reference))
         self._forget(time - self._config.delay[1] - EARLY)
 
+    def past(self, now: float, span: float) -> tuple[np.ndarray, np.ndarray]:
+        """Times (N,) and references (8, N) of the last ``span`` seconds before ``now``, and the one before them."""
+        earlier = [(time, reference) for time, reference in self._past if time < now]
+        first = next((i for i, (time, _) in enumerate(earlier) if time > now - span), len(earlier))
+        kept = earlier[max(first - 1, 0) :]
+        return np.array([time for time, _ in kept]), np.array([r for _, r in kept]).reshape(-1, len(self._joints)).T
+
     def conditions(self, position: np.ndarray, velocity: np.ndarray) -> dict[Cause, str]:
         """Faults of a measurement of finite numbers, each (8,); an empty sentence: nothing."""
         return {Cause.LIMIT: self._limit(position, velocity), Cause.CLEARANCE: self.contact(position)}

@@ -29,7 +29,7 @@ from robot_io.log import messages as records
 from robot_io.log import scan
 from robot_io.log.__main__ import Frames
 from robot_io.log.messages import LogError
-from robot_io.log.writer import sample_clock_offset
+from robot_io.log.writer import SessionWriter, parts, sample_clock_offset, session
 from tests.support.paths import ROOT
 
 NANO = 1_000_000_000
@@ -253,6 +253,30 @@ def test_the_pieces_of_a_stream_are_the_whole(recording):
             np.testing.assert_array_equal(np.concatenate(parts, axis=-1), getattr(getattr(whole, series), name))
     assert sum((piece.events for piece in pieces), ()) == whole.events
     assert "end" not in pieces[0].metadata and pieces[-1].metadata == whole.metadata
+
+
+def test_a_long_session_goes_on_in_more_files(recording, tmp_path):
+    """Each is a sound log by itself, and together they are what one file would be; so are the tables."""
+    made = session(tmp_path, "session", {}, {"robot.yaml": "rate: 75"}, EPOCH, START, False)
+    writer = SessionWriter(made, largest=30_000)
+    for record in (log.episode_start(START, 1), *(r for k in range(300) for r in tick(k, START + k / 75))):
+        writer.write(record.pack())
+    writer.write(records.End(3, 0).pack())
+    first = writer.finish()
+    files = parts(first)
+    assert first == tmp_path / "session.mcap" and files[1].name == "session.002.mcap" and len(files) > 2
+    assert sorted(files) == sorted(tmp_path.iterdir())
+    assert all(log.check(file).state == "sound" for file in files)
+    assert sum(log.read(file).ticks.tick.size for file in files) == 300
+    pieces = list(log.stream(first))
+    assert [piece.metadata["session"].get("part", "1") for piece in pieces] == [str(i + 1) for i in range(len(files))]
+    assert np.concatenate([piece.ticks.tick for piece in pieces]).tolist() == list(range(300))
+    assert pieces[-1].dropped == 3 and pieces[-1].attachments == {"robot.yaml": b"rate: 75"}
+    whole, _ = log.export([log.read(recording)], tmp_path / "whole")
+    parted, _ = log.export(log.stream(first), tmp_path / "parted")
+    for one, other in zip(whole, parted, strict=True):
+        if one.name != "events.csv":
+            assert one.read_text() == other.read_text(), one.name
 
 
 def test_a_stream_ends_where_the_file_is_damaged(recording, tmp_path):
@@ -532,8 +556,8 @@ def test_cut_files_give_their_complete_chunks(recording, tmp_path):
 
 
 def test_the_tables(recording, tmp_path):
-    session = log.read(recording)
-    paths = log.export(session, tmp_path / "tables")
+    paths, number = log.export([log.read(recording)], tmp_path / "tables")
+    assert number == 8
     assert sorted(os.listdir(tmp_path / "tables")) == sorted(path.name for path in paths)
     balls = read_balls(tmp_path / "tables" / "ball.csv")
     assert balls.sessions == ("session",)

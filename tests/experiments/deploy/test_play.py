@@ -100,26 +100,6 @@ def test_a_virtual_player_rallies_in_real_time(policy, tmp_path):
     assert [event.text for event in session.events if event.name == "policy"][0].startswith("policy comp")
 
 
-@pytest.mark.realtime
-def test_ctrl_c_ends_with_the_summary(policy, tmp_path):
-    command = [sys.executable, "-m", "experiments.cli", "run", str(policy), "--robot", "rig", "--log", str(tmp_path)]
-    pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    with subprocess.Popen(command, cwd=ROOT, start_new_session=True, **pipe) as running:
-        before = []
-        for line in running.stdout:
-            before.append(line)
-            if line.startswith("ball 1:"):
-                break
-        if running.poll() is None:
-            os.killpg(running.pid, signal.SIGINT)  # the whole group, as a terminal does
-        text = running.stdout.read()
-    assert running.returncode == 130, "".join(before) + text
-    assert "return rate" in text and "linear axes" in text and "stopped by Ctrl-C" in text
-    (summary,) = (json.loads(path.read_text()) for path in tmp_path.glob("*.json"))
-    assert summary["episodes"] >= 1 and summary["egm"]["replies"] > 100
-    assert len(log.read(summary["log"]).episodes) >= 1
-
-
 def as_in_a_terminal():
     """Signals end a program there; nohup, or an &, under which tests may run, passes on that they are ignored."""
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
@@ -156,16 +136,47 @@ def states(session_log):
     return [(text["to"], text["why"]) for text in texts]
 
 
+def apart(pid):
+    """The control process of a running play: it is not of its owner's group."""
+    (found,) = (child for child in children(pid) if os.getpgid(child) != os.getpgid(pid))
+    return found
+
+
+def summary_of(folder):
+    (summary,) = (json.loads(path.read_text()) for path in folder.glob("*.json"))
+    assert summary["episodes"] >= 1 and summary["egm"]["replies"] > 100
+    return summary
+
+
 @pytest.mark.realtime
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT])
-def test_a_terminal_that_closes_ends_the_play_in_order(policy, tmp_path, number):
-    """The owner dies at once; the control process is not of its group, brakes and ends its log."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_with_the_summary(policy, tmp_path, number):
+    """Ctrl-C, an orderly shutdown, a terminal that closes."""
+    with started(policy, tmp_path) as running:
+        os.killpg(running.pid, number)  # the whole group, as a terminal does
+        text = running.stdout.read()
+    assert running.returncode == 130, text
+    assert "return rate" in text and "linear axes" in text and "stopped by Ctrl-C" in text
+    assert len(log.read(summary_of(tmp_path)["log"]).episodes) >= 1
+
+
+@pytest.mark.realtime
+def test_a_play_whose_control_process_dies_keeps_its_summary(policy, tmp_path):
+    with started(policy, tmp_path) as running:
+        os.kill(apart(running.pid), signal.SIGKILL)
+        text = running.stdout.read()
+    assert running.returncode == 1 and "the control process has ended" in text, text
+    assert summary_of(tmp_path)["episodes"] >= 1
+
+
+@pytest.mark.realtime
+def test_an_owner_that_dies_ends_the_play_in_order(policy, tmp_path, number=signal.SIGQUIT):
+    """The control process is not of its group, brakes and ends its log."""
     before = set(Path("/dev/shm").glob("psm_*"))
     with started(policy, tmp_path) as running:
-        family = children(running.pid)
-        apart = [child for child in family if os.getpgid(child) != os.getpgid(running.pid)]
+        family, control = children(running.pid), apart(running.pid)
         try:
-            assert len(apart) == 1 and os.getsid(apart[0]) == apart[0]
+            assert os.getsid(control) == control
         finally:
             os.killpg(running.pid, number)
     assert running.returncode == -number

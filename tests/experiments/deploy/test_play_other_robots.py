@@ -129,7 +129,7 @@ def test_its_session_is_exported_with_its_joints(played):
 @pytest.mark.realtime
 def test_its_tables_name_its_joints(played, tmp_path):
     robot, path, _ = played
-    log.export(log.read(path), tmp_path)
+    log.export([log.read(path)], tmp_path)
     rows = [line.split(",")[1] for line in (tmp_path / "state.csv").read_text().splitlines()[1:]]
     assert tuple(dict.fromkeys(rows)) == robot.contract.joints
 

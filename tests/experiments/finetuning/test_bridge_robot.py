@@ -64,6 +64,8 @@ class Session:
                 self._report(messages.PolicySet(request.version))
             elif isinstance(request, messages.Pause):
                 bridge.paused = request.on
+            elif isinstance(request, messages.Discard):
+                self._report(messages.Discarded(bridge.discard(self.simulation.now)))
         except RefusedError as error:
             self._report(messages.Refused(request, error))
 
@@ -105,3 +107,43 @@ def test_a_ball_is_credited_to_the_policy_that_played_it(gap):
     assert session.last_requests() == [messages.Pause(True), messages.Beat(COMPUTING)]
     for number, member in credited.items():
         assert played[number] == {member}, (credited, played)
+
+
+@pytest.mark.parametrize("late", [0.1, 0.55])
+def test_a_late_discard_is_about_the_ball_that_was_seen(late):
+    """The next ball is struck soon after; it is another one's."""
+    session = Session([12.0 + 1.2 * i for i in range(20)])
+    keyboard = Nobody()
+    robot = BridgeRobot(session, None, keyboard, Nobody())
+    policy = Policy(np.ones(976), np.zeros(11), np.ones(11))
+    first = robot.play(policy, 0).summary
+    assert not robot.retracts()
+    press(keyboard, session, first.ended + late)
+    second = robot.play(policy, 1).summary
+    assert second.ball > first.ball and not second.discarded and robot.retracts() and not robot.retracts()
+    press(keyboard, session, second.ended + 0.2)
+    assert robot.retracts(0.5)  # before anybody plays on
+
+
+def test_a_discard_in_mid_play_is_about_that_ball():
+    session = Session([12.0 + 2.4 * i for i in range(20)])
+    keyboard = Nobody()
+    robot = BridgeRobot(session, None, keyboard, Nobody())
+    policy = Policy(np.ones(976), np.zeros(11), np.ones(11))
+    first = robot.play(policy, 0).summary
+    press(keyboard, session, first.started + 2.4 + 0.6)
+    second = robot.play(policy, 1).summary
+    assert second.discarded and second.unfit and not robot.retracts()
+
+
+def press(keyboard, session, time):
+    """Presses d once, at a time of the simulated clock."""
+    waiting = [time]
+
+    def pressed():
+        if not waiting or session.simulation.now < waiting[0]:
+            return None
+        waiting.clear()
+        return "d"
+
+    keyboard.pressed = pressed

@@ -421,10 +421,16 @@ def test_a_finished_run_goes_on_when_more_updates_are_asked_for(source, tmp_path
 
 
 class Person(Operator):
-    """Discards the balls of these numbers, stops after so many balls, pauses for some looks once."""
+    """Discards the balls of these numbers, some of them late, stops after so many balls, pauses for some looks once."""
 
-    def __init__(self, discards=(), stop_after: int | None = None, looks: int = 0) -> None:
+    def __init__(self, discards=(), stop_after: int | None = None, looks: int = 0, late=()) -> None:
         self.asked, self._discards, self._stop_after, self.looks = 0, set(discards), stop_after, looks
+        self._late = set(late)
+
+    def retracts(self, seconds: float = 0.0) -> bool:
+        wanted = self.asked - 1 in self._late
+        self._late.discard(self.asked - 1)
+        return wanted
 
     def discarded(self) -> bool:
         self.asked += 1
@@ -451,16 +457,33 @@ def test_discarded_balls_are_played_again_with_other_balls(source, tmp_path):
     assert len({row["trajectory"] for row in rows}) == 3 * 12 + 4
 
 
+def test_a_ball_that_is_discarded_late_is_played_again(source, tmp_path):
+    """The one before the newest, the last of an evaluation (number 3), the last of an update (number 16)."""
+    report = tune(source, tmp_path / "run", Toy(), Person(late={1, 4, 18}))
+    found = entries(tmp_path / "run")
+    kept = [entry for entry in found if not entry.discarded]
+    assert report["discarded"] == 3 and [i for i, entry in enumerate(found) if entry.discarded] == [1, 4, 18]
+    assert len(kept) == len({entry.slot for entry in kept}) == 3 * 12 + 2 * 4
+    tune(source, tmp_path / "early", Toy(), Person(discards={1, 4, 18}))
+    np.testing.assert_array_equal(last_theta(tmp_path / "run"), last_theta(tmp_path / "early"))
+
+
 def test_what_the_bridge_discards_or_the_operators_stop_ends_does_not_count(source, tmp_path):
     class Stopped(Toy):
         def play(self, *arguments) -> PlayedBall:
             played = super().play(*arguments)
             human = {5: {"human_fault": "net"}, 6: {"human_fault": "long"}}  # replayed by themselves
-            bad = (human | {2: {"fault": "stopped"}, 3: {"discarded": True}}).get(len(self.played), {})
+            others = {7 + i: {"fault": cause} for i, cause in enumerate(others_faults)}  # tracker, network, operator
+            own = {20: {"fault": "clearance"}, 21: {"fault": "arm_not_ready"}}
+            bad = (human | others | own | {2: {"fault": "stopped"}, 3: {"discarded": True}}).get(len(self.played), {})
             return PlayedBall(replace(played.summary, **bad), played.trajectory)
 
+    others_faults = ("stale_tracker", "clock", "stale_arm", "stale_axes", "estop", "operator", "timing", "stale_policy")
     report = tune(source, tmp_path / "run", Stopped())
-    assert report["discarded"] == 4 and report["before"]["balls"] == 4 and not report["before"]["faults"]
+    assert report["discarded"] == 4 + len(others_faults)
+    assert report["before"]["balls"] == 4 and not report["before"]["faults"]
+    kept = [entry for entry in entries(tmp_path / "run") if not entry.discarded]
+    assert [entry.summary.fault for entry in kept if entry.summary.fault] == ["clearance", "arm_not_ready"]
 
 
 def test_stop_and_continue_and_pause(source, tmp_path):
