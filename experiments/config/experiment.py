@@ -74,6 +74,9 @@ class Task(Section):
     """[Hz] of the physics, a whole multiple of control_rate."""
     max_steps: Count = 200
     """Control steps after which an episode ends."""
+    contact_ends_episode: bool = False
+    """The robot stops, as the real one, where it touches the table or itself; false: it passes through, and the term
+    collision counts the contact. First-order gradients climb past it either way."""
     rewards: Literal["sim", "real"] | Rewards = "sim"
     """The paper's weights by name, or a mapping that changes single ones."""
     observations: dict[str, Finite] = {}
