@@ -141,8 +141,8 @@ class Config(Section):
     balls: str | dict[str, Any]
     """A distribution's name such as player3/M1 or narrow, the path of a YAML, or the YAML's content."""
     model: str | dict[str, Any] = {}
-    """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise, ranges or
-    prior: what a laboratory that has measured nothing may expect."""
+    """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise: ranges,
+    prior (what a laboratory that has measured nothing may expect) or dynamics (of those the table, paddle, drives)."""
     robot: str | dict[str, Any] | None = None
     """A folder with YAML and MJCF of your own robot (docs/how-to/bring-your-own-robot.md), that YAML, its content, or
     the name of a robot that comes with the program; null: the paper's."""

@@ -155,7 +155,7 @@ def random_histories(policy: Policy, count: int, seed: int) -> np.ndarray:
 def onnx_model(policy: Policy, robot: contract.Contract = contract.PAPER) -> onnx.ModelProto:
     """The policy with its normaliser as a graph of standard operators: "history" (8, 11, B) to "action" (8, B).
 
-    Its ``metadata_props`` say what the numbers are: names, units, the scale of each action and the rate; whole as JSON
+    Its metadata say what the numbers are: names, units, the scale of each action and the rate; whole as JSON
     under ``contract``.
     """
     parameters = policy.parameters
