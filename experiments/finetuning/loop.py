@@ -338,6 +338,8 @@ def _open(run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, 
 
 
 def _check(folder: Path, found: dict[str, Any], wanted: dict[str, Any], settings: FineTuning) -> None:
+    # A run that an earlier version began has the defaults of keys that came later.
+    found = found | {"settings": FineTuning().model_dump(mode="json") | (found.get("settings") or {})}
     changeable = {"source"}  # the policy itself is compared
     if settings.step.schedule.kind == "constant":
         changeable.add("settings.updates")

@@ -329,6 +329,17 @@ def _plain(entry: Entry) -> dict:
     return asdict(entry) | {"trajectory": entry.trajectory.tolist()}
 
 
+def test_a_run_of_an_earlier_version_goes_on(source, tmp_path):
+    tune(source, tmp_path / "run", Toy(), updates=1)
+    file = tmp_path / "run" / loop.SETTINGS
+    recorded = yaml.safe_load(file.read_text())
+    del recorded["settings"]["observation_statistics"]
+    file.write_text(yaml.safe_dump(recorded))
+    tune(source, tmp_path / "run", Toy(), updates=2)
+    with pytest.raises(RunError, match="observation_statistics"):
+        tune(source, tmp_path / "run", Toy(), updates=2, observation_statistics="merged")
+
+
 class Interrupted(Exception):
     """Stands for a power cut."""
 
