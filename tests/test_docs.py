@@ -133,6 +133,16 @@ def test_every_statement_of_the_paper_has_a_place_and_a_class():
     assert {kind: int(count) for kind, count in counted.items()} == found
 
 
+def test_every_difference_of_a_key_says_what_was_measured():
+    page = text_of(ROOT / "docs/reference/paper.md")
+    table = page.partition("## Differences from the paper")[2].partition("\n## ")[0]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines() if line.startswith("| `")]
+    assert len(rows) > 20
+    for key, paper, default, *effect in rows:
+        assert key and paper and default and len(effect) == 1, key
+        assert "not measured" in effect[0] or "row above" in effect[0] or re.search(r"\d", effect[0]), key
+
+
 def test_names_in_docstrings_exist():
     missing = [
         f"{path.relative_to(ROOT)}:{line}: `{code}`: {word}"

@@ -20,10 +20,11 @@ _Loader.add_implicit_resolver(
 
 
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict:
-    keys = [loader.construct_object(key, deep=True) for key, _ in node.value]
+    nodes = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]  # <<: *name, which keys change
+    keys = [loader.construct_object(key, deep=True) for key in nodes]
     for i, key in enumerate(keys):
         if key in keys[:i]:
-            mark = node.value[i][0].start_mark
+            mark = nodes[i].start_mark
             raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", mark)
     return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
 

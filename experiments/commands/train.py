@@ -19,6 +19,7 @@ app = options.command(
   mjx-tt train quickstart.yaml
   mjx-tt train narrow.yaml medium.yaml --seeds 0,1,2        six runs: runs/narrow/seed0/ ... runs/medium/seed2/
   mjx-tt train player3_m2.yaml --seeds 0,1,2 --select       and name the best seed, in simulation
+  mjx-tt train player3_m2.yaml --seeds 0,1,2 --select --robot robot.yaml   the same on the robot, as the paper
   mjx-tt train my.yaml --set training.updates=500 --set balls=player1/M0
   mjx-tt train my.yaml --seeds 0,1,2,3 --site cluster.yaml   on a cluster's nodes: docs/how-to/use-a-cluster.md
   srun mjx-tt train my.yaml --distributed auto               one training by all processes of a SLURM job
@@ -46,6 +47,9 @@ def train(
         tuple[int, ...], option("0,1,2", "one run per seed, in a folder of its own", converter=_parse_seeds)
     ] = (),
     select: Annotated[bool, Parameter(help="play 50 episodes per seed and mark the best (needs --seeds)")] = False,
+    robot: Annotated[
+        str | None, option("YAML|rig|lockstep", "where --select plays (default: in the simulation of the training)")
+    ] = None,
     out: options.RunsFolder = "runs",
     overrides: options.Overrides = (),
     ranks: options.DistributedOptions = options.ALONE,
@@ -62,6 +66,10 @@ def train(
         raise ConfigError(f"--site {site}: with --distributed each process is started by you, or by srun")
     if select and not seeds:
         raise ConfigError("--select chooses among seeds: give them with --seeds, such as --seeds 0,1,2")
+    if robot is not None and not select:
+        raise ConfigError(f"--robot {robot}: plays the choice among seeds; give --select")
+    if robot is not None:
+        options.ROBOT.check(robot)
     paths = [options.find_shipped(name, config.shipped()) for name in experiments]
     configs = [(str(path), config.load(path, overrides)) for path in paths]
     elsewhere = options.load_site(site, processes=ranks.processes, devices=ranks.devices)
@@ -88,6 +96,9 @@ def train(
     with interruptible():
         ok = sweep.run_all(planned, screen, Path(out), Workers(side_by_side, elsewhere, str(site)))
         if select and ok:
+            from experiments.study.target_domain import selection_on_robot
+
             for name in dict.fromkeys(job.config.name for job in planned):
-                sweep.select(Path(out) / name, [job for job in planned if job.config.name == name], screen)
+                seeded = [job for job in planned if job.config.name == name]
+                sweep.select(Path(out) / name, seeded, screen, robot, selection_on_robot.score)
     return 0 if ok else 1

@@ -90,15 +90,16 @@ def experiment(config: Config, where: str) -> Experiment:
 
 
 def with_prior(data: dict[str, Any], robot: Robot, where: str) -> dict[str, Any]:
-    """A model's plain data with the ranges of the prior in place of its name. Raises ConfigError."""
-    if data.get("randomise") != prior.NAME:
+    """A model's plain data with the named ranges of the prior in place of their name. Raises ConfigError."""
+    given = data.get("randomise")
+    if not isinstance(given, str) or given not in prior.NAMED:
         return data
     if robot.contract.joints != JOINT_NAMES:
         raise ConfigError(
             f"{where}: model.randomise: expected a range for each parameter, as in {{ball.paddle.restitution: "
-            f"[0.83, 1.0]}}, got {prior.NAME}, whose ranges are of the paper's robot alone"
+            f"[0.83, 1.0]}}, got {given}, whose ranges are of the paper's robot alone"
         )
-    return data | {"randomise": dict(prior.PRIOR)}
+    return data | {"randomise": dict(prior.NAMED[given])}
 
 
 def believed(model: dict[str, Any]) -> ModelFile:

@@ -74,6 +74,9 @@ class Task(Section):
     """[Hz] of the physics, a whole multiple of control_rate."""
     max_steps: Count = 200
     """Control steps after which an episode ends."""
+    contact_ends_episode: bool = False
+    """The robot stops, as the real one, where it touches the table or itself; false: it passes through, and the term
+    collision counts the contact. First-order gradients climb past it either way."""
     rewards: Literal["sim", "real"] | Rewards = "sim"
     """The paper's weights by name, or a mapping that changes single ones."""
     observations: dict[str, Finite] = {}
@@ -138,8 +141,8 @@ class Config(Section):
     balls: str | dict[str, Any]
     """A distribution's name such as player3/M1 or narrow, the path of a YAML, or the YAML's content."""
     model: str | dict[str, Any] = {}
-    """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise, ranges or
-    prior: what a laboratory that has measured nothing may expect."""
+    """SimModel: the path of a YAML or its content, such as {sensing: {ball_noise: 0.02}}; may hold randomise: ranges,
+    prior (what a laboratory that has measured nothing may expect) or dynamics (of those the table, paddle, drives)."""
     robot: str | dict[str, Any] | None = None
     """A folder with YAML and MJCF of your own robot (docs/how-to/bring-your-own-robot.md), that YAML, its content, or
     the name of a robot that comes with the program; null: the paper's."""

@@ -34,6 +34,9 @@ class FineTuning(Shaping):
     ema_decay: EmaDecay = 0.0
     rewards: Literal["sim", "real"] | Rewards = "real"
     """The paper's weights by name, or a mapping that changes single ones; only terms measured on a robot count."""
+    observation_statistics: Literal["frozen", "merged"] = "frozen"
+    """Those of the training throughout, or with each update's observations merged into them, as the authors' library
+    does."""
     evaluation_balls: Annotated[int, Field(ge=2)] = 50
     """Balls played before the first update and again after the last, unperturbed."""
     seed: Seed = 0

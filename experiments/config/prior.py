@@ -1,4 +1,7 @@
-"""Ranges of what may be wrong of the simulation before anything is measured: ``randomise: prior`` in a model."""
+"""Ranges of what may be wrong of the simulation before anything is measured: ``randomise: prior`` in a model.
+
+``randomise: dynamics`` has those of table, paddle and drives alone: the paper randomises dynamics and gives no ranges.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ from typing import Any
 
 from robot_io.contract import JOINT_NAMES
 
-NAME = "prior"
 _LAGS = {name: (0.0, 0.04 if name.startswith("gantry") else 0.025) for name in JOINT_NAMES}  # [s]
 _ZEROS = {name: 0.007 if name.startswith("gantry") else 0.015 for name in JOINT_NAMES}  # [m], [rad]
 # What a laboratory that has measured nothing may expect: about the same measured values as those of the virtual reality
@@ -32,3 +34,9 @@ PRIOR: dict[str, Any] = {
     **{f"drives.{name}.velocity_gain": [0.93, 1.07] for name in JOINT_NAMES},
     **{f"drives.{name}.joint_offset": [-size, size] for name, size in _ZEROS.items()},
 }
+DYNAMICS = {
+    path: ends
+    for path, ends in PRIOR.items()
+    if path.startswith(("ball.paddle.", "ball.table.")) or path.endswith((".lag", ".velocity_gain"))
+}
+NAMED = {"prior": PRIOR, "dynamics": DYNAMICS}

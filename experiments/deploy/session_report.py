@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.progress import print_files
+from experiments.sparse_reward import reward_of
 from experiments.stats import t_interval, wilson
 from robot_io.control.config import RobotConfig
 from robot_io.control.episode import EpisodeSummary
@@ -59,6 +60,7 @@ def summary(
         "discarded": len(played.episodes) - len(episodes),
         "returned": returned,
         "hit": hit,
+        "selection_reward": reward_of(episodes),
     }
     if episodes:
         low, high = wilson(returned, len(episodes))

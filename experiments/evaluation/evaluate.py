@@ -14,6 +14,7 @@ from experiments.config.build import Experiment
 from experiments.evaluation import reachability
 from experiments.progress import Stage, silent
 from experiments.runs.load_policy import TrainedPolicy
+from experiments.sparse_reward import mean_reward
 from experiments.stats import wilson
 from mjx_tt.env.episode import HIT, MISSED, RETURNED
 from mjx_tt.env.evaluator import COLUMNS, Evaluator
@@ -149,12 +150,7 @@ def return_rate(result: RolloutResult) -> Rate:
 
 
 def selection_score(result: RolloutResult) -> float:
-    """``sparse_reward`` in simulation, where a robot faults when it touches itself or the table, or is not finite."""
+    """Mean sparse reward in simulation, where a robot faults when it touches itself or the table, or is not finite."""
     collision = result.terms[TERMS.index("collision")]
-    return sparse_reward(result.outcome, ~result.finite | (collision < 0))
-
-
-def sparse_reward(outcome: np.ndarray | jax.Array, fault: np.ndarray | jax.Array) -> float:
-    """The paper's reward for choosing a seed: +1 hit, +1 landed on the human's side, -2 fault; mean over episodes."""
-    score = (outcome != MISSED).astype(float) + (outcome == RETURNED)
-    return float(np.mean(np.where(fault, -2.0, score)))
+    fault = ~result.finite | (collision < 0)
+    return mean_reward(result.outcome != MISSED, result.outcome == RETURNED, fault) or 0.0

@@ -12,6 +12,7 @@ import math
 import os
 import time
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from rich.console import Console
 
 from ballmodel.io.atomic_files import replacing
 from bgs import normalizer, strategy
+from bgs.normalizer import ObservationStatistics
 from experiments.config import build
 from experiments.config.build import Experiment
 from experiments.config.files import read_yaml
@@ -135,6 +137,15 @@ def reward_terms(summary: EpisodeSummary) -> dict[str, float]:
     return {term.name: float(term(played)) for term in task.BUILT_IN_REWARDS if term.name in MEASURED_WEIGHTS}
 
 
+def observed(summary: EpisodeSummary) -> ObservationStatistics:
+    """Statistics of what the policy saw in an episode of at least one step."""
+    sums, squares = np.reshape(summary.observed, (2, -1))
+    mean = sums / summary.steps
+    m2 = np.maximum(squares - summary.steps * mean**2, 0.0)
+    count = jnp.array([0, summary.steps], jnp.int32)
+    return ObservationStatistics(count, *(jnp.asarray(x, jnp.float32) for x in (mean, m2)))
+
+
 class FineTuningRun:
     """A fine-tuning between two starts of the program.
 
@@ -159,8 +170,6 @@ class FineTuningRun:
         found = checkpoint.load_latest(run.checkpoints, first)
         self.state, notes = found or (first, {"update": 0, "seconds": 0.0})
         self.update, self._seconds = notes["update"], notes["seconds"]
-        # Frozen: as float32 numbers they are those of the exported policy.
-        self._normaliser = tuple(np.asarray(a) for a in normalizer.normaliser(first.statistics))
         self.journal = Journal(run.folder / JOURNAL)
         self._played = {entry.slot: entry for entry in self.journal.entries if not entry.discarded}
         if self.update > settings.updates:
@@ -217,7 +226,10 @@ class FineTuningRun:
         for entry in entries:
             returns[entry.member] += entry.returns / settings.repeats
         bgs, info = strategy.tell(self.state.bgs, population, jnp.asarray(returns, jnp.float32), self._bgs)
-        self.state, self.update = TrainState(bgs, self.state.statistics, self.state.key), number
+        statistics = self.state.statistics
+        if settings.observation_statistics == "merged":
+            statistics = reduce(normalizer.merge, (observed(e.summary) for e in entries if e.summary.steps), statistics)
+        self.state, self.update = TrainState(bgs, statistics, self.state.key), number
         now = time.monotonic()
         self._seconds, self._moment = self._seconds + now - self._moment, now
         row = {"update": number, "seconds": round(self._seconds, 3)} | report.update_row(entries)
@@ -264,7 +276,8 @@ class FineTuningRun:
                     "are done; restore the file or start a new run"
                 )
             number = self._next_number(*slot[:2])
-            mean, inv_std = self._normaliser
+            # As float32 numbers they are those of the exported policy.
+            mean, inv_std = (np.asarray(a) for a in normalizer.normaliser(self.state.statistics))
             played = self._robot.play(Policy(np.ascontiguousarray(theta), mean, inv_std, self._network), number)
             if self._operator.retracts():
                 self._retract(slot)
@@ -347,6 +360,8 @@ def _open(run: Run, experiment: Experiment, settings: FineTuning, robot: Robot, 
 
 
 def _check(folder: Path, found: dict[str, Any], wanted: dict[str, Any], settings: FineTuning) -> None:
+    # A run that an earlier version began has the defaults of keys that came later.
+    found = found | {"settings": FineTuning().model_dump(mode="json") | (found.get("settings") or {})}
     changeable = {"source"}  # the policy itself is compared
     if settings.step.schedule.kind == "constant":
         changeable.add("settings.updates")

@@ -16,6 +16,7 @@ from experiments.runs import load_policy, metrics, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
 from robot_io import contract
+from robot_io.policy import artefact as artefacts
 from robot_io.policy import export
 
 EPISODES_SHOWN = 2
@@ -96,6 +97,8 @@ def export_policy(
         "update": trained.notes.get("update"),
         "evaluation": report,
     }
+    if trained.policy.network is not None:
+        console.print(f"{folder}: a network of your own has {artefacts.JAX_EXPORT} and no ONNX file")
     export.write(folder, trained.policy, provenance, overwrite=True, robot=experiment.task.robot.contract)
     return True
 

@@ -24,15 +24,16 @@ from experiments.jobs.engine import Setup
 from experiments.jobs.site import ALONE, Workers
 from experiments.progress import make_console
 from experiments.runs import load_policy, run_dir
+from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.locate import SELECTION
 from experiments.runs.run_dir import Run
+from experiments.sparse_reward import EPISODES, FAULT
 from experiments.training import loop
 from experiments.training.finalize import finish
 from experiments.training.loop import train
 from experiments.training.ranks import SINGLE, Ranks
 
 WIDTH = 120  # [characters] of tables in a file
-SELECTION_EPISODES = 50  # Abeyruwan et al. 2022, appendix "Seed Selection for Rounds of Simulated Training"
 
 
 @dataclass(frozen=True)
@@ -188,26 +189,38 @@ def run_job(job: Job, console: Console, ranks: Ranks = SINGLE) -> str:
     return f"{report['return_rate']:.1%} ({report['low']:.1%} to {report['high']:.1%})"
 
 
-def select(folder: Path, jobs: list[Job], console: Console) -> None:
+def select(
+    folder: Path,
+    jobs: list[Job],
+    console: Console,
+    robot: str | None = None,
+    score_on: Callable[[TrainedPolicy, str, int, int, Console], float] | None = None,
+) -> None:
     """The paper's choice among seeds, written to selection.json: the best mean over 50 episodes of a sparse reward.
 
-    All seeds play the same balls. Raises what a missing run or an unwritable folder raises.
+    All seeds play the same balls, where the robot can. robot: on which they are played, by ``score_on(policy, robot,
+    balls, seed, console)``; None: in simulation. Raises what a missing run or an unwritable folder raises.
     """
     scores = {}
     for job in jobs:
-        experiment = build.experiment(job.config, job.where)
-        trained = load_policy.load(job.run.folder)
-        played = evaluate.evaluate(experiment, trained, SELECTION_EPISODES, job.config.evaluation.seed + 1)
-        scores[job.run.folder.name] = evaluate.selection_score(played.result)
+        trained, seed = load_policy.load(job.run.folder), job.config.evaluation.seed + 1
+        if robot is not None and score_on is not None:
+            scores[job.run.folder.name] = score_on(trained, robot, EPISODES, seed, console)
+        else:
+            played = evaluate.evaluate(build.experiment(job.config, job.where), trained, EPISODES, seed)
+            scores[job.run.folder.name] = evaluate.selection_score(played.result)
     best = max(scores, key=lambda seed: scores[seed])
     selection = {
-        "episodes": SELECTION_EPISODES,
-        "reward": {"hit": 1, "landed": 1, "fault": -2},
+        "episodes": EPISODES,
+        "robot": robot,
+        "reward": {"hit": 1, "landed": 1, "fault": FAULT},
         "scores": scores,
         "best": best,
     }
     run_dir.write_json(folder / SELECTION, selection)
-    console.print(f"{folder}: best seed by {SELECTION_EPISODES} episodes: {best} ({scores[best]:.2f} of 2)")
+    console.print(
+        f"{folder}: best seed by {EPISODES} episodes on {robot or 'the simulation'}: {best} ({scores[best]:.2f} of 2)"
+    )
 
 
 def _print_outcomes(outcomes: list[tuple[Job, str, str]], console: Console) -> None:

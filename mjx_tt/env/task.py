@@ -221,6 +221,7 @@ class TaskConfig:
     max_steps: int = 200  # control steps, both phases together
     max_observation_latency: float = 0.1  # longer draws are cut: mean + 7 deviations of the ball's
     max_action_latency: float = 0.13
+    contact_ends_episode: bool = False  # of the robot with the table or itself, as the real one stops; else it goes on
     rewards: tuple[RewardTerm, ...] = field(default_factory=lambda: weigh_rewards(SIM_WEIGHTS))
     observations: tuple[ObservationTerm, ...] = CONTRACT_OBSERVATIONS
     robot: Robot = field(default_factory=robots.paper)
@@ -391,6 +392,8 @@ class Task(Physics):
             limits=limits,
             period=period,
         )
+        if self.config.contact_ends_episode:
+            live = live & (gaps.table > 0.0) & (gaps.own > 0.0)
         ok = jnp.isfinite(sum(qpos[i] for i in range(self.contract.n_joints)) + sum(ball.position[i] for i in range(3)))
         return EpisodeState(
             qpos=qpos,

@@ -85,7 +85,8 @@ class ShotResult:
     ball: BallState  # (3, L) the player's ball as it left the paddle
     first: Bool[Array, " L"]  # it started a rally
     touch: Int[Array, " L"]  # its number in the rally, 1 for the first
-    landing: Float[Array, "2 L"]  # [m] where it bounced on the robot's side, NaN where it did not
+    valid: Bool[Array, " L"]  # it came onto the robot's side, as a ball in play has to
+    landing: Float[Array, "2 L"]  # [m] where it bounced there, NaN where it did not
     terms: Float[Array, "11 L"]  # unweighted reward terms, the fault among them
     finite: Bool[Array, " L"]
     outcome: Int[Array, " L"]  # task.MISSED, HIT, RETURNED
@@ -94,6 +95,8 @@ class ShotResult:
     return_landing: Float[Array, "2 L"]  # [m] where the robot's ball came down, NaN where it hit none
     robot_peak: Float[Array, "joints L"]  # [m/s], [rad/s]
     seconds: Float[Array, " L"]  # [s] until the player's next contact, or until the ball was over
+    steps: Int[Array, " L"]  # of the policy
+    observed: Float[Array, "2 observed L"]  # sums over them of what it saw less its mean, and of the squares
 
 
 @jax.tree_util.register_dataclass
@@ -255,6 +258,7 @@ class RallySimulator:
             ball=ball,
             first=first,
             touch=state.touches,
+            valid=sent.valid,
             landing=jnp.where(sent.valid, sent.landing, nowhere),
             terms=terms,
             finite=finite,
@@ -264,6 +268,8 @@ class RallySimulator:
             return_landing=jnp.where(hit, back.landing, nowhere),
             robot_peak=robot.accumulators.peak_velocity,
             seconds=steps + jnp.where(returned, met.incoming.seconds, 0.0),
+            steps=robot.accumulators.steps.astype(jnp.int32),
+            observed=jnp.stack([robot.accumulators.observation, robot.accumulators.observation_sq]),
         )
         return after, result, state.touches + hit.astype(jnp.int32)
 

@@ -400,7 +400,7 @@ class Bridge:
             self.gate.fault(Cause.MALFORMED_COMMAND, f"the policy failed: {format_error(error)}", now)
             return self._zeros.copy()
         self.policy_seconds = perf_counter() - began
-        episode.steps += 1
+        episode.saw(observation)
         self._log(Observation(self.counts.ticks, now, observation), Action(self.counts.ticks, now, action))
         return action * self._policy_limit
 

@@ -66,6 +66,7 @@ class EpisodeSummary:
     bounce      (2,) [m] where it came down on the robot's half, or None
     net         it touched the net on its way to the robot; grazed: on its way back
     idle        the robot did not react
+    observed    (2 n,) sums of the policy's n observed numbers over its steps, then of their squares
     """
 
     number: int
@@ -88,6 +89,7 @@ class EpisodeSummary:
     net: bool = False
     grazed: bool = False
     idle: bool = False
+    observed: tuple[float, ...] = ()
 
     @property
     def unfit(self) -> bool:
@@ -125,6 +127,7 @@ class Episode:
     net: bool = False
     grazed: bool = False
     idle: bool = True  # until the robot moves
+    observed: np.ndarray | float = 0.0  # (2, n) sums of what the policy saw and of its squares
     _launch: list[Seen] = field(default_factory=list)
     _recent: deque[Seen] = field(default_factory=lambda: deque(maxlen=2 * SIDE + 1))
     _turned: float = -np.inf  # time of the first sample after the hit
@@ -133,6 +136,11 @@ class Episode:
     def struck(self, samples: list[tuple[float, np.ndarray]]) -> None:
         """Take the samples (times [s], positions (3,) [m]) from the human's stroke until now."""
         self._launch = [Seen(time, position, FARTHEST) for time, position in samples[:LAUNCH]]
+
+    def saw(self, observation: np.ndarray) -> None:
+        """Count a step of the policy with what it saw, (n,)."""
+        self.steps += 1
+        self.observed = self.observed + np.array([observation, np.square(observation)], float)
 
     def follow(self, sample: BallSample, blade: np.ndarray, now: float) -> None:
         """Take an accepted sample with the blade's centre (3,) [m] at its capture, infinite where it is not known."""
@@ -303,6 +311,7 @@ class Episode:
             self.net,
             self.grazed,
             self.idle,
+            tuple(np.ravel(self.observed).tolist()) if self.steps else (),
         )
 
 

@@ -164,7 +164,7 @@ class Play:
 
     def _report(self, summary: EpisodeSummary, now: float) -> None:
         self.counts.outcomes[summary.outcome] += 1
-        details = {k: v for k, v in asdict(summary).items() if k not in ("number", "outcome")}
+        details = {k: v for k, v in asdict(summary).items() if k not in ("number", "outcome", "observed")}
         self._log(episode_end(now, summary.number, summary.outcome, {}, **details))
         try:
             if self._on_episode is not None:

@@ -152,8 +152,12 @@ def random_histories(policy: Policy, count: int, seed: int) -> np.ndarray:
     return (mean[:, None] + 2.0 * scale[:, None] * standard).astype(np.float32)
 
 
-def onnx_model(policy: Policy) -> onnx.ModelProto:
-    """The policy with its normaliser as a graph of standard operators: "history" (8, 11, B) to "action" (8, B)."""
+def onnx_model(policy: Policy, robot: contract.Contract = contract.PAPER) -> onnx.ModelProto:
+    """The policy with its normaliser as a graph of standard operators: "history" (8, 11, B) to "action" (8, B).
+
+    Its metadata say what the numbers are: names, units, the scale of each action and the rate; whole as JSON
+    under ``contract``.
+    """
     parameters = policy.parameters
     constants = {"mean": policy.mean[:, None], "inverse_scale": policy.inv_std[:, None]}
     nodes = [
@@ -196,12 +200,22 @@ def onnx_model(policy: Policy) -> onnx.ModelProto:
         [numpy_helper.from_array(array, name) for name, array in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", ONNX_OPSET)], ir_version=ONNX_IR_VERSION)
+    whole = contract.describe(robot)
+    columns = {
+        f"{kind}_{key}": [str(row[key]) for row in whole[kind]]
+        for kind in ("observation", "action")
+        for key in ("name", "unit")
+    }
+    columns["action_scale"] = [repr(row["scale"]) for row in whole["action"]]
+    properties = {key: ",".join(values) for key, values in columns.items()}
+    properties |= {"control_rate_hz": repr(whole["control_rate_hz"]), "contract": json.dumps(whole)}
+    helper.set_model_props(model, properties)
     onnx.checker.check_model(model, full_check=True)
     return model
 
 
 def jax_export(policy: Policy) -> bytes:
-    """The policy with its numbers inside, serialised by ``jax.export`` for the CPU, any batch size."""
+    """The policy with its numbers inside, serialised by ``jax.export``, any batch size."""
     shape = jax.export.symbolic_shape(f"{contract.HISTORY}, {policy.n_observation}, batch")
     return jax_policy.serialised(partial(_forward, policy), jax.ShapeDtypeStruct(shape, jnp.float32))
 
@@ -214,7 +228,7 @@ def _contents(policy: Policy, provenance: dict[str, Any], given: Any, robot: con
         contents = {
             artefacts.PARAMETERS: _npz(policy.parameters),
             artefacts.GOLDEN: _npz({"history": history, "action": action}),
-            artefacts.ONNX: onnx_model(policy).SerializeToString(),
+            artefacts.ONNX: onnx_model(policy, robot).SerializeToString(),
             artefacts.JAX_EXPORT: jax_export(policy),
         }
         architecture = artefacts.architecture(robot)

@@ -20,6 +20,7 @@ from robot_io.policy.policy import Policy as Policy
 
 jax.tree_util.register_dataclass(Policy, data_fields=["theta", "mean", "inv_std"], meta_fields=["network"])
 
+PLATFORMS = ("cpu", "cuda", "tpu")  # on which an export runs
 _FRAMES = "jax_traceback_in_locations_limit"
 # One compiled function for all policies: parameters are arguments, so another policy does not compile again.
 _forward = jax.jit(partial(forward, xp=jnp))
@@ -131,7 +132,7 @@ def exported(network: Any, n_observation: int = contract.N_OBSERVATION) -> Expor
 
 
 def serialised(function: Callable[..., Any], *shapes: Any) -> bytes:
-    """A function as ``jax.export`` writes it for the CPU, without the places in source files that it was traced from.
+    """A function as ``jax.export`` writes it for ``PLATFORMS``, without the source places that it was traced from.
 
     A policy is passed on; the folders of the machine that exported it are nobody's business. shapes: of its arguments.
     """
@@ -142,7 +143,7 @@ def serialised(function: Callable[..., Any], *shapes: Any) -> bytes:
     frames = getattr(jax.config, _FRAMES)
     jax.config.update(_FRAMES, 0)
     try:
-        return bytes(jax.export.export(jax.jit(anew), platforms=["cpu"])(*shapes).serialize())
+        return bytes(jax.export.export(jax.jit(anew), platforms=PLATFORMS)(*shapes).serialize())
     finally:
         jax.config.update(_FRAMES, frames)
 

@@ -200,12 +200,14 @@ def test_seeds_get_folders_of_their_own_and_the_best_is_selected(trained, tmp_pa
     assert done.returncode == 0, done.stdout + done.stderr
     selection = json.loads((tmp_path / "tiny" / "selection.json").read_text())
     assert selection["best"] == "seed7" and -2 <= selection["scores"]["seed7"] <= 2
-    assert "seed: 7" in (tmp_path / "tiny" / "seed7" / "config.yaml").read_text()
+    assert "seed: 7" in (tmp_path / "tiny" / "seed7" / "config.yaml").read_text() and selection["robot"] is None
 
 
 def test_selection_needs_seeds(tmp_path, capsys):
     assert cli.main(["train", "quickstart.yaml", "--select", "--out", str(tmp_path)]) == 1
     assert "--seeds 0,1,2" in capsys.readouterr().err
+    assert cli.main(["train", "quickstart.yaml", "--robot", "lockstep", "--out", str(tmp_path)]) == 1
+    assert "give --select" in capsys.readouterr().err
 
 
 def test_policy_is_the_same_from_run_and_from_artefact(trained):

@@ -34,6 +34,9 @@ WIDEST = 4.0  # high over low end of a ratio's interval that still shows "no dif
 PLAYS = 2.0  # touches; the shortest rally in the paper's table of player skill
 LARGEST = 1e4  # number that is printed as one
 SHORT_RALLY = 5  # touches
+TUNED = {"is2r-sim1": "is2r-ft35", "is2r-sim2": "is2r-ft65", "is2r-sim3": "is2r-ft100", "oracle-sim": "oracle-ft"}
+"""Zero-shot policies, and what fine-tuning makes of them."""
+SMOOTH = 10  # updates over which a fine-tuning's return rate is averaged
 ONE_SEED = "the players of one seed alone, who share its reality"
 AGREES, DIRECTION, DIFFERS, UNDECIDED, NOT_COMPARABLE = VERDICTS = (
     "agrees",
@@ -50,6 +53,7 @@ UNITS = {
     "kept_ratio": RATIO,
     "model_change": RATIO,
     "model_change_by_level": RATIO,
+    "tuning_cost": RATIO,
     "normalised_difference": DIFFERENCE,
     "short_share_difference": DIFFERENCE,
     "longer_share": SHARE,
@@ -57,6 +61,7 @@ UNITS = {
     "over_share": SHARE,
     "middle_share": SHARE,
     "mean_length": HITS,
+    "longest_rally": HITS,
 }
 """Unit of each statistic, a method of ``Measurements``."""
 Changes = dict[tuple[int, str], tuple[float, float]]  # of the human model, M0 to M1 and M1 to M2, by seed and player
@@ -139,6 +144,14 @@ class Measurements:
         """Mean length of a model's own evaluations."""
         return self.raw.mean(model, BY_SKILL)
 
+    def longest_rally(self, model: str) -> Estimate | None:
+        """Longest of a model's own rallies; its draws reach no further than the longest that was played."""
+        lengths = self.study.pick((model,), selected=False).length
+        if not lengths.size:
+            return None
+        draws = np.random.default_rng(0).choice(lengths, (DRAWS, lengths.size)).max(axis=1)
+        return Estimate(float(lengths.max()), draws, lengths.size)
+
     def normalised_difference(self, a: str, b: str, group: str = "all", others: bool = False) -> Estimate | None:
         """Mean normalised length of model a minus that of b."""
         return self._difference(self.cross_normalised if others else self.normalised, a, b, group, others)
@@ -185,13 +198,33 @@ class Measurements:
 
         return self._ball_share(model, (player,), choose)
 
-    def model_change(self) -> Interval | None:
-        """Second change of the human model over the first."""
-        return model_change(self.changes)
+    def model_change(self, group: str = "all") -> Interval | None:
+        """Second change of the human model over the first, over the players of a group."""
+        return model_change(self.changes, group)
 
     def model_change_by_level(self) -> Interval | None:
         """Second change of the human model, beginners over intermediate players."""
         return model_change_by_level(self.changes)
+
+    def tuning_cost(self) -> Interval | None:
+        """Updates of fine-tuning after a player's worst zero-shot policy over those after the best, to an equal level.
+
+        The level is the highest return rate, averaged over SMOOTH updates, that all of the player's fine-tunings reach.
+        """
+        logs = {}
+        for seed, player in ((s, p) for s in self.study.seeds for p in self.study.players):
+            found = []
+            for zero_shot, tuned in TUNED.items():
+                length = self.raw.point.get((seed, player, player, zero_shot))
+                rates = [row["return_rate"] for row in self.study.metrics(seed, player, tuned)]
+                if length is not None and len(rates) >= SMOOTH:
+                    found.append((length, np.convolve(rates, np.full(SMOOTH, 1.0 / SMOOTH), "valid")))
+            if len(found) > 1:
+                level = min(rates.max() for _, rates in found)
+                (_, worst), *_, (_, best) = sorted(found, key=lambda pair: pair[0])
+                taken = [int(np.argmax(rates >= level)) + SMOOTH for rates in (worst, best)]
+                logs[seed, player] = float(np.log(taken[0] / taken[1]))
+        return _geometric_mean(logs)
 
     def _difference(self, boot: Bootstrap, a: str, b: str, group: str, others: bool) -> Estimate | None:
         """Mean of a minus mean of b; ``larger`` is of the rally lengths."""
@@ -224,9 +257,16 @@ class Measurements:
         return Estimate(share, drawn[0] / np.maximum(drawn[1], 1), int(table[1].sum()))
 
 
-def model_change(changes: Changes) -> Interval | None:
-    """Geometric mean of the second change over the first; Student's t over seeds, over players where there is one."""
-    logs = {key: float(np.log(b / a)) for key, (a, b) in changes.items() if a > 0 and b > 0}
+def model_change(changes: Changes, group: str = "all") -> Interval | None:
+    """Geometric mean of the second change over the first, over the players of a group."""
+    players = of_level(group)
+    return _geometric_mean(
+        {(s, p): float(np.log(b / a)) for (s, p), (a, b) in changes.items() if a > 0 and b > 0 and p in players}
+    )
+
+
+def _geometric_mean(logs: dict[tuple[int, str], float]) -> Interval | None:
+    """Of two logarithms by seed and player at least: Student's t over seeds, over players where there is one."""
     if len(logs) < 2:
         return None
     found = average_over_seeds(logs)
@@ -263,7 +303,7 @@ def paper_number(claim: Claim) -> float | None:
     of_models = {"model_change": model_change, "model_change_by_level": model_change_by_level}.get(claim.statistic)
     if of_models is None:
         return claim.paper
-    interval = of_models({(0, player): paper_changes(player) for player in BY_SKILL})
+    interval = of_models({(0, player): paper_changes(player) for player in BY_SKILL}, **claim.of)
     return None if interval is None else interval.value
 
 

@@ -125,7 +125,7 @@ def make_rally_step(
             found = replace(found, begun=found.begun + 1)
             found.save(folder)
             try:
-                setup = RobotOptions(backend="numpy", seed=chance, player=evaluator)
+                setup = RobotOptions(seed=chance, player=evaluator)
                 missing = rallies - found.counted
                 status = play.run(artefact, RIG, folder, console, setup, rallies=missing)
             finally:

@@ -6,7 +6,6 @@ they have not finished ends the program with a sentence that says what to do; th
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -20,16 +19,17 @@ from ballmodel.trajectory import Dataset, Trajectory
 from experiments import measurements
 from experiments.config import robot as robots
 from experiments.config.study import Study
-from experiments.deploy import play, session_logs
+from experiments.deploy import session_logs
 from experiments.deploy.virtual_player import VirtualPlayer
 from experiments.errors import ConfigError, RunError, error_context
 from experiments.finetuning import loop
 from experiments.finetuning import on_robot as tuning
-from experiments.finetuning.robot import SCENE, BallRecorder, LockStepRobot
+from experiments.finetuning.robot import SCENE, BallRecorder
 from experiments.options import LOCK_STEP, RIG, RobotOptions
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import Run
-from experiments.study.target_domain.evaluation_on_robot import derive_seed, export_once
+from experiments.study.target_domain import selection_on_robot
+from experiments.study.target_domain.evaluation_on_robot import derive_seed
 from experiments.study.target_domain.hit_log import HitLog
 from experiments.study.workflow import Waiting
 from mjx_tt.diagnosis.logs import ROBOT_FILES, TURN, before_racket, load_logs
@@ -95,7 +95,7 @@ class RobotWorld:
             soft_wrap=True,
         )
         opponent = player if self._robot == RIG else None
-        setup = RobotOptions(backend="numpy", seed=derive_seed(name), player=opponent)
+        setup = RobotOptions(seed=derive_seed(name), player=opponent)
         found = tuning.finetune(str(source), settings, Run(folder), self._robot, self._console, setup)
         if found is None:
             raise Waiting(f"{name}: fine-tuning with {player} is not finished; the same command goes on with it")
@@ -118,28 +118,12 @@ class RobotWorld:
         return HitLog(Dataset(tracks, name), tuple(r.between(begin, end) for r in joints))
 
     def score(self, player: str, name: str) -> Callable[[TrainedPolicy], float] | None:
-        """Plays ``selection_episodes`` balls with each policy and counts +1 hit, +1 returned, -2 fault."""
-        if self._study.simulation.seeds == 1:
+        """Function that scores a policy on the robot; None where scores are not needed."""
+        simulation, seed = self._study.simulation, derive_seed(name)
+        if simulation.seeds == 1:
             return None
-        return lambda trained: self._score(player, name, trained)
-
-    def _score(self, player: str, name: str, trained: TrainedPolicy) -> float:
-        balls, robot = self._study.simulation.selection_episodes, self._robot
-        experiment = loop.experiment_of(trained.source)
-        if robot == LOCK_STEP:
-            emulated = loop.lock_step_robot(experiment, seed=derive_seed(name))
-            return float(np.mean([_lock_step(emulated, trained, n) for n in range(balls)]))
-        artefact = export_once(trained, self._console)
-        logs = trained.source / "selection"
-        self._console.print(f"{name}: {player} plays {balls} balls with {trained.source.name}", highlight=False)
-        setup = RobotOptions(backend="numpy", seed=derive_seed(name))
-        play.run(artefact, robot, logs, self._console, setup, balls)
-        found = json.loads(max(logs.glob("*.json")).read_text(encoding="utf-8"))
-        if found["episodes"] < balls:
-            raise Waiting(
-                f"{name}: {found['episodes']} of {balls} balls were played with {trained.source.name}; once more"
-            )
-        return (found["hit"] + found["returned"] - 2.0 * len(found["faults"])) / found["episodes"]
+        self._console.print(f"{name}: {player} to the table", highlight=False)
+        return lambda p: selection_on_robot.score(p, self._robot, simulation.selection_episodes, seed, self._console)
 
 
 class StandStill:
@@ -167,11 +151,6 @@ def serve_balls(player: str, count: int, seed: int, session: str) -> Dataset:
         if len(found) == before:
             raise RunError(f"{player} serves no ball on the rig")
     return Dataset(tuple(before_racket(t) for t in found), f"{player} on the rig")
-
-
-def _lock_step(robot: LockStepRobot, trained: TrainedPolicy, number: int) -> float:
-    summary = robot.play(trained.policy.astype(np.float32), number).summary
-    return -2.0 if summary.fault else float(summary.outcome != "missed") + float(summary.outcome == "returned")
 
 
 def split_by_stroke(track: Trajectory) -> tuple[Trajectory, ...]:

@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -28,9 +29,9 @@ from ballmodel.trajectory import Dataset, Trajectory
 from bgs import normalizer, strategy
 from bgs.normalizer import ObservationStatistics
 from bgs.strategy import BGSConfig, BGSInfo, BGSState
+from experiments import sparse_reward
 from experiments.config import build
 from experiments.config.study import Study
-from experiments.evaluation import evaluate
 from experiments.runs import checkpoint, load_policy, run_dir
 from experiments.runs.load_policy import TrainedPolicy
 from experiments.runs.run_dir import CONFIG, Run
@@ -48,8 +49,8 @@ from mjx_tt.rally.simulator import RallySimulator, RallyState, ShotResult
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
 
-FAULT = -2.0  # paper: a fault of the robot
 SELECTION_SESSIONS = 10  # side by side in which policies are compared
+ATTEMPTS = 100  # of a ball, after which a player who brings none onto the robot's half is taken as they are
 STROKES = 512  # from which the spin of a player's strokes is known
 STUDY = 6  # purpose of a key, beside those of experiments.config.build
 
@@ -58,7 +59,7 @@ STUDY = 6  # purpose of a key, beside those of experiments.config.build
 class Cycle:
     """Result of a cycle of fine-tuning.
 
-    state  after the last update; the observation statistics are those it began with
+    state  after the last update
     rows   per update: mean return, rates of balls hit and returned and of faults, norms of gradient and step
     balls  the player's hits as the cameras measured them, in the order of play
     """
@@ -122,12 +123,13 @@ class VirtualReality:
         sessions = self._settings.episodes_per_update
         rally = self.simulator.start(player, self.known, rally_key, sessions)
         # Strongly typed as what the updates return, so that the first call and the others are one program.
-        state, rally = jax.tree.map(
-            lambda x: jax.lax.convert_element_type(x, x.dtype), (strategy.init(jnp.asarray(theta), config), rally)
+        state, rally, statistics = jax.tree.map(
+            lambda x: jax.lax.convert_element_type(x, x.dtype),
+            (strategy.init(jnp.asarray(theta), config), rally, statistics),
         )
         found = []
         for _ in range(updates // self._chunk):
-            state, rally, part = self._updates(
+            state, rally, statistics, part = self._updates(
                 state, rally, statistics, player, self.known, ask_key, play_key, config=config
             )
             found.append(jax.tree.map(np.asarray, part))
@@ -147,8 +149,8 @@ class VirtualReality:
     def score(self, player: Player, policy: Policy, balls: int, key: PRNGKeyArray) -> float:
         """The paper's sparse reward by which a seed is chosen, over at least ``balls`` balls with the player."""
         turns = -(-balls // SELECTION_SESSIONS)
-        outcome, fault = self._compared(policy, player, self.known, key, turns=turns)
-        return evaluate.sparse_reward(np.asarray(outcome), np.asarray(fault))
+        outcome, fault, valid = map(np.asarray, self._compared(policy, player, self.known, key, turns=turns))
+        return sparse_reward.mean_reward(outcome != MISSED, outcome == RETURNED, fault, valid) or 0.0
 
     def _updates_of(
         self,
@@ -160,25 +162,49 @@ class VirtualReality:
         key: PRNGKeyArray,
         play_key: PRNGKeyArray,
         config: BGSConfig,
-    ) -> tuple[BGSState, RallyState, tuple[ShotResult, BGSInfo]]:
-        """``_chunk`` updates: state and rally after them, and each one's (ShotResult, BGSInfo)."""
+    ) -> tuple[BGSState, RallyState, ObservationStatistics, tuple[ShotResult, BGSInfo]]:
+        """``_chunk`` updates: state, rally and statistics after them, and each one's (ShotResult, BGSInfo)."""
         settings, sessions = self._settings, self._settings.episodes_per_update
-        frozen = [_repeat_per_session(x, sessions) for x in normalizer.normaliser(statistics)]
+        merging = settings.observation_statistics == "merged"
 
         def update(
-            carry: tuple[BGSState, RallyState], _: None
-        ) -> tuple[tuple[BGSState, RallyState], tuple[ShotResult, BGSInfo]]:
-            state, rally = carry
+            carry: tuple[BGSState, RallyState, ObservationStatistics], _: None
+        ) -> tuple[tuple[BGSState, RallyState, ObservationStatistics], tuple[ShotResult, BGSInfo]]:
+            state, rally, statistics = carry
+            mean, inv_std = normalizer.normaliser(statistics)
+            frozen = [_repeat_per_session(x, sessions) for x in (mean, inv_std)]
             population = strategy.ask(jax.random.fold_in(key, state.updates), state, config)
             theta = jnp.repeat(population.members, settings.repeats, axis=1)  # the sessions of a member side by side
             shot_key = jax.random.fold_in(play_key, state.updates)
-            rally, shots = self.simulator.shots(Policy(theta, *frozen), player, model, rally, shot_key)
+            rally, shots = self._valid_shots(Policy(theta, *frozen), player, model, rally, shot_key)
             returns = self._returns(shots).reshape(2 * settings.num_directions, settings.repeats).mean(axis=1)
             state, info = strategy.tell(state, population, returns, config)
-            return (state, rally), (shots, info)
+            if merging:
+                seen = jnp.where(shots.finite, shots.observed, 0.0).sum(axis=-1)
+                steps = jnp.where(shots.finite, shots.steps, 0).sum()
+                statistics = normalizer.merge(statistics, normalizer.from_sums(steps, mean, *seen))
+            return (state, rally, statistics), (shots, info)
 
-        (state, rally), found = jax.lax.scan(update, (state, rally), None, length=self._chunk)
-        return state, rally, found
+        after, found = jax.lax.scan(update, (state, rally, statistics), None, length=self._chunk)
+        return *after, found
+
+    def _valid_shots(
+        self, policy: Policy, player: Player, model: SimModel, rally: RallyState, key: PRNGKeyArray
+    ) -> tuple[RallyState, ShotResult]:
+        """A ball of every session; one that the player does not bring onto the robot's half is played again."""
+
+        def again(carry: tuple[Array, RallyState, ShotResult]) -> tuple[Array, RallyState, ShotResult]:
+            attempt, rally, shots = carry
+            played = self.simulator.shots(policy, player, model, rally, jax.random.fold_in(key, attempt))
+            replayed = jax.tree.map(partial(jnp.where, shots.valid | shots.fault), (rally, shots), played)
+            return attempt + 1, *replayed
+
+        first = self.simulator.shots(policy, player, model, rally, key)
+        replays = (jnp.int32(1), *first)
+        _, rally, shots = jax.lax.while_loop(
+            lambda c: (c[0] < ATTEMPTS) & ~jnp.all(c[2].valid | c[2].fault), again, replays
+        )
+        return rally, shots
 
     def _returns(self, shots: ShotResult) -> Array:
         """Weighted returns (L,) of what a robot measures; an episode that is not finite has none."""
@@ -187,14 +213,14 @@ class VirtualReality:
 
     def _shots_of(
         self, policy: Policy, player: Player, model: SimModel, key: PRNGKeyArray, turns: int
-    ) -> tuple[Array, Array]:
-        """Outcomes and faults (turns, SELECTION_SESSIONS) of one policy."""
+    ) -> tuple[Array, Array, Array]:
+        """Outcomes, faults and valid balls (turns, SELECTION_SESSIONS) of one policy."""
         policy = jax.tree.map(lambda x: _repeat_per_session(x, SELECTION_SESSIONS), policy)
         start_key, play_key = jax.random.split(key)
 
-        def shoot(rally: RallyState, turn: Array) -> tuple[RallyState, tuple[Array, Array]]:
+        def shoot(rally: RallyState, turn: Array) -> tuple[RallyState, tuple[Array, Array, Array]]:
             rally, shots = self.simulator.shots(policy, player, model, rally, jax.random.fold_in(play_key, turn))
-            return rally, (shots.outcome, shots.fault | ~shots.finite)
+            return rally, (shots.outcome, shots.fault | ~shots.finite, shots.valid)
 
         rally = self.simulator.start(player, model, start_key, SELECTION_SESSIONS)
         return jax.lax.scan(shoot, rally, jnp.arange(turns))[1]

@@ -11,6 +11,7 @@ import pytest
 from pydantic import Field
 from typing_extensions import TypedDict
 
+from ballmodel.io import yaml
 from ballmodel.io.ranges import Within, check_fields
 from ballmodel.io.validation import Increasing, Name, Section, find, json_schema, validate
 
@@ -102,3 +103,10 @@ def test_an_unknown_name_is_answered_with_the_known_ones_and_the_nearest():
     assert find({"left": 1, "right": 2}, "right", "side") == 2
     with pytest.raises(ValueError, match=r"expected a side, left, right, got 'Rigth'; did you mean 'right'\?"):
         find({"left": 1, "right": 2}, "Rigth", "side")
+
+
+def test_a_mapping_takes_another_ones_keys_and_changes_some():
+    text = "a: &first {x: 1, y: 2}\nb: {<<: *first, y: 3}\n"
+    assert yaml.parse(text, "file") == {"a": {"x": 1, "y": 2}, "b": {"x": 1, "y": 3}}
+    with pytest.raises(ValueError, match="'y' is given twice"):
+        yaml.parse("a: &first {x: 1}\nb: {<<: *first, y: 3, y: 4}\n", "file")

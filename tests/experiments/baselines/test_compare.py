@@ -20,6 +20,7 @@ from experiments.baselines import compare
 from experiments.baselines.learners import BudgetSpent, PpoLearner, SacLearner
 from experiments.baselines.qt_opt import QtOptLearner, best_action
 from experiments.config import baselines
+from experiments.config import experiment as config
 from experiments.config.baselines import Ppo, QtOpt, Replay, Sac
 from experiments.config.site import Site
 from experiments.errors import ConfigError, RunError
@@ -315,6 +316,21 @@ def test_an_algorithm_trains_in_a_world_of_its_own_and_is_judged_in_that_of_all(
 def test_a_shipped_comparison_is_valid(name):
     comparison, experiment = baselines.load(baselines.shipped()[name])
     assert comparison.name == name
+
+
+def test_the_pillars_change_elites_and_orthogonality_of_the_papers_settings_alone():
+    comparison, experiment = baselines.load(baselines.shipped()["compare_pillars"])
+    paper = config.load(config.shipped()["paper"])
+    assert (experiment.task, experiment.model) == (paper.task, paper.model)
+    rows = {name: learning.optimiser for name, learning in comparison.algorithms.items()}
+    assert rows["difference-orthogonal"] == paper.optimiser
+    for name, found in rows.items():
+        rule, directions = name.split("-")
+        rank = {"difference": "abs", "signed": "signed", "maximum": "max", "all": "abs"}[rule]
+        changed = {"rank": rank, "elite_fraction": 1.0 if rule == "all" else 0.3}
+        changed["orthogonal"] = directions == "orthogonal"
+        assert found == paper.optimiser.model_copy(update=changed), name
+    assert len(rows) == 8 and comparison.budget.episodes == 10_000 * 6_000
 
 
 @pytest.mark.slow

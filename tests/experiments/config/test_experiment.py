@@ -254,7 +254,8 @@ def test_paths_of_the_file_are_relative_to_it_and_paths_of_overrides_to_the_curr
 
 def test_paper_settings_are_the_papers():
     """The table of hyper-parameters in the paper's appendix."""
-    bgs = build.experiment(config.load(config.shipped()["paper"]), "paper").bgs
+    built = build.experiment(config.load(config.shipped()["paper"]), "paper")
+    bgs = built.bgs
     assert (bgs.num_directions, bgs.sigma, bgs.elite_fraction, bgs.orthogonal, bgs.ema_decay) == (
         200,
         0.025,
@@ -264,6 +265,11 @@ def test_paper_settings_are_the_papers():
     )
     paper = config.load(config.shipped()["paper"])
     assert paper.optimiser.repeats == 15
+    assert built.task.sim_rate == 300 and built.task.contact_ends_episode
+    assert built.model.model.ball.flight.integrator == "paper"
+    drawn = {one.path: [one.low, one.high] for one in built.model.randomise}  # dynamics; latencies and noise as printed
+    assert drawn["ball.table.restitution"] == [0.88, 0.98] and drawn["drives.joint_2.lag"] == [0.0, 0.025]
+    assert len(drawn) == 4 + 2 * 8 and drawn.items() <= PRIOR.items()
     assert config.load(config.shipped()["paper_mjx"], ("task.engine=fused", "name=paper")) == paper
     assert config.load(config.shipped()["paper_mjx"]).task.engine == "mjx"
     falling = config.load(config.shipped()["quickstart"], ("optimiser.sigma_fall={final: 0.01}",))

@@ -210,6 +210,36 @@ def test_an_update_follows_the_journal_by_the_papers_rule(source, tmp_path):
     np.testing.assert_allclose(last_theta(tmp_path / "run"), theta, atol=1e-5)
 
 
+class Observing(Toy):
+    """Says what the policy saw, and keeps it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: list[np.ndarray] = []
+
+    def play(self, policy, episode_number) -> PlayedBall:
+        played = super().play(policy, episode_number)
+        self.seen.append(np.random.default_rng(episode_number).normal(1.0, 2.0, (40, contract.N_OBSERVATION)))
+        sums = self.seen[-1].sum(axis=0), (self.seen[-1] ** 2).sum(axis=0)
+        return replace(played, summary=replace(played.summary, observed=tuple(np.concatenate(sums).tolist())))
+
+
+def test_observations_of_an_update_are_merged_where_it_is_asked_for(source, tmp_path):
+    """By NumPy over all that was seen in training, with the two observations that an artefact counts for."""
+    robot = Observing()
+    tune(source, tmp_path / "run", robot, observation_statistics="merged", updates=2)
+    half = 1.0 / INVERSE_SCALE / np.sqrt(2.0)
+    seen = np.concatenate([[MEAN - half, MEAN + half], *robot.seen[4:16]])
+    for number in (4, 15):
+        np.testing.assert_allclose(robot.played[number][1], MEAN, rtol=1e-6)
+    for number in (16, 27):
+        np.testing.assert_allclose(robot.played[number][1], seen.mean(axis=0), atol=1e-5)
+        np.testing.assert_allclose(robot.played[number][2], 1.0 / seen.std(axis=0, ddof=1), rtol=1e-4)
+    exported = artefacts.load(tmp_path / "run" / "artefact").policy
+    seen = np.concatenate([seen, *robot.seen[16:28]])
+    np.testing.assert_allclose(exported.mean, seen.mean(axis=0), atol=1e-5)
+
+
 def test_it_climbs_and_the_report_says_so(source, tmp_path):
     easy = {"updates": 150, "num_directions": 8, "repeats": 1, "elite_fraction": 1.0, "evaluation_balls": 10}
     report = tune(source, tmp_path / "run", Toy(), **easy)
@@ -297,6 +327,17 @@ def _lines(path: Path) -> int:
 
 def _plain(entry: Entry) -> dict:
     return asdict(entry) | {"trajectory": entry.trajectory.tolist()}
+
+
+def test_a_run_of_an_earlier_version_goes_on(source, tmp_path):
+    tune(source, tmp_path / "run", Toy(), updates=1)
+    file = tmp_path / "run" / loop.SETTINGS
+    recorded = yaml.safe_load(file.read_text())
+    del recorded["settings"]["observation_statistics"]
+    file.write_text(yaml.safe_dump(recorded))
+    tune(source, tmp_path / "run", Toy(), updates=2)
+    with pytest.raises(RunError, match="observation_statistics"):
+        tune(source, tmp_path / "run", Toy(), updates=2, observation_statistics="merged")
 
 
 class Interrupted(Exception):
@@ -519,6 +560,8 @@ def test_the_emulated_robots_balls_make_a_human_distribution(tmp_path):
     again = robot.play(Policy(theta, MEAN, INVERSE_SCALE), 4)
     np.testing.assert_array_equal(again.trajectory, played[4].trajectory)
     assert again.summary == played[4].summary
+    means = np.array(again.summary.observed[: contract.N_OBSERVATION]) / again.summary.steps
+    assert thrown.position[1].min() > means[1] > -2.9 and -1.0 < means[0] < 1.0  # of the ball's way to the robot
     other = robot.play(Policy(theta, MEAN, INVERSE_SCALE), 4 + BALLS)  # the same ball, seen with other noise
     assert not np.array_equal(other.trajectory[:5], again.trajectory[:5])
 

@@ -173,12 +173,16 @@ def test_reward_terms_of_a_still_robot_by_hand(serves, record, blade):
 @pytest.fixture(scope="module")
 def flailing():
     """A robot that is pushed around hard, with a ball that hangs in the air."""
-    rng = np.random.default_rng(0)
-    actions = np.repeat(rng.uniform(-1, 1, (TICKS // 10, N_JOINTS, P)), 10, axis=0)
+    with jax.enable_x64(True):
+        return play(task(), episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(gravity=0.0)), script(pushed()))
+
+
+def pushed() -> np.ndarray:
+    """Actions (TICKS, joints, P) that drive the robot into the table and itself."""
+    actions = np.repeat(np.random.default_rng(0).uniform(-1, 1, (TICKS // 10, N_JOINTS, P)), 10, axis=0)
     actions[:, 1] = 1.0  # up to the table
     actions[:, 3] = np.abs(actions[:, 3])  # the upper arm forwards
-    with jax.enable_x64(True):
-        return play(task(), episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(gravity=0.0)), script(actions))
+    return actions
 
 
 def test_motion_terms_equal_a_recount_of_the_commands(flailing):
@@ -222,6 +226,29 @@ def test_pose_terms_equal_a_recount_in_mujoco(flailing):
     for name, count in zip(("collision", "paddle_height", "style"), counts, strict=True):
         assert 0 < count.sum() < TICKS * P  # the flailing robot does all of it, but not all the time
         np.testing.assert_array_equal(flailing.terms[TERMS.index(name)], -count, err_msg=name)
+
+
+def test_a_contact_ends_the_episode_where_it_is_asked_for(flailing):
+    """The first period after which MuJoCo finds the robot in contact; until then nothing differs."""
+    mj = mjcf.load_model()
+    data, watched = mujoco.MjData(mj), robots.paper().file
+    pairs = [(mj.geom(a).id, mj.geom(b).id) for a, b in [*watched.pairs, *((a, "col_table") for a in watched.table)]]
+    with jax.enable_x64(True):
+        ends = Task(replace(task().config, contact_ends_episode=True))
+        stopped = play(
+            ends, episodes([0.0, 1.0, 0.5], [0.0, 0.0, 0.0], simulation=model(gravity=0.0)), script(pushed())
+        )
+    alive = np.ones((TICKS, P), bool)
+    for i in range(P):
+        for tick in range(TICKS):
+            data.qpos[:] = flailing.qpos[tick, :, i]
+            mujoco.mj_kinematics(mj, data)
+            if min(mujoco.mj_geomDistance(mj, data, a, b, 1.0, None) for a, b in pairs) <= 0:
+                alive[tick:, i] = False
+                break
+    assert flailing.live.all() and 0 < (~alive).any(axis=0).sum()
+    np.testing.assert_array_equal(stopped.live, alive)
+    np.testing.assert_array_equal(stopped.terms[TERMS.index("collision")], -(~alive).any(axis=0).astype(float))
 
 
 def test_commands_keep_the_kinematic_limits(flailing):

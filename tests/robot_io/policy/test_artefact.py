@@ -189,6 +189,23 @@ def test_stored_forms_load_without_this_package_and_agree(exported, batch):
     np.testing.assert_allclose(jax_action, expected, atol=1e-5)
 
 
+def test_the_onnx_file_says_what_its_numbers_are(exported):
+    """By ONNX Runtime alone, against the paper's robot as the manifest has it."""
+    session = onnxruntime.InferenceSession(exported[0] / artefacts.ONNX)
+    found = session.get_modelmeta().custom_metadata_map
+    manifest = json.loads((exported[0] / artefacts.MANIFEST).read_text())
+    assert json.loads(found["contract"]) == manifest["contract"] and float(found["control_rate_hz"]) == 75.0
+    assert found["observation_name"].split(",")[:3] == ["ball_x", "ball_y", "ball_z"]
+    assert found["action_name"].split(",") == [row["name"] for row in manifest["contract"]["action"]]
+    assert [float(x) for x in found["action_scale"].split(",")] == list(contract.LIMITS.policy_velocity)
+    assert found["action_unit"].split(",")[0] == "m/s"
+
+
+def test_the_jax_export_runs_on_accelerators_too(exported):
+    stored = jax.export.deserialize(bytearray((exported[0] / artefacts.JAX_EXPORT).read_bytes()))
+    assert set(stored.platforms) >= {"cpu", "cuda"}
+
+
 @pytest.mark.parametrize("made", ["here", "shipped"])
 def test_no_file_names_a_place_on_the_machine_that_wrote_it(exported, made):
     folder = exported[0] if made == "here" else ROOT / "experiments/shipped/policies/quickstart"

@@ -82,6 +82,7 @@ class Sessions:
         self.plan, self.chances, self.asked, self.length = list(plan), [], [], 0
 
     def run(self, artefact, robot, folder, console, setup, rallies):
+        assert setup.backend == "auto"  # the jitted policy, as mjx-tt run
         self.chances.append(setup.seed)
         self.asked.append(rallies)
         count, end = self.plan.pop(0)
