@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.ball.flights.linearization import Linear
+from mjx_tt.diagnosis.ball.inclusion import Family
 
 DIRECTIONS = ("x", "y", "z", "along the flight")
 FORCES = (0, 3, 2)  # directions of forces: along y and along the flight are nearly one
@@ -46,6 +47,26 @@ def hats(
 
 
 def build(
+    linear: Linear,
+    g: Grid,
+    sessions: Int[np.ndarray, " n"],
+    age: Float[np.ndarray, " n"],
+    called: Sequence[str],
+    first: int,
+) -> tuple[list[Family], np.ndarray]:
+    out: list[Family] = []
+    columns: list[np.ndarray] = []
+    for block in blocks(linear, g, sessions, age, called):
+        directions = np.array(block.directions)
+        usual = 0.1 if block.name.startswith("force") else 0.1 if block.name.startswith("bounce") else 0.002
+        for d in dict.fromkeys(block.directions):
+            mine = np.flatnonzero(directions == d)
+            out.append(Family(block.name, d, first + len(columns) + mine, tuple(block.labels[i] for i in mine), usual))
+        columns.extend(block.columns)
+    return out, np.array(columns)
+
+
+def blocks(
     linear: Linear, g: Grid, sessions: Int[np.ndarray, " n"], age: Float[np.ndarray, " n"], called: Sequence[str]
 ) -> list[Block]:
     """All families.
@@ -113,9 +134,6 @@ def build(
         spline(f"force over {name}", quantity, unit, response, along=FORCES)
     for name, quantity, unit in (("x", position[0], "m"), ("y", position[1], "m"), ("z", position[2], "m")):
         spline(f"measured position over {name}", quantity, unit, _shift, 5)
-    for name, coordinate in (("x", 0), ("y", 1), ("z", 2)):
-        steps, labels = _steps(position[coordinate], g.mask)
-        family(f"jump of the measured position at {name}", f"at a plane across {name}", steps, labels, _shift)
     late = later[:, :] > 0.0
     if late.any():
         bx, by = linear.base.bounce[0, 0], linear.base.bounce[1, 0]
