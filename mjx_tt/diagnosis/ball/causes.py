@@ -74,9 +74,8 @@ def part(
 
 
 def _left(found: BallFindings) -> Left:
-    s = found.search
-    rest = max(s.remaining - s.level, 0.0)
-    return Left(1e3 * float(np.sqrt(rest)), s.share(rest), 1e3 * float(np.sqrt(max(s.error - s.level, 0.0))))
+    rest, share, nominal = found.search.left_over
+    return Left(1e3 * float(np.sqrt(rest)), share, 1e3 * float(np.sqrt(nominal)))
 
 
 def _where(found: BallFindings, name: str) -> str:
@@ -163,7 +162,7 @@ def _effect_cause(found: BallFindings, j: int, half: float, without: Container[s
         parameters | {t.path: _twin(effect, t, nominal, theta, low, high) for t in twins},
         float(1e3 * abs(theta) * search.shift[j]),
         readings(effect, (*twins, *rivals)),
-        search.share(search.without[j] - search.remaining),
+        search.share(j),
     )
     # Of a pair with the same pattern the extended model needs one.
     return Expressed.by(cause, parameters)
@@ -228,7 +227,8 @@ def _spin_cause(found: BallFindings, wide: float, error: Float[np.ndarray, " K"]
     rms = float(np.sqrt(np.sum(prior.std**2 + prior.mean**2)))
     text = "in flight only the product of coefficient and spin shows: " + BY_NAME["magnus"].reading
     # Without spins, and all other causes, the nominal model is left.
-    share = 1.0 - search.share(max([search.remaining, *search.without.values()]) - search.level)
+    most = max([search.remaining[1], *(w[1] for w in search.without.values())])
+    share = 1.0 - (most - search.level) / max(search.errors[1] - search.level, 1e-12)
     cause = Cause("magnus", ("magnus",), 1.0, parameters, float(1e3 * rms * search.spin_shift), text, share)
     coefficient = {path: e for path, e in parameters.items() if path == MAGNUS}  # the spins are a distribution already
     return replace(Expressed.by(cause, parameters), ranges=Expressed.by(cause, coefficient).ranges)

@@ -63,14 +63,20 @@ class Search:
     left: Left  # beside the chosen
     shift: Float[np.ndarray, " K"]  # [m] median shift of a flight's last sample per unit of each effect
     spin_shift: float  # [m] the same per rad/s of spin
-    error: float  # of the nominal model
-    remaining: float  # beside the chosen
-    without: dict[int, float] = field(default_factory=dict)  # with each of the chosen left out
+    errors: Float[np.ndarray, 2]  # of the nominal model, see Sizes
+    remaining: Float[np.ndarray, 2]  # beside the chosen
+    without: dict[int, Float[np.ndarray, 2]] = field(default_factory=dict)  # with each of the chosen left out
     level: float = 0.0  # of the noise
 
-    def share(self, error: float) -> float:
-        """Part of the nominal model's error, the noise left out."""
-        return error / max(self.error - self.level, 1e-12)
+    def share(self, member: int) -> float:
+        """Part of the nominal model's error, the noise left out, that comes back without one of the chosen."""
+        return float(np.max((self.without[member] - self.remaining) / np.maximum(self.errors - self.level, 1e-12)))
+
+    @property
+    def left_over(self) -> tuple[float, float, float]:
+        """Error beside the chosen causes, its part of the nominal model's, and that [m^2], bounces all alike."""
+        rest, whole = max(self.remaining[1] - self.level, 0.0), max(self.errors[1] - self.level, 1e-12)
+        return float(rest), float(rest / whole), float(whole)
 
 
 def search(
@@ -133,9 +139,8 @@ def search(
             start = refit_worst(problem, theta, start, g, own, prior)
         at = Situation(theta, start)
     level = sizes.of(left, unknowns)
-    whole = max(error, nominal)
     return Search(
-        at, linear, own, prior, model, columns, chosen, path, evidence, beside, shift, spin_shift, whole, remaining,
+        at, linear, own, prior, model, columns, chosen, path, evidence, beside, shift, spin_shift, nominal, remaining,
         without, level,
     )  # fmt: skip
 
@@ -257,9 +262,10 @@ def _left(
 
 
 class Sizes:
-    """Error of some of the balls [m^2] under changes of the effects, by the model itself.
+    """Errors of some of the balls [m^2] under changes of the effects, by the model itself, after each ball's own start.
 
-    What bounces differ by from ball to ball is no error.
+    Two of them: where bounces may differ from ball to ball as they were found to, and where they may not. What is wrong
+    in the air shows in the first, though bounces scatter; what is wrong with all bounces in the second.
     """
 
     def __init__(
@@ -272,7 +278,7 @@ class Sizes:
     ) -> None:
         if index is None:
             index = np.unique(np.linspace(0, problem.grid.n - 1, FEW).round().astype(int))
-        self.index, self.problem, self.start = index, of_some(problem, index), at.start[:, index].copy()
+        self.index, self.problem, self.start = index, of_some(problem, index), at.start[:, index]
         self.noise = replace(own, frame=own.frame[..., index], scale=own.scale[:, index])
         self.prior = None if prior is None else prior.of_some(index)
 
@@ -284,11 +290,17 @@ class Sizes:
             theta[self.problem.coefficient] = np.clip(theta[self.problem.coefficient], *MAGNUS_RANGE)
         return theta
 
-    def __call__(self, theta: Float[np.ndarray, " K"]) -> float:
+    def __call__(self, theta: Float[np.ndarray, " K"]) -> Float[np.ndarray, 2]:
         """After each ball's own start, and its spin where balls spin."""
-        start = fit_starts(self.problem, theta, self.start, self.problem.grid, self.noise, self.prior, rounds=3)
-        left = self.problem.grid.measured - self.problem.fly(theta, start).measured[:, :, 0]
-        return mean_square(left, self.problem.grid, 6 if self.prior is None else 9)
+        return np.array([self._of(theta, own) for own in (self.noise, replace(self.noise, scatter=noise.ALIKE))])
+
+    def _of(self, theta: np.ndarray, own: Noise) -> float:
+        start, g = self.start.copy(), self.problem.grid
+        if not own.scatter.any():
+            start[KICK] = 0.0
+        start = fit_starts(self.problem, theta, start, g, own, self.prior, rounds=3)
+        left = g.measured - self.problem.fly(theta, start).measured[:, :, 0]
+        return mean_square(left, g, 6 if self.prior is None else 9)
 
     def of(self, left: Float[np.ndarray, "3 T n"], unknowns: int) -> float:
         """Of residuals of all balls."""
@@ -304,8 +316,8 @@ def mean_square(left: Float[np.ndarray, "3 T n"], g: Grid, unknowns: int) -> flo
 
 def _choose(
     model: LinearModel, sizes: Sizes, before: Set, error: float, level: float, early: bool
-) -> tuple[Set, list[Set], list[float], Left, float, float, dict[int, float]]:
-    """The likeliest set, as long as each of its causes takes away LEAST_SHARE of the error.
+) -> tuple[Set, list[Set], list[float], Left, np.ndarray, np.ndarray, dict[int, np.ndarray]]:
+    """The likeliest set, as long as each of its causes takes away LEAST_SHARE of an error.
 
     A set that was chosen before stays unless another is clearly better. early: sizes do not count yet.
     error: [m^2] of the nominal model, level: of the noise.
@@ -319,11 +331,12 @@ def _choose(
     if early and count == 0 and alone[-1] - alone[0] > HALF * (evidence[0] - alone[0]):
         count = 1  # to be looked at from there: what is far off is not told from here
     errors = [sizes(sizes.theta(model, s)) for s in path[: max(count, 1) + 1]]
-    least = max(error, errors[0]) - level
-    while not early and count and errors[count - 1] - errors[count] < LEAST_SHARE * least:
+    whole = np.maximum(errors[0], error) - level
+    gained = [float(np.max((a - b) / np.maximum(whole, 1e-12))) for a, b in zip(errors, errors[1:], strict=False)]
+    while not early and count and gained[count - 1] < LEAST_SHARE:
         count -= 1
-    if count == 0 and len(path) > 1 and errors[0] - errors[1] > LEADING_SHARE * least:
+    if count == 0 and gained and gained[0] > LEADING_SHARE:
         count = 1
     chosen = path[count]
     without = {j: sizes(sizes.theta(model, tuple(c for c in chosen if c != j))) for j in chosen}
-    return chosen, path, evidence.tolist(), beside[count], errors[count], errors[0], without
+    return chosen, path, evidence.tolist(), beside[count], errors[count], np.maximum(errors[0], error), without
