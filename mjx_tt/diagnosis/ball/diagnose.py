@@ -27,6 +27,8 @@ FEWEST_BALLS = 12
 FLOOR = 0.003  # [m] shift of a flight's last sample below which a cause is of no practical interest
 LEAST_LEFT, LEAST_LEFT_SHARE = 0.0025, 0.2  # [m] of what no cause explains, on one ball in ten; share of the error
 HALVES = 20  # of the balls, by which a cause's confidence is told
+WIDE = 10.0  # times ordinary sizes, where only the flights are to speak
+ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
 TIE = 5.0  # of the logarithm of the evidence by which a cause must beat another in its place
 FILTER = ("tracker_filter", "tracker_gate")
 
@@ -200,25 +202,35 @@ def _patterns(found: Search, g: Grid) -> tuple[tuple[Pattern, ...], float, float
 
 
 def _group(found: Search, member: int) -> Set:
-    """A chosen effect, and those that explain the flights as well in its place."""
+    """A chosen effect, and those that explain the flights as well in its place, or nearly in the same way."""
     rest = tuple(c for c in found.chosen if c != member)
     others = [c for c in found.model.candidates if c not in found.chosen]
-    evidence = found.model.evidence([found.chosen, *((*rest, c) for c in others)])
-    return (member, *(c for c, e in zip(others, evidence[1:], strict=True) if evidence[0] - e < TIE))
+    # What the flights say, not what is ordinary.
+    wide = replace(found.model, scale=WIDE * found.model.scale)
+    evidence = wide.evidence([found.chosen, *((*rest, c) for c in others)])
+    gram, beside = found.model.total[0], [*rest, *found.model.always]
+    pair = [member, *others]
+    alone = gram[np.ix_(pair, pair)]
+    if beside:
+        mixed = gram[np.ix_(pair, beside)]
+        alone = alone - mixed @ np.linalg.solve(gram[np.ix_(beside, beside)], mixed.T)
+    cosine = np.abs(alone[0]) / np.sqrt(np.maximum(alone[0, 0] * np.diagonal(alone), 1e-300))
+    same = (evidence[0] - evidence[1:] < TIE) | (cosine[1:] > ALIKE)
+    return (member, *(c for c, alike in zip(others, same, strict=True) if alike))
 
 
 def _confidence(found: Search, rng: np.random.Generator) -> dict[int, float]:
     """Share of random halves of the balls whose likeliest set holds each of the chosen effects, or one of its group."""
     groups = {j: set(_group(found, j)) for j in found.chosen}
-    share = dict.fromkeys(found.chosen, 0.0)
+    share = dict.fromkeys(found.chosen, 0)
     n = len(found.model.ball_gram)
     for _ in range(HALVES if share else 0):
         half = found.model.of_balls(rng.permutation(n)[: n // 2])
         path = half.best(len(found.chosen))
         likeliest = set(path[int(np.argmax(half.evidence(path)))])
         for j in share:
-            share[j] += bool(groups[j] & likeliest) / HALVES
-    return share
+            share[j] += bool(groups[j] & likeliest)
+    return {j: count / HALVES for j, count in share.items()}
 
 
 def jitter_cause(found: BallFindings) -> tuple[str, Jitter] | None:
