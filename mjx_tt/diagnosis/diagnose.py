@@ -141,11 +141,11 @@ def _of_balls(
     mode = "none" if spin == "free" and "magnus" in without else spin
     found = diagnose_balls(balls, model, mode, without, seed, say)
     say("predicting balls that were not used")
-    prediction = cross_validation.predictions(found, seed)
+    found, prediction = cross_validation.with_companions(found, seed)
     if not found.may_spin:
         return found, prediction, []
     spun = diagnose_balls(balls, model, "cause", without, seed, say)
-    of_spun = cross_validation.predictions(spun, seed)
+    spun, of_spun = cross_validation.with_companions(spun, seed)
     plain, with_spins = (1e3 * float(np.nanmedian(p.after)) for p in (prediction, of_spun))
     note = f"unseen balls are predicted to {with_spins:.1f} mm in the median with spin, to {plain:.1f} mm without"
     return (spun, of_spun, [note]) if with_spins < SPINS_PAY * plain else (found, prediction, [note])

@@ -106,9 +106,10 @@ def _causes(found: BallFindings, without: Container[str]) -> tuple[list[Expresse
     error = np.sqrt(np.diagonal(replace(search.model, spike=WIDER * search.model.spike).solve(search.chosen)[1]))
     named = [_effect_cause(found, j, wide * error[j], without) for j in found.named]
     beside: dict[str, float] = {}
-    for j in search.chosen:
+    size = search.model.solve((*search.chosen, *found.companions))[0]
+    for j in (*search.chosen, *found.companions):
         if j not in found.named:
-            change = problem.effects[j].values(problem.nominal, search.at.theta[j])
+            change = problem.effects[j].values(problem.nominal, float(size[j]))
             beside |= {path: float(value) for path, value in change.items()}
     if search.prior is not None:
         if found.spin_is_cause:

@@ -61,6 +61,7 @@ class BallFindings:
     sessions: Sessions
     spins: Spins | None  # of every ball, where balls spin
     may_spin: bool  # something is left that spins may explain
+    companions: Set = ()  # effects that are not named, and with which unseen balls are predicted better
 
     @property
     def spin_is_cause(self) -> bool:

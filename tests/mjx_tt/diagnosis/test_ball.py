@@ -233,9 +233,10 @@ def test_the_extended_model_is_one_that_training_loads(tmp_path):
     (samples,) = loaded.randomise
     drawn = dict(zip(samples.paths, samples.values.T, strict=True))
     low, high = np.quantile(drawn["ball.table.friction"], [0.05, 0.95])
-    assert abs(low - estimate.low) < 0.2 * (estimate.high - estimate.low) > abs(high - estimate.high)
-    # Others stay as they are in most draws: the log does not need them, and shows how little there can be of them.
-    assert all(np.mean(v == np.median(v)) > 0.5 for path, v in drawn.items() if path != "ball.table.friction")
+    assert low < estimate.low + 5e-4 and high > estimate.high - 5e-4 and high - low < 0.01
+    # Others are off by as much as nobody would name, which is little where the log shows them.
+    usual = {e.path: e.scale for e in FITTED if e.express is None}
+    assert all(np.std(v) < 0.31 * usual[path] for path, v in drawn.items() if path in usual)
     assert loaded.provenance["logs"] == {"log": "0" * 64}
 
 
@@ -358,8 +359,8 @@ def test_drag_leads_on_a_launchers_straight_balls_and_predicts_as_well_as_a_spin
     (cause,) = found.verdict.causes
     drag = cause.parameters["ball.flight.drag_coefficient"]
     # Seen when flights before the bounce alone are fitted: 0.30 to 0.33, not 0.47. The balls fly one way at one speed.
-    assert found.verdict.verdict == "unexplained" and cause.name == "drag_coefficient" and "wind_y" in cause.group
-    assert drag.low < 0.30 < 0.33 < drag.high < 0.36 and found.verdict.held_out.low > 0.0
+    assert cause.name == "drag_coefficient" and cause.share > 0.8 and found.verdict.held_out.low > 0.0
+    assert 0.28 < drag.estimate < 0.33
     # No camera is turned by 34 mrad and no table is 25 mm lower: both were named and adopted once.
     assert found.extended.model.sensing == SimModel().sensing and found.extended.model.ball.table.height == 0.0
     scored = benchmark("straight", read(path).trajectories, {"extended": found.extended.model})

@@ -208,7 +208,10 @@ def test_page_starts_with_the_verdict_and_the_picture_that_shows_it(windy, windy
     for verdict, start in (
         (windy.verdict, "The air moves sideways"),
         (replace(windy.verdict, verdict="none", causes=()), "The simulation agrees with 60 balls"),
-        (replace(windy.verdict, verdict="unexplained", unexplained=odd, causes=()), "No entry of the catalogue explains"),
+        (
+            replace(windy.verdict, verdict="unexplained", unexplained=odd, causes=()),
+            "No entry of the catalogue explains",
+        ),
         (several, f"{len(several.causes)} things are wrong: air that moves across the table"),
     ):
         d = replace(windy, verdict=verdict)

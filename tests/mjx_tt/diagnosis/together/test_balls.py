@@ -8,9 +8,9 @@ import pytest
 from ballmodel.trajectory import Trajectory
 from experiments.config.study import PRIOR
 from mjx_tt.diagnosis.ball import posterior
-from mjx_tt.diagnosis.ball.search import SCATTER
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, own_spins
 from mjx_tt.diagnosis.ball.flights.linearization import SPIN, Situation
+from mjx_tt.diagnosis.ball.search import SCATTER
 from mjx_tt.diagnosis.together import balls as of_balls
 from mjx_tt.sim.model import SimModel
 from tests.exam.generator.world import World, fly
