@@ -131,7 +131,7 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
         "picture": None,
         "sentence": text.sentence(d) if d.verdict.verdict == "none" else "",
         "causes": [
-            (_code(c.name), text.claim(c) + text.alike(c), _percent(c.share) if c.share else "", *_sure(c))
+            (_code(c.name), text.claim(c) + text.alike(c), _percent(min(c.share, 1.0)) if c.share else "", *_sure(c))
             for c in causes
         ],
         "warnings": [w for w in d.verdict.warnings if w not in _told_elsewhere(d)],
@@ -166,10 +166,6 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
 def _told_elsewhere(d: Diagnosis) -> set[str]:
     """Warnings that a section of their own holds."""
     return set(d.record.lines() if d.record is not None else ())
-
-
-def _of_error(c: Cause) -> str:
-    return _percent(min(c.share, 1.0)) if c.share else ""
 
 
 def _sure(c: Cause) -> tuple[str, str]:

@@ -248,7 +248,6 @@ def block(name: str) -> str:
         ("force over ", "a force that changes with "),
         ("bounce over ", "a bounce that changes with "),
         ("measured position over ", "a shift of the measured position that changes with "),
-        ("jump of the measured position at ", "a jump of the measured position across a plane in "),
         ("force by session", "a force that differs from session to session"),
         ("bounce by session", "a bounce that differs from session to session"),
     )
