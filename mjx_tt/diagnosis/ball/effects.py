@@ -252,7 +252,7 @@ EFFECTS: tuple[Effect, ...] = (
         meaning="speed that the table gives back",
         claim="The table returns {way:more|less} speed than the model says, restitution {instead}",
         path=TABLE + "restitution",
-        scale=0.03,
+        scale=0.05,
         unit="1",
         reading="a ball dropped on the table from 30 cm",
     ),

@@ -22,7 +22,7 @@ from mjx_tt.diagnosis.ball.flights.noise import Noise, Whitening
 from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior
 from mjx_tt.diagnosis.ball.inclusion import Family, Left, LinearModel, Set
 
-ROUNDS = 6
+ROUNDS = 8
 EARLY = 2  # of them, in which no cause has to be worth its name
 HALF = 0.5  # of all that the evidence gains, by which a single cause is looked at
 PASSES = 3  # of asking how spins and kicks are distributed
@@ -128,9 +128,9 @@ def search(
         theta = sizes.theta(model, chosen)
         say(f"round {round_ + 1}: {', '.join(problem.effects[i].name for i in inside) or 'nothing'}")
         moved = np.abs(theta - at.theta)[inside] / np.sqrt(np.diagonal(covariance))[inside]
-        if chosen == before and round_ >= EARLY and (np.max(moved, initial=0.0) < SETTLED or round_ > 2):
+        if chosen == before and round_ >= EARLY and np.max(moved, initial=0.0) < SETTLED:
             break
-        if round_ > EARLY and chosen in seen:
+        if round_ > EARLY and chosen in seen and chosen != before:
             break
         seen.add(chosen)
         before = chosen
