@@ -8,7 +8,7 @@ found.verdict.causes, found.extended
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from mjx_tt.diagnosis.ball import causes, cross_validation
 from mjx_tt.diagnosis.ball import effects as ball_effects
 from mjx_tt.diagnosis.ball.cross_validation import Prediction
 from mjx_tt.diagnosis.ball.diagnose import BallFindings, diagnose_balls
-from mjx_tt.diagnosis.ball.leading import Leading, leading
 from mjx_tt.diagnosis.hits import diagnose as paddle
 from mjx_tt.diagnosis.hits.diagnose import HitFindings, diagnose_hits
 from mjx_tt.diagnosis.hits.paddle_path import joint_path
@@ -33,6 +32,7 @@ from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
 
 SPINS = ("auto", "none", "free")
+SPINS_PAY = 0.8  # of the error without, that unseen balls must be predicted to with spins
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def diagnose(
     of_ball = [name for name in without if name in ball_effects.DESCRIPTIONS]
     of_joints = [name for name in without if name not in of_ball]
     parts: list[Part] = []
-    found = prediction = hits = robot = lead = None
+    found = prediction = hits = robot = None
     notes = list(logs.notes)
     record = None
     if logs.balls:
@@ -83,10 +83,10 @@ def diagnose(
         say("parting tracks into strokes")
         # A ball off a racket spins: where spin is not modelled what follows a hit inside a track is not used.
         strokes, record = clean(logs.balls, spin == "free")
-        found, prediction, lead = _balls(strokes, model, spin, of_ball, seed, say)
+        found, prediction, told = _of_balls(strokes, model, spin, of_ball, seed, say)
         say("judging the robot's hits")
         hits = diagnose_hits(found, record.tracks, joint_path(logs.joints, model), without)
-        notes += [*record.lines(), *found.spin_notes, *found.small_notes]
+        notes += [*record.lines(), *told]
     if logs.joints:
         nominal = {r.joint: nominal_response(model, r.joint, r.robot) for r in logs.joints}
         robot = diagnose_joints(
@@ -99,7 +99,7 @@ def diagnose(
         )
     if found is not None and prediction is not None:
         parts += [
-            causes.part(found, prediction, without, hits is not None, seed, say, lead),
+            causes.part(found, prediction, without, hits is not None, seed, say),
             paddle.part(found, hits, without),
         ]
     if robot is not None:
@@ -126,43 +126,26 @@ def _check(logs: Logs, spin: str, without: Sequence[str]) -> None:
         raise ValueError("the logs hold neither balls nor joints")
 
 
-def _balls(
+def _of_balls(
     balls: Sequence[Trajectory],
     model: SimModel,
     spin: str,
     without: list[str],
     seed: int,
     say: Callable[[str], None],
-) -> tuple[BallFindings, Prediction, Leading | None]:
-    """Findings of the flights, their held-out errors, and what leads where something stays open.
+) -> tuple[BallFindings, Prediction, list[str]]:
+    """Findings of the flights, their held-out errors, and notes.
 
-    Without spin where it predicts unseen balls worse.
+    Where the nominal ball does not spin, with spins if unseen balls are predicted better so.
     """
-    found, prediction = _judged(balls, model, spin, without, seed, say)
-    lead = leading(found, say, seed) if found.findings else None
-    return found, (prediction if lead is None else lead.prediction), lead
-
-
-def _judged(
-    balls: Sequence[Trajectory],
-    model: SimModel,
-    spin: str,
-    without: list[str],
-    seed: int,
-    say: Callable[[str], None],
-) -> tuple[BallFindings, Prediction]:
-    found = diagnose_balls(balls, model, spin, without, seed, say)
+    mode = "none" if spin == "free" and "magnus" in without else spin
+    found = diagnose_balls(balls, model, mode, without, seed, say)
     say("predicting balls that were not used")
-    prediction = cross_validation.predictions(found, seed)
-    if found.choice.spin and spin == "none" and cross_validation.held_out(prediction, seed).high < 0.0:
-        say("spin predicts unseen balls worse: once more without it")
-        other = diagnose_balls(balls, model, spin, [*without, "magnus"], seed, say)
-        prediction_of_other = cross_validation.predictions(other, seed)
-        if np.nanmedian(prediction_of_other.after) < np.nanmedian(prediction.after):
-            better = [1e3 * float(np.nanmedian(p.after)) for p in (prediction, prediction_of_other)]
-            note = (
-                f"spin was tried and dropped: with it unseen balls are predicted to {better[0]:.1f} mm in the median, "
-                f"without it to {better[1]:.1f} mm"
-            )
-            return replace(other, spin_notes=(*other.spin_notes, note)), prediction_of_other
-    return found, prediction
+    found, prediction = cross_validation.with_companions(found, seed)
+    if not found.may_spin:
+        return found, prediction, []
+    spun = diagnose_balls(balls, model, "cause", without, seed, say)
+    spun, of_spun = cross_validation.with_companions(spun, seed)
+    plain, with_spins = (1e3 * float(np.nanmedian(p.after)) for p in (prediction, of_spun))
+    note = f"unseen balls are predicted to {with_spins:.1f} mm in the median with spin, to {plain:.1f} mm without"
+    return (spun, of_spun, [note]) if with_spins < SPINS_PAY * plain else (found, prediction, [note])

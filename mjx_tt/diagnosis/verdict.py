@@ -39,6 +39,16 @@ class Cause:
     parameters: dict[str, Estimate]  # by dotted path of SimModel, of a joint by joint.parameter
     effect_mm: float  # median shift of a flight's last sample; rms movement of a joint [mrad], an axis [mm]
     separating_measurement: str
+    share: float = 0.0  # of the nominal model's error that it takes away; 0 for joints and hits
+
+
+@dataclass(frozen=True)
+class Left:
+    """What the named causes leave of the flights' error, after each ball's own start and without the noise."""
+
+    mm: float  # root mean square
+    share: float  # of the nominal model's mean square
+    nominal_mm: float  # root mean square under the nominal model
 
 
 @dataclass(frozen=True)
@@ -97,6 +107,7 @@ class Verdict:
     runners_up: tuple[dict, ...] = field(default=())
     warnings: tuple[str, ...] = field(default=())
     together: tuple[Together, ...] = field(default=())
+    left: Left | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Plain data; a number that is not finite (a limit that was never reached) is null."""
@@ -147,7 +158,8 @@ class Part:
     warnings: tuple[str, ...] = ()
     together: tuple[Together, ...] = ()
     samples: tuple[Samples, ...] = ()  # of what is open in the model, in place of the named causes' ranges
-    adopted: bool = False  # beside what is unexplained a cause leads that accounts for nearly all
+    adopted: bool = False  # the named causes predict unseen data better
+    left: Left | None = None
 
 
 def combined(
@@ -189,6 +201,7 @@ def combined(
         every("runners_up"),
         tuple(warnings),
         every("together"),
+        next((p.left for p in parts if p.left is not None), None),
     )
     if kind == "undetermined" and not (held_out and held_out.low > 0.0):
         return verdict, {}, ()

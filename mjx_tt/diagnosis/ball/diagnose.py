@@ -1,41 +1,46 @@
-"""Diagnosis of the flights: from measured balls to chosen causes, blocks without a name, and what the data can show."""
+"""Diagnosis of the flights: which causes there are, how much of the error each takes away, and what is left."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball import evidence, posterior, scores, selection
 from mjx_tt.diagnosis.ball.effects import BY_NAME, EFFECTS
 from mjx_tt.diagnosis.ball.flights import noise, tracker_gate
-from mjx_tt.diagnosis.ball.flights.fit import first_fit, fit_starts, heading, own_spins
+from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid
-from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Linear, Projected, Situation, shifts
-from mjx_tt.diagnosis.ball.flights.noise import Jitter, Noise
-from mjx_tt.diagnosis.ball.posterior import Posterior
-from mjx_tt.diagnosis.ball.scores import Scores
-from mjx_tt.diagnosis.ball.selection import Choice, Settled, Trial, search
+from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation
+from mjx_tt.diagnosis.ball.flights.noise import Jitter
+from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
+from mjx_tt.diagnosis.ball.inclusion import Set
+from mjx_tt.diagnosis.ball.search import Search, Sessions, mean_square, search, spins_pay
 from mjx_tt.diagnosis.ball.spins import Spins, estimate
-from mjx_tt.diagnosis.ball.unexplained import Finding, Left, find
 from mjx_tt.diagnosis.logs import before_racket
 from mjx_tt.sim.model import SimModel, with_values
 
 FEWEST_SAMPLES = 15  # of a flight
 FEWEST_BALLS = 12
-SCATTER = np.full(3, 0.1)  # [m/s] of bounces, before anything is known of it
-# Lift of balls that spin fast, of which a flight shows the product with the spin: their valley is not found from
-# ordinary spins on every processor.
-WEAK_LIFT = 0.15
-LEAST_SHIFT = selection.FLOOR / 2  # [m] of a flight's end, for bounces that differ from ball to ball
-TRACKERS = {"tracker_smoothing", "tracker_filter", "tracker_gate"}
-FILTERED = "the tracker filters: once more without most of the samples behind the bounce"
-MORE = 1.2  # times the samples left out, for another try with more
-BLURRED, BLUR = 5.0, (0.04, 0.12)  # memories of a tracker's filter for which it settles behind a bounce; [s] of it
+FLOOR = 0.003  # [m] shift of a flight's last sample below which a cause is of no practical interest
+LEAST_LEFT, LEAST_LEFT_SHARE = 0.0025, 0.2  # [m] of what no cause explains, on one ball in ten; share of the error
+HALVES = 20  # of the balls, by which a cause's confidence is told
+WIDE = 10.0  # times ordinary sizes, where only the flights are to speak
+ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
+TIE = 5.0  # of the logarithm of the evidence by which a cause must beat another in its place
+FILTER = ("tracker_filter", "tracker_gate")
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """One smooth function that no cause of the catalogue explains."""
+
+    name: str
+    direction: str
+    size: float  # [m] largest on a flight, beside its own start, on one ball in ten
+    rms: float  # [m] over all samples
 
 
 @dataclass(frozen=True)
@@ -43,33 +48,29 @@ class BallFindings:
     """Findings of a set of flights."""
 
     problem: BallProblem
-    situation: Situation
-    linear: Linear
-    choice: Choice
-    trial: Trial
-    noise: Noise
-    projected: Projected
-    findings: tuple[Finding, ...]
-    survivors: tuple[str, ...]  # names that hold beside what is unexplained; all of them where nothing is
-    start0: Float[np.ndarray, "9 n"]  # under the nominal model
+    search: Search
+    spinning: str  # "none", "free" or "cause", see diagnose_balls
+    named: Set  # of the chosen, those of a size that matters
+    groups: dict[int, Set]  # what can stand in for each of the chosen
+    confidence: dict[int, float]  # share of half logs that choose it
+    left_out: Set  # effects that were no candidates
+    patterns: tuple[Pattern, ...]  # the largest first
+    unexplained: bool  # the patterns are a fifth of the error, and large enough to matter
     residual0: Float[np.ndarray, "3 T n"]  # [m] under the nominal model
-    sessions: Int[np.ndarray, " n"]
-    age: Float[np.ndarray, " n"]
-    seen: Bool[np.ndarray, " K"]  # the data could show the effect, and it was not left out
-    imitated: tuple[str, ...]  # effects that were left out, each of which would replace two of the causes
-    together: Posterior  # all effects fitted at once, before any was chosen
+    start0: Float[np.ndarray, "12 n"]
+    sessions: Sessions
     spins: Spins | None  # of every ball, where balls spin
-    spin_notes: tuple[str, ...]  # what was tried about spin, and what it brought
-    small_notes: tuple[str, ...]  # what causes too small to be named explain
-    untried: bool  # spins and bounces that differ were not tried, because of a tracker's filter
+    may_spin: bool  # something is left that spins may explain
+    companions: Set = ()  # effects that are not named, and with which unseen balls are predicted better
 
-    def scores(self) -> Scores:
-        """Scores of the effects under the chosen treatment of spin."""
-        return scores.under(self.projected, self.choice.prior)
+    @property
+    def spin_is_cause(self) -> bool:
+        """True where balls spin that do not in the nominal model."""
+        return self.spinning == "cause"
 
     def residual(self) -> Float[np.ndarray, "3 T n"]:
         """Residual [m] beside the chosen causes and each ball's own start."""
-        return selection.left_over(self.linear, self.situation, self.projected, self.choice, self.problem.grid)[0]
+        return self.search.linear.residual
 
 
 def flights(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
@@ -86,82 +87,11 @@ def diagnose_balls(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> BallFindings:
-    """Chooses the causes, and once more without samples around the bounce that a tracker proves to have blurred.
-
-    Time stamps that shake round the corner of the bounce, and so does a filter that predicts: for a moment behind it
-    the samples say more about the tracker than about the table. What a bounce does to a ball stays.
-    spin: "none" when the nominal ball does not spin, so that spin is a cause; "free" when every ball may.
-    without: effects to omit from the catalogue. Raises ValueError when there are too few flights.
-    """
-    say = progress or (lambda text: None)
-    choose = partial(_diagnose, trajectories, model, spin, without, seed, progress)
-    found = choose()
-    near = _blurred(found, found.problem.grid)
-    if near is not None:
-        say(FILTERED)
-        clear = choose(near, found)
-        more = _blurred(clear, found.problem.grid) if clear.findings else None
-        if more is not None and more.sum() > MORE * near.sum():
-            say("it filters for longer than it seemed: once more without these samples as well")
-            near = near | more
-            clear = choose(near, found)
-        if found.untried and (clear.findings or evidence.extraordinary(clear.choice, clear.trial)):
-            say("something stays open: it is not the filter's doing alone")
-            found = choose(patient=False)
-            near = _blurred(found, found.problem.grid)
-            if near is not None:
-                say(FILTERED)
-                clear = choose(near, found)
-        found = found if near is None else clear
-    shaken = None if "latency_jitter" in without else shaking(found)
-    if shaken is None:
-        return found
-    say(f"time stamps shake by {1e3 * shaken.seconds:.1f} ms: once more without the bounce's samples")
-    shaky = np.abs(found.problem.grid.time - found.linear.base.bounce_time[0]) < 3.0 * shaken.seconds
-    return choose(shaky if near is None else near | shaky, found)
-
-
-def _blurred(found: BallFindings | Settled, g: Grid) -> Bool[np.ndarray, "T n"] | None:
-    """Samples behind the bounce that a predicting filter blurs, but the first, which shows the filter; None without it.
-
-    A filter that is not quite the catalogue's settles in a way of its own: it may also show in
-    sets that explain more than the chosen one, but with a size that no filter has.
-    """
-    choice, names = found.choice, [e.name for e in found.trial.effects]
-    filters = [t for j, t in zip(choice.effects, choice.theta, strict=True) if names[j] == "tracker_filter"]
-    better = {names[j] for subset, _, gain in choice.runners_up if gain > choice.gain for j in subset}
-    if not filters and (not better & TRACKERS or TRACKERS & {names[j] for j in choice.effects}):
-        return None
-    filters = filters or [0.0]
-    behind = g.time - found.linear.base.bounce_time[0]
-    first = (behind > 0.0) & (np.cumsum(behind > 0.0, axis=0) == 1)
-    settling = np.clip(BLURRED * filters[0], *BLUR)
-    return (behind > 0.0) & (behind < settling) & ~first
-
-
-def shaking(found: BallFindings) -> Jitter | None:
-    """Deviation of the time stamps in the residual beside the chosen causes, from the samples that count."""
-    g = found.problem.grid
-    g = replace(g, mask=g.mask & (found.projected.weight.T > 0.0))
-    return noise.time_jitter(found.residual(), found.linear.base.velocity[:, :, 0], g)
-
-
-def _diagnose(
-    trajectories: Sequence[Trajectory],
-    model: SimModel,
-    spin: str,
-    without: Sequence[str],
-    seed: int,
-    progress: Callable[[str], None] | None,
-    hidden: Bool[np.ndarray, "T n"] | None = None,
-    before: BallFindings | None = None,
-    patient: bool = True,
-) -> BallFindings:
     """Chooses the causes.
 
-    hidden: samples that do not count. before: findings with these samples, at whose spins the search starts.
-    patient: where a tracker's filter may be what stays open, spins and bounces that differ are not tried: a filter
-    looks like either.
+    spin: "none" when no ball spins; "free" when every ball may, in the nominal model as well; "cause" when every ball
+    may, and in the nominal model none does.
+    without: effects to omit from the catalogue. Raises ValueError when there are too few flights.
     """
     say = progress or (lambda text: None)
     kept = flights(trajectories)
@@ -174,215 +104,147 @@ def _diagnose(
     if "magnus" in gone and model.ball.flight.magnus_coefficient == 0.0:
         # Without the force the nominal model has no use for either.
         gone |= {"magnus_coefficient", "air_density", "lift_saturation", "spin_decay"}
-    fitted = tuple(e for e in EFFECTS if e.fit and not e.at_paddle and not (e.needs_spin and e.name in gone))
-    left_out = tuple(i for i, e in enumerate(fitted) if e.gone(gone))
-    mode = "never" if spin == "none" and "magnus" in gone else spin
-    names, sessions, age = _sessions(kept)
+    effects = tuple(e for e in EFFECTS if e.fit and not e.at_paddle)
+    sessions = _sessions(kept)
     g = grid(kept)
-    if before is not None:
-        g, model = replace(g, surprise=before.problem.grid.surprise), before.problem.model
-    if hidden is not None:
-        g = replace(g, mask=g.mask & ~hidden)
-    problem = BallProblem(g, model, fitted, heading(g))
+    problem = BallProblem(g, model, effects, heading(g))
     say(f"fitting {g.n} flights under the nominal model")
-    none = np.zeros(len(fitted))
-    start = first_fit(problem) if before is None else fit_starts(problem, none, before.start0, g)
-    nominal = Situation(none, start)
-    if before is None:
-        flown = problem.fly(none, start)
-        g = replace(g, surprise=noise.surprise(g.measured - flown.measured[:, :, 0], flown.bounce_time[0], g))
-        problem = BallProblem(g, model, fitted, heading(g))
-    linear = problem.linearise(nominal)
-    if before is None and model.sensing.filter_time in (None, 0.0) and "tracker_filter" not in gone:
-        gate = tracker_gate.likeliest(problem, nominal, linear)
-        if gate is not None and gate != problem.nominal[tracker_gate.GATE]:
-            problem = BallProblem(g, with_values(model, {tracker_gate.GATE: gate}), fitted, heading(g))
-            linear = problem.linearise(nominal)
-    called = [e.name for e in fitted]
-    bound = tuple(
-        (i, called.index(e.beside))
-        for i, e in enumerate(fitted)
-        if e.beside and problem.nominal[BY_NAME[e.beside].path] == 0.0
+    at = Situation(np.zeros(len(effects)), first_fit(problem))
+    problem, at, filters = _with_filter(problem, at, gone)
+    left_out = tuple(
+        i for i, e in enumerate(effects) if e.gone(gone) or (e.name in FILTER and not filters) or e.name == FILTER[1]
     )
-    trial = Trial(fitted, *shifts(linear, g, fitted), mode, seed, left_out, bound)
-    spin_notes: list[str] = []
-    if before is not None and not (before.untried and mode == "none"):
-        prior, together = before.choice.prior, before.together
-        own = prior is not None and prior.conditional
-        treated = replace(trial, spin="free") if own else trial
-        best = search(problem, treated, before.situation, prior, say, scatter=before.noise.scatter)
-        best = replace(best, trial=replace(best.trial, spin=trial.spin))
-        if (
-            own
-            and mode == "none"
-            and (evidence.shift_of_spins(best) < selection.FLOOR or evidence.spins_without_lift(best))
-        ):
-            best, together = plain(problem, replace(trial, spin="never"), nominal, say)
-    elif mode == "free":
-        best, together = spinning(problem, trial, nominal, say)
-    else:
-        best, together = plain(problem, trial, nominal, say)
-        if mode == "none" and evidence.spins_without_lift(best):
-            best, together = plain(problem, replace(trial, spin="never"), nominal, say)
-            best = replace(best, trial=replace(best.trial, spin="none"))
-    say("looking for what no entry explains")
-    left = find(best, g, sessions, age, names)
-    first = before is None
-    untried = first and patient and bool(left.findings) and _blurred(best, g) is not None
-    tries = first and not untried
-    doubted = (
-        bool(left.findings) or evidence.bent_too_far(best.choice) or evidence.extraordinary(best.choice, best.trial)
+    nominal = at  # starts under the nominal model, with spins where its balls have them
+    spun: SpinPrior | None = None
+    if spin != "none":
+        say("fitting each ball's spin")
+        at, spun = own_spins(problem, at)
+        nominal = at if spin == "free" else nominal
+    flown = problem.fly(np.zeros(len(effects)), nominal.start)
+    residual0 = np.where(g.mask, g.measured - flown.measured[:, :, 0], 0.0)
+    start_error = mean_square(residual0, g, 6)
+    error = start_error if spin == "cause" else 0.0
+    found = search(problem, at, spun, left_out, sessions, error, say)
+    doubt = False
+    if spin == "none" and "magnus" not in gone:
+        say("asking whether balls spin, each in its own way")
+        doubt = _open(found, g, start_error) or spins_pay(problem, found, *own_spins(problem, at))
+    patterns, _, _ = _patterns(found, g)
+    rng = np.random.default_rng(seed)
+    named = tuple(
+        j for j in found.chosen if abs(found.at.theta[j]) * found.shift[j] >= FLOOR or problem.effects[j].fades
     )
-    if mode == "none" and tries and doubted:
-        # Strong spin is out of reach of derivatives taken about balls that do not spin.
-        say("trying balls that spin fast, each in its own way")
-        other, theirs = spinning(problem, trial, nominal, say)
-        gained = evidence.misfit(best, g) - evidence.misfit(other, g)
-        shift = evidence.shift_of_spins(other)
-        bends = evidence.lifts(other)
-        spin_notes.append(_tried(gained, shift, bends, bool(left.findings)))
-        if gained > 0.0 and shift >= selection.FLOOR and bends:
-            best, together = replace(other, trial=replace(other.trial, spin="none")), theirs
-            left = find(best, g, sessions, age, names)
-    if tries and left.findings:
-        for attempt in _of_scattering(best.choice, mode):
-            say("trying bounces that differ from ball to ball")
-            other, theirs = attempt(problem, trial, nominal, say, SCATTER)
-            gained = evidence.misfit(best, g) - evidence.misfit(other, g)
-            shift = evidence.shift_of_scatter(other, g)
-            beside = find(other, g, sessions, age, names)
-            kept_so = gained > 0.0 and shift >= LEAST_SHIFT and not beside.findings
-            spin_notes.append(_scattering(gained, shift, other.noise.scatter, kept_so))
-            if kept_so:
-                best, together, left = other, theirs, beside
-                best = replace(best, trial=replace(best.trial, spin=mode))
-                break
-    seen = selection.visible(
-        scores.under(best.projected, best.choice.prior), best.trial, bool(best.noise.scatter.any())
-    )
-    seen[list(left_out)] = False
     return BallFindings(
         problem,
-        best.at,
-        best.linear,
-        best.choice,
-        best.trial,
-        best.noise,
-        best.projected,
-        left.findings,
-        left.holding,
-        start,
-        linear.residual,
+        found,
+        spin,
+        named,
+        {j: _group(found, j) for j in found.chosen},
+        _confidence(found, rng),
+        left_out,
+        patterns,
+        _open(found, g, start_error),
+        residual0,
+        nominal.start,
         sessions,
-        age,
-        seen,
-        evidence.imitated(best.projected, best.trial, best.choice),
-        together,
-        estimate(problem, best, kept),
-        tuple(spin_notes) if before is None else before.spin_notes,
-        _of_small(left),
-        untried,
+        estimate(problem, found, kept),
+        doubt,
     )
 
 
-def plain(
-    problem: BallProblem,
-    trial: Trial,
-    nominal: Situation,
-    say: Callable[[str], None],
-    scatter: Float[np.ndarray, 3] = noise.ALIKE,
-) -> tuple[Settled, Posterior]:
-    """Choice of causes about balls that do not spin to begin with, and all effects at once."""
-    fitted_all = posterior.fit(problem, nominal, None, trial.left_out, say, scatter)
-    found = search(problem, trial, fitted_all.at, None, say, fitted_all.linear, fitted_all.noise.scatter)
-    return found, fitted_all
+def shaking(found: BallFindings) -> Jitter | None:
+    """Deviation of the time stamps in the residual beside the chosen causes."""
+    return noise.time_jitter(found.residual(), found.search.linear.base.velocity[:, :, 0], found.problem.grid)
 
 
-def _tried(gained: float, shift: float, bends: bool, open_: bool) -> str:
-    """Account of balls with spins of their own, which shift [m] flights, against balls without, by twice the log
-    evidence gained. bends: the air bends such balls as it does real ones. open_: something stayed open without."""
-    why = "something stayed open without it" if open_ else "a cause was of a size that hardly any set-up has"
-    if gained > 0.0 and shift < selection.FLOOR:
-        then = f"dropped: it moves balls {1e3 * shift:.1f} mm"
-    elif gained > 0.0 and not bends:
-        then = "dropped: no air bends balls so much or little"
-    elif gained > 0.0:
-        then = f"kept: its evidence is {gained:.0f} better"
-    else:
-        then = f"dropped: its evidence is {-gained:.0f} worse"
-    return f"spin was tried because {why}, and {then}"
-
-
-def _of_small(left: Left) -> tuple[str, ...]:
-    """Account of what stays beside the named causes and has an explanation."""
-    if left.findings or not left.small:
-        return ()
-    most = left.small[0]
-    return (
-        f"small causes beside: {most.block}, {most.where}, up to {1e3 * most.size:.1f} mm, is what effects of the "
-        "catalogue explain together that are each too small to be named",
+def _with_filter(problem: BallProblem, at: Situation, gone: set[str]) -> tuple[BallProblem, Situation, bool]:
+    """The problem with the gate of a tracker's filter and its memory to begin with, where such a filter shows."""
+    model, index = problem.model, [e.name for e in problem.effects].index(FILTER[0])
+    if model.sensing.filter_time not in (None, 0.0) or FILTER[0] in gone:
+        return problem, at, FILTER[0] not in gone
+    likeliest = tracker_gate.likeliest(problem, at, problem.linearise(at))
+    if likeliest is None:
+        return problem, at, False
+    memory, gate = likeliest
+    problem = BallProblem(
+        problem.grid, with_values(model, {tracker_gate.GATE: gate}), problem.effects, heading(problem.grid)
     )
+    theta = at.theta.copy()
+    theta[index] = memory
+    return problem, replace(at, theta=theta), True
 
 
-def _of_scattering(choice: selection.Choice, mode: str) -> tuple[Callable[..., tuple[Settled, Posterior]], ...]:
-    """Searches that bounces of many kinds are tried with: kicks at the bounce may have been taken for spin."""
-    if mode == "free":
-        return (spinning,)
-    return (plain, spinning) if choice.prior is not None and choice.prior.conditional else (plain,)
+def _open(found: Search, g: Grid, error: float) -> bool:
+    """True where what no cause explains is large enough to matter, and a fifth of the error [m^2] of the nominal model.
+
+    Bounces count with what differs between them: a place that returns balls otherwise is no scatter.
+    """
+    _, largest, rms = _patterns(found, g)
+    return largest >= LEAST_LEFT and rms**2 > LEAST_LEFT_SHARE * max(error - found.level, rms**2)
 
 
-def _scattering(gained: float, shift: float, scatter: Float[np.ndarray, 3], kept: bool) -> str:
-    """Account of bounces that differ from ball to ball against bounces that are alike."""
-    across, against, up = scatter
-    text = (
-        "bounces that differ from ball to ball were tried because something stayed open without: by "
-        f"{across:.3f} m/s across the ball's way, {against:.3f} along it, {up:.3f} upwards, "
-        f"{1e3 * shift:.1f} mm at the end of a flight"
-    )
-    why = "something stays open with them as well, " if gained > 0.0 and not kept else ""
-    return f"{text}; {'kept' if kept else 'dropped'}: {why}evidence {gained:+.0f}"
+def _patterns(found: Search, g: Grid) -> tuple[tuple[Pattern, ...], float, float]:
+    """What the discrepancy is made of, the size [m] of all of it on one ball in ten, and its rms [m]."""
+    free = np.where(g.mask, found.linear.starts[:6], 0.0)
+    basis = np.linalg.qr(np.moveaxis(free.reshape(6, -1, g.n), (0, 1, 2), (2, 1, 0)))[0]
+
+    def sizes(columns: np.ndarray) -> tuple[float, float]:
+        shown = np.where(g.mask, np.tensordot(found.left.coefficients[columns], found.columns[columns], 1), 0.0)
+        rows = shown.reshape(-1, g.n).T[..., None]
+        rows = (rows - basis @ (basis.swapaxes(1, 2) @ rows)).reshape(g.n, 3, -1)
+        square = (rows**2).sum(axis=1)
+        return float(np.percentile(np.sqrt(square.max(axis=1)), 90)), float(np.sqrt(square.sum() / g.mask.sum()))
+
+    families = [f for f in found.model.families if found.left.coefficients[f.columns].any()]
+    if not families:
+        return (), 0.0, 0.0
+    every = [Pattern(f.name, f.direction, *sizes(f.columns)) for f in families]
+    return tuple(sorted(every, key=lambda p: -p.rms)), *sizes(np.concatenate([f.columns for f in families]))
 
 
-def spinning(
-    problem: BallProblem,
-    trial: Trial,
-    nominal: Situation,
-    say: Callable[[str], None],
-    scatter: Float[np.ndarray, 3] = noise.ALIKE,
-) -> tuple[Settled, Posterior]:
-    """Choice of causes where each ball has a spin of its own, about which derivatives are taken; and all at once."""
-    say("fitting each ball's spin")
-    fitted_all = posterior.fit(problem, *own_spins(problem, nominal), trial.left_out, say, scatter)
-    prior = fitted_all.prior
-    if prior is not None:
-        say(
-            f"spins of {prior.components} kind{'s' * (prior.components > 1)}: mean {np.round(prior.mean)}, "
-            f"deviation {np.round(prior.std)} rad/s about x, y, z"
-        )
-    spinning = replace(trial, spin="free")
-    found = search(problem, spinning, fitted_all.at, prior, say, fitted_all.linear, fitted_all.noise.scatter)
-    if prior is not None and evidence.extraordinary(found.choice, found.trial):
-        say("a cause of a size that hardly any set-up has: once more from spins alone")
-        coefficients = [None] if problem.coefficient is None else [fitted_all.at.theta[problem.coefficient], WEAK_LIFT]
-        tried = [found]
-        for coefficient in coefficients:
-            alone = np.zeros(len(trial.effects))
-            if coefficient is not None:
-                alone[problem.coefficient] = coefficient
-            start = fit_starts(problem, alone, fitted_all.at.start, problem.grid, fitted_all.noise, prior, rounds=5)
-            tried.append(search(problem, spinning, Situation(alone, start), prior, say, scatter=scatter))
-        found = min(tried, key=lambda settled: evidence.misfit(settled, problem.grid))
-    return found, fitted_all
+def _group(found: Search, member: int) -> Set:
+    """A chosen effect, and those that explain the flights as well in its place, or nearly in the same way."""
+    rest = tuple(c for c in found.chosen if c != member)
+    others = [c for c in found.model.candidates if c not in found.chosen]
+    # What the flights say, not what is ordinary.
+    wide = replace(found.model, scale=WIDE * found.model.scale)
+    evidence = wide.evidence([found.chosen, *((*rest, c) for c in others)])
+    gram, beside = found.model.total[0], [*rest, *found.model.always]
+    pair = [member, *others]
+    alone = gram[np.ix_(pair, pair)]
+    if beside:
+        mixed = gram[np.ix_(pair, beside)]
+        alone = alone - mixed @ np.linalg.solve(gram[np.ix_(beside, beside)], mixed.T)
+    cosine = np.abs(alone[0]) / np.sqrt(np.maximum(alone[0, 0] * np.diagonal(alone), 1e-300))
+    same = (evidence[0] - evidence[1:] < TIE) | (cosine[1:] > ALIKE)
+    return (member, *(c for c, alike in zip(others, same, strict=True) if alike))
 
 
-def _sessions(
-    kept: Sequence[Trajectory],
-) -> tuple[list[str], Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Names of the sessions, each ball's number of its session, and its place in it from 0 to 1."""
+def _confidence(found: Search, rng: np.random.Generator) -> dict[int, float]:
+    """Share of random halves of the balls whose likeliest set holds each of the chosen effects, or one of its group."""
+    groups = {j: set(_group(found, j)) for j in found.chosen}
+    share = dict.fromkeys(found.chosen, 0)
+    n = len(found.model.ball_gram)
+    for _ in range(HALVES if share else 0):
+        half = found.model.of_balls(rng.permutation(n)[: n // 2])
+        path = half.best(len(found.chosen))
+        likeliest = set(path[int(np.argmax(half.evidence(path)))])
+        for j in share:
+            share[j] += bool(groups[j] & likeliest)
+    return {j: count / HALVES for j, count in share.items()}
+
+
+def jitter_cause(found: BallFindings) -> tuple[str, Jitter] | None:
+    """The time stamps' scatter, where it moves a ball by half of FLOOR."""
+    shaken = shaking(found)
+    return (BY_NAME["latency_jitter"].name, shaken) if shaken is not None and shaken.shift > FLOOR / 2 else None
+
+
+def _sessions(kept: Sequence[Trajectory]) -> Sessions:
     names = list(dict.fromkeys(t.session for t in kept))
     sessions = np.array([names.index(t.session) for t in kept])
     age = np.zeros(len(kept))
     for s in range(len(names)):
         own = np.flatnonzero(sessions == s)
         age[own] = np.arange(len(own)) / max(len(own) - 1, 1)
-    return names, sessions, age
+    return Sessions(sessions, age, names)

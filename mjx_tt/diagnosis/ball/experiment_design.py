@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
 from mjx_tt.diagnosis.ball.flights.forward_model import grid
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem, Situation, project
@@ -51,13 +50,13 @@ def experiments(
     """The best throws to separate pairs (chosen effect, rival), and to show effects that nothing excited."""
     if not pairs and not hidden:
         return ()
-    effects = found.trial.effects
+    effects = found.problem.effects
     out = []
     for throw in THROWS:
         gram = _gram(found, throw)
         separates, worth = [], 0.0
         for chosen, rival in pairs:
-            size = found.choice.theta[found.choice.effects.index(chosen)]
+            size = found.search.at.theta[chosen]
             left = gram[chosen, chosen] - gram[chosen, rival] ** 2 / max(gram[rival, rival], 1e-300)
             if size**2 * left > 10.0:
                 separates.append(f"{effects[chosen].name} from {effects[rival].name}")
@@ -84,16 +83,15 @@ def _gram(found: BallFindings, throw: Throw) -> np.ndarray:
     flat = [Trajectory("", str(i), time, np.zeros((3, SAMPLES))) for i in range(BALLS)]
     g = grid(flat)
     problem = BallProblem(g, found.problem.model, found.problem.effects, velocity)
-    at = Situation(found.situation.theta, np.concatenate([position, velocity, spin, np.zeros_like(spin)]))
+    at = Situation(found.search.at.theta, np.concatenate([position, velocity, spin, np.zeros_like(spin)]))
     linear = problem.linearise(at)
     frame = flight_frame(linear.base.velocity[:, :, 0])
     noise = Noise(
         frame,
-        np.repeat(np.median(found.noise.scale, axis=1, keepdims=True), BALLS, axis=1),
-        found.noise.memory,
-        found.noise.interval,
-        found.noise.scatter,
+        np.repeat(np.median(found.search.noise.scale, axis=1, keepdims=True), BALLS, axis=1),
+        found.search.noise.memory,
+        found.search.noise.interval,
+        found.search.noise.scatter,
     )
-    p = project(linear, at, noise, np.ones((BALLS, SAMPLES)), g, problem.coefficient)
-    rated = scores.under(p, found.choice.prior)
-    return rated.gram[: len(problem.effects), : len(problem.effects)]
+    p = project(linear, at, noise, np.ones((BALLS, SAMPLES)), g)
+    return p.gram.sum(axis=0)

@@ -1,11 +1,11 @@
 """All effects of the catalogue at once: their posterior under what is known of them before a ball is measured.
 
-Real set-ups are wrong in many places by ordinary amounts, and the best change of one number depends on all others. So
-before any is named all are fitted together: Gauss-Newton on the nonlinear model, each ball's start projected out and
-its spin marginalised about its own best fit (the conditional linearisation of Lindstrom and Bates, Biometrics 46,
-1990), until nothing moves. An identification maximises the evidence itself, spins and kicks integrated out. An
-effect's prior is Student's with the catalogue's ``scale``: ordinary sizes cost little, a large one is not forbidden.
-Intervals take their spread from ball to ball; of an identification that did not settle, its last step as well.
+Real set-ups are wrong in many places by ordinary amounts, and the best change of one number depends on all others. An
+identification therefore fits all together: Gauss-Newton on the nonlinear model towards the maximum of the evidence,
+each ball's start projected out, spins and kicks integrated out about its own best fit (the conditional linearisation of
+Lindstrom and Bates, Biometrics 46, 1990), until nothing moves. An effect's prior is Student's: ordinary sizes cost
+little, a large one is not forbidden. Intervals take their spread from ball to ball; of a fit that did not settle, its
+last step as well.
 """
 
 from __future__ import annotations
@@ -16,15 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.effects import FLIGHT, TABLE
 from mjx_tt.diagnosis.ball.flights import marginal, noise
-from mjx_tt.diagnosis.ball.flights.fit import fit_starts, fit_with_cost, log_evidence, refit_worst
+from mjx_tt.diagnosis.ball.flights.fit import fit_starts, log_evidence, refit_worst
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
-from mjx_tt.diagnosis.ball.flights.linearization import KICK, MAGNUS, BallProblem, Linear, Projected, Situation, project
+from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, BallProblem, Linear, Situation
 from mjx_tt.diagnosis.ball.flights.marginal import Evidence
 from mjx_tt.diagnosis.ball.flights.noise import Noise
-from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior, learned
+from mjx_tt.diagnosis.ball.flights.spin_prior import MAGNUS_PRIOR, MAGNUS_RANGE, SpinPrior
 
 ROUNDS = 7
 SETTLED = 0.2  # of a standard deviation by which nothing moves any more
@@ -34,6 +33,7 @@ MEMORY = (0.0, 0.0, 0.3, 0.6, 0.9)  # of the noise, at most, round by round
 LEAST_LIFT = 0.03
 SHARES = (1.0, 0.5, 0.25, 0.1)  # of a step that are tried in turn
 LONGEST_MOVE = 3.0  # scales by which an effect may change in a round
+FREEDOM = 4.0  # degrees of Student's distribution of an effect's size
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,6 @@ def fit(
     say: Callable[[str], None],
     scatter: Float[np.ndarray, 3] = noise.ALIKE,
     besides: tuple[int, float] | None = None,
-    integrated: bool = False,
     held: int = 0,
     near: bool = False,
 ) -> Posterior:
@@ -72,8 +71,6 @@ def fit(
     scatter: [m/s] of the bounces from ball to ball, to start from; zero where they are alike
     besides: an effect and the error of it that the caller will state beside the posterior's; what moves by little of
     that has settled
-    integrated: the maximum of the evidence, spins and kicks integrated out. The diagnosis does without: it begins at
-    these sizes and compares sets of causes by thresholds that were made for the best fits.
     held: rounds besides in which the coefficient of lift stays as it is
     near: the situation is a maximum already, of nearly the same balls: all of the noise's memory counts
     """
@@ -92,36 +89,34 @@ def fit(
         linear = problem.linearise(at)
         most = MEMORY[-1] if near else MEMORY[min(round_, len(MEMORY) - 1)]
         own = _noise(linear, g, prior, most, scatter)
-        if integrated:
-            shown, own, prior = _evidence(problem, linear, at, own, prior, free)
-        else:
-            p = project(linear, at, own, noise.robust_weights(linear.residual, own, g), g)
-            if prior is not None:
-                prior = learned(p.spin_gram, p.spin_right - p.spin_effect @ at.theta)
-            shown = _about_own_spins(p, prior)
+        shown, own, prior = _evidence(problem, linear, at, own, prior, free)
         # Lift and spins are told apart by small differences: not before all else is about right.
         moving = [i for i in free if round_ >= held or effects[i].path != MAGNUS]
-        theta, covariance = _solved(shown, at.theta, moving, mean, scale, problem, LEAST_LIFT if integrated else None)
+        theta, covariance = _solved(shown, at.theta, moving, mean, scale, problem)
         change = theta - at.theta
         # An effect that starts with a threshold has no derivative to settle on.
         smooth = [i for i in free if effects[i].step is None]
         errors = stated(covariance, besides)
         moved = float(np.max(np.abs(change[smooth]) / errors[smooth], initial=0.0))
-        cost = log_evidence if integrated else fit_with_cost
-        before, at = at, _stepped(problem, at, theta, cost, shown, own, prior, mean, scale, free)
-        scatter = own.scatter if integrated else noise.scattered(at.start[KICK], p.kick_gram, scatter)
+        before, at = at, _stepped(problem, at, theta, shown, own, prior, mean, scale, free)
+        scatter = own.scatter
         say(f"all effects at once, round {round_ + 1}: moved by {moved:.1f} deviations")
-        stalled = stalled + 1 if integrated and at is before else 0
+        stalled = stalled + 1 if at is before else 0
         if round_ >= held and (moved < SETTLED or stalled >= 2):
             converged = moved < NEARLY_SETTLED
             break
-    if integrated and not converged:
+    if not converged:
         covariance += np.outer(change, change)  # where it would go on to it may be as well
     if prior is not None:
         start = refit_worst(problem, at.theta, at.start, g, own, prior)
         at = Situation(at.theta, fit_starts(problem, at.theta, start, g, own, prior))
     linear = problem.linearise(at)
     return Posterior(at.theta, covariance, tuple(free), at, linear, own, prior, converged)
+
+
+def price_of(theta: Float[np.ndarray, " c"], scale: Float[np.ndarray, " c"]) -> float:
+    """Evidence that sizes cost which would surprise: -2 times Student's log density of each."""
+    return float((FREEDOM + 1.0) * np.log1p((theta / scale) ** 2 / FREEDOM).sum())
 
 
 def misfit(problem: BallProblem, at: Situation, spins: SpinPrior, scatter: Float[np.ndarray, 3]) -> float:
@@ -132,18 +127,13 @@ def misfit(problem: BallProblem, at: Situation, spins: SpinPrior, scatter: Float
     prior, scatter = marginal.distributions(marginal.products(linear, flights), at.theta, spins, scatter)
     cost = log_evidence(problem, at.theta, at.start, g, replace(own, scatter=scatter), prior, 2)[1]
     spread = 2.0 * np.log(own.scale).sum(axis=0) * g.mask.sum(axis=0)
-    return float((cost + spread).sum() + scores.price(at.theta, np.array([e.scale for e in problem.effects])))
+    return float((cost + spread).sum() + price_of(at.theta, np.array([e.scale for e in problem.effects])))
 
 
 def _noise(linear: Linear, g: Grid, spins: SpinPrior | None, memory: float, scatter: Float[np.ndarray, 3]) -> Noise:
     frame = noise.flight_frame(linear.base.velocity[:, :, 0])
     own = noise.estimate(linear.residual, frame, g, 6 if spins is None else 9)
     return replace(noise.without_memory(own, memory), scatter=scatter)
-
-
-def _about_own_spins(p: Projected, prior: SpinPrior | None) -> Evidence:
-    rated = scores.under(p, prior)
-    return Evidence(rated.ball_gram, rated.ball_right, np.zeros((0, rated.gram.shape[0])), 0, rated.gram)
 
 
 def _evidence(
@@ -171,7 +161,6 @@ def _stepped(
     problem: BallProblem,
     at: Situation,
     theta: Float[np.ndarray, " K"],
-    priced: Callable[..., tuple[np.ndarray, np.ndarray]],
     shown: Evidence,
     own: Noise,
     prior: SpinPrior | None,
@@ -186,15 +175,15 @@ def _stepped(
     """
 
     def price(changes: np.ndarray) -> float:
-        return float(scores.price((changes - mean)[free], scale[free]))
+        return price_of((changes - mean)[free], scale[free])
 
     g = problem.grid
-    best, least = at, float(priced(problem, at.theta, at.start, g, own, prior, 0)[1].sum()) + price(at.theta)
+    best, least = at, float(log_evidence(problem, at.theta, at.start, g, own, prior, 0)[1].sum()) + price(at.theta)
     reach = shown.reach(theta - at.theta)
     for share in SHARES:
         there = at.theta + share * reach * (theta - at.theta)
         spins, scatter = shown.followed(there - at.theta, prior, own.scatter)
-        start, cost = priced(problem, there, at.start, g, replace(own, scatter=scatter), spins, 3)
+        start, cost = log_evidence(problem, there, at.start, g, replace(own, scatter=scatter), spins, 3)
         total = float(cost.sum()) + price(there)
         if total >= least and best is not at:
             break
@@ -212,12 +201,11 @@ def _solved(
     mean: np.ndarray,
     scale: np.ndarray,
     problem: BallProblem,
-    least_lift: float | None = None,
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K K"]]:
     """Changes of all effects from the evidence, and their covariance by the sandwich over balls."""
     count, low = len(scale), np.array([e.low for e in problem.effects])
     away = (before - mean) / scale
-    precision = (scores.FREEDOM + 1.0) / (scores.FREEDOM + away**2) / scale**2
+    precision = (FREEDOM + 1.0) / (FREEDOM + away**2) / scale**2
     held: list[int] = []
     while True:
         chosen = [i for i in free if i not in held]
@@ -232,8 +220,8 @@ def _solved(
             break
         held += below
     lift = [k for k, i in enumerate(chosen) if problem.effects[i].path == MAGNUS]
-    if least_lift is not None and lift:
-        missing = max(least_lift - problem.nominal[MAGNUS] - found[lift[0]], 0.0)
+    if lift:
+        missing = max(LEAST_LIFT - problem.nominal[MAGNUS] - found[lift[0]], 0.0)
         found = found + inverse[lift[0]] / inverse[lift[0], lift[0]] * missing  # the others as is best beside it
     left = flights.right[:, chosen] - flights.gram[:, chosen][:, :, chosen] @ found
     spread = left.T @ left + np.diag(pull)

@@ -12,9 +12,10 @@ from jaxtyping import Float
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem
+from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem, project
+from mjx_tt.diagnosis.ball.flights.noise import robust_weights
 from mjx_tt.diagnosis.ball.flights.spin_prior import TINY
-from mjx_tt.diagnosis.ball.selection import Settled, fitted_spins
+from mjx_tt.diagnosis.ball.search import Search
 
 HEADER = ("session", "trajectory", "t", *(f"{kind}_{axis}" for kind in ("spin", "std") for axis in "xyz"))
 
@@ -39,19 +40,19 @@ class Spins:
                 writer.writerow([session, name, f"{self.time[i]:.6f}", *(f"{x:.3f}" for x in numbers)])
 
 
-def estimate(problem: BallProblem, settled: Settled, balls: Sequence[Trajectory]) -> Spins | None:
+def estimate(problem: BallProblem, found: Search, balls: Sequence[Trajectory]) -> Spins | None:
     """Posterior of every ball's spin beside the chosen causes; None where no ball spins."""
-    prior, p = settled.choice.prior, settled.projected
+    prior, g = found.prior, problem.grid
     if prior is None:
         return None
-    precision = prior.of_balls(len(balls), TINY)[1]
-    mean = settled.at.start[SPIN] if prior.conditional else fitted_spins(p, settled.choice)
-    covariance = np.linalg.inv(p.spin_gram + precision)
+    weight = robust_weights(found.linear.residual, found.noise, g)
+    flown = project(found.linear, found.at, found.noise, weight, g)
+    covariance = np.linalg.inv(flown.spin_gram + prior.of_balls(len(balls), TINY)[1]) * found.model.temper
     variance = np.einsum("can,nab,cbn->cn", problem.axes, covariance, problem.axes)
     return Spins(
         tuple(t.session for t in balls),
         tuple(t.name for t in balls),
         np.array([t.time[0] for t in balls]),
-        np.einsum("can,an->cn", problem.axes, mean),
+        np.einsum("can,an->cn", problem.axes, found.at.start[SPIN]),
         np.sqrt(variance),
     )

@@ -16,14 +16,13 @@ from jaxtyping import Bool, Float
 from scipy.special import stdtr
 
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball import scores, selection
 from mjx_tt.diagnosis.ball.causes import estimates, quantile, readings
-from mjx_tt.diagnosis.ball.diagnose import BallFindings, flights
+from mjx_tt.diagnosis.ball.diagnose import TIE, BallFindings, flights
 from mjx_tt.diagnosis.ball.effects import EFFECTS, INVISIBLE, Effect
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid, grid, predict
 from mjx_tt.diagnosis.ball.flights.linearization import BallProblem
-from mjx_tt.diagnosis.ball.scores import Scores, Subset
+from mjx_tt.diagnosis.ball.inclusion import LinearModel, Set
 from mjx_tt.diagnosis.hits.paddle_path import JointPath, poses, watched
 from mjx_tt.diagnosis.robust import deviation, huber_weights
 from mjx_tt.diagnosis.verdict import Cause, Expressed, Part
@@ -31,8 +30,8 @@ from mjx_tt.diagnosis.verdict import Cause, Expressed, Part
 FEWEST_HITS = 12
 RETURN = 0.25  # [s] of each return that are used
 FARTHEST = 0.15  # [m] between measured and predicted return at the hit beyond which the model's blade missed the ball
-GAIN = 16.0  # evidence that an effect must bring
-LEAST_Z = 4.0
+GAIN = 16.0  # squared errors of a size that matters, for hits to show an effect at all
+SPIKE = 1e-2  # of its usual size, that an effect which is not chosen may have
 LEAST_SHIFT = 0.010  # [m] of the return RETURN after the hit, below which an effect is of no interest
 ROUNDS = 3
 HUBER = 3.5  # deviations of a hit, in six numbers, beyond which it counts less
@@ -74,8 +73,8 @@ def diagnose_hits(
     before = np.array([n for _, n in pairs])
     incoming = np.arange(len(g.time))[:, None] < before[None]
     problem = BallProblem(g, found.problem.model, (*found.problem.effects, *effects), heading(g))
-    theta = np.concatenate([found.situation.theta, np.zeros(len(effects))])
-    start = first_fit(problem, theta, None if found.choice.prior is None else found.choice.prior.mean, incoming)
+    theta = np.concatenate([found.search.at.theta, np.zeros(len(effects))])
+    start = first_fit(problem, theta, None if found.search.prior is None else found.search.prior.mean, incoming)
     change = np.zeros(len(effects))
     y, jacobian, hit = _compare(problem, theta, start, incoming)
     first, usable = y, np.isfinite(hit) & (np.linalg.norm(y[:3], axis=0) < FARTHEST)
@@ -104,7 +103,7 @@ def diagnose_hits(
                     float(abs(value) * shift[i]),
                 )
             )
-    could = np.diagonal(rated.gram) * (2.0 * LEAST_SHIFT / np.maximum(shift, 1e-9)) ** 2 > GAIN
+    could = np.diagonal(rated.total[0]) * (2.0 * LEAST_SHIFT / np.maximum(shift, 1e-9)) ** 2 > GAIN
     named = {c.effect.name for c in causes}
     quiet = tuple(e.name for e, ok in zip(effects, could, strict=True) if not ok and e.name not in named)
     now = theta.copy()
@@ -185,32 +184,23 @@ def line_behind(
 
 def _choose(
     y: Float[np.ndarray, "6 n"], jacobian: Float[np.ndarray, "K 6 n"], effects: tuple[Effect, ...]
-) -> tuple[Subset, np.ndarray, np.ndarray, Scores]:
-    """The best subset by penalised gain; hits are the clusters, their spread the noise."""
+) -> tuple[Set, np.ndarray, np.ndarray, LinearModel]:
+    """The likeliest set of effects; hits are the clusters, their spread the noise."""
     left = y - np.median(y, axis=1, keepdims=True)
-    chosen: Subset = ()
+    scale = np.array([e.scale for e in effects])
     for _ in range(ROUNDS):
         root, weight = spread(left)
         j = np.einsum("cd,kdn->kcn", root, jacobian) * np.sqrt(weight)
         t = root @ y * np.sqrt(weight)
-        gram = np.einsum("kcn,lcn->nkl", j, j)
-        right = np.einsum("kcn,cn->nk", j, t)
-        rated = Scores(gram.sum(axis=0), right.sum(axis=0), gram, right, 0.0, ())
-        gains = scores.all_gains(rated, tuple(range(len(effects))))
-        chosen, values, errors = (), np.zeros(0), np.zeros(0)
-        for subset in sorted(gains, key=lambda s: GAIN * len(s) - gains[s]):
-            values = scores.solve(rated, subset) if subset else np.zeros(0)
-            errors = np.sqrt(np.diagonal(scores.sandwich(rated, subset))) if subset else np.zeros(0)
-            within = (abs(v) < selection.WIDEST * effects[i].scale for v, i in zip(values, subset, strict=True))
-            if np.all(np.abs(values) >= LEAST_Z * errors) and all(within):
-                chosen = subset
-                break
-        left = (
-            y - np.einsum("kcn,k->cn", jacobian[list(chosen)], values)
-            if chosen
-            else y - np.median(y, axis=1, keepdims=True)
-        )
-    return chosen, values, errors, rated
+        gram, right = np.einsum("kcn,lcn->nkl", j, j), np.einsum("kcn,cn->nk", j, t)
+        model = LinearModel(gram, right, np.zeros(len(scale)), scale, SPIKE * scale, (), tuple(range(len(scale))))
+        path = model.best(len(effects))
+        chosen = path[int(np.argmax(model.evidence(path)))]
+        size, covariance, _ = model.solve(chosen)
+        values, errors = size[list(chosen)], np.sqrt(np.diagonal(covariance))[list(chosen)]
+        left = y - np.einsum("kcn,k->cn", jacobian[list(chosen)], values)
+        left = left - (0.0 if chosen else np.median(left, axis=1, keepdims=True))
+    return chosen, values, errors, model
 
 
 def spread(left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -229,12 +219,9 @@ def spread(left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return root / scale, weight
 
 
-def _rivals(rated: Scores, chosen: Subset, member: int) -> Subset:
+def _rivals(model: LinearModel, chosen: Set, member: int) -> Set:
     """Effects that explain the hits as well in place of a member."""
     rest = tuple(c for c in chosen if c != member)
-    best = scores.gain(rated, chosen)
-    return tuple(
-        c
-        for c in range(len(rated.gram))
-        if c not in chosen and best - scores.gain(rated, tuple(sorted((*rest, c)))) < selection.TIE
-    )
+    others = [c for c in model.candidates if c not in chosen]
+    evidence = model.evidence([chosen, *((*rest, c) for c in others)])
+    return tuple(c for c, e in zip(others, evidence[1:], strict=True) if evidence[0] - e < TIE)

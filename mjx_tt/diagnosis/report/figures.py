@@ -96,7 +96,7 @@ def forest_rows(causes: Sequence[Cause], found: BallFindings | None) -> list[Row
     for cause in causes:
         spins = [p for p in cause.parameters if p.startswith("ball_spin.mean_")]
         if spins and found is not None:
-            per = 1e3 * found.trial.spin_shift
+            per = 1e3 * found.search.spin_shift
             rows += [
                 Row(f"spin about {p[-1]}, mean", per * e.estimate, per * e.low, per * e.high, "mm")
                 for p in spins

@@ -17,12 +17,12 @@ from typing import TypedDict
 import numpy as np
 from markupsafe import Markup
 
-from mjx_tt.diagnosis.ball import selection
+from mjx_tt.diagnosis.ball.diagnose import FLOOR
 from mjx_tt.diagnosis.ball.effects import BY_NAME, INVISIBLE
+from mjx_tt.diagnosis.ball.search import LEAST_SHARE
 from mjx_tt.diagnosis.diagnose import Diagnosis
 from mjx_tt.diagnosis.hits.diagnose import LEAST_SHIFT, RETURN
 from mjx_tt.diagnosis.report import cleaning, figures, headline, residuals, spins, text
-from mjx_tt.diagnosis.report.rivals import rivals
 from mjx_tt.diagnosis.verdict import Cause
 from mjx_tt.viz.html import Page, environment
 
@@ -79,7 +79,7 @@ def _page(d: Diagnosis, title: str, play: Play | None) -> Page:
         ("Verdict", "verdict", _verdict),
         ("What the simulation gets wrong", "residuals", _residuals),
         ("The robot's hits", "hits", _hits),
-        ("Other explanations, and why they lost", "rivals", _rivals),
+        ("Sets of causes", "sets", _sets),
         ("What these logs cannot tell", "open_questions", _open_questions),
         ("Parameters", "parameters", _parameters),
         ("Gain on data that was not used", "held_out", _held_out),
@@ -101,7 +101,7 @@ def _page(d: Diagnosis, title: str, play: Play | None) -> Page:
 def _amount(d: Diagnosis) -> str:
     parts = []
     if d.balls is not None:
-        sessions = int(d.balls.sessions.max()) + 1
+        sessions = int(d.balls.sessions.number.max()) + 1
         parts.append(f"{d.balls.problem.grid.n} balls in {sessions} session{'s' if sessions > 1 else ''}")
     if d.robot is not None:
         parts.append(f"{len(d.robot.residuals)} joint{'s' if len(d.robot.residuals) > 1 else ''}")
@@ -131,13 +131,13 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
         "picture": None,
         "sentence": text.sentence(d) if d.verdict.verdict == "none" else "",
         "causes": [
-            (_code(c.name), text.claim(c) + text.alike(c), _confidence(c.confidence), _effect(c)) for c in causes
+            (_code(c.name), text.claim(c) + text.alike(c), _percent(min(c.share, 1.0)) if c.share else "", *_sure(c))
+            for c in causes
         ],
         "warnings": [w for w in d.verdict.warnings if w not in _told_elsewhere(d)],
         "effect_head": f"effect [{units.pop()}]" if len(units) == 1 else "effect",
         "return_time": f"{RETURN:g}",
-        "floor": f"{1e3 * selection.FLOOR:.0f}",
-        "least_z": selection.LEAST_Z,
+        "floor": f"{1e3 * FLOOR:.0f}",
         "small": text.below_floor(found) if found is not None else "",
         "bounce_map": "",
     }
@@ -149,12 +149,11 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
         context["joint_findings"] = [(u.joint, u.block, u.where, u.direction, f"{u.size:.2f}") for u in left]
     if found is not None:
         context["findings"] = [
-            (text.kind(f.block), f.where, f.direction, f"{1e3 * f.size:.1f}", f"{f.gain:.0f}")
-            for f in found.findings[:8]
+            (text.kind(p.name), p.direction, f"{1e3 * p.size:.1f}", f"{1e3 * p.rms:.2f}") for p in found.patterns[:8]
         ]
-        if any(f.block.startswith("bounce") for f in found.findings):
+        if found.unexplained and any(p.name.startswith("bounce") for p in found.patterns):
             context["bounce_map"] = page.embed("bounce_map", residuals.bounce_map(found))
-        floor = 1e3 * selection.FLOOR
+        floor = 1e3 * FLOOR
         context["checked"] = [
             (_code(name), text.description(name).meaning)
             + ((f"{size:.2f}", f"{max(size, floor):.1f}") if math.isfinite(size) else ("not excited", "-"))
@@ -166,8 +165,11 @@ def _verdict(d: Diagnosis, page: Page) -> Context:
 
 def _told_elsewhere(d: Diagnosis) -> set[str]:
     """Warnings that a section of their own holds."""
-    spins = d.balls.spin_notes if d.balls is not None else ()
-    return {*spins, *(d.record.lines() if d.record is not None else ())}
+    return set(d.record.lines() if d.record is not None else ())
+
+
+def _sure(c: Cause) -> tuple[str, str]:
+    return _confidence(c.confidence), _effect(c)
 
 
 def _confidence(share: float) -> str:
@@ -214,24 +216,21 @@ def _hits(d: Diagnosis, page: Page) -> Context:
     }
 
 
-def _rivals(d: Diagnosis, page: Page) -> Context:
+def _sets(d: Diagnosis, page: Page) -> Context:
+    """The likeliest set of each number of causes, and how far each is behind the best."""
     if d.balls is None:
         return None
-    chosen, others = rivals(d.balls)
-    most = max([math.log1p(max(r.behind, 0.0)) for r in others], default=1.0)
-    return {
-        "chosen": Markup(" + ").join(map(_code, chosen.split(" + "))),
-        "threshold": d.balls.choice.threshold,
-        "rows": [(Markup(" + ").join(map(_code, r.name.split(" + "))), _behind(r.behind, most), r.why) for r in others],
-    }
-
-
-def _behind(behind: float, most: float) -> Markup:
-    """Bar, of logarithmic length, and number; nothing to draw where a set fits better and a gate stopped it."""
-    if behind <= 0.0:
-        return Markup("stopped")
-    width = 100.0 * math.log1p(behind) / max(most, 1e-9)
-    return Markup('<span class="bar" style="width:{:.0f}px"></span> {:,.0f}').format(width, behind)
+    search, effects = d.balls.search, d.balls.problem.effects
+    best = max(search.evidence)
+    rows = [
+        (
+            Markup(" + ").join(_code(effects[j].name) for j in s) or "nothing",
+            f"{best - evidence:.1f}",
+            "chosen" if set(s) == set(search.chosen) else "",
+        )
+        for s, evidence in zip(search.path, search.evidence, strict=True)
+    ]
+    return {"rows": rows, "least": f"{100 * LEAST_SHARE:.0f} %"}
 
 
 def _open_questions(d: Diagnosis, page: Page) -> Context:
@@ -353,9 +352,9 @@ def _next(d: Diagnosis, page: Page) -> Context:
 
 def _spins(d: Diagnosis, page: Page) -> Context:
     found = d.balls
-    if found is None or (found.spins is None and not found.spin_notes):
+    if found is None or found.spins is None:
         return None
-    context: dict[str, object] = {"notes": found.spin_notes, "picture": None}
+    context: dict[str, object] = {"picture": None}
     if found.spins is not None:
         context["picture"] = page.embed("spins", spins.spins(found.spins))
         context["balls"] = len(found.spins.name)
@@ -378,7 +377,7 @@ def _cleaned(d: Diagnosis, page: Page) -> Context:
 def _data(d: Diagnosis, page: Page) -> Context:
     context: dict[str, object] = {"noise": [], "logs": []}
     if d.balls is not None:
-        noise, grid = d.balls.noise, d.balls.problem.grid
+        noise, grid = d.balls.search.noise, d.balls.problem.grid
         context["noise"] = [
             (name, f"{np.median(own):.2f}", f"{np.percentile(own, 5):.2f} to {np.percentile(own, 95):.2f}", f"{r:.2f}")
             for name, own, r in zip(

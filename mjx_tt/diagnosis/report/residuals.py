@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_tt.diagnosis.ball.diagnose import BallFindings
-from mjx_tt.diagnosis.ball.selection import fitted_spins
+from mjx_tt.diagnosis.ball.flights.linearization import SPIN
 from mjx_tt.diagnosis.joint import JointFindings, JointResidual
 from mjx_tt.viz.html import FAINT, INK, STYLE, WIDTH
 
@@ -73,7 +73,7 @@ def curve(
 
 def flight_time(found: BallFindings) -> tuple[Float[np.ndarray, "T n"], str]:
     """Time [s] since the bounce where most balls bounce, since the first sample otherwise; and what it is called."""
-    grid, bounce = found.problem.grid, found.linear.base.bounce_time[0]
+    grid, bounce = found.problem.grid, found.search.linear.base.bounce_time[0]
     if np.isfinite(bounce).mean() > 0.5:
         return np.where(np.isfinite(bounce), grid.time - np.where(np.isfinite(bounce), bounce, 0.0), np.nan), "bounce"
     return grid.time, "start"
@@ -141,7 +141,7 @@ def set_limits(ax: Axes, curves: Sequence[Curve]) -> None:
 
 def quantities(found: BallFindings) -> Figure:
     """Residuals against speed, height, place along the table and time in the session; against spin where balls spin."""
-    grid, base = found.problem.grid, found.linear.base
+    grid, base = found.problem.grid, found.search.linear.base
     speed = np.linalg.norm(base.velocity[:, :, 0], axis=0)
     height, along = grid.measured[2], grid.measured[1]
     whole = FEWEST_BALLS * int(np.median(grid.mask.sum(axis=0)))
@@ -149,10 +149,10 @@ def quantities(found: BallFindings) -> Figure:
         (speed, "speed [m/s]", FEWEST),
         (height, "height z [m]", FEWEST),
         (along, "place y [m] (human > 0, robot < 0)", FEWEST),
-        (np.broadcast_to(found.age, grid.mask.shape), "time in the session (0 start, 1 end)", whole),
+        (np.broadcast_to(found.sessions.age, grid.mask.shape), "time in the session (0 start, 1 end)", whole),
     ]
-    if found.choice.spin:
-        spin = fitted_spins(found.projected, found.choice)
+    if found.search.prior is not None:
+        spin = found.search.at.start[SPIN]
         a = int(np.argmax(spin.std(axis=1) + np.abs(spin.mean(axis=1))))
         rows.append((np.broadcast_to(spin[a], grid.mask.shape), f"fitted spin about {AXES[a]} [rad/s]", whole))
     both = residuals(found)
@@ -200,7 +200,7 @@ def bands(ax: Axes, c: Curve, colour: str, light: bool = False) -> None:
 
 def bounce_map(found: BallFindings) -> Figure:
     """Height after the bounce, measured minus predicted, at the place of the bounce, before and after."""
-    grid, base = found.problem.grid, found.linear.base
+    grid, base = found.problem.grid, found.search.linear.base
     late = grid.mask & (grid.time > base.bounce_time[0])
     bounced = np.flatnonzero(late.sum(axis=0) >= 3)
     place = base.bounce[:2, 0, bounced]

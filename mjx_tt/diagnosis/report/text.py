@@ -8,12 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from mjx_tt.diagnosis.ball import effects as ball_effects
-from mjx_tt.diagnosis.ball import scores, selection
-from mjx_tt.diagnosis.ball.diagnose import BallFindings
+from mjx_tt.diagnosis.ball import inclusion
+from mjx_tt.diagnosis.ball.diagnose import FLOOR, BallFindings
+from mjx_tt.diagnosis.ball.search import LEAST_EVIDENCE
 from mjx_tt.diagnosis.description import Description, Way
 from mjx_tt.diagnosis.diagnose import Diagnosis
 from mjx_tt.diagnosis.joint import effects as joint_effects
-from mjx_tt.diagnosis.verdict import Cause, Estimate, Experiment, Unexplained
+from mjx_tt.diagnosis.verdict import Cause, Estimate, Experiment, Unexplained, Verdict
 
 SUBSET = "a subset of the balls"  # block of balls of their own kind
 # Units that read better in thousandths below a size.
@@ -42,17 +43,30 @@ def headline(diagnosis: Diagnosis) -> str:
             count = len(diagnosis.robot.residuals)
             parts.append(f"{count} joint{'s' if count > 1 else ''}")
         return f"The simulation agrees with {' and '.join(parts)} to within the noise: nothing is named."
+    names, left = _and([_noun(c.name) + _share(c) for c in v.causes]), left_over(v)
     if v.unexplained is not None:
-        return f"Something is wrong that no entry of the catalogue explains: {_odd(v.unexplained)}."
-    if len(v.causes) == 1 and v.verdict == "named":
-        return f"{claim(v.causes[0])}."
-    names = _and([_noun(c.name) for c in v.causes])
+        open_ = f"no entry of the catalogue explains {left}: {_odd(v.unexplained)}"
+        return f"{names[0].upper()}{names[1:]}; beside it {open_}." if names else f"{open_[0].upper()}{open_[1:]}."
     if v.verdict == "undetermined":
-        return f"Several sets of causes explain these logs equally well, the best of them: {names}."
+        return f"What was found predicts unused data worse, and is not adopted: {names}."
+    if len(v.causes) == 1:
+        return f"{claim(v.causes[0])}{_share(v.causes[0])}."
     better = ""
     if v.held_out is not None and v.held_out.low > 0.0 and v.held_out.metric.endswith("[mm]"):
         better = f"; with them unused data are missed by {v.held_out.after:.1f} instead of {v.held_out.before:.1f} mm"
     return f"{len(v.causes)} things are wrong: {names}{better}."
+
+
+def _share(cause: Cause) -> str:
+    """Part of the error that a cause takes away, in words; "" where it is not told."""
+    return f" ({100 * min(cause.share, 1.0):.0f} % of the error)" if cause.share > 0.0 else ""
+
+
+def left_over(v: Verdict) -> str:
+    """What is left of the flights' error, in words."""
+    if v.left is None:
+        return "something"
+    return f"{v.left.mm:.1f} of {v.left.nominal_mm:.1f} mm"
 
 
 def _noun(name: str) -> str:
@@ -89,12 +103,11 @@ def sentence(diagnosis: Diagnosis) -> str:
     if v.verdict == "none":
         return _nothing(diagnosis)
     if v.unexplained is not None:
-        text = f"Something is wrong that no entry of the catalogue explains: {_odd(v.unexplained)}."
-        names = ", ".join(c.name for c in v.causes)
-        return text + (f" Beside it, to be taken with caution until it is understood: {names}." if names else "")
-    named = " ".join(f"{claim(c)}: named {c.name}{alike(c)}." for c in v.causes)
+        text = f"No entry of the catalogue explains {left_over(v)}: {_odd(v.unexplained)}."
+        return " ".join([*(f"{claim(c)}{_share(c)}: named {c.name}{alike(c)}." for c in v.causes), text])
+    named = " ".join(f"{claim(c)}{_share(c)}: named {c.name}{alike(c)}." for c in v.causes)
     if v.verdict == "undetermined":
-        return f"Several sets of causes explain these logs equally well; the best of them: {named}"
+        return f"What was found predicts unused data worse, and is not adopted. {named}"
     return named if len(v.causes) < 2 else f"{len(v.causes)} things are wrong. {named}"
 
 
@@ -116,23 +129,21 @@ def claim(cause: Cause) -> str:
 
 
 def detectable(found: BallFindings) -> dict[str, float]:
-    """Smallest shift of a flight's last sample [mm] at which each effect that was not named would have shown, by name.
+    """Smallest shift of a flight's last sample [mm] at which each effect that was not chosen would have shown, by name.
 
-    The gates of ``select`` but the practical floor: evidence and standard errors, beside what was named; infinite where
-    the logs do not excite the effect.
+    By the evidence beside what was chosen; infinite where the logs do not excite the effect.
     """
-    choice, trial, rated = found.choice, found.trial, found.scores()
-    base = [*choice.effects, *rated.always]
-    others = [j for j in range(len(trial.effects)) if j not in base and j not in trial.left_out]
-    own, gram = scores.unexplained_scores(rated, base, others)
+    search = found.search
     out = {}
-    for j, score, information in zip(others, own.T, np.diagonal(gram), strict=True):
-        if not found.seen[j] or information <= 0.0:
-            out[trial.effects[j].name] = math.inf
+    for j, effect in enumerate(found.problem.effects):
+        if j in search.chosen or j in search.model.always or j in found.left_out or effect.made_of:
             continue
-        error = math.sqrt(float(np.sum((score - score.mean()) ** 2))) / information
-        least = max(math.sqrt(choice.threshold / information), selection.LEAST_Z * error)
-        out[trial.effects[j].name] = 1e3 * least * float(trial.shift[j])
+        if j not in search.model.candidates:
+            out[effect.name] = math.inf
+            continue
+        error = math.sqrt(search.model.solve((*search.chosen, j))[1][j, j])
+        price = 2.0 * (inclusion.PRICE + LEAST_EVIDENCE) + 2.0 * math.log(max(search.model.scale[j] / error, 1.0))
+        out[effect.name] = 1e3 * error * math.sqrt(price) * float(search.shift[j])
     return out
 
 
@@ -237,7 +248,6 @@ def block(name: str) -> str:
         ("force over ", "a force that changes with "),
         ("bounce over ", "a bounce that changes with "),
         ("measured position over ", "a shift of the measured position that changes with "),
-        ("jump of the measured position at ", "a jump of the measured position across a plane in "),
         ("force by session", "a force that differs from session to session"),
         ("bounce by session", "a bounce that differs from session to session"),
     )
@@ -264,7 +274,7 @@ def _nothing(diagnosis: Diagnosis) -> str:
     parts = []
     if diagnosis.balls is not None:
         found = diagnosis.balls
-        floor = 1e3 * selection.FLOOR
+        floor = 1e3 * FLOOR
         sizes = [max(s, floor) for s in detectable(found).values() if math.isfinite(s)]
         small = f", but for what is too small to matter, {below_floor(found)}" if below_floor(found) else ""
         text = f"The model agrees with {found.problem.grid.n} balls to within the noise{small}: nothing is named"
@@ -289,8 +299,6 @@ def _nothing(diagnosis: Diagnosis) -> str:
 
 def below_floor(found: BallFindings) -> str:
     """Effects that the evidence asks for, but that move a flight's end by less than the practical floor."""
-    choice, trial = found.choice, found.trial
-    sizes = {
-        trial.effects[j].name: abs(t) * float(trial.shift[j]) for j, t in zip(choice.effects, choice.theta, strict=True)
-    }
-    return ", ".join(f"{name} ({1e3 * size:.1f} mm)" for name, size in sizes.items() if size < selection.FLOOR)
+    search = found.search
+    sizes = {found.problem.effects[j].name: abs(search.at.theta[j]) * float(search.shift[j]) for j in search.chosen}
+    return ", ".join(f"{name} ({1e3 * size:.1f} mm)" for name, size in sizes.items() if size < FLOOR)

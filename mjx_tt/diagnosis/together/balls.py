@@ -11,13 +11,14 @@ from jaxtyping import Bool, Float, Int
 from ballmodel.constants import BALL_RADIUS, TABLE_LENGTH, TABLE_WIDTH
 from ballmodel.trajectory import Trajectory
 from mjx_tt.diagnosis.ball import posterior
-from mjx_tt.diagnosis.ball.diagnose import FEWEST_BALLS, SCATTER, flights
+from mjx_tt.diagnosis.ball.diagnose import FEWEST_BALLS, flights
 from mjx_tt.diagnosis.ball.effects import EFFECTS, Numbers
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, heading, of_some, own_spins
 from mjx_tt.diagnosis.ball.flights.forward_model import grid
 from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem, Situation
 from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
 from mjx_tt.diagnosis.ball.posterior import Posterior
+from mjx_tt.diagnosis.ball.search import SCATTER
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.sim import model as models
 from mjx_tt.sim.model import SimModel
@@ -121,7 +122,7 @@ def fit(
         theta = np.zeros(len(effects))
         if problem.nominal[LIFT] == 0.0 and LIFT not in prior:
             nominal = Situation(theta, first_fit(problem))
-            return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say, SCATTER, integrated=True))
+            return BallsTogether(problem, posterior.fit(problem, nominal, None, (), say, SCATTER))
         lift = [i for i, effect in enumerate(effects) if effect.path == LIFT]
         besides = (lift[0], LIFT_ERROR) if lift else None
         if lift and first is None:
@@ -161,7 +162,7 @@ def _of_few(problem: BallProblem, lift: int, say: Callable[[str], None]) -> Post
         stay = np.flatnonzero(ordinary)
         some = of_some(few, stay)
         at = Situation(theta, at.start[:, stay])
-        found = posterior.fit(some, at, spins.of_some(stay), (), say, SCATTER, (lift, LIFT_ERROR), True, held)
+        found = posterior.fit(some, at, spins.of_some(stay), (), say, SCATTER, (lift, LIFT_ERROR), held)
         of_all = posterior.misfit(some, found.at, found.prior or spins, found.noise.scatter)
         fits.append((of_all / some.grid.mask.sum(), found))
     return min(fits, key=lambda one: np.nan_to_num(one[0], nan=np.inf))[1]
@@ -183,7 +184,7 @@ def _fitted(
     index, near = np.arange(problem.grid.n), first is not None
     scatter = SCATTER if first is None else first.noise.scatter
     while True:
-        whole = posterior.fit(problem, at, spins, (), say, scatter, besides, integrated=True, near=near)
+        whole = posterior.fit(problem, at, spins, (), say, scatter, besides, near=near)
         deviation = _deviation(problem, whole.at)
         ordinary = deviation <= WORST_FITTED * np.median(deviation)
         ordinary &= np.linalg.norm(whole.at.start[SPIN], axis=0) <= FASTEST

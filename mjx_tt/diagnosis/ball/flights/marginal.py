@@ -46,6 +46,7 @@ class Evidence:
     follow: Float[np.ndarray, "D K"]  # by how much the distributions' unknowns go along with the effects
     spreads: int  # of these unknowns, the last: logarithms of spreads
     alone: Float[np.ndarray, "K K"]  # information of all balls about the effects' columns under given distributions
+    ball_alone: Float[np.ndarray, "n K K"]  # the same of each ball: never negative
 
     def information(self, chosen: list[int], before: Float[np.ndarray, " c"]) -> Float[np.ndarray, "c c"]:
         """Of all balls about some effects, with the precision of what is known before.
@@ -193,7 +194,7 @@ def evidence(
     """
     used = [*([] if prior is None else range(3)), *(range(3, 6) if scatter.any() else [])]
     if not used:
-        return Evidence(p.gram, p.right, np.zeros((0, p.gram.shape[1])), 0, p.gram.sum(axis=0))
+        return Evidence(p.gram, p.right, np.zeros((0, p.gram.shape[1])), 0, p.gram.sum(axis=0), p.gram)
     n, k, size, spins = len(p.gram), p.gram.shape[1], len(used), 0 if prior is None else 3
     precision, middle = np.zeros((n, 6, 6)), np.zeros((n, 6))
     precision[:, 3:, 3:] = _of_kicks(scatter)
@@ -232,4 +233,4 @@ def evidence(
     mix = np.linalg.solve(inner, cross.sum(axis=0)).T
     of_distributions = np.concatenate([score[:, :spins], of_spread], axis=1)
     right = right + second @ theta - (of_distributions + cross @ theta) @ mix.T
-    return Evidence(gram + second - mix @ cross, right, -mix.T, size, gram.sum(axis=0))
+    return Evidence(gram + second - mix @ cross, right, -mix.T, size, gram.sum(axis=0), gram)

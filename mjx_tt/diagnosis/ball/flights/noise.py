@@ -109,18 +109,6 @@ def surprise(residual: np.ndarray, bounce_time: np.ndarray, g: Grid) -> float:
     return 2.1 * 1.4 * GAUSSIAN / np.sqrt(2.0) * float(np.sqrt(np.mean(steps**2)))
 
 
-def scattered(kick: np.ndarray, information: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """(3,) deviation [m/s] of the bounces' kicks (3, n), of which a flight tells as much as ``information`` (n, 3, 3).
-
-    One step of expectation-maximisation from the deviation before; kicks far beyond it count as if at four deviations.
-    """
-    if not before.any():
-        return before
-    uncertain = np.linalg.inv(information + np.diag(np.maximum(before, LEAST_SCATTER) ** -2.0))
-    square = np.minimum(kick**2, 16.0 * before[:, None] ** 2) + np.diagonal(uncertain, axis1=1, axis2=2).T
-    return np.maximum(np.sqrt(square.mean(axis=1)), LEAST_SCATTER)
-
-
 def without_memory(noise: Noise, most: float = 0.0) -> Noise:
     """The noise with no more memory than ``most``.
 

@@ -18,8 +18,8 @@ LEAST_GAIN = 10.0  # of log-likelihood, below which no filter shows and any gate
 TIME, GATE = "sensing.filter_time", "sensing.filter_gate"
 
 
-def likeliest(problem: BallProblem, at: Situation, linear: Linear) -> float | None:
-    """The likeliest gate [m] of a tracker's filter; None where no filter shows."""
+def likeliest(problem: BallProblem, at: Situation, linear: Linear) -> tuple[float, float] | None:
+    """The likeliest memory [s] and gate [m] of a tracker's filter; None where no filter shows."""
     g = problem.grid
     mask = np.broadcast_to(g.mask, linear.residual.shape)
 
@@ -38,4 +38,4 @@ def likeliest(problem: BallProblem, at: Situation, linear: Linear) -> float | No
     # Each ball's own noise is unknown, so that one that is fitted badly does not decide for all.
     cost = (1.5 * g.mask.sum(axis=0) * np.log(np.maximum((left**2).sum(axis=2), 1e-12))).sum(axis=1)
     best = int(np.argmin(cost[1:]))
-    return pairs[best][1] if cost[0] - cost[1 + best] > LEAST_GAIN else None
+    return pairs[best] if cost[0] - cost[1 + best] > LEAST_GAIN else None

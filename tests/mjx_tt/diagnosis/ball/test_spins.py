@@ -1,10 +1,9 @@
 """Spins of each ball's own: their distribution against scikit-learn's, their estimates against the truth, and finding
-causes beside them; sets of many causes against every set there is."""
+causes beside them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from sklearn.mixture import GaussianMixture
 
 from mjx_tt import SimModel
 from mjx_tt.diagnosis import diagnose, load_logs
-from mjx_tt.diagnosis.ball import scores
 from mjx_tt.diagnosis.ball.flights import spin_prior
 from mjx_tt.diagnosis.ball.flights.spin_prior import WIDEST_STD, SpinPrior, learned
 from tests.exam.generator.sessions import draw_balls, measure, with_spin
@@ -61,13 +59,6 @@ def test_one_kind_of_spin_is_called_one():
     assert learned(np.repeat(0.04 * np.eye(3)[None], 300, axis=0), 0.04 * spin).components == 1
 
 
-def test_a_prior_counts_by_how_little_a_flight_shows():
-    precision = np.repeat(np.diag([0.25, 0.25, 0.25])[None], 2, axis=0)
-    nothing, all_of_it = scores.loosened(precision, np.stack([np.zeros((3, 3)), 1e6 * np.eye(3)]))
-    np.testing.assert_allclose(nothing, precision[0])
-    assert np.abs(all_of_it).max() < 1e-6
-
-
 def test_the_prior_moves_with_its_mean():
     prior = SpinPrior(np.ones(3), np.ones(3), np.zeros((3, 5)), np.repeat(np.eye(3)[None], 5, axis=0))
     moved = prior.moved(np.array([1.0, 2.0, 3.0]))
@@ -75,24 +66,6 @@ def test_the_prior_moves_with_its_mean():
     np.testing.assert_array_equal(moved.of_balls(5)[0][:, 4], [1.0, 2.0, 3.0])
     assert moved.of_some(np.array([0, 2])).own_mean.shape == (3, 2)
     assert spin_prior.MAGNUS_RANGE[0] > 0.0
-
-
-def test_large_sets_of_causes_are_found_one_member_at_a_time():
-    rng = np.random.default_rng(3)
-    n, k = 40, 9
-    columns = rng.standard_normal((n, 30, k))
-    true = np.array([3.0, 0, -2.5, 0, 2.0, 0, 1.8, -1.5, 0])
-    target = columns @ true + rng.standard_normal((n, 30))
-    gram, right = np.einsum("nmk,nml->nkl", columns, columns), np.einsum("nmk,nm->nk", columns, target)
-    rated = scores.Scores(gram.sum(axis=0), right.sum(axis=0), gram, right, 0.0, ())
-    small = scores.all_gains(rated, tuple(range(k)))
-    wide = scores.widened(rated, small, tuple(range(k)), 14.0)
-    best = max(wide, key=lambda s: wide[s] - 14.0 * len(s))
-    every = {s: scores.gain(rated, s) for size in range(k + 1) for s in combinations(range(k), size)}
-    assert best == max(every, key=lambda s: every[s] - 14.0 * len(s)) == (0, 2, 4, 6, 7)
-    assert all(np.isclose(wide[s], every[s], rtol=1e-6) for s in wide)
-    half = rated.weighted(np.r_[np.ones(20), np.zeros(20)])
-    np.testing.assert_allclose(half.gram, gram[:20].sum(axis=0))
 
 
 def _log(tmp_path, world, balls, rng):
@@ -128,7 +101,9 @@ def test_bounces_that_differ_from_ball_to_ball_are_no_cause_and_hide_none(tmp_pa
     causes = {c.name: c for c in found.verdict.causes}
     assert set(causes) == ({"table_restitution"} if restitution < 0.93 else set())
     assert found.verdict.verdict == ("named" if causes else "none")
-    assert not found.verdict.unexplained and "differ from ball to ball" in " ".join(found.balls.spin_notes)
+    assert not found.verdict.unexplained
+    # The vertical kick, as the table gave it: restitution's spread times the speed of the impact.
+    assert found.balls.search.noise.scatter[2] == pytest.approx(0.02 * 3.0, rel=0.4)
 
 
 def _model(magnus_coefficient):

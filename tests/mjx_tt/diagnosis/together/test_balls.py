@@ -8,9 +8,9 @@ import pytest
 from ballmodel.trajectory import Trajectory
 from experiments.config.study import PRIOR
 from mjx_tt.diagnosis.ball import posterior
-from mjx_tt.diagnosis.ball.diagnose import SCATTER
 from mjx_tt.diagnosis.ball.flights.fit import first_fit, own_spins
 from mjx_tt.diagnosis.ball.flights.linearization import SPIN, Situation
+from mjx_tt.diagnosis.ball.search import SCATTER
 from mjx_tt.diagnosis.together import balls as of_balls
 from mjx_tt.sim.model import SimModel
 from tests.exam.generator.world import World, fly
@@ -133,7 +133,7 @@ def test_a_fit_that_did_not_settle_says_as_much_and_states_how_far_it_would_go_o
     at = [effect.path for effect in problem.effects].index("ball.table.restitution")
     nominal = Situation(np.zeros(len(problem.effects)), first_fit(problem))
     monkeypatch.setattr(posterior, "ROUNDS", 1)
-    found = posterior.fit(problem, *own_spins(problem, nominal), (), str, SCATTER, integrated=True)
+    found = posterior.fit(problem, *own_spins(problem, nominal), (), str, SCATTER)
     assert settled.posterior.converged and not found.converged
     value = float(problem.values(found.theta)["ball.table.restitution"])
     assert abs(value - 0.89) < 2.0 * found.std[at]

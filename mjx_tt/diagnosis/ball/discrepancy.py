@@ -1,36 +1,28 @@
-"""Anonymous blocks: what no entry of the catalogue explains, as smooth functions that carry no name.
+"""Discrepancy: what no entry of the catalogue explains, as smooth functions that carry no name.
 
-A block is a family of small extra forces, kicks at the bounce or shifts of the measured position. Its effect on a
-measured flight follows from the flight's own transition matrix, bounce included, so nothing is simulated again:
+A family of functions is one of small extra forces, of kicks at the bounce or of shifts of the measured position. Its
+effect on a measured flight follows from the flight's own transition matrix, bounce included, so nothing is simulated
+again:
     dx(t) = Phi_x(t) sum over s < t of Phi(s)^-1 [0; a(s)] ds
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mjx_tt.diagnosis.ball.flights.forward_model import Grid
 from mjx_tt.diagnosis.ball.flights.linearization import Linear
+from mjx_tt.diagnosis.ball.inclusion import Family
 
 DIRECTIONS = ("x", "y", "z", "along the flight")
 FORCES = (0, 3, 2)  # directions of forces: along y and along the flight are nearly one
 KNOTS = 4
+# Ordinary amplitudes: a hundredth of gravity [m/s^2], a kick of a worn table's [m/s], a calibration's error [m].
+USUAL = {"force": 0.1, "bounce": 0.1, "measured": 0.002}
 Respond = Callable[[np.ndarray, int], np.ndarray]  # (profile (T, n) or kick (n,), direction) -> column (3, T, n)
-
-
-@dataclass(frozen=True)
-class Block:
-    """A family of unnamed effects: columns in metres for unit coefficients, and what each stands for."""
-
-    name: str
-    where: str
-    columns: Float[np.ndarray, "m 3 T n"]
-    labels: tuple[str, ...]
-    directions: tuple[str, ...]
 
 
 def hats(
@@ -46,34 +38,37 @@ def hats(
 
 
 def build(
-    linear: Linear, g: Grid, sessions: Int[np.ndarray, " n"], age: Float[np.ndarray, " n"], called: Sequence[str]
-) -> list[Block]:
-    """All families.
+    linear: Linear,
+    g: Grid,
+    sessions: Int[np.ndarray, " n"],
+    age: Float[np.ndarray, " n"],
+    called: Sequence[str],
+    first: int,
+) -> tuple[list[Family], Float[np.ndarray, "m 3 T n"]]:
+    """All families, and their columns in metres for unit coefficients.
 
-    sessions: number of each ball's session; age: 0 to 1, its place in its session; called: the sessions' names.
+    sessions: number of each ball's session; age: 0 to 1, its place in its session; called: the sessions' names; first:
+    number of the first column.
     """
     position, velocity = linear.base.position[:, :, 0], linear.base.velocity[:, :, 0]  # (3, T, n)
     speed = np.linalg.norm(velocity, axis=0)
     later = np.where(g.mask, g.time > linear.base.bounce_time[0], False).astype(float)
     response, kicked = _propagators(linear, g)
-    out = []
+    families: list[Family] = []
+    columns: list[np.ndarray] = []
 
     def family(
         name: str,
-        where: str,
         basis: Iterable[np.ndarray],
         labels: Sequence[str],
         respond: Respond,
         along: Sequence[int] = (0, 1, 2),
     ) -> None:
-        columns, names, directions = [], [], []
-        for phi, label in zip(basis, labels, strict=True):
-            for d in along:
-                columns.append(respond(phi, d))
-                names.append(label)
-                directions.append(DIRECTIONS[d])
-        if columns:
-            out.append(Block(name, where, np.stack(columns), tuple(names), tuple(directions)))
+        functions = list(basis)
+        for d in along if functions else ():
+            mine = first + len(columns) + np.arange(len(functions))
+            families.append(Family(name, DIRECTIONS[d], mine, tuple(labels), USUAL[name.split()[0]]))
+            columns.extend(respond(phi, d) for phi in functions)
 
     def spline(
         name: str,
@@ -84,23 +79,8 @@ def build(
         along: Sequence[int] = (0, 1, 2),
     ) -> None:
         basis, places = hats(quantity, g.mask, knots)
-        family(
-            name,
-            quantity_names[name.split(" over ")[1]],
-            basis,
-            [f"{name.split(' over ')[1]} near {p:.2f} {unit}" for p in places],
-            respond,
-            along,
-        )
+        family(name, basis, [f"{name.split(' over ')[1]} near {p:.2f} {unit}" for p in places], respond, along)
 
-    quantity_names = {
-        "x": "across the table",
-        "y": "along the table",
-        "z": "with height",
-        "speed": "with speed",
-        "session": "over the time in a session",
-        "flight": "along the flight",
-    }
     ages = np.broadcast_to(age, g.time.shape)
     for name, quantity, unit in (
         ("x", position[0], "m"),
@@ -113,9 +93,6 @@ def build(
         spline(f"force over {name}", quantity, unit, response, along=FORCES)
     for name, quantity, unit in (("x", position[0], "m"), ("y", position[1], "m"), ("z", position[2], "m")):
         spline(f"measured position over {name}", quantity, unit, _shift, 5)
-    for name, coordinate in (("x", 0), ("y", 1), ("z", 2)):
-        steps, labels = _steps(position[coordinate], g.mask)
-        family(f"jump of the measured position at {name}", f"at a plane across {name}", steps, labels, _shift)
     late = later[:, :] > 0.0
     if late.any():
         bx, by = linear.base.bounce[0, 0], linear.base.bounce[1, 0]
@@ -130,7 +107,6 @@ def build(
             basis, places = hats(np.where(bounced, value, np.nan_to_num(value[bounced].mean())), bounced)
             family(
                 f"bounce over {name}",
-                f"at the bounce, with {name}",
                 basis,
                 [f"{name} near {p:.2f} {unit}" for p in places],
                 kicked,
@@ -143,30 +119,25 @@ def build(
         over("vertical speed", vz, "m/s")
         over("time in the session", age, "of it")
         cells, labels = _cells(bx, by, bounced)
-        family("bounce over the table", "at the bounce, by place", cells, labels, kicked, (2,))
+        family("bounce over the table", cells, labels, kicked, (2,))
     names = np.unique(sessions)
     if len(names) > 1:
         basis = np.stack([(sessions == s).astype(float) for s in names])
         wide = [np.broadcast_to(b, g.time.shape) for b in basis]
         labels = [f"session {called[s]}" for s in names]
-        family("force by session", "by session", wide, labels, response, FORCES)
+        family("force by session", wide, labels, response, FORCES)
         if late.any():
-            family("bounce by session", "at the bounce, by session", basis, labels, kicked)
+            family("bounce by session", basis, labels, kicked)
     crossing = _crossing(position[1], g)
     if crossing.any():
-        family("force at the net", "over the net", [crossing], ["|y| < 0.15 m"], response, FORCES)
-    return out
+        family("force at the net", [crossing], ["|y| < 0.15 m"], response, FORCES)
+    return families, np.array(columns)
 
 
 def _shift(phi: np.ndarray, d: int) -> np.ndarray:
     column = np.zeros((3, *phi.shape))
     column[d] = phi
     return column
-
-
-def _steps(value: np.ndarray, mask: np.ndarray) -> tuple[list[np.ndarray], list[str]]:
-    places = np.percentile(value[mask], [20, 35, 50, 65, 80])
-    return [(value > p).astype(float) for p in places], [f"beyond {p:.2f} m" for p in places]
 
 
 def _cells(x: np.ndarray, y: np.ndarray, bounced: np.ndarray) -> tuple[np.ndarray, list[str]]:

@@ -1,0 +1,195 @@
+"""Which causes are in the model: one linear Gaussian model of all flights, and the evidence of every set of causes.
+
+At the best fit so far the flights are linear in what is unknown. Every effect of the catalogue is somewhat off: the
+chosen ones by ordinary amounts (the catalogue's ``scale``), the others by as much as nobody would name (spike and slab:
+George and McCulloch, J. Am. Stat. Assoc. 88, 1993). Beside them smooth functions stand for what no effect explains (the
+discrepancy: Kennedy and O'Hagan, J. R. Stat. Soc. B 63, 2001), orthogonal to the chosen effects, so that it takes
+nothing from their sizes (Plumlee, J. Am. Stat. Assoc. 112, 2017). Each family of functions has an amplitude, which the
+evidence decides (MacKay, Neural Computation 4, 1992): one that is not needed goes to zero.
+
+Real noise is not quite the model's: the evidence is divided by how much more the flights' scores scatter from ball to
+ball than it says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+Set = tuple[int, ...]  # effects, by their place in the catalogue of the problem
+INFORMATION = 30.0  # of a discrepancy's usual coefficient, where its amplitude is begun
+LEARNING = 30  # rounds, at most, for amplitudes
+PRICE = 3.0  # of the logarithm of the evidence, that a cause must bring: one in twenty of those that could be is there
+PRICE_OF_FAMILY = 6.0  # the same of a discrepancy
+FARTHEST = 4.0  # ordinary sizes beyond which a cause is none
+EXHAUSTIVE = 3  # causes up to which every set is tried
+
+
+@dataclass(frozen=True)
+class Family:
+    """Columns of one smooth function."""
+
+    name: str
+    direction: str
+    columns: Int[np.ndarray, " m"]
+    labels: tuple[str, ...]
+    usual: float  # deviation of the amplitude's prior, in the columns' unit
+
+
+@dataclass(frozen=True)
+class Left:
+    """What a set of causes leaves to the discrepancy."""
+
+    coefficients: Float[np.ndarray, " c"]  # of all columns, effects' sizes beside the discrepancy among them
+    evidence: float  # logarithm, of set and discrepancy together
+    explained: float  # squared whitened error that set and discrepancy explain together
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """Flights about a fit: information about columns, effects first, then the families' functions."""
+
+    ball_gram: Float[np.ndarray, "n c c"]
+    ball_right: Float[np.ndarray, "n c"]
+    middle: Float[np.ndarray, " K"]  # of the effects' priors
+    scale: Float[np.ndarray, " K"]  # of an effect in the set
+    spike: Float[np.ndarray, " K"]  # of one that is not
+    families: tuple[Family, ...]
+    candidates: Set
+    always: Set = ()  # effects that every set holds
+    temper: float = 1.0
+
+    @property
+    def effects(self) -> int:
+        """Number of effects."""
+        return len(self.scale)
+
+    @cached_property
+    def total(self) -> tuple[Float[np.ndarray, "c c"], Float[np.ndarray, " c"]]:
+        """Information of all balls, and its right side about the priors' middles."""
+        gram, right = self.ball_gram.sum(axis=0), self.ball_right.sum(axis=0)
+        right = right - gram[:, : self.effects] @ self.middle
+        return gram / self.temper, right / self.temper
+
+    def of_balls(self, which: Int[np.ndarray, " m"]) -> LinearModel:
+        """The model of some of the balls."""
+        return replace(self, ball_gram=self.ball_gram[which], ball_right=self.ball_right[which])
+
+    def precision(self, chosen: Sequence[int]) -> Float[np.ndarray, " K"]:
+        """Of the effects' priors."""
+        inside = [*chosen, *self.always]
+        width = self.spike.copy()
+        width[inside] = self.scale[inside]
+        return width**-2.0
+
+    def evidence(self, sets: Sequence[Set]) -> Float[np.ndarray, " s"]:
+        """Logarithm of each set's evidence, the discrepancy left out; its price included."""
+        k = self.effects
+        gram, right = (x[..., :k] for x in self.total)
+        gram = gram[:k]
+        precision = np.array([self.precision(chosen) for chosen in sets])
+        size = 1.0 / np.sqrt(np.diagonal(gram) + precision)
+        full = gram * size[:, :, None] * size[:, None] + (precision * size**2)[:, :, None] * np.eye(k)
+        unit = right * size
+        mean = np.linalg.solve(full, unit[..., None])[..., 0]
+        spread = np.linalg.slogdet(full)[1] - 2.0 * np.log(size).sum(axis=1) - np.log(precision).sum(axis=1)
+        count = np.array([len(chosen) for chosen in sets])
+        far = (np.abs(mean * size) > FARTHEST * self.scale) & (precision == self.scale**-2.0)
+        logarithm = 0.5 * ((unit * mean).sum(axis=1) - spread) - PRICE * count
+        return np.where(far[:, list(self.candidates)].any(axis=1), -np.inf, logarithm)
+
+    def solve(self, chosen: Set) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K K"], float]:
+        """Sizes of all effects for one set, their covariance, and the squared error they explain less their price."""
+        k = self.effects
+        gram, right = self.total
+        full = gram[:k, :k] + np.diag(self.precision(chosen))
+        covariance = _inverse(full)
+        mean = covariance @ right[:k]
+        return mean + self.middle, covariance, float(right[:k] @ mean)
+
+    def best(self, most: int) -> list[Set]:
+        """The likeliest set of each number of causes up to ``most``."""
+        path: list[Set] = [()]
+        for count in range(1, min(most, len(self.candidates)) + 1):
+            if count <= EXHAUSTIVE:
+                tried = list(combinations(self.candidates, count))
+            else:
+                more = [tuple(sorted((*path[-1], c))) for c in self.candidates if c not in path[-1]]
+                swapped = [
+                    tuple(sorted({*s} - {a} | {b})) for s in more[:] for a in s for b in self.candidates if b not in s
+                ]
+                tried = list(dict.fromkeys([*more, *swapped]))
+            path.append(tried[int(np.argmax(self.evidence(tried)))])
+        return path
+
+    def beside(self, chosen: Set, prune: bool = True) -> Left:
+        """Discrepancy beside a set of causes, with the amplitudes that make the flights the likeliest."""
+        gram, right = self.total
+        inside = np.array([*self.always, *(c for c in chosen if c not in self.always)], dtype=int)
+        k = self.effects
+        rest = np.array([c for c in range(k) if c not in inside], dtype=int)
+        functions = np.concatenate([f.columns for f in self.families]) if self.families else np.zeros(0, int)
+        other = np.concatenate([rest, functions])
+        own, explained, share = 0.0, 0.0, np.zeros((0, len(other) + 1))
+        inner_gram, inner_right = gram[np.ix_(other, other)], right[other]
+        if len(inside):
+            full = gram[np.ix_(inside, inside)] + np.diag(self.scale[inside] ** -2.0)
+            share = np.linalg.solve(full, np.column_stack([gram[np.ix_(inside, other)], right[inside]]))
+            inner_gram = inner_gram - gram[np.ix_(other, inside)] @ share[:, :-1]
+            inner_right = inner_right - gram[np.ix_(other, inside)] @ share[:, -1]
+            explained = float(right[inside] @ share[:, -1])
+            own = 0.5 * (explained - np.linalg.slogdet(full)[1] + np.log(self.scale[inside] ** -2.0).sum())
+        precision = np.zeros(len(other))
+        precision[: len(rest)] = self.spike[rest] ** -2.0
+        ends = len(rest) + np.cumsum([0, *(len(f.columns) for f in self.families)])
+        parts = [slice(a, b) for a, b in zip(ends, ends[1:], strict=False)]
+        usual = np.array([f.usual for f in self.families])
+        diagonal = np.maximum(np.diagonal(inner_gram), 1e-300)
+        a = (
+            np.minimum([np.sqrt(INFORMATION / diagonal[p].mean()) for p in parts], 3.0 * usual)
+            if parts
+            else np.zeros(0)
+        )
+        decided = np.zeros(len(parts))
+        for _ in range(LEARNING):
+            for part, amplitude in zip(parts, a, strict=True):
+                precision[part] = amplitude**-2.0
+            full = inner_gram + np.diag(precision)
+            covariance = _inverse(full)
+            mean = covariance @ inner_right
+            decided = np.array(
+                [p.stop - p.start - np.trace(covariance[p, p]) / x**2 for p, x in zip(parts, a, strict=True)]
+            )
+            squares = np.array([mean[p] @ mean[p] for p in parts])
+            number = np.maximum(decided, 1e-9)
+            wanted = np.sqrt(0.5 * usual**2 * (np.sqrt(number**2 + 4.0 * squares / usual**2) - number))
+            new = np.clip(np.clip(wanted, 0.3 * a, 3.0 * a), 1e-3 * usual, None)
+            if np.max(np.abs(np.log(new / a)), initial=0.0) < 0.05:
+                break
+            a = new
+        spread = np.linalg.slogdet(full)[1] - np.log(precision).sum()
+        logarithm = own + 0.5 * (float(inner_right @ mean) - spread)
+        price = PRICE * len(chosen) + float(
+            (np.minimum(decided, 1.0) * (PRICE_OF_FAMILY + 0.5 * (a / usual) ** 2)).sum()
+        )
+        out = np.zeros(len(right))
+        if prune and (weak := decided < 1.0).any():
+            kept = tuple(f for f, gone in zip(self.families, weak, strict=True) if not gone)
+            return replace(self, families=kept).beside(chosen, False)
+        out[other] = mean
+        out[inside] = share[:, -1] - share[:, :-1] @ mean
+        out[: self.effects] += self.middle
+        return Left(out, logarithm - price, explained + float(inner_right @ mean))
+
+
+def _inverse(full: Float[np.ndarray, "c c"]) -> Float[np.ndarray, "c c"]:
+    """Of a symmetric matrix whose columns have very different units."""
+    size = 1.0 / np.sqrt(np.diagonal(full))
+    root = np.linalg.cholesky(full * size[:, None] * size + 1e-9 * np.eye(len(full)))
+    inverse = np.linalg.inv(root) * size
+    return inverse.T @ inverse
