@@ -20,6 +20,7 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg.lapack import dpotrf, dpotri
 
 Set = tuple[int, ...]  # effects, by their place in the catalogue of the problem
 INFORMATION = 30.0  # of a discrepancy's usual coefficient, where its amplitude is begun
@@ -190,6 +191,8 @@ class LinearModel:
 def _inverse(full: Float[np.ndarray, "c c"]) -> Float[np.ndarray, "c c"]:
     """Of a symmetric matrix whose columns have very different units."""
     size = 1.0 / np.sqrt(np.diagonal(full))
-    root = np.linalg.cholesky(full * size[:, None] * size + 1e-9 * np.eye(len(full)))
-    inverse = np.linalg.inv(root) * size
-    return inverse.T @ inverse
+    root, failed = dpotrf(full * size[:, None] * size + 1e-9 * np.eye(len(full)), lower=True)
+    if failed:
+        raise np.linalg.LinAlgError("the information about effects and discrepancy is not positive")
+    lower = np.tril(dpotri(root, lower=True)[0])
+    return (lower + lower.T - np.diag(np.diagonal(lower))) * size[:, None] * size

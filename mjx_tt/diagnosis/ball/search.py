@@ -25,7 +25,7 @@ from mjx_tt.diagnosis.ball.inclusion import Family, Left, LinearModel, Set
 ROUNDS = 8
 EARLY = 2  # of them, in which no cause has to be worth its name
 HALF = 0.5  # of all that the evidence gains, by which a single cause is looked at
-PASSES = 3  # of asking how spins and kicks are distributed
+PASSES = 2  # of asking how spins and kicks are distributed
 SETTLED = 1.0  # deviations by which a size may still move
 LEAST_SHARE = 0.03  # of the error, that a cause must take away
 LEADING_SHARE = 0.9  # of the error, beyond which a cause is named though a smooth function could stand for it
@@ -180,9 +180,7 @@ def _linear_model(
     more = None
     if prior is not None:
         physical = [i for i, e in enumerate(problem.effects) if e.path.startswith((FLIGHT, TABLE))]
-        grown = marginal.growth(problem, flights, linear, at, physical)
-        more = np.zeros((*grown.shape[:3], len(columns)))
-        more[..., :k] = grown
+        more = marginal.growth(problem, flights, linear, at, physical)
     # What is wrong with all bounces would pass for bounces that scatter, and with all flights for spin: how spins and
     # kicks are distributed is asked of what effects and discrepancy together leave.
     theta, everything = np.pad(at.theta, (0, len(columns) - k)), Left(np.zeros(0), 0.0, 0.0)

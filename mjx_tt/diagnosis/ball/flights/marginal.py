@@ -183,9 +183,9 @@ def evidence(
     theta: Float[np.ndarray, " K"],
     prior: SpinPrior | None,
     scatter: Float[np.ndarray, 3],
-    more: Float[np.ndarray, "n 6 3 K"] | None,
+    more: Float[np.ndarray, "n 6 3 M"] | None,
 ) -> Evidence:
-    """Evidence about changes theta. more: ``growth``, where balls spin.
+    """Evidence about changes theta. more: ``growth`` of the first M of them, where balls spin.
 
     The distributions were found from the same flights: the mean of the spins, and the spread of spins and kicks along
     each axis, follow theta and are projected out, so that what only their spread decides is not counted as known.
@@ -203,7 +203,8 @@ def evidence(
         middle[:, :3] = mean.T
     precision, middle = precision[:, used][:, :, used], middle[:, used]
     own, own_effect, own_right = p.own[:, used][:, :, used], p.own_effect[:, used], p.own_right[:, used]
-    wide = np.zeros((n, size, size, k))
+    m = 0 if more is None else more.shape[-1]  # effects of which it is known, the first ones
+    wide = np.zeros((n, size, size, m))
     if more is not None:
         wide[:, :, :3] = more[:, used]
     spread = np.linalg.inv(precision)
@@ -215,7 +216,7 @@ def evidence(
     left = np.einsum("nab,nb->na", shrunk, own_right - np.einsum("nab,nb->na", own, middle))
     gram = p.gram - own_effect.swapaxes(1, 2) @ known @ own_effect
     right = p.right - np.einsum("nak,na->nk", own_effect, middle + np.einsum("nab,nb->na", spread, left))
-    right = right - np.trace(turned, axis1=2, axis2=3)
+    right[:, :m] -= np.trace(turned, axis1=2, axis2=3)
     second = np.einsum("nkab,nlba->nkl", turned, turned)  # by the covariance; the rest of that is in the gram already
     # Unknowns of the distributions: the spins' mean, and the logarithm of the spread along each axis.
     score = left - effects @ theta
@@ -225,12 +226,17 @@ def evidence(
         wider[:, axis, :, axis] += spread[:, axis]
     weighted = shown[:, None] @ wider
     of_spread = 0.5 * (np.einsum("na,njab,nb->nj", score, wider, score) - np.trace(weighted, axis1=2, axis2=3))
-    cross = np.concatenate([effects[:, :spins], np.einsum("nkab,njba->njk", turned, weighted)], axis=1)
+    of_spreads = np.zeros((n, size, k))
+    of_spreads[..., :m] = np.einsum("nkab,njba->njk", turned, weighted)
+    cross = np.concatenate([effects[:, :spins], of_spreads], axis=1)
     inner = np.zeros((spins + size, spins + size))
     inner[:spins, :spins] = shown[:, :spins, :spins].sum(axis=0)
     inner[spins:, spins:] = 0.5 * np.einsum("njab,nlba->jl", weighted, weighted)
     inner += np.diag([WIDE_MEAN**-2.0] * spins + [WIDE_LOG**-2.0] * size)
     mix = np.linalg.solve(inner, cross.sum(axis=0)).T
     of_distributions = np.concatenate([score[:, :spins], of_spread], axis=1)
-    right = right + second @ theta - (of_distributions + cross @ theta) @ mix.T
-    return Evidence(gram + second - mix @ cross, right, -mix.T, size, gram.sum(axis=0), gram)
+    right = right - (of_distributions + cross @ theta) @ mix.T
+    right[:, :m] += second @ theta[:m]
+    whole = gram - mix @ cross
+    whole[:, :m, :m] += second
+    return Evidence(whole, right, -mix.T, size, gram.sum(axis=0), gram)
