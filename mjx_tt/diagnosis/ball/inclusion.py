@@ -60,6 +60,7 @@ class LinearModel:
     middle: Float[np.ndarray, " K"]  # of the effects' priors
     scale: Float[np.ndarray, " K"]  # of an effect in the set
     spike: Float[np.ndarray, " K"]  # of one that is not
+    low: Float[np.ndarray, " K"]  # sizes below which an effect makes no sense
     families: tuple[Family, ...]
     candidates: Set
     always: Set = ()  # effects that every set holds
@@ -100,7 +101,9 @@ class LinearModel:
         mean = np.linalg.solve(full, unit[..., None])[..., 0]
         spread = np.linalg.slogdet(full)[1] - 2.0 * np.log(size).sum(axis=1) - np.log(precision).sum(axis=1)
         count = np.array([len(chosen) for chosen in sets])
-        far = (np.abs(mean * size) > FARTHEST * self.scale) & (precision == self.scale**-2.0)
+        value = mean * size
+        far = (np.abs(value) > FARTHEST * self.scale) | (value + self.middle < self.low)
+        far &= precision == self.scale**-2.0
         logarithm = 0.5 * ((unit * mean).sum(axis=1) - spread) - PRICE * count
         return np.where(far[:, list(self.candidates)].any(axis=1), -np.inf, logarithm)
 

@@ -220,7 +220,8 @@ def _about(
     useful = tuple(f for f in families if information[f.columns].mean() * f.usual**2 > 0.1)
     candidates = tuple(c for c in candidates if information[c] * scale[c] ** 2 > 1.0)
     spike = np.minimum(spike, 0.3 * scale)
-    return LinearModel(shown.ball_alone, right, middle, scale, spike, useful, candidates, always)
+    low = np.array([e.low for e in problem.effects])
+    return LinearModel(shown.ball_alone, right, middle, scale, spike, low, useful, candidates, always)
 
 
 def _tempered(model: LinearModel) -> tuple[LinearModel, Left]:

@@ -193,7 +193,8 @@ def _choose(
         j = np.einsum("cd,kdn->kcn", root, jacobian) * np.sqrt(weight)
         t = root @ y * np.sqrt(weight)
         gram, right = np.einsum("kcn,lcn->nkl", j, j), np.einsum("kcn,cn->nk", j, t)
-        model = LinearModel(gram, right, np.zeros(len(scale)), scale, SPIKE * scale, (), tuple(range(len(scale))))
+        low, able = np.array([e.low for e in effects]), tuple(range(len(scale)))
+        model = LinearModel(gram, right, np.zeros(len(scale)), scale, SPIKE * scale, low, (), able)
         path = model.best(len(effects))
         chosen = path[int(np.argmax(model.evidence(path)))]
         size, covariance, _ = model.solve(chosen)

