@@ -148,7 +148,6 @@ class Part:
 
     named: tuple[Expressed, ...] = ()
     beside: dict[str, float] = field(default_factory=dict)  # values fitted beside the named causes
-    undetermined: bool = False  # another set of causes explains as much
     unexplained: Unexplained | None = None
     held_out: HeldOut | None = None
     not_identifiable: tuple[str, ...] = ()
@@ -168,8 +167,7 @@ def combined(
     """Verdict of all parts, and values of the extended model with what training may draw around them.
 
     Of what one part alone can say, the unexplained and the held-out error, the first part's counts. A part that leaves
-    something unexplained changes nothing unless a cause leads that was adopted; causes that others could replace do
-    only if they predict better. notes:
+    something unexplained changes nothing unless it was adopted; nor does what predicts worse. notes:
     warnings that stand before the parts' own.
     """
 
@@ -182,7 +180,7 @@ def combined(
     worse = bool(named) and held_out is not None and held_out.high < 0.0
     if unexplained is not None:
         kind = "unexplained"
-    elif worse or any(p.undetermined for p in parts):
+    elif worse:
         # What makes the prediction of unseen balls worse is no cause to act on.
         kind = "undetermined"
     else:
@@ -203,9 +201,9 @@ def combined(
         every("together"),
         next((p.left for p in parts if p.left is not None), None),
     )
-    if kind == "undetermined" and not (held_out and held_out.low > 0.0):
+    if kind == "undetermined":
         return verdict, {}, ()
-    # Beside what no entry explains a name may stand for just that, however well it predicts: nothing to train on.
+    # Beside what no entry explains a name may stand for just that: only what predicts unseen data better is adopted.
     sound = [p for p in parts if p.unexplained is None or p.adopted]
     values = {path: value for p in sound for path, value in p.beside.items()}
     values |= {path: value for p in sound for n in p.named for path, value in n.values.items()}

@@ -54,7 +54,6 @@ def part(
     return Part(
         tuple(_standing_in(n, without) for n in named),
         beside,
-        False,
         unexplained,
         held_out,
         tuple(hidden),

@@ -30,7 +30,7 @@ HALVES = 20  # of the balls, by which a cause's confidence is told
 WIDE = 10.0  # times ordinary sizes, where only the flights are to speak
 ALIKE = 0.97  # |cosine| of two effects' patterns beyond which they are one group
 TIE = 5.0  # of the logarithm of the evidence by which a cause must beat another in its place
-FILTER = ("tracker_filter", "tracker_gate")
+FILTER = "tracker_filter"
 
 
 @dataclass(frozen=True)
@@ -111,9 +111,7 @@ def diagnose_balls(
     say(f"fitting {g.n} flights under the nominal model")
     at = Situation(np.zeros(len(effects)), first_fit(problem))
     problem, at, filters = _with_filter(problem, at, gone)
-    left_out = tuple(
-        i for i, e in enumerate(effects) if e.gone(gone) or (e.name in FILTER and not filters) or e.name == FILTER[1]
-    )
+    left_out = tuple(i for i, e in enumerate(effects) if e.gone(gone) or (e.name == FILTER and not filters))
     nominal = at  # starts under the nominal model, with spins where its balls have them
     spun: SpinPrior | None = None
     if spin != "none":
@@ -125,11 +123,14 @@ def diagnose_balls(
     start_error = mean_square(residual0, g, 6)
     error = start_error if spin == "cause" else 0.0
     found = search(problem, at, spun, left_out, sessions, error, say)
-    doubt = False
-    if spin == "none" and "magnus" not in gone:
+    patterns, largest, rms = _patterns(found, g)
+    # Bounces count with what differs between them: a place that returns balls otherwise is no scatter.
+    whole = max(start_error - found.level, rms**2)
+    unexplained = largest >= LEAST_LEFT and rms**2 > LEAST_LEFT_SHARE * whole
+    may_spin = unexplained
+    if spin == "none" and not unexplained:
         say("asking whether balls spin, each in its own way")
-        doubt = _open(found, g, start_error) or spins_pay(problem, found, *own_spins(problem, at))
-    patterns, _, _ = _patterns(found, g)
+        may_spin = spins_pay(problem, found, *own_spins(problem, at))
     rng = np.random.default_rng(seed)
     named = tuple(
         j for j in found.chosen if abs(found.at.theta[j]) * found.shift[j] >= FLOOR or problem.effects[j].fades
@@ -143,12 +144,12 @@ def diagnose_balls(
         _confidence(found, rng),
         left_out,
         patterns,
-        _open(found, g, start_error),
+        unexplained,
         residual0,
         nominal.start,
         sessions,
         estimate(problem, found, kept),
-        doubt,
+        may_spin and spin == "none" and "magnus" not in gone,
     )
 
 
@@ -159,9 +160,9 @@ def shaking(found: BallFindings) -> Jitter | None:
 
 def _with_filter(problem: BallProblem, at: Situation, gone: set[str]) -> tuple[BallProblem, Situation, bool]:
     """The problem with the gate of a tracker's filter and its memory to begin with, where such a filter shows."""
-    model, index = problem.model, [e.name for e in problem.effects].index(FILTER[0])
-    if model.sensing.filter_time not in (None, 0.0) or FILTER[0] in gone:
-        return problem, at, FILTER[0] not in gone
+    model, index = problem.model, [e.name for e in problem.effects].index(FILTER)
+    if model.sensing.filter_time not in (None, 0.0) or FILTER in gone:
+        return problem, at, FILTER not in gone
     likeliest = tracker_gate.likeliest(problem, at, problem.linearise(at))
     if likeliest is None:
         return problem, at, False
@@ -172,15 +173,6 @@ def _with_filter(problem: BallProblem, at: Situation, gone: set[str]) -> tuple[B
     theta = at.theta.copy()
     theta[index] = memory
     return problem, replace(at, theta=theta), True
-
-
-def _open(found: Search, g: Grid, error: float) -> bool:
-    """True where what no cause explains is large enough to matter, and a fifth of the error [m^2] of the nominal model.
-
-    Bounces count with what differs between them: a place that returns balls otherwise is no scatter.
-    """
-    _, largest, rms = _patterns(found, g)
-    return largest >= LEAST_LEFT and rms**2 > LEAST_LEFT_SHARE * max(error - found.level, rms**2)
 
 
 def _patterns(found: Search, g: Grid) -> tuple[tuple[Pattern, ...], float, float]:

@@ -43,7 +43,6 @@ class Effect(Description):
     low: float = -np.inf  # smallest change that makes sense
     at_paddle: bool = False  # only a hit shows it, with the joints' log beside the ball's
     needs_spin: bool = False  # shows only on balls that spin
-    beside: str = ""  # the effect without which it means nothing, where the nominal model has none of that
     made_of: tuple[str, ...] = ()  # effects that it changes together: beside all of them it is no unknown of its own
     fades: bool = False  # shows for a moment only and is gone at the flight's end
     fit: bool = True  # False: not a shift of the path, found by other means
@@ -432,7 +431,7 @@ EFFECTS: tuple[Effect, ...] = (
         low=0.0,
         fades=True,
     ),
-    Effect(
+    Effect(  # found by flights/tracker_gate
         name="tracker_gate",
         meaning="the surprise at which a tracker's filter starts afresh",
         claim="The tracker's filter starts afresh {way:later|earlier} than the model says, at {instead}",
@@ -440,9 +439,7 @@ EFFECTS: tuple[Effect, ...] = (
         scale=0.015,
         unit="m",
         reading="the tracker's settings",
-        low=-0.028,
-        fades=True,
-        beside="tracker_filter",
+        fit=False,
     ),
     Effect(  # found by time_jitter
         name="latency_jitter",

@@ -23,10 +23,7 @@ def test_nothing_beside_the_unexplained_is_trained_on():
     assert verdict.warnings == ("a note", NOT_ADOPTED)
 
 
-def test_causes_that_others_could_replace_are_kept_where_they_predict_better():
-    part = Part((_named("wind_x", WIND, 0.3),), {"ball.flight.wind_z": 0.01}, undetermined=True, held_out=BETTER)
-    verdict, values, _ = combined([part])
-    assert verdict.verdict == "undetermined" and values == {WIND: 0.3, "ball.flight.wind_z": 0.01}
+def test_causes_that_predict_worse_are_not_trained_on():
     worse = HeldOut("rms", 50.0, 55.0, -8.0, -2.0)
     verdict, values, ranges = combined([Part((_named("wind_x", WIND, 0.3),), held_out=worse)])
     assert verdict.verdict == "undetermined" and values == {} and ranges == ()
