@@ -82,7 +82,7 @@ def fit_human(
     Landing points are those of the fitted states' simulated flights. A ball counts when it starts on the human's side,
     flies towards the robot, clears the net and lands on the robot's side. eps, min_samples: see ``fit_distribution``.
     serves: balls that bounce on the human's side first count as well, from 20 ms after that bounce. Start states of a
-    recording may spin; trajectories are taken not to (mjx_tt.prediction.state_fit estimates their spins).
+    recording may spin; trajectories are taken not to (``mjx_tt.prediction`` estimates their spins).
     fit: of trajectories. Both minimise the same distance, "nelder-mead" as the paper does, "gauss-newton" all at once.
     short_balls: the distribution draws balls as well that would bounce twice on the robot's side, if the person played
     any; without, those set its bounds only, and none of them is drawn.

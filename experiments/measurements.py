@@ -16,8 +16,7 @@ from ballmodel.trajectory import Dataset
 from experiments.errors import ConfigError, error_context
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.diagnosis.tracks.frame import align
-from mjx_tt.prediction import SpinPrior, fit_states
-from mjx_tt.prediction.state_fit import lift_known
+from mjx_tt.prediction.flight_fit import fit_states, learn
 from mjx_tt.sim.model import SimModel
 
 LEAST_SAMPLES = 8  # of a stroke whose start and spin are fitted
@@ -77,11 +76,11 @@ def start_states(measured: Dataset, model: SimModel) -> tuple[MeasuredStates, li
     strokes = tuple(t for t in strokes if len(t) >= LEAST_SAMPLES)
     if not strokes:
         raise ConfigError(f"{measured.source}: no stroke of {LEAST_SAMPLES} samples among {len(measured)} tracks")
-    spins = lift_known(model)
-    fitted = fit_states(strokes, model, None if spins else SpinPrior.still(), learn_prior=spins)
-    size = np.linalg.norm(fitted.state[6:], axis=0)
+    belief = learn(strokes, model)
+    fitted = fit_states(strokes, belief)
     lines = [*record.lines(), f"{len(strokes)} strokes of {len(measured)} tracks; noise {1e3 * fitted.noise:.1f} mm"]
-    if spins:
+    if belief.spins is not None:
+        size = np.linalg.norm(fitted.start.spin, axis=0)
         low, middle, high = np.percentile(size, [5, 50, 95])
         lines.append(f"spin {middle:.0f} rad/s in the median, {low:.0f} to {high:.0f} in 90 % of them")
     return MeasuredStates(np.arange(len(strokes)), fitted.start, measured.source), lines

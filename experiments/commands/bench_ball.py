@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -44,7 +45,8 @@ def bench_ball(
         for s in b.scores:
             if s.across == "all":
                 rms = " to ".join(f"{1e3 * v:.1f}" for v in s.rms[1:])
-                text = f"{1e3 * s.rms[0]:6.1f} mm ({rms}), median {1e3 * s.median[0]:.1f}"
+                inside = "" if math.isnan(s.inside) else f", {s.inside:.0%} in 90 % regions"
+                text = f"{1e3 * s.rms[0]:6.1f} mm ({rms}), median {1e3 * s.median[0]:.1f}{inside}"
                 screen.print(f"  {s.horizon:4.2f} s  {s.method:32} {text}")
     for path in ball_benchmark.write(Path(out), found)[:2]:
         screen.print(f"  {path}")

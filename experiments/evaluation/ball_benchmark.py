@@ -11,6 +11,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
+from scipy.stats import chi2
 
 from ballmodel.io import MeasuredStates, SpinDataset, read, read_events, read_spindoe
 from ballmodel.io.atomic_files import replacing
@@ -30,7 +31,7 @@ LICENCES = {
 }
 ACROSS = {"all": "all flights", "free": "before the bounce", "bounce": "across the bounce"}
 COLUMNS = ("set", "licence", "horizon_s", "across", "method", "flights", "rms_mm", "rms_low", "rms_high",
-           "median_mm", "median_low", "median_high")  # fmt: skip
+           "median_mm", "median_low", "median_high", "in_regions")  # fmt: skip
 
 
 def score(paths: Sequence[str], models: Mapping[str, SimModel]) -> list[tuple[Benchmark, str]]:
@@ -72,23 +73,23 @@ def write(folder: Path, found: Sequence[tuple[Benchmark, str]]) -> list[Path]:
         for b, licence in found:
             for s in b.scores:
                 millimetres = [f"{1e3 * v:.2f}" for v in (*s.rms, *s.median)]
-                writer.writerow([b.name, licence, f"{s.horizon:g}", s.across, s.method, s.flights, *millimetres])
+                writer.writerow(
+                    [b.name, licence, f"{s.horizon:g}", s.across, s.method, s.flights, *millimetres, f"{s.inside:.3f}"]
+                )
     page = Page("Predicting balls", f"the state from the first {WINDOW:g} s, every second flight held out")
     for b, licence in found:
         page.section(b.name, b.name)
         page.paragraph(f"{b.flights} flights; licence: {licence}. Errors in mm: RMS and median with 95 % intervals.")
-        page.add(html.table(*_table(b), right=(2, 3, 4)))
+        page.add(html.table(*_table(b), right=(2, 3, 4, 5)))
         page.add(page.picture(f"errors_{b.name}", _figure(b), Markup("Share of held-out flights with smaller errors."),
                               f"Errors of the predictors on {b.name}"))  # fmt: skip
+        if b.squares:
+            text = Markup("Share of held-out samples inside a region, over what the region promises.")
+            page.add(page.picture(f"regions_{b.name}", _regions(b), text, f"Calibration of the regions on {b.name}"))
         for line in b.record.lines():
             page.paragraph(f"Cleaned: {line}")
-        learnt = [
-            f"{method}: " + ", ".join(f"{path.split('.')[-1]} {v:.3g} ± {d:.2g}" for path, (v, d) in shared.items())
-            for method, shared in b.shared.items()
-            if shared
-        ]
-        if learnt:
-            page.add(html.details("Learnt from the other half", "".join(f"<p>{escape(line)}</p>" for line in learnt)))
+        if b.learnt:
+            page.paragraph(f"The diagnosis of the other half names: {b.learnt}.")
     return [table, *page.write(folder / "benchmark.html", folder / "plots")]
 
 
@@ -97,8 +98,10 @@ def _table(b: Benchmark) -> tuple[list[str], list[list[str]]]:
     for s in b.scores:
         if s.across == "all" or _apart(b, s):
             place = f"{s.horizon:.2g} s ahead, {ACROSS[s.across]}"
-            rows.append([str(escape(place)), str(escape(s.method)), str(s.flights), _cell(s.rms), _cell(s.median)])
-    return ["horizon", "method", "flights", "RMS", "median"], rows
+            inside = "" if np.isnan(s.inside) else f"{s.inside:.0%}"
+            cells = [escape(place), escape(s.method), s.flights, _cell(s.rms), _cell(s.median), inside]
+            rows.append([str(cell) for cell in cells])
+    return ["horizon", "method", "flights", "RMS", "median", "in 90 % regions"], rows
 
 
 def _apart(b: Benchmark, s: Score) -> bool:
@@ -109,6 +112,20 @@ def _apart(b: Benchmark, s: Score) -> bool:
 def _cell(value: tuple[float, float, float]) -> str:
     middle, low, high = (1e3 * v for v in value)
     return f"{middle:.1f} ({low:.1f} to {high:.1f})"
+
+
+def _regions(b: Benchmark) -> Figure:
+    promised = np.linspace(0.0, 1.0, 101)
+    with matplotlib.rc_context(html.STYLE):
+        figure = Figure(figsize=(0.6 * html.WIDTH, 3.8), layout="constrained")
+        ax = figure.subplots()
+    ax.plot([0.0, 1.0], [0.0, 1.0], color="0.7", lw=1.0)
+    for method, squares in b.squares.items():
+        known = squares[np.isfinite(squares)]
+        ax.plot(promised, (known[:, None] < chi2.ppf(promised, 3)).mean(axis=0), label=method, lw=1.4)
+    ax.set(xlabel="promised", ylabel="share inside")
+    ax.legend(fontsize=9, frameon=False)
+    return figure
 
 
 def _figure(b: Benchmark) -> Figure:

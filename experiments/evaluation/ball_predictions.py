@@ -12,7 +12,7 @@ from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Dataset
 from experiments.errors import ConfigError
 from mjx_tt.diagnosis.tracks import clean
-from mjx_tt.prediction.state_fit import fit_states, fly_on
+from mjx_tt.prediction.flight_fit import Belief, fit_states, fly_on, learn
 from mjx_tt.sim.model import SimModel
 
 PAIRS = tuple(combinations_with_replacement(range(3), 2))
@@ -20,6 +20,7 @@ COLUMNS = ("session", "trajectory", "t", "x", "y", "z", "sd_x", "sd_y", "sd_z") 
     f"cov_{'xyz'[i]}{'xyz'[j]}" for i, j in PAIRS
 )
 FEWEST = 6  # samples of a stroke
+FEWEST_STROKES = 12  # from which is learnt how balls spin and how far predictions miss
 
 
 def write(path: Path, measured: Dataset, model: SimModel, horizons: tuple[float, ...], seen: float | None) -> list[str]:
@@ -35,17 +36,17 @@ def write(path: Path, measured: Dataset, model: SimModel, horizons: tuple[float,
     parts = [t for t in parts if len(t) >= FEWEST]
     if not parts:
         raise ConfigError(f"{measured.source}: no stroke of {FEWEST} samples among {len(measured)} tracks")
-    fitted = fit_states(parts, model)
+    belief = learn(strokes, model, seen, horizons) if len(strokes) >= FEWEST_STROKES else Belief.of(model)
+    fitted = fit_states(parts, belief)
     ahead = np.array([[t.time[-1] - t.time[0] + h for t in parts] for h in horizons])
-    flown, slope = fly_on(fitted, ahead)
-    covariance = np.einsum("atin,nij,btjn->abtn", slope, fitted.covariance, slope)
+    flown, covariance = fly_on(fitted, ahead)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for n, t in enumerate(parts):
             for h in range(len(horizons)):
-                place, spread = flown.position[:, 1 + h, 0, n], covariance[:, :, h, n]
+                place, spread = flown.position[:, 1 + h, 0, n], covariance[n, h]
                 numbers = [t.time[0] + ahead[h, n], *place, *np.sqrt(np.diag(spread)), *(spread[p] for p in PAIRS)]
                 writer.writerow([t.session, t.name, *(f"{v:.9g}" for v in numbers)])
     return [*record.lines(), f"{path}: {len(parts)} strokes; noise {1e3 * fitted.noise:.1f} mm"]

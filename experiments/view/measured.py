@@ -16,7 +16,7 @@ from experiments.view.playlist import FixedPlaylist
 from experiments.view.replay import RATE, Replay, Series
 from mjx_tt import diagnosis
 from mjx_tt.diagnosis.tracks import clean
-from mjx_tt.prediction.state_fit import SpinPrior, fit_states, fly_on, lift_known
+from mjx_tt.prediction.flight_fit import Belief, first_part, fit_states, fly_on
 from mjx_tt.robot import robots
 from mjx_tt.robot.mjcf import home_qpos, load_model
 from mjx_tt.robot.robots import Robot
@@ -232,8 +232,7 @@ def _flights(strokes: Sequence[Trajectory], model: SimModel) -> list[np.ndarray]
     """Flights (T, 3) [m] from each first sample to the last, fitted to its first FITTED seconds."""
     if not strokes:
         return []
-    prior = SpinPrior() if lift_known(model) else SpinPrior.still()
-    fitted = fit_states(strokes, model, prior, seconds=FITTED)
+    fitted = fit_states([first_part(t, FITTED) for t in strokes], Belief.of(model))
     lengths = [int((t.time[-1] - t.time[0]) * RATE) + 1 for t in strokes]
     time = np.repeat(np.arange(1, max(lengths) + 1)[:, None] / RATE, len(strokes), axis=1)
     flown, _ = fly_on(fitted, time)

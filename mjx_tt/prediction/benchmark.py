@@ -1,37 +1,39 @@
 """Benchmark of predictors on measured flights: the state from the first 0.15 s, the place 0.3 s ahead.
 
-Every second flight is held out; what flights share (drag, lift, bounce, the spread of spins) is learnt from the others.
-An error is the distance between the prediction and the sample at that time, at most CAP; a flight counts once.
+Every second flight is held out; the others are diagnosed, and say how balls spin and how far predictions miss. An error
+is the distance between the prediction and the sample at that time, at most CAP; a flight counts once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.stats import chi2
 
 from ballmodel.aerodynamics import SATURATING_LIFT
 from ballmodel.io import Events
 from ballmodel.trajectory import Trajectory
+from mjx_tt import diagnosis
+from mjx_tt.diagnosis.ball.diagnose import FEWEST_BALLS
 from mjx_tt.diagnosis.ball.flights.forward_model import grid, heading_axes
 from mjx_tt.diagnosis.ball.flights.forward_model import predict as fly
 from mjx_tt.diagnosis.tracks import Record, clean
 from mjx_tt.diagnosis.tracks.chains import take_apart
 from mjx_tt.prediction import baselines
-from mjx_tt.prediction.state_fit import SHARED, Fitted, SpinPrior, fit_states, fly_on, lift_known
+from mjx_tt.prediction.flight_fit import LEVEL, first_part, fit_states, fly_on, learn, squared_miss, targets
 from mjx_tt.sim.model import SimModel, with_values
 
 WINDOW = 0.15  # [s] of a flight that a predictor sees
 HORIZONS = (0.1, 0.3, 0.5)  # [s] after it
 CAP = 0.5  # [m]
-CLOSE = 0.02  # [s] of a sample from the horizon
 LONGEST = 1.5  # [s] of a shot
 FEWEST = 8  # flights of a set
 DRAWS = 2000
-NO_LIFT = {path: v for path, v in SHARED.items() if not path.endswith("magnus_coefficient")}
+SATURATING = {f"ball.flight.{key}": value for key, value in SATURATING_LIFT.items()}
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class Score:
     flights: int
     rms: tuple[float, float, float]  # value, low, high
     median: tuple[float, float, float]
+    inside: float = np.nan  # share of the samples that lie in the predictor's 90 % regions
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,8 @@ class Benchmark:
     record: Record
     scores: tuple[Score, ...]
     errors: dict[str, Float[np.ndarray, "h n"]]  # method -> [m], NaN where a flight has no sample there
-    shared: dict[str, dict[str, tuple[float, float]]]  # method -> what was learnt, path -> value, deviation
+    squares: dict[str, Float[np.ndarray, "h n"]]  # method -> squared misses in units of their covariances
+    learnt: str  # what the diagnosis of the other half says
 
     def score(self, method: str, horizon: float, across: str = "all") -> Score:
         """The score of one method. Raises KeyError."""
@@ -63,9 +67,6 @@ class Benchmark:
             if (s.method, s.horizon, s.across) == (method, horizon, across):
                 return s
         raise KeyError(f"{method}, {horizon} s, {across}")
-
-
-Predictor = Callable[[Sequence[Trajectory], Sequence[Trajectory], np.ndarray], np.ndarray]
 
 
 def benchmark(
@@ -77,8 +78,9 @@ def benchmark(
 ) -> Benchmark:
     """Scores of the baselines and of the models on one set of tracks in the table frame.
 
-    models: by name; each predicts with a spin per ball where its ball is lifted, under a prior learnt from the other
-    half. Raises ValueError for fewer than FEWEST flights that are long enough.
+    models: by name; each predicts with a spin per ball where its ball is lifted, of a distribution learnt from the
+    other half. "diagnosed" is the nominal model as the diagnosis of the other half extends it, where that is large
+    enough. Raises ValueError for fewer than FEWEST flights that are long enough.
     """
     strokes, record = clean(tracks)
     usable = [t for t in strokes if t.time[-1] - t.time[0] > WINDOW + horizons[0] and _seen(t) >= 6]
@@ -87,37 +89,39 @@ def benchmark(
             f"{name}: {len(usable)} of {len(tracks)} flights last {WINDOW + horizons[0]:.2f} s, {FEWEST} are wanted"
         )
     known, held = usable[::2], usable[1::2]
-    times, targets = _targets(held, horizons)
+    parts = [first_part(t, WINDOW) for t in held]
+    times, places = targets(held, parts, horizons)
     bounced = _bounces(held, times)
-    horizons = [h for h, some in zip(horizons, np.isfinite(targets[0]).any(axis=1), strict=True) if some]
-    times, targets, bounced = times[: len(horizons)], targets[:, : len(horizons)], bounced[: len(horizons)]
-    shared: dict[str, dict[str, tuple[float, float]]] = {}
-
-    def with_model(method: str, model: SimModel, lifted: bool, paths: Mapping[str, tuple]) -> np.ndarray:
-        prior = None if lifted else SpinPrior.still()
-        learnt = fit_states(known, model, prior, learn_prior=lifted, shared=paths) if lifted or paths else None
-        shared[method] = {} if learnt is None else learnt.shared
-        seen = _of(held, model, prior) if learnt is None else _of(held, learnt.model, learnt.prior)
-        return fly_on(seen, times)[0].position[:, 1:, 0]
-
-    found = {
+    horizons = [h for h, some in zip(horizons, np.isfinite(places[0]).any(axis=1), strict=True) if some]
+    times, places, bounced = times[: len(horizons)], places[:, : len(horizons)], bounced[: len(horizons)]
+    worlds = {"nominal model": SimModel(), "saturating lift": with_values(SimModel(), SATURATING)}
+    learnt = "too few flights"
+    if len(known) >= FEWEST_BALLS:
+        found = diagnosis.diagnose(diagnosis.Logs(tuple(known), (), {}))
+        worlds["diagnosed"] = found.extended.model
+        learnt = ", ".join(c.name for c in found.verdict.causes) or "nothing"
+    worlds |= dict(models or {})
+    found_places = {
         "parabola": baselines.parabola(held, WINDOW, times),
         "Kalman filter": baselines.kalman(held, WINDOW, times),
-        "nominal model": with_model("nominal model", SimModel(), False, {}),
-        "drag, fitted": with_model("drag, fitted", SimModel(), False, NO_LIFT),
-        "drag and lift, a spin per ball": with_model("drag and lift, a spin per ball", SimModel(), True, SHARED),
     }
-    for label, model in (models or {}).items():
-        found[label] = with_model(label, model, lift_known(model), {})
-    errors = {method: np.minimum(np.linalg.norm(places - targets, axis=0), CAP) for method, places in found.items()}
+    squares = {}
+    for label, world in worlds.items():
+        belief = learn(known, world, WINDOW, horizons)
+        flown, covariance = fly_on(fit_states(parts, belief), times)
+        found_places[label] = flown.position[:, 1:, 0]
+        squares[label] = squared_miss(places - found_places[label], covariance)
+    errors = {m: np.minimum(np.linalg.norm(at - places, axis=0), CAP) for m, at in found_places.items()}
     scores = []
     for across, chosen in (("all", np.ones_like(bounced)), ("free", ~bounced), ("bounce", bounced)):
         for h, horizon in enumerate(horizons):
             for method, error in errors.items():
-                kept = error[h][chosen[h] & np.isfinite(error[h])]
-                if kept.size:
-                    scores.append(_score(method, float(horizon), across, kept, seed))
-    return Benchmark(name, len(usable), record, tuple(scores), errors, shared)
+                which = chosen[h] & np.isfinite(error[h])
+                if which.any():
+                    inside = squares[method][h, which] < chi2.ppf(LEVEL, 3) if method in squares else np.nan
+                    share = float(np.mean(inside))
+                    scores.append(_score(method, float(horizon), across, error[h][which], seed, share))
+    return Benchmark(name, len(usable), record, tuple(scores), errors, squares, learnt)
 
 
 def landing_benchmark(
@@ -137,8 +141,12 @@ def landing_benchmark(
     start = np.concatenate([position[:, shots], velocity[:, shots], along])
     moments = np.arange(0.0, LONGEST, 0.01)
     g = grid([Trajectory("", str(i), moments, np.zeros((3, moments.size))) for i in range(shots.size)])
-    known = {"no air": {"drag_coefficient": 0.0}, "nominal model": {}, "C_d 0.47, k 0.6": {"magnus_coefficient": 0.6}}
-    known["saturating lift"] = SATURATING_LIFT
+    known = {
+        "saturating lift": SATURATING_LIFT,
+        "no air": {"drag_coefficient": 0.0},
+        "nominal model": {},
+        "C_d 0.47, k 0.6": {"magnus_coefficient": 0.6},
+    }
     worlds = {
         label: with_values(SimModel(), {f"ball.flight.{key}": value for key, value in values.items()})
         for label, values in known.items()
@@ -150,31 +158,11 @@ def landing_benchmark(
         off = np.linalg.norm(landed.bounce[:2, 0] - position[:2, bounces], axis=0)
         errors[label] = np.minimum(np.where(np.isfinite(landed.bounce_time[0]), off, CAP), CAP)[None]
     scores = tuple(_score(label, seconds, "all", error[0], seed) for label, error in errors.items())
-    return Benchmark(name, shots.size, Record((), shots.size, shots.size, ()), scores, errors, {})
+    return Benchmark(name, shots.size, Record((), shots.size, shots.size, ()), scores, errors, {}, "")
 
 
 def _seen(t: Trajectory) -> int:
     return int(np.searchsorted(t.time, t.time[0] + WINDOW + 1e-9, side="right"))
-
-
-def _of(held: Sequence[Trajectory], model: SimModel, prior: SpinPrior | None) -> Fitted:
-    """States from the first WINDOW of the held-out flights."""
-    return fit_states(held, model, prior, seconds=WINDOW)
-
-
-def _targets(
-    held: Sequence[Trajectory], horizons: Sequence[float]
-) -> tuple[Float[np.ndarray, "h n"], Float[np.ndarray, "3 h n"]]:
-    """Times [s] since each flight's first sample, and the sample there [m]; NaN where the flight has none."""
-    times, places = np.zeros((len(horizons), len(held))), np.full((3, len(horizons), len(held)), np.nan)
-    for i, t in enumerate(held):
-        last = t.time[_seen(t) - 1]
-        for h, horizon in enumerate(horizons):
-            times[h, i] = last + horizon - t.time[0]
-            k = int(np.argmin(np.abs(t.time - last - horizon)))
-            if abs(t.time[k] - last - horizon) < CLOSE:
-                times[h, i], places[:, h, i] = t.time[k] - t.time[0], t.position[:, k]
-    return times, places
 
 
 def _bounces(held: Sequence[Trajectory], times: Float[np.ndarray, "h n"]) -> Bool[np.ndarray, "h n"]:
@@ -187,7 +175,9 @@ def _bounces(held: Sequence[Trajectory], times: Float[np.ndarray, "h n"]) -> Boo
     return out
 
 
-def _score(method: str, horizon: float, across: str, errors: Float[np.ndarray, " n"], seed: int) -> Score:
+def _score(
+    method: str, horizon: float, across: str, errors: Float[np.ndarray, " n"], seed: int, inside: float = np.nan
+) -> Score:
     rng = np.random.default_rng(seed)
     drawn = errors[rng.integers(0, errors.size, (DRAWS, errors.size))]
 
@@ -197,5 +187,5 @@ def _score(method: str, horizon: float, across: str, errors: Float[np.ndarray, "
 
     rms = interval(float(np.sqrt(np.mean(errors**2))), np.sqrt(np.mean(drawn**2, axis=1)))
     return Score(
-        method, horizon, across, errors.size, rms, interval(float(np.median(errors)), np.median(drawn, axis=1))
+        method, horizon, across, errors.size, rms, interval(float(np.median(errors)), np.median(drawn, axis=1)), inside
     )

@@ -23,7 +23,7 @@ from mjx_tt.diagnosis.logs import before_racket
 from mjx_tt.sim.model import SimModel, with_values
 
 FEWEST_SAMPLES = 15  # of a flight
-FEWEST_BALLS = 12
+FEWEST_BALLS = 6
 FLOOR = 0.003  # [m] shift of a flight's last sample below which a cause is of no practical interest
 LEAST_LEFT, LEAST_LEFT_SHARE = 0.0025, 0.2  # [m] of what no cause explains, on one ball in ten; share of the error
 HALVES = 20  # of the balls, by which a cause's confidence is told

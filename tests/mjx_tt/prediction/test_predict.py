@@ -10,9 +10,10 @@ import pytest
 
 from ballmodel.trajectory import Trajectory
 from experiments import cli
-from mjx_tt.prediction import SpinPrior, predict
+from mjx_tt.diagnosis.ball.flights.spin_prior import SpinPrior
+from mjx_tt.prediction import Belief, fit_states, fly_on, learn, predict
 from mjx_tt.prediction.benchmark import benchmark
-from mjx_tt.prediction.state_fit import fit_states, fly_on
+from mjx_tt.prediction.flight_fit import squared_miss
 from mjx_tt.sim.model import SimModel, with_values
 from tests.exam.generator.sessions import INTERVAL, SIGMA, draw_starts
 from tests.exam.generator.world import World, fly
@@ -39,41 +40,64 @@ def spinning(n: int = 40) -> tuple[tuple[Trajectory, ...], np.ndarray, np.ndarra
     return tuple(tracks), truth, start[6:]
 
 
+def told(scatter: float = 1e-3) -> Belief:
+    """What is true of the tracks' balls."""
+    return Belief(with_values(SimModel(), LIFT), SpinPrior(MEAN, SPREAD), np.full(3, scatter))
+
+
 def test_predictions_miss_by_what_their_covariances_say():
     """From 0.15 s on, 0.3 s ahead: squared errors in units of the covariance follow chi square of three."""
     tracks, truth, _ = spinning()
-    model, prior = with_values(SimModel(), LIFT), SpinPrior(MEAN, np.diag(SPREAD) ** 2)
-    squares, misses = [], []
-    seen = fit_states([t.part(0, 19) for t in tracks], model, prior, noise=SIGMA)
-    flown, slope = fly_on(seen, np.full((1, len(tracks)), 56 * INTERVAL))
-    for i in range(len(tracks)):
-        off = truth[:, 56, i] - flown.position[:, 1, 0, i]
-        covariance = np.einsum("ai,ij,bj->ab", slope[:, 0, :, i], seen.covariance[i], slope[:, 0, :, i])
-        squares.append(off @ np.linalg.solve(covariance, off))
-        misses.append(np.linalg.norm(off))
-    squares = np.array(squares)[np.isfinite(squares)]
-    assert 0.8 < np.median(squares) / 2.37 < 1.5  # median of chi square with three degrees
-    assert np.nanmedian(misses) < 0.05
+    flown, covariance = fly_on(
+        fit_states([t.part(0, 19) for t in tracks], told()), np.full((1, len(tracks)), 56 * INTERVAL)
+    )
+    off = truth[:, 56:57] - flown.position[:, 1:, 0]
+    place = covariance - SIGMA**2 * np.eye(3)  # the truth is no sample
+    squares = squared_miss(off, place)
+    assert 0.8 < np.nanmedian(squares) / 2.37 < 1.5  # median of chi square with three degrees
+    assert np.nanmedian(np.linalg.norm(off, axis=0)) < 0.05
+
+
+def test_regions_hold_what_they_promise_though_the_model_is_wrong():
+    """Learnt on twenty balls under a drag that is far off, of twenty others nine in ten samples lie inside."""
+    tracks, _, _ = spinning()
+    wrong = with_values(SimModel(), LIFT | {"ball.flight.drag_coefficient": 0.7})
+    belief = learn(tracks[::2], wrong, 0.15, (0.3,))
+    held = [t for t in tracks[1::2] if len(t) > 56]
+    flown, covariance = fly_on(
+        fit_states([t.part(0, 19) for t in held], belief), np.full((1, len(held)), 56 * INTERVAL)
+    )
+    off = np.stack([t.position[:, 56] for t in held], axis=1)[:, None] - flown.position[:, 1:, 0]
+    inside = squared_miss(off, covariance) < 6.25  # 90 % of chi square with three degrees
+    assert 0.75 < inside.mean() <= 1.0
+    plain = squared_miss(off, covariance / np.interp(0.3, *belief.wider)) < 6.25
+    assert plain.mean() < 0.6
 
 
 def test_predict_is_the_same_for_one_track_and_says_when_it_cannot():
     tracks, truth, _ = spinning()
-    model, prior = with_values(SimModel(), LIFT), SpinPrior(MEAN, np.diag(SPREAD) ** 2)
-    place, covariance = predict(tracks[0].part(0, 40), model, (12 * INTERVAL, 0.2), prior)
+    place, covariance = predict(tracks[0].part(0, 40), told(), (12 * INTERVAL, 0.2))
     assert place.shape == (3, 2) and covariance.shape == (3, 3, 2)
     step = round(tracks[0].time[39] / INTERVAL) + 12
     assert np.linalg.norm(place[:, 0] - truth[:, step, 0]) < 0.03
     assert np.all(np.linalg.eigvalsh(np.moveaxis(covariance, 2, 0)) > 0.0)
     with pytest.raises(ValueError, match="at least 4 samples"):
-        predict(tracks[0].part(0, 3), model)
+        predict(tracks[0].part(0, 3))
     with pytest.raises(ValueError, match="increasing seconds above 0"):
-        predict(tracks[0], model, (0.2, 0.1))
+        predict(tracks[0], horizon=(0.2, 0.1))
+
+
+def test_a_model_says_how_its_balls_spin():
+    lifted = with_values(SimModel(), LIFT | {"ball_spin.mean_x": 60.0, "ball_spin.std_x": 40.0})
+    assert Belief.of(SimModel()).spins is None
+    spins = Belief.of(lifted).spins
+    np.testing.assert_allclose([spins.mean, spins.std], [[60.0, 0.0, 0.0], [40.0, 0.0, 0.0]])
 
 
 @pytest.mark.slow
-def test_spins_and_shared_numbers_are_found_together():
+def test_spins_are_learnt_from_the_flights():
     tracks, _, spins = spinning()
-    fitted = fit_states(tracks, with_values(SimModel(), LIFT), learn_prior=True)
+    fitted = fit_states(tracks, learn(tracks, with_values(SimModel(), LIFT)))
     found = np.asarray(fitted.start.spin)
     assert np.corrcoef(found[0], spins[0])[0, 1] > 0.8
     assert abs(found[0].mean() - spins[0].mean()) < 12.0
@@ -84,11 +108,10 @@ def test_spins_and_shared_numbers_are_found_together():
 def test_the_benchmark_prefers_what_knows_spin():
     tracks, _, _ = spinning()
     found = benchmark("made", tracks, {"true": with_values(SimModel(), LIFT)}, (0.3,))
-    spin, true = (found.score(m, 0.3).rms[0] for m in ("drag and lift, a spin per ball", "true"))
-    assert spin < 1.15 * true and spin < 0.9 * found.score("nominal model", 0.3).rms[0]
-    assert spin < found.score("Kalman filter", 0.3).rms[0] < found.score("parabola", 0.3).rms[0]
-    drag = found.shared["drag and lift, a spin per ball"]["ball.flight.drag_coefficient"][0]
-    assert abs(drag - 0.40) < 0.04
+    ours, true = (found.score(m, 0.3).rms[0] for m in ("diagnosed", "true"))
+    assert ours < 1.15 * true and ours < 0.9 * found.score("nominal model", 0.3).rms[0]
+    assert ours < found.score("Kalman filter", 0.3).rms[0] < found.score("parabola", 0.3).rms[0]
+    assert "magnus" in found.learnt
     low, high = found.score("true", 0.3).rms[1:]
     assert low < true < high
 
@@ -108,5 +131,5 @@ def test_commands_write_tables_and_a_page(tmp_path, capsys):
     assert len(table) == 24 and all(0.0 < float(row["sd_y"]) < 0.2 for row in table)
     assert cli.main(["bench-ball", str(path), "--out", str(tmp_path / "bench")]) == 0
     page = (tmp_path / "bench" / "benchmark.html").read_text()
-    assert "not known here" in page and "a spin per ball" in page and "data:image/png" in page
+    assert "not known here" in page and "in 90 % regions" in page and "data:image/png" in page
     assert cli.main(["bench-ball", str(tmp_path), "--out", str(tmp_path / "bench")]) == 1

@@ -81,6 +81,20 @@ def fit_with_cost(
     return _fitted(problem, theta, start, g, noise, prior, rounds, keep)[:2]
 
 
+def fit_with_information(
+    problem: BallProblem,
+    theta: np.ndarray,
+    start: np.ndarray,
+    g: Grid,
+    noise: Noise,
+    prior: SpinPrior | None,
+    rounds: int = 8,
+) -> tuple[np.ndarray, list[int], np.ndarray]:
+    """Starts (12, n) as of ``fit_starts``, the a rows that were fitted, and information (n, a, a) about these."""
+    best, _, normal, _ = _fitted(problem, theta, start, g, noise, prior, rounds, None)
+    return best, _active(noise, prior), normal
+
+
 def _fitted(
     problem: BallProblem,
     theta: np.ndarray,
@@ -96,7 +110,7 @@ def _fitted(
     mask = g.mask if keep is None else g.mask & keep
     g = replace(g, mask=mask)
     whitening = Whitening(noise, g)
-    active = [*range(6), *([] if prior is None else range(6, 9)), *(range(9, 12) if noise.scatter.any() else [])]
+    active = _active(noise, prior)
     size = len(active)
     damping = np.full(g.n, LEAST_DAMPING)
     theta_v = np.repeat(theta[:, None], 1 + size, axis=1) if theta.ndim == 1 else theta[:, None]
@@ -143,6 +157,11 @@ def _fitted(
         start = best.copy()
         start[active] += change.T
     return best, best_cost, normal, precision[:, active][:, :, active]
+
+
+def _active(noise: Noise, prior: SpinPrior | None) -> list[int]:
+    """Rows of a start that a fit has free."""
+    return [*range(6), *([] if prior is None else range(6, 9)), *(range(9, 12) if noise.scatter.any() else [])]
 
 
 def fit_spins(
