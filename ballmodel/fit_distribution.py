@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ballmodel.constants import TABLE_LENGTH, TABLE_WIDTH
 from ballmodel.distribution import BallDistribution, DistributionReport, fit_distribution
 from ballmodel.flight import BallParams, step
 from ballmodel.initial_state import MIN_SAMPLES, fit_all_nelder_mead, fit_gauss_newton
@@ -22,6 +23,7 @@ from ballmodel.trajectory import Dataset, free_flight
 LANDED_TOGETHER = 512  # flights are simulated in multiples of it
 AFTER_BOUNCE = 6  # steps after a serve's bounce on the server's side at which its ball starts: 20 ms
 LONGEST_SERVE = 300  # steps until that bounce
+HALF_TURN = np.array([[-1.0], [-1.0], [1.0]])  # about the table's upright axis
 Fit: TypeAlias = Literal["gauss-newton", "nelder-mead"]
 
 
@@ -32,7 +34,7 @@ class HumanReport:
     measured: int
     too_short: int  # fewer than MIN_SAMPLES samples before the first bounce
     elsewhere: int  # not from the human's side towards the robot
-    outcomes: dict[str, int]  # simulated flights of the others, keys from pool.OUTCOMES
+    outcomes: dict[str, int]  # flights of the others, keys from pool.OUTCOMES
     landed: BallState  # (3, n) starts of those that land on the robot's side
     landing: np.ndarray  # (2, n) [m]
     fit_rms: np.ndarray  # (m,) [m] of each fitted flight; empty where states were measured
@@ -76,14 +78,17 @@ def fit_human(
     fit: Fit = "gauss-newton",
     progress: Callable[[int, int], None] | None = None,
     short_balls: bool = False,
+    both_players: bool = False,
 ) -> tuple[BallDistribution, HumanReport]:
     """The 16 numbers of a person's balls, from trajectories or from start states.
 
-    Landing points are those of the fitted states' simulated flights. A ball counts when it starts on the human's side,
-    flies towards the robot, clears the net and lands on the robot's side. eps, min_samples: see ``fit_distribution``.
+    A ball counts when it starts on the human's side, flies towards the robot, clears the net and lands on the robot's
+    side: where a bounce was measured there, or else by the start's simulated flight.
+    eps, min_samples: see ``fit_distribution``.
     serves: balls that bounce on the human's side first count as well, from 20 ms after that bounce. Start states of a
     recording may spin; trajectories are taken not to (``mjx_tt.prediction`` estimates their spins).
     fit: of trajectories. Both minimise the same distance, "nelder-mead" as the paper does, "gauss-newton" all at once.
+    both_players: strokes of the other player count as well, as if played from the human's side.
     short_balls: the distribution draws balls as well that would bounce twice on the robot's side, if the person played
     any; without, those set its bounds only, and none of them is drawn.
     progress: called with (flights fitted so far, all of them) by Nelder-Mead, which takes a tenth of a second for each.
@@ -105,8 +110,15 @@ def fit_human(
     else:
         state, rms, too_short = measured.state, np.zeros(0), 0
     state = jax.tree.map(np.asarray, state)
+    bounced = np.full((2, state.position.shape[1]), np.nan)
+    if isinstance(measured, MeasuredStates) and measured.landing is not None:
+        bounced = measured.landing
+    if both_players:
+        other = (state.position[1] < 0.0) & (state.velocity[1] > 0.0)
+        state = jax.tree.map(lambda a: np.where(other, HALF_TURN * a, a), state)
+        bounced = np.where(other, -bounced, bounced)
     towards = (state.position[1] > 0.0) & (state.velocity[1] < 0.0)
-    state = jax.tree.map(lambda a: a[:, towards], state)
+    state, bounced = jax.tree.map(lambda a: a[:, towards], state), bounced[:, towards]
     if not towards.any():
         raise ValueError(f"{measured.source}: none of {towards.size} balls flies from the human's side to the robot's")
     thrown, _ = _thrown(params, state)
@@ -120,6 +132,10 @@ def fit_human(
         landing = _replaced(landing, own, np.asarray(again.landing))
         outcome = _replaced(outcome, own, np.asarray(again.outcome))
         served = int(np.isin(again.outcome, (KEPT, SECOND_BOUNCE)).sum())
+    # What was seen to land has landed, whatever a model that is not quite right makes of it.
+    there = (np.abs(bounced[0]) < TABLE_WIDTH / 2) & (bounced[1] < 0.0) & (bounced[1] > -TABLE_LENGTH / 2)
+    landing = np.where(there, bounced, landing)
+    outcome = np.where(there & (outcome != SECOND_BOUNCE), KEPT, outcome)
     good = (outcome == KEPT) | (outcome == SECOND_BOUNCE)
     counts = np.bincount(outcome, minlength=len(OUTCOMES))
     outcomes = {text: int(count) for text, count in zip(OUTCOMES, counts, strict=True)}

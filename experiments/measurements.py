@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from ballmodel.io import MeasuredStates, TrackOptions, read
 from ballmodel.io.atomic_files import replacing
 from ballmodel.io.formats import GUESS
 from ballmodel.io.tables import COLUMNS
-from ballmodel.trajectory import Dataset
+from ballmodel.trajectory import Dataset, Trajectory
 from experiments.errors import ConfigError, error_context
+from mjx_tt import diagnosis
 from mjx_tt.diagnosis.tracks import clean
+from mjx_tt.diagnosis.tracks.chains import take_apart
 from mjx_tt.diagnosis.tracks.frame import align
 from mjx_tt.prediction.flight_fit import fit_states, learn
 from mjx_tt.sim.model import SimModel
@@ -67,23 +70,47 @@ def read_trajectories(
     return measured
 
 
-def start_states(measured: Dataset, model: SimModel) -> tuple[MeasuredStates, list[str]]:
-    """Start states of the strokes in measured tracks, with spins where the model's ball is lifted; and a summary.
+def start_states(
+    measured: Dataset, model: SimModel | None, say: Callable[[str], None] | None = None
+) -> tuple[MeasuredStates, SimModel, list[str]]:
+    """Start states of the strokes in measured tracks, with spins where the ball is lifted, and with measured landings.
 
-    Raises ConfigError where no stroke is left.
+    Args:
+        measured: tracks in the table frame.
+        model: in which they fly; None: as their own diagnosis extends the nominal one.
+        say: is told what goes on.
+
+    Returns:
+        States, the model, and a summary.
+
+    Raises:
+        ConfigError: no stroke is left, or too few for a diagnosis.
     """
     strokes, record = clean(measured.trajectories)
     strokes = tuple(t for t in strokes if len(t) >= LEAST_SAMPLES)
     if not strokes:
         raise ConfigError(f"{measured.source}: no stroke of {LEAST_SAMPLES} samples among {len(measured)} tracks")
+    lines = record.lines()
+    if model is None:
+        with error_context(measured.source):
+            found = diagnosis.diagnose(diagnosis.Logs(strokes, (), {}), progress=say)
+        model = found.extended.model
+        named = ", ".join(cause.name for cause in found.verdict.causes) or "the nominal model"
+        lines.append(f"flown as these strokes' own diagnosis says: {named}")
     belief = learn(strokes, model)
     fitted = fit_states(strokes, belief)
-    lines = [*record.lines(), f"{len(strokes)} strokes of {len(measured)} tracks; noise {1e3 * fitted.noise:.1f} mm"]
+    lines.append(f"{len(strokes)} strokes of {len(measured)} tracks; noise {1e3 * fitted.noise:.1f} mm")
     if belief.spins is not None:
-        size = np.linalg.norm(fitted.start.spin, axis=0)
-        low, middle, high = np.percentile(size, [5, 50, 95])
+        low, middle, high = np.percentile(np.linalg.norm(fitted.start.spin, axis=0), [5, 50, 95])
         lines.append(f"spin {middle:.0f} rad/s in the median, {low:.0f} to {high:.0f} in 90 % of them")
-    return MeasuredStates(np.arange(len(strokes)), fitted.start, measured.source), lines
+    landing = np.stack([_landing(t) for t in strokes], axis=1)
+    return MeasuredStates(np.arange(len(strokes)), fitted.start, measured.source, landing), model, lines
+
+
+def _landing(stroke: Trajectory) -> Float[np.ndarray, 2]:
+    """Place [m] of a stroke's first bounce on the table, NaN where none was measured."""
+    met = (j.place[:2] for chain in take_apart(stroke).chains for j in chain.junctions if j.met == "table")
+    return next(met, np.full(2, np.nan))
 
 
 def write_csv(path: Path, dataset: Dataset) -> None:

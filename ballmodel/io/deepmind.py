@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from ballmodel.state import BallState
 
@@ -28,6 +28,7 @@ class MeasuredStates:
     id: Int[np.ndarray, " n"]
     state: BallState  # (3, n) float64 NumPy arrays
     source: str
+    landing: Float[np.ndarray, "2 n"] | None = None  # [m] of the bounce that was seen next, NaN where none was
 
     def __len__(self) -> int:
         return self.id.size

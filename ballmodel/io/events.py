@@ -15,10 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ballmodel.io.deepmind import MeasuredStates
 from ballmodel.state import BallState
+from ballmodel.trajectory import LARGEST_COORDINATE
 
 KINDS = ("shot", "bounce", "net")
 COLUMNS = ("rally_id", "type", "timestamp", "ball_pos", "ball_vel_out", "ball_spin_out")
+LEAST_SPEED, LARGEST_SPEED = 0.2, 60.0  # [m/s] of a ball after an event
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|nan", re.IGNORECASE)
 
 
@@ -42,9 +45,22 @@ class Events:
         same = np.array([self.rally[i] == self.rally[i + 1] for i in shots], bool)
         return shots[same], shots[same] + 1
 
+    def shots(self) -> MeasuredStates:
+        """The shots as start states, each with the place of the bounce that follows it."""
+        every, (shots, bounces) = np.flatnonzero(self.shot), self.landings
+        landing = np.full((2, len(self)), np.nan)
+        landing[:, shots] = np.asarray(self.state.position)[:2, bounces]
+        state = BallState(
+            *(np.asarray(part)[:, every] for part in (self.state.position, self.state.velocity, self.state.spin))
+        )
+        return MeasuredStates(every, state, self.source, landing[:, every])
+
 
 def read_events(path: str | os.PathLike) -> Events:
-    """Reads the CSV; events without all their numbers are left out. Raises ValueError naming file, row and column."""
+    """Reads the CSV, without events that lack numbers or are no ball's.
+
+    Raises ValueError naming file, row and column.
+    """
     with open(path, newline="", encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file))
     missing = [name for name in COLUMNS if not rows or name not in rows[0]]
@@ -62,7 +78,9 @@ def read_events(path: str | os.PathLike) -> Events:
         if any(len(v) not in (0, 3) for v in vectors):
             raise ValueError(f"{path}: row {number}: three numbers in brackets are wanted as {', '.join(COLUMNS[3:])}")
         values = [float(row["timestamp"]), *(x for v in vectors for x in v or [np.nan] * 3)]
-        if np.all(np.isfinite(values)):
+        speed, away = np.linalg.norm(values[4:7]), np.abs(values[1:4]).max()
+        # A shot that does not move, or is somewhere else, stands for none: trackers write zeros or -1 for what is lost.
+        if np.all(np.isfinite(values)) and LEAST_SPEED < speed < LARGEST_SPEED and away < LARGEST_COORDINATE:
             rally.append(row["rally_id"].rpartition("/")[0] if unique else row["rally_id"])
             shot.append(kind == "shot")
             numbers.append(values)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ballmodel.io.aimy import read_aimy
 from ballmodel.io.deepmind import FIELDS, MeasuredStates, read_deepmind
+from ballmodel.io.events import read_events
 from ballmodel.io.messages import read_bag, read_mcap
 from ballmodel.io.samples import Samples, TrackOptions, make_dataset
 from ballmodel.io.spindoe import INDEX, read_spindoe
@@ -18,6 +19,7 @@ FORMATS: dict[str, Callable[[Path], Dataset | MeasuredStates]] = {
     "deepmind": read_deepmind,
     "aimy": read_aimy,
     "spindoe": read_spindoe,
+    "events": lambda path: read_events(path).shots(),
 }
 TRACKS: dict[str, Callable[[Path, TrackOptions], Samples]] = {
     "csv": read_table,
@@ -30,7 +32,8 @@ GUESS = TrackOptions()
 
 
 def read(path: str | os.PathLike, format: str | None = None, options: TrackOptions = GUESS) -> Dataset | MeasuredStates:
-    """Reads measured balls: tracks from tables and message logs, AIMY and SpinDOE, start states from DeepMind's JSON.
+    """Reads measured balls: tracks from tables and message logs, AIMY and SpinDOE, start states from DeepMind's JSON
+    and from Ace's events.
 
     Args:
         path: a file, or the folder of a ROS 2 bag or of flights with measured spin.
@@ -66,4 +69,6 @@ def _find_format(path: Path) -> str:
         head = file.read(4096)
     if suffix == ".json" and all(f'"{name}"'.encode() in head for name in FIELDS[:6]):
         return "deepmind"
+    if suffix == ".csv" and b"ball_spin_out" in head:
+        return "events"
     return "spindoe" if path.name == INDEX and b"traj_file" in head else SUFFIXES[suffix]

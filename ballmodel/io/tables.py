@@ -190,7 +190,9 @@ def _pick(path: Path, table: pd.DataFrame, first: int, options: TrackOptions) ->
     names = [str(name) for name in table.columns]
     table.columns = pd.Index(names)
     if EVENTS <= {_plain(name)[0] for name in names}:
-        raise ValueError(f"{path}: holds events, no tracks; `mjx-tt bench-ball` reads it")
+        raise ValueError(
+            f"{path}: holds events, no tracks; with ball_vel_out and ball_spin_out, `mjx-tt fit-human` reads them"
+        )
     for role, name in options.columns.items():
         if role not in COLUMNS or name not in names:
             expected = ", ".join(COLUMNS if role not in COLUMNS else names)

@@ -51,12 +51,13 @@ def fit_human(
     min_samples: Annotated[int, count("balls that make a cluster (default: 5)")] = 5,
     format: options.Format = None,
     fit: Annotated[
-        Literal["gauss-newton", "nelder-mead"],
-        Parameter(help="how flights are fitted: all at once, or one by one as in the paper"),
-    ] = "gauss-newton",
+        Literal["spins", "gauss-newton", "nelder-mead"],
+        Parameter(help="how flights are fitted: with their spins, or in the paper's drag all at once or one by one"),
+    ] = "spins",
     model: Annotated[
-        str | None, option("YAML", "simulation model of the flights; with lift, spins are fitted too")
+        str | None, option("YAML", "simulation model of the flights (default: what their own diagnosis finds)")
     ] = None,
+    both_players: Annotated[bool, Parameter(help="count the other player's strokes too, turned round")] = False,
     serves: Annotated[bool, Parameter(help="count serves too, from their bounce on the person's side")] = False,
     short_balls: Annotated[
         bool, Parameter(help="also draw balls that bounce twice on the robot's side, as the person plays them")
@@ -74,15 +75,17 @@ def fit_human(
     if eps is not None and not 0.0 < eps < float("inf"):
         raise ConfigError(f"--eps {eps:g}: a positive number is wanted")
     options.check_exists(*data, model)
-    if fit == "nelder-mead" and model is not None:
+    if fit != "spins" and model is not None:
         raise ConfigError(
-            f"--fit {fit} --model {model}: in a model, strokes are fitted together with their spins, which Nelder-Mead "
-            "does not find; leave one of the two out"
+            f"--fit {fit} --model {model}: in a model, strokes are fitted with their spins; leave one of the two out"
         )
     if mixture is not None:
         options.check_suffix(mixture, ".yaml", ".yml")
     options.start_jax(None)
+    import numpy as np
+
     from ballmodel import registry
+    from ballmodel.aerodynamics import SATURATING_LIFT
     from ballmodel.distribution import save_distribution
     from ballmodel.fit_distribution import fit_human as fit_box
     from ballmodel.flight import ball_params
@@ -101,14 +104,17 @@ def fit_human(
             f"{', '.join(data)}: holds start states, which need no fit; --fit {fit} is for trajectories, leave it out"
         )
     world = options.load_model(model) if model else None
-    if world is not None and isinstance(measured, Dataset):
-        measured, lines = start_states(measured, world)
+    if isinstance(measured, Dataset) and fit == "spins":
+        measured, world, lines = start_states(measured, world, screen.print)
         screen.print(*lines, sep="\n")
+    ball = ball_params() if world is None else world.ball
+    if world is None and not isinstance(measured, Dataset) and np.any(measured.state.spin):
+        ball = replace(ball, flight=replace(ball.flight, **SATURATING_LIFT))
     try:
-        ball = world.ball if world is not None else ball_params()
         with _show_fits(screen) as progress:
+            by = "nelder-mead" if fit == "nelder-mead" else "gauss-newton"
             distribution, report = fit_box(
-                measured, ball, eps, min_samples, name or path.stem, serves, fit, progress, short_balls
+                measured, ball, eps, min_samples, name or path.stem, serves, by, progress, short_balls, both_players
             )
     except ValueError as error:
         raise ConfigError(f"{', '.join(data)}: {error}") from None

@@ -32,7 +32,8 @@ from mjx_tt.sim import model as models
 from mjx_tt.sim.model import ModelFile, SimModel
 
 SPINS = ("auto", "none", "free")
-SPINS_PAY = 0.8  # of the error without, that unseen balls must be predicted to with spins
+SPINS_PAY = 4.0  # standard errors by which unseen balls must be predicted better with spins
+SPINS_LEAD = 0.6  # of the error without, below which spins are a cause though something stays unexplained
 
 
 @dataclass(frozen=True)
@@ -148,4 +149,9 @@ def _of_balls(
     spun, of_spun = cross_validation.with_companions(spun, seed)
     plain, with_spins = (1e3 * float(np.nanmedian(p.after)) for p in (prediction, of_spun))
     note = f"unseen balls are predicted to {with_spins:.1f} mm in the median with spin, to {plain:.1f} mm without"
-    return (spun, of_spun, [note]) if with_spins < SPINS_PAY * plain else (found, prediction, [note])
+    # Spins of their own let balls take up much that is none: they must pay, and leave nothing open.
+    gain = np.log(prediction.after / of_spun.after)
+    gain = gain[np.isfinite(gain)]
+    pays = gain.mean() > SPINS_PAY * gain.std() / np.sqrt(max(gain.size, 1))
+    chosen = pays and (not spun.unexplained or with_spins < SPINS_LEAD * plain)
+    return (spun, of_spun, [note]) if chosen else (found, prediction, [note])

@@ -91,7 +91,8 @@ def load_logs(
             ) from None
         if not hasattr(data, "trajectories"):
             raise ValueError(
-                f"{file}: holds single ball states, no trajectories: a diagnosis needs positions over time"
+                f"{file}: holds single ball states, no trajectories: a diagnosis needs positions over "
+                "time (`mjx-tt fit-human` takes such states)"
             )
         notes += tuple(f"{file.name}: {note}" for note in getattr(data, "notes", ()))
         single = len(data) == 1 and not data.trajectories[0].name

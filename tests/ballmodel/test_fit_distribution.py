@@ -33,6 +33,30 @@ def test_serves_start_behind_their_bounce():
     assert np.all(report.landing[1] < 0.0)
 
 
+def test_what_was_seen_to_land_counts_and_the_other_player_on_request():
+    """Fast balls with topspin, which by drag alone fly over the table's end."""
+    rng = np.random.default_rng(1)
+    n = 30
+    position = np.stack([rng.uniform(-0.3, 0.3, n), np.full(n, 1.5), rng.uniform(0.25, 0.3, n)])
+    velocity = np.stack([rng.uniform(-0.1, 0.1, n), rng.uniform(-11.0, -10.0, n), np.full(n, 1.5)])
+    landing = np.stack([rng.uniform(-0.5, 0.5, n), rng.uniform(-1.3, -1.0, n)])
+    landing[:, 0] = np.nan  # one that nobody saw land
+    state = BallState(position, velocity, np.zeros((3, n)))
+    with pytest.raises(ValueError, match="none of 30 balls lands on the robot's side"):
+        fit_human(MeasuredStates(np.arange(n), state, "fast"), ball_params())
+    box, report = fit_human(MeasuredStates(np.arange(n), state, "fast", landing), ball_params(), eps=50.0)
+    assert report.landed.position.shape == (3, n - 1)
+    np.testing.assert_allclose([box.landing_min[1], box.landing_max[1]], [landing[1, 1:].min(), landing[1, 1:].max()])
+    turn = np.array([[-1.0], [-1.0], [1.0]])
+    across = BallState(
+        *(np.concatenate([part[:, ::2], turn * part[:, 1::2]], axis=1) for part in (position, velocity, state.spin))
+    )
+    both = MeasuredStates(np.arange(n), across, "rally", np.concatenate([landing[:, ::2], -landing[:, 1::2]], axis=1))
+    again, _ = fit_human(both, ball_params(), eps=50.0, both_players=True)
+    np.testing.assert_allclose(sixteen(again), sixteen(box))
+    assert fit_human(both, ball_params(), eps=50.0)[1].elsewhere == n // 2
+
+
 def sixteen(box: BallDistribution) -> np.ndarray:
     return np.concatenate([getattr(box, f"{part}_{end}") for part in AXES for end in ("min", "max")])
 

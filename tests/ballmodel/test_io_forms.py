@@ -148,7 +148,7 @@ def test_what_a_person_says_counts(tmp_path):
 def test_tables_that_hold_no_tracks_say_so(tmp_path):
     path = tmp_path / "events.csv"
     path.write_text("rally_id,type,timestamp,ball_pos\n1,shot,0.1,[1 2 3]\n")
-    with pytest.raises(ValueError, match="holds events, no tracks; `mjx-tt bench-ball` reads it"):
+    with pytest.raises(ValueError, match="holds events, no tracks"):
         read(path)
     path.write_text("1,2,3\n4,5,6\n")
     with pytest.raises(ValueError, match="row 1: 3 numbers and no header; write one"):
@@ -170,7 +170,7 @@ def test_forms_of_other_peoples_making_hold_the_same_balls(forms):
     plain = np.concatenate([t.position.T for t in read(FORMS / "plain.csv")])
     scarce = ("08", "09", "10", "11", "12", "31", "32", "33")  # lost rows, or another rate
     framed = ("18", "19", "20", "21", "30")  # other coordinates
-    refused = {"44": "--salvage", "46": "bench-ball"}
+    refused = {"44": "--salvage", "46": "fit-human"}
     read_whole = 0
     for path in sorted(forms.iterdir()):
         number = path.name[:2]

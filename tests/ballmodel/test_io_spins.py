@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballmodel.io import read_events, read_spindoe
+from ballmodel.io import MeasuredStates, read, read_events, read_spindoe
 
 
 def test_spindoe(tmp_path):
@@ -60,6 +60,15 @@ def test_events(tmp_path):
     assert (
         len(players) == 2 and players.rally == ("m1/r0", "m1/r0") and [list(i) for i in players.landings] == [[0], [1]]
     )
+    path.write_text(
+        path.read_text()
+        + 'p1,m1/r1/event0,shot_p1,3.0,"[1.4, 0.2, 0.3]","[-6.0, 0.1, 1.0]","[0, 0, 9]"\n'
+        + 'p1,m1/r1/event1,shot_p2,3.5,"[-1, -1, -1]","[0, 0, 0]","[0, 0, 0]"\n'  # stands for a ball that was lost
+    )
+    shots = read(path)
+    assert isinstance(shots, MeasuredStates) and len(shots) == 2
+    np.testing.assert_allclose(shots.state.spin, [[0.0, 0.0], [0.0, 0.0], [0.0, 9.0]])
+    np.testing.assert_allclose(shots.landing, [[-0.3, np.nan], [-0.7, np.nan]])
     path.write_text(HEAD + 'a,1,serve,0.5,"[1,2,3]","[1,2,3]","[1,2,3]"\n')
     with pytest.raises(ValueError, match="row 2, column 'type': 'serve'; allowed: shot, bounce, net"):
         read_events(path)

@@ -259,7 +259,7 @@ def test_import_and_fit_human(tmp_path):
     assert converted.returncode == 0, converted.stderr
     back = mjx_tt("import", tmp_path / "a.mcap", "--out", tmp_path / "b.csv")
     assert f"{n} trajectories" in back.stdout, back.stderr
-    fitted = mjx_tt("fit-human", tmp_path / "b.csv", "--out", tmp_path / "anna.yaml")
+    fitted = mjx_tt("fit-human", tmp_path / "b.csv", "--fit", "gauss-newton", "--out", tmp_path / "anna.yaml")
     assert fitted.returncode == 0, fitted.stdout + fitted.stderr
     assert "player3/M2" in fitted.stdout and "anna" in fitted.stdout
     distribution = load_distribution(tmp_path / "anna.yaml")

@@ -127,8 +127,8 @@ def diagnose_balls(
     # Bounces count with what differs between them: a place that returns balls otherwise is no scatter.
     whole = max(start_error - found.level, rms**2)
     unexplained = largest >= LEAST_LEFT and rms**2 > LEAST_LEFT_SHARE * whole
-    may_spin = unexplained
-    if spin == "none" and not unexplained:
+    may_spin = largest >= LEAST_LEFT
+    if spin == "none" and not may_spin:
         say("asking whether balls spin, each in its own way")
         may_spin = spins_pay(problem, found, *own_spins(problem, at))
     rng = np.random.default_rng(seed)
