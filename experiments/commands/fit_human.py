@@ -85,14 +85,16 @@ def fit_human(
     import numpy as np
 
     from ballmodel import registry
-    from ballmodel.aerodynamics import SATURATING_LIFT
     from ballmodel.distribution import save_distribution
+    from ballmodel.fit_distribution import Fit
     from ballmodel.fit_distribution import fit_human as fit_box
     from ballmodel.flight import ball_params
     from ballmodel.trajectory import Dataset
     from experiments.commands.balls import print_numbers
     from experiments.measurements import read_all, start_states
     from experiments.progress import make_console
+    from mjx_tt.prediction.benchmark import SATURATING
+    from mjx_tt.sim.model import SimModel, with_values
 
     screen, path = make_console(), Path(out)
     measured = read_all(list(data), format, tracks.load(), tracks.frame or "auto")
@@ -107,12 +109,12 @@ def fit_human(
     if isinstance(measured, Dataset) and fit == "spins":
         measured, world, lines = start_states(measured, world, screen.print)
         screen.print(*lines, sep="\n")
+    elif world is None and not isinstance(measured, Dataset) and np.any(measured.state.spin):
+        world = with_values(SimModel(), SATURATING)
     ball = ball_params() if world is None else world.ball
-    if world is None and not isinstance(measured, Dataset) and np.any(measured.state.spin):
-        ball = replace(ball, flight=replace(ball.flight, **SATURATING_LIFT))
     try:
         with _show_fits(screen) as progress:
-            by = "nelder-mead" if fit == "nelder-mead" else "gauss-newton"
+            by: Fit = "nelder-mead" if fit == "nelder-mead" else "gauss-newton"
             distribution, report = fit_box(
                 measured, ball, eps, min_samples, name or path.stem, serves, by, progress, short_balls, both_players
             )

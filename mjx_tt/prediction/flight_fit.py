@@ -139,7 +139,7 @@ def learn(
     parts = [first_part(tracks[i], used[i]) for i in enough]
     ends, places = targets([tracks[i] for i in enough], parts, horizons)
     tried = [belief]
-    if belief.spins is not None:
+    if spins is not None:
         # Small errors of any model pass for spin in a short flight, and grow behind it.
         tried = [replace(belief, spins=SpinPrior(spins.mean, share * spins.std)) for share in BELIEVED]
     missed = [_missed(parts, one, ends, places) for one in tried]
