@@ -16,6 +16,7 @@ from ballmodel.io.tables import COLUMNS
 from ballmodel.trajectory import Dataset, Trajectory
 from experiments.errors import ConfigError, error_context
 from mjx_tt import diagnosis
+from mjx_tt.diagnosis.ball.diagnose import FEWEST_BALLS, flights
 from mjx_tt.diagnosis.tracks import clean
 from mjx_tt.diagnosis.tracks.chains import take_apart
 from mjx_tt.diagnosis.tracks.frame import align
@@ -77,21 +78,24 @@ def start_states(
 
     Args:
         measured: tracks in the table frame.
-        model: in which they fly; None: as their own diagnosis extends the nominal one.
+        model: in which they fly; None: the nominal one, as their own diagnosis extends it.
         say: is told what goes on.
 
     Returns:
         States, the model, and a summary.
 
     Raises:
-        ConfigError: no stroke is left, or too few for a diagnosis.
+        ConfigError: no stroke is left.
     """
     strokes, record = clean(measured.trajectories)
     strokes = tuple(t for t in strokes if len(t) >= LEAST_SAMPLES)
     if not strokes:
         raise ConfigError(f"{measured.source}: no stroke of {LEAST_SAMPLES} samples among {len(measured)} tracks")
     lines = record.lines()
-    if model is None:
+    if model is None and len(flights(strokes)) < FEWEST_BALLS:
+        model = SimModel()
+        lines.append(f"flown in the nominal model: a diagnosis needs {FEWEST_BALLS} strokes")
+    elif model is None:
         with error_context(measured.source):
             found = diagnosis.diagnose(diagnosis.Logs(strokes, (), {}), progress=say)
         model = found.extended.model

@@ -567,7 +567,8 @@ def test_the_emulated_robots_balls_make_a_human_distribution(tmp_path):
 
     path = tmp_path / "balls.csv"
     assert finetune_report.write_human_balls(path, "monday", played) == BALLS
-    assert cli.main(["fit-human", str(path), "--out", str(tmp_path / "anna.yaml"), "--eps", "100"]) == 0
+    given = ["fit-human", str(path), "--fit", "gauss-newton", "--eps", "100", "--out", str(tmp_path / "anna.yaml")]
+    assert cli.main(given) == 0
     found = load_distribution(tmp_path / "anna.yaml")
     np.testing.assert_allclose(found.velocity_max[1], thrown.velocity[1].max(), atol=0.25)
     np.testing.assert_allclose(found.velocity_min[1], thrown.velocity[1].min(), atol=0.25)
