@@ -58,7 +58,9 @@ Devices = Annotated[int | None, count("host devices (default: one per processor 
 Format = Annotated[str | None, option("NAME", "csv, mcap, bag, deepmind, aimy or spindoe (default: from the suffix)")]
 Model = Annotated[str | None, option("YAML", "another simulation model")]
 Overrides = Annotated[tuple[str, ...], option("KEY=VALUE", "change one key of the file; may be repeated", "--set")]
-PolicyFolder = Annotated[str, Parameter("RUN_OR_ARTEFACT", help="folder of a run or of an exported policy")]
+PolicyFolder = Annotated[
+    str, Parameter("RUN_OR_ARTEFACT", help="folder of a run or of an exported policy, or a shipped policy's name")
+]
 RigFile = Annotated[str | None, option("YAML", "another rig: world, delays, network faults")]
 RigSeed = Annotated[int, option("K", "seed of the balls that are thrown (default: 0)")]
 RunsFolder = Annotated[str, option("FOLDER", "where the folders of runs go (default: runs)")]

@@ -16,7 +16,7 @@ app = options.command(
     "play with an exported policy on a robot, real or emulated",
     """\
   mjx-tt run runs/quickstart --robot rig --balls 30
-  mjx-tt run runs/quickstart --robot rig --rallies 20 --player player3
+  mjx-tt run rallies --robot rig --rallies 20 --player player1
   mjx-tt run runs/quickstart/artefact --robot robot.yaml
   mjx-tt run runs/quickstart/artefact --robot rig --rig worn.yaml --distribution player1/M1
 
@@ -28,7 +28,9 @@ with balls by itself. Read docs/concepts/safety.md and docs/how-to/run-on-the-ro
 
 @app.default
 def run(
-    artefact: Annotated[str, Parameter("ARTEFACT", help="folder of an exported policy, or of its run")],
+    artefact: Annotated[
+        str, Parameter("ARTEFACT", help="folder of an exported policy or of its run, or a shipped one's name")
+    ],
     /,
     *,
     robot: Annotated[str, option("YAML", 'a robot.yaml, or "rig" for the emulated robot')],

@@ -10,6 +10,7 @@ from experiments.errors import RunError
 from experiments.runs.run_dir import CONFIG, Run
 from robot_io.policy.artefact import MANIFEST
 
+SHIPPED = Path(__file__).parents[1] / "shipped" / "policies"
 SELECTION = "selection.json"  # beside several trainings of one model: which was chosen
 LISTED = 6  # folders that a message names
 _MARKS = (
@@ -30,8 +31,13 @@ _MARKS = (
 
 
 def find_policy(folder: str | Path) -> Path:
-    """The folder of a run or of an artefact. Raises RunError for any other, naming those inside it."""
+    """The folder of a run or of an artefact, or a shipped policy by its name.
+
+    Raises RunError for any other, naming those inside it.
+    """
     folder = Path(folder)
+    if folder.parent == Path() and not folder.exists() and (SHIPPED / folder).is_dir():
+        folder = SHIPPED / folder
     if not (folder / CONFIG).is_file() and not (folder / MANIFEST).is_file():
         raise RunError(
             f"{folder}: neither a run (holding {CONFIG}) nor an artefact (holding {MANIFEST}){_inside(folder)}"

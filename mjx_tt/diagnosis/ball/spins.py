@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ballmodel.io.atomic_files import replacing
 from ballmodel.trajectory import Trajectory
-from mjx_tt.diagnosis.ball.flights.linearization import SPIN, BallProblem, project
+from mjx_tt.diagnosis.ball.flights.linearization import MAGNUS, SPIN, BallProblem, project
 from mjx_tt.diagnosis.ball.flights.noise import robust_weights
 from mjx_tt.diagnosis.ball.flights.spin_prior import TINY
 from mjx_tt.diagnosis.ball.search import Search
@@ -22,7 +22,10 @@ HEADER = ("session", "trajectory", "t", *(f"{kind}_{axis}" for kind in ("spin", 
 
 @dataclass(frozen=True)
 class Spins:
-    """Spins [rad/s] at each ball's first sample, in the table's axes; for a fixed coefficient k."""
+    """Spins [rad/s] at each ball's first sample, in the table's axes.
+
+    In flight only the product of spin and coefficient k shows: deviations hold that of k, where it was estimated.
+    """
 
     session: tuple[str, ...]
     name: tuple[str, ...]
@@ -48,11 +51,23 @@ def estimate(problem: BallProblem, found: Search, balls: Sequence[Trajectory]) -
     weight = robust_weights(found.linear.residual, found.noise, g)
     flown = project(found.linear, found.at, found.noise, weight, g)
     covariance = np.linalg.inv(flown.spin_gram + prior.of_balls(len(balls), TINY)[1]) * found.model.temper
-    variance = np.einsum("can,nab,cbn->cn", problem.axes, covariance, problem.axes)
+    mean = np.einsum("can,an->cn", problem.axes, found.at.start[SPIN])
+    variance = (
+        np.einsum("can,nab,cbn->cn", problem.axes, covariance, problem.axes) + (mean * _of_lift(problem, found)) ** 2
+    )
     return Spins(
         tuple(t.session for t in balls),
         tuple(t.name for t in balls),
         np.array([t.time[0] for t in balls]),
-        np.einsum("can,an->cn", problem.axes, found.at.start[SPIN]),
+        mean,
         np.sqrt(variance),
     )
+
+
+def _of_lift(problem: BallProblem, found: Search) -> float:
+    """Relative standard deviation of the coefficient of lift; zero where it was taken as it is."""
+    k = [e.path for e in problem.effects].index(MAGNUS)
+    if k not in (*found.chosen, *found.model.always):
+        return 0.0
+    deviation = np.sqrt(found.model.solve(found.chosen)[1][k, k])
+    return float(deviation / max(abs(problem.nominal[MAGNUS] + found.at.theta[k]), deviation))
