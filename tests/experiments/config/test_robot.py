@@ -55,6 +55,7 @@ CEILINGS = {
     "safety.head_room": (0.5, 1.0),
     "safety.drive_delay": (0.0, 0.3),
     "safety.drive_delay_error": (0.0, 0.05),
+    "safety.silence": (0.004, 10.0),
     "safety.table_margin": (0.01, 0.5),
     "safety.floor_margin": (0.15, 0.7),
     "safety.overspeed": (1.05, 2.0),
