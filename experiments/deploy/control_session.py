@@ -18,6 +18,7 @@ from rich.console import Console
 from experiments.config import robot as robots
 from experiments.deploy import calibration_check, robot_attachment
 from experiments.deploy.rig import box_of, rig_for
+from experiments.errors import ConfigError
 from experiments.options import RobotOptions
 from experiments.runs import run_dir
 from robot_io.contract import Contract
@@ -252,9 +253,9 @@ def load_installed(robot: str, policy: str | Path, contract: Contract, logs: Pat
     real, fast = not ipaddress.ip_address(config.arm.controller).is_loopback, robots.COMMISSIONING
     if real and config.safety.speed_scale > fast and not config.calibration.tracker.date:
         raise ConfigError(
-            f"{robot}: calibration.tracker: expected one at safety.speed_scale {config.safety.speed_scale}, got none: no "
-            "ball shows that x is mirrored, or the frame moved along the table. Calibrate it (mjx-tt calibrate tracker), "
-            f"or play at {fast}"
+            f"{robot}: calibration.tracker: expected one at safety.speed_scale {config.safety.speed_scale}, got none: "
+            "no ball shows that x is mirrored, or the frame moved along the table. Calibrate it (mjx-tt calibrate "
+            f"tracker), or play at {fast}"
         )
     return Installed(config, standing)
 
