@@ -1,4 +1,4 @@
-"""``mjx-tt log``: logs of sessions at the robot, to list, check, salvage and export, for LeRobot too."""
+"""``mjx-tt log``: logs of sessions at the robot, to list, check, salvage and export, and captures to replay."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 app = options.command(
     "log",
-    "list, check, salvage or export the logs of a robot",
+    "list, check, salvage or export the logs of a robot; replay a capture of its arm",
     """\
   mjx-tt log list runs/robot
   mjx-tt log check runs/robot/20261121-153000.mcap
@@ -26,23 +26,24 @@ app = options.command(
   mjx-tt log export runs/robot/20261121-153000.mcap --out tables/
   mjx-tt log lerobot runs/robot --out dataset/         a LeRobot data set of sessions
   mjx-tt log lerobot balls.csv --out dataset/          or of measured balls alone
+  mjx-tt log replay arm.pcap --out arm.csv             a real arm's EGM, played to the emulated controller
 """,
 )
 
 
 @app.default
 def log(
-    action: Annotated[Literal["list", "check", "salvage", "export", "lerobot"], Parameter("ACTION")],
+    action: Annotated[Literal["list", "check", "salvage", "export", "lerobot", "replay"], Parameter("ACTION")],
     /,
     *paths: Annotated[
         str,
         Parameter(
             "LOG",
-            help="an .mcap or .mcap.part; list: a folder; lerobot: .mcap, balls, or a folder",
+            help="an .mcap or .mcap.part; list: a folder; lerobot: .mcap, balls, or a folder; replay: a pcap",
             required=True,
         ),
     ],
-    out: Annotated[str | None, option("PATH", "salvage: the file; export and lerobot: the folder")] = None,
+    out: Annotated[str | None, option("PATH", "salvage and replay: the file; export and lerobot: the folder")] = None,
 ) -> int:
     """Returns 1 where a checked log is not sound."""
     from experiments.progress import make_console
@@ -54,6 +55,9 @@ def log(
         return 1 if check([Path(path) for path in paths], screen) else 0
     elif action == "lerobot":
         lerobot(paths, target, screen)
+    elif action == "replay":
+        for path in paths:
+            replay(Path(path), target, screen)
     else:
         for path in paths:
             (salvage if action == "salvage" else export)(Path(path), target, screen)
@@ -143,6 +147,39 @@ def lerobot(paths: Sequence[str], out: Path | None, console: Console) -> None:
     lines = (f"{out}: {len(recording.episodes):,} episodes, {frames:,} frames at 75 Hz", *recording.notes)
     for line in lines:
         console.print(line, soft_wrap=True)
+
+
+def replay(path: Path, out: Path | None, console: Console) -> None:
+    """Plays a capture's EGM replies to the emulated controller, and says how the real one differs.
+
+    ``out`` becomes a CSV of times [s], captured and replayed positions [rad].
+    """
+    if find_spec("dpkt") is None:
+        raise ConfigError("log replay needs dpkt: pip install 'mjx-tt[capture]'")
+    import numpy as np
+
+    from robot_io.emulator import capture as captures
+    from robot_io.emulator.arm import ArmParams
+
+    options.check_exists(str(path))
+    with error_context():
+        capture = captures.read(path)
+        emulated = captures.replay(capture, ArmParams())
+    captured, times = capture.positions, capture.times - capture.times[0]
+    gaps = 1e3 * np.diff(times, append=times[-1])
+    console.print(
+        f"{path}: {len(times):,} packets of the controller, {capture.lost:,} lost, every {np.median(gaps):.1f} ms, "
+        f"at most {gaps.max():.1f} ms; {len(capture.replies):,} replies, {capture.skipped:,} other packets",
+        soft_wrap=True,
+    )
+    for i, apart in enumerate(np.degrees(captured - emulated).T):
+        rough, worst = np.sqrt(np.mean(apart**2)), np.abs(apart).max()
+        console.print(f"  joint {i + 1}: {rough:.3f} deg from the emulated controller, at most {worst:.3f} deg")
+    if out is not None:
+        names = [f"{kind}_{i + 1}" for kind in ("captured", "replayed") for i in range(captured.shape[1])]
+        table = np.column_stack([times, captured, emulated])
+        np.savetxt(out, table, fmt="%.12g", delimiter=",", header=",".join(["time", *names]), comments="")
+        console.print(f"{out}: times [s] and positions [rad]", soft_wrap=True)
 
 
 def _logs_in(folder: Path) -> list[Path]:

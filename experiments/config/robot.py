@@ -74,6 +74,11 @@ def load_robot(path: str | Path, calibrated: bool = True, contract: Contract | N
         data.pop("calibration", None)
     if isinstance(named := data.get("calibration"), str):  # relative to robot.yaml
         data["calibration"] = plain(load_calibration(Path(path).parent / named))
+    if str(profile := data.get("axis_profile")).lower().startswith("excm"):
+        raise ConfigError(
+            f"{path}: axis_profile: expected a drive for each axis, 'cmmt' or 'fhpp', got {profile!r}: an EXCM moves "
+            "both axes of its gantry behind one controller, which is not supported; give each axis a CMMT or a CMMO"
+        )
     safety = data.setdefault("safety", {})
     if isinstance(safety, dict):
         safety.setdefault("speed_scale", COMMISSIONING)

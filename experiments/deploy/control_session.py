@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import math
 import select
@@ -17,6 +18,7 @@ from rich.console import Console
 from experiments.config import robot as robots
 from experiments.deploy import calibration_check, robot_attachment
 from experiments.deploy.rig import box_of, rig_for
+from experiments.errors import ConfigError
 from experiments.options import RobotOptions
 from experiments.runs import run_dir
 from robot_io.contract import Contract
@@ -242,12 +244,19 @@ def load_installed(robot: str, policy: str | Path, contract: Contract, logs: Pat
     """The robot of a robot.yaml, for a policy of this contract.
 
     Raises ArtefactError for a policy of another robot, ConfigError where the newest session in ``logs`` contradicts the
-    calibration.
+    calibration, or where a robot is to be fast whose tracker has never been shown a point at a known place.
     """
     standing = robots.standing(robot)
     artefacts.check_robot(policy, contract, standing)
     config = robots.load_robot(robot, contract=standing)
     calibration_check.check(config, robot, logs)
+    real, fast = not ipaddress.ip_address(config.arm.controller).is_loopback, robots.COMMISSIONING
+    if real and config.safety.speed_scale > fast and not config.calibration.tracker.date:
+        raise ConfigError(
+            f"{robot}: calibration.tracker: expected one at safety.speed_scale {config.safety.speed_scale}, got none: "
+            "no ball shows that x is mirrored, or the frame moved along the table. Calibrate it (mjx-tt calibrate "
+            f"tracker), or play at {fast}"
+        )
     return Installed(config, standing)
 
 

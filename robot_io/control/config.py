@@ -154,6 +154,11 @@ class RobotConfig:
                     f"{contract.joints[i]}, got {self.axes_motion.acceleration}: with less it runs farther than is "
                     "proven clear"
                 )
+            if (lead := self.axes_motion.lead) > (silence := self.safety.silence[i]):
+                raise ValueError(
+                    f"safety.silence[{i}]: expected at least axes_motion.lead, {lead} s, for which an axis runs on by "
+                    f"itself, got {silence} s"
+                )
             if (error := self.safety.following_error[i]) > 0.1:
                 raise ValueError(f"safety.following_error[{i}]: expected 0.005 to 0.1 m, got {error}")
 

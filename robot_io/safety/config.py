@@ -19,6 +19,7 @@ def _each(slide: float, hinge: float, units: tuple[str, ...] = JOINT_UNITS) -> t
 # Of a slide [m] and of a hinge [rad].
 _OVERSHOOT, _STILL, _FOLLOWING_ERROR = (0.03, 0.09), (0.02, 0.05), (0.06, 0.2)
 _DRIVE_DELAY = (0.0645, 0.071)  # [s], the paper's
+_SILENCE = (0.05, 0.1)  # [s], the lead of an axis's target and the shipped RAPID's CommTimeout
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,8 @@ class SafetyConfig:
     following_ticks  commands in a row after which a following error is a fault
     late             longest time between two commands: so long the robot may go on with the last one, and that way and
                      braking after it are proven clear as well; more is a fault
+    silence          (8,) [s] for which each device goes on with its last command where none follows: the lead of a
+                     linear axis's target, CommTimeout of the arm's controller. What it leads to touches nothing
     stale_*          longest age of what was last heard of a device, and of the policy's request; the tracker's is over
                      four frames: more would leave no time to stop within 0.15 s behind the arm's dead time
     """
@@ -66,6 +69,7 @@ class SafetyConfig:
     drive_delay: tuple[Annotated[float, Within(0.0, 0.3, "s")], ...] = _each(*_DRIVE_DELAY)
     drive_delay_error: Annotated[float, Within(0.0, 0.05, "s")] = 0.017
     following_ticks: Annotated[int, Within(1, 6)] = 3
+    silence: tuple[Annotated[float, Within(0.004, 10.0, "s")], ...] = _each(*_SILENCE)
     late: Annotated[float, Within(0.02, 0.1, "s")] = 0.03
     stale_arm: Annotated[float, Within(0.01, 0.1, "s")] = 0.05
     stale_axes: Annotated[float, Within(0.01, 0.1, "s")] = 0.05
@@ -76,8 +80,8 @@ class SafetyConfig:
     def of(cls, contract: Contract) -> SafetyConfig:
         """The defaults for a contract's robot."""
         names, pairs = (
-            ("overshoot", "still", "following_error", "drive_delay"),
-            (_OVERSHOOT, _STILL, _FOLLOWING_ERROR, _DRIVE_DELAY),
+            ("overshoot", "still", "following_error", "drive_delay", "silence"),
+            (_OVERSHOOT, _STILL, _FOLLOWING_ERROR, _DRIVE_DELAY, _SILENCE),
         )
         values: dict[str, Any] = {n: _each(*pair, contract.units) for n, pair in zip(names, pairs, strict=True)}
         return cls(**values)
@@ -93,7 +97,9 @@ class SafetyConfig:
         for name in ("blade_speed", "blade_acceleration", "overspeed", "late", "following_ticks", *ages):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a positive, finite number, got {getattr(self, name)}")
-        each = {name: getattr(self, name) for name in ("still", "overshoot", "following_error", "drive_delay")}
+        each = {
+            name: getattr(self, name) for name in ("still", "overshoot", "following_error", "drive_delay", "silence")
+        }
         lengths = {len(values) for values in each.values()}
         count = N_JOINTS if N_JOINTS in lengths else min(lengths)
         for name, values in each.items():

@@ -28,6 +28,7 @@ from robot_io.safety.config import SafetyConfig as SafetyConfig
 from robot_io.safety.faults import Cause, Fault, FaultLatch
 from robot_io.safety.monitor import FeedbackMonitor, numbers_of, worst
 from robot_io.safety.stopping import StopReference
+from robot_io.safety.ways import Silence, between, leads
 
 SHARES = (1.0, 0.5, 0.25)  # of the way from braking to the limited request that are tried in turn
 HALVINGS = 5  # of that way in the search for the share that keeps the blade's limits
@@ -106,6 +107,8 @@ class SafetyGate:
         self._inside = np.zeros(self._margin.shape, bool)  # gaps that have been below their margin since arming
         self._still = np.array(config.still)
         self._leads = leads(config, self.geometry.units)
+        ahead = self._leads - self._leads[:, [unit == "rad" for unit in self.geometry.units]].min(axis=1, keepdims=True)
+        self._silence = Silence(config, ahead, self._a)
         self._monitor = FeedbackMonitor(limits, self.geometry, config)
         self._stop = StopReference(limits, config, self.geometry.units)
         self._latch = FaultLatch()
@@ -434,7 +437,7 @@ class SafetyGate:
     def _clear(self, way: np.ndarray, velocity: np.ndarray) -> bool:
         """True when a way of this period at ``velocity`` (8,) and of braking keeps the margins, or leaves one that is
         missed already, whenever the next tick comes: until then, up to ``late``, the robot goes on at that velocity,
-        and all that comes after this period is shifted by it."""
+        and all that comes after this period is shifted by it. And where none comes any more, nothing is touched."""
         late = way.copy()
         late[:, 1:] += (self.config.late - self.period) * velocity[:, None]
         ways = between(way, late)
@@ -447,6 +450,9 @@ class SafetyGate:
                 return False
         beside = self._monitor.beside
         if beside.size and not all(self.geometry.clear_beside(each, beside, self._touch) for each in (way, late)):
+            return False
+        silent = self._silence.ways(way[:, :-1] + self._deviation[:, None], np.diff(way) / self.period)
+        if self.geometry.first_too_close(silent, self._touch, SLACK) is not None:
             return False
         if self._inside.any():
             gaps = self.geometry.gaps(way)[self._inside]
@@ -552,18 +558,3 @@ class SafetyGate:
             sentence = self._monitor.following_error(self._unexplained)
             if sentence:
                 self.fault(Cause.FOLLOWING_ERROR, sentence, now)
-
-
-def leads(config: SafetyConfig, units: tuple[str, ...]) -> np.ndarray:
-    """Times (2, n) [s] by which joints may be ahead of the slowest one: linear axes late and the arm early, and the
-    other way round."""
-    apart = np.where([unit == "m" for unit in units], config.drive_delay_error, -config.drive_delay_error)
-    delays = np.maximum(np.array(config.drive_delay) + np.stack([apart, -apart]), 0.0)
-    return delays.max(axis=1, keepdims=True) - delays
-
-
-def between(way: np.ndarray, late: np.ndarray) -> np.ndarray:
-    """References (8, M) along the first of two ways (8, N) from one place, back along the second and across each rung:
-    a tick that is a little late leads to a place on a rung."""
-    rungs = np.stack([late, way, late], axis=2)[:, -2:0:-1].reshape(len(way), -1)
-    return np.concatenate([way, late[:, -1:], rungs, way[:, :1]], axis=1)

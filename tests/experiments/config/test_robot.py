@@ -55,6 +55,7 @@ CEILINGS = {
     "safety.head_room": (0.5, 1.0),
     "safety.drive_delay": (0.0, 0.3),
     "safety.drive_delay_error": (0.0, 0.05),
+    "safety.silence": (0.004, 10.0),
     "safety.table_margin": (0.01, 0.5),
     "safety.floor_margin": (0.15, 0.7),
     "safety.overspeed": (1.05, 2.0),
@@ -172,6 +173,11 @@ def test_every_number_of_a_robot_has_a_lower_and_an_upper_end():
     [
         ("axes_motion: {acceleration: 10.0}", "axes_motion.acceleration: expected at least 15.0 m/s^2"),
         ("axis_profile: fhpp\naxes: [{}, {velocity_unit: 0.001}]", "axes.velocity_unit: expected no such key"),
+        (
+            "axis_profile: EXCM-30",
+            "an EXCM moves both axes of its gantry behind one controller, which is not supported",
+        ),
+        ("axes_motion: {lead: 0.08}", "safety.silence[0]: expected at least axes_motion.lead, 0.08 s"),
     ],
 )
 def test_what_voids_a_proof_or_reaches_no_drive_is_refused(tmp_path, text, says):

@@ -7,17 +7,20 @@ import math
 from types import SimpleNamespace
 
 import pytest
+import yaml
 from rich.console import Console
 
 from experiments.config import robot as robots
 from experiments.config.finetuning import FineTuning
 from experiments.deploy import calibration_check, play
+from experiments.deploy.control_session import load_installed
 from experiments.errors import ConfigError
 from experiments.finetuning import on_robot as tuning
 from experiments.options import ROBOT
 from experiments.runs import run_dir
 from mjx_tt.robot.robots import paper
 from robot_io.calibration import contacts
+from robot_io.contract import PAPER
 from robot_io.control.config import RobotConfig
 from robot_io.log.messages import LogError
 
@@ -91,3 +94,24 @@ def test_fine_tuning_refuses_what_a_session_contradicts(tmp_path, monkeypatch):
             tuning.loop, "experiment_of", lambda *_: SimpleNamespace(task=SimpleNamespace(robot=paper()))
         )
         tuning.finetune("nowhere", FineTuning(), run, "robot.yaml", Console(), ROBOT)
+
+
+@pytest.mark.parametrize(
+    ("controller", "scale", "date", "refused"),
+    [
+        ("192.168.125.1", 0.25, "", True),
+        ("192.168.125.1", 0.1, "", False),
+        ("192.168.125.1", 0.25, "2026-11-28", False),
+        ("127.0.0.1", 1.0, "", False),  # the rig: nothing real moves
+    ],
+)
+def test_a_robot_whose_trackers_frame_no_known_point_has_shown_stays_slow(tmp_path, controller, scale, date, refused):
+    """Balls cannot show that x is mirrored."""
+    path = tmp_path / "robot.yaml"
+    content = {"arm": {"controller": controller}, "safety": {"speed_scale": scale}}
+    path.write_text(yaml.safe_dump(content | ({"calibration": {"tracker": {"date": date}}} if date else {})))
+    if refused:
+        with pytest.raises(ConfigError, match=r"calibration.tracker: expected one at safety.speed_scale 0.25"):
+            load_installed(str(path), tmp_path, PAPER, tmp_path)
+    else:
+        assert load_installed(str(path), tmp_path, PAPER, tmp_path).config.safety.speed_scale == scale

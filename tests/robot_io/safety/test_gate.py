@@ -208,7 +208,10 @@ def closest_of_attack_on_delays(config, distances):
 def test_the_robot_keeps_its_distance_while_its_drives_delays_are_off_by_what_the_gate_is_told(distances):
     """A gate that takes all delays for equal lets the same attack come closer by a half."""
     assert closest_of_attack_on_delays(None, distances) > 0.01 - SLACK
-    assert closest_of_attack_on_delays(SafetyConfig(drive_delay=(0.071,) * 8, drive_delay_error=0.0), distances) < 0.005
+    equal = SafetyConfig(
+        drive_delay=(0.071,) * 8, drive_delay_error=0.0, silence=(0.004,) * 8
+    )  # which keeps it away too
+    assert closest_of_attack_on_delays(equal, distances) < 0.005
 
 
 def test_attacks_keep_every_limit_and_are_stopped_by_every_rule(attacked):
@@ -735,6 +738,47 @@ def test_a_late_tick_does_not_eat_the_clearance(distances):
 @pytest.mark.slow
 def test_three_thousand_late_ticks_do_not_eat_the_clearance(distances):
     check_late_ticks(3000, distances)
+
+
+# --- nobody speaks to the devices any more
+
+
+def gone_silent(gate, silence, again, distances):
+    """Smallest distance [m] of a robot whose devices go on with their last command from now on, each until its own
+    time-out, or until the computer speaks ``again`` after so many seconds; then they brake at their limits."""
+    dt, end = 0.005, np.array(silence) + T
+    position, velocity, least, time = gate.start, gate.velocity, np.inf, 0.0
+    while velocity.any():
+        braking = (time >= end) | (time >= again)
+        position = position + dt * velocity
+        velocity = np.where(braking, np.sign(velocity) * np.maximum(np.abs(velocity) - dt * A_MAX, 0.0), velocity)
+        time += dt
+        least = min(least, distances.least(position, 0.0))
+    return least
+
+
+def closest_in_silence(told, silence, moments, distances):
+    """Of gates that are told of one silence, while another one comes."""
+    rng, closest = np.random.default_rng(1), np.inf
+    for seed in range(moments // 10):
+        player, ideal = adversary(np.random.default_rng(seed)), Ideal(SafetyConfig(silence=told))
+        request = next(player)
+        for tick in range(200):
+            ideal.tick(request)
+            request = player.send(ideal.position)
+            if tick % 20 == 19:
+                again = rng.choice([np.inf, rng.uniform(0.0, max(silence))])
+                closest = min(closest, gone_silent(ideal.gate, silence, again, distances))
+    return closest
+
+
+@pytest.mark.slow
+def test_whatever_silence_leads_to_touches_nothing(distances):
+    """At any moment of an attack, while braking too; a gate that is told of shorter silences lets the same touch."""
+    for timeout in (0.1, 1.0):
+        silence = (0.05,) * 2 + (timeout,) * 6
+        assert closest_in_silence(silence, silence, 30, distances) > 0.005, timeout
+    assert closest_in_silence((0.004,) * 8, silence, 30, distances) <= 0.0
 
 
 # --- the rest
