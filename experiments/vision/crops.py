@@ -37,8 +37,20 @@ class Crops:
     @classmethod
     def load(cls, *paths: str) -> Crops:
         """Reads NPZs and joins them."""
-        files = [np.load(path) for path in paths]
-        return cls(*(np.concatenate([file[key] for file in files]) for key in ("fine", "coarse", "labels")))
+        parts = []
+        for path in paths:
+            with np.load(path) as file:
+                parts.append(cls(file["fine"], file["coarse"], file["labels"]))
+        return cls.join(parts)
+
+    @classmethod
+    def join(cls, parts: list[Crops]) -> Crops:
+        """All of several."""
+        return cls(*(np.concatenate([getattr(part, key) for part in parts]) for key in ("fine", "coarse", "labels")))
+
+    def every(self, step: int) -> Crops:
+        """Every so many of them."""
+        return Crops(self.fine[::step], self.coarse[::step], self.labels[::step])
 
 
 def cut(frames: list[np.ndarray], corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
