@@ -79,6 +79,7 @@ def render(
 
     from experiments.progress import make_console
     from experiments.vision import clips, evaluation, flights
+    from experiments.vision.crops import SEEN
 
     cameras, rng = read_rig(rig).cameras, np.random.default_rng(seed)
     for camera in cameras:
@@ -91,7 +92,7 @@ def render(
         for camera, shot in zip(cameras, shots, strict=True):
             picture = cv2.cvtColor(shot.frame, cv2.COLOR_BayerRGGB2BGR)
             cv2.imwrite(str(Path(out) / camera.name / f"{number}.png"), picture)
-            labels[camera.name][number] = camera.project(place) if shot.seen > evaluation.SEEN else None
+            labels[camera.name][number] = camera.project(place) if shot.seen > SEEN else None
     for name, places in labels.items():
         clips.write_labels(Path(out) / name / "labels.csv", places)
     make_console().print(f"{count} pictures of {', '.join(labels)} in {out}")
@@ -105,7 +106,7 @@ def record(
     rig: Rig = None,
     seed: Seed = 0,
 ) -> None:
-    """Records rendered flights as raw frames; the labels of camera NAME go beside it, as the recording's name and NAME.csv."""
+    """Records rendered flights as raw frames; each camera's labels go beside them, as OUT.CAMERA.csv."""
     check_extra()
     options.check_suffix(out, ".mcap")
     options.start_jax(1)
@@ -113,6 +114,7 @@ def record(
 
     from experiments.progress import make_console
     from experiments.vision import clips, evaluation
+    from experiments.vision.crops import SEEN
     from experiments.vision.flights import fly_balls
     from robot_io.vision.recording import FrameWriter
 
@@ -127,7 +129,7 @@ def record(
                 place = path(np.array([time]))[0]
                 for camera, shot in zip(cameras, shots, strict=True):
                     writer.write(camera.name, count / rate, shot.frame)
-                    seen = shot.seen > evaluation.SEEN and not np.isnan(place[0])
+                    seen = shot.seen > SEEN and not np.isnan(place[0])
                     labels[camera.name][count] = camera.project(place) if seen else None
                 count += 1
     for name, places in labels.items():
@@ -190,7 +192,9 @@ def evaluate(
     clip: Annotated[str | None, Parameter("CLIP", help="a video file or a recording; none: rendered flights")] = None,
     /,
     *,
-    labels: Annotated[str | None, option("CSV", "frame,x,y of the clip's balls, or what TTNet, BlurBall, TT3D have")] = None,
+    labels: Annotated[
+        str | None, option("CSV", "frame,x,y of the clip's balls, or what TTNet, BlurBall, TT3D have")
+    ] = None,
     detector: Detector = None,
     within: Annotated[float, option("PX", "distance from a label that counts as found (default: 10)")] = 10.0,
     camera: CameraName = None,

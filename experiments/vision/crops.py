@@ -155,7 +155,7 @@ def draw_crop(
     if not (inside and seen > SEEN) and not (inside and seen < HARDLY):
         if (spot > -12).all() and (spot < SIZE + 12).all():
             return None
-    frames = [shot.frame for shot in shots]
+    frames: list[np.ndarray] = [shot.frame for shot in shots]
     if video and rng.random() < 0.7:
         quality = int(rng.integers(35, 96))
         frames = [compress(frame, quality) for frame in frames]

@@ -17,7 +17,7 @@ from experiments.progress import Stage
 from experiments.vision import export, flights, network, search, training
 from experiments.vision.crops import Crops, make_crops, mine_crops
 from experiments.vision.evaluation import WITHIN, use_one_core
-from robot_io.vision.detector import Detector, read_cells
+from robot_io.vision.detector import Cells, Detector, read_cells
 
 SHIPPED = Path(__file__).parents[1] / "shipped" / "vision"
 MINING_THRESHOLD = 0.2
@@ -108,24 +108,23 @@ def _tell(note: Callable[[str], object]) -> Callable[[int, float, Any], object]:
     return lambda step, cost, params: note(f"  step {step}: cost {cost:.3f}")
 
 
-def _say(params: Any, crops: Crops) -> tuple[np.ndarray, ...]:
-    """What the network says of crops: probability, centre, covariance, velocity, deviation (see ``read_cells``)."""
-    said = [
-        read_cells(np.asarray(network.apply(params, crops.fine[i : i + 200], crops.coarse[i : i + 200])).transpose(0, 3, 1, 2))
-        for i in range(0, len(crops), 200)
-    ]
-    return tuple(np.concatenate(parts) for parts in zip(*said, strict=True))
+def _say(params: Any, crops: Crops) -> Cells:
+    """What the network says of crops."""
+    said = []
+    for i in range(0, len(crops), 200):
+        out = network.apply(params, crops.fine[i : i + 200], crops.coarse[i : i + 200])
+        said.append(read_cells(*(np.asarray(part).transpose(0, 3, 1, 2) for part in out)))
+    return Cells(*(np.concatenate(parts) for parts in zip(*said, strict=True)))
 
 
 def _squared(params: Any, crops: Crops) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of balls that were found: errors [px], and squared errors over the covariance; and the rest's probabilities."""
-    probability, centre, covariance, *_ = _say(params, crops)
-    there = crops.labels[:, 0] > 0
-    miss = centre - crops.labels[:, 1:3]
+    said, there = _say(params, crops), crops.labels[:, 0] > 0
+    miss = said.centre - crops.labels[:, 1:3]
     error = np.linalg.norm(miss, axis=1)
-    found = there & (probability > 0.5) & (error < WITHIN)
-    squared = np.einsum("ni,nij,nj->n", miss[found], np.linalg.inv(covariance[found]), miss[found])
-    return error[found], squared, probability[~there]
+    found = there & (said.probability > 0.5) & (error < WITHIN)
+    squared = np.einsum("ni,nij,nj->n", miss[found], np.linalg.inv(said.covariance[found]), miss[found])
+    return error[found], squared, said.probability[~there]
 
 
 def calibrate(params: Any, crops: Crops) -> Any:

@@ -6,7 +6,7 @@ little more than its noise. Colours are linear, as of an industrial camera witho
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import NamedTuple
@@ -87,7 +87,7 @@ def noise_bank(height: int, width: int) -> np.ndarray:
     return np.random.default_rng(1).standard_normal((height + MARGIN, width + MARGIN), np.float32)
 
 
-def draw_polygon(image: np.ndarray, camera: Camera, corners: list, colour: np.ndarray | tuple) -> None:
+def draw_polygon(image: np.ndarray, camera: Camera, corners: list, colour: Sequence[float] | np.ndarray) -> None:
     """Fills a polygon of corners (n, 3) [m]; its edges bend as the lens bends them."""
     points = np.array(corners, float)
     along = np.linspace(0.0, 1.0, 12, endpoint=False)[:, None]
@@ -103,8 +103,7 @@ def photographs() -> tuple[np.ndarray, ...]:
     from matplotlib import cbook, image
     from sklearn.datasets import load_sample_images
 
-    with cbook.get_sample_data("grace_hopper.jpg") as file:
-        portrait = image.imread(file, format="jpg")
+    portrait = image.imread(str(cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)))
     pictures = [*load_sample_images().images, portrait]
     return tuple((255 * (np.asarray(p) / 255.0) ** 2.2).astype(np.uint8) for p in pictures)
 
@@ -120,7 +119,9 @@ def _draw_surroundings(image: np.ndarray, camera: Camera, rng: np.random.Generat
             ((u, far + 1, v), (-far, u, v), (far, u, v))[side]
             for u, v in ((a, z), (a + w, z), (a + w, z + h), (a, z + h))
         ]
-        draw_polygon(image, camera, corners, rng.uniform(0, 255, 3) if rng.random() < 0.7 else [rng.uniform(150, 255)] * 3)
+        draw_polygon(
+            image, camera, corners, rng.uniform(0, 255, 3) if rng.random() < 0.7 else [rng.uniform(150, 255)] * 3
+        )
     floor, end = rng.uniform(20, 140, 3), -c.TABLE_HEIGHT
     draw_polygon(image, camera, [(-far, -2.2, end), (far, -2.2, end), (far, 6, end), (-far, 6, end)], floor)
     for _ in range(rng.integers(0, 5)):
@@ -166,7 +167,7 @@ def make_scene(camera: Camera, rng: np.random.Generator) -> Scene:
     tops = np.array([(20, 45, 130), (15, 70, 50), (30, 30, 35), (70, 20, 40)])
     _draw_table(image, camera, tops[rng.integers(4)] * rng.uniform(0.6, 1.6))
     blur = rng.uniform(0.45, 1.0)
-    image = cv2.GaussianBlur(image, (0, 0), blur)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), np.uint8)
     cover, reach, tape = np.zeros_like(image), c.TABLE_WIDTH / 2 + c.NET_OVERHANG, c.NET_HEIGHT - 0.015
     for bottom, hides in ((0.0, 110), (tape, 255)):
         corners = [(-reach, 0, bottom), (reach, 0, bottom), (reach, 0, c.NET_HEIGHT), (-reach, 0, c.NET_HEIGHT)]
@@ -176,7 +177,8 @@ def make_scene(camera: Camera, rng: np.random.Generator) -> Scene:
     image = (image + (cloth - image) * (net[..., None] / 255.0)).astype(np.uint8)
     ball = (ORANGE if rng.random() < 0.6 else WHITE) * rng.uniform(0.8, 1.08, 3)
     return Scene(
-        camera, image, net, np.minimum(ball, 255), rng.uniform(0.0008, 0.0045), rng.uniform(0.05, 0.4), rng.uniform(0.45, 1.1), blur
+        camera, image, net, np.minimum(ball, 255), blur=blur,
+        exposure=rng.uniform(0.0008, 0.0045), gain=rng.uniform(0.05, 0.4), brightness=rng.uniform(0.45, 1.1),
     )  # fmt: skip
 
 
@@ -192,7 +194,8 @@ class Actors:
         self.trousers, self.hair = rng.uniform(0, 120, 3), rng.uniform(0, 90, 3)
         self.rubber = np.array([(150, 20, 20), (20, 20, 20), (30, 60, 150)][rng.integers(3)])
         self.logos = [
-            (rng.uniform([-0.12, 0.2], [0.12, 0.55]), rng.uniform(0, 0.05), rng.uniform(0.008, 0.03), rng.uniform(0, 255, 3))
+            (rng.uniform([-0.12, 0.2], [0.12, 0.55]), rng.uniform(0, 0.05),
+             rng.uniform(0.008, 0.03), rng.uniform(0, 255, 3))
             for _ in range(rng.integers(1, 5))
         ]  # fmt: skip
         self.things = []
@@ -202,7 +205,9 @@ class Actors:
             length = way / np.linalg.norm(way) * radius * rng.uniform(2.5, 9)  # longer than any ball's streak is wide
             colour = (ORANGE, WHITE, self.skin)[rng.integers(3)] if rng.random() < 0.5 else rng.uniform(0, 255, 3)
             middle = rng.uniform([-1.0, -1.6, -0.1], [1.0, 2.0, 0.8])
-            self.things.append((middle, length, radius, colour, rng.uniform(0.05, 0.5, 3), rng.uniform(2, 14), rng.uniform(0, 6.3, 3)))
+            self.things.append(
+                (middle, length, radius, colour, rng.uniform(0.05, 0.5, 3), rng.uniform(2, 14), rng.uniform(0, 6.3, 3))
+            )
 
     def capsules(self, time: float, ball: np.ndarray | None) -> list[Capsule]:
         """All shapes at a time [s]; the paddles follow a ball (3,) [m] that is near."""
@@ -274,25 +279,21 @@ def render(
         depths, pixels = camera.depth(ends), camera.project(ends)
         for shape, depth, pair in zip(shapes, depths, pixels, strict=True):
             if depth.min() > NEAREST:
-                ordered.append((float(depth.mean()), pair - origin, camera.matrix[0, 0] * shape.radius / depth.mean(), shape))
+                ordered.append(
+                    (float(depth.mean()), pair - origin, camera.matrix[0, 0] * shape.radius / depth.mean(), shape)
+                )
     ordered.sort(key=lambda s: -s[0])
+    farther = sum(depth >= spot for depth, *_ in ordered)
+    for _, pair, radius, shape in ordered[:farther]:
+        drawn += _draw_capsule(image, pair, radius, shape.colour)
     seen, patch = 0.0, None
-    for depth, pair, radius, shape in [*ordered, (-2.0, None, 0.0, None)]:
-        if patch is None and len(places) and depth < spot:
-            shadow = _draw_shadow(scene, image, places[len(places) // 2], origin)
-            seen, patch = _draw_ball(scene, image, places, origin)
-            drawn += [box for box in (shadow, patch) if box is not None]
-            patch = patch or ()
-        if shape is None:
-            break
-        low, high = pair.min(0) - radius - 2, pair.max(0) + radius + 2
-        box = _clip_box(low, high, width, height)
-        if box is None:
-            continue
+    if len(places):
+        shadow = _draw_shadow(scene, image, places[len(places) // 2], origin)
+        seen, patch = _draw_ball(scene, image, places, origin)
+        drawn += [box for box in (shadow, patch) if box is not None]
+    for _, pair, radius, shape in ordered[farther:]:
         before = image[patch].copy() if patch else None
-        a, b = (tuple(np.round(p * 16).astype(int).tolist()) for p in pair)
-        cv2.line(image, a, b, [float(v) for v in shape.colour], max(1, int(2 * radius)), cv2.LINE_AA, 4)
-        drawn.append(box)
+        drawn += _draw_capsule(image, pair, radius, shape.colour)
         if patch and before is not None:
             seen *= 1.0 - float((before != image[patch]).any(-1).mean())
     bayer, deviation, table = scene.bayer[view], scene.noise[view], scene.deviations()
@@ -300,7 +301,9 @@ def render(
         bayer, deviation = bayer.copy(), deviation.copy()
     still = scene.image[view]
     for rows, columns in drawn:
-        box = (slice(rows.start // 2 * 2, (rows.stop + 1) // 2 * 2), slice(columns.start // 2 * 2, (columns.stop + 1) // 2 * 2))
+        # The colours of a quad are where they are in the whole frame.
+        even = (slice(side.start // 2 * 2, (side.stop + 1) // 2 * 2) for side in (rows, columns))
+        box = tuple(even)
         bayer[box] = mosaic(image[box])
         deviation[box] = cv2.LUT(bayer[box], table)
     for box in drawn:
@@ -309,6 +312,16 @@ def render(
     y, x = rng.integers(0, MARGIN, 2)
     noise = cv2.multiply(deviation, bank[y : y + height, x : x + width])
     return Picture(cv2.addWeighted(bayer, scene.brightness, noise, 1.0, 0.0, dtype=cv2.CV_8U), seen)
+
+
+def _draw_capsule(image: np.ndarray, pair: np.ndarray, radius: float, colour: np.ndarray) -> list[tuple[slice, slice]]:
+    """Draws a line (2, 2) [px] with round ends; the box that it covers, in a list, which is empty outside."""
+    box = _clip_box(pair.min(0) - radius - 2, pair.max(0) + radius + 2, image.shape[1], image.shape[0])
+    if box is None:
+        return []
+    a, b = (tuple(np.round(p * 16).astype(int).tolist()) for p in pair)
+    cv2.line(image, a, b, [float(v) for v in colour], max(1, int(2 * radius)), cv2.LINE_AA, 4)
+    return [box]
 
 
 def _clip_box(low: np.ndarray, high: np.ndarray, width: int, height: int) -> tuple[slice, slice] | None:
@@ -323,7 +336,10 @@ def _draw_shadow(scene: Scene, image: np.ndarray, ball: np.ndarray, origin: np.n
     if abs(ball[0]) > c.TABLE_WIDTH / 2 or abs(ball[1]) > c.TABLE_LENGTH / 2 or ball[2] < 0:
         return None
     foot = np.array([ball[0], ball[1], 0.0])
-    spot, radius = scene.camera.project(foot) - origin, scene.camera.matrix[0, 0] * c.BALL_RADIUS / scene.camera.depth(foot)
+    spot, radius = (
+        scene.camera.project(foot) - origin,
+        scene.camera.matrix[0, 0] * c.BALL_RADIUS / scene.camera.depth(foot),
+    )
     box = _clip_box(spot - 2 * radius - 3, spot + 2 * radius + 3, image.shape[1], image.shape[0])
     if box is not None:
         ys, xs = np.mgrid[box]
@@ -337,7 +353,10 @@ def _draw_ball(
 ) -> tuple[float, tuple[slice, slice] | None]:
     """Draws the exposure's streak; share of it that the net and the picture's edge leave, and the box it covers."""
     camera = scene.camera
-    pixels, radius = camera.project(places) - origin, float(camera.matrix[0, 0] * c.BALL_RADIUS / camera.depth(places).mean())
+    pixels, radius = (
+        camera.project(places) - origin,
+        float(camera.matrix[0, 0] * c.BALL_RADIUS / camera.depth(places).mean()),
+    )
     low, high = pixels.min(0) - radius - 3, pixels.max(0) + radius + 3
     box = _clip_box(low, high, image.shape[1], image.shape[0])
     if box is None:
@@ -359,7 +378,9 @@ def _draw_ball(
         hidden = float((veil * cover).sum() / max(cover.sum(), 1e-9))
         cover, shade = cover * (1 - veil), shade * (1 - veil)
     patch = image[box]
-    image[box] = np.clip(patch * (1 - cover[..., None]) + (shade[..., None] * 1.1) * scene.ball, 0, 255).astype(np.uint8)
+    image[box] = np.clip(patch * (1 - cover[..., None]) + (shade[..., None] * 1.1) * scene.ball, 0, 255).astype(
+        np.uint8
+    )
     cut = (inside.max(0) > 0.5).sum() / whole
     return (1.0 - hidden) * (min(1.0, cut) if cut < 0.9 else 1.0), box
 
