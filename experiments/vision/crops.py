@@ -169,7 +169,7 @@ def compress(bayer: np.ndarray, quality: int) -> np.ndarray:
     """The frame as a compressed colour video has it: halved colours, blocks of 8 pixels; mosaicked again."""
     colours = cv2.cvtColor(bayer, cv2.COLOR_BayerRGGB2BGR)
     _, data = cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return pictures.mosaic(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+    return pictures.mosaic(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1])
 
 
 def mine_crops(

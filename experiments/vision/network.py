@@ -100,5 +100,5 @@ def start(key: Any) -> Any:
 @jax.jit
 def apply(params: Any, fine: Array, coarse: Array) -> tuple[Array, Array]:
     """What it says of crops (n, 64, 64, 3) in 0..255: of fine (n, 16, 16, 6) and of coarse cells (n, 16, 16, 4)."""
-    cells, past = BallNetwork().apply({"params": params}, pack(fine), pack(coarse))
-    return cells, past
+    said: Any = BallNetwork().apply({"params": params}, pack(fine), pack(coarse))
+    return said

@@ -35,7 +35,7 @@ class Plan:
     first_steps: int = 2600
     hall_scenes: int = 400  # in which hard negatives are sought
     film_scenes: int = 150
-    steps: int = 7000
+    steps: int = 5000
     seed: int = 0
 
     @classmethod
