@@ -79,6 +79,7 @@ def make_crops(
     tracks: np.ndarray,
     rng: np.random.Generator,
     video: bool = False,
+    dressed: bool = False,
     report: Callable[[int], object] = lambda done: None,
 ) -> Crops:
     """Draws crops of rendered scenes.
@@ -88,6 +89,7 @@ def make_crops(
         tracks: flights (n, m, 3) [m] at 1 kHz.
         rng: draws all.
         video: longer exposures, fewer frames a second and compression, as of ordinary video.
+        dressed: people wear photographs.
         report: is told how many are done.
     """
     fine = np.empty((count, SIZE, SIZE, 3), np.uint8)
@@ -95,7 +97,7 @@ def make_crops(
     done = 0
     while done < count:
         camera = draw_camera(rng, VIDEO_FOCAL) if video else draw_camera(rng)
-        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng)
+        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, dressed=dressed)
         for _ in range(PER_SCENE):
             crop = draw_crop(scene, actors, tracks, rng, video)
             if crop is not None and done < count:
@@ -187,7 +189,7 @@ def mine_crops(
     found: list[tuple[np.ndarray, np.ndarray]] = []
     for scene_number in range(scenes):
         camera = draw_camera(rng, VIDEO_FOCAL) if video else draw_camera(rng)
-        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, 8)
+        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, 8, dressed=rng.random() < 0.5)
         gap = rng.uniform(0.008, 0.04) if video else GAP
         begin, quality = rng.uniform(0, 10), int(rng.integers(35, 96))
         ghost = np.array([rng.uniform(-0.5, 0.5), rng.uniform(-2, 2), 0.3])

@@ -31,6 +31,9 @@ class Plan:
     flights: int = 4000
     hall: int = 60_000  # crops as the paper's cameras give them
     film: int = 16_000  # crops as of ordinary video
+    dressed: int = (
+        14_000  # crops of people who wear photographs, half as hall and half as film, for the second training
+    )
     held_out: int = 4000  # crops of flights and halls that training never sees
     first_steps: int = 2600
     hall_scenes: int = 400  # in which hard negatives are sought
@@ -41,7 +44,7 @@ class Plan:
     @classmethod
     def small(cls) -> Plan:
         """A try-out of a minute, whose detector is poor."""
-        return cls(60, 900, 240, 240, 60, 4, 2, 60)
+        return cls(60, 900, 240, 120, 240, 60, 4, 2, 60)
 
 
 def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], object] = print) -> dict[str, float]:
@@ -73,6 +76,13 @@ def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], ob
     if not first.exists():
         with stage(f"network, {plan.first_steps} steps"):
             training.save(first, training.train(crops, plan.first_steps, plan.seed, report=_tell(note)))
+    dressed = work / "dressed.npz"
+    if not dressed.exists():
+        with stage(f"{plan.dressed} crops: dressed people"):
+            flown = flights.split_flights(tracks, False)
+            rng = np.random.default_rng(plan.seed + 21)
+            parts = [make_crops(plan.dressed // 2, flown, rng, video, dressed=True) for video in (False, True)]
+            Crops.join(parts).save(str(dressed))
     hard = work / "hard.npz"
     if not hard.exists():
         with stage("hard negatives"):
@@ -84,7 +94,7 @@ def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], ob
                 for video, count in enumerate((plan.hall_scenes, plan.film_scenes))
             ]
             Crops.join(mined).save(str(hard))
-    crops = Crops.join([crops, *[Crops.load(str(hard))] * HARD_SHARE])
+    crops = Crops.join([crops, Crops.load(str(dressed)), *[Crops.load(str(hard))] * HARD_SHARE])
     second = work / "second.npz"
     if not second.exists():
         with stage(f"network again, {plan.steps} steps"):

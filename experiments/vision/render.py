@@ -34,6 +34,7 @@ class Capsule(NamedTuple):
     end: np.ndarray  # (3,) [m]
     radius: float  # [m]
     colour: np.ndarray  # (3,) linear RGB, 0..255
+    texture: np.ndarray | None = None  # (h, w, 3) uint8 that repeats on it instead of the colour
 
 
 class Picture(NamedTuple):
@@ -183,9 +184,15 @@ def make_scene(camera: Camera, rng: np.random.Generator) -> Scene:
 
 
 class Actors:
-    """A person at the far end, a robot at the near one, and small things that move but are no balls."""
+    """A person at the far end, a robot at the near one, and small things that move but are no balls.
 
-    def __init__(self, rng: np.random.Generator, clutter: int = 4) -> None:
+    Args:
+        rng: draws their looks and motions.
+        clutter: most small things.
+        dressed: whether the person wears photographs, as clothes, skin and logos have structure.
+    """
+
+    def __init__(self, rng: np.random.Generator, clutter: int = 4, dressed: bool = False) -> None:
         self.at, self.phase, self.pace = rng.uniform(-0.5, 0.5), rng.uniform(0, 6.3, 4), rng.uniform(3, 9)
         self.far = rng.uniform(1.6, 2.3)
         self.shirt = np.full(3, rng.uniform(170, 250)) if rng.random() < 0.5 else rng.uniform(0, 200, 3)
@@ -209,6 +216,9 @@ class Actors:
                 (middle, length, radius, colour, rng.uniform(0.05, 0.5, 3), rng.uniform(2, 14), rng.uniform(0, 6.3, 3))
             )
 
+        parts = {"shirt": self.shirt, "trousers": self.trousers, "skin": self.skin, "hair": self.hair}
+        self.textures = {name: _weave(colour, rng) for name, colour in parts.items()} if dressed else {}
+
     def capsules(self, time: float, ball: np.ndarray | None) -> list[Capsule]:
         """All shapes at a time [s]; the paddles follow a ball (3,) [m] that is near."""
         swing = np.sin(self.pace * time + self.phase)
@@ -223,13 +233,19 @@ class Actors:
         shoulder, elbow, base = np.array([x + 0.2, y - 0.1, 0.55]), wrist - [0, 0.25, -0.15], np.array([0.2, -2.3, 0.3])
         blade, left = np.array([0.02, 0, 0.03]), np.array([x - 0.22, y - 0.1, 0.55])
         shapes = [
-            Capsule(np.array((x - 0.1, y, -0.7)), hip, 0.09, self.trousers),
-            Capsule(np.array((x + 0.1, y, -0.7)), hip, 0.09, self.trousers),
-            Capsule(hip, neck, 0.17, self.shirt),
-            Capsule(head, head, 0.1, self.skin),
-            Capsule(head + [0, 0.07, 0.06], head + [0, 0.07, 0.06], 0.09, self.hair),
-            Capsule(left, left + [-0.1 * swing[0], -0.3, -0.25 + 0.15 * swing[3]], 0.04, self.skin),
-            Capsule(shoulder, hand, 0.045, self.skin),
+            Capsule(np.array((x - 0.1, y, -0.7)), hip, 0.09, self.trousers, self.textures.get("trousers")),
+            Capsule(np.array((x + 0.1, y, -0.7)), hip, 0.09, self.trousers, self.textures.get("trousers")),
+            Capsule(hip, neck, 0.17, self.shirt, self.textures.get("shirt")),
+            Capsule(head, head, 0.1, self.skin, self.textures.get("skin")),
+            Capsule(head + [0, 0.07, 0.06], head + [0, 0.07, 0.06], 0.09, self.hair, self.textures.get("hair")),
+            Capsule(
+                left,
+                left + [-0.1 * swing[0], -0.3, -0.25 + 0.15 * swing[3]],
+                0.04,
+                self.skin,
+                self.textures.get("skin"),
+            ),
+            Capsule(shoulder, hand, 0.045, self.skin, self.textures.get("skin")),
             Capsule(hand, hand + blade, 0.075, self.rubber),
             Capsule(base, elbow, 0.07, self.robot),
             Capsule(elbow, wrist, 0.045, self.robot),
@@ -242,6 +258,16 @@ class Actors:
             spot = middle + reach * np.sin(pace * time + phase)
             shapes.append(Capsule(spot, spot + length, radius, colour))
         return shapes
+
+
+def _weave(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A texture (128, 128, 3) of a photograph's part in a colour."""
+    photo = photographs()[rng.integers(len(photographs()))]
+    size = int(rng.integers(40, 300))
+    y, x = (int(rng.integers(0, side - size)) for side in photo.shape[:2])
+    part = cv2.resize(photo[y : y + size, x : x + size], (128, 128), interpolation=cv2.INTER_AREA)
+    share = rng.uniform(0.2, 0.9)
+    return np.clip(share * part + (1 - share) * colour, 0, 255).astype(np.uint8)
 
 
 def render(
@@ -285,7 +311,7 @@ def render(
     ordered.sort(key=lambda s: -s[0])
     farther = sum(depth >= spot for depth, *_ in ordered)
     for _, pair, radius, shape in ordered[:farther]:
-        drawn += _draw_capsule(image, pair, radius, shape.colour)
+        drawn += _draw_capsule(image, pair, radius, shape)
     seen, patch = 0.0, None
     if len(places):
         shadow = _draw_shadow(scene, image, places[len(places) // 2], origin)
@@ -293,7 +319,7 @@ def render(
         drawn += [box for box in (shadow, patch) if box is not None]
     for _, pair, radius, shape in ordered[farther:]:
         before = image[patch].copy() if patch else None
-        drawn += _draw_capsule(image, pair, radius, shape.colour)
+        drawn += _draw_capsule(image, pair, radius, shape)
         if patch and before is not None:
             seen *= 1.0 - float((before != image[patch]).any(-1).mean())
     bayer, deviation, table = scene.bayer[view], scene.noise[view], scene.deviations()
@@ -314,13 +340,24 @@ def render(
     return Picture(cv2.addWeighted(bayer, scene.brightness, noise, 1.0, 0.0, dtype=cv2.CV_8U), seen)
 
 
-def _draw_capsule(image: np.ndarray, pair: np.ndarray, radius: float, colour: np.ndarray) -> list[tuple[slice, slice]]:
+def _draw_capsule(image: np.ndarray, pair: np.ndarray, radius: float, shape: Capsule) -> list[tuple[slice, slice]]:
     """Draws a line (2, 2) [px] with round ends; the box that it covers, in a list, which is empty outside."""
     box = _clip_box(pair.min(0) - radius - 2, pair.max(0) + radius + 2, image.shape[1], image.shape[0])
     if box is None:
         return []
     a, b = (tuple(np.round(p * 16).astype(int).tolist()) for p in pair)
-    cv2.line(image, a, b, [float(v) for v in colour], max(1, int(2 * radius)), cv2.LINE_AA, 4)
+    width = max(1, int(2 * radius))
+    if shape.texture is None:
+        cv2.line(image, a, b, [float(v) for v in shape.colour], width, cv2.LINE_AA, 4)
+        return [box]
+    inside = np.zeros(image.shape[:2], np.uint8)
+    cv2.line(inside, a, b, 255.0, width, cv2.LINE_8, 4)
+    rows, columns = (np.arange(side.start, side.stop) for side in box)
+    # It moves with the shape's first end.
+    u, v = np.round(pair[0]).astype(int)
+    cloth = shape.texture[((rows - v) % len(shape.texture))[:, None], (columns - u) % shape.texture.shape[1]]
+    chosen = inside[box] > 0
+    image[box][chosen] = cloth[chosen]
     return [box]
 
 

@@ -8,23 +8,11 @@ import pytest
 from experiments.vision import export
 from experiments.vision.pipeline import SHIPPED
 from robot_io.vision.detector import Detector
+from tests.support.discs import draw_discs
 
 RATE = 125.0
 SPEED = np.array([14.0, -6.0])  # px a frame
 START = np.array([300.0, 400.0])
-
-
-def draw(middles, size=(512, 640), colour=(220.0, 110.0, 25.0), radius=7.0):
-    """Frames of a shaded disc over a slope of grey, as a Bayer camera sees them."""
-    rng, (ys, xs) = np.random.default_rng(0), np.mgrid[: size[0], : size[1]].astype(float)
-    channel = np.array([[0, 1], [1, 2]])[(ys.astype(int) % 2), (xs.astype(int) % 2)]
-    frames = []
-    for u, v in middles:
-        cover = np.clip(radius - np.hypot(xs - u, ys - v) + 0.5, 0, 1)
-        shade = 0.85 - 0.3 * (ys - v) / radius
-        level = (30 + 40 * xs / size[1]) * (1 - cover) + cover * shade * np.array(colour)[channel]
-        frames.append(np.clip(level + rng.normal(0, 2, size), 0, 255).astype(np.uint8))
-    return frames
 
 
 def test_onnx_says_what_jax_said_of_the_golden_crops():
@@ -35,7 +23,7 @@ def test_onnx_says_what_jax_said_of_the_golden_crops():
 def test_a_disc_that_moves_is_found_with_place_and_velocity(colour):
     middles = [START + k * SPEED for k in range(8)]
     detector = Detector(SHIPPED, RATE)
-    for k, frame in enumerate(draw(middles, colour=colour)):
+    for k, frame in enumerate(draw_discs(middles, colour=colour)):
         found = detector.detect(frame)
         if k < 2:
             assert found == []
@@ -49,9 +37,9 @@ def test_a_disc_that_moves_is_found_with_place_and_velocity(colour):
 
 def test_still_discs_and_empty_pictures_are_no_balls_and_guesses_look_anywhere():
     detector = Detector(SHIPPED, RATE)
-    for frame in draw([START] * 6):
+    for frame in draw_discs([START] * 6):
         assert detector.detect(frame) == []
-    for frame in draw([(-50.0, -50.0)] * 4):
+    for frame in draw_discs([(-50.0, -50.0)] * 4):
         assert detector.detect(frame, [np.array([1.0, 1.0]), np.array([900.0, 20.0])]) == []
 
 
