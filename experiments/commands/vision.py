@@ -155,7 +155,7 @@ def label(
     from robot_io.vision.detector import Detector as BallDetector
 
     opened = clips.open_clip(clip, camera)
-    finder, labels = BallDetector(find_detector(detector), opened.rate), {}
+    finder, labels = BallDetector(find_detector(detector), opened.rate, bayer=opened.bayer), {}
     for number, frame in enumerate(opened.frames()):
         found = finder.detect(frame)
         labels[number] = found[0].centre if found else None

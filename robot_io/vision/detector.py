@@ -34,6 +34,8 @@ PLAUSIBLE = -4.0  # least score of a place, the logarithm of the odds of a ball,
 CHANGE = (4, 3)  # least change of a place [grey levels], and times the median change
 APART = 12.0  # [px] between two balls, or two windows
 
+# Columns and rows that are cut off, so that what is left begins with a red pixel.
+CUT = {"RGGB": (0, 0), "GRBG": (1, 0), "GBRG": (0, 1), "BGGR": (1, 1), "mono": (0, 0)}
 NETWORK, SEARCH = "ball.onnx", "search.onnx"
 
 
@@ -121,9 +123,17 @@ class Detector:
         rate: frames a second [Hz].
         most: windows that the search may fill.
         threshold: least probability of what is reported.
+        bayer: order of the frames' colours.
     """
 
-    def __init__(self, folder: str | Path, rate: float = 125.0, most: int = 5, threshold: float = 0.5) -> None:
+    def __init__(
+        self,
+        folder: str | Path,
+        rate: float = 125.0,
+        most: int = 5,
+        threshold: float = 0.5,
+        bayer: str = "RGGB",
+    ) -> None:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self._network, self._order = (
@@ -131,6 +141,7 @@ class Detector:
             for name in (NETWORK, SEARCH)
         )
         self.rate, self.most, self.threshold = rate, most, threshold
+        self._cut = np.array(CUT[bayer])
         self._frames: list[np.ndarray] = []
         self._half: list[np.ndarray] = []
         self._small: list[np.ndarray] = []
@@ -144,7 +155,7 @@ class Detector:
         """Balls in a frame, the surest first; none in the first two frames.
 
         Args:
-            frame: (h, w) uint8, RGGB; no copy is made, so it must not be overwritten for three frames.
+            frame: (h, w) uint8; no copy is made, so it must not be overwritten for three frames.
             guesses: pixels (2,) where a ball is expected.
             search: also look where the picture changes; else only at the guesses.
 
@@ -155,21 +166,28 @@ class Detector:
         if len(self._frames) < FRAMES:
             return []
         middles: list[np.ndarray] = []
-        extent = np.array(frame.shape[::-1])
-        for middle in [*guesses, *(self._expected if search else ()), *(self._search() if search else ())]:
+        extent = np.array(self._frames[0].shape[::-1])
+        for middle in [
+            *(guess - self._cut for guess in guesses),
+            *(self._expected if search else ()),
+            *(self._search() if search else ()),
+        ]:
             inside = (middle > -APART).all() and (middle < extent + APART).all()
             if inside and all(np.abs(middle - other).max() > APART for other in middles):
                 middles.append(middle)
         found = self._look(middles) if middles else []
-        self._expected = [d.centre + d.velocity / self.rate for d in found[:2]]
+        self._expected = [d.centre - self._cut + d.velocity / self.rate for d in found[:2]]
         return found
 
     def _push(self, frame: np.ndarray) -> None:
-        if frame.ndim != 2 or frame.dtype != np.uint8 or frame.shape[0] % QUARTER or frame.shape[1] % QUARTER:
+        if frame.ndim != 2 or frame.dtype != np.uint8 or min(frame.shape) < SIZE + QUARTER:
             raise ValueError(
-                f"expected a frame (height, width) of uint8 with sides that {QUARTER} divides, got {frame.dtype} "
+                f"expected a frame (height, width) of uint8, sides of {SIZE + QUARTER} px and more, got {frame.dtype} "
                 f"{frame.shape}; give the raw Bayer frame"
             )
+        left, top = self._cut
+        height, width = ((side - cut) // QUARTER * QUARTER for side, cut in zip(frame.shape, (top, left), strict=True))
+        frame = frame[top : top + height, left : left + width]
         if self._frames and frame.shape != self._frames[0].shape:
             raise ValueError(
                 f"expected frames of {self._frames[0].shape}, got {frame.shape}; use a detector per camera"
@@ -217,7 +235,7 @@ class Detector:
             spot, share = said.centre[k] + corners[k], float(said.probability[k])
             if share < self.threshold:
                 break
-            if all(np.abs(spot - other.centre).max() > APART for other in kept):
+            if all(np.abs(spot - other.centre + self._cut).max() > APART for other in kept):
                 speed, spread = said.velocity[k] * self.rate, float(said.deviation[k] * self.rate)
-                kept.append(Detection(spot, said.covariance[k], speed, spread, share))
+                kept.append(Detection(spot + self._cut, said.covariance[k], speed, spread, share))
         return kept

@@ -45,7 +45,7 @@ def test_a_video_gives_bayer_frames(tmp_path):
         file.mux(stream.encode())
     clip = clips.open_clip(path)
     frames = list(clip.frames())
-    assert clip.rate == 50 and len(frames) == 4 and frames[0].shape == (48, 68)
+    assert clip.rate == 50 and len(frames) == 4 and frames[0].shape == (50, 70)
     levels = [frames[1][row::2, column::2].mean() for row, column in ((0, 0), (0, 1), (1, 0), (1, 1))]
     np.testing.assert_allclose(levels, (200, 100, 100, 30), atol=6)
 

@@ -45,11 +45,21 @@ def test_still_discs_and_empty_pictures_are_no_balls_and_guesses_look_anywhere()
 
 def test_frames_of_another_kind_are_refused():
     detector = Detector(SHIPPED)
-    for wrong in (np.zeros((64, 64)), np.zeros((64, 64, 3), np.uint8), np.zeros((66, 64), np.uint8)):
+    for wrong in (np.zeros((64, 64)), np.zeros((64, 64, 3), np.uint8), np.zeros((66, 200), np.uint8)):
         with pytest.raises(ValueError, match="raw Bayer frame"):
             detector.detect(wrong)
     detector.detect(np.zeros((128, 128), np.uint8))
     with pytest.raises(ValueError, match="a detector per camera"):
-        detector.detect(np.zeros((128, 64), np.uint8))
+        detector.detect(np.zeros((128, 96), np.uint8))
     detector.forget()
-    assert detector.detect(np.zeros((128, 64), np.uint8)) == []
+    assert detector.detect(np.zeros((128, 96), np.uint8)) == []
+
+
+@pytest.mark.parametrize(("bayer", "left", "top"), [("GRBG", 1, 0), ("GBRG", 0, 1), ("BGGR", 1, 1)])
+def test_other_orders_of_colours_give_the_same_balls(bayer, left, top):
+    one, other = Detector(SHIPPED, RATE), Detector(SHIPPED, RATE, bayer=bayer)
+    for frame in draw_discs([START + k * SPEED for k in range(4)]):
+        expected = one.detect(frame)
+        found = other.detect(np.pad(frame, ((top, 3), (left, 3))), [START])
+    assert len(found) == len(expected) == 1
+    np.testing.assert_allclose(found[0].centre, expected[0].centre + [left, top], atol=0.2)
