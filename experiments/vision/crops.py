@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -53,6 +54,14 @@ class Crops:
         return Crops(self.fine[::step], self.coarse[::step], self.labels[::step])
 
 
+class Shots(NamedTuple):
+    """Three frames of a window, and what is in it."""
+
+    frames: list[np.ndarray]  # (h, w) uint8, Bayer, newest first
+    corner: np.ndarray  # (2,) [px] of the fine crop in them
+    label: np.ndarray  # (6,) as of ``Crops``
+
+
 def cut(frames: list[np.ndarray], corner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fine and coarse crop (SIZE, SIZE, 3) with the fine one's corner (2,) [px, even] in whole frames, newest first."""
     u, v = (int(x) for x in corner)
@@ -80,7 +89,6 @@ def make_crops(
     rng: np.random.Generator,
     video: bool = False,
     dressed: bool = False,
-    report: Callable[[int], object] = lambda done: None,
 ) -> Crops:
     """Draws crops of rendered scenes.
 
@@ -90,27 +98,43 @@ def make_crops(
         rng: draws all.
         video: longer exposures, fewer frames a second and compression, as of ordinary video.
         dressed: people wear photographs.
-        report: is told how many are done.
     """
     fine = np.empty((count, SIZE, SIZE, 3), np.uint8)
     coarse, labels = np.empty_like(fine), np.zeros((count, 6), np.float32)
-    done = 0
-    while done < count:
-        camera = draw_camera(rng, VIDEO_FOCAL) if video else draw_camera(rng)
-        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, dressed=dressed)
-        for _ in range(PER_SCENE):
-            crop = draw_crop(scene, actors, tracks, rng, video)
-            if crop is not None and done < count:
-                fine[done], coarse[done], labels[done] = crop
-                done += 1
-        report(done)
+    for done, shots in enumerate(draw_shots(count, tracks, rng, float(video), float(dressed))):
+        fine[done], coarse[done] = cut(shots.frames, shots.corner)
+        labels[done] = shots.label
     return Crops(fine, coarse, labels)
 
 
-def draw_crop(
+def draw_shots(
+    count: int, tracks: np.ndarray, rng: np.random.Generator, video: float, dressed: float
+) -> Iterator[Shots]:
+    """Random places of random halls.
+
+    Args:
+        count: how many.
+        tracks: flights (n, m, 3) [m] at 1 kHz.
+        rng: draws all.
+        video: share of the halls that are seen as by ordinary video.
+        dressed: share of those whose people wear photographs.
+    """
+    done = 0
+    while done < count:
+        film, worn = (share >= 1 or (share > 0 and rng.random() < share) for share in (video, dressed))
+        camera = draw_camera(rng, VIDEO_FOCAL) if film else draw_camera(rng)
+        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, dressed=worn)
+        for _ in range(PER_SCENE):
+            shots = _draw_shots(scene, actors, tracks, rng, film)
+            if shots is not None and done < count:
+                done += 1
+                yield shots
+
+
+def _draw_shots(
     scene: pictures.Scene, actors: pictures.Actors, tracks: np.ndarray, rng: np.random.Generator, video: bool
-) -> tuple[np.ndarray, np.ndarray, list[float]] | None:
-    """Fine, coarse and label of a random crop; None where a ball is neither seen nor hidden or outside of the frame."""
+) -> Shots | None:
+    """A random place; None where a ball is neither seen nor hidden, or outside of the frame."""
     width, height = scene.camera.size
     gap = GAP if rng.random() < 0.7 else rng.uniform(0.003, 0.04)
     scene.exposure = rng.uniform(0.0005, min(0.0045, 0.6 * gap))
@@ -164,7 +188,7 @@ def draw_crop(
     present = bool(inside and seen > SEEN)
     radius = scene.camera.matrix[0, 0] * 0.02 / scene.camera.depth(place[0])
     label = [1.0, *spot, *speed, radius] if present else [0.0] * 6
-    return *cut(frames, corner - [x, y]), label
+    return Shots(frames, corner - [x, y], np.array(label))
 
 
 def compress(bayer: np.ndarray, quality: int) -> np.ndarray:
@@ -180,14 +204,13 @@ def mine_crops(
     rng: np.random.Generator,
     frames: int = 12,
     video: bool = False,
-    report: Callable[[int], object] = lambda done: None,
 ) -> Crops:
     """Crops without a ball that a detector takes for one: people and a robot that pretend to play.
 
     A ball that nobody sees leads the hands and paddles. A low threshold of the detector gives more crops.
     """
     found: list[tuple[np.ndarray, np.ndarray]] = []
-    for scene_number in range(scenes):
+    for _ in range(scenes):
         camera = draw_camera(rng, VIDEO_FOCAL) if video else draw_camera(rng)
         scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, 8, dressed=rng.random() < 0.5)
         gap = rng.uniform(0.008, 0.04) if video else GAP
@@ -206,6 +229,5 @@ def mine_crops(
             for detection in detector.detect(frame):
                 corner = np.round((detection.centre - SIZE / 2 + rng.uniform(-14, 14, 2)) / 2) * 2
                 found.append(cut(kept, np.clip(corner, 0, [width - SIZE, height - SIZE]).astype(int)))
-        report(scene_number + 1)
     fine, coarse = (np.array([pair[i] for pair in found], np.uint8).reshape(-1, SIZE, SIZE, 3) for i in (0, 1))
     return Crops(fine, coarse, np.zeros((len(found), 6), np.float32))

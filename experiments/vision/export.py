@@ -115,7 +115,7 @@ def export_network(path: Path, params: Weights) -> None:
 
 
 def export_search(path: Path, layers: Weights) -> None:
-    """Writes the classifier of places: features (n, 245) to scores (n,), the logarithm of the odds of a ball."""
+    """Writes the classifier of places: features (n, 490) to scores (n,), the logarithm of the odds of a ball."""
     g, x = _Graph(), "places"
     for name in ("first", "second"):
         x = g.add(
@@ -129,7 +129,7 @@ def export_search(path: Path, layers: Weights) -> None:
         )
         x = g.add("Relu", [x], f"{name}/relu") if name == "first" else x
     out = g.add("Squeeze", [x, g.constant("last", np.array([1], np.int64))], "score")
-    size = FRAMES * (2 * PLACE + 1) ** 2 + 2
+    size = 2 * (FRAMES * (2 * PLACE + 1) ** 2 + 2)
     g.save(
         path,
         [helper.make_tensor_value_info("places", TensorProto.FLOAT, ["n", size])],

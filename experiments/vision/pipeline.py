@@ -31,20 +31,19 @@ class Plan:
     flights: int = 4000
     hall: int = 60_000  # crops as the paper's cameras give them
     film: int = 16_000  # crops as of ordinary video
-    dressed: int = (
-        14_000  # crops of people who wear photographs, half as hall and half as film, for the second training
-    )
+    dressed: int = 14_000  # crops of people who wear photographs, half as hall and half as film
     held_out: int = 4000  # crops of flights and halls that training never sees
     first_steps: int = 2600
+    places: int = 16_000  # crops for the search's classifier, a quarter as film
     hall_scenes: int = 400  # in which hard negatives are sought
     film_scenes: int = 150
-    steps: int = 5000
+    steps: int = 4000
     seed: int = 0
 
     @classmethod
     def small(cls) -> Plan:
         """A try-out of a minute, whose detector is poor."""
-        return cls(60, 900, 240, 120, 240, 60, 4, 2, 60)
+        return cls(60, 900, 240, 120, 240, 60, 240, 4, 2, 60)
 
 
 def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], object] = print) -> dict[str, float]:
@@ -83,10 +82,17 @@ def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], ob
             rng = np.random.default_rng(plan.seed + 21)
             parts = [make_crops(plan.dressed // 2, flown, rng, video, dressed=True) for video in (False, True)]
             Crops.join(parts).save(str(dressed))
+    seen = work / "places.npz"
+    if not seen.exists():
+        with stage(f"{plan.places} crops for the search"):
+            flown = flights.split_flights(tracks, False)
+            features, balls = search.collect_places(plan.places, flown, np.random.default_rng(plan.seed + 41))
+            np.savez(seen, features=features, balls=balls)
+    with np.load(seen) as file:
+        order = search.train_search(file["features"], file["balls"])
     hard = work / "hard.npz"
     if not hard.exists():
         with stage("hard negatives"):
-            order = search.train_search(*search.collect_places(crops.every(3)))
             export.export(work / "first", training.load(first), order, held_out)
             detector = Detector(work / "first", threshold=MINING_THRESHOLD)
             mined = [
@@ -102,9 +108,9 @@ def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], ob
                 crops, plan.steps, plan.seed + 1, training.load(first), training.RATE * 0.7, _tell(note)
             )
             training.save(second, params)
-    with stage("search, covariance, export"):
+    with stage("covariance, export"):
         params = calibrate(training.load(second), held_out)
-        export.export(out, params, search.train_search(*search.collect_places(crops.every(3))), held_out)
+        export.export(out, params, order, held_out)
     return judge(params, held_out)
 
 

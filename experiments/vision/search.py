@@ -10,29 +10,38 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments.vision.crops import Crops
-from robot_io.vision.detector import AROUND, PLACE, QUARTER, SIZE, describe_places, find_places
+from experiments.vision.crops import draw_shots
+from robot_io.vision.detector import PLACE, QUARTER, SIZE, describe_places, find_places, shrink
 
 HIDDEN = 32
 BATCH = 512
 WITHIN = 2.0  # [quarter px] of a place's middle from the ball's
 
 
-def collect_places(crops: Crops) -> tuple[np.ndarray, np.ndarray]:
-    """Features (n, 245) of the places that change within the crops' fine windows, and which are balls (n,)."""
+def collect_places(count: int, tracks: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Places that change in rendered crops, a quarter of them as of ordinary video.
+
+    Args:
+        count: crops.
+        tracks: flights (n, m, 3) [m] at 1 kHz.
+        rng: draws all.
+
+    Returns:
+        Features (k, 490) of places, and 1 for those that are balls (k,).
+    """
     features, balls = [], []
-    offset = AROUND / QUARTER - (QUARTER - 1) / 2 / QUARTER
-    for coarse, label in zip(crops.coarse, crops.labels, strict=True):
-        small = [cv2.resize(coarse[..., t], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for t in range(3)]
+    for shots in draw_shots(count, tracks, rng, video=0.25, dressed=0.4):
+        low, high = shots.corner // QUARTER, (shots.corner + SIZE) // QUARTER
+        small = [shrink(frame)[1] for frame in shots.frames]
         places = find_places(small)
-        low, high = AROUND // QUARTER, (AROUND + SIZE) // QUARTER
-        places = places[((places >= low) & (places < high)).all(1)]
+        places = places[((places >= low[::-1]) & (places < high[::-1])).all(1)]
         if not len(places):
             continue
-        small = [cv2.copyMakeBorder(s, *(PLACE,) * 4, cv2.BORDER_REPLICATE) for s in small]
-        features.append(describe_places(small, places))
-        away = np.abs(places - (label[2:0:-1] / QUARTER + offset)).max(1)
-        balls.append((away < WITHIN) & (label[0] > 0))
+        features.append(
+            describe_places([cv2.copyMakeBorder(s, *(PLACE,) * 4, cv2.BORDER_REPLICATE) for s in small], places)
+        )
+        spot = (shots.label[1:3] + shots.corner - (QUARTER - 1) / 2) / QUARTER
+        balls.append((np.abs(places - spot[::-1]).max(1) < WITHIN) & (shots.label[0] > 0))
     return np.concatenate(features), np.concatenate(balls).astype(np.float32)
 
 

@@ -39,30 +39,46 @@ CUT = {"RGGB": (0, 0), "GRBG": (1, 0), "GBRG": (0, 1), "BGGR": (1, 1), "mono": (
 NETWORK, SEARCH = "ball.onnx", "search.onnx"
 
 
+def shrink(frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A Bayer frame (h, w) as grey at half (h/2, w/2), and as grey and red at a quarter of its size (h/4, w/4, 2).
+
+    Red, for an orange ball before a wall that is as bright.
+    """
+    half = cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    red = cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_NEAREST)
+    both = [cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for picture in (half, red)]
+    return half, cv2.merge(both)
+
+
 def describe_places(small: Sequence[np.ndarray], middles: np.ndarray) -> np.ndarray:
-    """Features (n, 245) of places in quarter-size frames, newest first.
+    """Features (n, 490) of places in quarter-size frames, newest first.
 
     Args:
-        small: FRAMES pictures (h, w) with a border of PLACE pixels.
+        small: FRAMES pictures (h, w, 2) with a border of PLACE pixels.
         middles: rows and columns (n, 2) without the border.
 
     Returns:
-        The places' pixels less the newest frame's mean over their largest contrast, that contrast and that mean.
+        Of grey and of red: the places' pixels less the newest frame's mean over their largest contrast, that contrast
+        and that mean.
     """
     side = 2 * PLACE + 1
-    views = [np.lib.stride_tricks.sliding_window_view(frame, (side, side)) for frame in small]
-    patches = np.stack([view[middles[:, 0], middles[:, 1]] for view in views], 1).astype(np.float32)
-    mean = patches[:, :1].mean((2, 3), keepdims=True)
-    contrast = np.abs(patches - mean).max((1, 2, 3), keepdims=True) + 4.0
-    flat = ((patches - mean) / contrast).reshape(len(middles), FRAMES * side * side)
-    return np.concatenate([flat, np.log(contrast[:, 0, 0]) - 3.5, np.log(mean[:, 0, 0] + 4.0) - 3.5], 1)
+    views = [np.lib.stride_tricks.sliding_window_view(frame, (side, side), (0, 1)) for frame in small]
+    patches = np.stack([view[middles[:, 0], middles[:, 1]] for view in views], 2).astype(np.float32)
+    mean = patches[:, :, :1].mean((3, 4), keepdims=True)
+    patches -= mean
+    contrast = np.abs(patches).max((2, 3, 4), keepdims=True) + 4.0
+    levels = np.log(np.concatenate([contrast[:, :, 0, 0, 0], mean[:, :, 0, 0, 0] + 4.0], 1)) - 3.5
+    return np.concatenate([(patches / contrast).reshape(len(middles), -1), levels], 1)
 
 
 def find_places(small: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows and columns (n, 2) of where the newest of the quarter-size frames (h, w) differs from both others."""
+    """Rows and columns (n, 2) of where the newest of the quarter-size frames (h, w, 2) differs from both others."""
     change = cv2.blur(cv2.min(cv2.absdiff(small[0], small[1]), cv2.absdiff(small[0], small[2])), (3, 3))
-    least = max(CHANGE[0], CHANGE[1] * int(np.median(change[::4, ::4])))
-    ys, xs = np.nonzero((change == cv2.dilate(change, np.ones((5, 5), np.uint8))) & (change >= least))
+    usual = np.median(change[::4, ::4], axis=(0, 1))
+    least = [max(CHANGE[0], CHANGE[1] * float(value)) for value in usual]
+    grey, red = (cv2.subtract(channel, low) for channel, low in zip(cv2.split(change), least, strict=True))  # type: ignore[call-overload]
+    change = cv2.max(grey, red)
+    ys, xs = np.nonzero((change == cv2.dilate(change, np.ones((5, 5), np.uint8))) & (change > 0))
     order = np.argsort(-change[ys, xs].astype(np.int16), kind="stable")[:CANDIDATES]
     return np.stack([ys[order], xs[order]], 1)
 
@@ -192,12 +208,9 @@ class Detector:
             raise ValueError(
                 f"expected frames of {self._frames[0].shape}, got {frame.shape}; use a detector per camera"
             )
-        half = cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        small = cv2.resize(half, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        pads = (AROUND // 2,) * 4, (PLACE,) * 4
-        half, small = (
-            cv2.copyMakeBorder(x, *pad, cv2.BORDER_REPLICATE) for x, pad in zip((half, small), pads, strict=True)
-        )
+        half, small = shrink(frame)
+        half = cv2.copyMakeBorder(half, *(AROUND // 2,) * 4, cv2.BORDER_REPLICATE)
+        small = cv2.copyMakeBorder(small, *(PLACE,) * 4, cv2.BORDER_REPLICATE)
         self._frames = [frame, *self._frames[: FRAMES - 1]]
         self._half = [half, *self._half[: FRAMES - 1]]
         self._small = [small, *self._small[: FRAMES - 1]]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robot_io.vision import detector as module
-from robot_io.vision.detector import AROUND, CELL, FAR_CELL, describe_places, find_places, read_cells
+from robot_io.vision.detector import AROUND, CELL, FAR_CELL, describe_places, find_places, read_cells, shrink
 
 NONE = -20.0  # a score that excludes
 
@@ -44,20 +44,34 @@ def test_a_ball_that_was_not_there_has_no_velocity():
     assert (said.velocity == 0).all() and said.deviation[0] == module.UNKNOWN_SPEED
 
 
-def test_places_are_where_the_newest_frame_alone_differs():
-    small = [np.full((40, 50), 50, np.uint8) for _ in range(3)]
+def test_places_are_where_the_newest_frame_alone_differs_in_grey_or_in_red():
+    small = [np.full((40, 50, 2), 50, np.uint8) for _ in range(3)]
     for frame, (row, column) in zip(small, ((10, 12), (10, 24), (10, 36)), strict=True):
-        frame[row - 1 : row + 2, column - 1 : column + 2] = 200
-    small[0][30, 30] = small[1][30, 30] = 255  # came a frame ago
-    assert find_places(small).tolist() == [[10, 12]]
+        frame[row - 1 : row + 2, column - 1 : column + 2, 0] = 200
+    small[0][24:27, 29:32, 1] = 150
+    small[0][30, 10] = small[1][30, 10] = 255  # came a frame ago
+    assert find_places(small).tolist() == [[10, 12], [25, 30]]
 
 
 def test_the_description_of_a_place_ignores_offset_and_contrast():
     rng, middles = np.random.default_rng(0), np.array([[6, 7]])
-    frames = [rng.integers(0, 100, (20, 20)).astype(np.uint8) for _ in range(3)]
+    frames = [rng.integers(0, 100, (20, 20, 2)).astype(np.uint8) for _ in range(3)]
     side = slice(6, 6 + 9), slice(7, 7 + 9)
     one = describe_places(frames, middles)[0]
-    contrast = max(np.abs(f[side] - frames[0][side].mean()).max() for f in frames) + 4
-    expected = [(f[side] - frames[0][side].mean()) / contrast for f in frames]
-    np.testing.assert_allclose(one[:-2], np.ravel(expected), atol=1e-5)
-    np.testing.assert_allclose(one[-2:], np.log([contrast, frames[0][side].mean() + 4]) - 3.5, atol=1e-5)
+    expected, levels = [], []
+    for channel in (0, 1):
+        parts = [f[side][..., channel].astype(float) for f in frames]
+        mean = parts[0].mean()
+        contrast = max(np.abs(part - mean).max() for part in parts) + 4
+        expected += [(part - mean) / contrast for part in parts]
+        levels.append((contrast, mean + 4))
+    np.testing.assert_allclose(one[:-4], np.ravel(expected), atol=1e-5)
+    np.testing.assert_allclose(one[-4:], np.log(np.array(levels).T.ravel()) - 3.5, atol=1e-5)
+
+
+def test_a_shrunk_frame_has_grey_and_red():
+    frame = np.zeros((16, 16), np.uint8)
+    frame[::2, ::2], frame[1::2, 1::2] = 200, 100
+    half, small = shrink(frame)
+    assert (half == 75).all() and half.shape == (8, 8)
+    assert (small[..., 0] == 75).all() and (small[..., 1] == 200).all() and small.shape == (4, 4, 2)
