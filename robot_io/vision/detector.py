@@ -1,0 +1,193 @@
+"""Finds balls in Bayer frames, on one core: a search for what moves, and a network in windows.
+
+The search compares quarter-size pictures of the last three frames; a small classifier orders the places that change.
+The network sees the three frames of a window, 64 px in full and 128 px at half resolution. It says of each cell of 4 px
+how likely the ball's centre is in it, where in the cell, with which covariance, and how fast the ball is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnxruntime
+
+from robot_io.vision.detection import Detection
+
+SIZE = 64  # [px] of a window: fine at full, coarse at half resolution
+AROUND = SIZE // 2  # [px] by which the coarse window is larger on each side
+CELL = 4  # [px]
+OUTPUTS = 9  # numbers of a cell
+SPEED_UNIT = 10.0  # [px a frame]
+FRAMES = 3  # that are looked at together
+
+QUARTER = 4  # px of a frame per pixel of the search's pictures
+PLACE = 4  # [quarter px] a place reaches to each side of its middle
+CANDIDATES = 48  # places that the classifier orders
+CHANGE = (4, 3)  # least change of a place [grey levels], and times the median change
+APART = 12.0  # [px] between two balls, or two windows
+
+NETWORK, SEARCH = "ball.onnx", "search.onnx"
+
+
+def describe_places(small: Sequence[np.ndarray], middles: np.ndarray) -> np.ndarray:
+    """Features (n, 245) of places in quarter-size frames, newest first.
+
+    Args:
+        small: FRAMES pictures (h, w) with a border of PLACE pixels.
+        middles: rows and columns (n, 2) without the border.
+
+    Returns:
+        The places' pixels less the newest frame's mean over their largest contrast, that contrast and that mean.
+    """
+    side = 2 * PLACE + 1
+    views = [np.lib.stride_tricks.sliding_window_view(frame, (side, side)) for frame in small]
+    patches = np.stack([view[middles[:, 0], middles[:, 1]] for view in views], 1).astype(np.float32)
+    mean = patches[:, :1].mean((2, 3), keepdims=True)
+    contrast = np.abs(patches - mean).max((1, 2, 3), keepdims=True) + 4.0
+    flat = ((patches - mean) / contrast).reshape(len(middles), FRAMES * side * side)
+    return np.concatenate([flat, np.log(contrast[:, 0, 0]) - 3.5, np.log(mean[:, 0, 0] + 4.0) - 3.5], 1)
+
+
+def find_places(small: Sequence[np.ndarray]) -> np.ndarray:
+    """Rows and columns (n, 2) of where the newest of the quarter-size frames (h, w) differs from both others, most first."""
+    change = cv2.blur(cv2.min(cv2.absdiff(small[0], small[1]), cv2.absdiff(small[0], small[2])), (3, 3))
+    least = max(CHANGE[0], CHANGE[1] * int(np.median(change[::4, ::4])))
+    ys, xs = np.nonzero((change == cv2.dilate(change, np.ones((5, 5), np.uint8))) & (change >= least))
+    order = np.argsort(-change[ys, xs].astype(np.int16), kind="stable")[:CANDIDATES]
+    return np.stack([ys[order], xs[order]], 1)
+
+
+def read_cells(out: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The best ball of each window from what the network says (n, 9, h, w).
+
+    Returns:
+        Probabilities (n,), centres (n, 2) [px of the window], covariances (n, 2, 2) [px^2], velocities (n, 2) and their
+        deviations (n,) [px a frame].
+    """
+    n, _, h, w = out.shape
+    score = out[:, 0].reshape(n, -1)
+    top = np.maximum(score.max(1, keepdims=True), 0.0)
+    weight = np.exp(score - top)
+    share = (weight / (weight.sum(1, keepdims=True) + np.exp(-top))).reshape(n, h, w)
+    best = share.reshape(n, -1).argmax(1)
+    row, column = np.divmod(best, w)
+    padded = np.pad(share, ((0, 0), (1, 1), (1, 1)))
+    near = np.stack([padded[np.arange(n), row + i, column + j] for i in range(3) for j in range(3)]).sum(0)
+    cell = out[np.arange(n), :, row, column]
+    centre = (np.stack([column, row], 1) + 0.5 + cell[:, 1:3]) * CELL - 0.5
+    white = np.zeros((n, 2, 2))
+    white[:, 0, 0], white[:, 1, 0] = np.exp(np.clip(cell[:, 3], -3, 6)), cell[:, 4]
+    white[:, 1, 1] = np.exp(np.clip(cell[:, 5], -3, 6))
+    root = np.linalg.inv(white) * CELL
+    deviation = np.exp(np.clip(cell[:, 8], -4, 3)) * SPEED_UNIT
+    return near, centre, root @ root.transpose(0, 2, 1), cell[:, 6:8] * SPEED_UNIT, deviation
+
+
+class Detector:
+    """Of one camera; sees its frames one after the other.
+
+    Args:
+        folder: where the network and the search's classifier are.
+        rate: frames a second [Hz].
+        most: windows that the search may fill.
+        threshold: least probability of what is reported.
+    """
+
+    def __init__(self, folder: str | Path, rate: float = 125.0, most: int = 5, threshold: float = 0.5) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        self._network, self._order = (
+            onnxruntime.InferenceSession(str(Path(folder) / name), options, providers=["CPUExecutionProvider"])
+            for name in (NETWORK, SEARCH)
+        )
+        self.rate, self.most, self.threshold = rate, most, threshold
+        self._frames: list[np.ndarray] = []
+        self._half: list[np.ndarray] = []
+        self._small: list[np.ndarray] = []
+        self._expected: list[np.ndarray] = []
+
+    def forget(self) -> None:
+        """Begins anew, as after frames were lost."""
+        self._frames, self._half, self._small, self._expected = [], [], [], []
+
+    def detect(self, frame: np.ndarray, guesses: Sequence[np.ndarray] = (), search: bool = True) -> list[Detection]:
+        """Balls in a frame, the surest first; none in the first two frames.
+
+        Args:
+            frame: (h, w) uint8, RGGB; no copy is made, so it must not be overwritten for three frames.
+            guesses: pixels (2,) where a ball is expected.
+            search: also look where the picture changes; else only at the guesses.
+
+        Raises:
+            ValueError: the frame is no such array, or of another size than the last one.
+        """
+        self._push(frame)
+        if len(self._frames) < FRAMES:
+            return []
+        middles: list[np.ndarray] = []
+        extent = np.array(frame.shape[::-1])
+        for middle in [*guesses, *(self._expected if search else ()), *(self._search() if search else ())]:
+            inside = (middle > -APART).all() and (middle < extent + APART).all()
+            if inside and all(np.abs(middle - other).max() > APART for other in middles):
+                middles.append(middle)
+        found = self._look(middles) if middles else []
+        self._expected = [d.centre + d.velocity / self.rate for d in found[:2]]
+        return found
+
+    def _push(self, frame: np.ndarray) -> None:
+        if frame.ndim != 2 or frame.dtype != np.uint8 or frame.shape[0] % QUARTER or frame.shape[1] % QUARTER:
+            raise ValueError(
+                f"expected a frame (height, width) of uint8 with sides that {QUARTER} divides, got {frame.dtype} "
+                f"{frame.shape}; give the raw Bayer frame"
+            )
+        if self._frames and frame.shape != self._frames[0].shape:
+            raise ValueError(f"expected frames of {self._frames[0].shape}, got {frame.shape}; use a detector per camera")
+        half = cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        small = cv2.resize(half, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        pads = (AROUND // 2,) * 4, (PLACE,) * 4
+        half, small = (
+            cv2.copyMakeBorder(x, *pad, cv2.BORDER_REPLICATE) for x, pad in zip((half, small), pads, strict=True)
+        )
+        self._frames = [frame, *self._frames[: FRAMES - 1]]
+        self._half = [half, *self._half[: FRAMES - 1]]
+        self._small = [small, *self._small[: FRAMES - 1]]
+
+    def _search(self) -> list[np.ndarray]:
+        """Middles [px] of the places that are most like a ball that flies."""
+        places = find_places([frame[PLACE:-PLACE, PLACE:-PLACE] for frame in self._small])
+        if not len(places):
+            return []
+        score = self._order.run(None, {"places": describe_places(self._small, places)})[0]
+        chosen: list[np.ndarray] = []
+        for k in np.argsort(-score):
+            middle = places[k, ::-1] * float(QUARTER) + (QUARTER - 1) / 2
+            if all(np.abs(middle - other).max() > APART for other in chosen):
+                chosen.append(middle)
+            if len(chosen) == self.most:
+                break
+        return chosen
+
+    def _look(self, middles: Sequence[np.ndarray]) -> list[Detection]:
+        height, width = self._frames[0].shape
+        corners = np.round((np.stack(middles) - (SIZE - 1) / 2) / 2).astype(int) * 2
+        corners = np.clip(corners, 0, [width - SIZE, height - SIZE])
+        fine = np.empty((len(corners), FRAMES, SIZE, SIZE), np.uint8)
+        coarse = np.empty_like(fine)
+        for i, (u, v) in enumerate(corners):
+            for t in range(FRAMES):
+                fine[i, t] = self._frames[t][v : v + SIZE, u : u + SIZE]
+                coarse[i, t] = self._half[t][v // 2 : v // 2 + SIZE, u // 2 : u // 2 + SIZE]
+        out = self._network.run(None, {"fine": fine, "coarse": coarse})[0]
+        probability, centre, covariance, velocity, deviation = read_cells(out)
+        kept: list[Detection] = []
+        for k in np.argsort(-probability):
+            spot = centre[k] + corners[k]
+            if probability[k] < self.threshold:
+                break
+            if all(np.abs(spot - other.centre).max() > APART for other in kept):
+                speed, spread = velocity[k] * self.rate, float(deviation[k] * self.rate)
+                kept.append(Detection(spot, covariance[k], speed, spread, float(probability[k])))
+        return kept
