@@ -190,7 +190,9 @@ def evaluate(
     clip: Annotated[str | None, Parameter("CLIP", help="a video file or a recording; none: rendered flights")] = None,
     /,
     *,
-    labels: Annotated[str | None, option("CSV", "frame,x,y of the clip's balls, or what TTNet, BlurBall, TT3D have")] = None,
+    labels: Annotated[
+        str | None, option("CSV", "frame,x,y of the clip's balls, or what TTNet, BlurBall, TT3D have")
+    ] = None,
     detector: Detector = None,
     within: Annotated[float, option("PX", "distance from a label that counts as found (default: 10)")] = 10.0,
     camera: CameraName = None,

@@ -17,7 +17,12 @@ from experiments.vision.render import mosaic
 from robot_io.vision.detector import QUARTER
 from robot_io.vision.recording import FrameReader
 
-NAMES = {"frame": ("frame", "img", "image", "frame_id"), "x": ("x", "u"), "y": ("y", "v"), "visibility": ("visibility", "visible")}
+NAMES = {
+    "frame": ("frame", "img", "image", "frame_id"),
+    "x": ("x", "u"),
+    "y": ("y", "v"),
+    "visibility": ("visibility", "visible"),
+}
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,9 @@ def open_clip(path: str | os.PathLike, camera: str | None = None) -> Clip:
         with av.open(str(path)) as file:
             rate = file.streams.video[0].average_rate
     except (av.error.FFmpegError, IndexError) as error:
-        raise ConfigError(f"{path}: expected a video file or a recording (.mcap), got something else: {error}") from None
+        raise ConfigError(
+            f"{path}: expected a video file or a recording (.mcap), got something else: {error}"
+        ) from None
     return Clip(path, float(rate or 25.0))
 
 

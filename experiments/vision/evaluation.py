@@ -67,10 +67,14 @@ class Sights:
             chosen = (self.speed >= low) & (self.speed < high)
             if chosen.any():
                 half, most = np.percentile(np.linalg.norm(self.speed_error[chosen], axis=1), [50, 90])
-                lines.append(f"velocity error at {low} to {high} px a frame, 50 / 90 %: {half:.2f} / {most:.2f} px a frame")
+                lines.append(
+                    f"velocity error at {low} to {high} px a frame, 50 / 90 %: {half:.2f} / {most:.2f} px a frame"
+                )
         if len(self.acquired):
             shares = [(self.acquired <= limit + 1e-9).mean() for limit in (0.0, 0.008, 0.024, 0.12)]
-            lines.append("acquired by all cameras within 0 / 8 / 24 / 120 ms: " + " / ".join(f"{s:.3f}" for s in shares))
+            lines.append(
+                "acquired by all cameras within 0 / 8 / 24 / 120 ms: " + " / ".join(f"{s:.3f}" for s in shares)
+            )
         lines.append(f"{1e3 * self.seconds:.2f} ms of a core a frame")
         return lines
 

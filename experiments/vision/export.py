@@ -44,7 +44,11 @@ class _Graph:
         span = dilation * (kernel.shape[0] - 1)
         low = (span - stride + 1) // 2 if stride > 1 else span // 2
         high = span - (stride - 1) - low
-        inputs = [x, self.constant(f"{name}/kernel", kernel.transpose(3, 2, 0, 1)), self.constant(f"{name}/bias", np.asarray(layer["bias"]))]
+        inputs = [
+            x,
+            self.constant(f"{name}/kernel", kernel.transpose(3, 2, 0, 1)),
+            self.constant(f"{name}/bias", np.asarray(layer["bias"])),
+        ]
         return self.add(
             "Conv", inputs, name, dilations=[dilation] * 2, strides=[stride] * 2, pads=[low, low, high, high]
         )  # fmt: skip
@@ -74,11 +78,21 @@ def export_network(path: Path, params: Weights) -> None:
     for k, dilation in enumerate(network.COARSE_BLOCKS):
         far = g.add("Add", [far, relu(g.convolve(far, f"far{k}", params[f"coarse{k}"], dilation))], f"far{k}/sum")
     quarter = SIZE // 16
-    ends = [g.constant(n, np.array(v, np.int64)) for n, v in (("starts", [quarter] * 2), ("ends", [3 * quarter] * 2), ("axes", [2, 3]))]
+    ends = [
+        g.constant(n, np.array(v, np.int64))
+        for n, v in (("starts", [quarter] * 2), ("ends", [3 * quarter] * 2), ("axes", [2, 3]))
+    ]
     far = g.add("Slice", [far, *ends], "far/middle")
     far = g.convolve(far, "far/join", params["join"])
     scales = g.constant("scales", np.array([1, 1, 2, 2], np.float32))
-    far = g.add("Resize", [far, "", scales], "far/wide", mode="nearest", coordinate_transformation_mode="asymmetric", nearest_mode="floor")
+    far = g.add(
+        "Resize",
+        [far, "", scales],
+        "far/wide",
+        mode="nearest",
+        coordinate_transformation_mode="asymmetric",
+        nearest_mode="floor",
+    )
     x = relu(g.convolve(prepare("fine"), "fine0/first", params["fine"], stride=2))
     for k, dilation in enumerate(network.BLOCKS):
         if k == 1:
@@ -97,11 +111,23 @@ def export_search(path: Path, layers: Weights) -> None:
     """Writes the classifier of places: features (n, 245) to scores (n,), the logarithm of the odds of a ball."""
     g, x = _Graph(), "places"
     for name in ("first", "second"):
-        x = g.add("Gemm", [x, g.constant(f"{name}/kernel", np.asarray(layers[name]["kernel"])), g.constant(f"{name}/bias", np.asarray(layers[name]["bias"]))], name)
+        x = g.add(
+            "Gemm",
+            [
+                x,
+                g.constant(f"{name}/kernel", np.asarray(layers[name]["kernel"])),
+                g.constant(f"{name}/bias", np.asarray(layers[name]["bias"])),
+            ],
+            name,
+        )
         x = g.add("Relu", [x], f"{name}/relu") if name == "first" else x
     out = g.add("Squeeze", [x, g.constant("last", np.array([1], np.int64))], "score")
     size = FRAMES * (2 * PLACE + 1) ** 2 + 2
-    g.save(path, [helper.make_tensor_value_info("places", TensorProto.FLOAT, ["n", size])], [helper.make_tensor_value_info(out, TensorProto.FLOAT, ["n"])])
+    g.save(
+        path,
+        [helper.make_tensor_value_info("places", TensorProto.FLOAT, ["n", size])],
+        [helper.make_tensor_value_info(out, TensorProto.FLOAT, ["n"])],
+    )
 
 
 def export(folder: Path, params: Weights, search: Weights, crops: Crops) -> float:
@@ -114,7 +140,9 @@ def export(folder: Path, params: Weights, search: Weights, crops: Crops) -> floa
     export_search(folder / SEARCH, search)
     fine, coarse = crops.fine[:GOLDEN_COUNT], crops.coarse[:GOLDEN_COUNT]
     said = np.asarray(network.apply(params, fine, coarse)).transpose(0, 3, 1, 2)
-    np.savez_compressed(folder / GOLDEN, fine=fine, coarse=coarse, out=said.astype(np.float32), labels=crops.labels[:GOLDEN_COUNT])
+    np.savez_compressed(
+        folder / GOLDEN, fine=fine, coarse=coarse, out=said.astype(np.float32), labels=crops.labels[:GOLDEN_COUNT]
+    )
     worst = check_golden(folder)
     if worst > AGREEMENT:
         raise ValueError(f"expected ONNX to agree with JAX to {AGREEMENT:g}, got {worst:.2g}; the export is wrong")

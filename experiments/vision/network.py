@@ -35,7 +35,9 @@ class BallNetwork(nn.Module):
     """The fine part sees the window in full, the coarse one twice as far around at half resolution."""
 
     @nn.compact
-    def __call__(self, fine: Float[Array, "n 32 32 12"], coarse: Float[Array, "n 32 32 12"]) -> Float[Array, "n 16 16 9"]:
+    def __call__(
+        self, fine: Float[Array, "n 32 32 12"], coarse: Float[Array, "n 32 32 12"]
+    ) -> Float[Array, "n 16 16 9"]:
         """Packed crops to what every cell says."""
         far = nn.relu(nn.Conv(COARSE_WIDTH, (3, 3), strides=2, name="coarse")(jnp.sqrt(coarse + DARK)))
         for k, dilation in enumerate(COARSE_BLOCKS):

@@ -111,7 +111,9 @@ def _tell(note: Callable[[str], object]) -> Callable[[int, float, Any], object]:
 def _say(params: Any, crops: Crops) -> tuple[np.ndarray, ...]:
     """What the network says of crops: probability, centre, covariance, velocity, deviation (see ``read_cells``)."""
     said = [
-        read_cells(np.asarray(network.apply(params, crops.fine[i : i + 200], crops.coarse[i : i + 200])).transpose(0, 3, 1, 2))
+        read_cells(
+            np.asarray(network.apply(params, crops.fine[i : i + 200], crops.coarse[i : i + 200])).transpose(0, 3, 1, 2)
+        )
         for i in range(0, len(crops), 200)
     ]
     return tuple(np.concatenate(parts) for parts in zip(*said, strict=True))

@@ -120,7 +120,9 @@ def _draw_surroundings(image: np.ndarray, camera: Camera, rng: np.random.Generat
             ((u, far + 1, v), (-far, u, v), (far, u, v))[side]
             for u, v in ((a, z), (a + w, z), (a + w, z + h), (a, z + h))
         ]
-        draw_polygon(image, camera, corners, rng.uniform(0, 255, 3) if rng.random() < 0.7 else [rng.uniform(150, 255)] * 3)
+        draw_polygon(
+            image, camera, corners, rng.uniform(0, 255, 3) if rng.random() < 0.7 else [rng.uniform(150, 255)] * 3
+        )
     floor, end = rng.uniform(20, 140, 3), -c.TABLE_HEIGHT
     draw_polygon(image, camera, [(-far, -2.2, end), (far, -2.2, end), (far, 6, end), (-far, 6, end)], floor)
     for _ in range(rng.integers(0, 5)):
@@ -202,20 +204,33 @@ class Actors:
             length = way / np.linalg.norm(way) * radius * rng.uniform(2.5, 9)  # longer than any ball's streak is wide
             colour = (ORANGE, WHITE, self.skin)[rng.integers(3)] if rng.random() < 0.5 else rng.uniform(0, 255, 3)
             middle = rng.uniform([-1.0, -1.6, -0.1], [1.0, 2.0, 0.8])
-            self.things.append((middle, length, radius, colour, rng.uniform(0.05, 0.5, 3), rng.uniform(2, 14), rng.uniform(0, 6.3, 3)))
+            self.things.append(
+                (middle, length, radius, colour, rng.uniform(0.05, 0.5, 3), rng.uniform(2, 14), rng.uniform(0, 6.3, 3))
+            )
 
     def capsules(self, time: float, ball: np.ndarray | None) -> list[Capsule]:
         """All shapes at a time [s]; the paddles follow a ball (3,) [m] that is near."""
         swing = np.sin(self.pace * time + self.phase)
+        wrist = np.array([-self.at + 0.4 * swing[3], -1.75 + 0.1 * swing[1], 0.25 + 0.15 * swing[0]])
+        if ball is not None and ball[1] < -1.2:
+            wrist = wrist + (ball - [0, 0.09, 0] - wrist) * min(1.0, (-1.2 - ball[1]) / 0.3)
+        elbow, base = wrist - [0, 0.25, -0.15], np.array([0.2, -2.3, 0.3])
+        return [
+            *self.person(time, ball),
+            Capsule(base, elbow, 0.07, self.robot),
+            Capsule(elbow, wrist, 0.045, self.robot),
+            Capsule(wrist, wrist + [0.02, 0, 0.03], 0.075, np.full(3, 20.0)),
+        ]
+
+    def person(self, time: float, ball: np.ndarray | None) -> list[Capsule]:
+        """The same without the robot."""
+        swing = np.sin(self.pace * time + self.phase)
         x, y = self.at + 0.25 * swing[0], self.far + 0.1 * swing[1]
         hip, neck, head = np.array([(x, y, 0.1), (x, y - 0.1, 0.62), (x, y - 0.12, 0.82)])
         hand = np.array([x + 0.35 + 0.25 * swing[2], y - 0.45 + 0.2 * swing[3], 0.25 + 0.2 * swing[2]])
-        wrist = np.array([-self.at + 0.4 * swing[3], -1.75 + 0.1 * swing[1], 0.25 + 0.15 * swing[0]])
         if ball is not None and ball[1] > self.far - 0.9:
             hand = hand + (ball + [0, 0.08, 0] - hand) * min(1.0, (ball[1] - self.far + 0.9) / 0.5)
-        if ball is not None and ball[1] < -1.2:
-            wrist = wrist + (ball - [0, 0.09, 0] - wrist) * min(1.0, (-1.2 - ball[1]) / 0.3)
-        shoulder, elbow, base = np.array([x + 0.2, y - 0.1, 0.55]), wrist - [0, 0.25, -0.15], np.array([0.2, -2.3, 0.3])
+        shoulder = np.array([x + 0.2, y - 0.1, 0.55])
         blade, left = np.array([0.02, 0, 0.03]), np.array([x - 0.22, y - 0.1, 0.55])
         shapes = [
             Capsule(np.array((x - 0.1, y, -0.7)), hip, 0.09, self.trousers),
@@ -226,9 +241,6 @@ class Actors:
             Capsule(left, left + [-0.1 * swing[0], -0.3, -0.25 + 0.15 * swing[3]], 0.04, self.skin),
             Capsule(shoulder, hand, 0.045, self.skin),
             Capsule(hand, hand + blade, 0.075, self.rubber),
-            Capsule(base, elbow, 0.07, self.robot),
-            Capsule(elbow, wrist, 0.045, self.robot),
-            Capsule(wrist, wrist + blade, 0.075, np.full(3, 20.0)),
         ]
         for (u, v), wide, radius, colour in self.logos:
             spot = np.array([x + u, y - 0.27, v])
@@ -274,7 +286,9 @@ def render(
         depths, pixels = camera.depth(ends), camera.project(ends)
         for shape, depth, pair in zip(shapes, depths, pixels, strict=True):
             if depth.min() > NEAREST:
-                ordered.append((float(depth.mean()), pair - origin, camera.matrix[0, 0] * shape.radius / depth.mean(), shape))
+                ordered.append(
+                    (float(depth.mean()), pair - origin, camera.matrix[0, 0] * shape.radius / depth.mean(), shape)
+                )
     ordered.sort(key=lambda s: -s[0])
     seen, patch = 0.0, None
     for depth, pair, radius, shape in [*ordered, (-2.0, None, 0.0, None)]:
@@ -300,7 +314,10 @@ def render(
         bayer, deviation = bayer.copy(), deviation.copy()
     still = scene.image[view]
     for rows, columns in drawn:
-        box = (slice(rows.start // 2 * 2, (rows.stop + 1) // 2 * 2), slice(columns.start // 2 * 2, (columns.stop + 1) // 2 * 2))
+        box = (
+            slice(rows.start // 2 * 2, (rows.stop + 1) // 2 * 2),
+            slice(columns.start // 2 * 2, (columns.stop + 1) // 2 * 2),
+        )
         bayer[box] = mosaic(image[box])
         deviation[box] = cv2.LUT(bayer[box], table)
     for box in drawn:
@@ -323,7 +340,10 @@ def _draw_shadow(scene: Scene, image: np.ndarray, ball: np.ndarray, origin: np.n
     if abs(ball[0]) > c.TABLE_WIDTH / 2 or abs(ball[1]) > c.TABLE_LENGTH / 2 or ball[2] < 0:
         return None
     foot = np.array([ball[0], ball[1], 0.0])
-    spot, radius = scene.camera.project(foot) - origin, scene.camera.matrix[0, 0] * c.BALL_RADIUS / scene.camera.depth(foot)
+    spot, radius = (
+        scene.camera.project(foot) - origin,
+        scene.camera.matrix[0, 0] * c.BALL_RADIUS / scene.camera.depth(foot),
+    )
     box = _clip_box(spot - 2 * radius - 3, spot + 2 * radius + 3, image.shape[1], image.shape[0])
     if box is not None:
         ys, xs = np.mgrid[box]
@@ -337,7 +357,10 @@ def _draw_ball(
 ) -> tuple[float, tuple[slice, slice] | None]:
     """Draws the exposure's streak; share of it that the net and the picture's edge leave, and the box it covers."""
     camera = scene.camera
-    pixels, radius = camera.project(places) - origin, float(camera.matrix[0, 0] * c.BALL_RADIUS / camera.depth(places).mean())
+    pixels, radius = (
+        camera.project(places) - origin,
+        float(camera.matrix[0, 0] * c.BALL_RADIUS / camera.depth(places).mean()),
+    )
     low, high = pixels.min(0) - radius - 3, pixels.max(0) + radius + 3
     box = _clip_box(low, high, image.shape[1], image.shape[0])
     if box is None:
@@ -359,7 +382,9 @@ def _draw_ball(
         hidden = float((veil * cover).sum() / max(cover.sum(), 1e-9))
         cover, shade = cover * (1 - veil), shade * (1 - veil)
     patch = image[box]
-    image[box] = np.clip(patch * (1 - cover[..., None]) + (shade[..., None] * 1.1) * scene.ball, 0, 255).astype(np.uint8)
+    image[box] = np.clip(patch * (1 - cover[..., None]) + (shade[..., None] * 1.1) * scene.ball, 0, 255).astype(
+        np.uint8
+    )
     cut = (inside.max(0) > 0.5).sum() / whole
     return (1.0 - hidden) * (min(1.0, cut) if cut < 0.9 else 1.0), box
 

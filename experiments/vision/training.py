@@ -25,7 +25,9 @@ def augment(frames: Crops, rng: np.random.Generator) -> Crops:
     n = len(frames)
     row = (n, 1, 1, 1)
     gamma = np.exp(rng.uniform(-0.9, 0.3, row)).astype(np.float32)
-    factor = np.exp(rng.normal(0, 0.25, row) + rng.normal(0, 0.04, (n, 1, 1, 3)) * (rng.random(row) < 0.4)).astype(np.float32)
+    factor = np.exp(rng.normal(0, 0.25, row) + rng.normal(0, 0.04, (n, 1, 1, 3)) * (rng.random(row) < 0.4)).astype(
+        np.float32
+    )
     red, blue = np.exp(rng.normal(0, 0.15, (2, *row))).astype(np.float32)
     level, strong = rng.uniform(0, 0.015, row).astype(np.float32), rng.random(n) < 0.25
     labels, mirrored = frames.labels.copy(), rng.random(n) < 0.5

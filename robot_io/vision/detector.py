@@ -144,7 +144,9 @@ class Detector:
                 f"{frame.shape}; give the raw Bayer frame"
             )
         if self._frames and frame.shape != self._frames[0].shape:
-            raise ValueError(f"expected frames of {self._frames[0].shape}, got {frame.shape}; use a detector per camera")
+            raise ValueError(
+                f"expected frames of {self._frames[0].shape}, got {frame.shape}; use a detector per camera"
+            )
         half = cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         small = cv2.resize(half, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         pads = (AROUND // 2,) * 4, (PLACE,) * 4

@@ -48,7 +48,9 @@ def decompress_frame(data: bytes, width: int, height: int) -> np.ndarray:
     try:
         raw = zstandard.ZstdDecompressor().decompress(data, max_output_size=width * height)
     except zstandard.ZstdError as error:
-        raise ValueError(f"expected a compressed frame, got {len(data)} other bytes ({error}); record it again") from None
+        raise ValueError(
+            f"expected a compressed frame, got {len(data)} other bytes ({error}); record it again"
+        ) from None
     if len(raw) != width * height:
         raise ValueError(f"expected a frame of {width} x {height} bytes, got {len(raw)}; record it again")
     delta = np.frombuffer(raw, np.uint8).reshape(2, 2, height // 2, width // 2)

@@ -158,9 +158,7 @@ class BallTracker:
             return np.inf
         return float(residual @ np.linalg.solve(slope @ h.ball.covariance @ slope.T + noise, residual))
 
-    def _seen(
-        self, h: Hypothesis, camera: Camera, detection: Detection
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _seen(self, h: Hypothesis, camera: Camera, detection: Detection) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         slope = np.zeros((2, 9))
         slope[:, :3] = camera.jacobian(h.ball.mean[:3])
         noise = detection.covariance + self.options.floor**2 * np.eye(2)
