@@ -29,10 +29,11 @@ class TrackerOptions:
     floor      [px] deviation that calibration and lens add to every detection's
     agree      squared deviation up to which two cameras see the same
     gate       the same of a pixel, and ``gate_space`` of a place, against a prediction
-    sure       probability of the detections that begin a hypothesis
+    sure       probability of the detections that begin a hypothesis; ``struck`` of those where the ball was just lost
     fast       [m/s] from which on ``hits`` places make a ball; slower ones need ``slow_hits``
-    slowest    [m/s] below which nothing is a new ball: a ball that lies, a logo, a lamp
-    forget     [s] without a sight after which the reported ball is given up; ``drop`` of any other hypothesis
+    slowest    [m/s] below which nothing is a new ball: a hand, a ball that lies, a lamp
+    forget     [s] without a place after which the reported ball is given up; ``drop`` of any other hypothesis
+    alone      [s] without a place up to which one camera's sights are enough to report it as seen
     reach      [m/s] within which a struck ball leaves
     most       hypotheses that are kept
     """
@@ -42,24 +43,32 @@ class TrackerOptions:
     gate: float = 16.0
     gate_space: float = 21.0
     sure: float = 0.8
-    fast: float = 2.0
+    struck: float = 0.5
+    fast: float = 2.5
     hits: int = 3
-    slow_hits: int = 8
-    slowest: float = 0.5
+    slow_hits: int = 10
+    slowest: float = 1.5
     forget: float = 0.1
     drop: float = 0.025
+    alone: float = 0.05
     reach: float = 20.0
     most: int = 4
 
 
 @dataclass(eq=False)
 class Hypothesis:
-    """A ball that may be one: its filter at ``time`` [s], sights so far, and when it was last seen and began."""
+    """A ball that may be one.
+
+    ball    its filter at ``time`` [s]
+    begun   [s], when it was last seen by a camera, and when last placed by two
+    hits    places so far
+    """
 
     ball: Kalman
     time: float
-    seen: float
     begun: float
+    seen: float
+    placed: float
     hits: int = 1
 
     @property
@@ -119,7 +128,8 @@ class BallTracker:
         if h is None:
             return None
         mean, covariance = h.ball.mean, h.ball.covariance[:6, :6]
-        return TrackedBall(self.number, mean[:3].copy(), mean[3:6].copy(), covariance.copy(), h.seen == time)
+        seen = h.seen == time and time - h.placed <= self.options.alone
+        return TrackedBall(self.number, mean[:3].copy(), mean[3:6].copy(), covariance.copy(), seen)
 
     def _find_sights(self, detections: Sequence[Sequence[Detection]]) -> list[Sight]:
         found = []
@@ -138,7 +148,7 @@ class BallTracker:
             sight = free.pop(fits[0][1])
             for camera, detection in zip(self.cameras, sight.detections, strict=False):
                 self._take(h, camera, detection, np.inf)
-            h.hits, h.seen = h.hits + 1, h.time
+            h.hits, h.seen, h.placed = h.hits + 1, h.time, h.time
             return
         if any(np.linalg.norm(sight.point - h.ball.mean[:3]) < 0.3 for sight in free):
             return  # both cameras see it elsewhere
@@ -178,14 +188,15 @@ class BallTracker:
         """Hypotheses of places that none explains; where the reported ball was just lost, it is its stroke."""
         options, old = self.options, self.reported
         for sight in sorted(free, key=lambda s: -s.probability):
-            if sight.probability < options.sure:
+            struck = old is not None and old is self.reported and 0.0 < time - old.placed <= options.drop
+            if struck and old is not None:
+                away = float(np.linalg.norm(sight.point - old.ball.mean[:3]))
+                struck = away < 0.03 + options.reach * (time - old.placed)
+            if sight.probability < (options.struck if struck else options.sure):
                 continue
             new = self._start(time, sight)
             self.hypotheses.append(new)
-            if old is None or old.seen == time or old is not self.reported:
-                continue
-            if np.linalg.norm(sight.point - old.ball.mean[:3]) < 0.03 + options.reach * (time - old.seen):
-                self.hypotheses.remove(old)
+            if struck:
                 self.reported, self.number = new, self.number + 1
 
     def _start(self, time: float, sight: Sight) -> Hypothesis:
@@ -198,7 +209,7 @@ class BallTracker:
         covariance[:3, :3], covariance[3:6, 3:6] = sight.covariance, spread + 0.3**2 * np.eye(3)
         covariance[6:, 6:] = 100.0**2 * np.eye(3)
         ball = Kalman(np.concatenate([sight.point, velocity, np.zeros(3)]), covariance, self.physics)
-        return Hypothesis(ball, time, time, time)
+        return Hypothesis(ball, time, time, time, time)
 
     def _choose(self, time: float) -> None:
         """Drops what is seen no more, and reports the likeliest."""
@@ -206,12 +217,12 @@ class BallTracker:
         self.hypotheses = [
             h
             for h in self.hypotheses
-            if time - h.seen <= (options.forget if h is self.reported else options.drop) + 1e-9
+            if time - h.placed <= (options.forget if h is self.reported else options.drop) + 1e-9
         ]
         if self.reported not in self.hypotheses:
             self.reported = None
         others = [h for h in self.hypotheses if h is not self.reported and self._is_ball(h)]
-        lost = self.reported is None or time - self.reported.seen > options.drop
+        lost = self.reported is None or time - self.reported.placed > options.drop
         if lost and others:
             self.reported, self.number = max(others, key=lambda h: (h.hits, h.speed)), self.number + 1
         order = sorted(self.hypotheses, key=lambda h: (h is not self.reported, -h.hits, h.begun))
