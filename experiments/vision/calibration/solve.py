@@ -29,7 +29,7 @@ SKEW = 0.005  # [s]
 DRAG = 0.03  # [1/m]
 STATE = np.array([0.05] * 3 + [0.3] * 3 + [60.0] * 3)  # deviations of flights' states from their first guess
 DETERMINED = 0.5  # share of a prior's deviation that the data must at least leave
-FEWEST_SIDES, FEWEST_POINTS = 3, 60
+FEWEST_SIDES, FEWEST_POINTS, FEWEST_FLIGHTS = 3, 60, 3
 LARGEST_RESIDUAL = 1.5  # [px] root mean square
 
 
@@ -130,30 +130,33 @@ def fit_rig(rig: CameraRig, edges: Sequence[Edges], flights: Sequence[Flight], b
     Raises:
         ValueError: the flights do not fit, or too few of them are given.
     """
-    if 0 < len(flights) < 3:
+    if 0 < len(flights) < FEWEST_FLIGHTS:
         raise ValueError(
-            f"expected at least 3 free flights that two cameras see, got {len(flights)}; record more balls"
+            f"expected at least {FEWEST_FLIGHTS} free flights that two cameras see, got {len(flights)}; record more balls"
         )
-    count = len(rig.cameras)
     problem = _Problem(rig, tuple(edges), tuple(flights), bumped)
-    x = problem.start
-    solved = least_squares(problem.residuals, x, x_scale="jac", loss="soft_l1", f_scale=3.0, max_nfev=30)
-    # The Jacobian of the robust cost is scaled; its normal matrix holds the priors, which are residuals too.
-    covariance = np.linalg.pinv(solved.jac.T @ solved.jac)
-    scale = problem.scale
-    deviation = np.sqrt(np.diag(covariance)) * scale
-    cameras, delays, drag, _ = problem.parts(solved.x)
+    x, jacobian = problem.solve()
+    if flights:
+        rms = problem.misfits(x)
+        keep = rms <= max(1.0, 3.0 * float(np.median(rms)))  # the net, a hand, or another ball
+        if not keep.all() and keep.sum() >= FEWEST_FLIGHTS:
+            flights = [flight for flight, kept in zip(flights, keep, strict=True) if kept]
+            problem = _Problem(rig, tuple(edges), tuple(flights), bumped)
+            x, jacobian = problem.solve()
+    # The normal matrix holds the priors, which are residuals too.
+    deviation = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))) * problem.scale
+    cameras, delays, drag, _ = problem.parts(x)
     deviations, undetermined = {}, []
     for k, value in enumerate(problem.free):
-        name, prior = problem.names[value], problem.prior[value]
-        deviations[name] = float(deviation[k])
-        if deviation[k] > DETERMINED * prior:
-            undetermined.append(name)
+        deviations[problem.names[value]] = float(deviation[k])
+        if deviation[k] > DETERMINED * problem.prior[value]:
+            undetermined.append(problem.names[value])
     residuals = []
-    for i in range(count):
-        away = [edges[i].residuals(cameras[i])]
+    away_all = problem.away(x)
+    for i, camera in enumerate(cameras):
+        away = [edges[i].residuals(camera)]
         if flights:
-            away.append(problem.away(solved.x, i).ravel())
+            away.append(away_all[i].ravel())
         each = np.concatenate(away)
         residuals.append(float(np.sqrt(np.nanmean(np.minimum(each**2, 9.0)))))
     if max(residuals) > LARGEST_RESIDUAL:
@@ -200,27 +203,64 @@ class _Problem:
         states = self._first + (x[len(self.free) :].reshape(-1, 9) * STATE).T
         return cameras, delays, PHYSICS.drag + float(change[-1]), states
 
+    def solve(self) -> tuple[np.ndarray, np.ndarray]:
+        """Solution and Jacobian, heavy tails taken lightly."""
+        found = least_squares(
+            self.residuals, self.start, self.jacobian, x_scale="jac", loss="soft_l1", f_scale=3.0, max_nfev=40
+        )
+        return found.x, self.jacobian(found.x)
+
     def residuals(self, x: np.ndarray) -> np.ndarray:
-        """All, over their deviations."""
+        """All, over their deviations; those of flights last, flight by flight."""
         cameras = self.parts(x)[0]
         out = [np.nan_to_num(e.residuals(c), nan=1e3) / EDGE for e, c in zip(self._edges, cameras, strict=True)]
         out.append(x[: len(self.free)] * self._unit[self.free] / self.prior[self.free])
         if self._flights:
-            out += [np.nan_to_num(self.away(x, i)).ravel() / PIXEL for i in range(len(cameras))]
-            out.append((x[len(self.free) :].reshape(-1, 9)[:, 6:]).ravel())
+            away = np.nan_to_num(self.away(x)).transpose(1, 0, 2, 3).reshape(len(self._flights), -1) / PIXEL
+            out.append(np.concatenate([away, x[len(self.free) :].reshape(-1, 9)], 1).ravel())
         return np.concatenate(out)
 
-    def away(self, x: np.ndarray, camera: int) -> np.ndarray:
-        """Flights' projections less what a camera saw (flights, n, 2) [px]; NaN where it saw nothing."""
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """By differences; the flights' states, each of which moves only its own flight, all at once."""
+        base, small, own, count = self.residuals(x), 1e-5, len(self.free), len(self._flights)
+        out = np.zeros((len(base), len(x)))
+        for i in range(own):
+            moved = x.copy()
+            moved[i] += small
+            out[:, i] = (self.residuals(moved) - base) / small
+        rows = (len(base) - self._shared) // max(count, 1)
+        for j in range(9 if count else 0):
+            moved = x.copy()
+            moved[own + j :: 9] += small
+            change = (self.residuals(moved) - base) / small
+            for k in range(count):
+                part = slice(self._shared + k * rows, self._shared + (k + 1) * rows)
+                out[part, own + 9 * k + j] = change[part]
+        return out
+
+    @property
+    def _shared(self) -> int:
+        """Residuals that belong to no flight."""
+        return sum(len(e.points) for e in self._edges) + len(self.free)
+
+    def misfits(self, x: np.ndarray) -> np.ndarray:
+        """Root mean square [px] of each flight (flights,)."""
+        return np.sqrt(np.nanmean(self.away(x) ** 2, axis=(0, 2, 3)))
+
+    def away(self, x: np.ndarray) -> np.ndarray:
+        """Flights' projections less what each camera saw (cameras, flights, n, 2) [px]; NaN where it saw nothing."""
         cameras, delays, drag, states = self.parts(x)
-        physics = replace(PHYSICS, drag=drag)
-        # A stamp t of this camera was taken at t + its delay; the tracks' times have the rig's present delays in them.
-        late = delays[camera] - self._rig.delays[camera]
-        out = np.full((len(self._flights), self._longest, 2), np.nan)
-        places = fly(states, self._flights, late, physics)
-        for k, flight in enumerate(self._flights):
-            n = len(flight.times)
-            out[k, :n] = cameras[camera].project(places[k, :n]) - flight.pixels[camera]
+        physics, count = replace(PHYSICS, drag=drag), len(self._flights)
+        out = np.full((len(cameras), count, self._longest, 2), np.nan)
+        if not count:
+            return out
+        # A camera whose delay is larger took its frames later than the flights' times say, by as much.
+        late = np.repeat(np.array(delays) - np.array(self._rig.delays), count)
+        places = fly(np.tile(states, len(cameras)), self._flights * len(cameras), late, physics)
+        for i, camera in enumerate(cameras):
+            for k, flight in enumerate(self._flights):
+                n = len(flight.times)
+                out[i, k, :n] = camera.project(places[i * count + k, :n]) - flight.pixels[i]
         return out
 
     def _first_states(self) -> np.ndarray:
@@ -237,10 +277,10 @@ class _Problem:
         return first
 
 
-def fly(states: np.ndarray, flights: Sequence[Flight], late: float, physics: Physics) -> np.ndarray:
-    """Places (flights, n, 3) of states (9, flights) at the flights' times, each ``late`` [s] later."""
+def fly(states: np.ndarray, flights: Sequence[Flight], late: np.ndarray, physics: Physics) -> np.ndarray:
+    """Places (flights, n, 3) of states (9, flights) at the flights' times, each ``late`` (flights,) [s] later."""
     longest = max(len(f.times) for f in flights)
-    times = np.stack([np.pad(f.times, (0, longest - len(f.times)), mode="edge") for f in flights]) + late
+    times = np.stack([np.pad(f.times, (0, longest - len(f.times)), mode="edge") for f in flights]) + late[:, None]
     out, before = np.empty((*times.shape, 3)), np.zeros(len(flights))
     for k in range(longest):
         states, before = move(states, times[:, k] - before, physics), times[:, k]
