@@ -124,11 +124,11 @@ class BallTracker:
             self._follow(h, detections, free)
         self._begin(time, free)
         self._choose(time)
-        h = self.reported
-        if h is None:
+        best = self.reported
+        if best is None:
             return None
-        mean, covariance = h.ball.mean, h.ball.covariance[:6, :6]
-        seen = h.seen == time and time - h.placed <= self.options.alone
+        mean, covariance = best.ball.mean, best.ball.covariance[:6, :6]
+        seen = best.seen == time and time - best.placed <= self.options.alone
         return TrackedBall(self.number, mean[:3].copy(), mean[3:6].copy(), covariance.copy(), seen)
 
     def _find_sights(self, detections: Sequence[Sequence[Detection]]) -> list[Sight]:

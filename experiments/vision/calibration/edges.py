@@ -117,7 +117,7 @@ def _find_steps(offsets: np.ndarray, line: np.ndarray, width: float) -> np.ndarr
     peak = peak[np.argsort(-step[peak])[:CANDIDATES]]
     slope = np.gradient(line)
     out = []
-    for i in peak + w:  # the steepest place near the peak, by a parabola
+    for i in (peak + w).tolist():  # the steepest place near the peak, by a parabola
         near = slice(max(i - w, 1), min(i + w, len(line) - 1))
         j = near.start + int(np.argmin(slope[near]))
         j = min(max(j, 1), len(line) - 2)
