@@ -14,7 +14,6 @@ import numpy as np
 
 from experiments.errors import ConfigError
 from experiments.vision.render import mosaic
-from robot_io.vision.detector import QUARTER
 from robot_io.vision.recording import FrameReader
 
 NAMES = {
@@ -32,9 +31,10 @@ class Clip:
     path: Path
     rate: float  # [Hz]
     camera: str | None = None  # of a recording
+    bayer: str = "RGGB"
 
     def frames(self) -> Iterator[np.ndarray]:
-        """Bayer frames (h, w) uint8 in order, RGGB; sides that the detector cannot divide lose their last pixels."""
+        """Bayer frames (h, w) uint8 in order; of a video RGGB, and odd sides lose their last pixels."""
         if self.path.suffix == ".mcap":
             yield from (recorded.frame for recorded in FrameReader(self.path).frames(self.camera))
             return
@@ -43,7 +43,7 @@ class Clip:
         with av.open(str(self.path)) as file:
             for image in file.decode(video=0):
                 colours = image.to_ndarray(format="rgb24")
-                height, width = (side // QUARTER * QUARTER for side in colours.shape[:2])
+                height, width = (side // 2 * 2 for side in colours.shape[:2])
                 yield mosaic(colours[:height, :width])
 
 
@@ -61,7 +61,7 @@ def open_clip(path: str | os.PathLike, camera: str | None = None) -> Clip:
             raise ConfigError(str(error)) from None
         if camera is None and len(reader.cameras) > 1:
             raise ConfigError(f"{path}: expected --camera, one of {', '.join(reader.cameras)}, got none")
-        return Clip(path, reader.rate, camera or next(iter(reader.cameras)))
+        return Clip(path, reader.rate, camera or next(iter(reader.cameras)), reader.bayer)
     if find_spec("av") is None:
         raise ConfigError(f'{path}: reading video needs PyAV; pip install "mjx-tt[vision]"')
     import av
@@ -82,8 +82,8 @@ Labels = dict[int, np.ndarray | None]  # frame, from 0, to the ball's pixel (2,)
 def read_labels(path: str | os.PathLike) -> Labels:
     """Labels of a clip. Frames that are not in the file are not judged.
 
-    Takes a CSV with the columns frame, x and y (an empty or negative one: no ball) and, where it has one, visibility (0:
-    no ball), which is also what BlurBall and TT3D publish; and TTNet's JSON of frames with x and y (-1: no ball).
+    Takes a CSV with the columns frame, x and y (an empty or negative one: no ball) and, where it has one, visibility
+    (0: no ball), which is also what BlurBall and TT3D write; and TTNet's JSON of frames with x and y (-1: no ball).
 
     Raises:
         ConfigError: the file is neither, or a value is no number.

@@ -79,6 +79,7 @@ def make_crops(
     tracks: np.ndarray,
     rng: np.random.Generator,
     video: bool = False,
+    dressed: bool = False,
     report: Callable[[int], object] = lambda done: None,
 ) -> Crops:
     """Draws crops of rendered scenes.
@@ -88,6 +89,7 @@ def make_crops(
         tracks: flights (n, m, 3) [m] at 1 kHz.
         rng: draws all.
         video: longer exposures, fewer frames a second and compression, as of ordinary video.
+        dressed: people wear photographs.
         report: is told how many are done.
     """
     fine = np.empty((count, SIZE, SIZE, 3), np.uint8)
@@ -95,7 +97,7 @@ def make_crops(
     done = 0
     while done < count:
         camera = draw_camera(rng, VIDEO_FOCAL) if video else draw_camera(rng)
-        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng)
+        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, dressed=dressed)
         for _ in range(PER_SCENE):
             crop = draw_crop(scene, actors, tracks, rng, video)
             if crop is not None and done < count:
@@ -155,7 +157,7 @@ def draw_crop(
     if not (inside and seen > SEEN) and not (inside and seen < HARDLY):
         if (spot > -12).all() and (spot < SIZE + 12).all():
             return None
-    frames = [shot.frame for shot in shots]
+    frames: list[np.ndarray] = [shot.frame for shot in shots]
     if video and rng.random() < 0.7:
         quality = int(rng.integers(35, 96))
         frames = [compress(frame, quality) for frame in frames]
@@ -169,7 +171,7 @@ def compress(bayer: np.ndarray, quality: int) -> np.ndarray:
     """The frame as a compressed colour video has it: halved colours, blocks of 8 pixels; mosaicked again."""
     colours = cv2.cvtColor(bayer, cv2.COLOR_BayerRGGB2BGR)
     _, data = cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return pictures.mosaic(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+    return pictures.mosaic(np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))[..., ::-1])
 
 
 def mine_crops(
@@ -187,7 +189,7 @@ def mine_crops(
     found: list[tuple[np.ndarray, np.ndarray]] = []
     for scene_number in range(scenes):
         camera = draw_camera(rng, VIDEO_FOCAL) if video else draw_camera(rng)
-        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, 8)
+        scene, actors = pictures.make_scene(camera, rng), pictures.Actors(rng, 8, dressed=rng.random() < 0.5)
         gap = rng.uniform(0.008, 0.04) if video else GAP
         begin, quality = rng.uniform(0, 10), int(rng.integers(35, 96))
         ghost = np.array([rng.uniform(-0.5, 0.5), rng.uniform(-2, 2), 0.3])

@@ -238,7 +238,7 @@ def evaluate_clip(folder: Path, clip: Clip, labels: Labels, guided: bool, within
         guided: give the detector the place that the two labels before lead to, as a tracker does.
         within: [px] of the label that count as found.
     """
-    detector = Detector(folder, clip.rate)
+    detector = Detector(folder, clip.rate, bayer=clip.bayer)
     frames = balls = false = 0
     spent, errors = 0.0, []
     for k, frame in enumerate(clip.frames()):

@@ -17,7 +17,7 @@ from experiments.progress import Stage
 from experiments.vision import export, flights, network, search, training
 from experiments.vision.crops import Crops, make_crops, mine_crops
 from experiments.vision.evaluation import WITHIN, use_one_core
-from robot_io.vision.detector import Detector, read_cells
+from robot_io.vision.detector import Cells, Detector, read_cells
 
 SHIPPED = Path(__file__).parents[1] / "shipped" / "vision"
 MINING_THRESHOLD = 0.2
@@ -31,17 +31,20 @@ class Plan:
     flights: int = 4000
     hall: int = 60_000  # crops as the paper's cameras give them
     film: int = 16_000  # crops as of ordinary video
+    dressed: int = (
+        14_000  # crops of people who wear photographs, half as hall and half as film, for the second training
+    )
     held_out: int = 4000  # crops of flights and halls that training never sees
     first_steps: int = 2600
     hall_scenes: int = 400  # in which hard negatives are sought
     film_scenes: int = 150
-    steps: int = 7000
+    steps: int = 5000
     seed: int = 0
 
     @classmethod
     def small(cls) -> Plan:
         """A try-out of a minute, whose detector is poor."""
-        return cls(60, 900, 240, 240, 60, 4, 2, 60)
+        return cls(60, 900, 240, 120, 240, 60, 4, 2, 60)
 
 
 def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], object] = print) -> dict[str, float]:
@@ -73,6 +76,13 @@ def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], ob
     if not first.exists():
         with stage(f"network, {plan.first_steps} steps"):
             training.save(first, training.train(crops, plan.first_steps, plan.seed, report=_tell(note)))
+    dressed = work / "dressed.npz"
+    if not dressed.exists():
+        with stage(f"{plan.dressed} crops: dressed people"):
+            flown = flights.split_flights(tracks, False)
+            rng = np.random.default_rng(plan.seed + 21)
+            parts = [make_crops(plan.dressed // 2, flown, rng, video, dressed=True) for video in (False, True)]
+            Crops.join(parts).save(str(dressed))
     hard = work / "hard.npz"
     if not hard.exists():
         with stage("hard negatives"):
@@ -84,7 +94,7 @@ def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], ob
                 for video, count in enumerate((plan.hall_scenes, plan.film_scenes))
             ]
             Crops.join(mined).save(str(hard))
-    crops = Crops.join([crops, *[Crops.load(str(hard))] * HARD_SHARE])
+    crops = Crops.join([crops, Crops.load(str(dressed)), *[Crops.load(str(hard))] * HARD_SHARE])
     second = work / "second.npz"
     if not second.exists():
         with stage(f"network again, {plan.steps} steps"):
@@ -108,26 +118,23 @@ def _tell(note: Callable[[str], object]) -> Callable[[int, float, Any], object]:
     return lambda step, cost, params: note(f"  step {step}: cost {cost:.3f}")
 
 
-def _say(params: Any, crops: Crops) -> tuple[np.ndarray, ...]:
-    """What the network says of crops: probability, centre, covariance, velocity, deviation (see ``read_cells``)."""
-    said = [
-        read_cells(
-            np.asarray(network.apply(params, crops.fine[i : i + 200], crops.coarse[i : i + 200])).transpose(0, 3, 1, 2)
-        )
-        for i in range(0, len(crops), 200)
-    ]
-    return tuple(np.concatenate(parts) for parts in zip(*said, strict=True))
+def _say(params: Any, crops: Crops) -> Cells:
+    """What the network says of crops."""
+    said = []
+    for i in range(0, len(crops), 200):
+        out = network.apply(params, crops.fine[i : i + 200], crops.coarse[i : i + 200])
+        said.append(read_cells(*(np.asarray(part).transpose(0, 3, 1, 2) for part in out)))
+    return Cells(*(np.concatenate(parts) for parts in zip(*said, strict=True)))
 
 
 def _squared(params: Any, crops: Crops) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of balls that were found: errors [px], and squared errors over the covariance; and the rest's probabilities."""
-    probability, centre, covariance, *_ = _say(params, crops)
-    there = crops.labels[:, 0] > 0
-    miss = centre - crops.labels[:, 1:3]
+    said, there = _say(params, crops), crops.labels[:, 0] > 0
+    miss = said.centre - crops.labels[:, 1:3]
     error = np.linalg.norm(miss, axis=1)
-    found = there & (probability > 0.5) & (error < WITHIN)
-    squared = np.einsum("ni,nij,nj->n", miss[found], np.linalg.inv(covariance[found]), miss[found])
-    return error[found], squared, probability[~there]
+    found = there & (said.probability > 0.5) & (error < WITHIN)
+    squared = np.einsum("ni,nij,nj->n", miss[found], np.linalg.inv(said.covariance[found]), miss[found])
+    return error[found], squared, said.probability[~there]
 
 
 def calibrate(params: Any, crops: Crops) -> Any:

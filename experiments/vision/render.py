@@ -6,7 +6,7 @@ little more than its noise. Colours are linear, as of an industrial camera witho
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import NamedTuple
@@ -35,6 +35,7 @@ class Capsule(NamedTuple):
     end: np.ndarray  # (3,) [m]
     radius: float  # [m]
     colour: np.ndarray  # (3,) linear RGB, 0..255
+    texture: np.ndarray | None = None  # (h, w, 3) uint8 that repeats on it instead of the colour
 
 
 class Picture(NamedTuple):
@@ -88,7 +89,9 @@ def noise_bank(height: int, width: int) -> np.ndarray:
     return np.random.default_rng(1).standard_normal((height + MARGIN, width + MARGIN), np.float32)
 
 
-def draw_polygon(image: np.ndarray, camera: Camera, corners: list, colour: np.ndarray | tuple, finer: int = 1) -> None:
+def draw_polygon(
+    image: np.ndarray, camera: Camera, corners: list, colour: Sequence[float] | np.ndarray, finer: int = 1
+) -> None:
     """Fills a polygon of corners (n, 3) [m]; its edges bend as the lens bends them.
 
     finer  factor by which it is drawn larger and averaged: OpenCV makes polygons half a pixel too large on every side
@@ -121,8 +124,7 @@ def photographs() -> tuple[np.ndarray, ...]:
     from matplotlib import cbook, image
     from sklearn.datasets import load_sample_images
 
-    with cbook.get_sample_data("grace_hopper.jpg") as file:
-        portrait = image.imread(file, format="jpg")
+    portrait = image.imread(str(cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)))
     pictures = [*load_sample_images().images, portrait]
     return tuple((255 * (np.asarray(p) / 255.0) ** 2.2).astype(np.uint8) for p in pictures)
 
@@ -172,9 +174,8 @@ def _draw_table(image: np.ndarray, camera: Camera, colour: np.ndarray) -> None:
         draw_polygon(image, camera, [(u, -y, 0), (u + line, -y, 0), (u + line, y, 0), (u, y, 0)], white, FINER)
     for v in (-y, y - line):
         draw_polygon(image, camera, [(-x, v, 0), (x, v, 0), (x, v + line, 0), (-x, v + line, 0)], white, FINER)
-    draw_polygon(
-        image, camera, [(-0.0015, -y, 0), (0.0015, -y, 0), (0.0015, y, 0), (-0.0015, y, 0)], (200.0,) * 3, FINER
-    )
+    middle = [(-0.0015, -y, 0), (0.0015, -y, 0), (0.0015, y, 0), (-0.0015, y, 0)]
+    draw_polygon(image, camera, middle, (200.0,) * 3, FINER)
 
 
 def make_scene(camera: Camera, rng: np.random.Generator) -> Scene:
@@ -188,7 +189,7 @@ def make_scene(camera: Camera, rng: np.random.Generator) -> Scene:
     tops = np.array([(20, 45, 130), (15, 70, 50), (30, 30, 35), (70, 20, 40)])
     _draw_table(image, camera, tops[rng.integers(4)] * rng.uniform(0.6, 1.6))
     blur = rng.uniform(0.45, 1.0)
-    image = cv2.GaussianBlur(image, (0, 0), blur)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur), np.uint8)
     cover, reach, tape = np.zeros_like(image), c.TABLE_WIDTH / 2 + c.NET_OVERHANG, c.NET_HEIGHT - 0.015
     for bottom, hides in ((0.0, 110), (tape, 255)):
         corners = [(-reach, 0, bottom), (reach, 0, bottom), (reach, 0, c.NET_HEIGHT), (-reach, 0, c.NET_HEIGHT)]
@@ -198,14 +199,21 @@ def make_scene(camera: Camera, rng: np.random.Generator) -> Scene:
     image = (image + (cloth - image) * (net[..., None] / 255.0)).astype(np.uint8)
     ball = (ORANGE if rng.random() < 0.6 else WHITE) * rng.uniform(0.8, 1.08, 3)
     return Scene(
-        camera, image, net, np.minimum(ball, 255), rng.uniform(0.0008, 0.0045), rng.uniform(0.05, 0.4), rng.uniform(0.45, 1.1), blur
+        camera, image, net, np.minimum(ball, 255), blur=blur,
+        exposure=rng.uniform(0.0008, 0.0045), gain=rng.uniform(0.05, 0.4), brightness=rng.uniform(0.45, 1.1),
     )  # fmt: skip
 
 
 class Actors:
-    """A person at the far end, a robot at the near one, and small things that move but are no balls."""
+    """A person at the far end, a robot at the near one, and small things that move but are no balls.
 
-    def __init__(self, rng: np.random.Generator, clutter: int = 4) -> None:
+    Args:
+        rng: draws their looks and motions.
+        clutter: most small things.
+        dressed: whether the person wears photographs, as clothes, skin and logos have structure.
+    """
+
+    def __init__(self, rng: np.random.Generator, clutter: int = 4, dressed: bool = False) -> None:
         self.at, self.phase, self.pace = rng.uniform(-0.5, 0.5), rng.uniform(0, 6.3, 4), rng.uniform(3, 9)
         self.far = rng.uniform(1.6, 2.3)
         self.shirt = np.full(3, rng.uniform(170, 250)) if rng.random() < 0.5 else rng.uniform(0, 200, 3)
@@ -214,7 +222,8 @@ class Actors:
         self.trousers, self.hair = rng.uniform(0, 120, 3), rng.uniform(0, 90, 3)
         self.rubber = np.array([(150, 20, 20), (20, 20, 20), (30, 60, 150)][rng.integers(3)])
         self.logos = [
-            (rng.uniform([-0.12, 0.2], [0.12, 0.55]), rng.uniform(0, 0.05), rng.uniform(0.008, 0.03), rng.uniform(0, 255, 3))
+            (rng.uniform([-0.12, 0.2], [0.12, 0.55]), rng.uniform(0, 0.05),
+             rng.uniform(0.008, 0.03), rng.uniform(0, 255, 3))
             for _ in range(rng.integers(1, 5))
         ]  # fmt: skip
         self.things = []
@@ -227,6 +236,9 @@ class Actors:
             self.things.append(
                 (middle, length, radius, colour, rng.uniform(0.05, 0.5, 3), rng.uniform(2, 14), rng.uniform(0, 6.3, 3))
             )
+
+        parts = {"shirt": self.shirt, "trousers": self.trousers, "skin": self.skin, "hair": self.hair}
+        self.textures = {name: _weave(colour, rng) for name, colour in parts.items()} if dressed else {}
 
     def capsules(self, time: float, ball: np.ndarray | None) -> list[Capsule]:
         """All shapes at a time [s]; the paddles follow a ball (3,) [m] that is near."""
@@ -253,13 +265,19 @@ class Actors:
         shoulder = np.array([x + 0.2, y - 0.1, 0.55])
         blade, left = np.array([0.02, 0, 0.03]), np.array([x - 0.22, y - 0.1, 0.55])
         shapes = [
-            Capsule(np.array((x - 0.1, y, -0.7)), hip, 0.09, self.trousers),
-            Capsule(np.array((x + 0.1, y, -0.7)), hip, 0.09, self.trousers),
-            Capsule(hip, neck, 0.17, self.shirt),
-            Capsule(head, head, 0.1, self.skin),
-            Capsule(head + [0, 0.07, 0.06], head + [0, 0.07, 0.06], 0.09, self.hair),
-            Capsule(left, left + [-0.1 * swing[0], -0.3, -0.25 + 0.15 * swing[3]], 0.04, self.skin),
-            Capsule(shoulder, hand, 0.045, self.skin),
+            Capsule(np.array((x - 0.1, y, -0.7)), hip, 0.09, self.trousers, self.textures.get("trousers")),
+            Capsule(np.array((x + 0.1, y, -0.7)), hip, 0.09, self.trousers, self.textures.get("trousers")),
+            Capsule(hip, neck, 0.17, self.shirt, self.textures.get("shirt")),
+            Capsule(head, head, 0.1, self.skin, self.textures.get("skin")),
+            Capsule(head + [0, 0.07, 0.06], head + [0, 0.07, 0.06], 0.09, self.hair, self.textures.get("hair")),
+            Capsule(
+                left,
+                left + [-0.1 * swing[0], -0.3, -0.25 + 0.15 * swing[3]],
+                0.04,
+                self.skin,
+                self.textures.get("skin"),
+            ),
+            Capsule(shoulder, hand, 0.045, self.skin, self.textures.get("skin")),
             Capsule(hand, hand + blade, 0.075, self.rubber),
         ]
         for (u, v), wide, radius, colour in self.logos:
@@ -269,6 +287,16 @@ class Actors:
             spot = middle + reach * np.sin(pace * time + phase)
             shapes.append(Capsule(spot, spot + length, radius, colour))
         return shapes
+
+
+def _weave(colour: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A texture (128, 128, 3) of a photograph's part in a colour."""
+    photo = photographs()[rng.integers(len(photographs()))]
+    size = int(rng.integers(40, 300))
+    y, x = (int(rng.integers(0, side - size)) for side in photo.shape[:2])
+    part = cv2.resize(photo[y : y + size, x : x + size], (128, 128), interpolation=cv2.INTER_AREA)
+    share = rng.uniform(0.2, 0.9)
+    return np.clip(share * part + (1 - share) * colour, 0, 255).astype(np.uint8)
 
 
 def render(
@@ -310,23 +338,17 @@ def render(
                     (float(depth.mean()), pair - origin, camera.matrix[0, 0] * shape.radius / depth.mean(), shape)
                 )
     ordered.sort(key=lambda s: -s[0])
+    farther = sum(depth >= spot for depth, *_ in ordered)
+    for _, pair, radius, shape in ordered[:farther]:
+        drawn += _draw_capsule(image, pair, radius, shape)
     seen, patch = 0.0, None
-    for depth, pair, radius, shape in [*ordered, (-2.0, None, 0.0, None)]:
-        if patch is None and len(places) and depth < spot:
-            shadow = _draw_shadow(scene, image, places[len(places) // 2], origin)
-            seen, patch = _draw_ball(scene, image, places, origin)
-            drawn += [box for box in (shadow, patch) if box is not None]
-            patch = patch or ()
-        if shape is None:
-            break
-        low, high = pair.min(0) - radius - 2, pair.max(0) + radius + 2
-        box = _clip_box(low, high, width, height)
-        if box is None:
-            continue
+    if len(places):
+        shadow = _draw_shadow(scene, image, places[len(places) // 2], origin)
+        seen, patch = _draw_ball(scene, image, places, origin)
+        drawn += [box for box in (shadow, patch) if box is not None]
+    for _, pair, radius, shape in ordered[farther:]:
         before = image[patch].copy() if patch else None
-        a, b = (tuple(np.round(p * 16).astype(int).tolist()) for p in pair)
-        cv2.line(image, a, b, [float(v) for v in shape.colour], max(1, int(2 * radius)), cv2.LINE_AA, 4)
-        drawn.append(box)
+        drawn += _draw_capsule(image, pair, radius, shape)
         if patch and before is not None:
             seen *= 1.0 - float((before != image[patch]).any(-1).mean())
     bayer, deviation, table = scene.bayer[view], scene.noise[view], scene.deviations()
@@ -334,10 +356,9 @@ def render(
         bayer, deviation = bayer.copy(), deviation.copy()
     still = scene.image[view]
     for rows, columns in drawn:
-        box = (
-            slice(rows.start // 2 * 2, (rows.stop + 1) // 2 * 2),
-            slice(columns.start // 2 * 2, (columns.stop + 1) // 2 * 2),
-        )
+        # The colours of a quad are where they are in the whole frame.
+        even = (slice(side.start // 2 * 2, (side.stop + 1) // 2 * 2) for side in (rows, columns))
+        box = tuple(even)
         bayer[box] = mosaic(image[box])
         deviation[box] = cv2.LUT(bayer[box], table)
     for box in drawn:
@@ -346,6 +367,27 @@ def render(
     y, x = rng.integers(0, MARGIN, 2)
     noise = cv2.multiply(deviation, bank[y : y + height, x : x + width])
     return Picture(cv2.addWeighted(bayer, scene.brightness, noise, 1.0, 0.0, dtype=cv2.CV_8U), seen)
+
+
+def _draw_capsule(image: np.ndarray, pair: np.ndarray, radius: float, shape: Capsule) -> list[tuple[slice, slice]]:
+    """Draws a line (2, 2) [px] with round ends; the box that it covers, in a list, which is empty outside."""
+    box = _clip_box(pair.min(0) - radius - 2, pair.max(0) + radius + 2, image.shape[1], image.shape[0])
+    if box is None:
+        return []
+    a, b = (tuple(np.round(p * 16).astype(int).tolist()) for p in pair)
+    width = max(1, int(2 * radius))
+    if shape.texture is None:
+        cv2.line(image, a, b, [float(v) for v in shape.colour], width, cv2.LINE_AA, 4)
+        return [box]
+    inside = np.zeros(image.shape[:2], np.uint8)
+    cv2.line(inside, a, b, 255.0, width, cv2.LINE_8, 4)
+    rows, columns = (np.arange(side.start, side.stop) for side in box)
+    # It moves with the shape's first end.
+    u, v = np.round(pair[0]).astype(int)
+    cloth = shape.texture[((rows - v) % len(shape.texture))[:, None], (columns - u) % shape.texture.shape[1]]
+    chosen = inside[box] > 0
+    image[box][chosen] = cloth[chosen]
+    return [box]
 
 
 def _clip_box(low: np.ndarray, high: np.ndarray, width: int, height: int) -> tuple[slice, slice] | None:

@@ -32,7 +32,7 @@ def augment(frames: Crops, rng: np.random.Generator) -> Crops:
     level, strong = rng.uniform(0, 0.015, row).astype(np.float32), rng.random(n) < 0.25
     labels, mirrored = frames.labels.copy(), rng.random(n) < 0.5
     size = frames.fine.shape[2]
-    parts = []
+    parts: list[np.ndarray] = []
     for whole, colours in ((frames.fine, True), (frames.coarse, False)):
         x = whole.astype(np.float32) / 255.0
         x = x**gamma * factor
@@ -54,7 +54,7 @@ def augment(frames: Crops, rng: np.random.Generator) -> Crops:
     there = mirrored & (labels[:, 0] > 0)
     labels[there, 1] = size - 2 - labels[there, 1]
     labels[there, 3] *= -1
-    return Crops(*parts, labels)
+    return Crops(parts[0], parts[1], labels)
 
 
 def draw_batches(crops: Crops, rng: np.random.Generator) -> Iterator[Crops]:
@@ -96,7 +96,7 @@ def train(
 def save(path: str | Path, params: Any) -> None:
     """Writes parameters to an NPZ."""
     flat = jax.tree_util.tree_leaves_with_path(params)
-    np.savez(path, **{"/".join(k.key for k in keys): np.asarray(value) for keys, value in flat})
+    np.savez(path, **{"/".join(k.key for k in keys): np.asarray(value) for keys, value in flat})  # type: ignore[arg-type]
 
 
 def load(path: str | Path) -> Any:

@@ -2,13 +2,15 @@
 
 The search compares quarter-size pictures of the last three frames; a small classifier orders the places that change.
 The network sees the three frames of a window, 64 px in full and 128 px at half resolution. It says of each cell of 4 px
-how likely the ball's centre is in it, where in the cell, with which covariance, and how fast the ball is.
+how likely the ball's centre is in it, where in the cell and with which covariance; and of each cell of 8 px in the
+wider window how likely the ball was there one frame ago. Both together are the velocity.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,16 +21,21 @@ from robot_io.vision.detection import Detection
 SIZE = 64  # [px] of a window: fine at full, coarse at half resolution
 AROUND = SIZE // 2  # [px] by which the coarse window is larger on each side
 CELL = 4  # [px]
-OUTPUTS = 9  # numbers of a cell
-SPEED_UNIT = 10.0  # [px a frame]
+OUTPUTS = 6  # numbers of a cell
+FAR_CELL = 8  # [px] of the wider window
+FAR_OUTPUTS = 4  # numbers of such a cell
+UNKNOWN_SPEED = 40.0  # [px a frame] deviation of a velocity that was not seen
 FRAMES = 3  # that are looked at together
 
 QUARTER = 4  # px of a frame per pixel of the search's pictures
 PLACE = 4  # [quarter px] a place reaches to each side of its middle
 CANDIDATES = 48  # places that the classifier orders
+PLAUSIBLE = -4.0  # least score of a place, the logarithm of the odds of a ball, for a window
 CHANGE = (4, 3)  # least change of a place [grey levels], and times the median change
 APART = 12.0  # [px] between two balls, or two windows
 
+# Columns and rows that are cut off, so that what is left begins with a red pixel.
+CUT = {"RGGB": (0, 0), "GRBG": (1, 0), "GBRG": (0, 1), "BGGR": (1, 1), "mono": (0, 0)}
 NETWORK, SEARCH = "ball.onnx", "search.onnx"
 
 
@@ -52,7 +59,7 @@ def describe_places(small: Sequence[np.ndarray], middles: np.ndarray) -> np.ndar
 
 
 def find_places(small: Sequence[np.ndarray]) -> np.ndarray:
-    """Rows and columns (n, 2) of where the newest of the quarter-size frames (h, w) differs from both others, most first."""
+    """Rows and columns (n, 2) of where the newest of the quarter-size frames (h, w) differs from both others."""
     change = cv2.blur(cv2.min(cv2.absdiff(small[0], small[1]), cv2.absdiff(small[0], small[2])), (3, 3))
     least = max(CHANGE[0], CHANGE[1] * int(np.median(change[::4, ::4])))
     ys, xs = np.nonzero((change == cv2.dilate(change, np.ones((5, 5), np.uint8))) & (change >= least))
@@ -60,30 +67,52 @@ def find_places(small: Sequence[np.ndarray]) -> np.ndarray:
     return np.stack([ys[order], xs[order]], 1)
 
 
-def read_cells(out: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The best ball of each window from what the network says (n, 9, h, w).
+class Cells(NamedTuple):
+    """The best ball of each of n windows."""
+
+    probability: np.ndarray  # (n,)
+    centre: np.ndarray  # (n, 2) [px of the window]
+    covariance: np.ndarray  # (n, 2, 2) [px^2]
+    velocity: np.ndarray  # (n, 2) [px a frame]
+    deviation: np.ndarray  # (n,) [px a frame] of each component of the velocity
+
+
+def find_cell(out: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The likeliest cell of outputs (n, c, h, w).
 
     Returns:
-        Probabilities (n,), centres (n, 2) [px of the window], covariances (n, 2, 2) [px^2], velocities (n, 2) and their
-        deviations (n,) [px a frame].
+        The share (n,) of it and its neighbours, its ball's place (n, 2) [cells], and its numbers (n, c).
     """
     n, _, h, w = out.shape
     score = out[:, 0].reshape(n, -1)
     top = np.maximum(score.max(1, keepdims=True), 0.0)
     weight = np.exp(score - top)
-    share = (weight / (weight.sum(1, keepdims=True) + np.exp(-top))).reshape(n, h, w)
-    best = share.reshape(n, -1).argmax(1)
-    row, column = np.divmod(best, w)
-    padded = np.pad(share, ((0, 0), (1, 1), (1, 1)))
-    near = np.stack([padded[np.arange(n), row + i, column + j] for i in range(3) for j in range(3)]).sum(0)
-    cell = out[np.arange(n), :, row, column]
-    centre = (np.stack([column, row], 1) + 0.5 + cell[:, 1:3]) * CELL - 0.5
-    white = np.zeros((n, 2, 2))
-    white[:, 0, 0], white[:, 1, 0] = np.exp(np.clip(cell[:, 3], -3, 6)), cell[:, 4]
-    white[:, 1, 1] = np.exp(np.clip(cell[:, 5], -3, 6))
-    root = np.linalg.inv(white) * CELL
-    deviation = np.exp(np.clip(cell[:, 8], -4, 3)) * SPEED_UNIT
-    return near, centre, root @ root.transpose(0, 2, 1), cell[:, 6:8] * SPEED_UNIT, deviation
+    row, column = np.divmod(score.argmax(1), w)
+    padded = np.pad(weight.reshape(n, h, w), ((0, 0), (1, 1), (1, 1)))
+    index = np.arange(n)[:, None, None]
+    near = padded[index, row[:, None, None] + np.arange(3)[:, None], column[:, None, None] + np.arange(3)].sum((1, 2))
+    cell = out[np.arange(n), :, row, column].astype(np.float64)
+    place = np.stack([column, row], 1) + 0.5 + cell[:, 1:3]
+    return near / (weight.sum(1) + np.exp(-top[:, 0])), place, cell
+
+
+def read_cells(cells: np.ndarray, past: np.ndarray) -> Cells:
+    """The best ball of each window from what the network says: (n, OUTPUTS, h, w) and (n, FAR_OUTPUTS, h, w)."""
+    probability, place, cell = find_cell(cells)
+    centre = place * CELL - 0.5
+    # The inverse of the factor (a 0; b c) that whitens the error.
+    white_u, white_v = np.exp(-np.clip(cell[:, 3], -3, 6)), np.exp(-np.clip(cell[:, 5], -3, 6))
+    root = np.zeros((len(cell), 2, 2))
+    root[:, 0, 0], root[:, 1, 1], root[:, 1, 0] = white_u, white_v, -cell[:, 4] * white_u * white_v
+    covariance = root @ root.transpose(0, 2, 1) * CELL**2
+
+    known, before, far = find_cell(past)
+    velocity = centre - (before * FAR_CELL - AROUND - 0.5)
+    # Student's distribution of four degrees of freedom, in which the network learnt it, has twice the variance.
+    spread = 2.0 * np.exp(-2.0 * np.clip(far[:, 3], -3, 6)) * FAR_CELL**2 + np.trace(covariance, axis1=1, axis2=2) / 2
+    seen = known > 0.5
+    velocity = np.where(seen[:, None], velocity, 0.0)
+    return Cells(probability, centre, covariance, velocity, np.where(seen, np.sqrt(spread), UNKNOWN_SPEED))
 
 
 class Detector:
@@ -94,9 +123,17 @@ class Detector:
         rate: frames a second [Hz].
         most: windows that the search may fill.
         threshold: least probability of what is reported.
+        bayer: order of the frames' colours.
     """
 
-    def __init__(self, folder: str | Path, rate: float = 125.0, most: int = 5, threshold: float = 0.5) -> None:
+    def __init__(
+        self,
+        folder: str | Path,
+        rate: float = 125.0,
+        most: int = 5,
+        threshold: float = 0.5,
+        bayer: str = "RGGB",
+    ) -> None:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         self._network, self._order = (
@@ -104,6 +141,7 @@ class Detector:
             for name in (NETWORK, SEARCH)
         )
         self.rate, self.most, self.threshold = rate, most, threshold
+        self._cut = np.array(CUT[bayer])
         self._frames: list[np.ndarray] = []
         self._half: list[np.ndarray] = []
         self._small: list[np.ndarray] = []
@@ -117,7 +155,7 @@ class Detector:
         """Balls in a frame, the surest first; none in the first two frames.
 
         Args:
-            frame: (h, w) uint8, RGGB; no copy is made, so it must not be overwritten for three frames.
+            frame: (h, w) uint8; no copy is made, so it must not be overwritten for three frames.
             guesses: pixels (2,) where a ball is expected.
             search: also look where the picture changes; else only at the guesses.
 
@@ -128,21 +166,28 @@ class Detector:
         if len(self._frames) < FRAMES:
             return []
         middles: list[np.ndarray] = []
-        extent = np.array(frame.shape[::-1])
-        for middle in [*guesses, *(self._expected if search else ()), *(self._search() if search else ())]:
+        extent = np.array(self._frames[0].shape[::-1])
+        for middle in [
+            *(guess - self._cut for guess in guesses),
+            *(self._expected if search else ()),
+            *(self._search() if search else ()),
+        ]:
             inside = (middle > -APART).all() and (middle < extent + APART).all()
             if inside and all(np.abs(middle - other).max() > APART for other in middles):
                 middles.append(middle)
         found = self._look(middles) if middles else []
-        self._expected = [d.centre + d.velocity / self.rate for d in found[:2]]
+        self._expected = [d.centre - self._cut + d.velocity / self.rate for d in found[:2]]
         return found
 
     def _push(self, frame: np.ndarray) -> None:
-        if frame.ndim != 2 or frame.dtype != np.uint8 or frame.shape[0] % QUARTER or frame.shape[1] % QUARTER:
+        if frame.ndim != 2 or frame.dtype != np.uint8 or min(frame.shape) < SIZE + QUARTER:
             raise ValueError(
-                f"expected a frame (height, width) of uint8 with sides that {QUARTER} divides, got {frame.dtype} "
+                f"expected a frame (height, width) of uint8, sides of {SIZE + QUARTER} px and more, got {frame.dtype} "
                 f"{frame.shape}; give the raw Bayer frame"
             )
+        left, top = self._cut
+        height, width = ((side - cut) // QUARTER * QUARTER for side, cut in zip(frame.shape, (top, left), strict=True))
+        frame = frame[top : top + height, left : left + width]
         if self._frames and frame.shape != self._frames[0].shape:
             raise ValueError(
                 f"expected frames of {self._frames[0].shape}, got {frame.shape}; use a detector per camera"
@@ -165,6 +210,8 @@ class Detector:
         score = self._order.run(None, {"places": describe_places(self._small, places)})[0]
         chosen: list[np.ndarray] = []
         for k in np.argsort(-score):
+            if score[k] < PLAUSIBLE:
+                break
             middle = places[k, ::-1] * float(QUARTER) + (QUARTER - 1) / 2
             if all(np.abs(middle - other).max() > APART for other in chosen):
                 chosen.append(middle)
@@ -182,14 +229,13 @@ class Detector:
             for t in range(FRAMES):
                 fine[i, t] = self._frames[t][v : v + SIZE, u : u + SIZE]
                 coarse[i, t] = self._half[t][v // 2 : v // 2 + SIZE, u // 2 : u // 2 + SIZE]
-        out = self._network.run(None, {"fine": fine, "coarse": coarse})[0]
-        probability, centre, covariance, velocity, deviation = read_cells(out)
+        said = read_cells(*self._network.run(None, {"fine": fine, "coarse": coarse}))
         kept: list[Detection] = []
-        for k in np.argsort(-probability):
-            spot = centre[k] + corners[k]
-            if probability[k] < self.threshold:
+        for k in np.argsort(-said.probability):
+            spot, share = said.centre[k] + corners[k], float(said.probability[k])
+            if share < self.threshold:
                 break
-            if all(np.abs(spot - other.centre).max() > APART for other in kept):
-                speed, spread = velocity[k] * self.rate, float(deviation[k] * self.rate)
-                kept.append(Detection(spot, covariance[k], speed, spread, float(probability[k])))
+            if all(np.abs(spot - other.centre + self._cut).max() > APART for other in kept):
+                speed, spread = said.velocity[k] * self.rate, float(said.deviation[k] * self.rate)
+                kept.append(Detection(spot + self._cut, said.covariance[k], speed, spread, share))
         return kept

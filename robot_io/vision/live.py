@@ -19,6 +19,7 @@ from robot_io.vision.sources import Source
 from robot_io.vision.tracker import BallTracker
 
 LOOK = 0.25  # [s] between looks at the health
+START = 5.0  # [s] that cameras' processes have to start
 
 
 @dataclass

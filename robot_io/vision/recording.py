@@ -1,8 +1,8 @@
 """Raw frames in an MCAP file, compressed without loss.
 
 A channel ``/camera/NAME`` for each camera; a message's log time is the middle of its exposure. Its data are the four
-colours' quarter pictures, each as differences from the left neighbour modulo 256, under Zstandard; the channel's metadata
-say width, height, order of the colours and this encoding.
+colours' quarter pictures, each as differences from the left neighbour modulo 256, under Zstandard. The channel's
+metadata say width, height, order of the colours and this encoding.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 import zstandard
+from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
@@ -115,7 +116,10 @@ class FrameReader:
     def __init__(self, path: str | os.PathLike) -> None:
         self.path = Path(path)
         with self.path.open("rb") as file:
-            summary = make_reader(file).get_summary()
+            try:
+                summary = make_reader(file).get_summary()
+            except McapError as error:
+                raise ValueError(f"{path}: expected a recording (MCAP), got something else: {error}") from None
         channels = summary.channels.values() if summary else ()
         ours = {c.topic.removeprefix(TOPIC): c.metadata for c in channels if c.metadata.get("encoding") == ENCODING}
         if not ours:

@@ -88,6 +88,17 @@ def fit_edges(picture: np.ndarray, guess: Camera, lens: bool = True) -> tuple[Ca
     return camera, edges
 
 
+def see_edges(picture: np.ndarray, camera: Camera) -> tuple[Camera, Edges]:
+    """A camera that stands as it stood, and the lines that it sees. Raises ValueError where they are elsewhere."""
+    edges = find_edges(picture, camera, REACHES[-1])
+    away = edges.residuals(camera)
+    if len(away) < FEWEST_POINTS or float(np.sqrt(np.mean(away**2))) > LARGEST_RESIDUAL:
+        raise ValueError(
+            f"camera {camera.name}: expected it to stand as calibrated, but the table's lines are elsewhere"
+        )
+    return camera, edges
+
+
 @dataclass(frozen=True, eq=False)
 class Flight:
     """Free flight of a ball as each camera saw it.
