@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 app = options.command(
     "vision",
-    "find balls in camera pictures: render, record, label, train, evaluate",
+    "balls from camera pictures: detector, calibration, tracker",
     """\
   mjx-tt vision render --out pictures/                  what the cameras see, as PNG with labels
   mjx-tt vision record --out rally.mcap                 a rendered rally as raw frames, losslessly
@@ -235,3 +235,129 @@ def evaluate(
         screen.print("no ball", *ghosts.lines(), sep="\n  ")
     rate = evaluation.measure_renderer(cameras[0], tracks[0], np.random.default_rng(seed))
     screen.print(f"the renderer makes {rate:.0f} whole frames a second of a core")
+
+
+@app.command
+def calibrate(
+    recording: Annotated[str, Parameter("MCAP", help="a recording of all cameras: the cleared table, then balls")],
+    /,
+    *,
+    out: Annotated[str, option("YAML", "the calibrated rig; may be the file of --rig")],
+    bumped: Annotated[str | None, option("CAMERA", "only this camera's pose has changed")] = None,
+    rig: Rig = None,
+    detector: Detector = None,
+) -> None:
+    """Calibrates the rig's cameras by the table's lines and flying balls; --rig says roughly where they stand."""
+    check_extra()
+    options.check_exists(recording)
+    options.check_suffix(out, ".yaml")
+    from dataclasses import replace
+
+    from experiments.progress import make_console
+    from experiments.vision.calibration import solve, watch
+    from robot_io.vision import rig as rigs
+    from robot_io.vision.detector import Detector as BallDetector
+
+    described, folder, screen = read_rig(rig), find_detector(detector), make_console()
+    names = [camera.name for camera in described.cameras]
+    if bumped is not None and bumped not in names:
+        raise ConfigError(f"--bumped: expected one of {', '.join(names)}, got {bumped!r}")
+    with error_context(recording):
+        stills = watch.read_stills(Path(recording), described)
+        lens = bumped is None
+        fitted = [
+            solve.fit_edges(still, camera, lens) if bumped in (None, camera.name) else solve.see_edges(still, camera)
+            for still, camera in zip(stills, described.cameras, strict=True)
+        ]
+        rough = replace(described, cameras=tuple(camera for camera, _ in fitted))
+        detectors = [BallDetector(folder, described.rate) for _ in names]
+        moments = watch.detect_all(watch.pair_frames(Path(recording), described), detectors)
+        flights = watch.find_flights(moments, rough)
+        if bumped is not None and len(flights) < solve.FEWEST_FLIGHTS:
+            flights = []
+        found = solve.fit_rig(rough, [edges for _, edges in fitted], flights, bumped)
+        rigs.write(out, found.rig)
+    screen.print(f"{found.flights} flights; drag {found.drag:.3f} 1/m; {out}")
+    for name, delay, residual in zip(names, found.rig.delays, found.rig.residuals, strict=True):
+        screen.print(f"  {name}: residual {residual:.2f} px, delay {1e3 * delay:+.2f} ms")
+    for name, deviation in found.deviations.items():
+        doubt = "  not determined: record more flights" if name in found.undetermined else ""
+        screen.print(f"  {name:<18} +- {deviation:.2g}{doubt}")
+
+
+@app.command
+def check(
+    recording: Annotated[
+        str | None, Parameter("MCAP", help="a recording of all cameras; none: rendered flights")
+    ] = None,
+    /,
+    *,
+    rig: Rig = None,
+    detector: Detector = None,
+    flights: Annotated[int, options.count("rendered flights (default: 20)")] = 20,
+    seed: Seed = 1000,
+) -> None:
+    """Says what is wrong with a recording's cameras, or how well rendered flights are tracked."""
+    check_extra()
+    from experiments.progress import make_console
+
+    described, folder, screen = read_rig(rig), find_detector(detector), make_console()
+    if recording is not None:
+        options.check_exists(recording)
+        from robot_io.vision import live, sources
+
+        recorded = [sources.RecordedSource(recording, camera.name) for camera in described.cameras]
+        with error_context(recording):
+            summary = live.run(described, recorded, folder, None, screen.print, live=False)
+        screen.print(*summary.lines(), "nothing is wrong" if not summary.problems else "", sep="\n")
+        return
+    options.start_jax(1)
+    import numpy as np
+
+    from experiments.vision import evaluation, tracking
+    from experiments.vision.flights import fly_balls
+
+    evaluation.use_one_core()
+    tracks = fly_balls(flights, seed)
+    found = tracking.evaluate_tracker(folder, described, described, tracks, np.random.default_rng(seed))
+    screen.print(*found.lines(), sep="\n")
+
+
+@app.command
+def run(
+    source: Annotated[str, Parameter("SOURCE", help="a recording, or pylon:SERIAL,SERIAL of the rig's cameras")],
+    /,
+    *,
+    host: Annotated[str, option("ADDRESS", "where datagrams go (default: this machine)")] = "127.0.0.1",
+    port: Annotated[int, option("PORT", "UDP port that the bridge listens on (default: 6520)")] = 6520,
+    triggered: Annotated[bool, Parameter(help="the cameras wait for a trigger on line 1")] = False,
+    rig: Rig = None,
+    detector: Detector = None,
+) -> None:
+    """Runs the tracker: a process for each camera, datagrams to the bridge, and what is wrong as it happens."""
+    check_extra()
+    import time
+
+    from experiments.progress import make_console
+    from robot_io.vision import live, sources
+
+    described, folder, screen = read_rig(rig), find_detector(detector), make_console()
+    opened: list[sources.Source]
+    if source.startswith("pylon:"):
+        serials = source.removeprefix("pylon:").split(",")
+        if len(serials) != len(described.cameras):
+            raise ConfigError(f"SOURCE: expected {len(described.cameras)} serial numbers, got {len(serials)}")
+        opened = [
+            sources.PylonSource(serial, described.rate, described.exposure, camera.size, triggered)
+            for serial, camera in zip(serials, described.cameras, strict=True)
+        ]
+    else:
+        options.check_exists(source)
+        start = time.monotonic() + live.START
+        opened = [sources.RecordedSource(source, camera.name, True, start) for camera in described.cameras]
+    with error_context(source):
+        try:
+            summary = live.run(described, opened, folder, (host, port), screen.print, live=True)
+        except KeyboardInterrupt:
+            return
+    screen.print(*summary.lines(), sep="\n")

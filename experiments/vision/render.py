@@ -21,6 +21,7 @@ ORANGE, WHITE = np.array([235.0, 115.0, 25.0]), np.array([235.0, 235.0, 225.0])
 READ_NOISE = 1.5  # [grey levels^2]
 MARGIN = 256  # [px] by which the bank of noise is larger than a frame, so that its place can be drawn
 NEAREST = 0.2  # [m] of depth; nearer shapes are left out
+FINER = 4  # of the table's lines, which cameras are calibrated by
 PER_STEP = 1.2  # [px] between the discs that make a streak
 
 Path = Callable[[np.ndarray], np.ndarray]  # times (n,) [s] to the ball's places (n, 3) [m]; NaN where there is none
@@ -88,14 +89,33 @@ def noise_bank(height: int, width: int) -> np.ndarray:
     return np.random.default_rng(1).standard_normal((height + MARGIN, width + MARGIN), np.float32)
 
 
-def draw_polygon(image: np.ndarray, camera: Camera, corners: list, colour: Sequence[float] | np.ndarray) -> None:
-    """Fills a polygon of corners (n, 3) [m]; its edges bend as the lens bends them."""
+def draw_polygon(
+    image: np.ndarray, camera: Camera, corners: list, colour: Sequence[float] | np.ndarray, finer: int = 1
+) -> None:
+    """Fills a polygon of corners (n, 3) [m]; its edges bend as the lens bends them.
+
+    finer  factor by which it is drawn larger and averaged: OpenCV makes polygons half a pixel too large on every side
+    """
     points = np.array(corners, float)
     along = np.linspace(0.0, 1.0, 12, endpoint=False)[:, None]
     edges = np.concatenate([a + (b - a) * along for a, b in zip(points, np.roll(points, -1, 0), strict=True)])
-    if (camera.depth(edges) > NEAREST).all():
-        pixels = np.clip(np.round(camera.project(edges) * 16), -(2**20), 2**20).astype(np.int32)
-        cv2.fillPoly(image, [pixels], [float(v) for v in colour], cv2.LINE_AA, 4)
+    if not (camera.depth(edges) > NEAREST).all():
+        return
+    pixels = camera.project(edges)
+    if finer == 1:
+        whole = np.clip(np.round(pixels * 16), -(2**20), 2**20).astype(np.int32)
+        cv2.fillPoly(image, [whole], [float(v) for v in colour], cv2.LINE_AA, 4)
+        return
+    box = _clip_box(pixels.min(0) - 1, pixels.max(0) + 1, image.shape[1], image.shape[0])
+    if box is None:
+        return
+    height, width = (side.stop - side.start for side in box)
+    mask = np.zeros((height * finer, width * finer), np.uint8)
+    corner = np.array([box[1].start, box[0].start])
+    inside = np.round(((pixels - corner + 0.5) * finer - 0.5) * 16).astype(np.int32)
+    cv2.fillPoly(mask, [inside], 255, cv2.LINE_8, 4)
+    share = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA)[..., None] / 255.0
+    image[box] = (image[box] + (np.array(colour, float) - image[box]) * share).astype(np.uint8)
 
 
 @cache
@@ -148,13 +168,14 @@ def _draw_surroundings(image: np.ndarray, camera: Camera, rng: np.random.Generat
 
 def _draw_table(image: np.ndarray, camera: Camera, colour: np.ndarray) -> None:
     x, y, line = c.TABLE_WIDTH / 2, c.TABLE_LENGTH / 2, 0.02
-    draw_polygon(image, camera, [(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], colour)
+    draw_polygon(image, camera, [(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], colour, FINER)
     white = (225.0,) * 3
     for u in (-x, x - line):
-        draw_polygon(image, camera, [(u, -y, 0), (u + line, -y, 0), (u + line, y, 0), (u, y, 0)], white)
+        draw_polygon(image, camera, [(u, -y, 0), (u + line, -y, 0), (u + line, y, 0), (u, y, 0)], white, FINER)
     for v in (-y, y - line):
-        draw_polygon(image, camera, [(-x, v, 0), (x, v, 0), (x, v + line, 0), (-x, v + line, 0)], white)
-    draw_polygon(image, camera, [(-0.0015, -y, 0), (0.0015, -y, 0), (0.0015, y, 0), (-0.0015, y, 0)], (200.0,) * 3)
+        draw_polygon(image, camera, [(-x, v, 0), (x, v, 0), (x, v + line, 0), (-x, v + line, 0)], white, FINER)
+    middle = [(-0.0015, -y, 0), (0.0015, -y, 0), (0.0015, y, 0), (-0.0015, y, 0)]
+    draw_polygon(image, camera, middle, (200.0,) * 3, FINER)
 
 
 def make_scene(camera: Camera, rng: np.random.Generator) -> Scene:
@@ -222,15 +243,26 @@ class Actors:
     def capsules(self, time: float, ball: np.ndarray | None) -> list[Capsule]:
         """All shapes at a time [s]; the paddles follow a ball (3,) [m] that is near."""
         swing = np.sin(self.pace * time + self.phase)
+        wrist = np.array([-self.at + 0.4 * swing[3], -1.75 + 0.1 * swing[1], 0.25 + 0.15 * swing[0]])
+        if ball is not None and ball[1] < -1.2:
+            wrist = wrist + (ball - [0, 0.09, 0] - wrist) * min(1.0, (-1.2 - ball[1]) / 0.3)
+        elbow, base = wrist - [0, 0.25, -0.15], np.array([0.2, -2.3, 0.3])
+        return [
+            *self.person(time, ball),
+            Capsule(base, elbow, 0.07, self.robot),
+            Capsule(elbow, wrist, 0.045, self.robot),
+            Capsule(wrist, wrist + [0.02, 0, 0.03], 0.075, np.full(3, 20.0)),
+        ]
+
+    def person(self, time: float, ball: np.ndarray | None) -> list[Capsule]:
+        """The same without the robot."""
+        swing = np.sin(self.pace * time + self.phase)
         x, y = self.at + 0.25 * swing[0], self.far + 0.1 * swing[1]
         hip, neck, head = np.array([(x, y, 0.1), (x, y - 0.1, 0.62), (x, y - 0.12, 0.82)])
         hand = np.array([x + 0.35 + 0.25 * swing[2], y - 0.45 + 0.2 * swing[3], 0.25 + 0.2 * swing[2]])
-        wrist = np.array([-self.at + 0.4 * swing[3], -1.75 + 0.1 * swing[1], 0.25 + 0.15 * swing[0]])
         if ball is not None and ball[1] > self.far - 0.9:
             hand = hand + (ball + [0, 0.08, 0] - hand) * min(1.0, (ball[1] - self.far + 0.9) / 0.5)
-        if ball is not None and ball[1] < -1.2:
-            wrist = wrist + (ball - [0, 0.09, 0] - wrist) * min(1.0, (-1.2 - ball[1]) / 0.3)
-        shoulder, elbow, base = np.array([x + 0.2, y - 0.1, 0.55]), wrist - [0, 0.25, -0.15], np.array([0.2, -2.3, 0.3])
+        shoulder = np.array([x + 0.2, y - 0.1, 0.55])
         blade, left = np.array([0.02, 0, 0.03]), np.array([x - 0.22, y - 0.1, 0.55])
         shapes = [
             Capsule(np.array((x - 0.1, y, -0.7)), hip, 0.09, self.trousers, self.textures.get("trousers")),
@@ -247,9 +279,6 @@ class Actors:
             ),
             Capsule(shoulder, hand, 0.045, self.skin, self.textures.get("skin")),
             Capsule(hand, hand + blade, 0.075, self.rubber),
-            Capsule(base, elbow, 0.07, self.robot),
-            Capsule(elbow, wrist, 0.045, self.robot),
-            Capsule(wrist, wrist + blade, 0.075, np.full(3, 20.0)),
         ]
         for (u, v), wide, radius, colour in self.logos:
             spot = np.array([x + u, y - 0.27, v])

@@ -65,7 +65,7 @@ class Camera:
     def sees(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Which points (...) of (..., 3) lie in the picture, at least ``margin`` [px] from its edges."""
         pixels = self.project(points)
-        return (pixels >= margin).all(-1) & (pixels <= np.array(self.size) - 1.0 - margin).all(-1)
+        return np.asarray((pixels >= margin).all(-1) & (pixels <= np.array(self.size) - 1.0 - margin).all(-1))
 
     def moved(self, turn: np.ndarray, shift: np.ndarray) -> Camera:
         """The camera turned by a matrix (3, 3) in its own frame and shifted by (3,) [m] in the world."""
