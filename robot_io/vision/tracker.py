@@ -231,7 +231,7 @@ class BallTracker:
         ]
         if self.reported not in self.hypotheses:
             self.reported = None
-        others = [h for h in self.hypotheses if h is not self.reported and self._is_ball(h)]
+        others = [h for h in self.hypotheses if h is not self.reported and h.placed == time and self._is_ball(h)]
         best, old = max(others, key=lambda h: h.score, default=None), self.reported
         lost = old is None or time - old.placed > options.drop
         if best is not None and (lost or old is None or best.score > old.score + options.margin):
