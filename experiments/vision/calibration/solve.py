@@ -143,7 +143,8 @@ def fit_rig(rig: CameraRig, edges: Sequence[Edges], flights: Sequence[Flight], b
     """
     if 0 < len(flights) < FEWEST_FLIGHTS:
         raise ValueError(
-            f"expected at least {FEWEST_FLIGHTS} free flights that two cameras see, got {len(flights)}; record more balls"
+            f"expected at least {FEWEST_FLIGHTS} free flights that two cameras see, got {len(flights)}; "
+            "record more balls"
         )
     problem = _Problem(rig, tuple(edges), tuple(flights), bumped)
     x, jacobian = problem.solve()
