@@ -2,7 +2,7 @@
 
 A hypothesis begins with a place that two cameras agree on and that no other explains. It takes whole places first, and
 what one camera sees alone where there is none. A consistent place beside the prediction is no outlier: the ball was
-struck. What flies is believed soon, what is slow later, for hands and paddles are slow.
+struck. What flies and looks like a ball is believed soon, what is slow later, for hands and paddles are slow.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from robot_io.vision.detection import Detection
 from robot_io.vision.triangulation import Sight, triangulate
 
 PHYSICS = Physics(drag=0.141, lift=0.0033, wander=0.1, bounced=(0.5, 0.25, 60.0))
+CLUTTER, FADING = 5.0, 0.9  # evidence that a place of clutter has; share of it that is left after a frame
+SUREST = 0.993  # probability beyond which more counts no more
+UNSEEN = 2.0  # evidence that a frame without a place takes
 ROOM = np.array([[-4.0, -5.0, -0.8], [4.0, 5.0, 3.0]])  # [m] in which there are balls
 
 
@@ -31,6 +34,7 @@ class TrackerOptions:
     gate       the same of a pixel, and ``gate_space`` of a place, against a prediction
     sure       probability of the detections that begin a hypothesis; ``struck`` of those where the ball was just lost
     fast       [m/s] from which on ``hits`` places make a ball; slower ones need ``slow_hits``
+    score      evidence that makes a ball, and ``margin`` by which another must have more to take its place
     slowest    [m/s] below which nothing is a new ball: a hand, a ball that lies, a lamp
     forget     [s] without a place after which the reported ball is given up; ``drop`` of any other hypothesis
     alone      [s] without a place up to which one camera's sights are enough to report it as seen
@@ -46,6 +50,8 @@ class TrackerOptions:
     struck: float = 0.5
     fast: float = 2.5
     hits: int = 3
+    score: float = 7.0
+    margin: float = 6.0
     slow_hits: int = 10
     slowest: float = 1.5
     forget: float = 0.1
@@ -62,6 +68,7 @@ class Hypothesis:
     ball    its filter at ``time`` [s]
     begun   [s], when it was last seen by a camera, and when last placed by two
     hits    places so far
+    score   evidence: logarithms of the odds that its sights were balls, less what clutter brings, the old ones fading
     """
 
     ball: Kalman
@@ -70,6 +77,7 @@ class Hypothesis:
     seen: float
     placed: float
     hits: int = 1
+    score: float = 0.0
 
     @property
     def speed(self) -> float:
@@ -149,7 +157,9 @@ class BallTracker:
             for camera, detection in zip(self.cameras, sight.detections, strict=False):
                 self._take(h, camera, detection, np.inf)
             h.hits, h.seen, h.placed = h.hits + 1, h.time, h.time
+            h.score = FADING * h.score + weigh(sight)
             return
+        h.score = FADING * h.score - UNSEEN
         if any(np.linalg.norm(sight.point - h.ball.mean[:3]) < 0.3 for sight in free):
             return  # both cameras see it elsewhere
         for camera, seen in zip(self.cameras, detections, strict=True):
@@ -209,7 +219,7 @@ class BallTracker:
         covariance[:3, :3], covariance[3:6, 3:6] = sight.covariance, spread + 0.3**2 * np.eye(3)
         covariance[6:, 6:] = 100.0**2 * np.eye(3)
         ball = Kalman(np.concatenate([sight.point, velocity, np.zeros(3)]), covariance, self.physics)
-        return Hypothesis(ball, time, time, time, time)
+        return Hypothesis(ball, time, time, time, time, score=weigh(sight))
 
     def _choose(self, time: float) -> None:
         """Drops what is seen no more, and reports the likeliest."""
@@ -221,13 +231,21 @@ class BallTracker:
         ]
         if self.reported not in self.hypotheses:
             self.reported = None
-        others = [h for h in self.hypotheses if h is not self.reported and self._is_ball(h)]
-        lost = self.reported is None or time - self.reported.placed > options.drop
-        if lost and others:
-            self.reported, self.number = max(others, key=lambda h: (h.hits, h.speed)), self.number + 1
+        others = [h for h in self.hypotheses if h is not self.reported and h.placed == time and self._is_ball(h)]
+        best, old = max(others, key=lambda h: h.score, default=None), self.reported
+        lost = old is None or time - old.placed > options.drop
+        if best is not None and (lost or old is None or best.score > old.score + options.margin):
+            self.reported, self.number = best, self.number + 1
         order = sorted(self.hypotheses, key=lambda h: (h is not self.reported, -h.hits, h.begun))
         self.hypotheses = order[: options.most]
 
     def _is_ball(self, h: Hypothesis) -> bool:
         options = self.options
-        return h.speed > options.slowest and h.hits >= (options.hits if h.speed > options.fast else options.slow_hits)
+        enough = options.hits if h.speed > options.fast else options.slow_hits
+        return h.speed > options.slowest and h.hits >= enough and h.score > options.score
+
+
+def weigh(sight: Sight) -> float:
+    """Evidence for a ball, of both cameras."""
+    odds = [min(d.probability, SUREST) for d in sight.detections]
+    return float(sum(np.log(p / (1.0 - p)) for p in odds)) - CLUTTER
