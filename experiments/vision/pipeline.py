@@ -34,7 +34,7 @@ class Plan:
     dressed: int = 14_000  # crops of people who wear photographs, half as hall and half as film
     held_out: int = 4000  # crops of flights and halls that training never sees
     first_steps: int = 2600
-    places: int = 16_000  # crops for the search's classifier, a quarter as film
+    places: int = 8_000  # crops for the search's classifier, a quarter as film
     hall_scenes: int = 400  # in which hard negatives are sought
     film_scenes: int = 150
     steps: int = 4000
