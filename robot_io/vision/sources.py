@@ -89,10 +89,12 @@ class PylonSource:
                 with camera.RetrieveResult(PATIENCE, pylon.TimeoutHandling_ThrowException) as result:
                     if not result.GrabSucceeded():
                         continue  # counted as dropped, by the gap in its stamps
-                    taken, frame = NANO * result.TimeStamp + self.exposure / 2, np.array(result.Array)
-                if offset is None:
-                    offset = time.monotonic() - taken if taken else 0.0
-                yield taken + offset, frame
+                    taken, frame, now = NANO * result.TimeStamp, np.array(result.Array), time.monotonic()
+                if not taken:  # emulated cameras have no clock
+                    yield now, frame
+                    continue
+                offset = now - taken if offset is None else offset
+                yield taken + offset + self.exposure / 2, frame
         except genicam.GenericException as error:
             raise DeviceError(f"pylon: camera {self.serial}: {error}") from None
         finally:
