@@ -25,6 +25,9 @@ app = options.command(
   mjx-tt vision evaluate clip.mp4 --labels clip.csv     how many it finds; the columns are frame,x,y
   mjx-tt vision evaluate --flights 100                  on rendered flights instead
   mjx-tt vision train --out runs/detector               from nothing to weights, in less than an hour
+  mjx-tt vision calibrate rally.mcap --out rig.yaml     cameras by the table's lines and flights
+  mjx-tt vision run rally.mcap --rig rig.yaml           the tracker: datagrams to the bridge
+  mjx-tt vision rally runs/quickstart/artefact          the emulated robot plays by rendered cameras
 """,
 )
 
@@ -361,3 +364,33 @@ def run(
         except KeyboardInterrupt:
             return
     screen.print(*summary.lines(), sep="\n")
+
+
+@app.command
+def rally(
+    artefact: Annotated[str, Parameter("ARTEFACT", help="folder of an exported policy, or of its run")],
+    /,
+    *,
+    balls: Annotated[int, options.count("balls (default: 10)")] = 10,
+    distribution: Annotated[str, option("NAME", "what is thrown (default: player3/M0)")] = "player3/M0",
+    triangulated: Annotated[bool, Parameter(help="by the emulator's triangulation instead, to compare")] = False,
+    rig: Rig = None,
+    detector: Detector = None,
+    seed: Seed = 0,
+) -> None:
+    """Plays on the emulated robot by what rendered cameras see, in lock-step."""
+    check_extra()
+    options.start_jax(1)
+    from experiments.progress import make_console
+    from experiments.runs.locate import artefact_of
+    from experiments.vision import evaluation
+    from experiments.vision import rally as rallies
+    from robot_io.policy.artefact import load
+
+    evaluation.use_one_core()
+    folder, screen = artefact_of(artefact), make_console()
+    with error_context():
+        played = rallies.play(
+            load(folder), read_rig(rig), find_detector(detector), balls, distribution, seed, not triangulated
+        )
+    screen.print(*played.lines(), sep="\n")

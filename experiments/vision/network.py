@@ -2,7 +2,7 @@
 
 Every fine cell gives six numbers: how likely the ball's centre is in it (a softmax over all cells and "no ball"), its
 offset from the cell's middle [cells], and the offset's uncertainty as a factor of its inverse covariance (log a, b,
-log c: white errors are ``a du`` and ``c dv + b du``). Every coarse cell of 8 px gives four: how likely the ball was in
+log c: white errors are a du and c dv + b du). Every coarse cell of 8 px gives four: how likely the ball was in
 it one frame ago, its offset, and the log of that one's precision. The velocity is the way between the two; one that is
 regressed is learnt late, and never beyond the window.
 """

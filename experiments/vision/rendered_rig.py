@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from robot_io.emulator.tracker import TrackerParams
 from robot_io.emulator.world import World
 from robot_io.vision.detector import Detector
 from robot_io.vision.rig import CameraRig
-from robot_io.vision.tracker import BallTracker
+from robot_io.vision.tracker import BallTracker, TrackedBall
 
 PAINT, RUBBER, BLADE = np.array([225.0, 105.0, 30.0]), np.array([20.0, 20.0, 20.0]), 0.075
 
@@ -25,13 +26,15 @@ class RenderedCameras:
     """Makes the tracker of a rig whose ``tracker.cameras`` is "rendered".
 
     rig        the cameras
-    believed   the cameras as their calibration has them; None: it is perfect
     detector   folder of the network
+    believed   the cameras as their calibration has them; None: it is perfect
+    watch      is told of every frame the reported ball, and where it is [m] (3,); None: there is none
     """
 
     rig: CameraRig
     detector: Path
     believed: CameraRig | None = None
+    watch: Callable[[TrackedBall | None, np.ndarray | None], None] | None = None
 
     def open(self, params: TrackerParams, world: World, seed: int) -> RenderedTracker:
         """The tracker of a world; the seed draws the hall, the person and noise."""
@@ -43,7 +46,7 @@ class RenderedTracker:
 
     def __init__(self, cameras: RenderedCameras, params: TrackerParams, world: World, seed: int) -> None:
         self._world, self._params, rig = world, params, cameras.rig
-        self._random = np.random.default_rng(seed)
+        self._random, self._watch = np.random.default_rng(seed), cameras.watch
         self._scenes = [pictures.make_scene(camera, self._random) for camera in rig.cameras]
         for scene in self._scenes:
             scene.exposure, scene.ball = rig.exposure, self._scenes[0].ball
@@ -79,6 +82,8 @@ class RenderedTracker:
             frame = pictures.render(scene, path, now, self._random, shapes).frame
             found.append(detector.detect(frame, places))
         tracked = self.tracker.update(now, found)
+        if self._watch is not None:
+            self._watch(tracked, position)
         sample = BallSample(self._sequence, self.tracker.number, now, None)
         if tracked is not None and tracked.seen:
             sample = BallSample(

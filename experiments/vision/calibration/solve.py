@@ -34,7 +34,7 @@ LARGEST_RESIDUAL = 1.5  # [px] root mean square
 
 
 def adjust(camera: Camera, change: np.ndarray) -> Camera:
-    """A camera turned by (3,) [rad] and shifted by (3,) [m], its focal length times exp of a number, k1 plus one (8,)."""
+    """A camera turned (3,) [rad] and shifted (3,) [m], its focal length times exp of a number, and k1 plus one."""
     matrix, distortion = camera.matrix.copy(), camera.distortion.copy()
     matrix[[0, 1], [0, 1]] *= np.exp(change[6])
     distortion[0] += change[7]
@@ -58,15 +58,15 @@ def fit_edges(picture: np.ndarray, guess: Camera, lens: bool = True) -> tuple[Ca
         edges = find_edges(picture, camera, reach)
         found = np.bincount(edges.sides, minlength=len(SIDES)) > 0
         if found.sum() < FEWEST_SIDES or len(edges.points) < FEWEST_POINTS:
+            names = ", ".join(side for side, there in zip(SIDES, found, strict=True) if there) or "none"
             raise ValueError(
-                f"camera {guess.name}: expected three of the table's sides, got "
-                f"{', '.join(s for s, f in zip(SIDES, found, strict=True) if f) or 'none'} ({len(edges.points)} points); "
+                f"camera {guess.name}: expected three of the table's sides, got {names} ({len(edges.points)} points); "
                 "correct its position and rotation in the rig's YAML until they are right to a few centimetres and "
                 "degrees, and clear the table"
             )
         free = slice(8) if lens and reach < 80.0 else slice(6)
 
-        def residuals(x: np.ndarray, edges: Edges = edges, free: slice = free) -> np.ndarray:
+        def residuals(x: np.ndarray, edges: Edges = edges, free: slice = free, camera: Camera = camera) -> np.ndarray:
             change = np.zeros(8)
             change[free] = x * UNIT[free]
             moved = adjust(camera, change)
@@ -143,7 +143,8 @@ def fit_rig(rig: CameraRig, edges: Sequence[Edges], flights: Sequence[Flight], b
     """
     if 0 < len(flights) < FEWEST_FLIGHTS:
         raise ValueError(
-            f"expected at least {FEWEST_FLIGHTS} free flights that two cameras see, got {len(flights)}; record more balls"
+            f"expected at least {FEWEST_FLIGHTS} free flights that two cameras see, got {len(flights)}; "
+            "record more balls"
         )
     problem = _Problem(rig, tuple(edges), tuple(flights), bumped)
     x, jacobian = problem.solve()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ballmodel import flight
+from ballmodel.kalman import Physics, move
 from ballmodel.state import BallState
 from robot_io.vision import rig
 from robot_io.vision.detection import Detection
@@ -96,10 +97,12 @@ def test_a_ball_is_found_at_once_and_followed_through_its_bounce(tracked):
 def test_a_stroke_is_another_ball_from_its_first_place_on():
     places, velocities = fly()
     rng, tracker, numbers = np.random.default_rng(2), BallTracker(CAMERAS), []
+    struck = np.concatenate([places[160], [0.3, 6.0, 1.5], np.zeros(3)])[:, None]
     for k in range(0, 320, 8):
-        back = k > 160
-        place = places[160] + (k - 160) * 1e-3 * np.array([0.3, 6.0, 1.5]) if back else places[k]
-        velocity = np.array([0.3, 6.0, 1.5]) if back else velocities[k]
+        place, velocity = places[k], velocities[k]
+        if k > 160:
+            state = move(struck, (k - 160) * 1e-3, Physics(drag=0.141))[:, 0]
+            place, velocity = state[:3], state[3:6]
         ball = tracker.update(k * 1e-3, [[detect(c, place, velocity, rng)] for c in CAMERAS])
         if ball is not None:
             numbers.append((k, ball.number, np.linalg.norm(ball.position - place)))
