@@ -152,8 +152,11 @@ def _squared(params: Any, crops: Crops) -> tuple[np.ndarray, np.ndarray, np.ndar
 def calibrate(params: Any, squared: np.ndarray) -> Any:
     """Scales the covariance so that the squared errors over it (n,) get the mean of two degrees of freedom, 2.
 
-    They come from whole frames: crops have more balls that are half hidden or at a window's edge.
+    They come from whole frames: crops have more balls that are half hidden or at a window's edge. Without any, as in a
+    try-out that finds no ball, the covariance stays.
     """
+    if not len(squared):
+        return params
     factor = np.sqrt(2.0 / squared.mean())
     kernel, bias = (np.array(params["out"][name]) for name in ("kernel", "bias"))
     for diagonal in (3, 5):
@@ -165,12 +168,12 @@ def calibrate(params: Any, squared: np.ndarray) -> Any:
 def judge(params: Any, crops: Crops) -> dict[str, float]:
     """Figures on crops: share found, false shares, errors [px], squared errors over the covariance."""
     error, squared, empty = _squared(params, crops)
-    half, most = np.percentile(error, [50, 90])
+    half, most = np.percentile(error, [50, 90]) if len(error) else (np.nan, np.nan)
     found = len(error) / max(int((crops.labels[:, 0] > 0).sum()), 1)
     return {
         "found": found,
         "false": float((empty > 0.5).mean()),
         "error_50": float(half),
         "error_90": float(most),
-        "squared": float(squared.mean()),
+        "squared": float(squared.mean()) if len(squared) else np.nan,
     }
