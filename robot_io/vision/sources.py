@@ -55,7 +55,7 @@ class RecordedSource:
 
 @dataclass(frozen=True)
 class PylonSource:
-    """A Basler camera by its serial number; emulated ones are there when the environment variable PYLON_CAMEMU says how many.
+    """A Basler camera by its serial number; the environment variable PYLON_CAMEMU says how many are emulated.
 
     rate, exposure  [Hz], [s]
     size            width and height [px]

@@ -13,6 +13,7 @@ from robot_io.vision import rig
 from robot_io.vision.camera import Camera
 from robot_io.vision.triangulation import intersect
 
+pytestmark = pytest.mark.slow
 SKEW = 0.0012  # [s]
 GRID = np.stack(np.meshgrid([-0.7, 0.0, 0.7], [-1.3, 0.0, 1.3], [0.05, 0.4]), -1).reshape(-1, 3)
 

@@ -12,6 +12,8 @@ from robot_io.vision.health import Health
 RIG = rig.standard()
 PERIOD = 1.0 / RIG.rate
 BEGIN, END = 1.0, 2.0  # [s] of the fault
+COVER = np.random.default_rng(0).normal(4, 2, (1024, 1280)).clip(0, 255).astype(np.uint8)
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def watch(pictures, fault: str = "") -> dict[str, float]:
                 continue
             frame = pictures[kind][i][k % 4]
             if fault == "cover" and on and i == 0:
-                frame = rng.normal(4, 2, frame.shape).clip(0, 255).astype(np.uint8)
+                frame = COVER
             health.frame(i, time, frame)
         flight = time % 0.6
         seen = []

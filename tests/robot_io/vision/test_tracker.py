@@ -113,7 +113,7 @@ def test_a_stroke_is_another_ball_from_its_first_place_on():
 
 def test_clutter_alone_and_hands_are_no_balls():
     rng, tracker = np.random.default_rng(3), BallTracker(CAMERAS)
-    for k in range(500):
+    for k in range(250):
         hand = np.array([0.3 * np.sin(0.05 * k), 1.5, 0.3 + 0.1 * np.cos(0.04 * k)])
         seen = [[clutter(c, rng) for _ in range(rng.poisson(0.5))] for c in CAMERAS]
         for i, camera in enumerate(CAMERAS):
