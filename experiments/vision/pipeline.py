@@ -16,7 +16,8 @@ import numpy as np
 from experiments.progress import Stage
 from experiments.vision import export, flights, network, search, training
 from experiments.vision.crops import Crops, make_crops, mine_crops
-from experiments.vision.evaluation import WITHIN, use_one_core
+from experiments.vision.evaluation import WITHIN, evaluate_rendered, use_one_core
+from robot_io.vision import rig
 from robot_io.vision.detector import Cells, Detector, read_cells
 
 SHIPPED = Path(__file__).parents[1] / "shipped" / "vision"
@@ -38,12 +39,13 @@ class Plan:
     hall_scenes: int = 400  # in which hard negatives are sought
     film_scenes: int = 150
     steps: int = 4000
+    calibration_flights: int = 12  # by which the covariance is scaled
     seed: int = 0
 
     @classmethod
     def small(cls) -> Plan:
         """A try-out of a minute, whose detector is poor."""
-        return cls(60, 900, 240, 120, 240, 60, 240, 4, 2, 60)
+        return cls(60, 900, 240, 120, 240, 60, 240, 4, 2, 60, 1)
 
 
 def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], object] = print) -> dict[str, float]:
@@ -109,7 +111,11 @@ def train_detector(out: Path, plan: Plan, stage: Stage, note: Callable[[str], ob
             )
             training.save(second, params)
     with stage("covariance, export"):
-        params = calibrate(training.load(second), held_out)
+        params = training.load(second)
+        export.export(out, params, order, held_out)
+        flown = flights.split_flights(tracks, False)[: plan.calibration_flights]
+        sights = evaluate_rendered(out, rig.standard().cameras, flown, np.random.default_rng(plan.seed + 51))
+        params = calibrate(params, sights.squared)
         export.export(out, params, order, held_out)
     return judge(params, held_out)
 
@@ -143,9 +149,14 @@ def _squared(params: Any, crops: Crops) -> tuple[np.ndarray, np.ndarray, np.ndar
     return error[found], squared, said.probability[~there]
 
 
-def calibrate(params: Any, crops: Crops) -> Any:
-    """Scales the covariance so that crops' squared errors over it have the mean of two degrees of freedom, 2."""
-    _, squared, _ = _squared(params, crops)
+def calibrate(params: Any, squared: np.ndarray) -> Any:
+    """Scales the covariance so that the squared errors over it (n,) get the mean of two degrees of freedom, 2.
+
+    They come from whole frames: crops have more balls that are half hidden or at a window's edge. Without any, as in a
+    try-out that finds no ball, the covariance stays.
+    """
+    if not len(squared):
+        return params
     factor = np.sqrt(2.0 / squared.mean())
     kernel, bias = (np.array(params["out"][name]) for name in ("kernel", "bias"))
     for diagonal in (3, 5):
@@ -157,12 +168,12 @@ def calibrate(params: Any, crops: Crops) -> Any:
 def judge(params: Any, crops: Crops) -> dict[str, float]:
     """Figures on crops: share found, false shares, errors [px], squared errors over the covariance."""
     error, squared, empty = _squared(params, crops)
-    half, most = np.percentile(error, [50, 90])
+    half, most = np.percentile(error, [50, 90]) if len(error) else (np.nan, np.nan)
     found = len(error) / max(int((crops.labels[:, 0] > 0).sum()), 1)
     return {
         "found": found,
         "false": float((empty > 0.5).mean()),
         "error_50": float(half),
         "error_90": float(most),
-        "squared": float(squared.mean()),
+        "squared": float(squared.mean()) if len(squared) else np.nan,
     }

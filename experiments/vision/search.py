@@ -53,7 +53,7 @@ def train_search(features: np.ndarray, balls: np.ndarray, epochs: int = 12, seed
         "second": {"kernel": rng.normal(0, 0.2, (HIDDEN, 1)), "bias": np.zeros(1)},
     }
     layers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), layers)
-    steps = epochs * (len(balls) // BATCH)
+    steps = epochs * max(len(balls) // BATCH, 1)
     optimiser = optax.adamw(optax.cosine_decay_schedule(2e-3, steps), weight_decay=1e-3)
 
     @jax.jit

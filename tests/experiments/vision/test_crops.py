@@ -14,6 +14,7 @@ def tracks():
     return flights.fly_balls(12, 3)
 
 
+@pytest.mark.slow
 def test_flights_obey_gravity_where_nothing_is_touched(tracks):
     first = tracks[:, :60]  # metres, at 1 kHz
     height = first[..., 2]
@@ -36,6 +37,7 @@ def test_a_crop_holds_what_the_frames_hold_around_its_corner():
     assert (corner[:, : AROUND // 2 - 1, 0] == corner[:, :1, 0]).all() and corner[:, AROUND:, 0].std() > 5
 
 
+@pytest.mark.slow
 def test_labels_are_where_the_picture_changes(tracks):
     made = crops.make_crops(60, tracks, np.random.default_rng(1))
     there = np.nonzero(made.labels[:, 0])[0]
