@@ -36,6 +36,7 @@ from experiments.commands import (
     train,
     unpack,
     view,
+    vision,
 )
 from experiments.errors import explained
 from experiments.robots import command as robot_command
@@ -52,7 +53,7 @@ The usual way:
 WIDTH = 120  # [characters] of help in a file or pipe
 MODULES = (
     *(train, evaluate, export, pack, unpack, fit_human, import_, render, view, curves, run, finetune, is2r),
-    *(study_report, blind, compare, robot, rig, log, calibrate, diagnose, predict, bench_ball, schema, balls),
+    *(study_report, blind, compare, robot, rig, log, calibrate, diagnose, predict, bench_ball, vision, schema, balls),
 )
 COMMANDS = tuple(module.app for module in MODULES)
 app = App(

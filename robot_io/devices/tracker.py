@@ -10,6 +10,12 @@ One datagram per camera frame, also when no ball is seen, so that silence and an
     12  i64     capture time of the frame [ns], the clock that TrackerConfig names
     20  3 f64   position x, y, z [m] of the ball's centre in the table frame; zeros when none is seen
     44  u32     CRC-32 (zlib) of bytes 0..43
+
+Version 2 has 156 bytes, only for frames that show a ball; one stream may hold both. Bytes 0..43 are those of version 1
+but for the version, then:
+    44  3 f64   velocity [m/s] in the table frame
+    68  21 f32  upper triangle, by rows, of the covariance of position and velocity in m and m/s
+   152  u32     CRC-32 (zlib) of bytes 0..151
 """
 
 from __future__ import annotations
@@ -31,11 +37,14 @@ from robot_io.errors import DeviceError
 from robot_io.history import History
 
 MAGIC = b"TTBL"
-VERSION = 1
+VERSION, MOVING = 1, 2  # versions: a place, and a place with velocity and covariance
 SEEN = 1
 _BODY = struct.Struct("<4sBBHIq3d")
 _CRC = struct.Struct("<I")
+_MOTION = struct.Struct("<3d21f")
+_UPPER = np.triu_indices(6)
 SIZE = _BODY.size + _CRC.size
+MOVING_SIZE = SIZE + _MOTION.size
 SEQUENCE = 1 << 32
 NANO = 1_000_000_000
 MAX_DRAIN = 1000  # datagrams per call: a flood must not keep the caller from its control tick
@@ -52,34 +61,52 @@ SILENCE = 1.0  # [s] after which the tracker may have been started anew
 
 @dataclass(frozen=True)
 class BallSample:
-    """Content of one frame; position (3,) [m] is None where no ball was seen; times in seconds."""
+    """Content of one frame; position (3,) [m] is None where no ball was seen; times in seconds.
+
+    velocity    (3,) [m/s]; None where the tracker sends none
+    covariance  (6, 6) of position and velocity [m], [m/s], beside a velocity
+    """
 
     sequence: int
     ball: int
     captured: float
     position: np.ndarray | None
+    velocity: np.ndarray | None = None
+    covariance: np.ndarray | None = None
 
 
 def encode(sample: BallSample) -> bytes:
-    """The datagram of a frame. Raises ValueError for a position that is not finite."""
+    """The datagram of a frame, of version 2 where it has a velocity.
+
+    Raises ValueError for what is not finite, and for a velocity without position or covariance.
+    """
     position = np.zeros(3) if sample.position is None else np.asarray(sample.position, float)
     if position.shape != (3,) or not np.isfinite(position).all():
         raise ValueError(f"position {sample.position}, three finite numbers [m] are needed")
     flags = 0 if sample.position is None else SEEN
+    version = VERSION if sample.velocity is None else MOVING
     captured = round(sample.captured * NANO)
-    body = _BODY.pack(MAGIC, VERSION, flags, sample.ball & 0xFFFF, sample.sequence % SEQUENCE, captured, *position)
+    body = _BODY.pack(MAGIC, version, flags, sample.ball & 0xFFFF, sample.sequence % SEQUENCE, captured, *position)
+    if sample.velocity is not None:
+        covariance = np.full((6, 6), np.nan) if sample.covariance is None else sample.covariance
+        motion = np.concatenate([sample.velocity, covariance[_UPPER]])
+        if sample.position is None or motion.shape != (24,) or not np.isfinite(motion).all():
+            raise ValueError("velocity: expected a seen ball, three finite numbers [m/s] and a covariance (6, 6)")
+        body += _MOTION.pack(*motion)
     return body + _CRC.pack(zlib.crc32(body))
 
 
 def decode(datagram: bytes) -> BallSample:
     """The frame of a datagram. Raises ValueError saying what is wrong with it."""
-    if len(datagram) != SIZE:
-        raise ValueError(f"size: {len(datagram)} bytes, a frame has {SIZE}")
-    body = datagram[: _BODY.size]
-    if _CRC.unpack(datagram[_BODY.size :])[0] != zlib.crc32(body):
+    if len(datagram) not in (SIZE, MOVING_SIZE):
+        raise ValueError(f"size: {len(datagram)} bytes, a frame has {SIZE} or {MOVING_SIZE}")
+    body = datagram[: -_CRC.size]
+    if _CRC.unpack(datagram[-_CRC.size :])[0] != zlib.crc32(body):
         raise ValueError("checksum: the CRC does not fit")
-    magic, version, flags, ball, sequence, captured, *position = _BODY.unpack(body)
-    if magic != MAGIC or version != VERSION or flags & ~SEEN:
+    magic, version, flags, ball, sequence, captured, *position = _BODY.unpack_from(body)
+    moving = len(datagram) == MOVING_SIZE
+    allowed = flags == SEEN if moving else not flags & ~SEEN
+    if magic != MAGIC or version != (MOVING if moving else VERSION) or not allowed:
         raise ValueError(f"format: magic {magic!r}, version {version}, flags {flags}")
     if not flags & SEEN:
         if any(position):
@@ -88,7 +115,17 @@ def decode(datagram: bytes) -> BallSample:
     point = np.array(position)
     if not np.isfinite(point).all() or np.abs(point).max() > REACH:
         raise ValueError(f"position: {position}")
-    return BallSample(sequence, ball, captured / NANO, point)
+    if not moving:
+        return BallSample(sequence, ball, captured / NANO, point)
+    motion = np.array(_MOTION.unpack_from(body, _BODY.size))
+    velocity, covariance = motion[:3], np.zeros((6, 6))
+    if not np.isfinite(motion).all() or float(velocity @ velocity) > FASTEST**2:
+        raise ValueError(f"velocity: {velocity.tolist()}")
+    covariance[_UPPER] = motion[3:]
+    covariance = covariance + covariance.T - np.diag(np.diag(covariance))
+    if np.linalg.eigvalsh(covariance)[0] < -1e-6 * np.trace(covariance) or np.trace(covariance) <= 0.0:
+        raise ValueError("covariance: not one of anything")
+    return BallSample(sequence, ball, captured / NANO, point, velocity, covariance)
 
 
 @dataclass(frozen=True)
@@ -171,8 +208,7 @@ class Tracker:
         self._sequence, self._far = sample.sequence, None
         self.received = now
         self._port = port if self._unpinned(silent) else self._port
-        position = None if sample.position is None else self.frame.outward(sample.position)
-        sample = BallSample(sample.sequence, sample.ball, captured, position)
+        sample = self._in_table_frame(sample, captured)
         self.newest = sample
         if sample.position is None:
             self.counts["accepted"] += 1
@@ -192,6 +228,15 @@ class Tracker:
         if self.track.add(captured, sample.position):
             self.seen = captured
         return sample
+
+    def _in_table_frame(self, sample: BallSample, captured: float) -> BallSample:
+        velocity, covariance = sample.velocity, sample.covariance
+        if velocity is not None and covariance is not None and not self.frame.neutral:
+            turn = self.frame.matrix
+            both = np.kron(np.eye(2), turn)
+            velocity, covariance = turn @ velocity, both @ covariance @ both.T
+        position = None if sample.position is None else self.frame.outward(sample.position)
+        return BallSample(sample.sequence, sample.ball, captured, position, velocity, covariance)
 
     def problem(self, now: float) -> str | None:
         """Reason why nothing is known of the ball, as a sentence; None: frames come."""

@@ -28,7 +28,7 @@ from robot_io.emulator.arm import ArmController, ArmStateError
 from robot_io.emulator.config import STANDARD_RIG, RigParams, drives_of, for_robot
 from robot_io.emulator.network import Network
 from robot_io.emulator.opponent import Opponent, Throws, ball_source
-from robot_io.emulator.tracker import TrackerEmulator
+from robot_io.emulator.tracker import EmulatedTracker, TrackerEmulator, TrackerMaker
 from robot_io.emulator.world import World
 from robot_io.errors import JogFirstError, RefusedError
 from robot_io.log.recorder import SessionRecorder
@@ -51,6 +51,7 @@ class LockStep:
     config  of the bridge; its contract says which joints arm and axes have
     balls_needed  as of BridgeConfig; with the default the tracker, which nobody can move, counts as shown, and only
             balls that contradict it are heeded
+    rendered  makes the tracker where ``tracker.cameras`` is "rendered"
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class LockStep:
         tracker: TrackerConfig = SAME_CLOCK,
         calibration: Calibration = UNCALIBRATED,
         balls_needed: int = 0,
+        rendered: TrackerMaker | None = None,
     ) -> None:
         contract = config.contract
         self.params = params = for_robot(params, contract)
@@ -88,7 +90,11 @@ class LockStep:
         ]
         self.axes: FestoAxes | FixedBase = FestoAxes(axes) if axes else FixedBase()
         seed = np.random.SeedSequence([params.seed, first]).generate_state(4)
-        self.cameras = TrackerEmulator(params.tracker, int(seed[0]), params.hidden)
+        self.cameras: EmulatedTracker
+        if rendered is not None and params.tracker.cameras == "rendered":
+            self.cameras = rendered.open(params.tracker, self.world, int(seed[0]))
+        else:
+            self.cameras = TrackerEmulator(params.tracker, int(seed[0]), params.hidden)
         self._to_bridge = Network(params.arm_network, int(seed[1]))
         self._to_arm = Network(params.arm_network, int(seed[2]))
         self._frames = Network(params.tracker_network, int(seed[3]))

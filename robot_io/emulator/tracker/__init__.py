@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol, TypeAlias, get_args
 
 import numpy as np
 
@@ -32,7 +32,8 @@ class TrackerParams:
     identity  what a number stands for: "ball", one from its first stroke to the end of the rally; "stroke", one from
              stroke to stroke; "lost", as "ball", but the ball is out of sight from its bounce on the human's half until
              it is struck
-    cameras  two that triangulate the ball, lose it and mistake it for another
+    cameras  two that triangulate the ball, lose it and mistake it for another; "rendered": the world is drawn, and the
+             ball is found in the pictures, in lock-step only
     """
 
     rate: Annotated[float, Within(10.0, 1000.0, "Hz")] = 125.0
@@ -40,7 +41,7 @@ class TrackerParams:
     noise: Annotated[float, Within(0.0, 1.0, "m")] = 0.003
     offset: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
     identity: Identity = "ball"
-    cameras: CameraParams = CameraParams()
+    cameras: CameraParams | Literal["rendered"] = CameraParams()
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -51,6 +52,30 @@ class TrackerParams:
         return world.strokes if self.identity == "stroke" else world.number, world.visible and not hidden
 
 
+class EmulatedTracker(Protocol):
+    """A tracker of the rig."""
+
+    def drop_out(self, until: float) -> None:
+        """Sends nothing until then."""
+        ...
+
+    def step(self, now: float, ball: int, position: np.ndarray | None) -> None:
+        """Captures a frame: the ball's number and true position (3,) [m], None when there is none."""
+        ...
+
+    def due(self, now: float) -> list[bytes]:
+        """Datagrams that are ready to be sent."""
+        ...
+
+
+class TrackerMaker(Protocol):
+    """Makes the tracker of a world whose ``cameras`` is "rendered"."""
+
+    def open(self, params: TrackerParams, world: World, seed: int) -> EmulatedTracker:
+        """The tracker of a world; the seed draws all that is random."""
+        ...
+
+
 class TrackerEmulator:
     """Frames of the ball; ``step`` once per 1 / rate seconds."""
 
@@ -58,7 +83,12 @@ class TrackerEmulator:
         self._params, self._hidden, self._random = params, hidden, np.random.default_rng(seed)
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._sequence = 0
-        self._cameras = CameraPair(params.cameras, params.rate, self._random) if params.cameras.triangulated else None
+        pair = params.cameras
+        if not isinstance(pair, CameraParams):
+            raise ValueError(
+                "tracker.cameras: expected triangulated cameras in real time, got 'rendered'; it is for lock-step"
+            )
+        self._cameras = CameraPair(pair, params.rate, self._random) if pair.triangulated else None
         self._silent_until = -np.inf
 
     def drop_out(self, until: float) -> None:

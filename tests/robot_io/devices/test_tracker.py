@@ -9,6 +9,7 @@ import zlib
 import numpy as np
 import pytest
 
+from robot_io.calibrated import Calibration, TrackerCalibration
 from robot_io.devices.tracker import SIZE, BallSample, Tracker, TrackerConfig, TrackerSocket, decode, encode
 from robot_io.emulator.network import Network, NetworkFaults
 from robot_io.emulator.tracker import TrackerEmulator, TrackerParams
@@ -49,6 +50,52 @@ def test_golden_bytes():
     empty = bytes.fromhex("5454424c0100070004030201002f685900000000") + bytes(24)
     assert decode(empty + crc32(empty).to_bytes(4, "little")).position is None
     assert encode(BallSample(0x01020304, 7, 1.5, None)) == empty + crc32(empty).to_bytes(4, "little")
+
+
+def moving(velocity=(0.25, -4.0, 1.0), spread=1.0) -> BallSample:
+    covariance = np.diag([1e-6, 1e-6, 4e-6, 0.0625, 0.0625, 0.25]) * spread
+    covariance[0, 3] = covariance[3, 0] = 1e-4
+    return BallSample(5, 7, 1.5, np.array([0.5, -1.25, 0.25]), np.array(velocity), covariance)
+
+
+def test_golden_bytes_of_the_second_version():
+    body = bytes.fromhex("5454424c0201070005000000002f685900000000") + GOLDEN[20:]
+    body += struct.pack("<3d", 0.25, -4.0, 1.0)
+    rows = [[1e-6, 0, 0, 1e-4, 0, 0], [1e-6, 0, 0, 0, 0], [4e-6, 0, 0, 0], [0.0625, 0, 0], [0.0625, 0], [0.25]]
+    body += struct.pack("<21f", *(number for row in rows for number in row))
+    datagram = body + crc32(body).to_bytes(4, "little")
+    assert encode(moving()) == datagram and len(datagram) == 156
+    sample = decode(datagram)
+    np.testing.assert_array_equal(sample.velocity, [0.25, -4.0, 1.0])
+    np.testing.assert_allclose(sample.covariance, moving().covariance, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "datagram, reason",
+    [
+        (resealed(encode(moving())[:5] + b"\x00" + encode(moving())[6:-4]), "format"),
+        (resealed(encode(moving())[:4] + b"\x01" + encode(moving())[5:-4]), "format"),
+        (encode(moving((50.0, 0.0, 0.0))), "velocity"),
+        (encode(moving(spread=-1.0)), "covariance"),
+        (encode(moving(spread=1e-9)), "covariance"),  # the correlation is more than one
+        (encode(moving())[:-1], "size"),
+        (encode(moving())[:-5] + b"\x01" + encode(moving())[-4:], "checksum"),
+    ],
+)
+def test_impossible_motions_are_refused(datagram, reason):
+    with pytest.raises(ValueError, match=reason):
+        decode(datagram)
+
+
+def test_the_bridge_s_track_takes_both_versions_and_turns_motions_into_the_table_s_frame():
+    turned = TrackerCalibration((0.1, 0.0, 0.0), (0.0, 0.0, np.pi / 2), 0.001, 9, "2026-01-01")
+    tracker = Tracker(TrackerConfig(), Calibration(tracker=turned))
+    assert tracker.receive(frame(4, 1.492, 7, (0.5, -1.2, 0.25)), HOME, 1.5) is not None
+    sample = tracker.receive(encode(moving()), HOME, 1.51)
+    assert sample.position == pytest.approx([1.35, 0.5, 0.25], abs=1e-6)
+    assert sample.velocity == pytest.approx([4.0, 0.25, 1.0], abs=1e-6)
+    assert sample.covariance[1, 4] == pytest.approx(1e-4, rel=1e-3)
+    assert tracker.counts["accepted"] == 2 and tracker.counts["lost"] == 0
 
 
 @pytest.mark.parametrize("place, value", [(0, b"X"), (4, b"\x02"), (5, b"\x02"), (5, b"\x81"), (5, b"\x00")])

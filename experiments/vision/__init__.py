@@ -1,0 +1,1 @@
+"""The ball detector's pictures, training and evaluation."""

@@ -1,0 +1,1 @@
+"""Cameras calibrated by what they see anyway: the table's lines, then balls that fly."""

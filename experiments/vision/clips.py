@@ -1,0 +1,130 @@
+"""Clips to evaluate on: video files through PyAV and recordings, as Bayer frames; and the labels of their balls."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from experiments.errors import ConfigError
+from experiments.vision.render import mosaic
+from robot_io.vision.recording import FrameReader
+
+NAMES = {
+    "frame": ("frame", "img", "image", "frame_id"),
+    "x": ("x", "u"),
+    "y": ("y", "v"),
+    "visibility": ("visibility", "visible"),
+}
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames of one camera."""
+
+    path: Path
+    rate: float  # [Hz]
+    camera: str | None = None  # of a recording
+    bayer: str = "RGGB"
+
+    def frames(self) -> Iterator[np.ndarray]:
+        """Bayer frames (h, w) uint8 in order; of a video RGGB, and odd sides lose their last pixels."""
+        if self.path.suffix == ".mcap":
+            yield from (recorded.frame for recorded in FrameReader(self.path).frames(self.camera))
+            return
+        import av
+
+        with av.open(str(self.path)) as file:
+            for image in file.decode(video=0):
+                colours = image.to_ndarray(format="rgb24")
+                height, width = (side // 2 * 2 for side in colours.shape[:2])
+                yield mosaic(colours[:height, :width])
+
+
+def open_clip(path: str | os.PathLike, camera: str | None = None) -> Clip:
+    """A clip of a video file or of a recording's camera.
+
+    Raises:
+        ConfigError: the file is neither, PyAV is missing, or a recording of several cameras needs ``camera``.
+    """
+    path = Path(path)
+    if path.suffix == ".mcap":
+        try:
+            reader = FrameReader(path)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        if camera is None and len(reader.cameras) > 1:
+            raise ConfigError(f"{path}: expected --camera, one of {', '.join(reader.cameras)}, got none")
+        return Clip(path, reader.rate, camera or next(iter(reader.cameras)), reader.bayer)
+    if find_spec("av") is None:
+        raise ConfigError(f'{path}: reading video needs PyAV; pip install "mjx-tt[vision]"')
+    import av
+
+    try:
+        with av.open(str(path)) as file:
+            rate = file.streams.video[0].average_rate
+    except (av.error.FFmpegError, IndexError) as error:
+        raise ConfigError(
+            f"{path}: expected a video file or a recording (.mcap), got something else: {error}"
+        ) from None
+    return Clip(path, float(rate or 25.0))
+
+
+Labels = dict[int, np.ndarray | None]  # frame, from 0, to the ball's pixel (2,), or None where there is no ball
+
+
+def read_labels(path: str | os.PathLike) -> Labels:
+    """Labels of a clip. Frames that are not in the file are not judged.
+
+    Takes a CSV with the columns frame, x and y (an empty or negative one: no ball) and, where it has one, visibility
+    (0: no ball), which is also what BlurBall and TT3D write; and TTNet's JSON of frames with x and y (-1: no ball).
+
+    Raises:
+        ConfigError: the file is neither, or a value is no number.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: expected text, a CSV or JSON; got something else") from None
+    try:
+        rows = _json_rows(text) if path.suffix == ".json" else _csv_rows(text)
+        labels: Labels = {}
+        for frame, x, y, visible in rows:
+            place = np.array([float(x or "nan"), float(y or "nan")])
+            there = float(visible or 1) > 0 and bool((place >= 0).all())
+            labels[int(float(Path(str(frame)).stem))] = place if there else None
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ConfigError(f"{path}: expected the columns frame,x,y or a JSON of frames with x and y; {error}") from None
+    if not labels:
+        raise ConfigError(f"{path}: expected labels, got none")
+    return labels
+
+
+def _csv_rows(text: str) -> list[tuple[str, str, str, str]]:
+    reader = csv.DictReader(text.splitlines())
+    given = {name.strip().lower(): name for name in reader.fieldnames or ()}
+    column = {key: next((given[n] for n in names if n in given), None) for key, names in NAMES.items()}
+    missing = [key for key in ("frame", "x", "y") if column[key] is None]
+    if missing:
+        raise ValueError(f"got {', '.join(given) or 'no header'}, which lacks {', '.join(missing)}")
+    return [tuple((row[name] or "").strip() if name else "" for name in column.values()) for row in reader]  # type: ignore[misc]
+
+
+def _json_rows(text: str) -> list[tuple[str, str, str, str]]:
+    return [(frame, str(at["x"]), str(at["y"]), "") for frame, at in json.loads(text).items()]
+
+
+def write_labels(path: str | os.PathLike, labels: Labels) -> None:
+    """Writes labels as a CSV with the columns frame, x and y."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(("frame", "x", "y"))
+        for frame, place in sorted(labels.items()):
+            writer.writerow((frame, "", "") if place is None else (frame, f"{place[0]:.2f}", f"{place[1]:.2f}"))

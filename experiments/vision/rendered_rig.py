@@ -1,0 +1,112 @@
+"""The rig from pixels: its world is drawn for each camera, and the ball is found, triangulated and tracked."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from experiments.vision import render as pictures
+from robot_io.devices.tracker import BallSample, encode
+from robot_io.emulator.tracker import TrackerParams
+from robot_io.emulator.world import World
+from robot_io.vision.detector import Detector
+from robot_io.vision.rig import CameraRig
+from robot_io.vision.tracker import BallTracker, TrackedBall
+
+PAINT, RUBBER, BLADE = np.array([225.0, 105.0, 30.0]), np.array([20.0, 20.0, 20.0]), 0.075
+
+
+@dataclass(frozen=True)
+class RenderedCameras:
+    """Makes the tracker of a rig whose ``tracker.cameras`` is "rendered".
+
+    rig        the cameras
+    detector   folder of the network
+    believed   the cameras as their calibration has them; None: it is perfect
+    watch      is told of every frame the reported ball, and where it is [m] (3,); None: there is none
+    """
+
+    rig: CameraRig
+    detector: Path
+    believed: CameraRig | None = None
+    watch: Callable[[TrackedBall | None, np.ndarray | None], None] | None = None
+
+    def open(self, params: TrackerParams, world: World, seed: int) -> RenderedTracker:
+        """The tracker of a world; the seed draws the hall, the person and noise."""
+        return RenderedTracker(self, params, world, seed)
+
+
+class RenderedTracker:
+    """Has the methods of ``TrackerEmulator``; what it does with a frame is what ``mjx-tt vision run`` does."""
+
+    def __init__(self, cameras: RenderedCameras, params: TrackerParams, world: World, seed: int) -> None:
+        self._world, self._params, rig = world, params, cameras.rig
+        self._random, self._watch = np.random.default_rng(seed), cameras.watch
+        self._scenes = [pictures.make_scene(camera, self._random) for camera in rig.cameras]
+        for scene in self._scenes:
+            scene.exposure, scene.ball = rig.exposure, self._scenes[0].ball
+        self._person = pictures.Actors(self._random, clutter=0)
+        self._detectors = [Detector(cameras.detector, params.rate) for _ in rig.cameras]
+        self.tracker = BallTracker((cameras.believed or rig).cameras)
+        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._sequence, self._silent_until = 0, -np.inf
+        model = world.model
+        self._capsules = [
+            i
+            for i in range(model.ngeom)
+            if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_CAPSULE and model.geom_bodyid[i] > 0
+        ]
+
+    def drop_out(self, until: float) -> None:
+        """Sends nothing until then."""
+        self._silent_until = until
+
+    def step(self, now: float, ball: int, position: np.ndarray | None) -> None:
+        """Exposes a frame in whose middle the ball is at a position (3,) [m], or nowhere; its number is not seen."""
+        velocity = self._world.ball_velocity
+
+        def path(times: np.ndarray) -> np.ndarray:
+            if position is None:
+                return pictures.no_ball(times)
+            return position + (times - now)[:, None] * velocity
+
+        shapes = [*self._person.person(now, position), *self._robot()]
+        guesses = self.tracker.guesses(now)
+        found = []
+        for scene, detector, places in zip(self._scenes, self._detectors, guesses, strict=True):
+            frame = pictures.render(scene, path, now, self._random, shapes).frame
+            found.append(detector.detect(frame, places))
+        tracked = self.tracker.update(now, found)
+        if self._watch is not None:
+            self._watch(tracked, position)
+        sample = BallSample(self._sequence, self.tracker.number, now, None)
+        if tracked is not None and tracked.seen:
+            sample = BallSample(
+                self._sequence, tracked.number, now, tracked.position, tracked.velocity, tracked.covariance
+            )
+        if now >= self._silent_until:
+            self._waiting.append((now + self._params.latency, encode(sample)))
+        self._sequence += 1
+
+    def due(self, now: float) -> list[bytes]:
+        """Datagrams that are ready to be sent."""
+        ready = []
+        while self._waiting and self._waiting[0][0] <= now + 1e-9:
+            ready.append(self._waiting.popleft()[1])
+        return ready
+
+    def _robot(self) -> list[pictures.Capsule]:
+        """The robot's capsules, and its blade."""
+        model, data = self._world.model, self._world.data
+        shapes = []
+        for i in self._capsules:
+            half = data.geom_xmat[i].reshape(3, 3)[:, 2] * model.geom_size[i, 1]
+            place = data.geom_xpos[i]
+            shapes.append(pictures.Capsule(place - half, place + half, float(model.geom_size[i, 0]), PAINT))
+        blade = data.site("paddle").xpos.copy()
+        return [*shapes, pictures.Capsule(blade, blade + [0.0, 0.01, 0.0], BLADE, RUBBER)]

@@ -1,0 +1,1 @@
+"""Balls from pictures: cameras, detection, places, tracks."""

@@ -1,0 +1,251 @@
+"""The ball among several hypotheses: a filter each, of which one is reported.
+
+A hypothesis begins with a place that two cameras agree on and that no other explains. It takes whole places first, and
+what one camera sees alone where there is none. A consistent place beside the prediction is no outlier: the ball was
+struck. What flies and looks like a ball is believed soon, what is slow later, for hands and paddles are slow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+
+from ballmodel.kalman import Kalman, Physics
+from robot_io.vision.camera import Camera
+from robot_io.vision.detection import Detection
+from robot_io.vision.triangulation import Sight, triangulate
+
+PHYSICS = Physics(drag=0.141, lift=0.0033, wander=0.1, bounced=(0.5, 0.25, 60.0))
+CLUTTER, FADING = 5.0, 0.9  # evidence that a place of clutter has; share of it that is left after a frame
+SUREST = 0.993  # probability beyond which more counts no more
+UNSEEN = 2.0  # evidence that a frame without a place takes
+ROOM = np.array([[-4.0, -5.0, -0.8], [4.0, 5.0, 3.0]])  # [m] in which there are balls
+
+
+@dataclass(frozen=True)
+class TrackerOptions:
+    """How much is believed.
+
+    floor      [px] deviation that calibration and lens add to every detection's
+    agree      squared deviation up to which two cameras see the same
+    gate       the same of a pixel, and ``gate_space`` of a place, against a prediction
+    sure       probability of the detections that begin a hypothesis; ``struck`` of those where the ball was just lost
+    fast       [m/s] from which on ``hits`` places make a ball; slower ones need ``slow_hits``
+    score      evidence that makes a ball, and ``margin`` by which another must have more to take its place
+    slowest    [m/s] below which nothing is a new ball: a hand, a ball that lies, a lamp
+    forget     [s] without a place after which the reported ball is given up; ``drop`` of any other hypothesis
+    alone      [s] without a place up to which one camera's sights are enough to report it as seen
+    reach      [m/s] within which a struck ball leaves
+    most       hypotheses that are kept
+    """
+
+    floor: float = 0.15
+    agree: float = 16.0
+    gate: float = 16.0
+    gate_space: float = 21.0
+    sure: float = 0.8
+    struck: float = 0.5
+    fast: float = 2.5
+    hits: int = 3
+    score: float = 7.0
+    margin: float = 6.0
+    slow_hits: int = 10
+    slowest: float = 1.5
+    forget: float = 0.1
+    drop: float = 0.025
+    alone: float = 0.05
+    reach: float = 20.0
+    most: int = 4
+
+
+@dataclass(eq=False)
+class Hypothesis:
+    """A ball that may be one.
+
+    ball    its filter at ``time`` [s]
+    begun   [s], when it was last seen by a camera, and when last placed by two
+    hits    places so far
+    score   evidence: logarithms of the odds that its sights were balls, less what clutter brings, the old ones fading
+    """
+
+    ball: Kalman
+    time: float
+    begun: float
+    seen: float
+    placed: float
+    hits: int = 1
+    score: float = 0.0
+
+    @property
+    def speed(self) -> float:
+        """[m/s]"""
+        return float(np.linalg.norm(self.ball.mean[3:6]))
+
+    def at(self, time: float) -> np.ndarray:
+        """State (9,) expected at a time, of itself or later."""
+        ahead = replace(self.ball, covariance=self.ball.covariance.copy())
+        if time > self.time:
+            ahead.predict(time - self.time)
+        return ahead.mean
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedBall:
+    """The reported ball: number, place (3,) [m], velocity (3,) [m/s], their covariance (6, 6), whether it was seen."""
+
+    number: int
+    position: np.ndarray
+    velocity: np.ndarray
+    covariance: np.ndarray
+    seen: bool
+
+
+@dataclass
+class BallTracker:
+    """Takes the detections of all cameras, frame by frame; the first two make places, every one corrects them."""
+
+    cameras: tuple[Camera, ...]
+    options: TrackerOptions = TrackerOptions()
+    physics: Physics = PHYSICS
+    hypotheses: list[Hypothesis] = field(default_factory=list)
+    reported: Hypothesis | None = None
+    number: int = 0
+    sights: list[Sight] = field(default_factory=list)  # of the newest frame
+
+    def guesses(self, time: float) -> list[list[np.ndarray]]:
+        """Of every camera, the pixels (2,) at which the two likeliest hypotheses will be."""
+        ahead = [h.at(time)[:3] for h in self.hypotheses[:2]]
+        pixels = [[camera.project(point) for point in ahead] for camera in self.cameras]
+        return [[p for p in row if np.isfinite(p).all()] for row in pixels]
+
+    def update(self, time: float, detections: Sequence[Sequence[Detection]]) -> TrackedBall | None:
+        """Takes what each camera saw in the frame exposed at ``time`` [s]; the ball, None where none is believed."""
+        self.sights = self._find_sights(detections)
+        for h in self.hypotheses:
+            h.ball.predict(time - h.time)
+            h.time = time
+        free = list(self.sights)
+        for h in self.hypotheses:
+            self._follow(h, detections, free)
+        self._begin(time, free)
+        self._choose(time)
+        best = self.reported
+        if best is None:
+            return None
+        mean, covariance = best.ball.mean, best.ball.covariance[:6, :6]
+        seen = best.seen == time and time - best.placed <= self.options.alone
+        return TrackedBall(self.number, mean[:3].copy(), mean[3:6].copy(), covariance.copy(), seen)
+
+    def _find_sights(self, detections: Sequence[Sequence[Detection]]) -> list[Sight]:
+        found = []
+        for pair in product(*detections[:2]):
+            sight = triangulate(self.cameras[:2], pair, self.options.floor)
+            if sight is None or sight.deviation > self.options.agree:
+                continue
+            if (sight.point > ROOM[0]).all() and (sight.point < ROOM[1]).all():
+                found.append(sight)
+        return found
+
+    def _follow(self, h: Hypothesis, detections: Sequence[Sequence[Detection]], free: list[Sight]) -> None:
+        """Corrects a hypothesis by the place that fits best, which is free no more, or by single cameras' sights."""
+        fits = sorted((self._distance(h, sight), i) for i, sight in enumerate(free))
+        if fits and fits[0][0] < self.options.gate_space:
+            sight = free.pop(fits[0][1])
+            for camera, detection in zip(self.cameras, sight.detections, strict=False):
+                self._take(h, camera, detection, np.inf)
+            h.hits, h.seen, h.placed = h.hits + 1, h.time, h.time
+            h.score = FADING * h.score + weigh(sight)
+            return
+        h.score = FADING * h.score - UNSEEN
+        if any(np.linalg.norm(sight.point - h.ball.mean[:3]) < 0.3 for sight in free):
+            return  # both cameras see it elsewhere
+        for camera, seen in zip(self.cameras, detections, strict=True):
+            near = [(self._misfit(h, camera, d), i) for i, d in enumerate(seen)]
+            if near and min(near)[0] < self.options.gate:
+                self._take(h, camera, seen[min(near)[1]], self.options.gate)
+                h.seen = h.time
+
+    def _distance(self, h: Hypothesis, sight: Sight) -> float:
+        r = sight.point - h.ball.mean[:3]
+        return float(r @ np.linalg.solve(h.ball.covariance[:3, :3] + sight.covariance, r))
+
+    def _misfit(self, h: Hypothesis, camera: Camera, detection: Detection) -> float:
+        residual, slope, noise = self._seen(h, camera, detection)
+        if not np.isfinite(residual).all():
+            return np.inf
+        return float(residual @ np.linalg.solve(slope @ h.ball.covariance @ slope.T + noise, residual))
+
+    def _seen(self, h: Hypothesis, camera: Camera, detection: Detection) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        slope = np.zeros((2, 9))
+        slope[:, :3] = camera.jacobian(h.ball.mean[:3])
+        noise = detection.covariance + self.options.floor**2 * np.eye(2)
+        return detection.centre - camera.project(h.ball.mean[:3]), slope, noise
+
+    def _take(self, h: Hypothesis, camera: Camera, detection: Detection, gate: float) -> None:
+        h.ball.correct(*self._seen(h, camera, detection))
+        slope = np.zeros((2, 9))
+        slope[:, 3:6] = camera.jacobian(h.ball.mean[:3])
+        noise = detection.velocity_deviation**2 * np.eye(2)
+        residual = detection.velocity - slope @ h.ball.mean
+        total = slope @ h.ball.covariance @ slope.T + noise
+        if float(residual @ np.linalg.solve(total, residual)) < self.options.gate:
+            h.ball.correct(residual, slope, noise)
+
+    def _begin(self, time: float, free: list[Sight]) -> None:
+        """Hypotheses of places that none explains; where the reported ball was just lost, it is its stroke."""
+        options, old = self.options, self.reported
+        for sight in sorted(free, key=lambda s: -s.probability):
+            struck = old is not None and old is self.reported and 0.0 < time - old.placed <= options.drop
+            if struck and old is not None:
+                away = float(np.linalg.norm(sight.point - old.ball.mean[:3]))
+                struck = away < 0.03 + options.reach * (time - old.placed)
+            if sight.probability < (options.struck if struck else options.sure):
+                continue
+            new = self._start(time, sight)
+            self.hypotheses.append(new)
+            if struck:
+                self.reported, self.number = new, self.number + 1
+
+    def _start(self, time: float, sight: Sight) -> Hypothesis:
+        slope = np.concatenate([c.jacobian(sight.point) for c in self.cameras[:2]])
+        weights = np.repeat([d.velocity_deviation**-2 for d in sight.detections], 2)[:, None]
+        prior = 8.0**-2 * np.eye(3)
+        covariance = np.zeros((9, 9))
+        spread = np.linalg.inv(slope.T @ (weights * slope) + prior)
+        velocity = spread @ slope.T @ (weights[:, 0] * np.concatenate([d.velocity for d in sight.detections]))
+        covariance[:3, :3], covariance[3:6, 3:6] = sight.covariance, spread + 0.3**2 * np.eye(3)
+        covariance[6:, 6:] = 100.0**2 * np.eye(3)
+        ball = Kalman(np.concatenate([sight.point, velocity, np.zeros(3)]), covariance, self.physics)
+        return Hypothesis(ball, time, time, time, time, score=weigh(sight))
+
+    def _choose(self, time: float) -> None:
+        """Drops what is seen no more, and reports the likeliest."""
+        options = self.options
+        self.hypotheses = [
+            h
+            for h in self.hypotheses
+            if time - h.placed <= (options.forget if h is self.reported else options.drop) + 1e-9
+        ]
+        if self.reported not in self.hypotheses:
+            self.reported = None
+        others = [h for h in self.hypotheses if h is not self.reported and h.placed == time and self._is_ball(h)]
+        best, old = max(others, key=lambda h: h.score, default=None), self.reported
+        lost = old is None or time - old.placed > options.drop
+        if best is not None and (lost or old is None or best.score > old.score + options.margin):
+            self.reported, self.number = best, self.number + 1
+        order = sorted(self.hypotheses, key=lambda h: (h is not self.reported, -h.hits, h.begun))
+        self.hypotheses = order[: options.most]
+
+    def _is_ball(self, h: Hypothesis) -> bool:
+        options = self.options
+        enough = options.hits if h.speed > options.fast else options.slow_hits
+        return h.speed > options.slowest and h.hits >= enough and h.score > options.score
+
+
+def weigh(sight: Sight) -> float:
+    """Evidence for a ball, of both cameras."""
+    odds = [min(d.probability, SUREST) for d in sight.detections]
+    return float(sum(np.log(p / (1.0 - p)) for p in odds)) - CLUTTER

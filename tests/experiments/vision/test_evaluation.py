@@ -1,0 +1,97 @@
+"""What evaluation counts, on clips of drawn discs; the commands from a recording to its figures; the whole training."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+from experiments import cli
+from experiments.vision import clips, evaluation, export, pipeline
+from experiments.vision.pipeline import SHIPPED
+from robot_io.vision import rig
+from robot_io.vision.detection import Detection
+from robot_io.vision.detector import Detector
+from robot_io.vision.recording import FrameWriter
+from tests.support.discs import draw_discs
+
+START, SPEED = np.array([300.0, 400.0]), np.array([14.0, -6.0])
+
+
+def see(camera, point):
+    return Detection(camera.project(np.array(point)), np.eye(2), np.zeros(2), 1.0, 1.0)
+
+
+def test_rays_meet_where_both_cameras_see_one_point():
+    cameras = rig.standard().cameras
+    point = (0.3, -0.4, 0.25)
+    assert evaluation.rays_meet(cameras, see(cameras[0], point), see(cameras[1], point))
+    assert not evaluation.rays_meet(cameras, see(cameras[0], point), see(cameras[1], (0.3, -0.4, 0.35)))
+
+
+def test_a_clip_s_balls_misses_and_false_sights_are_counted(tmp_path):
+    middles = [START + k * SPEED for k in range(10)]
+    path = tmp_path / "a.mcap"
+    with FrameWriter(path, {"a": (640, 512)}, 125.0) as writer:
+        for k, frame in enumerate(draw_discs(middles)):
+            writer.write("a", k / 125, frame)
+    labels = dict(enumerate(middles))
+    labels[5] = middles[5] + 50.0  # a wrong label: neither found nor right
+    labels[6] = None  # as if there were none
+    del labels[8]
+    clip = clips.open_clip(path)
+    for guided in (False, True):
+        sights = evaluation.evaluate_clip(SHIPPED, clip, labels, guided)
+        assert (sights.frames, sights.balls, sights.found) == (7, 6, 5)  # from the third frame on, without one
+        assert sights.false >= 2 and sights.error.max() < 1.0
+        assert any(line == "found 0.8333" for line in sights.lines())
+
+
+@pytest.mark.slow
+def test_from_a_recording_to_its_figures(tmp_path, capsys):
+    recording, draft = tmp_path / "rally.mcap", tmp_path / "draft.csv"
+    assert cli.main(["vision", "record", "--flights", "1", "--seed", "5", "--out", str(recording)]) == 0
+    name = rig.standard().cameras[0].name
+    truth = clips.read_labels(recording.with_suffix(f".{name}.csv"))
+    assert cli.main(["vision", "label", str(recording), "--camera", name, "--out", str(draft)]) == 0
+    drawn = clips.read_labels(draft)
+    both = [k for k in truth if truth[k] is not None and drawn[k] is not None]
+    assert np.median([np.linalg.norm(truth[k] - drawn[k]) for k in both]) < 1.0
+    arguments = ["--labels", str(recording.with_suffix(f".{name}.csv")), "--camera", name]
+    capsys.readouterr()
+    assert cli.main(["vision", "evaluate", str(recording), *arguments]) == 0
+    said = capsys.readouterr().out
+    assert float(said.split("found ")[1].split()[0]) > 0.8 and "guided" in said
+    assert cli.main(["vision", "render", "--count", "1", "--out", str(tmp_path / "pictures")]) == 0
+    assert len(list((tmp_path / "pictures").rglob("*.png"))) == 2
+
+
+def test_requests_that_cannot_be_met_are_refused(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("frame,x,y\n0,1,2\n")
+    refused = {
+        ("evaluate", str(tmp_path / "a.csv")): "--labels",
+        ("evaluate", "--detector", str(tmp_path)): "mjx-tt vision train",
+        ("record", "--out", str(tmp_path / "a.mp4")): ".mcap",
+        ("label", "nowhere.mp4", "--out", str(tmp_path / "b.csv")): "no such file",
+        ("evaluate", str(tmp_path / "a.csv"), "--labels", str(tmp_path / "a.csv")): "expected a video file",
+    }
+    for arguments, message in refused.items():
+        assert cli.main(["vision", *arguments]) == 1
+        assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_training_from_nothing_gives_a_detector_and_resumes(tmp_path):
+    plan = pipeline.Plan(20, 300, 120, 80, 120, 20, 120, 2, 1, 20, 1)
+    figures = pipeline.train_detector(tmp_path, plan, lambda text: nullcontext())
+    assert set(figures) == {"found", "false", "error_50", "error_90", "squared"}
+    assert export.check_golden(tmp_path) < export.AGREEMENT
+    assert Detector(tmp_path).detect(np.zeros((128, 128), np.uint8)) == []
+    before = (tmp_path / "work" / "second.npz").stat().st_mtime_ns
+    assert pipeline.train_detector(tmp_path, plan, lambda text: nullcontext()) == pytest.approx(figures, nan_ok=True)
+    assert (tmp_path / "work" / "second.npz").stat().st_mtime_ns == before
+    assert json.loads((tmp_path / "work" / "plan.json").read_text())["steps"] == 20
+    with pytest.raises(ValueError, match="another --out"):
+        pipeline.train_detector(tmp_path, pipeline.Plan.small(), lambda text: nullcontext())

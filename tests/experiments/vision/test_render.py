@@ -1,0 +1,94 @@
+"""Frames against closed forms: where the streak is, how long, how much noise; and what is still stays as it was."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments.vision import render
+from robot_io.vision.camera import look_at
+
+CAMERA = look_at("side", (-2.3, -0.9, 1.8))
+START, VELOCITY = np.array([0.1, -0.2, 0.3]), np.array([1.0, 6.0, 0.5])
+
+
+def fly(times):
+    return START + np.asarray(times)[:, None] * VELOCITY
+
+
+@pytest.fixture(scope="module")
+def scene():
+    made = render.make_scene(CAMERA, np.random.default_rng(3))
+    made.image[:], made.net[:] = 1, 0
+    made.work[:], made.bayer[:], made.noise[:] = 1, 1, 0
+    made.ball = np.full(3, 200.0)
+    return made
+
+
+def see(scene, exposure, time=0.0, window=None, path=fly):
+    """The mean of noisy frames."""
+    scene.exposure = exposure
+    scene.relight(0.0, 1.0)
+    rng = np.random.default_rng(0)
+    return np.mean([render.render(scene, path, time, rng, window=window).frame for _ in range(40)], 0)
+
+
+def test_the_streak_is_centred_at_mid_exposure_and_as_long_as_the_flight(scene):
+    pixels = CAMERA.project(fly(np.array([-0.002, 0.0, 0.002])))
+    ys, xs = np.nonzero(see(scene, 0.004) - 1.0 > 5)
+    assert np.hypot(xs.mean() - pixels[1][0], ys.mean() - pixels[1][1]) < 0.35
+    length = np.linalg.norm(pixels[2] - pixels[0])
+    along = np.stack([xs, ys], 1) @ (pixels[2] - pixels[0]) / length
+    radius = CAMERA.matrix[0, 0] * 0.02 / CAMERA.depth(START)
+    assert np.ptp(along) == pytest.approx(length + 2 * radius, abs=2.0)
+
+
+def test_noise_grows_with_the_light_as_counted_photons_do(scene):
+    rng = np.random.default_rng(1)
+    for level, gain, brightness in ((40, 0.3, 1.0), (120, 0.3, 1.0), (120, 0.1, 0.5)):
+        scene.image[:] = scene.work[:] = level
+        scene.bayer[:] = level
+        scene.relight(gain, brightness)
+        frame = render.render(scene, render.no_ball, 0.0, rng).frame.astype(float)
+        assert frame.mean() == pytest.approx(level * brightness, abs=0.1)
+        # A rounded level adds a twelfth.
+        assert frame.var() == pytest.approx(gain * brightness * level + render.READ_NOISE + 1 / 12, rel=0.03)
+    scene.image[:] = scene.work[:] = 1
+    scene.bayer[:] = 1
+
+
+def test_a_window_shows_what_the_whole_frame_shows_there(scene):
+    x, y = (np.round(CAMERA.project(START) / 2) * 2 - 40).astype(int)
+    whole = see(scene, 0.002)[y : y + 80, x : x + 80]
+    part = see(scene, 0.002, window=(int(x), int(y), 80, 80))
+    assert np.abs(whole - part).max() < 2.0 and part.max() > 100
+
+
+def test_what_stands_still_is_drawn_once():
+    rng = np.random.default_rng(5)
+    made, actors = render.make_scene(CAMERA, rng), render.Actors(rng)
+    before = made.bayer.copy()
+    for time in (0.0, 0.3):
+        shapes = actors.capsules(time, START)
+        assert render.render(made, fly, time, rng, shapes).frame.std() > 1
+    np.testing.assert_array_equal(made.work, made.image)
+    np.testing.assert_array_equal(made.bayer, before)
+
+
+def test_a_ball_behind_something_or_outside_is_not_seen(scene):
+    rng, towards = np.random.default_rng(0), CAMERA.centre - START
+    beside = START + 0.3 * towards / np.linalg.norm(towards)
+    for radius, seen in ((0.2, 0.0), (0.0005, 1.0)):
+        wall = render.Capsule(beside, beside + [0.0, 0.0, 0.01], radius, np.zeros(3))
+        assert render.render(scene, fly, 0.0, rng, [wall]).seen == pytest.approx(seen, abs=0.25)
+    behind = render.Capsule(START - towards, START - towards, 0.2, np.zeros(3))
+    assert render.render(scene, fly, 0.0, rng, [behind]).seen == 1.0
+    for nowhere in (lambda times: fly(times) + [0.0, 40.0, 0.0], render.no_ball):
+        assert render.render(scene, nowhere, 0.0, rng).seen == 0.0
+
+
+def test_the_mosaic_keeps_the_colour_of_each_pixel():
+    image = np.random.default_rng(0).integers(0, 255, (4, 6, 3), np.uint8)
+    pattern = [[0, 1], [1, 2]]  # red green, green blue
+    expected = [[image[y, x, pattern[y % 2][x % 2]] for x in range(6)] for y in range(4)]
+    np.testing.assert_array_equal(render.mosaic(image), expected)
