@@ -24,7 +24,7 @@ app = options.command(
   mjx-tt vision label clip.mp4 --out clip.csv           the detector's balls, for a person to correct
   mjx-tt vision evaluate clip.mp4 --labels clip.csv     how many it finds; the columns are frame,x,y
   mjx-tt vision evaluate --flights 100                  on rendered flights instead
-  mjx-tt vision train --out runs/detector               from nothing to weights, in less than an hour
+  mjx-tt vision train --out runs/detector               from nothing to weights, in about an hour and a half
   mjx-tt vision calibrate rally.mcap --out rig.yaml     cameras by the table's lines and flights
   mjx-tt vision run rally.mcap --rig rig.yaml           the tracker: datagrams to the bridge
   mjx-tt vision rally runs/quickstart/artefact          the emulated robot plays by rendered cameras
