@@ -120,7 +120,9 @@ def test_unknown_suffix_and_format(tmp_path):
         (tmp_path / name).write_text(GOOD)
     with pytest.raises(ValueError, match="suffix '.xls' is unknown; expected .csv"):
         read(tmp_path / "balls.xls")
-    with pytest.raises(ValueError, match="expected a format of csv, mcap, bag, deepmind, aimy, spindoe, got 'xls'"):
+    with pytest.raises(
+        ValueError, match="expected a format of csv, mcap, bag, deepmind, aimy, spindoe, events, got 'xls'"
+    ):
         read(tmp_path / "balls.csv", "xls")
 
 

@@ -12,6 +12,9 @@ from robot_io.devices.festo.config import Axis
 from robot_io.devices.festo.profile import AxisStatus
 
 STANDING_TIME, STANDING_WAY = 0.06, 1e-3  # [s], [m]: an axis that moved less than that in this time stands
+# [s] of the same, for one that is held: longer than a drive swings to and fro. At every turn of a swing an axis stands
+# for a moment, and a hold that followed it from turn to turn made the swing grow.
+STANDING_AGAIN = 0.3
 # One that shakes is held as well: [s] after the last command, when it is [m] away from its place, once in [s].
 LONGEST_BRAKING, SHAKING_WAY, SHAKING = 0.5, 5e-3, 1.0
 # [m/s] at which a drive takes its set-point back to an axis that stands: 0.4 m in less than a second.
@@ -38,7 +41,7 @@ class Channel:
         self.homing = False  # shall be homed
         self.jumped = False  # its position, as no axis can; until somebody switches it on again
         self.held: float | None = None  # where it is held; None while it moves, brakes or is not known
-        self._past: deque[tuple[float, float]] = deque()  # times and positions of the last STANDING_TIME
+        self._past: deque[tuple[float, float]] = deque()  # times and positions of the last STANDING_AGAIN
         self._idle_since, self._held_since = math.inf, -math.inf  # [s] without commands; held at this place
 
     def answered(self, status: AxisStatus, now: float, speed: float) -> None:
@@ -48,7 +51,7 @@ class Channel:
         self.jumped |= bool(homed and status.homed) and abs(position - self.position) > reach
         self.status, self.received, self.position = status, now, position
         self._past.append((now, position))
-        while len(self._past) > 1 and self._past[1][0] <= now - STANDING_TIME:
+        while len(self._past) > 1 and self._past[1][0] <= now - STANDING_AGAIN:
             self._past.popleft()
 
     def follow(self) -> None:
@@ -58,8 +61,9 @@ class Channel:
     def hold(self, now: float) -> None:
         """Note where to hold an axis that follows no commands: where it is measured, once it stands."""
         self._idle_since = min(self._idle_since, now)
-        positions = [position for _, position in self._past]
-        stands = bool(positions) and self._past[0][0] <= now - STANDING_TIME and np.ptp(positions) <= STANDING_WAY
+        begin = now - (STANDING_TIME if self.held is None else STANDING_AGAIN)
+        known = bool(self._past) and self._past[0][0] <= begin
+        stands = known and np.ptp([position for time, position in self._past if time >= begin]) <= STANDING_WAY
         shakes = min(now - self._idle_since - LONGEST_BRAKING, now - self._held_since - SHAKING) > 0.0
         away = math.inf if self.held is None else abs(self.position - self.held)
         if self.status is None or not self.status.homed or self.homing or self.jumped:

@@ -24,12 +24,46 @@ from robot_io.devices.festo import (
     FhppProfile,
     ModbusLink,
 )
+from robot_io.devices.festo.channel import Channel
+from robot_io.devices.festo.profile import AxisStatus
 from robot_io.emulator.axes import AxisEmulator, AxisUnits, DriveParams, serve
 from tests.support.axes_lockstep import CYCLE, PROFILES, STEP, LockStep, Stream
 from tests.support.paths import ROOT
 
 A = 15.0  # [m/s^2]
 EDCON_PYTHON = "MJX_TT_FESTO_EDCON_PYTHON"
+
+
+# Where an axis without commands is held
+
+
+def test_a_swinging_axis_settles_where_it_is_held():
+    """A drive that swings to and fro about its target, seen 0.08 s late: damped, it must come to rest."""
+    channel, place, velocity, seen = Channel(Axis("x", None, CmmtProfile(), -1.0, 1.0)), 0.02, 0.0, []
+    width, damping = 2.0 * np.pi * 4.5, 0.04
+    furthest = []
+    for step in range(8000):
+        now, target = step * 1e-3, channel.held or 0.0
+        velocity += 1e-3 * (width**2 * (target - place) - 2.0 * damping * width * velocity)
+        place += 1e-3 * velocity
+        seen.append(place)
+        furthest.append(abs(velocity))
+        if step % 13 == 0:
+            channel.answered(AxisStatus(True, True, False, 0, 0, False, True, seen[max(step - 80, 0)], 0.0), now, 2.0)
+            channel.hold(now)
+    assert channel.held is not None and max(furthest[-500:]) < 3e-3  # [m/s]; it swung by 0.5 m/s
+
+
+def test_an_axis_that_was_pushed_away_is_held_where_it_stands_then():
+    channel = Channel(Axis("x", None, CmmtProfile(), -1.0, 1.0))
+    held = []
+    for step in range(150):
+        now = step * 0.0133
+        place = 0.1 if now < 0.6 else min(0.1 + 0.5 * (now - 0.6), 0.15)
+        channel.answered(AxisStatus(True, True, False, 0, 0, False, True, place, 0.0), now, 2.0)
+        channel.hold(now)
+        held.append(channel.held)
+    assert held[10] == 0.1 and held[-1] == 0.15
 
 
 # Registers, worked out by hand from the bits' names
