@@ -62,8 +62,9 @@ class Channel:
         """Note where to hold an axis that follows no commands: where it is measured, once it stands."""
         self._idle_since = min(self._idle_since, now)
         begin = now - (STANDING_TIME if self.held is None else STANDING_AGAIN)
-        known = bool(self._past) and self._past[0][0] <= begin
-        stands = known and np.ptp([position for time, position in self._past if time >= begin]) <= STANDING_WAY
+        recent = [position for time, position in self._past if time >= begin]
+        known = len(recent) > 1 and self._past[0][0] <= begin  # an axis that has not answered for long may be anywhere
+        stands = known and np.ptp(recent) <= STANDING_WAY
         shakes = min(now - self._idle_since - LONGEST_BRAKING, now - self._held_since - SHAKING) > 0.0
         away = math.inf if self.held is None else abs(self.position - self.held)
         if self.status is None or not self.status.homed or self.homing or self.jumped:

@@ -64,6 +64,9 @@ def test_an_axis_that_was_pushed_away_is_held_where_it_stands_then():
         channel.hold(now)
         held.append(channel.held)
     assert held[10] == 0.1 and held[-1] == 0.15
+    channel.follow()
+    channel.hold(now + 5.0)  # after a silence nothing says that it stands
+    assert channel.held is None
 
 
 # Registers, worked out by hand from the bits' names
