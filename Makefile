@@ -1,6 +1,6 @@
 # make view   set up and show a policy that comes with the program in the browser, at once
 # make demo   set up, train the quickstart, evaluate it, export it
-# make rig-demo  a policy for rallies plays 20 of them with a virtual player on the emulated robot, over real sockets in
+# make rig-demo  a policy for rallies plays five minutes with a virtual player on the emulated robot, over real sockets in
 #             real time
 # make study-quick  the whole study in small: five virtual players, all methods, a report (16 to 30 minutes on two
 #             cores; resumable)
@@ -27,7 +27,7 @@ demo: $(READY)
 	$(BIN)/mjx-tt train quickstart.yaml --out runs
 
 rig-demo: $(READY)
-	$(BIN)/mjx-tt run rallies --robot rig --rallies 20 --player player1 --log runs/rig-demo
+	$(BIN)/mjx-tt run rallies --robot rig --rallies 20 --seconds 300 --player player1 --log runs/rig-demo
 
 study-quick: $(READY)
 	$(BIN)/mjx-tt is2r study_quick.yaml --out runs

@@ -267,10 +267,10 @@ def test_braking_from_every_accepted_state_is_safe_and_allowed(attacked, distanc
 def test_in_free_space_the_gate_is_the_simulations_limiter_bit_for_bit():
     """Apart from the room that it keeps for the drives: at the ends of the ranges, and below full speed.
 
-    The arm's controller waits for nobody here: what it would do in silence asks for more room than these places have.
+    No device waits for anybody here: what it would do in silence asks for more room than these places have.
     """
     rng = np.random.default_rng(3)
-    config = SafetyConfig(silence=(0.05,) * 2 + (0.01,) * 6)
+    config = SafetyConfig(silence=(0.004,) * 8)
     speed = tuple((0.9 * V_MAX).tolist())
     limits = replace(LIMITS, margin=SafetyConfig().overshoot, velocity=speed, policy_velocity=speed)
     for _ in range(10):
